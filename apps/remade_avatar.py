@@ -149,7 +149,7 @@ def _manifest(bundle: Bundle, recipe: _Recipe, network: Any, quantised: Quantise
 
 def _quantised(bundle: Bundle, recipe: _Recipe, chosen: NDArray[np.intp]) -> Quantised:
     try:
-        from trilane.training.calibration_views import training_views
+        from trilane.training.make_bundle import training_views
         from trilane.training.quantising.quantise import quantise
         from trilane.training.validate import open_renderer
     except ImportError as error:
@@ -163,10 +163,8 @@ def _float_model(bundle: Bundle, recipe: _Recipe) -> onnx.ModelProto:
     """The network that is quantised: the avatar's own, or an untrained one."""
     import torch
 
-    from trilane.training.calibration_views import float_model
-    from trilane.training.make_bundle import CALIBRATION_SHAPE
-    from trilane.training.network import UNet
-    from trilane.training.onnx_export import export_onnx
+    from trilane.training.make_bundle import CALIBRATION_SHAPE, float_model
+    from trilane.training.network import UNet, export_onnx
 
     own = bundle.manifest.network
     if not recipe.trained:

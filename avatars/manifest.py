@@ -104,7 +104,7 @@ class Figures(_Model):
 
     `psnr_db_by_band`: in dB, before random backgrounds, inside the box of the true mask. `see_through`: share of the
     inside of the person whose alpha is less than 0.9. `iou`, `ssim`: means. The other keys, see `summary` of
-    `training/error_summary.py`, are None where nobody measured them, and then not written; without
+    `training/image_error.py`, are None where nobody measured them, and then not written; without
     `psnr_db_by_background` the figures are before one grey, as an older Trilane measured them.
     """
 

@@ -9,29 +9,31 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from itertools import islice
+from pathlib import Path
+from typing import Any, Protocol
 
+import numpy as np
+import psutil
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from trilane.training.activation_noise import add_activation_noise
-from trilane.training.adversary import Adversary
+from trilane.errors import BadInputError, MissingPartError, reason
+from trilane.files import DAMAGED
+from trilane.install import package_line
 from trilane.training.batch_choice import Batch, batch_stream, is_whole, load_batch
 from trilane.training.byte_grid import ByteGrid
-from trilane.training.device import chosen_device
-from trilane.training.dropout import add_dropout
-from trilane.training.objective import Objective
-from trilane.training.optimisers import clip_gradients, optimiser_of
-from trilane.training.perceptual import Vgg16
-from trilane.training.rounding import round_to_bytes
+from trilane.training.make_bundle import round_to_bytes
+from trilane.training.network import add_activation_noise, add_dropout
+from trilane.training.objective import Adversary, Objective, Vgg16
 from trilane.training.sample_files import ShapeGroup
 from trilane.training.trainable_avatar import TrainableAvatar
-from trilane.training.training_settings import TrainingSettings
-from trilane.training.training_state import TrainingState
+from trilane.training.training_settings import OptimiserOptions, TrainingSettings
+from trilane.writing import write_atomically
 
-#: Share of the steps in which the learning rate rises.
-WARM_UP = 0.02
 #: Steps that are measured to say what all will take.
 MEASURED = 4
 #: Moves the number of a step into the bits above the seed.
@@ -170,3 +172,252 @@ def _measured(
     for _ in going:
         pass
     return (time.monotonic() - start) / MEASURED
+
+
+# Where a training computes: the CPU, or a GPU that PyTorch can use.
+#
+# Rule: a device that was asked for by name is used, or its absence is said; only `auto` chooses.
+
+MB = 1e6
+
+
+def chosen_device(asked: str) -> torch.device:
+    """`asked`: "auto", "cpu" or "cuda". Raises MissingPartError where there is no such GPU."""
+    found = torch.cuda.is_available()
+    if asked == "cuda" and not found:
+        what = "device cuda: this PyTorch finds no NVIDIA GPU (device auto or cpu trains on the CPU)"
+        raise MissingPartError(what, f"{package_line('torch')}, with NVIDIA's driver")
+    return torch.device("cuda" if found and asked != "cpu" else "cpu")
+
+
+def device_words(device: torch.device, threads: int) -> str:
+    """What `device` is, as part of a sentence. `threads`: of PyTorch on the CPU."""
+    if device.type == "cuda":
+        return f"the GPU {torch.cuda.get_device_name(device)}"
+    return f"{threads} {'thread' if threads == 1 else 'threads'} of the CPU"
+
+
+def memory_words(device: torch.device) -> str:
+    """What this process has of memory now, and of a GPU's the most that it had."""
+    of_cpu = f"{psutil.Process().memory_info().rss / MB:.0f} MB of memory"
+    if device.type != "cuda":
+        return of_cpu
+    return f"{of_cpu}, {torch.cuda.max_memory_allocated(device) / MB:.0f} MB of the GPU's"
+
+
+# Adam and AdamW that leave numbers without a gradient as they are, with their moments.
+#
+# Rule: a texel that a batch does not show is no texel whose gradient is 0: plain Adam would go on moving it by its old
+# momentum, let that fade, and let its weight decay.
+
+#: Key of the groups of parameters that are masked.
+MASKED = "masked"
+MOMENTS = ("exp_avg", "exp_avg_sq")
+
+
+class _Masked(torch.optim.Optimizer):
+    """What is put before a class of Adam.
+
+    In groups of parameters with `masked`, numbers whose gradient is exactly 0 do not take part in a step. The count of
+    steps, which corrects the moments' bias, goes on for all, as in `torch.optim.SparseAdam`.
+    """
+
+    def step(self, closure: Callable[[], float] | None = None) -> Any:
+        """As the class behind this one."""
+        groups = [group for group in self.param_groups if group.get(MASKED)]
+        kept = [
+            self._kept(parameter) for group in groups for parameter in group["params"] if parameter.grad is not None
+        ]
+        loss = super().step(closure)
+        for parameter, unseen, values in kept:
+            for tensor, before in zip(self._tensors(parameter), values, strict=True):
+                tensor.data[unseen] = before
+        return loss
+
+    def _kept(self, parameter: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """`parameter`, where it has no gradient, and what it and its moments have there; moments begin at 0."""
+        unseen = parameter.grad == 0
+        if self.state[parameter]:
+            return parameter, unseen, [tensor.data[unseen].clone() for tensor in self._tensors(parameter)]
+        value = parameter.data[unseen].clone()
+        return parameter, unseen, [value, *(torch.zeros_like(value) for _ in MOMENTS)]
+
+    def _tensors(self, parameter: Tensor) -> list[Tensor]:
+        return [parameter, *(self.state[parameter][name] for name in MOMENTS)]
+
+
+class MaskedAdam(_Masked, torch.optim.Adam):
+    """Adam, whose weight decay is part of the gradient and so is left out where there is none."""
+
+
+class MaskedAdamW(_Masked, torch.optim.AdamW):
+    """AdamW."""
+
+
+# The optimiser of an avatar: Adam or AdamW, of three groups of parameters.
+#
+# Rule: a group is what shares a learning rate, a decay and moments; the table says which class steps it.
+
+#: By kind, and whether texels without a gradient stay.
+CLASSES: dict[tuple[str, bool], type[torch.optim.Optimizer]] = {
+    ("adamw", False): torch.optim.AdamW,
+    ("adamw", True): MaskedAdamW,
+    ("adam", False): torch.optim.Adam,
+    ("adam", True): MaskedAdam,
+}
+USUAL = OptimiserOptions()
+
+
+class Rates(Protocol):
+    """Learning rates of network and texture, and the decay of weights."""
+
+    @property
+    def network_rate(self) -> float: ...
+
+    @property
+    def texture_rate(self) -> float: ...
+
+    @property
+    def weight_decay(self) -> float: ...
+
+
+def optimiser_of(
+    avatar: TrainableAvatar, rates: Rates, options: OptimiserOptions = USUAL, masked: bool = False
+) -> torch.optim.Optimizer:
+    """What steps `avatar`: its kernels, the network's other weights, which do not decay, and its texture.
+
+    `rates`: learning rates and decay.
+    `options`: kind and momenta.
+    `masked`: texels without a gradient stay as they are, with their moments.
+    """
+    kernels = [p for p in avatar.network.parameters() if p.ndim > 1]
+    others = [p for p in avatar.network.parameters() if p.ndim <= 1]
+    texture = list(avatar.texture.parameters())
+    rows = (
+        (kernels, rates.network_rate, rates.weight_decay, options.momentum),
+        (others, rates.network_rate, 0.0, options.momentum),
+        (texture, rates.texture_rate, rates.weight_decay, options.texture_momentum),
+    )
+    groups: list[dict[str, Any]] = [
+        {"params": params, "lr": rate, "weight_decay": decay, "betas": (momentum, options.second_momentum)}
+        for params, rate, decay, momentum in rows
+    ]
+    if masked:
+        groups[-1][MASKED] = True
+    return CLASSES[options.kind, masked](groups, lr=rates.network_rate)
+
+
+def clip_gradients(module: nn.Module, options: OptimiserOptions = USUAL) -> None:
+    """Limit the gradients of `module`: each number by `clip_value`, then the norm of all by `clip_norm`. In place."""
+    if options.clip_value:
+        nn.utils.clip_grad_value_(module.parameters(), options.clip_value)
+    if options.clip_norm:
+        nn.utils.clip_grad_norm_(module.parameters(), options.clip_norm)
+
+
+# Everything that a training by steps goes on from, as one .npz file: weights, their average and Adam's moments, and the
+# same of discriminators.
+#
+# Rule: what was read computes the same bits as what was written, so tensors keep their layout in memory.
+
+EXPECTED = "the state of this training"
+REMEDY = "remove it, and the training begins anew"
+
+
+@dataclass
+class TrainingState:
+    """`avatar`, trained by `optimiser` for the `objective`; the `average` of its weights; `step`s were done."""
+
+    avatar: TrainableAvatar
+    average: TrainableAvatar
+    optimiser: torch.optim.Optimizer
+    objective: Objective
+    step: int = 0
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by name; they are the state's own."""
+        modules: dict[str, nn.Module] = {"avatar": self.avatar, "average": self.average}
+        if self.objective.adversary is not None:
+            modules["discriminators"] = self.objective.adversary.discriminators
+        named = {
+            f"{kind}.{name}": value for kind, module in modules.items() for name, value in module.state_dict().items()
+        }
+        if self.avatar.grid is not None:
+            named |= {"grid.ends": self.avatar.grid.ends, "grid.alike": self.avatar.grid.alike}
+        for kind, optimiser in self.optimisers().items():
+            for number, moments in optimiser.state_dict()["state"].items():
+                named |= {f"{kind}.{number}.{name}": value for name, value in moments.items()}
+        return named
+
+    @property
+    def device(self) -> torch.device:
+        """Where it is trained."""
+        return next(self.avatar.parameters()).device
+
+    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """All optimisers by name, each of Adam's kind."""
+        adversary = self.objective.adversary
+        return {"optimiser": self.optimiser} | ({} if adversary is None else {"judges": adversary.optimiser})
+
+
+def save_state(state: TrainingState, path: Path) -> None:
+    """Write `state` as the file `path`, whole or not at all. Raises BadInputError."""
+    arrays = {name: value.detach().cpu().numpy() for name, value in state.tensors().items()}
+    with write_atomically(path) as draft, draft.open("wb") as file:
+        np.savez(file, step=np.int64(state.step), **arrays)
+
+
+def load_state(state: TrainingState, path: Path) -> None:
+    """Set `state` to what `save_state` wrote. Raises BadInputError for the state of another training."""
+    try:
+        with path.open("rb") as source, np.load(source, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except (*DAMAGED, TypeError) as error:  # TypeError: of a lone array
+        raise BadInputError(path, reason(error).splitlines()[0], EXPECTED, REMEDY) from error
+    for optimiser in state.optimisers().values():
+        _add_moments(optimiser)
+    wanted = {name: tuple(value.shape) for name, value in state.tensors().items()} | {"step": ()}
+    found = {name: array.shape for name, array in arrays.items()}
+    if wanted != found:
+        other = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
+        raise BadInputError(path, f"{other[0]} {found.get(other[0], 'missing')}", EXPECTED, REMEDY)
+    state.step = int(arrays.pop("step"))
+    _fill(state.tensors(), arrays)
+
+
+def _fill(tensors: dict[str, Tensor], arrays: dict[str, NDArray[np.generic]]) -> None:
+    for name, value in tensors.items():
+        value.data.copy_(torch.from_numpy(arrays[name]))
+
+
+def _add_moments(optimiser: torch.optim.Optimizer) -> None:
+    """Adam's moments, as its first step makes them: laid out in memory as their parameters."""
+    for group in optimiser.param_groups:
+        for parameter in group["params"]:
+            optimiser.state[parameter] = {
+                "step": torch.tensor(0.0),
+                "exp_avg": torch.zeros_like(parameter, memory_format=torch.preserve_format),
+                "exp_avg_sq": torch.zeros_like(parameter, memory_format=torch.preserve_format),
+            }
+
+
+#: Share of the steps in which the learning rate rises.
+WARM_UP = 0.02
+
+
+# How far a training's loss fell: the same samples, before the first step and after the last.
+#
+# Rule: it is a loss of the avatar alone, without what discriminators find, which is another measure after each step; it
+# is of the weights that become the avatar, over the same backgrounds, and computing it changes nothing of the training.
+
+
+def probe_loss(state: TrainingState, groups: list[ShapeGroup]) -> float:
+    """The mean loss of the averaged avatar of `state`, as it would be written now, over first samples of `groups`."""
+    judge = replace(state.objective, adversary=None)
+    losses = list[float]()
+    with torch.no_grad(), torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        for group in groups:
+            uv, covered, target = load_batch(group, np.zeros(1, np.int64), state.device)
+            losses.append(float(judge.total(judge.terms(state.average(uv, covered), target))))
+    return float(np.mean(losses))

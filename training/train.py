@@ -10,40 +10,54 @@ import json
 import math
 import shlex
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import torch
+from PIL import Image
 
-from trilane.avatars.bundle import OFFSETS, bundle_folder, load_bundle
+from trilane.avatars.bundle import OFFSETS, Bundle, bundle_folder, load_bundle, write_manifest
 from trilane.avatars.manifest import sha256_of
 from trilane.errors import BadInputError
 from trilane.files import read_text
-from trilane.training.body_arrays import body_arrays
-from trilane.training.capture_error import error_facts, frame_errors, write_held_out_error
-from trilane.training.dataset import Planned, plan_training, write_dataset
-from trilane.training.device import chosen_device, device_words, memory_words
+from trilane.training.capture.capture_samples import CaptureRenderer
+from trilane.training.dataset import VALIDATION_SIZE, Planned, plan_training, write_dataset
 from trilane.training.first_texture import first_texture
-from trilane.training.from_integers import network_of
-from trilane.training.make_bundle import quantise_avatar, write_avatar, write_float_network
+from trilane.training.image_error import MEANS, ImageError, image_error
+from trilane.training.make_bundle import keep_rounded_weights, quantise_avatar, write_avatar, write_float_network
 from trilane.training.network import UNet
-from trilane.training.neural_texture import SIDES, NeuralTexture
-from trilane.training.outlines import subject_with_offsets
-from trilane.training.perceptual import Vgg16, read_vgg16
-from trilane.training.probe_loss import probe_loss
-from trilane.training.progress_sheet import write_sheet
-from trilane.training.rounding import keep_rounded_weights
+from trilane.training.objective import Vgg16, read_vgg16
 from trilane.training.sample_files import FIELDS, ShapeGroup, open_groups
-from trilane.training.step_loop import first_state, step_seconds, steps
+from trilane.training.stand_off import subject_with_offsets
+from trilane.training.step_loop import (
+    TrainingState,
+    chosen_device,
+    device_words,
+    first_state,
+    load_state,
+    memory_words,
+    probe_loss,
+    save_state,
+    step_seconds,
+    steps,
+)
 from trilane.training.subject import Subject, captured_subject, clothed_subject
-from trilane.training.trainable_avatar import TrainableAvatar
+from trilane.training.surface import body_arrays
+from trilane.training.trainable_avatar import (
+    SIDES,
+    NeuralTexture,
+    TrainableAvatar,
+    float_painter,
+    load_network,
+    network_of,
+    save_network,
+)
 from trilane.training.training_settings import NAME, TrainingSettings, read_settings, settings_text
-from trilane.training.training_state import TrainingState, load_state, save_state
-from trilane.training.weights_file import load_network, save_network
-from trilane.writing import write_bytes
+from trilane.training.validate import integer_painter, side_by_side
+from trilane.writing import write_atomically, write_bytes
 
 CHANNELS = 16
 DEFAULT_NETWORK = Path(__file__).with_name("default-network.npz")
@@ -290,3 +304,66 @@ def _measure(places: Places, subject: Subject, settings: TrainingSettings) -> di
     facts = error_facts(frame_errors(bundle, subject.frames, subject.held_out, settings.threads))
     write_held_out_error(bundle, facts)
     return facts
+
+
+# Sheets of a training on a capture: held-out frames beside what the avatar paints of them so far.
+#
+# Rule: frames are taken whole, as they are measured at the end, and painting changes nothing of the training.
+
+#: Held-out frames on a sheet.
+MOST_FRAMES = 6
+
+
+def write_sheet(path: Path, avatar: TrainableAvatar, subject: Subject) -> None:
+    """Write as PNG: a row for each of some held-out frames, the frame on the left. Without such frames, nothing.
+
+    Raises BadInputError when it cannot be written.
+    """
+    paint, rows = float_painter(avatar.network, *(level.detach() for level in avatar.texture.levels())), []
+    for number in subject.held_out[:: max(1, len(subject.held_out) // MOST_FRAMES)][:MOST_FRAMES]:
+        sample = subject.frames.whole_sample(number, VALIDATION_SIZE) if subject.frames is not None else None
+        if sample is not None and subject.frames is not None:
+            uv, truth = subject.frames.render(sample)
+            rows.append(side_by_side((truth, paint(sample, uv))))
+    if rows:
+        path.parent.mkdir(exist_ok=True)
+        with write_atomically(path) as draft:
+            Image.fromarray(np.vstack(rows)).save(draft, format="png")
+
+
+# How good an avatar is on frames of a capture that training never read.
+#
+# Rule: what is measured lies in the bundle and runs as in the pipeline; frames are taken whole, nothing is random.
+
+RUNTIME = "ort"
+
+
+def frame_errors(bundle: Bundle, renderer: CaptureRenderer, numbers: Sequence[int], threads: int) -> list[ImageError]:
+    """The error of `bundle` on each of the frames `numbers` that shows the person, against the frame and its mask.
+
+    `threads`: of the runtime. Raises BadInputError, MissingPartError.
+    """
+    paint = integer_painter(renderer, bundle, RUNTIME, threads)
+    errors = []
+    for number in numbers:
+        sample = renderer.whole_sample(number, VALIDATION_SIZE)
+        if sample is None:
+            continue
+        uv, truth = renderer.render(sample)
+        errors.append(image_error(paint(sample, uv), truth))
+    return [error for error in errors if error is not None]
+
+
+def error_facts(errors: Sequence[ImageError]) -> dict[str, Any]:
+    """Means of `errors`, and how they were measured: keys `runtime`, `size`, `frames`, and those of an error."""
+    names = [name for name in MEANS if name != "background"]
+    means = (
+        {name: round(float(np.mean([getattr(error, name) for error in errors])), 4) for name in names} if errors else {}
+    )
+    return {"runtime": RUNTIME, "size": VALIDATION_SIZE, "frames": len(errors), **means}
+
+
+def write_held_out_error(bundle: Bundle, facts: dict[str, Any]) -> None:
+    """Put `facts` of held-out frames into the provenance of the manifest of `bundle`."""
+    provenance = bundle.manifest.provenance | {"held_out_error": facts}
+    write_manifest(bundle.folder, bundle.manifest.model_copy(update={"provenance": provenance}))

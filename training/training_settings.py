@@ -9,7 +9,7 @@ import json
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError
 
@@ -17,9 +17,149 @@ from trilane.errors import BadInputError
 from trilane.files import read_text
 from trilane.near_miss import did_you_mean
 from trilane.scene.schema import Table
-from trilane.training.loss_weights import LossWeights
-from trilane.training.training_options import BatchOptions, OptimiserOptions, RegularisationOptions
-from trilane.training.usual_settings import with_usual
+
+# Options of a training, in tables of `training.toml`: the optimiser, how batches are made, what makes it harder.
+#
+# Rule: it needs no PyTorch, so that settings are read, and refused, where none is installed. The defaults change
+# nothing.
+
+Repeats = Annotated[int, Field(ge=1, le=100)]
+
+
+class OptimiserOptions(Table):
+    """`[optimiser]`.
+
+    `kind`: Adam (a decay of weights goes through its moments) or AdamW (it does not). `momentum`, `texture_momentum`:
+    Adam's first, of network and texture; 0 is off. `second_momentum`: Adam's second, of both. `clip_norm`: the norm of
+    all gradients is at most this; 0 is off. `clip_value`: each number of a gradient is at most this; 0 is off.
+    `batches_per_step`: whose mean gradient makes a step.
+    """
+
+    kind: Literal["adamw", "adam"] = "adamw"
+    momentum: float = Field(default=0.9, ge=0, lt=1)
+    texture_momentum: float = Field(default=0.9, ge=0, lt=1)
+    second_momentum: float = Field(default=0.99, ge=0, lt=1)
+    clip_norm: float = Field(default=1.0, ge=0, le=1e6)
+    clip_value: float = Field(default=0.0, ge=0, le=1e6)
+    batches_per_step: int = Field(default=1, ge=1, le=1000)
+
+
+class BatchOptions(Table):
+    """`[batches]`.
+
+    `sample_share`: of the samples, drawn once, that are used. `same_zoom`: the samples of a batch have about one zoom.
+    `full_body_statistics`: batch statistics come from batches of whole bodies alone, other batches use them.
+    `full_body_from`: share of the steps after which all samples show whole bodies. `repeats`: how often an epoch has a
+    sample of each band: far, full body, upper body, face, anywhere.
+    """
+
+    sample_share: float = Field(default=1.0, gt=0, le=1)
+    same_zoom: bool = False
+    full_body_statistics: bool = False
+    full_body_from: float = Field(default=1.0, ge=0, le=1)
+    repeats: tuple[Repeats, Repeats, Repeats, Repeats, Repeats] = (1, 1, 1, 1, 1)
+
+
+class RegularisationOptions(Table):
+    """`[regularisation]`: what is done to the avatar in each step.
+
+    `texture_noise`, `input_noise`: standard deviation of Gaussian noise on every texel, and on every number of the
+    network's input. `dropout`: probability of each channel to be 0 after each level of encoder and decoder.
+    """
+
+    texture_noise: float = Field(default=0.0, ge=0, le=1)
+    input_noise: float = Field(default=0.0, ge=0, le=1)
+    dropout: float = Field(default=0.0, ge=0, lt=1)
+
+
+# Weights of the terms of the loss, by name.
+#
+# Rule: it needs no PyTorch, so that settings are read, and refused, where none is installed.
+
+
+class LossWeights(Table):
+    """Of each term of `losses.loss_terms`; 0 leaves it out. The defaults are the default avatar's.
+
+    `perceptual` is by features of VGG-16 where their weights are given, else one minus MS-SSIM, as `structure` always
+    is. `adversarial` and `features` (feature matching) bring discriminators.
+    """
+
+    composite: float = Field(default=0.4, ge=0, le=1000)
+    decibels: float = Field(default=0.03, ge=0, le=1000)
+    colour: float = Field(default=0.1, ge=0, le=1000)
+    edges: float = Field(default=0.2, ge=0, le=1000)
+    coarse: float = Field(default=0.2, ge=0, le=1000)
+    mask: float = Field(default=0.1, ge=0, le=1000)
+    background: float = Field(default=0.05, ge=0, le=1000)
+    overlap: float = Field(default=0.1, ge=0, le=1000)
+    structure: float = Field(default=0.0, ge=0, le=1000)
+    perceptual: float = Field(default=0.0, ge=0, le=1000)
+    adversarial: float = Field(default=0.0, ge=0, le=1000)
+    features: float = Field(default=0.0, ge=0, le=1000)
+
+    @property
+    def judged(self) -> bool:
+        """Whether a term is about what discriminators find."""
+        return self.adversarial > 0 or self.features > 0
+
+    def by_name(self) -> dict[str, float]:
+        """The weights as `losses.total_loss` takes them."""
+        return {str(name): float(value) for name, value in self.model_dump().items()}
+
+
+# What is usual in a training where its settings do not say it: by its loss, by what it starts from, by its length.
+#
+# Rule: these are values of `TrainingSettings`, nothing else, and all of them stand in the `training.toml` of an avatar.
+
+#: Losses by name: the weights, and the settings that belong to them where a training does not say others.
+LOSSES: dict[str, dict[str, Any]] = {
+    "default": {"loss": {}},
+    "thesis": {
+        "loss": dict.fromkeys(LossWeights.model_fields, 0.0)
+        | {"composite": 25.0, "overlap": 25.0, "perceptual": 20.0, "adversarial": 1.0, "features": 1.0},
+        "network_rate": 1e-3,
+        "texture_rate": 1e-3,
+        "discriminator_rate": 1e-5,
+        "weight_decay": 0.0,
+        "optimiser": {"kind": "adam", "second_momentum": 0.999, "clip_norm": 0.0},
+    },
+}
+#: With a network that is trained already, and with a new one.
+TRAINED: dict[str, Any] = {"small_until": 0.0, "freeze_norms_at": 0.3}
+NEW: dict[str, Any] = {"small_until": 0.12, "freeze_norms_at": 0.6}
+#: Of a new network that has less than so many minutes: cheap steps at a high rate (docs/decisions/avatar-training.md).
+SHORT_MINUTES = 5.0
+SHORT: dict[str, Any] = {"batch": 2, "small_until": 0.8, "network_rate": 5e-3, "texture_rate": 1e-3}
+
+
+def with_usual(values: dict[str, Any], where: str | Path) -> dict[str, Any]:
+    """`values`, which stand at `where`, and what is usual with them; a loss that has a name by its weights.
+
+    Raises BadInputError for a name that no loss has.
+    """
+    start, name = values.get("start", "default"), values.get("loss")
+    usual = (NEW if start == "new" else TRAINED) | (_of_loss(name, where) if isinstance(name, str) else {})
+    if start == "new" and _is_short(values):
+        usual |= SHORT
+    given = {key: value for key, value in values.items() if key != "loss" or not isinstance(name, str)}
+    return usual | {key: _over(usual.get(key), value) for key, value in given.items()}
+
+
+def _of_loss(name: str, where: str | Path) -> dict[str, Any]:
+    if name not in LOSSES:
+        raise BadInputError(f"{where}: loss", repr(name), f"one of {', '.join(LOSSES)}", did_you_mean(name, LOSSES))
+    return LOSSES[name]
+
+
+def _is_short(values: dict[str, Any]) -> bool:
+    minutes = values.get("minutes")
+    return "steps" not in values and isinstance(minutes, int | float) and minutes < SHORT_MINUTES
+
+
+def _over(usual: Any, value: Any) -> Any:
+    """`value`; of a table, what it does not say is as `usual`."""
+    return usual | value if isinstance(usual, dict) and isinstance(value, dict) else value
+
 
 NAME = "training.toml"
 EXPECTED = "settings of a training (TOML): docs/captures.md"

@@ -146,8 +146,7 @@ def _untrained(
     except ModuleNotFoundError as error:
         raise MissingPartError("exporting a network needs PyTorch", extra="train") from error
 
-    from trilane.training.network import UNet
-    from trilane.training.onnx_export import export_onnx
+    from trilane.training.network import UNet, export_onnx
 
     torch.manual_seed(seed)
     unet = UNet(encoder, norm, width, channels)

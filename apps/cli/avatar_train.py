@@ -6,7 +6,7 @@ Rule: this file talks to the person; the work is done in `trilane.training.train
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
 
-    from trilane.training.event_log import EventLog
-
 EPILOG_TRAIN = """\b
 Examples:
   trilane avatar train my-capture --out mine --minutes 600
@@ -37,8 +35,8 @@ Examples:
 CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 #: Share of the newest loss in the one that is shown; seconds between two lines where no bar is drawn.
 NEWEST, LINE_S = 0.05, 30.0
-#: Folder of the log for TensorBoard, in the work folder.
-LOG = "tensorboard"
+#: Folder of the log for TensorBoard, in the work folder; seconds after which what was logged is on the disk.
+LOG, FLUSH_S = "tensorboard", 10
 #: Width of the networks of `default` and `hiker`.
 DEFAULT_WIDTH = 16
 
@@ -91,11 +89,10 @@ def train(
     if asked.start != "new" and asked.width != DEFAULT_WIDTH:
         raise BadInputError("--width", str(asked.width), f"{DEFAULT_WIDTH} of a trained network", "or --start new")
     _require_torch()
-    from trilane.training.event_log import EventLog, require_tensorboard
     from trilane.training.train import Places, train_avatar
 
-    if tensorboard:
-        require_tensorboard()
+    if tensorboard and not machine.here.has_package("tensorboard"):
+        raise MissingPartError("a log for TensorBoard needs the package tensorboard", extra="tensorboard")
     work = out.parent / f"{out.name}-work" if work is None else work
     places = Places(capture, out, work, out.name, vgg)
     log = EventLog(work / LOG) if tensorboard else None
@@ -159,3 +156,34 @@ class _Shown:
         self._line = now
         left_s = (now - self._start) / max(1, step - self._first_step) * (total - step)
         self.say(f"step {step} of {total}: {shown}" + (f", {left_s:.0f} s left" if step > self._first_step else ""))
+
+
+class EventLog:
+    """The losses of a training as a log that TensorBoard shows, in `folder`; the first step makes its file.
+
+    A training that goes on takes back what was logged after its state.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._writer: Any = None
+
+    def write(self, step: int, terms: Mapping[str, float], loss: float) -> None:
+        """The `terms` of the loss at `step`, before weighting, as `terms/NAME`, and their weighted sum, as `loss`."""
+        if self._writer is None:
+            self._writer = _writer(self._folder, step)
+        self._writer.add_scalar("loss", loss, step)
+        for name, value in terms.items():
+            self._writer.add_scalar(f"terms/{name}", value, step)
+
+    def close(self) -> None:
+        """Write what is left."""
+        if self._writer is not None:
+            self._writer.close()
+
+
+def _writer(folder: Path, step: int) -> Any:
+    """A writer, for which everything in `folder` from `step` on does not count."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    return SummaryWriter(str(folder), purge_step=step, flush_secs=FLUSH_S)

@@ -64,7 +64,7 @@ def drawn_material(avatar: str, views: int, held_out: int) -> tuple[onnx.ModelPr
         remedy = "`trilane avatar validate --float-network` notes which it is"
         raise BadInputError(bundle.folder, "no float network that its manifest names", "one to quantise", remedy)
     try:
-        from trilane.training.calibration_views import float_model, held_out_views, training_views
+        from trilane.training.make_bundle import float_model, held_out_views, training_views
     except ImportError as error:
         raise MissingPartError(f"quantising an avatar anew needs {error.name}", extra="train") from None
     from trilane.training.validate import open_renderer

@@ -72,7 +72,7 @@ def trained(bundle: Bundle, weights: Path) -> Paint:
     import torch
 
     from trilane.training.network import UNet
-    from trilane.training.weights_file import load_network
+    from trilane.training.trainable_avatar import load_network
 
     entry = bundle.manifest.network
     untrained = UNet(entry.encoder, entry.norm, entry.width, entry.channels, input_skip=True)

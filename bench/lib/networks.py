@@ -49,7 +49,7 @@ def untrained(
     Raises MissingPartError without PyTorch, BadInputError for wrong settings.
     """
     network, torch = _unet(encoder, norm, width, channels)
-    from trilane.training.onnx_export import export_onnx
+    from trilane.training.network import export_onnx
 
     small = export_onnx(network, CALIBRATION_SIDE, CALIBRATION_SIDE)
     rng = np.random.default_rng(0)
@@ -63,7 +63,7 @@ def untrained(
 
 def untrained_float(encoder: str, norm: str, width: int, size: tuple[int, int], channels: int = 16) -> onnx.ModelProto:
     """The network that `untrained` quantises, in float: (1, C, H, W) float32. Parameters and errors as there."""
-    from trilane.training.onnx_export import export_onnx
+    from trilane.training.network import export_onnx
 
     return export_onnx(_unet(encoder, norm, width, channels)[0], *size)
 

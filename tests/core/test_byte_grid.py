@@ -13,14 +13,12 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("scipy")
 pytest.importorskip("skimage")
 
-from trilane.training import rounding  # noqa: E402
+from trilane.training import make_bundle  # noqa: E402
 from trilane.training.byte_grid import ByteGrid, rounded_weights  # noqa: E402
-from trilane.training.network import UNet  # noqa: E402
-from trilane.training.neural_texture import NeuralTexture  # noqa: E402
-from trilane.training.onnx_export import export_onnx  # noqa: E402
+from trilane.training.network import UNet, export_onnx  # noqa: E402
 from trilane.training.quantising.power_of_two_scales import _round_weights  # noqa: E402
 from trilane.training.quantising.quantise import ByteRanges, byte_ranges, quantise  # noqa: E402
-from trilane.training.trainable_avatar import TrainableAvatar  # noqa: E402
+from trilane.training.trainable_avatar import NeuralTexture, TrainableAvatar  # noqa: E402
 
 SHAPE, CHANNELS = (64, 32), 5
 
@@ -147,9 +145,11 @@ def test_ranges_are_given_for_each_place() -> None:
 def test_what_was_trained_rounded_keeps_its_rounded_weights(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rounding again changes no weight, so the integer network stays but for ranges that are measured anew, which are
     worth a step; the float network comes nearer to it."""
-    monkeypatch.setattr(rounding, "ranges_of", lambda one, *_: byte_ranges(export_onnx(one.network, *SHAPE), frames()))
+    monkeypatch.setattr(
+        make_bundle, "ranges_of", lambda one, *_: byte_ranges(export_onnx(one.network, *SHAPE), frames())
+    )
     made, texture = network(), NeuralTexture(np.zeros((32, 32, CHANNELS), np.float32), (32,))
-    rounding.keep_rounded_weights(TrainableAvatar(texture, made), [], 1)
+    make_bundle.keep_rounded_weights(TrainableAvatar(texture, made), [], 1)
     before, after = (quantise(export_onnx(one, *SHAPE), frames()).network for one in (network(), made))
     grid = grid_of(made)
     for name, weight in grid.weights(made).items():

@@ -17,11 +17,15 @@ from trilane.body.body import ShapedBody
 from trilane.errors import BadInputError
 from trilane.testing.capture_folder import CAMERA, HEIGHT, WIDTH, fit, write_capture_folder
 from trilane.training.capture import check
-from trilane.training.capture.capture import open_capture
-from trilane.training.capture.capture_file import OPENGL_FROM_OPENCV, read_capture_file
-from trilane.training.capture.faults import Fault, FaultyCaptureError, fault_lines
+from trilane.training.capture.capture import frames_by_side, open_capture, side_of, widest_gap_deg
+from trilane.training.capture.capture_file import (
+    OPENGL_FROM_OPENCV,
+    Fault,
+    FaultyCaptureError,
+    fault_lines,
+    read_capture_file,
+)
 from trilane.training.capture.fits import read_fit
-from trilane.training.capture.view_coverage import frames_by_side, side_of, widest_gap_deg
 
 Command = Callable[..., tuple[str, str]]
 

@@ -14,16 +14,24 @@ from trilane.body.body import ShapedBody
 from trilane.body.skinning import blend_matrices
 from trilane.errors import BadInputError
 from trilane.scene.lens import Lens
-from trilane.training.body_arrays import BodyArrays, body_arrays
-from trilane.training.capture import texel_coverage
-from trilane.training.capture.body_raster import BodyRaster
-from trilane.training.capture.body_regions import REGIONS, vertex_regions
-from trilane.training.capture.check import CheckedFrame, bad_frames, checked
-from trilane.training.capture.check_facts import capture_facts, require_fits
-from trilane.training.capture.check_sheet import MOST_CELLS, chosen, overlaid, sheet
+from trilane.training.capture import check
+from trilane.training.capture.capture_samples import BodyRaster, projected
+from trilane.training.capture.check import (
+    MOST_CELLS,
+    REGIONS,
+    CheckedFrame,
+    TexelCoverage,
+    bad_frames,
+    capture_facts,
+    checked,
+    chosen,
+    overlaid,
+    require_fits,
+    sheet,
+    vertex_regions,
+)
 from trilane.training.capture.fits import Fit
-from trilane.training.capture.image_map import projected
-from trilane.training.capture.texel_coverage import TexelCoverage
+from trilane.training.surface import BodyArrays, body_arrays
 
 
 def rows(*spans: tuple[int, int]) -> Mask:
@@ -64,7 +72,7 @@ def test_fits_that_lie_elsewhere_are_refused(tmp_path: Any) -> None:
 @pytest.fixture
 def square(monkeypatch: pytest.MonkeyPatch) -> TexelCoverage:
     """Coverage of a square that fills the texture: two triangles to the left of its middle, two to the right of it."""
-    monkeypatch.setattr(texel_coverage, "vertex_regions", lambda _: np.repeat([0, 1], 4))
+    monkeypatch.setattr(check, "vertex_regions", lambda _: np.repeat([0, 1], 4))
     left = np.array([[0.0, 0], [0.5, 0], [0.5, 1], [0, 1]])
     corners = np.concatenate([left, left + np.array([0.5, 0.0])])
     faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])

@@ -18,13 +18,11 @@ from trilane.avatars.manifest import CAPTURED
 from trilane.avatars.validation import refused
 from trilane.errors import BadInputError
 from trilane.testing.capture_folder import write_capture_folder
-from trilane.training import capture_error
+from trilane.training import train
 from trilane.training.capture.capture import open_capture
-from trilane.training.capture.capture_samples import CaptureRenderer
-from trilane.training.capture.image_map import moved, projected
-from trilane.training.capture.zoomed_view import ViewRule
-from trilane.training.capture_error import error_facts, frame_errors, write_held_out_error
-from trilane.training.sample_crop import OUTPUT_ROWS
+from trilane.training.capture.capture_samples import CaptureRenderer, ViewRule, moved, projected
+from trilane.training.random_views import OUTPUT_ROWS
+from trilane.training.train import error_facts, frame_errors, write_held_out_error
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +69,7 @@ def test_the_error_is_of_what_the_bundle_paints(renderer: CaptureRenderer, monke
     doubled: Any = SimpleNamespace(
         whole_sample=lambda number, size: None if number == 7 else renderer.whole_sample(number, size), render=rendered
     )
-    monkeypatch.setattr(capture_error, "integer_painter", integer_painter)
+    monkeypatch.setattr(train, "integer_painter", integer_painter)
     first, second = frame_errors("bundle", doubled, (2, 5, 7), 3)  # type: ignore[arg-type]
     assert asked == [(doubled, "bundle", "ort", 3)]
     assert (first.psnr_db, first.iou) == (100.0, 1.0)

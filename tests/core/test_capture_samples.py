@@ -21,13 +21,21 @@ from trilane.scene.lens import Lens
 from trilane.testing.capture_folder import write_capture_folder
 from trilane.training import subject
 from trilane.training.capture import capture_samples
-from trilane.training.capture.body_raster import BodyRaster
 from trilane.training.capture.capture import Capture, open_capture
-from trilane.training.capture.capture_samples import CaptureRenderer, held_out_frames
-from trilane.training.capture.centres import JointCentres, VertexCentres
+from trilane.training.capture.capture_samples import (
+    BodyRaster,
+    Camera,
+    CaptureRenderer,
+    JointCentres,
+    VertexCentres,
+    ViewRule,
+    held_out_frames,
+    moved,
+    projected,
+    seen_of_frame,
+    zoomed_view,
+)
 from trilane.training.capture.check import checked_frame, coverage_of
-from trilane.training.capture.image_map import moved, projected, seen_of_frame
-from trilane.training.capture.zoomed_view import Camera, ViewRule, zoomed_view
 from trilane.training.random_views import BANDS
 from trilane.training.sample_renderer import ANYWHERE_BAND
 from trilane.training.subject import captured_subject

@@ -19,10 +19,10 @@ from trilane.avatars.bundle import load_bundle  # noqa: E402
 from trilane.errors import BadInputError  # noqa: E402
 from trilane.training import train as command  # noqa: E402
 from trilane.training.network import UNet  # noqa: E402
-from trilane.training.neural_texture import NeuralTexture  # noqa: E402
 from trilane.training.sample_files import create_group  # noqa: E402
 from trilane.training.subject import Person, Subject  # noqa: E402
 from trilane.training.train import Places, train_avatar  # noqa: E402
+from trilane.training.trainable_avatar import NeuralTexture  # noqa: E402
 from trilane.training.training_settings import TrainingSettings, parsed_settings, read_settings  # noqa: E402
 
 SHAPE, SIDES = (32, 32), (64, 32)

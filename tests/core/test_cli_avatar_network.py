@@ -74,9 +74,8 @@ class Untrained:
         self.model = onnx.ModelProto(ir_version=8)
         torch = module("torch", manual_seed=lambda seed: self.asked.append(("seed", seed)))
         monkeypatch.setitem(sys.modules, "torch", torch)
-        monkeypatch.setitem(sys.modules, "trilane.training.network", module("network", UNet=self._unet))
-        export = module("onnx_export", export_onnx=self._export)
-        monkeypatch.setitem(sys.modules, "trilane.training.onnx_export", export)
+        network = module("network", UNet=self._unet, export_onnx=self._export)
+        monkeypatch.setitem(sys.modules, "trilane.training.network", network)
         monkeypatch.setattr("trilane.hw_profiles.network_work.graph_facts", lambda model: {"gmac": 1.5, "of": model})
 
     def _unet(self, *arguments: Any) -> Any:

@@ -15,9 +15,7 @@ import trilane.training
 from trilane import machine
 from trilane.apps.cli import avatar_train
 from trilane.errors import BadInputError
-from trilane.training import event_log
-from trilane.training.training_options import OptimiserOptions
-from trilane.training.training_settings import TrainingSettings, parsed_settings, settings_text
+from trilane.training.training_settings import OptimiserOptions, TrainingSettings, parsed_settings, settings_text
 
 Command = Callable[..., tuple[str, str]]
 
@@ -127,7 +125,7 @@ def test_a_log_is_written_beside_what_is_shown(
         def close(self) -> None:
             made.append("closed")
 
-    monkeypatch.setattr(event_log, "EventLog", Log)
+    monkeypatch.setattr(avatar_train, "EventLog", Log)
     monkeypatch.setattr(machine.here, "has_package", lambda _: True)
     words = ("avatar", "train", "their", "--out", tmp_path / "mine", "--work", tmp_path / "work")
     command(*words)

@@ -7,12 +7,9 @@ import pytest
 
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import load_body
-from trilane.training.body_arrays import BodyArrays
-from trilane.training.clothing.garments import GARMENTS
-from trilane.training.clothing.landmarks import find_landmarks
-from trilane.training.clothing.layers import MATERIALS, clothing_layers
-from trilane.training.clothing.looks import DEFAULT
-from trilane.training.clothing.surface_geometry import obscurance, shell, vertex_normals
+from trilane.training.clothing.layers import GARMENTS, MATERIALS, clothing_layers
+from trilane.training.clothing.looks import DEFAULT, find_landmarks
+from trilane.training.surface import BodyArrays, obscurance, shell, vertex_normals
 
 #: Percentile of a layer's vertices, metres that it stands off the body at least, and the farthest at most. Hair is cut
 #: out of a cap that lies close on the face.

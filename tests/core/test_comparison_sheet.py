@@ -8,9 +8,8 @@ import pytest
 pytest.importorskip("skimage")
 
 from trilane.training.backgrounds import scenes
-from trilane.training.comparison_sheet import worst_sheet
-from trilane.training.evaluate import Evaluated
 from trilane.training.image_error import ImageError
+from trilane.training.validate import Evaluated, worst_sheet
 
 BANDS = ("far", "full_body", "upper_body", "face")
 #: Height and width of a cell.

@@ -13,9 +13,16 @@ from numpy.typing import NDArray
 from trilane.body.body import Body, load_body
 from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
 from trilane.errors import BadInputError
-from trilane.training.anny_mesh import joint_bones, joint_of_bone
-from trilane.training.body_from_anny import regressor, round_weights
-from trilane.training.t_pose import about, align, bake, power
+from trilane.training.body_from_anny import (
+    about,
+    align,
+    bake,
+    joint_bones,
+    joint_of_bone,
+    power,
+    regressor,
+    round_weights,
+)
 
 PATH = Path(__file__).resolve().parents[2] / "avatars" / "default" / "body.npz"
 

@@ -14,8 +14,8 @@ from trilane.avatars.bundle import Bundle, load_bundle  # noqa: E402
 from trilane.avatars.network_file import reshaped  # noqa: E402
 from trilane.errors import BadInputError  # noqa: E402
 from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime  # noqa: E402
-from trilane.training.from_integers import network_of  # noqa: E402
 from trilane.training.sample_files import U16, ShapeGroup, create_group  # noqa: E402
+from trilane.training.trainable_avatar import network_of  # noqa: E402
 
 SHAPE = (64, 96)
 
@@ -56,7 +56,7 @@ def test_its_norms_have_the_statistics_of_the_samples(groups: list[ShapeGroup]) 
     stem = network.encoder.stem[1]
     assert float((stem.weight.detach() - torch.sqrt(stem.running_var + stem.eps)).abs().max()) < 1e-6
     from trilane.training.batch_choice import load_batch
-    from trilane.training.neural_texture import read_texture
+    from trilane.training.trainable_avatar import read_texture
 
     texture = torch.from_numpy(bundle.read_texture()).permute(2, 0, 1)[None]
     uv, covered, _ = load_batch(groups[0], np.arange(16))

@@ -14,14 +14,11 @@ from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.kinematics import Skeleton
 from trilane.shapes import shape_buckets
-from trilane.training.body_arrays import body_arrays
-from trilane.training.clothing.garments import GARMENTS
-from trilane.training.clothing.landmarks import ANKLES, find_landmarks
-from trilane.training.clothing.shoes import shoe
-from trilane.training.clothing.surface_geometry import Smoother, obscurance, shell, smoothstep, vertex_areas
+from trilane.training.clothing.layers import GARMENTS, shoe
+from trilane.training.clothing.looks import ANKLES, find_landmarks
 from trilane.training.random_poses import ATTITUDES, random_pose
-from trilane.training.random_views import BANDS, look_at, perspective, random_view
-from trilane.training.sample_crop import Cropper
+from trilane.training.random_views import BANDS, Cropper, look_at, perspective, random_view
+from trilane.training.surface import Smoother, body_arrays, obscurance, shell, smoothstep, vertex_areas
 
 Held = Callable[[str, Any], None]
 

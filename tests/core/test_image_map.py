@@ -10,10 +10,9 @@ import pytest
 from trilane.body.body import ShapedBody
 from trilane.body.kinematics import Skeleton
 from trilane.scene.lens import Lens
-from trilane.training.capture.body_raster import BodyRaster
-from trilane.training.capture.fits import Fit
-from trilane.training.capture.image_map import (
+from trilane.training.capture.capture_samples import (
     Augmentation,
+    BodyRaster,
     augmented_projection,
     image_map,
     moved,
@@ -22,6 +21,7 @@ from trilane.training.capture.image_map import (
     seen_of_frame,
     unmirrored,
 )
+from trilane.training.capture.fits import Fit
 
 FRAME, TARGET = (180, 320), (160, 96)
 LENS = Lens(320, 180, 300.0, 260.0, 150.0, 97.0)

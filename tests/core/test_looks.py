@@ -12,10 +12,9 @@ from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import load_body
 from trilane.errors import BadInputError
 from trilane.training import subject
-from trilane.training.body_arrays import body_arrays
-from trilane.training.clothing.garments import GARMENTS
-from trilane.training.clothing.landmarks import find_landmarks
-from trilane.training.clothing.looks import DEFAULT, HIKER, LOOKS, look_named, look_of
+from trilane.training.clothing.layers import GARMENTS
+from trilane.training.clothing.looks import DEFAULT, HIKER, LOOKS, find_landmarks, look_named, look_of
+from trilane.training.surface import body_arrays
 
 BODY = bundle_folder("default") / "body.npz"
 

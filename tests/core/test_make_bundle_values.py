@@ -14,15 +14,13 @@ pytest.importorskip("scipy")
 pytest.importorskip("skimage")
 
 from trilane.avatars.bundle import load_bundle  # noqa: E402
-from trilane.training import float_painter, make_bundle  # noqa: E402
-from trilane.training.body_arrays import BodyArrays  # noqa: E402
+from trilane.training import make_bundle, trainable_avatar  # noqa: E402
 from trilane.training.network import UNet  # noqa: E402
-from trilane.training.neural_texture import NeuralTexture  # noqa: E402
 from trilane.training.quantising.quantise import Quantised  # noqa: E402
 from trilane.training.sample_files import U16, create_group  # noqa: E402
 from trilane.training.subject import Person  # noqa: E402
-from trilane.training.trainable_avatar import TrainableAvatar  # noqa: E402
-from trilane.training.weights_file import save_network  # noqa: E402
+from trilane.training.surface import BodyArrays  # noqa: E402
+from trilane.training.trainable_avatar import NeuralTexture, TrainableAvatar, save_network  # noqa: E402
 
 CHANNELS = 3
 
@@ -205,7 +203,7 @@ def test_a_painter_in_floats_reads_the_texture_and_rounds_the_picture(tmp_path):
         output = made.network(torch.from_numpy(x.transpose(2, 0, 1)[None].astype(np.float32)))
     wanted = np.round(output[0].permute(1, 2, 0).numpy() * 255)
     made.network.train()
-    found = float_painter.float_painter(made.network, image)(None, uv)
+    found = trainable_avatar.float_painter(made.network, image)(None, uv)
     assert found.dtype == np.uint8 and found.shape == (32, 64, 4)
     assert np.abs(found - wanted).max() <= 1 and (found != wanted).mean() < 0.01
 
@@ -214,5 +212,5 @@ def test_a_painter_in_floats_reads_the_texture_and_rounds_the_picture(tmp_path):
     texture = image[0].permute(1, 2, 0).numpy()
     parts = {"read_texture": lambda: texture, "read_levels": lambda: None}
     bundle = SimpleNamespace(manifest=SimpleNamespace(network=entry), **parts)
-    again = float_painter.float_painter_of(bundle, tmp_path / "n.npz")(None, uv)
+    again = trainable_avatar.float_painter_of(bundle, tmp_path / "n.npz")(None, uv)
     assert np.abs(again.astype(int) - found).max() <= 2, "weights in half precision"

@@ -9,7 +9,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from trilane.training.masked_adam import MaskedAdamW  # noqa: E402
+from trilane.training.step_loop import MaskedAdamW  # noqa: E402
 
 RATE, BETAS = 0.05, (0.9, 0.99)
 

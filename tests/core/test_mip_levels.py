@@ -14,8 +14,7 @@ from trilane.stages.gpu.texture_array import filter_of
 
 torch = pytest.importorskip("torch")
 
-from trilane.training.mip_levels import level_of_detail, levels_of, read_levels  # noqa: E402
-from trilane.training.neural_texture import NeuralTexture, read_texture  # noqa: E402
+from trilane.training.trainable_avatar import NeuralTexture, level_of_detail, levels_of, read_levels, read_texture  # noqa: E402
 
 SIDE = 64
 

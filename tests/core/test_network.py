@@ -10,9 +10,13 @@ torch = pytest.importorskip("torch")
 
 from trilane.avatars.network_file import reshaped  # noqa: E402
 from trilane.errors import BadInputError  # noqa: E402
-from trilane.training.encoders import ENCODERS, Shortcut  # noqa: E402
-from trilane.training.network import NORMS, UNet  # noqa: E402
-from trilane.training.onnx_export import export_onnx  # noqa: E402
+from trilane.training.network import (  # noqa: E402
+    ENCODERS,
+    NORMS,
+    Shortcut,
+    UNet,
+    export_onnx,
+)
 from trilane.training.quantising.quantise import quantise  # noqa: E402
 
 

@@ -13,13 +13,14 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from trilane.errors import BadInputError
-from trilane.training.quantising.ideal_noise import float_ranges, ideal_noise_model
 from trilane.training.quantising.noise_model import (
     DRAWS,
     RISK,
     STUDENT_T,
     NoiseModel,
     float_picture,
+    float_ranges,
+    ideal_noise_model,
     noise_model,
     predicted_bound,
 )

@@ -13,11 +13,15 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("skimage")
 
 from trilane.errors import BadInputError, MissingPartError  # noqa: E402
-from trilane.training import perceptual  # noqa: E402
-from trilane.training.losses import WEIGHTS, composite, drawn_behind  # noqa: E402
-from trilane.training.objective import Objective  # noqa: E402
-from trilane.training.perceptual import read_vgg16  # noqa: E402
-from trilane.training.structural_similarity import ms_ssim  # noqa: E402
+from trilane.training import objective  # noqa: E402
+from trilane.training.objective import (  # noqa: E402
+    WEIGHTS,
+    Objective,
+    composite,
+    drawn_behind,
+    ms_ssim,
+    read_vgg16,
+)
 from trilane.training.train import with_vgg  # noqa: E402
 from trilane.training.training_settings import parsed_settings  # noqa: E402
 
@@ -32,7 +36,7 @@ NARROW = ((2, 3), (2, 4), (3, 4), (3, 5), (3, 5))
 @pytest.fixture
 def state(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Random weights of a narrow VGG-16, by torchvision's names, and some of the classifier."""
-    monkeypatch.setattr(perceptual, "BLOCKS", NARROW)
+    monkeypatch.setattr(objective, "BLOCKS", NARROW)
     rng, before, found = np.random.default_rng(4), 3, dict[str, Any]()
     channels = [width for count, width in NARROW for _ in range(count)]
     for place, width in zip(PLACES, channels, strict=True):
@@ -81,7 +85,7 @@ def test_the_distance_is_its_formula(file: Path, state: dict[str, Any]) -> None:
 
 
 def test_the_table_is_torchvisions_vgg16() -> None:
-    sizes = {name: tuple(value.shape) for name, value in perceptual.Vgg16().state_dict().items()}
+    sizes = {name: tuple(value.shape) for name, value in objective.Vgg16().state_dict().items()}
     before = (3, *CHANNELS[:-1])
     wanted = {f"features.{k}.weight": (c, b, 3, 3) for k, c, b in zip(PLACES, CHANNELS, before, strict=True)}
     assert sizes == wanted | {f"features.{place}.bias": (c,) for place, c in zip(PLACES, CHANNELS, strict=True)}
@@ -157,7 +161,7 @@ def test_settings_have_the_digest_of_the_weights(tmp_path: Path) -> None:
     assert chosen.vgg == digest and with_vgg(chosen, file) == chosen and with_vgg(thesis, None) == thesis
     with pytest.raises(BadInputError, match=f"found no file of weights, expected that with SHA-256 {digest}; give it"):
         with_vgg(chosen, None)
-    with pytest.raises(BadInputError, match="--vgg: found a loss without `perceptual`"):
+    with pytest.raises(BadInputError, match="--vgg: found a loss without `objective`"):
         with_vgg(parsed_settings({}, ""), file)
     file.write_bytes(b"abd")
     with pytest.raises(BadInputError, match=rf"vgg.pth: found SHA-256 .*expected that of the settings, {digest}"):

@@ -16,10 +16,9 @@ from onnx import TensorProto, helper, numpy_helper
 from trilane.errors import BadInputError
 from trilane.training.quantising import calibration_table as table
 from trilane.training.quantising.calibration import share_ranges, widen
-from trilane.training.quantising.calibration_plot import plot_calibrations
-from trilane.training.quantising.cross_layer_equalisation import equalised
-from trilane.training.quantising.layer_noise import _sqnr_db, layer_report
-from trilane.training.quantising.quantise import quantise
+from trilane.training.quantising.calibration_table import plot_calibrations
+from trilane.training.quantising.noise_model import _sqnr_db, layer_report
+from trilane.training.quantising.quantise import equalised, quantise
 
 Kernels = dict[str, Any]
 

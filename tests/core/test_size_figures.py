@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("skimage")
 from trilane import machine
 from trilane.arrays import U8
-from trilane.training import size_figures
+from trilane.training import validate
 from trilane.training.validate import ValidationPlan
 
 
@@ -61,16 +61,16 @@ def test_every_view_is_painted_at_every_size(monkeypatch: pytest.MonkeyPatch) ->
             truth[..., 3] = 0
         return f"uv of {sample.name}", truth
 
-    monkeypatch.setattr(size_figures, "integer_painter", painter)
-    monkeypatch.setattr(size_figures, "plan_validation", planned)
-    monkeypatch.setattr(size_figures, "held_out_motions", lambda names: ("motions", names))
+    monkeypatch.setattr(validate, "integer_painter", painter)
+    monkeypatch.setattr(validate, "plan_validation", planned)
+    monkeypatch.setattr(validate, "held_out_motions", lambda names: ("motions", names))
     renderer: Any = SimpleNamespace(render=rendered)
     bundle: Any = SimpleNamespace(read_network=lambda: SimpleNamespace(shape=(1, 64, 64, 12)))
     plan = ValidationPlan(
         held_out=("/far/a.bvh", "builtin:b"), seeds=(5, 6), per_band=3, runtimes=("x", "y"), threads=2
     )
     before, looks = machine.here.now().date(), list[int]()
-    found = size_figures.measure_sizes(bundle, plan, renderer, lambda: looks.append(1))
+    found = validate.measure_sizes(bundle, plan, renderer, lambda: looks.append(1))
     assert before <= found.date <= machine.here.now().date()
     assert asked == [(renderer, bundle, "x", 2), (renderer, 3, 5, ("motions", plan.held_out), "64x64")]
     assert (found.runtime, found.seed, found.per_band, found.held_out) == ("x", 5, 3, ("a.bvh", "builtin:b"))
@@ -85,16 +85,16 @@ def test_every_view_is_painted_at_every_size(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_sizes_are_whole_steps_of_the_networks_own() -> None:
     """Three quarters and a half, down to whole steps of 32 pixels, and at least one."""
-    assert size_figures.sizes_of((512, 256)) == [(512, 256), (384, 192), (256, 128)]
-    assert size_figures.sizes_of((160, 96)) == [(160, 96), (96, 64), (64, 32)]
-    assert size_figures.sizes_of((32, 32)) == [(32, 32)]
+    assert validate.sizes_of((512, 256)) == [(512, 256), (384, 192), (256, 128)]
+    assert validate.sizes_of((160, 96)) == [(160, 96), (96, 64), (64, 32)]
+    assert validate.sizes_of((32, 32)) == [(32, 32)]
 
 
 def test_light_is_linear_between_its_ends() -> None:
     """IEC 61966-2-1: linear below 0.04045, and both ways undo each other."""
     encoded = np.linspace(0, 1, 1001)
-    linear = size_figures._linear(encoded)
+    linear = validate._linear(encoded)
     assert linear[[0, 1000]].tolist() == [0.0, 1.0]
     assert linear[40] == pytest.approx(0.04 / 12.92) and linear[500] == pytest.approx(0.2140411, rel=1e-6)
-    assert size_figures._encoded(linear) == pytest.approx(encoded, abs=2e-7)
-    assert size_figures._encoded(np.array([0.003])) == pytest.approx([0.03876])
+    assert validate._encoded(linear) == pytest.approx(encoded, abs=2e-7)
+    assert validate._encoded(np.array([0.003])) == pytest.approx([0.03876])

@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("scipy", reason="measuring outlines needs the train extra")
 
 from trilane.body.joints import JOINTS
-from trilane.training import outlines
+from trilane.training import stand_off as module
 from trilane.training.random_views import look_at, perspective
 from trilane.training.stand_off import Outline, measured_heights, smoothed, stand_off
 
@@ -138,8 +138,8 @@ def test_what_measuring_takes_is_said_by_four_views(monkeypatch: pytest.MonkeyPa
         drawn.extend(samples)
         return [outline((0, 0, 1)) for _ in samples]
 
-    monkeypatch.setattr(outlines, "time", SimpleNamespace(monotonic=lambda: next(times)))
-    monkeypatch.setattr(outlines, "outlines", draw)
-    said = outlines._cost(SimpleNamespace(shaped=sphere()), range(300))  # type: ignore[arg-type]
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: next(times)))
+    monkeypatch.setattr(module, "outlines", draw)
+    said = module._cost(SimpleNamespace(shaped=sphere()), range(300))  # type: ignore[arg-type]
     assert drawn == [0, 75, 150, 225]
     assert said == "how far clothes and hair stand off: 300 views, 3 times: about 450 s (by 4 that were measured)"

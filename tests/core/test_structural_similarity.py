@@ -11,8 +11,12 @@ pytest.importorskip("skimage")
 from scipy.ndimage import gaussian_filter  # noqa: E402
 from skimage.metrics import structural_similarity  # noqa: E402
 
-from trilane.training.losses import WEIGHTS, loss_terms, total_loss  # noqa: E402
-from trilane.training.structural_similarity import ms_ssim  # noqa: E402
+from trilane.training.objective import (  # noqa: E402
+    WEIGHTS,
+    loss_terms,
+    ms_ssim,
+    total_loss,
+)
 
 #: Weights of the paper, of which those that fit are scaled to a sum of 1.
 PAPER = np.array([0.0448, 0.2856, 0.3001, 0.2363, 0.1333])

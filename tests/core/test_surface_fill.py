@@ -7,9 +7,8 @@ import pytest
 
 pytest.importorskip("scipy")
 
-from trilane.training.body_arrays import BodyArrays
-from trilane.training.surface_fill import fill_along_surface, harmonic_fill
-from trilane.training.texture_layout import fill_beside, fill_gaps, grown, lay_out
+from trilane.training.first_texture import fill_along_surface, fill_beside, fill_gaps, grown, harmonic_fill, lay_out
+from trilane.training.surface import BodyArrays
 
 ROUND, RINGS, SIDE = 24, 13, 96
 #: Of the texture, what lies beside the cylinder's layout at each border.

@@ -13,9 +13,9 @@ from trilane.body.body import ShapedBody
 from trilane.body.kinematics import Skeleton, rodrigues
 from trilane.errors import BadInputError
 from trilane.training.capture import synthetic
-from trilane.training.capture.capture import open_capture
+from trilane.training.capture.capture import camera_direction, frames_by_side, open_capture
 from trilane.training.capture.capture_file import OPENGL_FROM_OPENCV, CameraTable
-from trilane.training.capture.image_map import projected
+from trilane.training.capture.capture_samples import projected
 from trilane.training.capture.synthetic import (
     FILLED,
     MOST_FARTHER,
@@ -28,7 +28,6 @@ from trilane.training.capture.synthetic import (
     turned_at_random,
     write_capture,
 )
-from trilane.training.capture.view_coverage import camera_direction, frames_by_side
 from trilane.training.clothing.looks import LOOKS
 from trilane.training.random_views import look_at, perspective
 

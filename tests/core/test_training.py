@@ -13,20 +13,25 @@ from trilane.avatars.bundle import bundle_folder  # noqa: E402
 from trilane.body.joints import JOINT_INDEX  # noqa: E402
 from trilane.errors import BadInputError  # noqa: E402
 from trilane.scene.motion.builtin import BUILTIN  # noqa: E402
-from trilane.training.clear_view import ClothedSurface, vertex_reach  # noqa: E402
 from trilane.training.clothing.layers import Layer  # noqa: E402
-from trilane.training.error_summary import SampleError, summary  # noqa: E402
-from trilane.training.image_error import ImageError, image_error  # noqa: E402
-from trilane.training.losses import loss_terms, total_loss  # noqa: E402
+from trilane.training.first_texture import (  # noqa: E402
+    eigenfunctions,
+    fill_gaps,
+    lay_out,
+)
+from trilane.training.image_error import ImageError, SampleError, image_error, summary  # noqa: E402
 from trilane.training.network import UNet  # noqa: E402
-from trilane.training.neural_texture import NeuralTexture, read_texture  # noqa: E402
+from trilane.training.objective import loss_terms, total_loss  # noqa: E402
 from trilane.training.random_poses import random_pose  # noqa: E402
-from trilane.training.random_views import BANDS, View, look_at, perspective, random_view  # noqa: E402
+from trilane.training.random_views import BANDS, ClothedSurface, View, look_at, perspective, random_view, vertex_reach  # noqa: E402
 from trilane.training.sample_files import U16, batches, create_group, open_groups  # noqa: E402
-from trilane.training.surface_fields import eigenfunctions  # noqa: E402
-from trilane.training.texture_layout import fill_gaps, lay_out  # noqa: E402
-from trilane.training.trainable_avatar import TrainableAvatar  # noqa: E402
-from trilane.training.weights_file import load_network, save_network  # noqa: E402
+from trilane.training.trainable_avatar import (  # noqa: E402
+    NeuralTexture,
+    TrainableAvatar,
+    load_network,
+    read_texture,
+    save_network,
+)
 
 CHANNELS = 4
 SHAPE = (32, 64)

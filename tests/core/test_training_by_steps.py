@@ -15,22 +15,19 @@ pytest.importorskip("skimage")
 
 from trilane.errors import BadInputError  # noqa: E402
 from trilane.training import batch_choice, step_loop  # noqa: E402
-from trilane.training.activation_noise import add_activation_noise  # noqa: E402
 from trilane.training.batch_choice import load_batch  # noqa: E402
-from trilane.training.losses import drawn_behind, loss_terms, total_loss  # noqa: E402
-from trilane.training.network import UNet  # noqa: E402
-from trilane.training.neural_texture import NeuralTexture  # noqa: E402
+from trilane.training.network import UNet, add_activation_noise  # noqa: E402
+from trilane.training.objective import drawn_behind, loss_terms, total_loss  # noqa: E402
 from trilane.training.sample_files import U16, ShapeGroup, batches, create_group, open_groups  # noqa: E402
-from trilane.training.step_loop import first_state, step_seconds, steps  # noqa: E402
+from trilane.training.step_loop import TrainingState, first_state, load_state, save_state, step_seconds, steps  # noqa: E402
 from trilane.training.train import resumed_settings  # noqa: E402
-from trilane.training.trainable_avatar import TrainableAvatar  # noqa: E402
+from trilane.training.trainable_avatar import NeuralTexture, TrainableAvatar  # noqa: E402
 from trilane.training.training_settings import (  # noqa: E402
     TrainingSettings,
     parsed_settings,
     read_settings,
     settings_text,
 )
-from trilane.training.training_state import TrainingState, load_state, save_state  # noqa: E402
 
 SMALL, LARGE = (32, 32), (64, 32)
 COUNT = 7

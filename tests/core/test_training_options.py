@@ -23,21 +23,30 @@ from trilane.training.batch_choice import (  # noqa: E402
     phases,
     zoom,
 )
-from trilane.training.dropout import add_dropout  # noqa: E402
-from trilane.training.network import NORMS, UNet  # noqa: E402
-from trilane.training.neural_texture import NeuralTexture  # noqa: E402
+from trilane.training.network import (  # noqa: E402
+    NORMS,
+    UNet,
+    add_dropout,
+)
 from trilane.training.objective import Objective  # noqa: E402
-from trilane.training.optimisers import clip_gradients, optimiser_of  # noqa: E402
 from trilane.training.sample_files import U16, ShapeGroup, create_group, open_groups  # noqa: E402
 from trilane.training.step_loop import (  # noqa: E402
+    TrainingState,
     add_gradients,
+    clip_gradients,
     first_state,
+    load_state,
+    optimiser_of,
+    save_state,
     steps,
 )
-from trilane.training.trainable_avatar import TrainableAvatar  # noqa: E402
-from trilane.training.training_options import OptimiserOptions  # noqa: E402
-from trilane.training.training_settings import TrainingSettings, parsed_settings, settings_text  # noqa: E402
-from trilane.training.training_state import TrainingState, load_state, save_state  # noqa: E402
+from trilane.training.trainable_avatar import NeuralTexture, TrainableAvatar  # noqa: E402
+from trilane.training.training_settings import (  # noqa: E402
+    OptimiserOptions,
+    TrainingSettings,
+    parsed_settings,
+    settings_text,
+)
 
 COUNT = 4
 FAR, FULL_BODY, FACE = 0, 1, 3

@@ -13,14 +13,22 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from trilane.apps.cli.avatar_train import EventLog  # noqa: E402
 from trilane.errors import MissingPartError  # noqa: E402
 from trilane.training.batch_choice import load_batch  # noqa: E402
-from trilane.training.device import chosen_device, device_words, memory_words  # noqa: E402
-from trilane.training.event_log import EventLog  # noqa: E402
-from trilane.training.losses import drawn_behind, loss_terms, total_loss  # noqa: E402
-from trilane.training.objective import Objective  # noqa: E402
-from trilane.training.probe_loss import probe_loss  # noqa: E402
+from trilane.training.objective import (  # noqa: E402
+    Objective,
+    drawn_behind,
+    loss_terms,
+    total_loss,
+)
 from trilane.training.sample_files import U16, ShapeGroup, create_group  # noqa: E402
+from trilane.training.step_loop import (  # noqa: E402
+    chosen_device,
+    device_words,
+    memory_words,
+    probe_loss,
+)
 
 
 @pytest.mark.parametrize(
@@ -46,7 +54,7 @@ def test_a_gpu_that_is_not_there_is_no_cpu(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_device_and_memory_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
     process = SimpleNamespace(memory_info=lambda: SimpleNamespace(rss=1_234_000_000))
-    monkeypatch.setattr("trilane.training.device.psutil.Process", lambda: process)
+    monkeypatch.setattr("trilane.training.step_loop.psutil.Process", lambda: process)
     monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda _: 2_345_600_000)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "Nvidia X")
     cpu, gpu = torch.device("cpu"), torch.device("cuda")

@@ -11,19 +11,31 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("scipy")
 pytest.importorskip("skimage")
 
-from trilane.training import losses, step_loop  # noqa: E402
-from trilane.training.activation_noise import add_activation_noise  # noqa: E402
-from trilane.training.body_arrays import BodyArrays  # noqa: E402
-from trilane.training.encoders import ENCODERS  # noqa: E402
-from trilane.training.first_texture import first_texture, head_on, mean_colours, used_texels  # noqa: E402
-from trilane.training.network import NORMS, UNet  # noqa: E402
-from trilane.training.neural_texture import NeuralTexture, read_texture  # noqa: E402
-from trilane.training.onnx_export import export_onnx  # noqa: E402
-from trilane.training.optimisers import optimiser_of  # noqa: E402
+from trilane.training import objective, step_loop  # noqa: E402
+from trilane.training.first_texture import (  # noqa: E402
+    eigenfunctions,
+    fill_gaps,
+    first_texture,
+    head_on,
+    lay_out,
+    mean_colours,
+    used_texels,
+)
+from trilane.training.network import (  # noqa: E402
+    ENCODERS,
+    NORMS,
+    UNet,
+    add_activation_noise,
+    export_onnx,
+)
 from trilane.training.sample_files import U16, ShapeGroup, batches  # noqa: E402
-from trilane.training.surface_fields import eigenfunctions  # noqa: E402
-from trilane.training.texture_layout import fill_gaps, lay_out  # noqa: E402
-from trilane.training.trainable_avatar import TrainableAvatar  # noqa: E402
+from trilane.training.step_loop import optimiser_of  # noqa: E402
+from trilane.training.surface import BodyArrays  # noqa: E402
+from trilane.training.trainable_avatar import (  # noqa: E402
+    NeuralTexture,
+    TrainableAvatar,
+    read_texture,
+)
 from trilane.training.training_settings import parsed_settings  # noqa: E402
 
 
@@ -79,21 +91,21 @@ def terms_by_loops(output, target):
 
 def test_losses_are_their_formulas(pictures):
     output, target = pictures
-    terms = losses.loss_terms(*map(torch.from_numpy, (output, target, BEHIND)))
+    terms = objective.loss_terms(*map(torch.from_numpy, (output, target, BEHIND)))
     wanted = terms_by_loops(output, target)
-    assert set(terms) == set(wanted) == set(losses.WEIGHTS)
+    assert set(terms) == set(wanted) == set(objective.WEIGHTS)
     for name, value in wanted.items():
         assert float(terms[name]) == pytest.approx(value, rel=1e-6), name
     weights = {"composite": 0.4, "decibels": 0.03, "colour": 0.1, "edges": 0.2, "coarse": 0.2, "mask": 0.1}
     weights |= {"overlap": 0.1, "background": 0.05}
     total = sum(weights[name] * value for name, value in wanted.items())
-    assert float(losses.total_loss(terms)) == pytest.approx(total, rel=1e-6)
+    assert float(objective.total_loss(terms)) == pytest.approx(total, rel=1e-6)
 
 
 def test_masks_at_their_ends_cost_a_finite_amount():
     """A mask of 1 where none is wanted is taken as 1 - 1e-4, a colour of 1 likewise."""
     output, target = torch.ones(1, 4, 8, 8), torch.zeros(1, 4, 8, 8)
-    terms = losses.loss_terms(output, target, torch.zeros(1, 3, 8, 8))
+    terms = objective.loss_terms(output, target, torch.zeros(1, 3, 8, 8))
     assert float(terms["mask"]) == pytest.approx(-math.log(1e-4), rel=1e-3)
     assert float(terms["background"]) == pytest.approx(-math.log(1e-4), rel=1e-3)
 
@@ -341,9 +353,9 @@ def test_each_picture_of_a_batch_stands_before_a_background_of_its_own():
     """The seed of PyTorch alone decides them, so that a training that goes on draws what it would have drawn."""
     target = torch.zeros(32, 4, 8, 8)
     torch.manual_seed(2)
-    first, second = losses.drawn_behind(target), losses.drawn_behind(target)
+    first, second = objective.drawn_behind(target), objective.drawn_behind(target)
     torch.manual_seed(2)
-    assert torch.equal(losses.drawn_behind(target), first) and not torch.equal(first, second)
+    assert torch.equal(objective.drawn_behind(target), first) and not torch.equal(first, second)
     assert first.shape == (32, 3, 8, 8)
     drawn = {each.numpy().tobytes() for each in first}
     plain = [each for each in first if float(each.min()) == float(each.max())]
@@ -357,8 +369,8 @@ def test_training_sees_a_person_as_grey_as_the_one_background_that_was():
     ghost[:, 3] = 0.7
     behind = torch.stack((torch.zeros(3, 16, 16), torch.ones(3, 16, 16)))
     pixels = 2 * 3 * 16 * 16
-    terms = losses.loss_terms(ghost, target, behind)
+    terms = objective.loss_terms(ghost, target, behind)
     assert float(terms["composite"]) == pytest.approx(0.15 * 1.05 * pixels / (pixels + 1), rel=1e-5)
     assert float(terms["decibels"]) == pytest.approx(10 * math.log10(1 + 0.15**2 / 1e-5 * 768 / 769), rel=1e-5)
-    hidden = losses.loss_terms(ghost, target, torch.full((2, 3, 16, 16), 0.5))
+    hidden = objective.loss_terms(ghost, target, torch.full((2, 3, 16, 16), 0.5))
     assert float(hidden["composite"]) == float(hidden["decibels"]) == 0

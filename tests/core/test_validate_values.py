@@ -18,7 +18,7 @@ from trilane import machine
 from trilane.avatars.bundle import Bundle, load_bundle
 from trilane.avatars.manifest import digests_of
 from trilane.body.body import load_body
-from trilane.training import dataset, evaluate, validate
+from trilane.training import dataset, validate
 from trilane.training.clothing.looks import LOOKS
 from trilane.training.image_error import image_error
 from trilane.training.random_poses import random_pose
@@ -194,7 +194,7 @@ def test_what_a_plan_leaves_out():
     assert ValidationPlan() == ValidationPlan(
         ("builtin:walk-wave-turn",), (1, 2, 3, 4, 5, 6, 7, 8), 24, ("ort",), "256", 1, None, None
     )
-    assert (validate.FLOAT, evaluate.BAND_NAMES) == ("float", BANDS)
+    assert (validate.FLOAT, validate.BAND_NAMES) == ("float", BANDS)
 
 
 def test_motions_are_found_from_where_one_is(parts):
@@ -276,10 +276,10 @@ def test_the_integer_network_is_run_as_in_the_pipeline(monkeypatch):
         assert (mesh, texture.shape, levels) == ("mesh", (8, 8, 5), kept[-1])
         return SimpleNamespace(draw=lambda *words: packed.drawn.append(words))
 
-    monkeypatch.setattr(evaluate, "PackedPass", packed_pass)
-    monkeypatch.setattr(evaluate, "PackedAvatar", packed_avatar)
-    monkeypatch.setattr(evaluate, "reshaped", lambda network, *shape: (network, shape))
-    monkeypatch.setattr(evaluate, "load_runtime", lambda name: SimpleNamespace(load=Session, name=name))
+    monkeypatch.setattr(validate, "PackedPass", packed_pass)
+    monkeypatch.setattr(validate, "PackedAvatar", packed_avatar)
+    monkeypatch.setattr(validate, "reshaped", lambda network, *shape: (network, shape))
+    monkeypatch.setattr(validate, "load_runtime", lambda name: SimpleNamespace(load=Session, name=name))
     network = SimpleNamespace(input=SimpleNamespace(scale=0.5, zero_point=7))
     kept = [None]
     parts = {
@@ -291,19 +291,19 @@ def test_the_integer_network_is_run_as_in_the_pipeline(monkeypatch):
     skeleton = SimpleNamespace(pose=lambda pose: SimpleNamespace(matrices=f"joints of {pose}"))
     renderer = SimpleNamespace(ctx="context", mesh="mesh", skeleton=skeleton)
     renderer.placed = lambda sample: SampleRenderer.placed(renderer, sample)
-    paint = evaluate.integer_painter(renderer, bundle, "ort", 3)
-    assert made[0].made == ("context", 5, evaluate.Quantisation(0.5, 7), True)
+    paint = validate.integer_painter(renderer, bundle, "ort", 3)
+    assert made[0].made == ("context", 5, validate.Quantisation(0.5, 7), True)
     for number, shape in enumerate(((2, 3), (4, 2), (2, 3))):
         crop = SimpleNamespace(shape=shape, projection=f"projection {number}")
         sample = SimpleNamespace(pose=number, crop=crop, view=SimpleNamespace(view=f"view {number}"))
         picture = paint(sample, None)
         tensor = (np.arange(shape[0] * shape[1] * 5) % 251).reshape(*shape, 5)
         assert picture.dtype == np.uint8 and (picture == tensor[..., 1:]).all()
-    placement = evaluate.Placement("joints of 1", "projection 1", (0, 0, 4, 2))
+    placement = validate.Placement("joints of 1", "projection 1", (0, 0, 4, 2))
     assert made[0].drawn[1] == (("target", (4, 2)), "view 1", placement)
     assert loaded == [((network, (2, 3)), 3), ((network, (4, 2)), 3)]
     kept.append("levels")
-    evaluate.integer_painter(renderer, bundle, "ort", 3)
+    validate.integer_painter(renderer, bundle, "ort", 3)
     assert made[1].made[3] is False, "a deferred pass cannot read smaller levels"
 
 

@@ -10,13 +10,10 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from trilane.training.adversary import Adversary  # noqa: E402
 from trilane.training.network import UNet  # noqa: E402
-from trilane.training.neural_texture import NeuralTexture  # noqa: E402
-from trilane.training.objective import Objective  # noqa: E402
-from trilane.training.optimisers import clip_gradients  # noqa: E402
-from trilane.training.step_loop import add_gradients  # noqa: E402
-from trilane.training.trainable_avatar import TrainableAvatar  # noqa: E402
+from trilane.training.objective import Adversary, Objective  # noqa: E402
+from trilane.training.step_loop import add_gradients, clip_gradients  # noqa: E402
+from trilane.training.trainable_avatar import NeuralTexture, TrainableAvatar  # noqa: E402
 from trilane.training.training_settings import parsed_settings  # noqa: E402
 
 #: Gradients are sums of up to N*H*W = 8192 products; the rounding of such a sum differs by about sqrt(8192) * 2**-24 of

@@ -13,8 +13,8 @@ from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Quantisatio
 
 torch = pytest.importorskip("torch")
 
-from trilane.training.mip_levels import read_levels  # noqa: E402
 from trilane.training.random_poses import random_pose  # noqa: E402
+from trilane.training.trainable_avatar import read_levels  # noqa: E402
 
 QUANTISATION = Quantisation(1 / 127, 128)
 

@@ -15,7 +15,7 @@ from trilane.errors import BadInputError
 from trilane.stages.gpu.mesh_arrays import mesh_arrays
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement, Quantisation
 from trilane.stages.gpu.skinned_mesh import PosedMesh, SkinnedMesh
-from trilane.training.uv_image import UvBytes, UvRaster
+from trilane.training.sample_renderer import UvBytes, UvRaster
 
 ENCODING = Quantisation(6 / 255, 117)
 REST = np.zeros(165)
