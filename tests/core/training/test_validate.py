@@ -5,9 +5,11 @@ from __future__ import annotations
 import hashlib
 import math
 import shutil
+from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,15 +17,20 @@ import pytest
 pytest.importorskip("skimage")
 
 from trilane import machine
+from trilane.arrays import U8
 from trilane.avatars.bundle import Bundle, load_bundle
 from trilane.avatars.manifest import digests_of
 from trilane.body.body import load_body
 from trilane.training import dataset, validate
+from trilane.training.backgrounds import scenes
 from trilane.training.clothing.looks import LOOKS
-from trilane.training.image_error import image_error
+from trilane.training.image_error import (
+    ImageError,
+    image_error,
+)
 from trilane.training.random_poses import random_pose
 from trilane.training.sample_renderer import SampleRenderer
-from trilane.training.validate import FloatNetwork, ValidationPlan
+from trilane.training.validate import Evaluated, FloatNetwork, ValidationPlan, worst_sheet
 
 BANDS = ("far", "full_body", "upper_body", "face")
 GREY = 100
@@ -332,3 +339,146 @@ def test_ssim_by_loops(side, window):
 def test_a_picture_too_small_for_a_window_is_like():
     truth = np.full((2, 9, 4), 255, np.uint8)
     assert image_error(truth // 2 + 128, truth).ssim == 1.0
+
+
+# The figures of smaller tensors: which views, sizes and means, with painter and renderer that are told.
+
+
+@dataclass(frozen=True)
+class Crop:
+    shape: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Sample:
+    name: str
+    crop: Crop
+
+
+def square(side: int, grey: int) -> U8:
+    """A grey square without anything transparent."""
+    picture = np.full((side, side, 4), grey, np.uint8)
+    picture[..., 3] = 255
+    return picture
+
+
+def test_every_view_is_painted_at_every_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three views, of which the second shows nobody. In the first, greys are 64 off in the own size and 128 in the
+    smaller one, in the third 32 in both: 20 log10(255 / 64) = 12.01 dB, and so on.
+    """
+    views = ["first", "nobody", "third"]
+    asked: list[Any] = []
+
+    def painter(renderer: Any, bundle: Any, runtime: str, threads: int) -> Any:
+        asked.append((renderer, bundle, runtime, threads))
+
+        def paint(sample: Any, uv: str) -> U8:
+            assert uv == f"uv of {sample.name}"
+            off = {64: 64, 32: 128}[sample.crop.shape[0]] if sample.name == "first" else 32
+            return square(sample.crop.shape[0], off)
+
+        return paint
+
+    def planned(renderer: Any, per_band: int, seed: int, motions: Any, size: str) -> list[Any]:
+        asked.append((renderer, per_band, seed, motions, size))
+        return [Sample(name=name, crop=Crop((9, 9))) for name in views]
+
+    def rendered(sample: Any) -> tuple[str, U8]:
+        truth = square(64, 0)
+        if sample.name == "nobody":
+            truth[..., 3] = 0
+        return f"uv of {sample.name}", truth
+
+    monkeypatch.setattr(validate, "integer_painter", painter)
+    monkeypatch.setattr(validate, "plan_validation", planned)
+    monkeypatch.setattr(validate, "held_out_motions", lambda names: ("motions", names))
+    renderer: Any = SimpleNamespace(render=rendered)
+    bundle: Any = SimpleNamespace(read_network=lambda: SimpleNamespace(shape=(1, 64, 64, 12)))
+    plan = ValidationPlan(
+        held_out=("/far/a.bvh", "builtin:b"), seeds=(5, 6), per_band=3, runtimes=("x", "y"), threads=2
+    )
+    before, looks = machine.here.now().date(), list[int]()
+    found = validate.measure_sizes(bundle, plan, renderer, lambda: looks.append(1))
+    assert before <= found.date <= machine.here.now().date()
+    assert asked == [(renderer, bundle, "x", 2), (renderer, 3, 5, ("motions", plan.held_out), "64x64")]
+    assert (found.runtime, found.seed, found.per_band, found.held_out) == ("x", 5, 3, ("a.bvh", "builtin:b"))
+    assert len(looks) == 3
+    db = {off: 20 * np.log10(255 / off) for off in (32, 64, 128)}
+    assert list(found.psnr_db) == ["64x64", "32x32"]
+    assert found.psnr_db == {
+        "64x64": round((db[64] + db[32]) / 2, 2),
+        "32x32": round((db[128] + db[32]) / 2, 2),
+    }
+
+
+def test_sizes_are_whole_steps_of_the_networks_own() -> None:
+    """Three quarters and a half, down to whole steps of 32 pixels, and at least one."""
+    assert validate.sizes_of((512, 256)) == [(512, 256), (384, 192), (256, 128)]
+    assert validate.sizes_of((160, 96)) == [(160, 96), (96, 64), (64, 32)]
+    assert validate.sizes_of((32, 32)) == [(32, 32)]
+
+
+def test_light_is_linear_between_its_ends() -> None:
+    """IEC 61966-2-1: linear below 0.04045, and both ways undo each other."""
+    encoded = np.linspace(0, 1, 1001)
+    linear = validate._linear(encoded)
+    assert linear[[0, 1000]].tolist() == [0.0, 1.0]
+    assert linear[40] == pytest.approx(0.04 / 12.92) and linear[500] == pytest.approx(0.2140411, rel=1e-6)
+    assert validate._encoded(linear) == pytest.approx(encoded, abs=2e-7)
+    assert validate._encoded(np.array([0.003])) == pytest.approx([0.03876])
+
+
+# Sheets of pictures side by side: which samples, in which order, how large, before what.
+
+SHEET_BANDS = ("far", "full_body", "upper_body", "face")
+#: Height and width of a cell.
+CELL = (256, 192)
+PAINTERS = ("float", "ort")
+ALPHA = ("alpha_inside", "alpha_edge", "alpha_outside", "see_through")
+
+
+def evaluated(band: str, number: int, psnr_db: float, shape: tuple[int, int] = (64, 32)) -> Evaluated:
+    """Its pictures have one grey each: ten times its number, one more for `float` and two more for `ort`."""
+
+    def flat(grey: int) -> np.ndarray:
+        return np.full((*shape, 4), (grey, grey, grey, 255), np.uint8)
+
+    def error(value: float) -> ImageError:
+        return ImageError(value, 0.0, {}, 0.0, ssim=1.0, iou=1.0, **dict.fromkeys(ALPHA, 0.0))
+
+    pictures = {name: flat(10 * number + k) for k, name in enumerate(PAINTERS, start=1)}
+    return Evaluated(number, band, flat(10 * number), pictures, {"float": error(-psnr_db), "ort": error(psnr_db)})
+
+
+def cells(sheet: np.ndarray) -> list[list[int]]:
+    """The grey in the middle of each cell."""
+    rows, columns = sheet.shape[0] // CELL[0], sheet.shape[1] // CELL[1]
+    return [[int(sheet[256 * r + 128, 192 * c + 96, 0]) for c in range(columns)] for r in range(rows)]
+
+
+def test_a_small_picture_stands_in_the_middle_of_grey() -> None:
+    sheet = worst_sheet([evaluated("far", 2, 1.0), evaluated("face", 7, 1.0)], ("ort",))
+    assert cells(sheet) == [[20, 22], [70, 72]]
+    cell = sheet[:256, :192]
+    assert (cell[96:160, 80:112] == 20).all()
+    assert (cell != 128).all(axis=2).sum() == 64 * 32, "all else is grey"
+
+
+def test_a_large_picture_is_shrunk_into_its_cell() -> None:
+    """512 x 96 to 256 x 48, and 64 x 768 to 16 x 192."""
+    for shape, rows, columns in (
+        ((512, 96), slice(0, 256), slice(72, 120)),
+        ((64, 768), slice(120, 136), slice(0, 192)),
+    ):
+        cell = worst_sheet([evaluated("far", 2, 1.0, shape)], ())
+        assert (cell[rows, columns] == 20).all()
+        assert (cell != 128).any(axis=2).sum() == (256 * 48 if shape[0] == 512 else 16 * 192)
+
+
+def test_what_is_transparent_shows_the_scenery() -> None:
+    """The middle of a cell is pixel (32, 16) of a picture; black of alpha 127 lets 128 of 255 parts through."""
+    sample = evaluated("far", 0, 1.0)
+    sample.truth[..., 3] = 0
+    sample.pictures["ort"][...] = (0, 0, 0, 127)
+    behind = scenes()[0][32, 16, 0]
+    assert cells(worst_sheet([sample], ("ort",))) == [[round(255 * behind), round(128 * behind)]]

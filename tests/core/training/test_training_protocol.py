@@ -12,8 +12,8 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
-FILE = Path(__file__).with_name("printed") / "training-protocol.txt"
+ROOT = Path(__file__).resolve().parents[3]
+FILE = Path(__file__).resolve().parents[1] / "printed" / "training-protocol.txt"
 PLAIN = (
     *(ast.Constant, ast.Tuple, ast.List, ast.Set, ast.Dict, ast.UnaryOp, ast.BinOp, ast.operator, ast.unaryop),
     ast.expr_context,

@@ -24,7 +24,7 @@ from trilane.training.body_from_anny import (
     round_weights,
 )
 
-PATH = Path(__file__).resolve().parents[2] / "avatars" / "default" / "body.npz"
+PATH = Path(__file__).resolve().parents[3] / "avatars" / "default" / "body.npz"
 
 
 @cache
