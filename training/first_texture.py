@@ -109,8 +109,6 @@ def used_texels(body: BodyArrays, side: int, margin: int) -> NDArray[np.bool_]:
 # Rule: fields are smooth on the body, so points that are close on the body start with similar values, also across UV
 # seams.
 
-SMALLEST_PART = 0.2
-
 
 def eigenfunctions(vertices: F64, faces: Ints, count: int) -> F64:
     """The `count` smoothest non-constant eigenfunctions (V,count) of the cotangent Laplacian, each scaled to -1..1.

@@ -1,7 +1,7 @@
 """Training by a number of steps, in one process: the same settings give the same weights.
 
 Rule: what a step does depends on its number, the settings and the state alone, so a training that was ended anywhere
-goes on as if it had not been.
+goes on as if it had not been ended.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import psutil
@@ -24,16 +24,17 @@ from torch import Tensor, nn
 from trilane.errors import BadInputError, MissingPartError, reason
 from trilane.files import DAMAGED
 from trilane.install import package_line
-from trilane.training.batch_choice import Batch, batch_stream, is_whole, load_batch
 from trilane.training.byte_grid import ByteGrid
 from trilane.training.make_bundle import round_to_bytes
 from trilane.training.network import add_activation_noise, add_dropout
 from trilane.training.objective import Adversary, Objective, Vgg16
-from trilane.training.sample_files import ShapeGroup
-from trilane.training.trainable_avatar import TrainableAvatar
+from trilane.training.sample_files import Batch, ShapeGroup, batch_stream, is_whole
+from trilane.training.trainable_avatar import TrainableAvatar, load_batch
 from trilane.training.training_settings import OptimiserOptions, TrainingSettings
 from trilane.writing import write_atomically
 
+#: Share of the steps in which the learning rate rises.
+WARM_UP = 0.02
 #: Steps that are measured to say what all will take.
 MEASURED = 4
 #: Moves the number of a step into the bits above the seed.
@@ -41,7 +42,10 @@ SEED_BITS = 31
 
 
 def first_state(avatar: TrainableAvatar, settings: TrainingSettings, vgg: Vgg16 | None = None) -> TrainingState:
-    """The state of a training of `avatar` before its first step. `vgg`: for a perceptual loss by its features."""
+    """Make the state of a training of `avatar` before its first step.
+
+    `vgg`: network of the perceptual loss; None for MS-SSIM.
+    """
     device = chosen_device(settings.device)
     average = copy.deepcopy(avatar.to(device)).eval()
     harder = settings.regularisation
@@ -55,17 +59,17 @@ def first_state(avatar: TrainableAvatar, settings: TrainingSettings, vgg: Vgg16 
     loss, rate = settings.loss, settings.discriminator_rate
     adversary = Adversary(settings.width, rate, settings.seed, device) if loss.judged else None
     objective = Objective(loss.by_name(), None if vgg is None else vgg.to(device), adversary)
-    optimiser = optimiser_of(avatar, settings, settings.optimiser, settings.masked_texture)
+    optimiser = optimiser_of(avatar, settings)
     return TrainingState(avatar, average, optimiser, objective)
 
 
 def steps(
     state: TrainingState, groups: list[ShapeGroup], settings: TrainingSettings, count: int
 ) -> Iterator[dict[str, float]]:
-    """Do the steps of `state` up to number `count`; yields after each what `add_gradients` tells.
+    """Do the steps of `state` up to number `count`, and yield the terms of the loss after each, by name.
 
-    `state`: changes in place.
-    `groups`: the samples.
+    `state`: state of the training, which changes in place.
+    `groups`: samples of the training.
     """
     stream = batch_stream(groups, settings, count, state.step)
     peaks = (settings.network_rate, settings.network_rate, settings.texture_rate)
@@ -82,16 +86,16 @@ def steps(
 
 
 def _round(avatar: TrainableAvatar, groups: list[ShapeGroup], settings: TrainingSettings, share: float) -> None:
-    """Round `avatar` to bytes where the `share` of the steps that is done says so; the grid is measured at first."""
+    """Begin to round `avatar` to bytes once the `share` of the steps that are done passes `bytes_from`."""
     if avatar.grid is None or share <= settings.bytes_from:
         return
     round_to_bytes(avatar, avatar.grid, groups, settings.seed)
 
 
 def _step(state: TrainingState, stream: Iterator[Batch], settings: TrainingSettings, frozen: bool) -> dict[str, float]:
-    """One step by the mean gradient of the next batches of `stream`; the mean terms of their losses.
+    """Do one step by the mean gradient of the next batches, and return the mean terms of their losses.
 
-    `frozen`: batch statistics no longer change.
+    `frozen`: whether batch statistics stay.
     """
     options, avatar = settings.optimiser, state.avatar
     state.optimiser.zero_grad(set_to_none=True)
@@ -108,9 +112,10 @@ def _step(state: TrainingState, stream: Iterator[Batch], settings: TrainingSetti
 def add_gradients(
     avatar: TrainableAvatar, batch: tuple[Tensor, Tensor, Tensor], objective: Objective, share: float = 1.0
 ) -> dict[str, float]:
-    """Add `share` of the gradients of `batch`, as `load_batch` returns it, to those of `avatar`; the terms by name.
+    """Add `share` of the gradients of `batch` to those of `avatar`, and return the terms of the loss by name.
 
-    `objective`: what is minimised; its discriminators learn from every batch.
+    `batch`: UV image, coverage and target, as `load_batch` returns them.
+    `objective`: loss to minimise; its discriminators learn from every batch.
     """
     uv, covered, target = batch
     output = avatar(uv, covered)
@@ -120,14 +125,14 @@ def add_gradients(
 
 
 def rate_share(share: float) -> float:
-    """What learning rates are multiplied by when `share` of the training is done: up at first, then half a cosine."""
+    """Return the factor of the learning rates when `share` of the training is done: a rise, then half a cosine."""
     if share < WARM_UP:
         return max(share / WARM_UP, 0.02)
     return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * (share - WARM_UP) / (1 - WARM_UP)))
 
 
 def set_mode(avatar: TrainableAvatar, frozen: bool) -> None:
-    """Put `avatar` into training mode; `frozen`: its batch statistics no longer change."""
+    """Put `avatar` into training mode. `frozen`: whether its batch statistics stay."""
     avatar.train()
     if frozen:
         for module in avatar.modules():
@@ -146,7 +151,7 @@ def follow(average: TrainableAvatar, avatar: TrainableAvatar, keep: float) -> No
 def step_seconds(
     avatar: TrainableAvatar, groups: list[ShapeGroup], settings: TrainingSettings, vgg: Vgg16 | None = None
 ) -> float:
-    """Mean seconds of a step of a copy of `avatar`, measured; small samples count by their share of the steps."""
+    """Measure the mean seconds of a step on a copy of `avatar`; small samples count by their share of the steps."""
     share = settings.small_until
     of_small = _measured(avatar, groups, settings, vgg, 1.0) if share > 0 else 0.0
     of_all = _measured(avatar, groups, settings, vgg, 0.0) if share < 1 else 0.0
@@ -160,7 +165,7 @@ def _measured(
     vgg: Vgg16 | None,
     small_until: float,
 ) -> float:
-    """Mean seconds of a step, after one that warms up."""
+    """Measure the mean seconds of a step, after one that warms up."""
     going = steps(
         first_state(copy.deepcopy(avatar), settings, vgg),
         groups,
@@ -182,7 +187,7 @@ MB = 1e6
 
 
 def chosen_device(asked: str) -> torch.device:
-    """`asked`: "auto", "cpu" or "cuda". Raises MissingPartError where there is no such GPU."""
+    """Return the device for "auto", "cpu" or "cuda". Raises MissingPartError where there is no such GPU."""
     found = torch.cuda.is_available()
     if asked == "cuda" and not found:
         what = "device cuda: this PyTorch finds no NVIDIA GPU (device auto or cpu trains on the CPU)"
@@ -191,14 +196,14 @@ def chosen_device(asked: str) -> torch.device:
 
 
 def device_words(device: torch.device, threads: int) -> str:
-    """What `device` is, as part of a sentence. `threads`: of PyTorch on the CPU."""
+    """Name `device` in words. `threads`: threads of PyTorch on the CPU."""
     if device.type == "cuda":
         return f"the GPU {torch.cuda.get_device_name(device)}"
     return f"{threads} {'thread' if threads == 1 else 'threads'} of the CPU"
 
 
 def memory_words(device: torch.device) -> str:
-    """What this process has of memory now, and of a GPU's the most that it had."""
+    """Say how much memory this process has now, and the most that it had of a GPU's."""
     of_cpu = f"{psutil.Process().memory_info().rss / MB:.0f} MB of memory"
     if device.type != "cuda":
         return of_cpu
@@ -265,49 +270,29 @@ CLASSES: dict[tuple[str, bool], type[torch.optim.Optimizer]] = {
     ("adam", False): torch.optim.Adam,
     ("adam", True): MaskedAdam,
 }
-USUAL = OptimiserOptions()
 
 
-class Rates(Protocol):
-    """Learning rates of network and texture, and the decay of weights."""
-
-    @property
-    def network_rate(self) -> float: ...
-
-    @property
-    def texture_rate(self) -> float: ...
-
-    @property
-    def weight_decay(self) -> float: ...
-
-
-def optimiser_of(
-    avatar: TrainableAvatar, rates: Rates, options: OptimiserOptions = USUAL, masked: bool = False
-) -> torch.optim.Optimizer:
-    """What steps `avatar`: its kernels, the network's other weights, which do not decay, and its texture.
-
-    `rates`: learning rates and decay.
-    `options`: kind and momenta.
-    `masked`: texels without a gradient stay as they are, with their moments.
-    """
+def optimiser_of(avatar: TrainableAvatar, settings: TrainingSettings) -> torch.optim.Optimizer:
+    """Make the optimiser of three groups: kernels, the network's other weights, which do not decay, and texture."""
+    options = settings.optimiser
     kernels = [p for p in avatar.network.parameters() if p.ndim > 1]
     others = [p for p in avatar.network.parameters() if p.ndim <= 1]
     texture = list(avatar.texture.parameters())
     rows = (
-        (kernels, rates.network_rate, rates.weight_decay, options.momentum),
-        (others, rates.network_rate, 0.0, options.momentum),
-        (texture, rates.texture_rate, rates.weight_decay, options.texture_momentum),
+        (kernels, settings.network_rate, settings.weight_decay, options.momentum),
+        (others, settings.network_rate, 0.0, options.momentum),
+        (texture, settings.texture_rate, settings.weight_decay, options.texture_momentum),
     )
     groups: list[dict[str, Any]] = [
         {"params": params, "lr": rate, "weight_decay": decay, "betas": (momentum, options.second_momentum)}
         for params, rate, decay, momentum in rows
     ]
-    if masked:
+    if settings.masked_texture:
         groups[-1][MASKED] = True
-    return CLASSES[options.kind, masked](groups, lr=rates.network_rate)
+    return CLASSES[options.kind, settings.masked_texture](groups, lr=settings.network_rate)
 
 
-def clip_gradients(module: nn.Module, options: OptimiserOptions = USUAL) -> None:
+def clip_gradients(module: nn.Module, options: OptimiserOptions) -> None:
     """Limit the gradients of `module`: each number by `clip_value`, then the norm of all by `clip_norm`. In place."""
     if options.clip_value:
         nn.utils.clip_grad_value_(module.parameters(), options.clip_value)
@@ -321,7 +306,7 @@ def clip_gradients(module: nn.Module, options: OptimiserOptions = USUAL) -> None
 # Rule: what was read computes the same bits as what was written, so tensors keep their layout in memory.
 
 EXPECTED = "the state of this training"
-REMEDY = "remove it, and the training begins anew"
+REMEDY = "remove it to begin again"
 
 
 @dataclass
@@ -399,10 +384,6 @@ def _add_moments(optimiser: torch.optim.Optimizer) -> None:
                 "exp_avg": torch.zeros_like(parameter, memory_format=torch.preserve_format),
                 "exp_avg_sq": torch.zeros_like(parameter, memory_format=torch.preserve_format),
             }
-
-
-#: Share of the steps in which the learning rate rises.
-WARM_UP = 0.02
 
 
 # How far a training's loss fell: the same samples, before the first step and after the last.

@@ -87,20 +87,20 @@ class Places:
 
 
 class Listener(Protocol):
-    """Who is told how the work goes."""
+    """Someone who is told how the work goes."""
 
     def say(self, line: str) -> None:
-        """`line`: what was found, or what the next part of the work will take."""
+        """Take a line about what was found, or what the next part of the work costs."""
 
     def track(self, text: str, numbers: Iterable[Any], total: int) -> Iterable[Any]:
-        """`numbers`, of which there are `total`, while they are gone through; `text` says what is done."""
+        """Yield the `total` items of `numbers` and show how far the work `text` is."""
 
     def trained(self, step: int, total: int, terms: dict[str, float], loss: float) -> None:
-        """Step `step` of `total` was done; `terms` of the loss before weighting, and their weighted sum."""
+        """Take the `terms` of the loss at `step` of `total`, before weighting, and their weighted sum `loss`."""
 
 
 def train_avatar(places: Places, asked: TrainingSettings, listener: Listener) -> dict[str, Any]:
-    """Train what `asked` says and write the bundle; facts of the training and of held-out frames.
+    """Train as `asked`, write the bundle, and return facts of the training and of held-out frames.
 
     A training that was ended before goes on from its last state.
     Raises BadInputError; FaultyCaptureError with all faults; MissingPartError without OpenGL.
@@ -148,7 +148,7 @@ def train_avatar(places: Places, asked: TrainingSettings, listener: Listener) ->
 
 
 def _subject(places: Places, settings: TrainingSettings, listener: Listener) -> Subject:
-    """The person of the capture, or the default body in the settings' look. Raises BadInputError for both or none."""
+    """Return the person of the capture, or the default body in a look. Raises BadInputError for both or none."""
     if places.capture is None:
         if settings.look is None:
             raise BadInputError("CAPTURE", "none", "the folder of a capture", "or settings (--config) with a `look`")
@@ -159,7 +159,7 @@ def _subject(places: Places, settings: TrainingSettings, listener: Listener) -> 
 
 
 def with_vgg(asked: TrainingSettings, file: Path | None) -> TrainingSettings:
-    """`asked`, with the digest of the weights in `file`. Raises BadInputError where one is given without the other."""
+    """Add the digest of the weights in `file` to `asked`. Raises BadInputError where one is given without the other."""
     if file is None:
         if asked.vgg is not None:
             raise BadInputError("vgg", "no file of weights", f"that with SHA-256 {asked.vgg}", "give it with --vgg")
@@ -173,7 +173,7 @@ def with_vgg(asked: TrainingSettings, file: Path | None) -> TrainingSettings:
 
 
 def _raised(subject: Subject, places: Places, settings: TrainingSettings, listener: Listener) -> Subject:
-    """`subject`, drawn with the offsets of its clothes and hair where the settings ask for them."""
+    """Add the offsets of clothes and hair to `subject` where the settings ask for them."""
     if not settings.stand_off:
         return subject
 
@@ -184,9 +184,9 @@ def _raised(subject: Subject, places: Places, settings: TrainingSettings, listen
 
 
 def resumed_settings(path: Path, asked: TrainingSettings) -> TrainingSettings:
-    """Those of the training that the file `path` is of, where they are what is `asked` for; else `asked`.
+    """Return the settings in the file `path` where a training has begun there, else `asked`.
 
-    Steps that were counted before stay. Raises BadInputError when the file has others.
+    A number of steps that was counted before stays. Raises BadInputError when the file differs from `asked`.
     """
     if not path.exists():
         return asked
@@ -226,7 +226,7 @@ def _draw_samples(subject: Subject, places: Places, settings: TrainingSettings, 
 
 
 def _sample_cost(subject: Subject, samples: list[Planned], settings: TrainingSettings) -> str:
-    """What drawing `samples` will take, by some that are drawn."""
+    """Say what drawing `samples` costs, by drawing some of them."""
     start, tried = time.monotonic(), samples[:: max(1, len(samples) // 4)][:4]
     for sample in tried:
         subject.renderer.render(sample)
@@ -239,7 +239,7 @@ def _sample_cost(subject: Subject, samples: list[Planned], settings: TrainingSet
 
 
 def _first_avatar(subject: Subject, places: Places, settings: TrainingSettings) -> TrainableAvatar:
-    """What training starts from; of a training that was begun, only its shapes matter."""
+    """Return what training starts from; once a state is on the disk, only its shapes matter."""
     groups = open_groups(places.work / SAMPLES)
     network = UNet(norm=settings.norm, width=settings.width, channels=CHANNELS, input_skip=True)
     if (places.work / STATE).exists():
@@ -259,7 +259,7 @@ def _first_avatar(subject: Subject, places: Places, settings: TrainingSettings) 
 def _with_steps(
     avatar: TrainableAvatar, places: Places, settings: TrainingSettings, vgg: Vgg16 | None, listener: Listener
 ) -> TrainingSettings:
-    """`settings` with a number of steps, by default as many as fit into the minutes; says what they take."""
+    """Return `settings` with a number of steps, by default as many as fit into the minutes, and say what they take."""
     seconds = step_seconds(avatar, open_groups(places.work / SAMPLES), settings, vgg)
     count = settings.steps or max(LEAST_STEPS, int(60 * settings.minutes / seconds))
     memory = memory_words(chosen_device(settings.device))
@@ -271,7 +271,7 @@ def _with_steps(
 def _train(
     state: TrainingState, subject: Subject, places: Places, settings: TrainingSettings, listener: Listener
 ) -> None:
-    """Do all steps that are left."""
+    """Do all steps that are left, with a sheet and a state on the disk now and then."""
     path, count = places.work / STATE, settings.steps or LEAST_STEPS
     if path.exists():
         load_state(state, path)
@@ -290,7 +290,7 @@ def _train(
 
 
 def _loss_before(state: TrainingState, places: Places, groups: list[ShapeGroup]) -> float:
-    """The loss before the first step, as it was when the training was begun."""
+    """Return the loss before the first step; a training that goes on reads it from the work folder."""
     path = places.work / LOSS_BEFORE
     if not (places.work / STATE).exists():
         write_bytes(path, json.dumps(probe_loss(state, groups)).encode())
@@ -298,7 +298,7 @@ def _loss_before(state: TrainingState, places: Places, groups: list[ShapeGroup])
 
 
 def _measure(places: Places, subject: Subject, settings: TrainingSettings) -> dict[str, Any]:
-    """The error of the bundle on frames that training never read, which is written into it."""
+    """Measure the bundle on frames that training never read, and write the error into it."""
     assert subject.frames is not None
     bundle = load_bundle(places.out)
     facts = error_facts(frame_errors(bundle, subject.frames, subject.held_out, settings.threads))

@@ -23,10 +23,9 @@ from trilane.arrays import F32, U8
 from trilane.avatars.bundle import Bundle, split_levels
 from trilane.avatars.network_file import constants_of
 from trilane.errors import BadInputError, reason
-from trilane.training.batch_choice import load_batch
 from trilane.training.byte_grid import ByteGrid, convolutions, module_of
 from trilane.training.network import UNet
-from trilane.training.sample_files import ShapeGroup, batches
+from trilane.training.sample_files import U16, ShapeGroup, batches
 from trilane.writing import write_atomically
 
 if TYPE_CHECKING:
@@ -68,6 +67,16 @@ class TrainableAvatar(nn.Module):
 
     def _noisy(self, x: Tensor, deviation: float) -> Tensor:
         return x + deviation * torch.randn_like(x) if self.training and deviation else x
+
+
+def load_batch(
+    group: ShapeGroup, index: NDArray[np.int64], device: torch.device | str = "cpu"
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Read the samples `index` (N,): `uv` (N,H,W,2) in 0..1, `covered` (N,H,W) bool, target (N,4,H,W) in 0..1."""
+    uv = torch.from_numpy(group.uv[index].astype(np.float32) / U16)
+    covered = torch.from_numpy(group.covered[index] > 0)
+    target = torch.from_numpy(group.rgba[index].astype(np.float32) / 255).permute(0, 3, 1, 2)
+    return uv.to(device), covered.to(device), target.to(device)
 
 
 # The neural texture: one image of C channels, stored as the sum of several scales.

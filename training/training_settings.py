@@ -167,22 +167,32 @@ HEAD = "# How this avatar was trained; `trilane avatar train --config training.t
 
 
 class TrainingSettings(Table):
-    """One training.
+    """Everything that decides what one training makes. A share is a share of the steps, 0 to 1.
 
-    `samples`: views of the person, drawn before training. `minutes`: of training, which `steps` are counted
-    for by measured time where they are not given. `batch`: samples of a step. `seed`: of all random numbers. `threads`:
-    of PyTorch. `device`: auto is a GPU that PyTorch can use, where there is one. `precision`: of the network while it
-    is trained. `look`: the default body in these clothes is who is trained; none: the person of a capture. `start`: the
-    avatar whose network is trained further, or one of random weights. `width`: of a new one. `texture`: the avatar
-    whose texture is trained further, or one of the samples' colours.
-    `network_rate`, `texture_rate`: peaks of the learning rates. `small_until`, `freeze_norms_at`: shares of the steps,
-    up to which only half-size samples are used, and after which batch statistics stay. `average_share`: of the steps so
-    far, time constant of the average that becomes the avatar. `discriminator_rate`: of learning, for discriminators; it
-    stays as it is. `noise_steps`: on activations, steps of a byte. `masked_texture`: texels that a batch does not show
-    keep their values and their momentum. `stand_off`: the body is drawn with clothes and hair raised by what masks
-    show. `norm`: of a new network. `mip_levels`: smaller levels of the texture that are learnt with it. `bytes_from`:
-    share of the steps after which weights and activations are rounded as the bundle's are, in float32. `vgg`: SHA-256
-    of VGG-16's weights that the perceptual loss is by.
+    `samples`: number of views of the person, drawn before training.
+    `minutes`: time of training; it becomes a number of `steps` by measurement where `steps` is absent.
+    `batch`: samples of a step.
+    `seed`: seed of all random numbers.
+    `threads`: threads of PyTorch, and processes that draw.
+    `device`: where PyTorch computes; auto is a GPU where there is one.
+    `precision`: floating-point format of the network while it is trained.
+    `look`: clothes of the default body, who is trained then; None for the person of a capture.
+    `start`: avatar whose network is trained further; new for random weights.
+    `texture`: avatar whose texture is trained further; new for the colours of the samples.
+    `width`: channels of a new network; 64 is full.
+    `network_rate`, `texture_rate`: peaks of the learning rates.
+    `discriminator_rate`: constant learning rate of the discriminators.
+    `weight_decay`: decay of kernels and texture.
+    `small_until`: share up to which only half-size samples are used.
+    `freeze_norms_at`: share after which batch statistics stay.
+    `average_share`: time constant of the average that becomes the avatar, as a share of the steps so far.
+    `noise_steps`: noise on activations, in steps of a byte.
+    `masked_texture`: whether texels that a batch does not show keep their values and their momentum.
+    `stand_off`: whether the body is drawn with clothes and hair raised to where masks end.
+    `norm`: normalisation of a new network.
+    `bytes_from`: share after which weights and activations are rounded to the bundle's bytes, in float32.
+    `mip_levels`: number of smaller levels of the texture that are learnt with it.
+    `vgg`: SHA-256 of the VGG-16 weights of the perceptual loss.
     """
 
     schema_: Literal[1] = Field(default=1, alias="schema")

@@ -23,7 +23,8 @@ TOLERANCE = 1e-4
 
 @pytest.mark.parametrize("loss", ["default", "thesis"])
 def test_one_step_is_the_cpus(cuda: Any, loss: str) -> None:
-    weights = parsed_settings({"loss": loss}, "a test").loss
+    settings = parsed_settings({"loss": loss}, "a test")
+    weights = settings.loss
     torch.manual_seed(0)
     torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
     random = np.random.default_rng(0)
@@ -40,7 +41,7 @@ def test_one_step_is_the_cpus(cuda: Any, loss: str) -> None:
         adversary = Adversary(4, 1e-3, 1, device) if weights.judged else None
         placed = (batch[0].to(device), batch[1].to(device), batch[2].to(device))
         losses.append(add_gradients(each, placed, Objective(weights.by_name(), None, adversary)))
-        clip_gradients(each)
+        clip_gradients(each, settings.optimiser)
         torch.optim.SGD(each.parameters(), 0.01).step()
     assert losses[1] == pytest.approx(losses[0], rel=TOLERANCE)
     for name, value in avatar.state_dict().items():

@@ -17,7 +17,7 @@ pytest.importorskip("skimage")
 
 from trilane.errors import BadInputError, MissingPartError  # noqa: E402
 from trilane.training import objective  # noqa: E402
-from trilane.training.objective import (  # noqa: E402  # noqa: E402  # noqa: E402
+from trilane.training.objective import (  # noqa: E402  # noqa: E402
     JUDGES,
     WEIGHTS,
     Adversary,

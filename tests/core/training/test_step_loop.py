@@ -14,8 +14,7 @@ pytest.importorskip("scipy")
 pytest.importorskip("skimage")
 
 from trilane.errors import BadInputError  # noqa: E402
-from trilane.training import batch_choice, step_loop  # noqa: E402
-from trilane.training.batch_choice import load_batch  # noqa: E402
+from trilane.training import sample_files, step_loop  # noqa: E402
 from trilane.training.network import UNet, add_activation_noise  # noqa: E402
 from trilane.training.objective import drawn_behind, loss_terms, total_loss  # noqa: E402
 from trilane.training.sample_files import U16, ShapeGroup, batches, create_group, open_groups  # noqa: E402
@@ -29,7 +28,11 @@ from trilane.training.step_loop import (  # noqa: E402
     steps,
 )
 from trilane.training.train import resumed_settings  # noqa: E402
-from trilane.training.trainable_avatar import NeuralTexture, TrainableAvatar  # noqa: E402
+from trilane.training.trainable_avatar import (  # noqa: E402
+    NeuralTexture,
+    TrainableAvatar,
+    load_batch,
+)
 from trilane.training.training_settings import TrainingSettings, parsed_settings, read_settings, settings_text  # noqa: E402
 
 SMALL, LARGE = (32, 32), (64, 32)
@@ -68,7 +71,7 @@ def one_thread() -> Any:
 @pytest.fixture
 def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[ShapeGroup]:
     """Five samples of a small shape and four of a large one."""
-    monkeypatch.setattr(batch_choice, "SMALL_PIXELS", math.prod(LARGE))
+    monkeypatch.setattr(sample_files, "SMALL_PIXELS", math.prod(LARGE))
     rng = np.random.default_rng(0)
     for shape, count in ((SMALL, 5), (LARGE, 4)):
         group = create_group(tmp_path / "data", shape, (np.arange(count) % 2).astype(np.int8))
@@ -97,7 +100,7 @@ def bits(state: TrainingState) -> dict[str, bytes]:
 
 
 def test_half_size_tensors_have_fewer_than_160_x_160_pixels() -> None:
-    assert batch_choice.SMALL_PIXELS == 25600
+    assert sample_files.SMALL_PIXELS == 25600
 
 
 def test_a_batch_is_in_shares(groups: list[ShapeGroup]) -> None:

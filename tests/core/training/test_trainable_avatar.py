@@ -182,8 +182,7 @@ def test_its_norms_have_the_statistics_of_the_samples(groups: list[ShapeGroup]) 
     network = network_of(bundle, groups, 1)
     stem = network.encoder.stem[1]
     assert float((stem.weight.detach() - torch.sqrt(stem.running_var + stem.eps)).abs().max()) < 1e-6
-    from trilane.training.batch_choice import load_batch
-    from trilane.training.trainable_avatar import read_texture
+    from trilane.training.trainable_avatar import load_batch, read_texture
 
     texture = torch.from_numpy(bundle.read_texture()).permute(2, 0, 1)[None]
     uv, covered, _ = load_batch(groups[0], np.arange(16))

@@ -15,21 +15,24 @@ pytest.importorskip("scipy")
 pytest.importorskip("skimage")
 
 from trilane.errors import BadInputError  # noqa: E402
-from trilane.training import batch_choice, objective, step_loop  # noqa: E402
-from trilane.training.batch_choice import (  # noqa: E402
-    batch_stream,
-    is_whole,
-    load_batch,
-    phases,
-    zoom,
-)
+from trilane.training import objective, sample_files, step_loop  # noqa: E402
 from trilane.training.network import (  # noqa: E402
     NORMS,
     UNet,
     add_dropout,
 )
 from trilane.training.objective import Objective  # noqa: E402
-from trilane.training.sample_files import U16, ShapeGroup, create_group, open_groups  # noqa: E402
+from trilane.training.sample_files import (  # noqa: E402
+    U16,
+    ShapeGroup,
+    batch_stream,
+    create_group,
+    is_whole,
+    load_batch,
+    open_groups,
+    phases,
+    zoom,
+)
 from trilane.training.step_loop import (  # noqa: E402
     TrainingState,
     add_gradients,
@@ -231,9 +234,9 @@ def adam_by_hand(start: Any, gradients: list[Any], row: dict[str, Any]) -> np.nd
 @pytest.mark.parametrize(("momentum", "texture_momentum"), [(0.9, 0.0), (0.0, 0.8)])
 def test_the_optimiser_is_its_formula(kind: Any, masked: bool, momentum: float, texture_momentum: float) -> None:
     made = avatar()
-    asked = settings(network_rate=0.02, texture_rate=0.03, weight_decay=0.1)
-    options = OptimiserOptions(kind=kind, momentum=momentum, texture_momentum=texture_momentum, second_momentum=0.95)
-    optimiser = optimiser_of(made, asked, options, masked)
+    options = {"kind": kind, "momentum": momentum, "texture_momentum": texture_momentum, "second_momentum": 0.95}
+    rates = {"network_rate": 0.02, "texture_rate": 0.03, "weight_decay": 0.1}
+    optimiser = optimiser_of(made, settings(**rates, masked_texture=masked, optimiser=options))
     rng = np.random.default_rng(2)
     network = {"rate": 0.02, "beta": momentum, "masked": False}
     rows = (
@@ -340,7 +343,7 @@ def test_only_whole_bodies_are_read_at_last(groups: list[ShapeGroup]) -> None:
 
 
 def test_small_samples_end_where_whole_bodies_begin(groups: list[ShapeGroup], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch_choice, "SMALL_PIXELS", 64 * 64)
+    monkeypatch.setattr(sample_files, "SMALL_PIXELS", 64 * 64)
     asked = settings(small_until=0.8, batches={"full_body_from": 0.5})
     found = list(batch_stream(groups, asked, 10))
     assert len(found) == 10 and all(group.shape == (64, 32) for group, _ in found[:5])

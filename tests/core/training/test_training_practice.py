@@ -15,7 +15,6 @@ torch = pytest.importorskip("torch")
 
 from trilane.apps.cli.avatar_train import EventLog  # noqa: E402
 from trilane.errors import MissingPartError  # noqa: E402
-from trilane.training.batch_choice import load_batch  # noqa: E402
 from trilane.training.objective import (  # noqa: E402
     Objective,
     drawn_behind,
@@ -29,6 +28,7 @@ from trilane.training.step_loop import (  # noqa: E402
     memory_words,
     probe_loss,
 )
+from trilane.training.trainable_avatar import load_batch  # noqa: E402
 
 
 @pytest.mark.parametrize(
