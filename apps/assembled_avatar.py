@@ -16,10 +16,8 @@ import onnx
 from numpy.typing import NDArray
 
 from trilane.avatars.bundle import TEXTURE_KEYS, Bundle, load_bundle, read_texture, write_bundle
-from trilane.avatars.integer_network import NetworkFile, check_integer_layers
 from trilane.avatars.manifest import CAPTURED, UNTRAINED, Manifest, network_entry
-from trilane.avatars.network_file import read_network
-from trilane.avatars.network_reshape import STRIDE, reshaped
+from trilane.avatars.network_file import STRIDE, NetworkFile, check_integer_layers, read_network, reshaped
 from trilane.avatars.validation import refused
 from trilane.body.body import Body, load_body
 from trilane.errors import BadInputError

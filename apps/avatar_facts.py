@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from trilane.avatars.bundle import Bundle
-from trilane.avatars.integer_network import NetworkFile
+from trilane.avatars.network_file import NetworkFile
 from trilane.avatars.validation import validation_facts
 from trilane.errors import BadInputError
 from trilane.hw_profiles.network_work import graph_facts

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from trilane.apps.scene_plan import ScenePlan
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import reshaped
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import LEAST_FPS, MOST_FPS, RUNTIMES, Variant
 from trilane.hw_profiles.beside import MOST_TENANTS, NEWEST, SKIPS, Tenant

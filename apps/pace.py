@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from trilane.avatars.bundle import load_bundle
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import reshaped
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import Plan, application_graph, stage_times_ms
 from trilane.hw_profiles.load import load_runnable

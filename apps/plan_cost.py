@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from trilane.avatars.integer_network import NetworkFile
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import NetworkFile, reshaped
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import Plan, Variant, stage_times_ms, steady, workers_of
 from trilane.hw_profiles.host import host_cores, usable_cores

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from trilane.apps.remake import METHOD, VIEWS, Remake, calibration_of
 from trilane.arrays import F32
 from trilane.avatars.bundle import MANIFEST, TEXTURE_KEYS, Bundle, load_bundle, write_bundle
-from trilane.avatars.digests import digests_of, sha256_of
-from trilane.avatars.manifest import UNTRAINED, Manifest, network_entry
+from trilane.avatars.manifest import UNTRAINED, Manifest, digests_of, network_entry, sha256_of
 from trilane.bench.lib.full_network import float_weights, weights_name
 from trilane.cache import cache_dir
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
@@ -117,7 +116,7 @@ def _alone(lock: Path) -> Iterator[None]:
 
 
 def _make(bundle: Bundle, recipe: _Recipe, folder: Path) -> None:
-    from trilane.avatars.network_reshape import reshaped
+    from trilane.avatars.network_file import reshaped
 
     chosen = np.arange(recipe.channels) % bundle.manifest.network.channels
     quantised = _quantised(bundle, recipe, chosen)
@@ -150,7 +149,7 @@ def _manifest(bundle: Bundle, recipe: _Recipe, network: Any, quantised: Quantise
 
 def _quantised(bundle: Bundle, recipe: _Recipe, chosen: NDArray[np.intp]) -> Quantised:
     try:
-        from trilane.training.calibration_views import training_views
+        from trilane.training.make_bundle import training_views
         from trilane.training.quantising.quantise import quantise
         from trilane.training.validate import open_renderer
     except ImportError as error:
@@ -164,10 +163,8 @@ def _float_model(bundle: Bundle, recipe: _Recipe) -> onnx.ModelProto:
     """The network that is quantised: the avatar's own, or an untrained one."""
     import torch
 
-    from trilane.training.calibration_views import float_model
-    from trilane.training.make_bundle import CALIBRATION_SHAPE
-    from trilane.training.network import UNet
-    from trilane.training.onnx_export import export_onnx
+    from trilane.training.make_bundle import CALIBRATION_SHAPE, float_model
+    from trilane.training.network import UNet, export_onnx
 
     own = bundle.manifest.network
     if not recipe.trained:

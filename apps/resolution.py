@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from trilane.apps.report import Resolution, TensorSize
-from trilane.avatars.size_loss import SizeLoss
+from trilane.avatars.validation import SizeLoss
 from trilane.scene.planner import ALL_WORK
 from trilane.stages.config import RunConfig
 

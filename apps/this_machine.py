@@ -11,7 +11,7 @@ from pathlib import Path
 from statistics import median
 
 from trilane.apps.beside import NETWORK_ENDING, asked
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import reshaped
 from trilane.errors import TrilaneError
 from trilane.hw_profiles.graph_file import GraphFile, read_graph
 from trilane.hw_profiles.host import usable_cores

@@ -7,21 +7,18 @@ from __future__ import annotations
 
 import math
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import onnx
 from numpy.typing import NDArray
 
 from trilane.arrays import F32
-from trilane.avatars.digests import digests_of
-from trilane.avatars.integer_network import MAX_SIDE, Affine, NetworkFile
-from trilane.avatars.manifest import ByteRange, Manifest, parse_manifest
-from trilane.avatars.network_file import read_network
-from trilane.avatars.offsets import read_offsets, save_offsets
-from trilane.avatars.texture_levels import check_levels
+from trilane.avatars.manifest import ByteRange, Manifest, digests_of, parse_manifest
+from trilane.avatars.network_file import MAX_SIDE, Affine, NetworkFile, read_network
 from trilane.body.body import Body, ShapedBody, load_body
 from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_npz, read_text, require_file
@@ -254,3 +251,84 @@ def _check_scale(scale: Any, path: Path, channels: int) -> NDArray[np.float32]:
         )
     factor: NDArray[np.float32] = scale.astype(np.float32)
     return factor
+
+
+# Smaller levels of a neural texture, which were learnt with it: read where a texel is smaller than a pixel.
+#
+# Rule: they are stored side by side in one array (H/2, W/2 + W/4 + ..., C), each at the top, so that an avatar has one
+# array more and its width says how many levels there are.
+
+#: More would end below 16 texels of the usual 512, which hold no part of a body.
+MOST_LEVELS = 5
+
+
+def pack_levels(levels: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """The array of `levels` (H/2,W/2,C), (H/4,W/4,C), ...; at least one."""
+    height = levels[0].shape[0]
+    rows = [np.pad(level, ((0, height - level.shape[0]), (0, 0), (0, 0))) for level in levels]
+    return np.concatenate(rows, axis=1)
+
+
+def split_levels(packed: NDArray[Any] | None, width: int) -> list[NDArray[Any]]:
+    """The levels of `packed`, for a texture of `width`; none without an array."""
+    levels: list[NDArray[Any]] = []
+    left = 0
+    while packed is not None and left < packed.shape[1]:
+        shift = len(levels)
+        side, height = width >> (shift + 1), packed.shape[0] >> shift
+        levels.append(np.ascontiguousarray(packed[:height, left : left + side]))
+        left += side
+    return levels
+
+
+def check_levels(packed: NDArray[Any], texture: NDArray[Any], where: object) -> None:
+    """Raises BadInputError unless `packed` has levels of `texture` (H,W,C), in numbers of its kind."""
+    height, width, channels = texture.shape
+    widths = [sum(width >> (k + 1) for k in range(count)) for count in range(1, MOST_LEVELS + 1)]
+    fits = packed.ndim == 3 and packed.shape[::2] == (height // 2, channels) and packed.shape[1] in widths
+    if not fits or packed.dtype != texture.dtype or height % (1 << MOST_LEVELS) or width % (1 << MOST_LEVELS):
+        found = f"levels of shape {packed.shape}, {packed.dtype}"
+        expected = (
+            f"({height // 2}, {widths[0]} to {widths[-1]}, {channels}), {texture.dtype}: 1 to {MOST_LEVELS} levels"
+        )
+        raise BadInputError(where, found, expected)  # type: ignore[arg-type]
+
+
+# Offsets of a body's vertices, from the skin to what is drawn, as a file of a bundle.
+#
+# Rule: as many as the body has vertices, finite, and none longer than clothes and hair are; kept in float16, which is
+# exact to 16 micrometres at 5 cm.
+
+OFFSETS_KEY = "offsets"
+OFFSETS_EXPECTED = "offsets of a body's vertices at rest (.npz)"
+#: Metres; what stands farther off is no part of a body's surface.
+LONGEST_M = 0.5
+
+
+def as_kept(offsets: F32) -> F32:
+    """`offsets` (V,3) as a file keeps them."""
+    return offsets.astype(np.float16).astype(np.float32)
+
+
+def save_offsets(file: Path | BinaryIO, offsets: F32) -> None:
+    """Write `offsets` (V,3), metres."""
+    np.savez_compressed(file, offsets=offsets.astype(np.float16))
+
+
+def read_offsets(path: Path, vertices: int) -> F32:
+    """(V,3) metres, of a body of so many `vertices`. Raises BadInputError."""
+    array = read_npz(path, (OFFSETS_KEY,), OFFSETS_EXPECTED).get(OFFSETS_KEY)
+    if array is None:
+        raise BadInputError(path, f"no array {OFFSETS_KEY!r}", OFFSETS_EXPECTED)
+    where = f"{path}[{OFFSETS_KEY}]"
+    if array.shape != (vertices, 3) or array.dtype.kind != "f":
+        raise BadInputError(
+            where, f"{array.dtype} of shape {array.shape}", f"floating-point numbers of shape ({vertices}, 3)"
+        )
+    with np.errstate(over="ignore"):
+        offsets: F32 = array.astype(np.float32)
+        lengths = np.linalg.norm(offsets, axis=1)
+    if not (lengths <= LONGEST_M).all():  # NaN and infinity are not
+        raise BadInputError(where, "offsets that are not finite or too long", f"at most {LONGEST_M} m")
+    offsets.flags.writeable = False
+    return offsets

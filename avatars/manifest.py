@@ -6,7 +6,9 @@ Rule: every number has a range and every key is known, so what is read needs no 
 from __future__ import annotations
 
 import datetime
+import hashlib
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -20,7 +22,7 @@ from pydantic import (
     model_validator,
 )
 
-from trilane.avatars.integer_network import MAX_CHANNELS, NetworkFile
+from trilane.avatars.network_file import MAX_CHANNELS, NetworkFile, network_files
 from trilane.errors import BadInputError
 
 #: Of `provenance`: what `weights` says of a network that nobody trained.
@@ -102,7 +104,7 @@ class Figures(_Model):
 
     `psnr_db_by_band`: in dB, before random backgrounds, inside the box of the true mask. `see_through`: share of the
     inside of the person whose alpha is less than 0.9. `iou`, `ssim`: means. The other keys, see `summary` of
-    `training/error_summary.py`, are None where nobody measured them, and then not written; without
+    `training/image_error.py`, are None where nobody measured them, and then not written; without
     `psnr_db_by_background` the figures are before one grey, as an older Trilane measured them.
     """
 
@@ -177,7 +179,7 @@ class Validation(Figures):
 
     `date`: of the validation, UTC; None in a manifest that an older Trilane wrote, as the next two and `made_with`.
     `digests`: of what was validated.
-    `figures_digest`: of all other keys here, by `figures_digest` of `avatars/digests.py`.
+    `figures_digest`: of all other keys here, by `figures_digest` of `avatars/manifest.py`.
     `made_with`: by which code.
     `runtime`: on which the pictures of `integer` were painted, whose errors stand at the top too.
     `other_runtimes`: the figures of more runtimes, by name.
@@ -257,3 +259,64 @@ def parse_manifest(text: str, path: Path) -> Manifest:
 def _short(value: object) -> str:
     text = json.dumps(value, default=str)
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+# What an avatar's pictures depend on, as digests: the bytes of its files and the numbers of its manifest.
+#
+# Rule: a byte that changes the picture changes a digest; names, provenance and other words change none.
+
+BLOCK = 1 << 20
+
+
+def digests_of(folder: Path, manifest: Manifest) -> Digests:
+    """The digests of the files in `folder` that `manifest` names. Raises BadInputError for one that cannot be read."""
+    return Digests(
+        body=sha256_of([folder / file for file in (manifest.body, manifest.offsets) if file is not None]),
+        texture=sha256_of([folder / manifest.texture]),
+        network=sha256_of(network_files(folder / manifest.network.file)),
+        constants=hashlib.sha256(_constants(manifest).encode()).hexdigest(),
+    )
+
+
+def figures_digest(validation: Validation) -> str:
+    """SHA-256, hexadecimal, of all that `validation` says but this digest, written in one way.
+
+    A key that is None counts as not there, so an optional key that a later Trilane adds changes no older digest.
+    """
+    said = validation.model_dump(mode="json", exclude={"figures_digest"})
+    return hashlib.sha256(_in_one_way(said).encode()).hexdigest()
+
+
+def with_figures_digest(validation: Validation) -> Validation:
+    """`validation`, which has just been measured, with the digest of its figures."""
+    return validation.model_copy(update={"figures_digest": figures_digest(validation)})
+
+
+def sha256_of(files: Sequence[Path]) -> str:
+    """SHA-256, hexadecimal, of the bytes of `files`, one after the other. Raises BadInputError."""
+    digest = hashlib.sha256()
+    for file in files:
+        try:
+            with file.open("rb") as stream:
+                while block := stream.read(BLOCK):
+                    digest.update(block)
+        except OSError as error:
+            raise BadInputError.of_os_error(file, error, "a readable file") from error
+    return digest.hexdigest()
+
+
+def _constants(manifest: Manifest) -> str:
+    """The manifest's numbers that the picture depends on, written in one way."""
+    network = manifest.network
+    numbers = {
+        "betas": list(manifest.betas),
+        "expression": list(manifest.expression),
+        "channels": network.channels,
+        "input": network.input.model_dump(),
+        "output": network.output.model_dump(),
+    }
+    return _in_one_way(numbers)
+
+
+def _in_one_way(values: dict[str, Any]) -> str:
+    return json.dumps(values, sort_keys=True, separators=(",", ":"))

@@ -17,7 +17,7 @@ from typing import Any
 import onnx
 from onnx import TensorProto, helper
 
-from trilane.avatars.integer_network import IntegerNetwork, NetworkFile
+from trilane.avatars.network_file import IntegerNetwork, NetworkFile
 from trilane.errors import BadInputError
 
 QUANTIZE = "QuantizeLinear"

@@ -6,16 +6,17 @@ everything else is a sentence that names what differs and the command that measu
 
 from __future__ import annotations
 
+import math
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from trilane.avatars.bundle import BUILT_IN, Bundle, bundle_folder
-from trilane.avatars.digests import digests_of, figures_digest
-from trilane.avatars.manifest import CAPTURED, UNTRAINED, Validation
+from trilane.avatars.manifest import CAPTURED, UNTRAINED, Validation, digests_of, figures_digest
 from trilane.figure_sources import NO_FIGURES, from_validation
+from trilane.shapes import parse_shape
 
 #: Part of an avatar to its name in a sentence.
 PARTS = {
@@ -147,3 +148,42 @@ def name_of(folder: Path) -> str:
     """What a person types for `folder`: the name of an avatar of the package, or the folder."""
     known = (name for name in BUILT_IN if folder.absolute() == bundle_folder(name).absolute())
     return next(known, str(folder))
+
+
+# What an avatar loses in smaller tensors than its network was trained for. Rule: its validation's figures or none.
+
+WHOLE = 1000  # thousandths
+DIGITS = 2
+
+
+@dataclass(frozen=True)
+class SizeLoss:
+    """`by_work`: PSNR in dB that is lost, by thousandths of the pixels; empty without figures.
+
+    `source`: where they come from, or why there are none and what measures them.
+    """
+
+    source: str
+    by_work: Mapping[int, float]
+
+    def at(self, work: int) -> float | None:
+        """The loss with so many thousandths of the pixels: of the next smaller size that was measured, if any was."""
+        if work >= WHOLE and self.by_work:
+            return 0.0
+        measured = [size for size in self.by_work if size <= work]
+        return self.by_work[max(measured)] if measured else None
+
+
+def size_loss(bundle: Bundle) -> SizeLoss:
+    """Of `bundle`. Raises BadInputError for a file that cannot be read."""
+    validation, name = bundle.manifest.validation, bundle.manifest.name
+    measures = f"`{VALIDATE} {name_of(bundle.folder)} --sizes` measures them"
+    if validation is None or refused(bundle):
+        how = f"`{VALIDATE} {name_of(bundle.folder)}` first, then {measures}"
+        return SizeLoss(f"avatar {name}: {NO_FIGURES} by tensor size, for it has no valid validation: {how}", {})
+    if validation.by_size is None:
+        return SizeLoss(f"avatar {name}: {NO_FIGURES} by tensor size; {measures}", {})
+    pixels = {math.prod(parse_shape(size)): psnr for size, psnr in validation.by_size.psnr_db.items()}
+    own = max(pixels)
+    losses = {WHOLE * count // own: round(pixels[own] - psnr, DIGITS) for count, psnr in pixels.items()}
+    return SizeLoss(f"{from_validation(validation.by_size.date)}, by tensor size", losses)

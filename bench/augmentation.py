@@ -26,8 +26,8 @@ from trilane.training.clothing.looks import look_named
 if TYPE_CHECKING:
     from trilane.body.body import ShapedBody
     from trilane.training.capture.capture import Capture
-    from trilane.training.evaluate import Painter
     from trilane.training.sample_renderer import SampleRenderer
+    from trilane.training.validate import Painter
 
 FRAME = (720, 1280)
 CAMERA, IMAGE = "camera space", "image space"
@@ -105,8 +105,7 @@ def _sources(capture: Capture) -> dict[str, Callable[[], Any]]:
 def open_source(capture: Capture, resamples: bool) -> Any:
     """The renderer of samples of all frames. `resamples`: image-space augmentation. Raises MissingPartError."""
     from trilane.bench.lib.image_space import ImageSpaceRenderer
-    from trilane.training.capture.capture_samples import CaptureRenderer
-    from trilane.training.capture.zoomed_view import ViewRule
+    from trilane.training.capture.capture_samples import CaptureRenderer, ViewRule
 
     renderer = CaptureRenderer(capture, range(len(capture)), ViewRule(), threads=1)
     return ImageSpaceRenderer(renderer) if resamples else renderer
@@ -116,18 +115,15 @@ def _trained(work: _Work, source: Callable[[], Any], folder: Path) -> tuple[Pain
     """The painter of the avatar that was trained on samples of `source`, and the last loss."""
     import torch
 
-    from trilane.training.body_arrays import body_arrays
-    from trilane.training.captured_avatar import DEFAULT_NETWORK
     from trilane.training.dataset import plan_training, write_dataset
     from trilane.training.first_texture import first_texture
-    from trilane.training.float_painter import float_painter
     from trilane.training.network import UNet
-    from trilane.training.neural_texture import SIDES, NeuralTexture
     from trilane.training.sample_files import open_groups
     from trilane.training.step_loop import first_state, steps
-    from trilane.training.trainable_avatar import TrainableAvatar
+    from trilane.training.surface import body_arrays
+    from trilane.training.train import DEFAULT_NETWORK
+    from trilane.training.trainable_avatar import SIDES, NeuralTexture, TrainableAvatar, float_painter, load_network
     from trilane.training.training_settings import parsed_settings
-    from trilane.training.weights_file import load_network
 
     settings = parsed_settings({"seed": work.seed}, "bench augmentation")
     torch.set_num_threads(settings.threads)
@@ -150,9 +146,8 @@ def _trained(work: _Work, source: Callable[[], Any], folder: Path) -> tuple[Pain
 def _errors(studio: SampleRenderer, paint: Painter, views: int, seed: int) -> dict[str, float]:
     """PSNR by band, and IoU, of what is painted of held-out poses in held-out views."""
     from trilane.training.dataset import plan_validation
-    from trilane.training.error_summary import SampleError, summary
-    from trilane.training.evaluate import evaluate
-    from trilane.training.validate import BUILTIN_HELD_OUT, FLOAT, held_out_motions
+    from trilane.training.image_error import SampleError, summary
+    from trilane.training.validate import BUILTIN_HELD_OUT, FLOAT, evaluate, held_out_motions
 
     planned = plan_validation(studio, views, seed, held_out_motions([BUILTIN_HELD_OUT]))
     with studio.ctx:  # the trainings opened contexts of their own

@@ -13,7 +13,7 @@ import numpy as np
 
 from trilane.arrays import U8
 from trilane.avatars.bundle import load_bundle
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import reshaped
 from trilane.bench.lib.drawable import load_drawable
 from trilane.bench.lib.fixture import standing
 from trilane.bench.lib.ground_truth import ground_truth

@@ -21,7 +21,7 @@ from trilane.errors import BadInputError
 from trilane.stages.gpu.opengl import describe, open_context
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
-from trilane.training.uv_image import UvRaster
+from trilane.training.sample_renderer import UvRaster
 
 CHANNELS = 16
 MAX_SIDE = 2048

@@ -14,7 +14,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import reshaped
 from trilane.bench.lib import full_width
 from trilane.bench.lib.rank_correlation import rank_correlation
 from trilane.errors import BadInputError, TrilaneError

@@ -20,7 +20,7 @@ from trilane.errors import BadInputError, TrilaneError
 from trilane.stages.gpu.opengl import describe, open_context
 from trilane.stages.gpu.packed_pass import CHANNELS, PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import PosedMesh, SkinnedMesh
-from trilane.training.uv_image import UvBytes
+from trilane.training.sample_renderer import UvBytes
 
 MAX_SIDE = 4096
 #: The variants whose bytes are compared.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from trilane.arrays import U8
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M, load_bundle
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import reshaped
 from trilane.bench.lib.drawable import load_drawable
 from trilane.bench.lib.ground_truth import ground_truth, shaped_body
 from trilane.body.kinematics import Skeleton

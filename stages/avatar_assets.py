@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F32
 from trilane.avatars.bundle import Bundle
-from trilane.avatars.integer_network import NetworkFile
-from trilane.avatars.network_checks import check_network
+from trilane.avatars.network_file import NetworkFile, check_network
 from trilane.body.body import Body, ShapedBody
 from trilane.errors import BadInputError
 from trilane.pipeline.shared_assets import Assets

@@ -16,10 +16,9 @@ from typing import Any
 from pydantic import ValidationError
 
 from trilane.avatars.bundle import load_bundle
-from trilane.avatars.integer_network import NetworkFile
+from trilane.avatars.network_file import NetworkFile
 from trilane.avatars.network_split import split
-from trilane.avatars.size_loss import SizeLoss, size_loss
-from trilane.avatars.validation import DrawnAs, accuracy_of
+from trilane.avatars.validation import DrawnAs, SizeLoss, accuracy_of, size_loss
 from trilane.errors import EGL_LINE, BadInputError, MissingPartError, did_you_mean
 from trilane.hw_profiles.host import asked_cores, rule_placement, settings_of, usable_cores
 from trilane.hw_profiles.load import HOST, load_profile

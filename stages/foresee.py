@@ -17,9 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M
-from trilane.avatars.integer_network import NetworkFile
-from trilane.avatars.network_reshape import STRIDE, reshaped
-from trilane.avatars.size_loss import SizeLoss
+from trilane.avatars.network_file import STRIDE, NetworkFile, reshaped
+from trilane.avatars.validation import SizeLoss
 from trilane.body.body import ShapedBody
 from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError

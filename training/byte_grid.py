@@ -16,8 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from trilane.training.network import UNet
-from trilane.training.onnx_export import INPUT
+from trilane.training.network import INPUT, UNet
 from trilane.training.quantising.power_of_two_scales import WEIGHT_TOP
 from trilane.training.quantising.quantise import ByteRanges
 from trilane.unet_tables import DECODER

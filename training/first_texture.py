@@ -5,15 +5,17 @@ Rule: it is computed from the body and the training set alone.
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
-from trilane.arrays import F32
-from trilane.training.body_arrays import BodyArrays
+import numpy as np
+import scipy.sparse as sparse
+from numpy.typing import NDArray
+from scipy.sparse.linalg import eigsh, splu
+from scipy.spatial import cKDTree
+
+from trilane.arrays import F32, F64, Ints, Mask
 from trilane.training.sample_files import U16, ShapeGroup
-from trilane.training.surface_fields import eigenfunctions
-from trilane.training.surface_fill import fill_along_surface
-from trilane.training.texture_layout import fill_beside, fill_gaps, lay_out
+from trilane.training.surface import BodyArrays
 
 COLOURS = 3
 OPAQUE = 250
@@ -100,3 +102,197 @@ def used_texels(body: BodyArrays, side: int, margin: int) -> NDArray[np.bool_]:
         grown[:, :-1] |= known[:, 1:]
         known = grown
     return known
+
+
+# Smooth fields on the body's surface, which most channels of the neural texture start from.
+#
+# Rule: fields are smooth on the body, so points that are close on the body start with similar values, also across UV
+# seams.
+
+
+def eigenfunctions(vertices: F64, faces: Ints, count: int) -> F64:
+    """The `count` smoothest non-constant eigenfunctions (V,count) of the cotangent Laplacian, each scaled to -1..1.
+
+    `vertices` (V,3), `faces` (F,3). Pinkall and Polthier, Computing discrete minimal surfaces and their conjugates,
+    1993. Vertices that are not connected to the largest part of the mesh (eyeballs) take the values of its nearest
+    vertex.
+    """
+    laplacian, mass = cotangent_laplacian(vertices, faces)
+    part = _largest_part(laplacian)
+    inner = laplacian[part][:, part]
+    values, vectors = eigsh(inner, k=count + 1, M=sparse.diags(mass[part]), sigma=-1e-3, v0=np.ones(len(part)))
+    vectors = vectors[:, np.argsort(values)][:, 1:]
+    vectors *= np.sign(vectors[np.abs(vectors).argmax(axis=0), np.arange(count)])
+    fields = np.empty((len(vertices), count))
+    fields[part] = vectors / np.abs(vectors).max(axis=0)
+    rest = np.setdiff1d(np.arange(len(vertices)), part)
+    for vertex in rest:
+        nearest = part[((vertices[part] - vertices[vertex]) ** 2).sum(axis=1).argmin()]
+        fields[vertex] = fields[nearest]
+    return fields
+
+
+def cotangent_laplacian(vertices: F64, faces: Ints) -> tuple[Any, F64]:
+    """The cotangent Laplacian (V,V), sparse, and each vertex's share of the area (V,)."""
+    count = len(vertices)
+    rows, columns, values = [], [], []
+    mass = np.zeros(count)
+    for k in range(3):
+        i, j, o = faces[:, (k + 1) % 3], faces[:, (k + 2) % 3], faces[:, k]
+        a, b = vertices[i] - vertices[o], vertices[j] - vertices[o]
+        double_area = np.maximum(np.linalg.norm(np.cross(a, b), axis=1), 1e-12)
+        cot = np.clip((a * b).sum(axis=1) / double_area, 0.01, 20.0) / 2
+        rows += [i, j]
+        columns += [j, i]
+        values += [-cot, -cot]
+        mass += np.bincount(o, weights=double_area / 6, minlength=count)
+    off = sparse.coo_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (count, count))
+    laplacian = (off - sparse.diags(np.asarray(off.sum(axis=1)).ravel())).tocsr()
+    return laplacian, mass
+
+
+def _largest_part(laplacian: Any) -> NDArray[np.int64]:
+    _, label = sparse.csgraph.connected_components(laplacian, directed=False)
+    return np.flatnonzero(label == np.bincount(label).argmax())
+
+
+# Lays values of a mesh's vertices out as an image in texture space.
+#
+# Rule: a texel that a face covers is interpolated from the face's corners; gaps between faces are filled on request.
+
+
+def lay_out(values: F64, faces: Ints, uv: F64, uv_faces: Ints, side: int) -> tuple[F64, NDArray[np.bool_]]:
+    """An image (side,side,C) of the vertices' values, and which texels (side,side) a face covers; others are 0.
+
+    `values`: (V,C).
+    `faces`: (F,3) indices of `values`.
+    `uv`: (T,2).
+    `uv_faces`: (F,3) indices of `uv`, per corner.
+    `side`: of the image, texels.
+    """
+    image = np.zeros((side, side, values.shape[1]))
+    covered = np.zeros((side, side), bool)
+    corners = uv[uv_faces] * side - 0.5
+    for corner, face in zip(corners, faces, strict=True):
+        low = np.maximum(np.floor(corner.min(axis=0)).astype(int), 0)
+        high = np.minimum(np.ceil(corner.max(axis=0)).astype(int) + 1, side)
+        if (high <= low).any():
+            continue
+        x, y = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
+        weights = _barycentric(corner, x, y)
+        if weights is None:
+            continue
+        inside = (weights >= -0.25).all(axis=-1)
+        image[y[inside], x[inside]] = weights[inside] @ values[face]
+        covered[y[inside], x[inside]] = True
+    return image, covered
+
+
+def fill_gaps(image: NDArray[Any], known: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """`image` (S,S,C) with the texels that are not `known` (S,S) filled from those round them (push and pull)."""
+    weight = known.astype(np.float64)[..., None]
+    return _pulled(image * weight, weight)
+
+
+def fill_beside(image: NDArray[Any], known: NDArray[np.bool_]) -> tuple[F64, NDArray[np.bool_]]:
+    """`image` (S,S,C) where texels beside those that are `known` (S,S) have their mean; and which are known now."""
+    total = np.sum(_round_each(image * known[..., None]), axis=0)
+    count = np.sum(_round_each(known.astype(np.float64)[..., None]), axis=0)
+    near = np.asarray(count[..., 0] > 0)
+    return np.where((near & ~known)[..., None], total / np.maximum(count, 1), image), near
+
+
+def grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """`mask` (S,S) and the eight texels round each of its own."""
+    return np.asarray(np.any(_round_each(mask[..., None]), axis=0)[..., 0])
+
+
+def _round_each(image: NDArray[Any]) -> list[NDArray[Any]]:
+    """Of `image` (S,S,C): nine images, in which each texel has its own value or that of one beside it; 0 beyond."""
+    side = image.shape[0]
+    padded = np.pad(image, ((1, 1), (1, 1), (0, 0)))
+    return [padded[y : y + side, x : x + side] for y in range(3) for x in range(3)]
+
+
+def _pulled(total: F64, weight: F64) -> F64:
+    mean = total / np.maximum(weight, 1e-9)
+    if total.shape[0] == 1 or total.shape[0] % 2 or bool((weight > 0).all()):
+        return mean
+    halves = [a.reshape(a.shape[0] // 2, 2, a.shape[1] // 2, 2, -1).sum(axis=(1, 3)) for a in (total, weight)]
+    coarse = _pulled(*halves).repeat(2, axis=0).repeat(2, axis=1)
+    return np.where(weight > 0, mean, coarse)
+
+
+def _barycentric(corner: F64, x: NDArray[Any], y: NDArray[Any]) -> F64 | None:
+    (ax, ay), (bx, by), (cx, cy) = corner
+    area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+    if abs(area) < 1e-9:
+        return None
+    b = ((x - ax) * (cy - ay) - (cx - ax) * (y - ay)) / area
+    c = ((bx - ax) * (y - ay) - (x - ax) * (by - ay)) / area
+    return np.stack([1 - b - c, b, c], axis=-1)
+
+
+# Fills what is not known on a surface from what is known round it, along the surface and so across its UV seams.
+#
+# Rule: filled values are harmonic: each is the weighted mean of its neighbours on the mesh, so none lies beyond the
+# known ones. What is known stays as it is.
+
+
+def harmonic_fill(values: F64, known: Mask, vertices: F64, faces: Ints) -> F64:
+    """`values` (V,C) of a mesh with those of vertices that are not `known` (V,) solved for.
+
+    The solution of Laplace's equation with the known values as boundary, for the cotangent Laplacian (Pinkall and
+    Polthier 1993) of `vertices` (V,3), `faces` (F,3). Parts of the mesh without any known vertex take the values of the
+    known vertex that is nearest in space. Unchanged when no vertex is known.
+    """
+    filled = np.array(values, np.float64)
+    if not known.any():
+        return filled
+    laplacian, _ = cotangent_laplacian(vertices, faces)
+    _, part = sparse.csgraph.connected_components(laplacian, directed=False)
+    reached = np.bincount(part, weights=known)[part] > 0
+    far = np.flatnonzero(~reached)
+    if len(far):
+        sources = np.flatnonzero(known)
+        filled[far] = filled[sources[cKDTree(vertices[sources]).query(vertices[far])[1]]]
+    open_ = np.flatnonzero(reached & ~known)
+    if len(open_):
+        rows = laplacian[open_]
+        filled[open_] = splu(rows[:, open_].tocsc()).solve(-(rows[:, known] @ filled[known]))
+    return filled
+
+
+def fill_along_surface(image: NDArray[np.floating], unseen: Mask, body: BodyArrays) -> F64:
+    """`image` (S,S,C) with the texels `unseen` (S,S) filled from the others that the body uses.
+
+    Those that a face covers are filled along the body's surface; those beside the faces, which only bilinear reads at
+    seams use, from the texels round them.
+    """
+    side = len(image)
+    values, known = _at_vertices(np.asarray(image, np.float64), ~unseen, body)
+    laid, covered = lay_out(
+        harmonic_fill(values, known, body.vertices, body.faces), body.faces, body.uv, body.uv_faces, side
+    )
+    filled = np.where((unseen & covered)[..., None], laid, image)
+    return np.where((unseen & ~covered)[..., None], fill_gaps(filled, ~unseen | covered), filled)
+
+
+def _at_vertices(image: F64, seen: Mask, body: BodyArrays) -> tuple[F64, Mask]:
+    """The values (V,C) of the `seen` texels of `image` at the body's vertices, and which vertices (V,) have one.
+
+    Each of a vertex's places in the texture is read bilinearly, from seen texels alone; a vertex on a seam has the mean
+    of its places.
+    """
+    side, count = len(image), len(body.vertices)
+    pairs = np.unique(np.column_stack([body.faces.reshape(-1), body.uv_faces.reshape(-1)]), axis=0)
+    at = np.clip(body.uv[pairs[:, 1]] * side - 0.5, 0, side - 1)
+    low = np.minimum(at.astype(np.int64), side - 2)
+    share = at - low
+    total, weight = np.zeros((count, image.shape[2])), np.zeros(count)
+    for x, y in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        column, row = (low + np.array([x, y])).T
+        part = np.where((x, y), share, 1 - share).prod(axis=1) * seen[row, column]
+        np.add.at(total, pairs[:, 0], part[:, None] * image[row, column])
+        np.add.at(weight, pairs[:, 0], part)
+    return total / np.maximum(weight, 1e-12)[:, None], weight > 0

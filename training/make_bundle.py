@@ -5,7 +5,10 @@ Rule: what is written was never validated; `validate` measures the files themsel
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -14,22 +17,23 @@ import onnx
 import torch
 from numpy.typing import NDArray
 
-from trilane.arrays import F64, Mask
-from trilane.avatars.bundle import write_bundle
+from trilane.arrays import F32, F64, Mask
+from trilane.avatars.bundle import Bundle, pack_levels, write_bundle
 from trilane.avatars.manifest import Manifest, network_entry
-from trilane.avatars.network_reshape import reshaped
-from trilane.avatars.texture_levels import pack_levels
+from trilane.avatars.network_file import reshaped
 from trilane.body.body import ShapedBody
-from trilane.training.body_arrays import BodyArrays, body_arrays
-from trilane.training.first_texture import used_texels
-from trilane.training.mip_levels import read_levels
-from trilane.training.onnx_export import export_onnx
+from trilane.training.byte_grid import ByteGrid
+from trilane.training.dataset import SIZES, TRAINING_SHARE, VALIDATION_SIZE, motion_poses
+from trilane.training.first_texture import fill_along_surface, grown, used_texels
+from trilane.training.network import UNet, export_onnx
 from trilane.training.quantising.quantise import ByteRanges, Quantised, byte_ranges, quantise
+from trilane.training.random_poses import random_pose
 from trilane.training.sample_files import U16, ShapeGroup
+from trilane.training.sample_renderer import BAND_NAMES, Sample, SampleRenderer
 from trilane.training.subject import Person
-from trilane.training.surface_fill import fill_along_surface
-from trilane.training.texture_layout import grown
-from trilane.training.trainable_avatar import TrainableAvatar
+from trilane.training.surface import BodyArrays, body_arrays
+from trilane.training.trainable_avatar import TrainableAvatar, levels_of, load_network, read_levels
+from trilane.training.validate import BUILTIN_HELD_OUT, held_out_motions
 from trilane.writing import write_atomically, write_bytes
 
 INT8_MAX = 127
@@ -179,3 +183,72 @@ def _inputs(avatar: TrainableAvatar, group: ShapeGroup, index: NDArray[np.int64]
         covered = torch.from_numpy(group.covered[number] > 0)[None]
         frames.append(read_levels(levels, uv, covered)[0].permute(1, 2, 0).numpy())
     return frames
+
+
+# The rounding of an avatar to the bytes of its bundle while it is trained, and what is left of it at the end.
+#
+# Rule: the grid is measured once, on a copy in the form in which the avatar is exported; at the end the float network
+# has the rounded weights, because those that they were rounded from paint a worse picture.
+
+
+def round_to_bytes(avatar: TrainableAvatar, grid: ByteGrid, groups: list[ShapeGroup], seed: int) -> None:
+    """Round `avatar` on `grid` from now on. `groups`, `seed`: as of `ranges_of`."""
+    if not grid.measured:
+        grid.measure(ranges_of(copy.deepcopy(avatar).cpu(), groups, seed))
+    grid.active = True
+
+
+def keep_rounded_weights(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> None:
+    """Put the weights of `avatar`, which was trained rounded, on the grid. `groups`, `seed`: as of `ranges_of`."""
+    grid = ByteGrid(copy.deepcopy(avatar.network))
+    grid.measure(ranges_of(copy.deepcopy(avatar).cpu(), groups, seed))
+    avatar.network.load_state_dict(grid.weights(avatar.network), strict=False)
+
+
+# Inputs of a network to calibrate it on, drawn as the training draws its views, and others to look at the result.
+#
+# Rule: every kind of view that the training has, in its shares; what the result is looked at on comes from motions that
+# no training has. All are of the one tensor shape that networks are calibrated at.
+
+#: Seed of the views; the training of the default avatar had another one.
+SEED = 17
+
+
+def float_model(bundle: Bundle, weights: Any) -> onnx.ModelProto:
+    """The float network of file `weights`, of `bundle`, at the calibration's shape. Raises BadInputError."""
+    entry = bundle.manifest.network
+    untrained = UNet(entry.encoder, entry.norm, entry.width, entry.channels, input_skip=True)
+    return export_onnx(load_network(untrained, weights), *CALIBRATION_SHAPE)
+
+
+def training_views(renderer: SampleRenderer, bundle: Bundle, views: int) -> list[F32]:
+    """`views` inputs (H,W,C), of random poses and views in the training's shares."""
+    rng = np.random.default_rng((SEED, 0))
+    bands, sizes = list(TRAINING_SHARE), list(SIZES)
+
+    def sample(number: int) -> Sample:
+        band = str(rng.choice(bands, p=list(TRAINING_SHARE.values())))
+        size = str(rng.choice(sizes, p=list(SIZES.values())))
+        return renderer.plan((SEED, 1, number), random_pose, band, size)
+
+    return list(_tensors(renderer, bundle, sample, views))
+
+
+def held_out_views(renderer: SampleRenderer, bundle: Bundle, views: int) -> list[F32]:
+    """`views` inputs (H,W,C) of all bands in turn, in poses of a motion that no training has."""
+    poses = motion_poses(held_out_motions([BUILTIN_HELD_OUT]))
+
+    def sample(number: int) -> Sample:
+        band = number % len(BAND_NAMES)
+        return renderer.plan((SEED, 2, number, band), poses, BAND_NAMES[band], VALIDATION_SIZE)
+
+    return list(_tensors(renderer, bundle, sample, views))
+
+
+def _tensors(renderer: SampleRenderer, bundle: Bundle, sample: Callable[[int], Sample], wanted: int) -> Iterator[F32]:
+    """Of samples 0, 1, 2, ... the first `wanted` that have the calibration's shape, as the network is given them."""
+    levels = levels_of(bundle)
+    found = (one for one in map(sample, count()) if one.crop.shape == CALIBRATION_SHAPE)
+    for _, one in zip(range(wanted), found, strict=False):
+        uv = torch.from_numpy(np.ascontiguousarray(renderer.render(one)[0]))[None]
+        yield read_levels(levels, uv[..., :2], uv[..., 2] > 0)[0].permute(1, 2, 0).contiguous().numpy()

@@ -5,17 +5,223 @@ Rule: this is the only definition of the network that computes; every runtime ru
 
 from __future__ import annotations
 
+import io
 import math
+import warnings
 from collections.abc import Callable
-from typing import Self
+from typing import Any, Protocol, Self
 
+import numpy as np
+import onnx
 import torch
+from onnx import numpy_helper
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from trilane.errors import BadInputError
-from trilane.training.encoders import ENCODERS
-from trilane.unet_tables import DECODER, HEADS, NORM_GROUPS
+from trilane.unet_tables import (
+    DECODER,
+    HEADS,
+    MOBILE_ENCODERS,
+    NORM_GROUPS,
+    RESNET18_STAGES,
+    RESNET18_STEM,
+    MobileBlock,
+    MobileEncoder,
+    squeeze_channels,
+)
+
+# The encoders in PyTorch: each turns (N, C, H, W) into features at strides 2, 4, 8, 16 and 32.
+#
+# Rule: channel counts, kernels and strides come from `trilane.unet_tables`; this file only says what a row means.
+
+Norm = Callable[[int], nn.Module]
+Scale = Callable[[int], int]
+
+#: A strided 1x1 convolution of as many channels is trained as it is: a whole vector of floats.
+SAFE_CHANNELS = 16
+ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {"relu": nn.ReLU, "relu6": nn.ReLU6, "hardswish": nn.Hardswish}
+
+
+class Encoder(Protocol):
+    """`channels`: of the five features, from stride 2 to stride 32."""
+
+    channels: tuple[int, ...]
+
+    def __call__(self, x: Tensor) -> list[Tensor]:
+        """(N, C, H, W), sides multiples of 32 -> five features, finest first."""
+
+
+class Shortcut(nn.Conv2d):
+    """A strided 1x1 convolution without bias.
+
+    In float32, oneDNN's backward pass of one with 8 channels or fewer, channels last, writes beyond its memory (seen
+    with PyTorch 2.13 under AVX-512, from 4 and 8 channels). While training, pixels are therefore left out before it.
+    """
+
+    def __init__(self, c_in: int, c_out: int, stride: int) -> None:
+        """From `c_in` to `c_out` channels, at every `stride`-th pixel of each axis."""
+        super().__init__(c_in, c_out, 1, stride, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        if not self.training or self.in_channels >= SAFE_CHANNELS:
+            return super().forward(x)
+        down, along = self.stride
+        return functional.conv2d(x[:, :, ::down, ::along], self.weight)
+
+
+class ResidualBlock(nn.Module):
+    """Two 3x3 convolutions, added to a shortcut, which is a strided 1x1 convolution where the shape changes."""
+
+    def __init__(self, c_in: int, c_out: int, stride: int, norm: Norm) -> None:
+        """A block from `c_in` to `c_out` channels.
+
+        `c_in`, `c_out`: channels of its input and output.
+        `stride`: of its first convolution.
+        `norm`: makes a normalisation for a number of channels.
+        """
+        super().__init__()
+        self.body = nn.Sequential(
+            nn.Conv2d(c_in, c_out, 3, stride, 1, bias=False),
+            norm(c_out),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(c_out, c_out, 3, 1, 1, bias=False),
+            norm(c_out),
+        )
+        same = stride == 1 and c_in == c_out
+        self.shortcut = nn.Identity() if same else nn.Sequential(Shortcut(c_in, c_out, stride), norm(c_out))
+        self.relu = nn.ReLU(inplace=True)
+
+    def forward(self, x: Tensor) -> Tensor:
+        out: Tensor = self.relu(self.body(x) + self.shortcut(x))
+        return out
+
+
+class ResNet18(nn.Module):
+    """7x7 stride-2 stem, 3x3 stride-2 max pool, four stages of two residual blocks."""
+
+    def __init__(self, c_in: int, scale: Scale, norm: Norm) -> None:
+        super().__init__()
+        stem = scale(RESNET18_STEM)
+        self.stem = nn.Sequential(nn.Conv2d(c_in, stem, 7, 2, 3, bias=False), norm(stem), nn.ReLU(inplace=True))
+        self.pool = nn.MaxPool2d(3, 2, 1)
+        self.stages = nn.ModuleList()
+        before = stem
+        for count, stride in RESNET18_STAGES:
+            c = scale(count)
+            self.stages.append(nn.Sequential(ResidualBlock(before, c, stride, norm), ResidualBlock(c, c, 1, norm)))
+            before = c
+        self.channels = (stem, *(scale(count) for count, _ in RESNET18_STAGES))
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        features = [self.stem(x)]
+        x = self.pool(features[0])
+        for stage in self.stages:
+            x = stage(x)
+            features.append(x)
+        return features
+
+
+class SqueezeExcite(nn.Module):
+    """Squeeze-and-excitation: scales each channel by a factor computed from the channels' means over the picture."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        inner = squeeze_channels(channels)
+        self.body = nn.Sequential(
+            nn.AdaptiveAvgPool2d(1),
+            nn.Conv2d(channels, inner, 1),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(inner, channels, 1),
+            nn.Hardsigmoid(),
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        out: Tensor = x * self.body(x)
+        return out
+
+
+class InvertedResidual(nn.Module):
+    """1x1 expansion, depthwise convolution, optional squeeze, linear 1x1 projection, added where shapes agree."""
+
+    def __init__(self, c_in: int, row: MobileBlock, scale: Scale, norm: Norm) -> None:
+        """The block of one row of the table.
+
+        `c_in`: channels of its input.
+        `row`: its kernel, channels, stride and activation.
+        `scale`: scales a channel count by the network's width.
+        `norm`: makes a normalisation for a number of channels.
+        """
+        super().__init__()
+        inner, c_out = scale(row.expanded), scale(row.channels)
+        activation = ACTIVATIONS[row.activation]
+        layers: list[nn.Module] = []
+        if inner != c_in:
+            layers += [nn.Conv2d(c_in, inner, 1, bias=False), norm(inner), activation()]
+        layers += [
+            nn.Conv2d(inner, inner, row.kernel, row.stride, row.kernel // 2, groups=inner, bias=False),
+            norm(inner),
+            activation(),
+            *([SqueezeExcite(inner)] if row.squeeze else []),
+            nn.Conv2d(inner, c_out, 1, bias=False),
+            norm(c_out),
+        ]
+        self.body = nn.Sequential(*layers)
+        self.add = row.stride == 1 and c_in == c_out
+
+    def forward(self, x: Tensor) -> Tensor:
+        out: Tensor = self.body(x)
+        return x + out if self.add else out
+
+
+class MobileFeatures(nn.Module):
+    """A 3x3 stride-2 stem, inverted residual blocks, a last 1x1 layer.
+
+    Features: the tensors that enter the strided blocks, and the last layer's output.
+    """
+
+    def __init__(self, spec: MobileEncoder, c_in: int, scale: Scale, norm: Norm) -> None:
+        """The encoder of one table.
+
+        `spec`: the table.
+        `c_in`: channels of its input.
+        `scale`: scales a channel count by the network's width.
+        `norm`: makes a normalisation for a number of channels.
+        """
+        super().__init__()
+        before = scale(spec.stem)
+        activation = ACTIVATIONS[spec.activation]
+        stages = [[nn.Conv2d(c_in, before, 3, 2, 1, bias=False), norm(before), activation()]]
+        channels = []
+        for row in spec.rows:
+            if row.stride == 2:
+                channels.append(before)
+                stages.append([])
+            stages[-1].append(InvertedResidual(before, row, scale, norm))
+            before = scale(row.channels)
+        last = scale(spec.last)
+        stages[-1] += [nn.Conv2d(before, last, 1, bias=False), norm(last), activation()]
+        self.stages = nn.ModuleList(nn.Sequential(*stage) for stage in stages)
+        self.channels = (*channels, last)
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        features = []
+        for stage in self.stages:
+            x = stage(x)
+            features.append(x)
+        return features
+
+
+def _mobile(spec: MobileEncoder) -> Callable[[int, Scale, Norm], nn.Module]:
+    return lambda c_in, scale, norm: MobileFeatures(spec, c_in, scale, norm)
+
+
+ENCODERS: dict[str, Callable[[int, Scale, Norm], nn.Module]] = {
+    "resnet18": ResNet18,
+    **{name: _mobile(spec) for name, spec in MOBILE_ENCODERS.items()},
+}
+
 
 FULL_WIDTH = 64
 CHANNEL_STEP = 4
@@ -118,3 +324,127 @@ def _check(encoder: str, norm: str, width: int, channels: int) -> None:
     for name, number, top in (("width", width, 256), ("channels", channels, 64)):
         if not 1 <= number <= top:
             raise BadInputError("network", f"{name} {number}", f"a number from 1 to {top}")
+
+
+# Noise on activations while training, so that the picture hardly changes when another runtime rounds differently.
+#
+# Rule: noise is added only to positive outputs of ReLUs, is about as large as one step of a byte, and only in training.
+
+BYTE_STEPS = 255
+#: Values that are drawn once, beyond those of the largest output: noise begins at any of them, which costs a fifth of
+#: drawing all of it anew.
+STARTS = 1 << 16
+
+
+def add_activation_noise(network: nn.Module, steps: float) -> None:
+    """Make every ReLU of `network` add noise of up to `steps` times 1/255 of its largest output, in training mode."""
+    bank = torch.empty(0)
+
+    def noise_for(output: Tensor) -> Tensor:
+        """Like `output`, uniform in -1..1."""
+        nonlocal bank
+        if len(bank) < output.numel() + STARTS or bank.dtype != output.dtype or bank.device != output.device:
+            drawn = torch.rand(output.numel() + STARTS, generator=torch.Generator().manual_seed(0))
+            bank = (2 * drawn - 1).to(output.device, output.dtype)
+        start = int(torch.randint(STARTS, ()))
+        return torch.as_strided(bank, output.shape, output.stride(), start)
+
+    def hook(module: nn.Module, _inputs: Any, output: Tensor) -> Tensor | None:
+        if not module.training:
+            return None
+        shown = output.detach()
+        size = shown.amax() * (steps / BYTE_STEPS)
+        return torch.addcmul(output, torch.where(shown > 0, noise_for(shown), 0), size)
+
+    for module in network.modules():
+        if isinstance(module, nn.ReLU):
+            module.register_forward_hook(hook)
+
+
+# Dropout of whole channels after each level of encoder and decoder.
+#
+# Rule: it acts in training mode only and adds no weights, so that what is exported and resumed is as without it.
+
+
+def add_dropout(network: UNet, probability: float) -> None:
+    """Make each level of `network` set a channel to 0 with `probability`; the others grow, so that the mean stays."""
+
+    def hook(module: nn.Module, _inputs: Any, output: Tensor) -> Tensor | None:
+        return functional.dropout2d(output, probability) if module.training else None
+
+    if probability:
+        for level in (*network.encoder.children(), *network.levels):
+            for part in level if isinstance(level, nn.ModuleList) else (level,):
+                if not isinstance(part, nn.MaxPool2d):
+                    part.register_forward_hook(hook)
+
+
+# Exports the network as a float ONNX model of one static shape, with batch norms folded into the convolutions.
+#
+# Rule: the model computes the same as the network; only the layout of the two heads differs.
+
+OPSET = 17
+INPUT, OUTPUT = "tensor", "rgba"
+
+
+class _OneHead(nn.Module):
+    """Both heads as one, so that the features are read once: first layers side by side, second ones block-diagonal."""
+
+    def __init__(self, network: UNet) -> None:
+        super().__init__()
+        self.network = network
+        heads = [_fused(head) for head in (network.colour, network.mask)]
+        c = heads[0][0].in_channels
+        self.first = nn.Conv2d(c, 2 * c, 3, 1, 1)
+        self.second = nn.Conv2d(2 * c, 4, 3, 1, 1)
+        with torch.no_grad():
+            self.second.weight.zero_()
+            self.second.weight[:3, :c] = heads[0][1].weight
+            self.second.weight[3:, c:] = heads[1][1].weight
+            for target, layers in ((self.first, 0), (self.second, 1)):
+                target.bias.copy_(torch.cat([head[layers].bias for head in heads]))
+            self.first.weight.copy_(torch.cat([head[0].weight for head in heads]))
+
+    def forward(self, x: Tensor) -> Tensor:
+        features = self.network.features(x)
+        return torch.sigmoid(self.second(torch.relu(self.first(features))))
+
+
+def _fused(head: nn.Sequential) -> tuple[nn.Conv2d, nn.Conv2d]:
+    return fuse_conv_bn_eval(head[0], head[1]), head[3]
+
+
+def export_onnx(network: UNet, height: int, width: int) -> onnx.ModelProto:
+    """A float model for (1, C, height, width): input `tensor`, output `rgba` (1, 4, height, width) in 0..1.
+
+    `network` is put into evaluation mode. `height` and `width`: multiples of 32.
+    """
+    network.eval()
+    batch_norm = isinstance(network.colour[1], nn.BatchNorm2d)
+    channels = next(network.parameters()).shape[1]
+    example = torch.zeros(1, channels, height, width)
+    file = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            (_OneHead(network) if batch_norm else network).eval(),
+            (example,),
+            file,
+            dynamo=False,
+            opset_version=OPSET,
+            input_names=[INPUT],
+            output_names=[OUTPUT],
+        )
+    model = onnx.load_model_from_string(file.getvalue())
+    _free_reshapes(model)
+    return model
+
+
+def _free_reshapes(model: onnx.ModelProto) -> None:
+    """Make every Reshape take batch and width from its input and compute the height, so that no shape is fixed."""
+    makers = {out: node for node in model.graph.node for out in node.output}
+    for node in model.graph.node:
+        if node.op_type == "Reshape":
+            shape = makers[node.input[1]].attribute[0].t
+            channels = int(numpy_helper.to_array(shape)[1])
+            shape.CopyFrom(numpy_helper.from_array(np.array([0, channels, -1, 0], np.int64)))

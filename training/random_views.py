@@ -5,12 +5,22 @@ Rule: a close-up is taken by a camera that is near or has a long lens; pixels ar
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from trilane.arrays import F64
-from trilane.body.joints import JOINT_INDEX
+from trilane.avatars.bundle import CLOTHES_STANDOFF_M
+from trilane.body.body import ShapedBody
+from trilane.body.joints import JOINT_INDEX, JOINTS
+from trilane.body.kinematics import Posed
+from trilane.body.skinning import blend_matrices
+from trilane.scene.crop import choose_bucket, crop_projection
+from trilane.shapes import Shape
+from trilane.stages.cpu.mesh_bounds import MeshBounds
+from trilane.training.clothing.layers import Layer
 
 NEAR_M, FAR_M = 0.05, 100.0
 NEAREST_M = 0.45
@@ -102,3 +112,78 @@ def perspective(fov_y: float, aspect: float, near: float = NEAR_M, far: float = 
 def _pitch(rng: np.random.Generator) -> float:
     low, high = PITCH_DEG
     return float(rng.triangular(low, 5.0, high))
+
+
+# The crop of a sample: the pipeline's rectangle, bucket and projection for one body in one view.
+#
+# Rule: crops are computed by the functions that the pose stage calls, so training sees what the pipeline draws.
+
+#: Height in pixels of the picture that samples are cropped from.
+OUTPUT_ROWS = 480
+
+
+@dataclass(frozen=True)
+class Crop:
+    """`shape`: of the tensor. `projection` (4,4): of the crop. `pixels`: of the screen, in the body's rectangle."""
+
+    shape: Shape
+    projection: NDArray[np.float64]
+    pixels: float
+
+
+class Cropper:
+    """Crops of one shaped body."""
+
+    def __init__(self, shaped: ShapedBody, pose_blend: bool = False) -> None:
+        """Of `shaped`; `pose_blend`: whether its pose blend shapes, if any, are drawn."""
+        self._bounds = MeshBounds(shaped, standoff_m=CLOTHES_STANDOFF_M, pose_blend=pose_blend)
+
+    def crop(self, posed: Posed, view: View, buckets: Sequence[Shape]) -> Crop | None:
+        """The crop of the body as seen from `view`, in one of the tensor shapes `buckets`; None when it is not seen."""
+        rect = self._bounds.rect(posed, view.projection @ view.view)
+        if rect is None:
+            return None
+        output = (OUTPUT_ROWS, round(OUTPUT_ROWS * view.aspect))
+        shape, grown = choose_bucket(rect, output, buckets)
+        pixels = rect.width * rect.height * output[0] * output[1] / 4
+        return Crop(shape, crop_projection(view.projection, grown), pixels)
+
+
+# Which cameras stand clear of a clothed body: those whose near plane cannot cut it.
+#
+# Rule: a cut body has no ground truth, because the picture of it shows the inside of clothes and limbs; the bound comes
+# from the triangles themselves, so that every other near view stays.
+
+
+class ClothedSurface:
+    """The surface of all `layers` of a clothed body, as points that reach over the triangles round them."""
+
+    def __init__(self, layers: Sequence[Layer]) -> None:
+        self._rest = np.concatenate([layer.vertices for layer in layers])
+        self._weights = np.concatenate([layer.weights for layer in layers]).astype(np.float64)
+        self._reach = np.concatenate([vertex_reach(layer.vertices, layer.faces) for layer in layers])
+
+    def posed(self, posed: Posed) -> F64:
+        """The points (N,3), world metres, in the pose `posed`."""
+        matrices = posed.matrices.reshape(JOINTS, 12).astype(np.float64)
+        moved = blend_matrices(self._weights, matrices).reshape(-1, 3, 4)
+        return np.asarray(np.einsum("vab,vb->va", moved[:, :, :3], self._rest) + moved[:, :, 3])
+
+    def is_clear_of(self, view: View, points: F64) -> bool:
+        """Whether the near plane of `view` cannot cut the surface, whose points of `posed` are `points`."""
+        eye = np.linalg.inv(view.view)[:3, 3]
+        distance = np.linalg.norm(points - eye, axis=1)
+        return bool((distance - self._reach).min() > view.near_reach_m)
+
+
+def vertex_reach(vertices: F64, faces: NDArray[np.int64]) -> F64:
+    """(N,) metres: every point of a triangle is within this distance of that corner of it which is nearest.
+
+    A point of a triangle is at most its longest edge over the root of 3 from the nearest corner, as the middle of an
+    equilateral one is. `vertices` (N,3), `faces` (F,3).
+    """
+    corners = vertices[faces]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    reach = np.zeros(len(vertices))
+    np.maximum.at(reach, faces.reshape(-1), np.repeat(longest / np.sqrt(3), 3))
+    return reach

@@ -1,12 +1,14 @@
-"""Rendered samples on disk: one folder of memory-mapped arrays per tensor shape.
+"""Rendered samples on disk, and which of them a training reads in which of its steps.
 
-Rule: arrays hold the pixels that were rendered, none resampled.
+Rule: arrays hold the pixels that were rendered, none resampled; there is one folder of memory-mapped arrays per shape.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,10 @@ import numpy as np
 from numpy.lib.format import open_memmap
 from numpy.typing import NDArray
 
+from trilane.errors import BadInputError
 from trilane.shapes import Shape, parse_shape
+from trilane.training.sample_renderer import BAND_NAMES
+from trilane.training.training_settings import TrainingSettings
 
 U16 = 65535
 #: Array to its trailing shape and type. `uv`: u and v in 1/65535. `covered`: 1 on the body. `rgba`: the ground truth.
@@ -87,3 +92,99 @@ def batches(
                 epoch += [(group, np.sort(part)) for part in parts if len(part)]
         for index in rng.permutation(len(epoch)):
             yield epoch[index]
+
+
+# Which samples a training by steps reads in which of its steps.
+#
+# Rule: it follows from the settings, the samples and the number of the step alone, so that an ended training goes on
+# with the batches that it would have read.
+#
+# A training has up to three phases: half-size samples alone, all samples, and samples of whole bodies alone.
+
+#: Tensors with fewer pixels are half-size ones, which alone are used at first because they are cheap.
+SMALL_PIXELS = 160 * 160
+#: Bands whose samples show the whole body: the tensor is cut to the body, so it has one size in both.
+WHOLE_BANDS = [BAND_NAMES.index(name) for name in ("far", "full_body")]
+#: Zooms in one octave that batches of one zoom tell apart; every which row of a sample its zoom is measured on.
+ZOOMS_PER_OCTAVE, ROW_STEP = 2, 8
+LEFT_OUT = -1
+
+Batch = tuple[ShapeGroup, NDArray[np.int64]]
+
+
+@dataclass(frozen=True)
+class Phase:
+    """Steps from `first` to before `end`; `labels`, of all groups: as `batches` takes them."""
+
+    first: int
+    end: int
+    labels: list[NDArray[np.int64]]
+
+
+def batch_stream(groups: list[ShapeGroup], settings: TrainingSettings, count: int, step: int = 0) -> Iterator[Batch]:
+    """The batches of a training of `count` steps, from step `step` on; `batches_per_step` of them are one step's.
+
+    Raises BadInputError when no sample is left for some steps.
+    """
+    per_step = settings.optimiser.batches_per_step
+    for number, phase in enumerate(phases(groups, settings, count)):
+        rng = np.random.default_rng((settings.seed, 2, number))
+        stream = batches(groups, settings.batch, rng, settings.batches.repeats, phase.labels)
+        done = min(max(step - phase.first, 0), phase.end - phase.first)
+        yield from islice(stream, done * per_step, (phase.end - phase.first) * per_step)
+
+
+def phases(groups: list[ShapeGroup], settings: TrainingSettings, count: int) -> list[Phase]:
+    """The phases of a training of `count` steps; some may have no step. Raises BadInputError."""
+    labels = _labels(groups, settings)
+    small = [math.prod(group.shape) < SMALL_PIXELS for group in groups]
+    whole_from = math.ceil(settings.batches.full_body_from * count)
+    switch = min(math.ceil(settings.small_until * count), whole_from)
+    of_small = [label if each or not any(small) else _none(label) for label, each in zip(labels, small, strict=True)]
+    of_whole = [np.where(_whole(group), label, LEFT_OUT) for group, label in zip(groups, labels, strict=True)]
+    found = [Phase(0, switch, of_small), Phase(switch, whole_from, labels), Phase(whole_from, count, of_whole)]
+    for phase in found:
+        if phase.first < phase.end and not any((label >= 0).any() for label in phase.labels):
+            shown = "shows a whole body" if phase is found[2] else "is used"
+            raise BadInputError("samples", f"none that {shown}", "some for every step", "draw more samples")
+    return found
+
+
+def is_whole(batch: Batch) -> bool:
+    """Whether all samples of `batch` show the whole body."""
+    group, index = batch
+    return bool(np.isin(group.band[index], WHOLE_BANDS).all())
+
+
+def zoom(group: ShapeGroup) -> NDArray[np.float64]:
+    """(N,): how many pixels of the tensor go to one side of the UV image; the median over pixels next to each other."""
+    rows = group.uv[:, ::ROW_STEP].astype(np.int64)
+    shown = group.covered[:, ::ROW_STEP] > 0
+    steps = np.sqrt(np.square(np.diff(rows, axis=2)).sum(axis=-1)) / U16
+    pairs = (shown[:, :, 1:] & shown[:, :, :-1]) & (steps > 0)
+    return np.array([1 / np.median(step[pair]) if pair.any() else 1.0 for step, pair in zip(steps, pairs, strict=True)])
+
+
+def _labels(groups: list[ShapeGroup], settings: TrainingSettings) -> list[NDArray[np.int64]]:
+    """Of each group (N,): what the samples of a batch have in common; below 0 where a sample is not used."""
+    options = settings.batches
+    rng = np.random.default_rng((settings.seed, 3))
+    found = []
+    for group in groups:
+        label = np.zeros(len(group), np.int64)
+        if options.same_zoom:
+            label += 2 * np.maximum(0, np.round(ZOOMS_PER_OCTAVE * np.log2(zoom(group)))).astype(np.int64)
+        if options.full_body_statistics:
+            label += _whole(group)
+        left_out = rng.permutation(len(group))[math.ceil(options.sample_share * len(group)) :]
+        label[left_out] = LEFT_OUT
+        found.append(label)
+    return found
+
+
+def _whole(group: ShapeGroup) -> NDArray[np.bool_]:
+    return np.isin(group.band, WHOLE_BANDS)
+
+
+def _none(label: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.full_like(label, LEFT_OUT)

@@ -1,34 +1,39 @@
 """Training by a number of steps, in one process: the same settings give the same weights.
 
 Rule: what a step does depends on its number, the settings and the state alone, so a training that was ended anywhere
-goes on as if it had not been. `training_loop.py` is the other loop, of processes that share a budget of time.
+goes on as if it had not been ended.
 """
 
 from __future__ import annotations
 
 import copy
+import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from itertools import islice
+from pathlib import Path
+from typing import Any
 
+import numpy as np
+import psutil
 import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
 
-from trilane.training.activation_noise import add_activation_noise
-from trilane.training.adversary import Adversary
-from trilane.training.batch_choice import Batch, batch_stream, is_whole
+from trilane.errors import BadInputError, MissingPartError, package_line, reason
+from trilane.files import DAMAGED
 from trilane.training.byte_grid import ByteGrid
-from trilane.training.device import chosen_device
-from trilane.training.dropout import add_dropout
-from trilane.training.objective import Objective
-from trilane.training.optimisers import clip_gradients, optimiser_of
-from trilane.training.perceptual import Vgg16
-from trilane.training.rounding import round_to_bytes
-from trilane.training.sample_files import ShapeGroup
-from trilane.training.trainable_avatar import TrainableAvatar
-from trilane.training.training_loop import add_gradients, follow, load_batch, rate_share, set_mode
-from trilane.training.training_settings import TrainingSettings
-from trilane.training.training_state import TrainingState
+from trilane.training.make_bundle import round_to_bytes
+from trilane.training.network import add_activation_noise, add_dropout
+from trilane.training.objective import Adversary, Objective, Vgg16
+from trilane.training.sample_files import Batch, ShapeGroup, batch_stream, is_whole
+from trilane.training.trainable_avatar import TrainableAvatar, load_batch
+from trilane.training.training_settings import OptimiserOptions, TrainingSettings
+from trilane.writing import write_atomically
 
+#: Share of the steps in which the learning rate rises.
+WARM_UP = 0.02
 #: Steps that are measured to say what all will take.
 MEASURED = 4
 #: Moves the number of a step into the bits above the seed.
@@ -36,7 +41,10 @@ SEED_BITS = 31
 
 
 def first_state(avatar: TrainableAvatar, settings: TrainingSettings, vgg: Vgg16 | None = None) -> TrainingState:
-    """The state of a training of `avatar` before its first step. `vgg`: for a perceptual loss by its features."""
+    """Make the state of a training of `avatar` before its first step.
+
+    `vgg`: network of the perceptual loss; None for MS-SSIM.
+    """
     device = chosen_device(settings.device)
     average = copy.deepcopy(avatar.to(device)).eval()
     harder = settings.regularisation
@@ -50,17 +58,17 @@ def first_state(avatar: TrainableAvatar, settings: TrainingSettings, vgg: Vgg16 
     loss, rate = settings.loss, settings.discriminator_rate
     adversary = Adversary(settings.width, rate, settings.seed, device) if loss.judged else None
     objective = Objective(loss.by_name(), None if vgg is None else vgg.to(device), adversary)
-    optimiser = optimiser_of(avatar, settings, settings.optimiser, settings.masked_texture)
+    optimiser = optimiser_of(avatar, settings)
     return TrainingState(avatar, average, optimiser, objective)
 
 
 def steps(
     state: TrainingState, groups: list[ShapeGroup], settings: TrainingSettings, count: int
 ) -> Iterator[dict[str, float]]:
-    """Do the steps of `state` up to number `count`; yields after each what `train_step` tells.
+    """Do the steps of `state` up to number `count`, and yield the terms of the loss after each, by name.
 
-    `state`: changes in place.
-    `groups`: the samples.
+    `state`: state of the training, which changes in place.
+    `groups`: samples of the training.
     """
     stream = batch_stream(groups, settings, count, state.step)
     peaks = (settings.network_rate, settings.network_rate, settings.texture_rate)
@@ -77,16 +85,16 @@ def steps(
 
 
 def _round(avatar: TrainableAvatar, groups: list[ShapeGroup], settings: TrainingSettings, share: float) -> None:
-    """Round `avatar` to bytes where the `share` of the steps that is done says so; the grid is measured at first."""
+    """Begin to round `avatar` to bytes once the `share` of the steps that are done passes `bytes_from`."""
     if avatar.grid is None or share <= settings.bytes_from:
         return
     round_to_bytes(avatar, avatar.grid, groups, settings.seed)
 
 
 def _step(state: TrainingState, stream: Iterator[Batch], settings: TrainingSettings, frozen: bool) -> dict[str, float]:
-    """One step by the mean gradient of the next batches of `stream`; the mean terms of their losses.
+    """Do one step by the mean gradient of the next batches, and return the mean terms of their losses.
 
-    `frozen`: batch statistics no longer change.
+    `frozen`: whether batch statistics stay.
     """
     options, avatar = settings.optimiser, state.avatar
     state.optimiser.zero_grad(set_to_none=True)
@@ -100,10 +108,49 @@ def _step(state: TrainingState, stream: Iterator[Batch], settings: TrainingSetti
     return sums
 
 
+def add_gradients(
+    avatar: TrainableAvatar, batch: tuple[Tensor, Tensor, Tensor], objective: Objective, share: float = 1.0
+) -> dict[str, float]:
+    """Add `share` of the gradients of `batch` to those of `avatar`, and return the terms of the loss by name.
+
+    `batch`: UV image, coverage and target, as `load_batch` returns them.
+    `objective`: loss to minimise; its discriminators learn from every batch.
+    """
+    uv, covered, target = batch
+    output = avatar(uv, covered)
+    terms = objective.terms(output, target)
+    (share * objective.total(terms)).backward()
+    return {name: float(term.detach()) for name, term in terms.items()} | objective.learn(output.detach(), target)
+
+
+def rate_share(share: float) -> float:
+    """Return the factor of the learning rates when `share` of the training is done: a rise, then half a cosine."""
+    if share < WARM_UP:
+        return max(share / WARM_UP, 0.02)
+    return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * (share - WARM_UP) / (1 - WARM_UP)))
+
+
+def set_mode(avatar: TrainableAvatar, frozen: bool) -> None:
+    """Put `avatar` into training mode. `frozen`: whether its batch statistics stay."""
+    avatar.train()
+    if frozen:
+        for module in avatar.modules():
+            if isinstance(module, nn.BatchNorm2d):
+                module.eval()
+
+
+def follow(average: TrainableAvatar, avatar: TrainableAvatar, keep: float) -> None:
+    """Move `average` towards `avatar`; it keeps the share `keep` of itself."""
+    current = avatar.state_dict()
+    for name, value in average.state_dict().items():
+        if value.dtype.is_floating_point:
+            value.lerp_(current[name], 1 - keep)
+
+
 def step_seconds(
     avatar: TrainableAvatar, groups: list[ShapeGroup], settings: TrainingSettings, vgg: Vgg16 | None = None
 ) -> float:
-    """Mean seconds of a step of a copy of `avatar`, measured; small samples count by their share of the steps."""
+    """Measure the mean seconds of a step on a copy of `avatar`; small samples count by their share of the steps."""
     share = settings.small_until
     of_small = _measured(avatar, groups, settings, vgg, 1.0) if share > 0 else 0.0
     of_all = _measured(avatar, groups, settings, vgg, 0.0) if share < 1 else 0.0
@@ -117,7 +164,7 @@ def _measured(
     vgg: Vgg16 | None,
     small_until: float,
 ) -> float:
-    """Mean seconds of a step, after one that warms up."""
+    """Measure the mean seconds of a step, after one that warms up."""
     going = steps(
         first_state(copy.deepcopy(avatar), settings, vgg),
         groups,
@@ -129,3 +176,228 @@ def _measured(
     for _ in going:
         pass
     return (time.monotonic() - start) / MEASURED
+
+
+# Where a training computes: the CPU, or a GPU that PyTorch can use.
+#
+# Rule: a device that was asked for by name is used, or its absence is said; only `auto` chooses.
+
+MB = 1e6
+
+
+def chosen_device(asked: str) -> torch.device:
+    """Return the device for "auto", "cpu" or "cuda". Raises MissingPartError where there is no such GPU."""
+    found = torch.cuda.is_available()
+    if asked == "cuda" and not found:
+        what = "device cuda: this PyTorch finds no NVIDIA GPU (device auto or cpu trains on the CPU)"
+        raise MissingPartError(what, f"{package_line('torch')}, with NVIDIA's driver")
+    return torch.device("cuda" if found and asked != "cpu" else "cpu")
+
+
+def device_words(device: torch.device, threads: int) -> str:
+    """Name `device` in words. `threads`: threads of PyTorch on the CPU."""
+    if device.type == "cuda":
+        return f"the GPU {torch.cuda.get_device_name(device)}"
+    return f"{threads} {'thread' if threads == 1 else 'threads'} of the CPU"
+
+
+def memory_words(device: torch.device) -> str:
+    """Say how much memory this process has now, and the most that it had of a GPU's."""
+    of_cpu = f"{psutil.Process().memory_info().rss / MB:.0f} MB of memory"
+    if device.type != "cuda":
+        return of_cpu
+    return f"{of_cpu}, {torch.cuda.max_memory_allocated(device) / MB:.0f} MB of the GPU's"
+
+
+# Adam and AdamW that leave numbers without a gradient as they are, with their moments.
+#
+# Rule: a texel that a batch does not show is no texel whose gradient is 0: plain Adam would go on moving it by its old
+# momentum, let that fade, and let its weight decay.
+
+#: Key of the groups of parameters that are masked.
+MASKED = "masked"
+MOMENTS = ("exp_avg", "exp_avg_sq")
+
+
+class _Masked(torch.optim.Optimizer):
+    """What is put before a class of Adam.
+
+    In groups of parameters with `masked`, numbers whose gradient is exactly 0 do not take part in a step. The count of
+    steps, which corrects the moments' bias, goes on for all, as in `torch.optim.SparseAdam`.
+    """
+
+    def step(self, closure: Callable[[], float] | None = None) -> Any:
+        """As the class behind this one."""
+        groups = [group for group in self.param_groups if group.get(MASKED)]
+        kept = [
+            self._kept(parameter) for group in groups for parameter in group["params"] if parameter.grad is not None
+        ]
+        loss = super().step(closure)
+        for parameter, unseen, values in kept:
+            for tensor, before in zip(self._tensors(parameter), values, strict=True):
+                tensor.data[unseen] = before
+        return loss
+
+    def _kept(self, parameter: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """`parameter`, where it has no gradient, and what it and its moments have there; moments begin at 0."""
+        unseen = parameter.grad == 0
+        if self.state[parameter]:
+            return parameter, unseen, [tensor.data[unseen].clone() for tensor in self._tensors(parameter)]
+        value = parameter.data[unseen].clone()
+        return parameter, unseen, [value, *(torch.zeros_like(value) for _ in MOMENTS)]
+
+    def _tensors(self, parameter: Tensor) -> list[Tensor]:
+        return [parameter, *(self.state[parameter][name] for name in MOMENTS)]
+
+
+class MaskedAdam(_Masked, torch.optim.Adam):
+    """Adam, whose weight decay is part of the gradient and so is left out where there is none."""
+
+
+class MaskedAdamW(_Masked, torch.optim.AdamW):
+    """AdamW."""
+
+
+# The optimiser of an avatar: Adam or AdamW, of three groups of parameters.
+#
+# Rule: a group is what shares a learning rate, a decay and moments; the table says which class steps it.
+
+#: By kind, and whether texels without a gradient stay.
+CLASSES: dict[tuple[str, bool], type[torch.optim.Optimizer]] = {
+    ("adamw", False): torch.optim.AdamW,
+    ("adamw", True): MaskedAdamW,
+    ("adam", False): torch.optim.Adam,
+    ("adam", True): MaskedAdam,
+}
+
+
+def optimiser_of(avatar: TrainableAvatar, settings: TrainingSettings) -> torch.optim.Optimizer:
+    """Make the optimiser of three groups: kernels, the network's other weights, which do not decay, and texture."""
+    options = settings.optimiser
+    kernels = [p for p in avatar.network.parameters() if p.ndim > 1]
+    others = [p for p in avatar.network.parameters() if p.ndim <= 1]
+    texture = list(avatar.texture.parameters())
+    rows = (
+        (kernels, settings.network_rate, settings.weight_decay, options.momentum),
+        (others, settings.network_rate, 0.0, options.momentum),
+        (texture, settings.texture_rate, settings.weight_decay, options.texture_momentum),
+    )
+    groups: list[dict[str, Any]] = [
+        {"params": params, "lr": rate, "weight_decay": decay, "betas": (momentum, options.second_momentum)}
+        for params, rate, decay, momentum in rows
+    ]
+    if settings.masked_texture:
+        groups[-1][MASKED] = True
+    return CLASSES[options.kind, settings.masked_texture](groups, lr=settings.network_rate)
+
+
+def clip_gradients(module: nn.Module, options: OptimiserOptions) -> None:
+    """Limit the gradients of `module`: each number by `clip_value`, then the norm of all by `clip_norm`. In place."""
+    if options.clip_value:
+        nn.utils.clip_grad_value_(module.parameters(), options.clip_value)
+    if options.clip_norm:
+        nn.utils.clip_grad_norm_(module.parameters(), options.clip_norm)
+
+
+# Everything that a training by steps goes on from, as one .npz file: weights, their average and Adam's moments, and the
+# same of discriminators.
+#
+# Rule: what was read computes the same bits as what was written, so tensors keep their layout in memory.
+
+EXPECTED = "the state of this training"
+REMEDY = "remove it to begin again"
+
+
+@dataclass
+class TrainingState:
+    """`avatar`, trained by `optimiser` for the `objective`; the `average` of its weights; `step`s were done."""
+
+    avatar: TrainableAvatar
+    average: TrainableAvatar
+    optimiser: torch.optim.Optimizer
+    objective: Objective
+    step: int = 0
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by name; they are the state's own."""
+        modules: dict[str, nn.Module] = {"avatar": self.avatar, "average": self.average}
+        if self.objective.adversary is not None:
+            modules["discriminators"] = self.objective.adversary.discriminators
+        named = {
+            f"{kind}.{name}": value for kind, module in modules.items() for name, value in module.state_dict().items()
+        }
+        if self.avatar.grid is not None:
+            named |= {"grid.ends": self.avatar.grid.ends, "grid.alike": self.avatar.grid.alike}
+        for kind, optimiser in self.optimisers().items():
+            for number, moments in optimiser.state_dict()["state"].items():
+                named |= {f"{kind}.{number}.{name}": value for name, value in moments.items()}
+        return named
+
+    @property
+    def device(self) -> torch.device:
+        """Where it is trained."""
+        return next(self.avatar.parameters()).device
+
+    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """All optimisers by name, each of Adam's kind."""
+        adversary = self.objective.adversary
+        return {"optimiser": self.optimiser} | ({} if adversary is None else {"judges": adversary.optimiser})
+
+
+def save_state(state: TrainingState, path: Path) -> None:
+    """Write `state` as the file `path`, whole or not at all. Raises BadInputError."""
+    arrays = {name: value.detach().cpu().numpy() for name, value in state.tensors().items()}
+    with write_atomically(path) as draft, draft.open("wb") as file:
+        np.savez(file, step=np.int64(state.step), **arrays)
+
+
+def load_state(state: TrainingState, path: Path) -> None:
+    """Set `state` to what `save_state` wrote. Raises BadInputError for the state of another training."""
+    try:
+        with path.open("rb") as source, np.load(source, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except (*DAMAGED, TypeError) as error:  # TypeError: of a lone array
+        raise BadInputError(path, reason(error).splitlines()[0], EXPECTED, REMEDY) from error
+    for optimiser in state.optimisers().values():
+        _add_moments(optimiser)
+    wanted = {name: tuple(value.shape) for name, value in state.tensors().items()} | {"step": ()}
+    found = {name: array.shape for name, array in arrays.items()}
+    if wanted != found:
+        other = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
+        raise BadInputError(path, f"{other[0]} {found.get(other[0], 'missing')}", EXPECTED, REMEDY)
+    state.step = int(arrays.pop("step"))
+    _fill(state.tensors(), arrays)
+
+
+def _fill(tensors: dict[str, Tensor], arrays: dict[str, NDArray[np.generic]]) -> None:
+    for name, value in tensors.items():
+        value.data.copy_(torch.from_numpy(arrays[name]))
+
+
+def _add_moments(optimiser: torch.optim.Optimizer) -> None:
+    """Adam's moments, as its first step makes them: laid out in memory as their parameters."""
+    for group in optimiser.param_groups:
+        for parameter in group["params"]:
+            optimiser.state[parameter] = {
+                "step": torch.tensor(0.0),
+                "exp_avg": torch.zeros_like(parameter, memory_format=torch.preserve_format),
+                "exp_avg_sq": torch.zeros_like(parameter, memory_format=torch.preserve_format),
+            }
+
+
+# How far a training's loss fell: the same samples, before the first step and after the last.
+#
+# Rule: it is a loss of the avatar alone, without what discriminators find, which is another measure after each step; it
+# is of the weights that become the avatar, over the same backgrounds, and computing it changes nothing of the training.
+
+
+def probe_loss(state: TrainingState, groups: list[ShapeGroup]) -> float:
+    """The mean loss of the averaged avatar of `state`, as it would be written now, over first samples of `groups`."""
+    judge = replace(state.objective, adversary=None)
+    losses = list[float]()
+    with torch.no_grad(), torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        for group in groups:
+            uv, covered, target = load_batch(group, np.zeros(1, np.int64), state.device)
+            losses.append(float(judge.total(judge.terms(state.average(uv, covered), target))))
+    return float(np.mean(losses))

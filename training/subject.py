@@ -16,13 +16,17 @@ import numpy as np
 from trilane.arrays import F32, U8, Mask
 from trilane.avatars.manifest import CAPTURED
 from trilane.body.body import ShapedBody, load_body
-from trilane.training.capture.body_raster import BodyRaster
 from trilane.training.capture.capture import Capture, open_capture
-from trilane.training.capture.capture_samples import CaptureRenderer, held_out_frames
-from trilane.training.capture.check import CheckedFrame, bad_frames, checked_frame, coverage_of
-from trilane.training.capture.check_facts import require_fits, texel_facts
-from trilane.training.capture.texel_coverage import TexelCoverage
-from trilane.training.capture.zoomed_view import ViewRule
+from trilane.training.capture.capture_samples import BodyRaster, CaptureRenderer, ViewRule, held_out_frames
+from trilane.training.capture.check import (
+    CheckedFrame,
+    TexelCoverage,
+    bad_frames,
+    checked_frame,
+    coverage_of,
+    require_fits,
+    texel_facts,
+)
 from trilane.training.clothing.looks import DEFAULT_NAME, KEY, look_named
 from trilane.training.dataset import SampleSource, clothed_source
 from trilane.training.sample_renderer import SampleRenderer

@@ -1,315 +1,369 @@
-"""`python -m trilane.training.train`: render, train, quantise, validate and write an avatar in one go.
+"""Trains an avatar of a capture or of a clothed default body: draws samples, trains by steps, quantises and measures.
 
-Rule: everything a run depends on is in `TrainConfig`, and the command that was run is written into the bundle.
+Rule: what was finished is kept in the work folder and not done again; each part of the work says what it will cost
+before it starts.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
+import math
 import shlex
-import sys
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from PIL import Image
 
-from trilane.avatars.bundle import OFFSETS, bundle_folder, load_bundle
-from trilane.avatars.manifest import Validation
-from trilane.body.body import ShapedBody
-from trilane.errors import BadInputError, TrilaneError
-from trilane.training.body_arrays import body_arrays
+from trilane.avatars.bundle import OFFSETS, Bundle, bundle_folder, load_bundle, write_manifest
+from trilane.avatars.manifest import sha256_of
+from trilane.errors import BadInputError
+from trilane.files import read_text
 from trilane.training.capture.capture_samples import CaptureRenderer
-from trilane.training.capture_error import error_facts, frame_errors, write_held_out_error
-from trilane.training.clothing.looks import DEFAULT_NAME
-from trilane.training.comparison_sheet import comparison_sheet
-from trilane.training.dataset import plan_training, write_dataset
-from trilane.training.evaluate import Evaluated
+from trilane.training.dataset import VALIDATION_SIZE, Planned, plan_training, write_dataset
 from trilane.training.first_texture import first_texture
-from trilane.training.float_painter import float_painter
-from trilane.training.from_integers import network_of
-from trilane.training.make_bundle import quantise_avatar, write_avatar
+from trilane.training.image_error import MEANS, ImageError, image_error
+from trilane.training.make_bundle import keep_rounded_weights, quantise_avatar, write_avatar, write_float_network
 from trilane.training.network import UNet
-from trilane.training.neural_texture import SIDES, NeuralTexture
-from trilane.training.outlines import subject_with_offsets
-from trilane.training.rounding import keep_rounded_weights
-from trilane.training.sample_files import open_groups
-from trilane.training.sample_renderer import SampleRenderer
-from trilane.training.subject import Subject, captured_subject, clothed_subject
-from trilane.training.trainable_avatar import Precision, TrainableAvatar
-from trilane.training.training_loop import FitConfig, fit
-from trilane.training.validate import (
-    BUILTIN_HELD_OUT,
-    FLOAT,
-    PER_BAND,
-    SEEDS,
-    FloatNetwork,
-    ValidationPlan,
-    held_out_motions,
-    revalidate,
-    validate,
+from trilane.training.objective import Vgg16, read_vgg16
+from trilane.training.sample_files import FIELDS, ShapeGroup, open_groups
+from trilane.training.stand_off import subject_with_offsets
+from trilane.training.step_loop import (
+    TrainingState,
+    chosen_device,
+    device_words,
+    first_state,
+    load_state,
+    memory_words,
+    probe_loss,
+    save_state,
+    step_seconds,
+    steps,
 )
-from trilane.training.weights_file import load_avatar, load_network, save_avatar, save_network
+from trilane.training.subject import Subject, captured_subject, clothed_subject
+from trilane.training.surface import body_arrays
+from trilane.training.trainable_avatar import (
+    SIDES,
+    NeuralTexture,
+    TrainableAvatar,
+    float_painter,
+    load_network,
+    network_of,
+    save_network,
+)
+from trilane.training.training_settings import NAME, TrainingSettings, read_settings, settings_text
+from trilane.training.validate import integer_painter, side_by_side
+from trilane.writing import write_atomically, write_bytes
 
 CHANNELS = 16
-CHECKPOINT, FINAL, NETWORK = "checkpoint.npz", "final.npz", "network.npz"
-FACTS, TRAINING = "dataset.json", "training"
-#: Settings of `FitConfig` for a training that starts from a network, and for one that also has a trained texture.
-#: What the loop is told as the command is.
-SHARED = ("minutes", "workers", "threads", "batch", "seed", "precision", "bytes_from")
-REPEATS = (2, 1, 2, 3, 1)
-KNOWN_NETWORK: dict[str, Any] = {"small_until": 0.0, "freeze_norms_at": 0.3, "repeats": REPEATS}
-RESUMED: dict[str, Any] = {
-    "network_rate": 1e-3,
-    "texture_rate": 3e-4,
-    "small_until": 0.0,
-    "freeze_norms_at": 0.1,
-    "repeats": REPEATS,
-}
+DEFAULT_NETWORK = Path(__file__).with_name("default-network.npz")
+SAMPLES, SAMPLE_FACTS, STATE, NETWORK, SHEETS = "samples", "samples.json", "state.npz", "network.npz", "sheets"
+LOSS_BEFORE = "loss-before.json"
+LEAST_STEPS = 10
+#: Most sheets of a training, evenly over its steps, and least steps between two: a sheet takes about as long as a step.
+SHEET_COUNT, SHEET_STEPS = 10, 10
+#: Seconds between two states on the disk.
+SAVE_S = 60.0
+ANOTHER_WORK = "use another --work folder, or remove this one"
 
 
 @dataclass(frozen=True)
-class TrainConfig:
-    """One training run.
+class Places:
+    """Folders and files of one training.
 
-    `body`: the body file. `out`: folder of the bundle. `name`: of the avatar. `work`: folder of data set and weights.
-    `sheet`: picture file that compares held-out samples; None for none.
-    `minutes`: of training. `samples`: of the training set. `per_band`: validation samples of each band and seed.
-    `held_out`: motions that validation poses come from. `width`: of the network; 64 is full.
-    `capture`: folder of the person to train on; None for the body in `body`, clothed. `look`: of that body, a name of
-    `LOOKS`.
-    `precision`: of the network while it is trained; "bfloat16" is three times as fast on processors with AMX.
-    `bytes_from`: share of the minutes after which weights and activations are rounded as the bundle's are.
-    `weights`: do not train, use these. `resume`: continue from these weights at a lower rate. `network`: start from the
-    network of these weights or, with the name or folder of an avatar, from that of its integers; with a new texture or
-    with `texture`, that of a trained avatar (a name or a folder).
+    `capture`: folder; None where the settings have a look. `out`: of the bundle. `work`: of samples, state and sheets.
+    `name`: of the avatar. `vgg`: the file of VGG-16's weights, for a perceptual loss by its features.
     """
 
-    body: Path = bundle_folder("default") / "body.npz"
-    out: Path = Path("avatar")
-    name: str = "default"
-    work: Path = Path("avatar-work")
-    sheet: Path | None = None
-    minutes: float = 60.0
-    samples: int = 4000
-    per_band: int = PER_BAND
-    held_out: tuple[str, ...] = (BUILTIN_HELD_OUT,)
-    width: int = 16
-    workers: int = 3
-    threads: int = 1
-    batch: int = 4
-    seed: int = 1
-    weights: Path | None = None
-    resume: Path | None = None
-    network: Path | None = None
-    texture: str | None = None
-    capture: Path | None = None
-    look: str | None = None
-    precision: Precision = "float32"
-    bytes_from: float = 1.0
+    capture: Path | None
+    out: Path
+    work: Path
+    name: str
+    vgg: Path | None = None
 
 
-def train(config: TrainConfig, report: Callable[[str], None]) -> Path:
-    """Run `config` and return the bundle's folder; `report` takes lines of progress.
+class Listener(Protocol):
+    """Someone who is told how the work goes."""
 
-    Raises BadInputError for inputs that do not fit together, MissingPartError without OpenGL.
+    def say(self, line: str) -> None:
+        """Take a line about what was found, or what the next part of the work costs."""
+
+    def track(self, text: str, numbers: Iterable[Any], total: int) -> Iterable[Any]:
+        """Yield the `total` items of `numbers` and show how far the work `text` is."""
+
+    def trained(self, step: int, total: int, terms: dict[str, float], loss: float) -> None:
+        """Take the `terms` of the loss at `step` of `total`, before weighting, and their weighted sum `loss`."""
+
+
+def train_avatar(places: Places, asked: TrainingSettings, listener: Listener) -> dict[str, Any]:
+    """Train as `asked`, write the bundle, and return facts of the training and of held-out frames.
+
+    A training that was ended before goes on from its last state.
+    Raises BadInputError; FaultyCaptureError with all faults; MissingPartError without OpenGL.
     """
-    torch.manual_seed(config.seed)
-    config.work.mkdir(parents=True, exist_ok=True)
-    subject = subject_with_offsets(_subject(config, report), config.work / OFFSETS, config.seed, report)
-    held_out_motions(config.held_out)  # a motion that cannot be read ends the command here
-    _render_training_set(subject, config, report)
-    shaped = subject.shaped
-    avatar, steps = _trained(shaped, config, report)
-    report("quantising and evaluating")
-    torch.set_num_threads(config.workers)
-    if config.bytes_from < 1:
-        keep_rounded_weights(avatar, open_groups(config.work / TRAINING), config.seed)
-        save_network(avatar, config.work / NETWORK)
-    groups = open_groups(config.work / TRAINING)
-    quantised = quantise_avatar(avatar, shaped, groups, config.seed, subject.unseen)
-    names = {"name": config.name, "training_command": command_of(config)}
-    provenance = _provenance(config, steps) | subject.facts
-    write_avatar(config.out, subject.person, quantised, config.width, provenance, names)
+    started = time.monotonic()
+    settings = resumed_settings(places.work / NAME, with_vgg(asked, places.vgg))
+    vgg = read_vgg16(places.vgg) if places.vgg is not None else None
+    torch.set_num_threads(settings.threads)
+    listener.say(f"trains on {device_words(chosen_device(settings.device), settings.threads)}")
+    if settings.loss.perceptual:
+        listener.say(f"perceptual loss: {'MS-SSIM' if vgg is None else f'features of VGG-16 in {places.vgg}'}")
+    subject = _subject(places, settings, listener)
+    places.work.mkdir(parents=True, exist_ok=True)
+    subject = _raised(subject, places, settings, listener)
+    _draw_samples(subject, places, settings, listener)
+    groups = open_groups(places.work / SAMPLES)
+    torch.manual_seed(settings.seed)
+    avatar = _first_avatar(subject, places, settings)
+    settings = _with_steps(avatar, places, settings, vgg, listener)
+    write_bytes(places.work / NAME, settings_text(settings).encode())
+    state = first_state(avatar, settings, vgg)
+    losses = {"before": _loss_before(state, places, groups)}
+    _train(state, subject, places, settings, listener)
+    losses["after"] = probe_loss(state, groups)
+    state.average.cpu()
+    if settings.bytes_from < 1:
+        keep_rounded_weights(state.average, groups, settings.seed)
+    save_network(state.average, places.work / NETWORK)
+    files = write_float_network(places.work, state.average, groups, settings.seed)
+    quantised = quantise_avatar(state.average, subject.shaped, groups, settings.seed, subject.unseen)
+    made = {"samples": settings.samples, "steps": state.step, "batch": settings.batch, "seed": settings.seed}
+    provenance = made | {"texture_sides": list(SIDES)} | subject.facts
+    capture = [] if places.capture is None else [places.capture.name]
+    command = shlex.join(["trilane", "avatar", "train", *capture, "--config", NAME])
+    names = {"name": places.name, "training_command": command}
+    write_avatar(places.out, subject.person, quantised, settings.width, provenance, names)
+    write_bytes(places.out / NAME, settings_text(settings).encode())
+    facts = {"avatar": str(places.out), "steps": state.step, "loss": losses}
+    facts |= {"held_out_error": _measure(places, subject, settings)} if subject.held_out else {}
     if subject.truth is not None:
-        validation = _validate(config, avatar, subject.truth)
-        report(validation.model_dump_json())
-    if subject.frames is not None:
-        report(json.dumps({"held_out_error": _measure_held_out(config, subject.frames, subject.held_out)}))
-    return config.out
+        measure = ["trilane", "avatar", "validate", str(places.out), "--float-network", str(places.work / NETWORK)]
+        listener.say(f"measure it on views that it was not trained on: {shlex.join(measure)}")
+    sheets = str(places.work / SHEETS) if subject.held_out else None
+    return facts | files | {"sheets": sheets, "seconds": round(time.monotonic() - started, 1)}
 
 
-def _subject(config: TrainConfig, report: Callable[[str], None]) -> Subject:
-    if config.capture is None:
-        return clothed_subject(config.body, config.workers, config.look or DEFAULT_NAME)
-    if config.look is not None:
-        raise BadInputError("--look", repr(config.look), "none beside --capture, which has a person of its own")
-    return captured_subject(config.capture, config.workers, report)
+def _subject(places: Places, settings: TrainingSettings, listener: Listener) -> Subject:
+    """Return the person of the capture, or the default body in a look. Raises BadInputError for both or none."""
+    if places.capture is None:
+        if settings.look is None:
+            raise BadInputError("CAPTURE", "none", "the folder of a capture", "or settings (--config) with a `look`")
+        return clothed_subject(bundle_folder("default") / "body.npz", settings.threads, settings.look)
+    if settings.look is not None:
+        raise BadInputError("look", repr(settings.look), "none beside a capture, which has a person of its own")
+    return captured_subject(places.capture, settings.threads, listener.say)
 
 
-def _measure_held_out(config: TrainConfig, renderer: CaptureRenderer, numbers: Sequence[int]) -> dict[str, Any]:
-    """The error on frames of the capture that training never read, which is written into the bundle."""
-    bundle = load_bundle(config.out)
-    facts = error_facts(frame_errors(bundle, renderer, numbers, config.workers))
+def with_vgg(asked: TrainingSettings, file: Path | None) -> TrainingSettings:
+    """Add the digest of the weights in `file` to `asked`. Raises BadInputError where one is given without the other."""
+    if file is None:
+        if asked.vgg is not None:
+            raise BadInputError("vgg", "no file of weights", f"that with SHA-256 {asked.vgg}", "give it with --vgg")
+        return asked
+    if not asked.loss.perceptual:
+        raise BadInputError("--vgg", "a loss without `perceptual`", "a weight for it", "such as that of --loss thesis")
+    digest = sha256_of([file])
+    if asked.vgg not in (None, digest):
+        raise BadInputError(file, f"SHA-256 {digest}", f"that of the settings, {asked.vgg}")
+    return asked.model_copy(update={"vgg": digest})
+
+
+def _raised(subject: Subject, places: Places, settings: TrainingSettings, listener: Listener) -> Subject:
+    """Add the offsets of clothes and hair to `subject` where the settings ask for them."""
+    if not settings.stand_off:
+        return subject
+
+    def track(views: list[Any]) -> Iterable[Any]:
+        return listener.track("measuring outlines", views, len(views))
+
+    return subject_with_offsets(subject, places.work / OFFSETS, settings.seed, listener.say, track)
+
+
+def resumed_settings(path: Path, asked: TrainingSettings) -> TrainingSettings:
+    """Return the settings in the file `path` where a training has begun there, else `asked`.
+
+    A number of steps that was counted before stays. Raises BadInputError when the file differs from `asked`.
+    """
+    if not path.exists():
+        return asked
+    begun = read_settings(path)
+    if asked.steps is None:
+        asked = asked.model_copy(update={"steps": begun.steps})
+    one, other = begun.model_dump(), asked.model_dump()
+    for key, value in one.items():
+        if other[key] != value:
+            raise BadInputError(f"{path}: {key}", f"a training with {value}", f"{other[key]}, as asked", ANOTHER_WORK)
+    return begun
+
+
+def _draw_samples(subject: Subject, places: Places, settings: TrainingSettings, listener: Listener) -> None:
+    """Draw the samples into the work folder, unless they are there. Raises BadInputError where others are."""
+    facts = places.work / SAMPLE_FACTS
+    decides = ("samples", "seed", "stand_off")
+    who = {"look": settings.look} if places.capture is None else {"capture": str(places.capture.resolve())}
+    wanted = who | {key: getattr(settings, key) for key in decides}
+    if facts.exists():
+        present = json.loads(facts.read_text(encoding="utf-8"))
+        if present != wanted:
+            raise BadInputError(facts, str(present), str(wanted), ANOTHER_WORK)
+        return
+    samples = plan_training(
+        subject.renderer,
+        settings.samples,
+        settings.seed,
+        lambda all_: listener.track("choosing views", all_, len(all_)),
+    )
+    listener.say(_sample_cost(subject, samples, settings))
+    folder, processes = places.work / SAMPLES, settings.threads
+    write_dataset(
+        subject.source, samples, folder, processes, lambda parts: listener.track("drawing views", parts, len(parts))
+    )
+    write_bytes(facts, json.dumps(wanted).encode())
+
+
+def _sample_cost(subject: Subject, samples: list[Planned], settings: TrainingSettings) -> str:
+    """Say what drawing `samples` costs, by drawing some of them."""
+    start, tried = time.monotonic(), samples[:: max(1, len(samples) // 4)][:4]
+    for sample in tried:
+        subject.renderer.render(sample)
+    seconds = (time.monotonic() - start) / len(tried) * len(samples) / settings.threads
+    pixel = sum(int(np.prod(tail, dtype=int)) * np.dtype(kind).itemsize for tail, kind in FIELDS.values())
+    megabytes = sum(sample.crop.shape[0] * sample.crop.shape[1] for sample in samples) * pixel / 1e6
+    return (
+        f"{len(samples)} views: about {seconds:.0f} s, {megabytes:.0f} MB on the disk (by {len(tried)} that were drawn)"
+    )
+
+
+def _first_avatar(subject: Subject, places: Places, settings: TrainingSettings) -> TrainableAvatar:
+    """Return what training starts from; once a state is on the disk, only its shapes matter."""
+    groups = open_groups(places.work / SAMPLES)
+    network = UNet(norm=settings.norm, width=settings.width, channels=CHANNELS, input_skip=True)
+    if (places.work / STATE).exists():
+        texture = np.zeros((SIDES[0], SIDES[0], CHANNELS), np.float32)
+        return TrainableAvatar(NeuralTexture(texture, mip_levels=settings.mip_levels), network)
+    if settings.start == "default":
+        network = load_network(network, DEFAULT_NETWORK)
+    elif settings.start != "new":
+        network = network_of(load_bundle(settings.start), groups, settings.seed)
+    if settings.texture == "new":
+        texture = first_texture(body_arrays(subject.shaped), groups, SIDES[0], CHANNELS)
+    else:
+        texture = load_bundle(settings.texture).read_texture()
+    return TrainableAvatar(NeuralTexture(texture, mip_levels=settings.mip_levels), network)
+
+
+def _with_steps(
+    avatar: TrainableAvatar, places: Places, settings: TrainingSettings, vgg: Vgg16 | None, listener: Listener
+) -> TrainingSettings:
+    """Return `settings` with a number of steps, by default as many as fit into the minutes, and say what they take."""
+    seconds = step_seconds(avatar, open_groups(places.work / SAMPLES), settings, vgg)
+    count = settings.steps or max(LEAST_STEPS, int(60 * settings.minutes / seconds))
+    memory = memory_words(chosen_device(settings.device))
+    per_step = f"{seconds:.2f} s a step as just measured"
+    listener.say(f"{count} steps: about {count * seconds / 60:.1f} min ({per_step}), {memory}")
+    return settings.model_copy(update={"steps": count})
+
+
+def _train(
+    state: TrainingState, subject: Subject, places: Places, settings: TrainingSettings, listener: Listener
+) -> None:
+    """Do all steps that are left, with a sheet and a state on the disk now and then."""
+    path, count = places.work / STATE, settings.steps or LEAST_STEPS
+    if path.exists():
+        load_state(state, path)
+        listener.say(f"goes on after step {state.step} of {count}")
+    weights, saved = settings.loss.by_name(), time.monotonic()
+    every = max(SHEET_STEPS, math.ceil(count / SHEET_COUNT))
+    for terms in steps(state, open_groups(places.work / SAMPLES), settings, count):
+        loss = sum(weights.get(name, 0.0) * value for name, value in terms.items())
+        listener.trained(state.step, count, terms, loss)
+        if state.step % every == 0 or state.step == count:
+            write_sheet(places.work / SHEETS / f"step-{state.step:07}.png", state.average, subject)
+        if time.monotonic() - saved > SAVE_S:
+            save_state(state, path)
+            saved = time.monotonic()
+    save_state(state, path)
+
+
+def _loss_before(state: TrainingState, places: Places, groups: list[ShapeGroup]) -> float:
+    """Return the loss before the first step; a training that goes on reads it from the work folder."""
+    path = places.work / LOSS_BEFORE
+    if not (places.work / STATE).exists():
+        write_bytes(path, json.dumps(probe_loss(state, groups)).encode())
+    return float(json.loads(read_text(path, "the loss before this training")))
+
+
+def _measure(places: Places, subject: Subject, settings: TrainingSettings) -> dict[str, Any]:
+    """Measure the bundle on frames that training never read, and write the error into it."""
+    assert subject.frames is not None
+    bundle = load_bundle(places.out)
+    facts = error_facts(frame_errors(bundle, subject.frames, subject.held_out, settings.threads))
     write_held_out_error(bundle, facts)
     return facts
 
 
-def _validate(config: TrainConfig, avatar: TrainableAvatar, renderer: SampleRenderer) -> Validation:
-    """Validate the bundle that was written, beside the float weights that it was made of."""
-    bundle, samples = load_bundle(config.out), list[Evaluated]()
-    plan = ValidationPlan(config.held_out, SEEDS, config.per_band, threads=config.workers)
-    paint = float_painter(avatar.network, avatar.texture.image().detach())
+# Sheets of a training on a capture: held-out frames beside what the avatar paints of them so far.
+#
+# Rule: frames are taken whole, as they are measured at the end, and painting changes nothing of the training.
 
-    def keep(seed: int, sample: Evaluated) -> None:
-        if seed == plan.seeds[0]:
-            samples.append(sample)
-
-    validation = validate(bundle, plan, renderer, FloatNetwork("the trained weights", paint), keep)
-    revalidate(bundle, validation)
-    if config.sheet is not None:
-        Image.fromarray(comparison_sheet(samples, (FLOAT, *plan.runtimes))).save(config.sheet)
-    return validation
+#: Held-out frames on a sheet.
+MOST_FRAMES = 6
 
 
-def _provenance(config: TrainConfig, steps: int) -> dict[str, Any]:
-    return {
-        "samples": config.samples,
-        "steps": steps,
-        "batch": config.batch,
-        "seed": config.seed,
-        "held_out_motions": [Path(name).name for name in config.held_out],
-        "texture_sides": list(SIDES),
-    }
+def write_sheet(path: Path, avatar: TrainableAvatar, subject: Subject) -> None:
+    """Write as PNG: a row for each of some held-out frames, the frame on the left. Without such frames, nothing.
+
+    Raises BadInputError when it cannot be written.
+    """
+    paint, rows = float_painter(avatar.network, *(level.detach() for level in avatar.texture.levels())), []
+    for number in subject.held_out[:: max(1, len(subject.held_out) // MOST_FRAMES)][:MOST_FRAMES]:
+        sample = subject.frames.whole_sample(number, VALIDATION_SIZE) if subject.frames is not None else None
+        if sample is not None and subject.frames is not None:
+            uv, truth = subject.frames.render(sample)
+            rows.append(side_by_side((truth, paint(sample, uv))))
+    if rows:
+        path.parent.mkdir(exist_ok=True)
+        with write_atomically(path) as draft:
+            Image.fromarray(np.vstack(rows)).save(draft, format="png")
 
 
-def command_of(config: TrainConfig) -> str:
-    """The command line of `config` without folders: motions and weights are written by their file names alone."""
-    options: list[str] = []
-    for field in fields(TrainConfig):
-        value = getattr(config, field.name)
-        if isinstance(value, tuple):
-            options += [part for motion in value for part in ("--held-out", Path(motion).name)]
-        elif field.name in ("weights", "resume", "network", "capture") and value is not None:
-            options += [f"--{field.name}", value.name]
-        elif isinstance(value, int | float | str):
-            options += [f"--{field.name.replace('_', '-')}", str(value)]
-    return shlex.join(["python", "-m", "trilane.training.train", *options])
+# How good an avatar is on frames of a capture that training never read.
+#
+# Rule: what is measured lies in the bundle and runs as in the pipeline; frames are taken whole, nothing is random.
+
+RUNTIME = "ort"
 
 
-def _render_training_set(subject: Subject, config: TrainConfig, report: Callable[[str], None]) -> None:
-    """Render the training set into the work folder, unless it is there. Raises BadInputError for another set's."""
-    facts, folder = config.work / FACTS, config.work / TRAINING
-    wanted: dict[str, Any] = {"samples": config.samples, "seed": config.seed}
-    if config.capture is not None:
-        wanted |= {"capture": str(config.capture.resolve())}
-    elif config.look is not None:
-        wanted |= {"look": config.look}
-    if facts.exists():
-        present = json.loads(facts.read_text())
-        if present != wanted:
-            raise BadInputError(facts, str(present), str(wanted), "use another --work folder")
-        return
-    report(f"rendering {config.samples} samples into {folder}")
-    samples = plan_training(subject.renderer, config.samples, config.seed)
-    write_dataset(subject.source, samples, folder, config.workers)
-    facts.write_text(json.dumps(wanted))
+def frame_errors(bundle: Bundle, renderer: CaptureRenderer, numbers: Sequence[int], threads: int) -> list[ImageError]:
+    """The error of `bundle` on each of the frames `numbers` that shows the person, against the frame and its mask.
+
+    `threads`: of the runtime. Raises BadInputError, MissingPartError.
+    """
+    paint = integer_painter(renderer, bundle, RUNTIME, threads)
+    errors = []
+    for number in numbers:
+        sample = renderer.whole_sample(number, VALIDATION_SIZE)
+        if sample is None:
+            continue
+        uv, truth = renderer.render(sample)
+        errors.append(image_error(paint(sample, uv), truth))
+    return [error for error in errors if error is not None]
 
 
-def _trained(shaped: ShapedBody, config: TrainConfig, report: Callable[[str], None]) -> tuple[TrainableAvatar, int]:
-    """The trained avatar and its number of steps; with `config.weights`, those weights as they are."""
-    if config.weights is not None:
-        return load_avatar(_blank_avatar(config), config.weights)
-    avatar, steps_before, settings = _starting_point(shaped, config)
-
-    def checkpoint(avatar: TrainableAvatar, steps: int) -> None:
-        save_avatar(avatar, steps_before + steps, config.work / CHECKPOINT)
-
-    avatar, steps = fit(avatar, config.work / TRAINING, settings, report, checkpoint)
-    save_avatar(avatar, steps_before + steps, config.work / FINAL)
-    save_network(avatar, config.work / NETWORK)
-    return avatar, steps_before + steps
+def error_facts(errors: Sequence[ImageError]) -> dict[str, Any]:
+    """Means of `errors`, and how they were measured: keys `runtime`, `size`, `frames`, and those of an error."""
+    names = [name for name in MEANS if name != "background"]
+    means = (
+        {name: round(float(np.mean([getattr(error, name) for error in errors])), 4) for name in names} if errors else {}
+    )
+    return {"runtime": RUNTIME, "size": VALIDATION_SIZE, "frames": len(errors), **means}
 
 
-def _starting_point(shaped: ShapedBody, config: TrainConfig) -> tuple[TrainableAvatar, int, FitConfig]:
-    """The avatar that training starts from, the steps it has been trained, and the settings of the training."""
-    shared = {name: getattr(config, name) for name in SHARED}
-    settings = FitConfig(**shared)
-    if config.resume is not None:
-        avatar, steps = load_avatar(_blank_avatar(config), config.resume)
-        return avatar, steps, replace(settings, **RESUMED, seed=config.seed + config.workers)
-    network = _new_network(config)
-    texture = _first_texture(shaped, config)
-    if config.network is not None:
-        settings = replace(settings, **(RESUMED if config.texture else KNOWN_NETWORK))
-        network = _known_network(network, config)
-    return TrainableAvatar(NeuralTexture(texture), network), 0, settings
-
-
-def _new_network(config: TrainConfig) -> UNet:
-    return UNet(width=config.width, channels=CHANNELS, input_skip=True)
-
-
-def _known_network(blank: UNet, config: TrainConfig) -> UNet:
-    """The network of `config.network`: weights for `blank`, or an avatar."""
-    assert config.network is not None
-    if config.network.suffix == ".npz":
-        return load_network(blank, config.network)
-    return network_of(load_bundle(config.network), open_groups(config.work / TRAINING), config.seed)
-
-
-def _blank_avatar(config: TrainConfig) -> TrainableAvatar:
-    """An avatar of the right shapes, for weights to be loaded into."""
-    network = _new_network(config)
-    return TrainableAvatar(NeuralTexture(np.zeros((SIDES[0], SIDES[0], CHANNELS), np.float32)), network)
-
-
-def _first_texture(shaped: ShapedBody, config: TrainConfig) -> NDArray[np.float32]:
-    if config.texture is None:
-        return first_texture(body_arrays(shaped), open_groups(config.work / TRAINING), SIDES[0], CHANNELS)
-    texture = load_bundle(config.texture).read_texture()
-    if texture.shape != (SIDES[0], SIDES[0], CHANNELS):
-        raise BadInputError("--texture", f"shape {texture.shape}", f"({SIDES[0]}, {SIDES[0]}, {CHANNELS})")
-    return texture
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m trilane.training.train", description=__doc__)
-    for field in fields(TrainConfig):
-        default = field.default
-        if isinstance(default, tuple):
-            parser.add_argument("--held-out", action="append", help=f"motion for validation (default {default[0]})")
-        else:
-            is_path = "Path" in str(field.type)
-            kind = Path if is_path else str if default is None else type(default)
-            parser.add_argument(f"--{field.name.replace('_', '-')}", type=kind, default=default, help=f"({default})")
-    return parser
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line `arguments`, the process's own by default, and return the exit code."""
-    values = vars(_parser().parse_args(sys.argv[1:] if arguments is None else list(arguments)))
-    values["held_out"] = tuple(values["held_out"] or (BUILTIN_HELD_OUT,))
-    started = time.monotonic()
-
-    def report(line: str) -> None:
-        print(f"{time.monotonic() - started:7.0f} s  {line}", file=sys.stderr)
-
-    try:
-        folder = train(TrainConfig(**values), report)
-    except TrilaneError as error:
-        print(error, *error.details, sep="\n", file=sys.stderr)
-        return error.exit_code
-    print(os.fspath(folder))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def write_held_out_error(bundle: Bundle, facts: dict[str, Any]) -> None:
+    """Put `facts` of held-out frames into the provenance of the manifest of `bundle`."""
+    provenance = bundle.manifest.provenance | {"held_out_error": facts}
+    write_manifest(bundle.folder, bundle.manifest.model_copy(update={"provenance": provenance}))

@@ -6,15 +6,31 @@ there is any, is in training mode alone.
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+import onnx
 import torch
+from numpy.typing import NDArray
+from onnx import numpy_helper
 from torch import Tensor, nn
+from torch.nn import functional
 
-from trilane.training.byte_grid import ByteGrid
-from trilane.training.mip_levels import read_levels
+from trilane.arrays import F32, U8
+from trilane.avatars.bundle import Bundle, split_levels
+from trilane.avatars.network_file import constants_of
+from trilane.errors import BadInputError, reason
+from trilane.training.byte_grid import ByteGrid, convolutions, module_of
 from trilane.training.network import UNet
-from trilane.training.neural_texture import NeuralTexture
+from trilane.training.sample_files import U16, ShapeGroup, batches
+from trilane.writing import write_atomically
+
+if TYPE_CHECKING:
+    from trilane.training.sample_renderer import Sample
+    from trilane.training.validate import Painter
 
 Precision = Literal["float32", "bfloat16"]
 #: Steps of the network's input bytes on each side of zero.
@@ -51,3 +67,293 @@ class TrainableAvatar(nn.Module):
 
     def _noisy(self, x: Tensor, deviation: float) -> Tensor:
         return x + deviation * torch.randn_like(x) if self.training and deviation else x
+
+
+def load_batch(
+    group: ShapeGroup, index: NDArray[np.int64], device: torch.device | str = "cpu"
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Read the samples `index` (N,): `uv` (N,H,W,2) in 0..1, `covered` (N,H,W) bool, target (N,4,H,W) in 0..1."""
+    uv = torch.from_numpy(group.uv[index].astype(np.float32) / U16)
+    covered = torch.from_numpy(group.covered[index] > 0)
+    target = torch.from_numpy(group.rgba[index].astype(np.float32) / 255).permute(0, 3, 1, 2)
+    return uv.to(device), covered.to(device), target.to(device)
+
+
+# The neural texture: one image of C channels, stored as the sum of several scales.
+#
+# Rule: a coarse scale holds what neighbouring texels have in common, a finer one only the difference to it.
+
+SIDES = (512, 256, 128, 64, 32)
+LIMIT = 1.0
+
+
+class NeuralTexture(nn.Module):
+    """A Laplacian pyramid that sums to `start` (S,S,C) before training; S is the greatest of `sides`.
+
+    Each scale holds the difference of `start`, shrunk to its side, and the next coarser scale's image, enlarged. The
+    sum is clipped to -1..1, because the network's input has one byte range for all channels.
+
+    `mip_levels`: smaller images, each of half the side, that are learnt on their own from `start`, shrunk.
+    """
+
+    def __init__(self, start: F32, sides: tuple[int, ...] = SIDES, mip_levels: int = 0) -> None:
+        super().__init__()
+        target = torch.from_numpy(np.ascontiguousarray(start.transpose(2, 0, 1)))[None]
+        scales: list[Tensor] = []
+        coarser = torch.zeros(1, 1, 1, 1)
+        for side in sorted(sides):
+            shrunk = functional.interpolate(target, size=(side, side), mode="area")
+            scales.append(shrunk - _enlarged(coarser, side))
+            coarser = shrunk
+        self.scales = nn.ParameterList([nn.Parameter(scale) for scale in reversed(scales)])
+        smaller = [max(sides) >> (number + 1) for number in range(mip_levels)]
+        self.mips = nn.ParameterList(
+            [nn.Parameter(functional.interpolate(target, size=(side, side), mode="area")) for side in smaller]
+        )
+
+    def image(self) -> Tensor:
+        """The texture (1, C, S, S)."""
+        *finer, total = list(self.scales)
+        for scale in reversed(finer):
+            total = scale + _enlarged(total, scale.shape[-1])
+        return total.clamp(-LIMIT, LIMIT)
+
+    def levels(self) -> list[Tensor]:
+        """The texture and its smaller levels, (1, C, S, S), (1, C, S/2, S/2), ..."""
+        return [self.image(), *(level.clamp(-LIMIT, LIMIT) for level in self.mips)]
+
+
+def _enlarged(scale: Tensor, side: int) -> Tensor:
+    return functional.interpolate(scale, size=(side, side), mode="bilinear", align_corners=False)
+
+
+def read_texture(image: Tensor, uv: Tensor, covered: Tensor) -> Tensor:
+    """The network's input (N, C, H, W), channels last in memory: the texture read bilinearly at `uv`.
+
+    `image` (1, C, S, S), `uv` (N, H, W, 2) in 0..1, `covered` (N, H, W) bool. Pixels that are not covered are 0.
+    """
+    n, h, w = covered.shape
+    points = uv[covered] * 2 - 1
+    values = functional.grid_sample(
+        image, points[None, None], mode="bilinear", align_corners=False, padding_mode="border"
+    )
+    filled = image.new_zeros((n, h, w, image.shape[1]))
+    filled[covered] = values[0, :, 0].T
+    return filled.permute(0, 3, 1, 2)
+
+
+# Reads a texture that has smaller levels, as a GPU does: the more texels go by from pixel to pixel, the smaller.
+#
+# Rule: it is OpenGL's trilinear filter (specification 4.6, section 8.14): the level is the binary logarithm of the
+# texels that one pixel moves on, at most, and two levels next to it are mixed by it.
+#
+# A GPU knows a triangle's own derivatives; here the lesser of the differences to the two neighbours stands for them, so
+# that a seam, where u and v jump, does not count.
+
+#: Texels a pixel below which the level is 0 anyway.
+LEAST = 1e-3
+
+
+def read_levels(levels: Sequence[Tensor], uv: Tensor, covered: Tensor) -> Tensor:
+    """The network's input (N, C, H, W), as `read_texture` gives it of one level.
+
+    `levels`: (1, C, S, S), (1, C, S/2, S/2), ...; `uv` (N, H, W, 2) in 0..1; `covered` (N, H, W) bool.
+    """
+    if len(levels) == 1:
+        return read_texture(levels[0], uv, covered)
+    detail = level_of_detail(uv, covered, levels[0].shape[-1]).clamp(max=len(levels) - 1)[:, None]
+    parts = [
+        (1 - (detail - number).abs()).clamp(min=0) * read_texture(level, uv, covered)
+        for number, level in enumerate(levels)
+    ]
+    return torch.stack(parts).sum(dim=0)
+
+
+def levels_of(bundle: Bundle) -> list[Tensor]:
+    """The texture of `bundle` and its smaller levels, as `read_levels` takes them. Raises BadInputError."""
+    texture = bundle.read_texture()
+    levels = [texture, *split_levels(bundle.read_levels(), texture.shape[1])]
+    return [torch.from_numpy(level.transpose(2, 0, 1).copy())[None] for level in levels]
+
+
+def level_of_detail(uv: Tensor, covered: Tensor, side: int) -> Tensor:
+    """(N, H, W): 0 where a pixel moves on by a texel of `side` at most, 1 where by two, and so on."""
+    texels = torch.maximum(_least_step(uv, covered, 1), _least_step(uv, covered, 2)) * side
+    return torch.log2(texels.clamp(min=LEAST)).clamp(min=0)
+
+
+def _least_step(uv: Tensor, covered: Tensor, axis: int) -> Tensor:
+    """(N, H, W): how far `uv` is from that of the nearer neighbour on the body along `axis`; 0 where there is none."""
+    size = covered.shape[axis] - 1
+    ends = (uv.narrow(axis, 0, size), uv.narrow(axis, 1, size))
+    both = covered.narrow(axis, 0, size) & covered.narrow(axis, 1, size)
+    step = torch.where(both, (ends[1] - ends[0]).norm(dim=-1), torch.inf)
+    before = (1, 0) if axis == 2 else (0, 0, 1, 0)
+    after = (0, 1) if axis == 2 else (0, 0, 0, 1)
+    least = torch.minimum(functional.pad(step, before, value=torch.inf), functional.pad(step, after, value=torch.inf))
+    return torch.where(least.isinf(), 0.0, least)
+
+
+# Weights of a network as an .npz file.
+#
+# Rule: a file is complete or not there; weights are loaded only into a network that has every one of them.
+
+SAVED_WEIGHTS = "weights that this network's training saved"
+
+
+def load_network(network: UNet, path: Path) -> UNet:
+    """Load the network of a file of `save_network` into `network`. Raises BadInputError."""
+    weights = _read_weights(path)
+    prefix = "network."
+    _fill(network, {k.removeprefix(prefix): v.float() for k, v in weights.items() if k.startswith(prefix)}, path)
+    return network
+
+
+def save_network(avatar: TrainableAvatar, path: Path) -> None:
+    """Write the network alone in half precision: a small file, precise enough to continue training from.
+
+    Raises BadInputError when `path` cannot be written.
+    """
+    weights = {f"network.{name}": value.detach().numpy() for name, value in avatar.network.state_dict().items()}
+    halves = {name: value.astype(np.float16) for name, value in weights.items() if value.dtype.kind == "f"}
+    with write_atomically(path) as draft, draft.open("wb") as file:
+        np.savez_compressed(file, **halves)
+
+
+def _read_weights(path: Path) -> dict[str, Tensor]:
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return {name: torch.from_numpy(arrays[name]) for name in arrays.files}
+    except (OSError, ValueError, KeyError) as error:
+        raise BadInputError(path, reason(error).splitlines()[0], SAVED_WEIGHTS) from error
+
+
+def _fill(module: nn.Module, weights: dict[str, Tensor], path: Path) -> None:
+    """Load `weights` into `module`. Every weight must be there; only the counters of batches may be missing."""
+    try:
+        missing, unexpected = module.load_state_dict(weights, strict=False)
+    except RuntimeError as error:
+        raise BadInputError(path, str(error).splitlines()[-1].strip(), SAVED_WEIGHTS) from error
+    missing = [name for name in missing if not name.endswith("num_batches_tracked")]
+    if missing or unexpected:
+        raise BadInputError(path, f"no {missing[0]}" if missing else f"also {unexpected[0]}", SAVED_WEIGHTS)
+
+
+# The float network that an avatar's integers stand for, so that training goes on where only the avatar was kept.
+#
+# Rule: it computes what the integer network computes, but for the rounding of activations. Batch norms, which were
+# folded into the convolutions before them, are there again with the statistics of training samples.
+
+#: The two convolutions of the heads, which are exported side by side: colour first, then the mask.
+FIRST, SECOND, COLOURS = "first", "second", 3
+#: Samples that norms are measured on.
+BATCH, BATCHES = 8, 8
+
+
+def network_of(bundle: Bundle, groups: list[ShapeGroup], seed: int) -> UNet:
+    """The float network of `bundle`. `groups`: samples that norms are measured on, chosen by `seed`.
+
+    Raises BadInputError.
+    """
+    entry = bundle.manifest.network
+    network = UNet(entry.encoder, "batch", entry.width, entry.channels, input_skip=True)
+    network.eval()
+    constants = dict(_constants(bundle.read_network().model))
+    for name, conv, norm in convolutions(network):
+        if name not in constants:
+            raise BadInputError(bundle.network_path, f"no convolution {name}", f"those of {entry.encoder}")
+        kernel, bias = (torch.from_numpy(values.copy()) for values in constants[name])
+        with torch.no_grad():
+            conv.weight.copy_(kernel)
+            if norm is None:
+                assert conv.bias is not None
+                conv.bias.copy_(bias)
+            else:
+                assert norm.running_var is not None
+                norm.bias.copy_(bias)
+                norm.running_var.fill_(1 - norm.eps)
+    _measure_norms(network, _inputs(bundle, groups, seed))
+    return network
+
+
+def _inputs(bundle: Bundle, groups: list[ShapeGroup], seed: int) -> Iterator[Tensor]:
+    """(N,C,H,W): what the network of `bundle` reads of some samples."""
+    texture = torch.from_numpy(bundle.read_texture()).permute(2, 0, 1)[None]
+    for group, index in islice(batches(groups, BATCH, np.random.default_rng(seed)), BATCHES):
+        uv, covered, _ = load_batch(group, index)
+        yield read_texture(texture, uv, covered)
+
+
+def _constants(model: onnx.ModelProto) -> Iterator[tuple[str, tuple[F32, F32]]]:
+    """Name, kernel and bias of each convolution of `model` as the modules of a `UNet` have them."""
+    stored = {name: numpy_helper.to_array(tensor) for name, tensor in constants_of(model).items()}
+    made_by = {node.output[0]: node for node in model.graph.node if node.op_type == "DequantizeLinear"}
+
+    def real(name: str) -> F32:
+        integers, scale = (stored[part] for part in made_by[name].input[:2])
+        return np.asarray(integers * scale.reshape(-1, *[1] * (integers.ndim - 1)), np.float32)
+
+    for node in model.graph.node:
+        if node.op_type != "Conv":
+            continue
+        name, (kernel, bias) = module_of(node.name), (real(part) for part in node.input[1:3])
+        if name == FIRST:
+            half = len(kernel) // 2
+            yield "colour.0", (kernel[:half], bias[:half])
+            yield "mask.0", (kernel[half:], bias[half:])
+        elif name == SECOND:
+            half = kernel.shape[1] // 2
+            yield "colour.3", (kernel[:COLOURS, :half], bias[:COLOURS])
+            yield "mask.3", (kernel[COLOURS:, half:], bias[COLOURS:])
+        else:
+            yield name, (kernel, bias)
+
+
+def _measure_norms(network: UNet, inputs: Iterable[Tensor]) -> None:
+    """Give the norms of `network`, which change nothing but add their biases, the statistics of `inputs`; in place."""
+    norms = [norm for _, _, norm in convolutions(network) if norm is not None]
+    sums: dict[nn.Module, list[Tensor]] = {norm: [] for norm in norms}
+
+    def look(norm: nn.Module, given: Any) -> None:
+        x = given[0]
+        sums[norm].append(torch.stack((x.mean(dim=(0, 2, 3)), x.square().mean(dim=(0, 2, 3)))))
+
+    hooks = [norm.register_forward_pre_hook(look) for norm in norms]
+    with torch.no_grad():
+        for x in inputs:
+            network(x)
+        for hook in hooks:
+            hook.remove()
+        for norm in norms:
+            mean, square = torch.stack(sums[norm]).mean(dim=0)
+            assert norm.running_mean is not None and norm.running_var is not None
+            norm.running_mean.copy_(mean)
+            norm.running_var.copy_((square - mean.square()).clamp(min=0))
+            norm.weight.copy_(torch.sqrt(norm.running_var + norm.eps))
+            norm.bias.add_(mean)
+
+
+# Paints samples with the float network, to compare the integer network with.
+#
+# Rule: the texture is read at the UV image bilinearly, as in training.
+
+
+def float_painter(network: UNet, *levels: torch.Tensor) -> Painter:
+    """A painter that runs `network` on the texture of `levels` (1,C,S,S), (1,C,S/2,S/2), ..., where they are."""
+    network.eval()
+
+    def paint(_: Sample, uv: NDArray[np.float32]) -> U8:
+        image = torch.from_numpy(np.ascontiguousarray(uv))[None].to(levels[0].device)
+        with torch.no_grad():
+            output = network(read_levels(levels, image[..., :2], image[..., 2] > 0))
+        pixels: U8 = (output[0].permute(1, 2, 0) * 255).round().to(torch.uint8).cpu().numpy()
+        return pixels
+
+    return paint
+
+
+def float_painter_of(bundle: Bundle, weights: Path) -> Painter:
+    """A painter that runs the network of a file of `save_network` on the texture of `bundle`. Raises BadInputError."""
+    entry = bundle.manifest.network
+    network = load_network(UNet(norm=entry.norm, width=entry.width, channels=entry.channels, input_skip=True), weights)
+    return float_painter(network, *levels_of(bundle))

@@ -1,4 +1,4 @@
-"""`training.toml`: everything that decides what a training on a capture makes, in one file that the bundle keeps.
+"""`training.toml`: everything that decides what a training makes, in one file that the bundle keeps.
 
 Rule: no folders are in it; the same file, capture and machine give the same avatar on one thread of a CPU.
 """
@@ -9,37 +9,189 @@ import json
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError
 
 from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_text
 from trilane.scene.schema import Table
-from trilane.training.loss_weights import LossWeights
-from trilane.training.training_options import BatchOptions, OptimiserOptions, RegularisationOptions
-from trilane.training.usual_settings import with_usual
+
+# Options of a training, in tables of `training.toml`: the optimiser, how batches are made, what makes it harder.
+#
+# Rule: it needs no PyTorch, so that settings are read, and refused, where none is installed. The defaults change
+# nothing.
+
+Repeats = Annotated[int, Field(ge=1, le=100)]
+
+
+class OptimiserOptions(Table):
+    """`[optimiser]`.
+
+    `kind`: Adam (a decay of weights goes through its moments) or AdamW (it does not). `momentum`, `texture_momentum`:
+    Adam's first, of network and texture; 0 is off. `second_momentum`: Adam's second, of both. `clip_norm`: the norm of
+    all gradients is at most this; 0 is off. `clip_value`: each number of a gradient is at most this; 0 is off.
+    `batches_per_step`: whose mean gradient makes a step.
+    """
+
+    kind: Literal["adamw", "adam"] = "adamw"
+    momentum: float = Field(default=0.9, ge=0, lt=1)
+    texture_momentum: float = Field(default=0.9, ge=0, lt=1)
+    second_momentum: float = Field(default=0.99, ge=0, lt=1)
+    clip_norm: float = Field(default=1.0, ge=0, le=1e6)
+    clip_value: float = Field(default=0.0, ge=0, le=1e6)
+    batches_per_step: int = Field(default=1, ge=1, le=1000)
+
+
+class BatchOptions(Table):
+    """`[batches]`.
+
+    `sample_share`: of the samples, drawn once, that are used. `same_zoom`: the samples of a batch have about one zoom.
+    `full_body_statistics`: batch statistics come from batches of whole bodies alone, other batches use them.
+    `full_body_from`: share of the steps after which all samples show whole bodies. `repeats`: how often an epoch has a
+    sample of each band: far, full body, upper body, face, anywhere.
+    """
+
+    sample_share: float = Field(default=1.0, gt=0, le=1)
+    same_zoom: bool = False
+    full_body_statistics: bool = False
+    full_body_from: float = Field(default=1.0, ge=0, le=1)
+    repeats: tuple[Repeats, Repeats, Repeats, Repeats, Repeats] = (1, 1, 1, 1, 1)
+
+
+class RegularisationOptions(Table):
+    """`[regularisation]`: what is done to the avatar in each step.
+
+    `texture_noise`, `input_noise`: standard deviation of Gaussian noise on every texel, and on every number of the
+    network's input. `dropout`: probability of each channel to be 0 after each level of encoder and decoder.
+    """
+
+    texture_noise: float = Field(default=0.0, ge=0, le=1)
+    input_noise: float = Field(default=0.0, ge=0, le=1)
+    dropout: float = Field(default=0.0, ge=0, lt=1)
+
+
+# Weights of the terms of the loss, by name.
+#
+# Rule: it needs no PyTorch, so that settings are read, and refused, where none is installed.
+
+
+class LossWeights(Table):
+    """Of each term of `losses.loss_terms`; 0 leaves it out. The defaults are the default avatar's.
+
+    `perceptual` is by features of VGG-16 where their weights are given, else one minus MS-SSIM, as `structure` always
+    is. `adversarial` and `features` (feature matching) bring discriminators.
+    """
+
+    composite: float = Field(default=0.4, ge=0, le=1000)
+    decibels: float = Field(default=0.03, ge=0, le=1000)
+    colour: float = Field(default=0.1, ge=0, le=1000)
+    edges: float = Field(default=0.2, ge=0, le=1000)
+    coarse: float = Field(default=0.2, ge=0, le=1000)
+    mask: float = Field(default=0.1, ge=0, le=1000)
+    background: float = Field(default=0.05, ge=0, le=1000)
+    overlap: float = Field(default=0.1, ge=0, le=1000)
+    structure: float = Field(default=0.0, ge=0, le=1000)
+    perceptual: float = Field(default=0.0, ge=0, le=1000)
+    adversarial: float = Field(default=0.0, ge=0, le=1000)
+    features: float = Field(default=0.0, ge=0, le=1000)
+
+    @property
+    def judged(self) -> bool:
+        """Whether a term is about what discriminators find."""
+        return self.adversarial > 0 or self.features > 0
+
+    def by_name(self) -> dict[str, float]:
+        """The weights as `losses.total_loss` takes them."""
+        return {str(name): float(value) for name, value in self.model_dump().items()}
+
+
+# What is usual in a training where its settings do not say it: by its loss, by what it starts from, by its length.
+#
+# Rule: these are values of `TrainingSettings`, nothing else, and all of them stand in the `training.toml` of an avatar.
+
+#: Losses by name: the weights, and the settings that belong to them where a training does not say others.
+LOSSES: dict[str, dict[str, Any]] = {
+    "default": {"loss": {}},
+    "thesis": {
+        "loss": dict.fromkeys(LossWeights.model_fields, 0.0)
+        | {"composite": 25.0, "overlap": 25.0, "perceptual": 20.0, "adversarial": 1.0, "features": 1.0},
+        "network_rate": 1e-3,
+        "texture_rate": 1e-3,
+        "discriminator_rate": 1e-5,
+        "weight_decay": 0.0,
+        "optimiser": {"kind": "adam", "second_momentum": 0.999, "clip_norm": 0.0},
+    },
+}
+#: With a network that is trained already, and with a new one.
+TRAINED: dict[str, Any] = {"small_until": 0.0, "freeze_norms_at": 0.3}
+NEW: dict[str, Any] = {"small_until": 0.12, "freeze_norms_at": 0.6}
+#: Of a new network that has less than so many minutes: cheap steps at a high rate (docs/decisions/avatar-training.md).
+SHORT_MINUTES = 5.0
+SHORT: dict[str, Any] = {"batch": 2, "small_until": 0.8, "network_rate": 5e-3, "texture_rate": 1e-3}
+
+
+def with_usual(values: dict[str, Any], where: str | Path) -> dict[str, Any]:
+    """`values`, which stand at `where`, and what is usual with them; a loss that has a name by its weights.
+
+    Raises BadInputError for a name that no loss has.
+    """
+    start, name = values.get("start", "default"), values.get("loss")
+    usual = (NEW if start == "new" else TRAINED) | (_of_loss(name, where) if isinstance(name, str) else {})
+    if start == "new" and _is_short(values):
+        usual |= SHORT
+    given = {key: value for key, value in values.items() if key != "loss" or not isinstance(name, str)}
+    return usual | {key: _over(usual.get(key), value) for key, value in given.items()}
+
+
+def _of_loss(name: str, where: str | Path) -> dict[str, Any]:
+    if name not in LOSSES:
+        raise BadInputError(f"{where}: loss", repr(name), f"one of {', '.join(LOSSES)}", did_you_mean(name, LOSSES))
+    return LOSSES[name]
+
+
+def _is_short(values: dict[str, Any]) -> bool:
+    minutes = values.get("minutes")
+    return "steps" not in values and isinstance(minutes, int | float) and minutes < SHORT_MINUTES
+
+
+def _over(usual: Any, value: Any) -> Any:
+    """`value`; of a table, what it does not say is as `usual`."""
+    return usual | value if isinstance(usual, dict) and isinstance(value, dict) else value
+
 
 NAME = "training.toml"
 EXPECTED = "settings of a training (TOML): docs/captures.md"
-HEAD = "# How this avatar was trained; `trilane avatar train CAPTURE --config training.toml` trains one so again.\n"
+HEAD = "# How this avatar was trained; `trilane avatar train --config training.toml` trains one so again.\n"
 
 
 class TrainingSettings(Table):
-    """One training.
+    """Everything that decides what one training makes. A share is a share of the steps, 0 to 1.
 
-    `samples`: views of the capture's frames, drawn before training. `minutes`: of training, which `steps` are counted
-    for by measured time where they are not given. `batch`: samples of a step. `seed`: of all random numbers. `threads`:
-    of PyTorch. `device`: auto is a GPU that PyTorch can use, where there is one. `precision`: of the network while it
-    is trained. `start`: the network of the default avatar, or one of random weights. `width`: of a new one.
-    `network_rate`, `texture_rate`: peaks of the learning rates. `small_until`, `freeze_norms_at`: shares of the steps,
-    up to which only half-size samples are used, and after which batch statistics stay. `average_share`: of the steps so
-    far, time constant of the average that becomes the avatar. `discriminator_rate`: of learning, for discriminators; it
-    stays as it is. `noise_steps`: on activations, steps of a byte. `masked_texture`: texels that a batch does not show
-    keep their values and their momentum. `stand_off`: the body is drawn with clothes and hair raised by what masks
-    show. `norm`: of a new network. `mip_levels`: smaller levels of the texture that are learnt with it. `bytes_from`:
-    share of the steps after which weights and activations are rounded as the bundle's are, in float32. `vgg`: SHA-256
-    of VGG-16's weights that the perceptual loss is by.
+    `samples`: number of views of the person, drawn before training.
+    `minutes`: time of training; it becomes a number of `steps` by measurement where `steps` is absent.
+    `batch`: samples of a step.
+    `seed`: seed of all random numbers.
+    `threads`: threads of PyTorch, and processes that draw.
+    `device`: where PyTorch computes; auto is a GPU where there is one.
+    `precision`: floating-point format of the network while it is trained.
+    `look`: clothes of the default body, who is trained then; None for the person of a capture.
+    `start`: avatar whose network is trained further; new for random weights.
+    `texture`: avatar whose texture is trained further; new for the colours of the samples.
+    `width`: channels of a new network; 64 is full.
+    `network_rate`, `texture_rate`: peaks of the learning rates.
+    `discriminator_rate`: constant learning rate of the discriminators.
+    `weight_decay`: decay of kernels and texture.
+    `small_until`: share up to which only half-size samples are used.
+    `freeze_norms_at`: share after which batch statistics stay.
+    `average_share`: time constant of the average that becomes the avatar, as a share of the steps so far.
+    `noise_steps`: noise on activations, in steps of a byte.
+    `masked_texture`: whether texels that a batch does not show keep their values and their momentum.
+    `stand_off`: whether the body is drawn with clothes and hair raised to where masks end.
+    `norm`: normalisation of a new network.
+    `bytes_from`: share after which weights and activations are rounded to the bundle's bytes, in float32.
+    `mip_levels`: number of smaller levels of the texture that are learnt with it.
+    `vgg`: SHA-256 of the VGG-16 weights of the perceptual loss.
     """
 
     schema_: Literal[1] = Field(default=1, alias="schema")
@@ -51,7 +203,9 @@ class TrainingSettings(Table):
     threads: int = Field(default=1, ge=1, le=256)
     device: Literal["auto", "cpu", "cuda"] = "auto"
     precision: Literal["float32", "bfloat16"] = "float32"
-    start: Literal["default", "new"] = "default"
+    look: str | None = None
+    start: Literal["default", "hiker", "new"] = "default"
+    texture: Literal["default", "hiker", "new"] = "new"
     width: int = Field(default=16, ge=4, le=64)
     network_rate: float = Field(default=1.5e-3, gt=0, le=1)
     texture_rate: float = Field(default=4e-4, gt=0, le=1)
@@ -96,7 +250,7 @@ def parsed_settings(values: dict[str, Any], where: str | Path) -> TrainingSettin
 
 #: What does not go together: key, test, what is expected of the key, and another way.
 CLASHES: tuple[tuple[str, Callable[[TrainingSettings], bool], str, str], ...] = (
-    ("norm", lambda s: s.start == "default" and s.norm != "batch", "batch of the default network", 'or start = "new"'),
+    ("norm", lambda s: s.start != "new" and s.norm != "batch", "batch of a trained network", 'or start = "new"'),
     (
         "bytes_from",
         lambda s: s.bytes_from < 1 and s.norm in ("instance", "group"),

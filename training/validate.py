@@ -5,25 +5,119 @@ Rule: bundle, seeds, motions, size and runtimes alone decide the figures; the di
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
 
 from trilane import machine
+from trilane.arrays import F64, U8
 from trilane.avatars.bundle import Bundle, write_manifest
-from trilane.avatars.digests import digests_of, sha256_of, with_figures_digest
-from trilane.avatars.manifest import AT_THE_TOP, MadeWith, Validation
+from trilane.avatars.manifest import (
+    AT_THE_TOP,
+    BySize,
+    MadeWith,
+    Validation,
+    digests_of,
+    sha256_of,
+    with_figures_digest,
+)
+from trilane.avatars.network_file import reshaped
 from trilane.scene.motion.files import load_motion
 from trilane.scene.motion.motion import Motion
+from trilane.scene.planner import SIDES
 from trilane.scene.schema import AvatarSpec
-from trilane.stages.dsp.runtime import load_runtime
+from trilane.shapes import BUCKET_STEP, Shape
+from trilane.stages.dsp.runtime import RuntimeOptions, Session, load_runtime
+from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement, Quantisation
+from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 from trilane.stages.machine_facts import package_version
+from trilane.training.backgrounds import SIDE, scenes
 from trilane.training.clothing.looks import look_of
 from trilane.training.dataset import VALIDATION_SIZE, plan_validation
-from trilane.training.error_summary import SampleError, summary
-from trilane.training.evaluate import Evaluated, Painter, evaluate, integer_painter
-from trilane.training.sample_renderer import SampleRenderer
+from trilane.training.image_error import ImageError, SampleError, image_error, over, summary
+from trilane.training.sample_renderer import BAND_NAMES, Sample, SampleRenderer
+
+# Evaluates an avatar on held-out samples: every painter's picture of a sample beside the sample's ground truth.
+#
+# Rule: the integer network is evaluated as it runs in the pipeline: bytes of the packed pass, through a runtime.
+
+#: Paints the picture (h,w,4) of a sample and its UV image (h,w,3).
+Painter = Callable[[Any, NDArray[np.float32]], U8]
+
+
+class Drawn(Protocol):
+    """A renderer whose samples the packed pass can draw."""
+
+    ctx: Any
+    mesh: SkinnedMesh
+
+    def placed(self, sample: Any) -> tuple[F64, Placement]:
+        """The camera (4,4) of `sample`, and its body's pose, crop and place in the tensor."""
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """One sample.
+
+    `number`: of the sample among those that were given. `band`: its name. `truth`: the ground truth (h,w,4).
+    `pictures`, `errors`: of each painter, by its name.
+    """
+
+    number: int
+    band: str
+    truth: U8
+    pictures: dict[str, U8]
+    errors: dict[str, ImageError]
+
+
+def evaluate(
+    renderer: SampleRenderer, samples: Iterable[Sample], painters: Mapping[str, Painter]
+) -> Iterator[Evaluated]:
+    """Pictures and errors of `samples` by each of `painters`; samples that show no person are left out."""
+    for number, sample in enumerate(samples):
+        uv, truth = renderer.render(sample)
+        pictures = {name: paint(sample, uv) for name, paint in painters.items()}
+        errors = {name: image_error(picture, truth) for name, picture in pictures.items()}
+        known = {name: error for name, error in errors.items() if error is not None}
+        if known:
+            yield Evaluated(number, BAND_NAMES[sample.band], truth, pictures, known)
+
+
+def integer_painter(renderer: Drawn, bundle: Bundle, runtime: str, threads: int) -> Painter:
+    """A painter that runs the GPU unit's packed pass, then the integer network of `bundle` on `runtime`.
+
+    `renderer`: the body and its OpenGL context.
+    `bundle`: whose texture and network are read.
+    `runtime`: its name.
+    `threads`: of the runtime.
+    Raises BadInputError, MissingPartError.
+    """
+    network, texture, runs = bundle.read_network(), bundle.read_texture(), load_runtime(runtime)
+    quantisation = Quantisation(network.input.scale, network.input.zero_point)
+    levels = bundle.read_levels()
+    packed = PackedPass(renderer.ctx, texture.shape[2], quantisation, deferred=levels is None)
+    drawn = PackedAvatar(packed, renderer.mesh, texture, levels)
+    sessions: dict[Shape, Session] = {}
+
+    def paint(sample: Any, _: NDArray[np.float32]) -> U8:
+        shape = sample.crop.shape
+        tensor = np.empty((1, *shape, packed.channels), np.uint8)
+        drawn.draw(packed.begin(shape), *renderer.placed(sample))
+        packed.read_into(shape, tensor.reshape(-1))
+        if shape not in sessions:
+            sessions[shape] = runs.load(reshaped(network, *shape), RuntimeOptions(threads=threads))
+        picture = np.empty((1, *shape, 4), np.uint8)
+        sessions[shape].bind([tensor], [picture]).run()
+        pixels: U8 = picture[0]
+        return pixels
+
+    return paint
+
 
 BUILTIN_HELD_OUT = "builtin:walk-wave-turn"
 #: Seeds of a validation; the worst of 96 samples differs by several dB from seed to seed.
@@ -155,3 +249,114 @@ def _arranged(figures: Mapping[str, dict[str, Any]], runtimes: tuple[str, ...], 
 def _origin(motion: str) -> str:
     """What the motion is beyond its name: built in, or the digest of its file."""
     return "built in" if motion.startswith("builtin:") else f"sha256 {sha256_of([Path(motion)])}"
+
+
+# What smaller tensors cost an avatar: the same views, painted at several sizes of tensor.
+#
+# Rule: a smaller picture is enlarged as the composite does it, bilinearly in linear light with its colours multiplied
+# by alpha, to the size of the largest; there all are compared with the same ground truth.
+
+DIGITS = 2
+
+
+def sizes_of(own: Shape) -> list[Shape]:
+    """Of a network's own tensor and the planner's smaller ones, in whole steps; each once, the largest first."""
+    return list(dict.fromkeys((_stepped(own[0] * side), _stepped(own[1] * side)) for side in SIDES))
+
+
+def _stepped(side: float) -> int:
+    return max(int(side) // BUCKET_STEP, 1) * BUCKET_STEP
+
+
+def measure_sizes(
+    bundle: Bundle, plan: ValidationPlan, renderer: SampleRenderer, look: Callable[[], None] = lambda: None
+) -> BySize:
+    """The figures of `bundle` by size of tensor.
+
+    `plan`: of the validation; views of its first seed are painted on its first runtime.
+    `renderer`: of `trilane.training.validate.open_renderer`.
+    `look`: called for every view.
+    Raises BadInputError, MissingPartError.
+    """
+    own, *smaller = sizes_of(bundle.read_network().shape[1:3])
+    runtime, seed = plan.runtimes[0], plan.seeds[0]
+    paint = integer_painter(renderer, bundle, runtime, plan.threads)
+    size = f"{own[0]}x{own[1]}"
+    found: dict[Shape, list[float]] = {shape: [] for shape in (own, *smaller)}
+    for sample in plan_validation(renderer, plan.per_band, seed, held_out_motions(plan.held_out), size):
+        uv, truth = renderer.render(sample)
+        for shape, errors in found.items():
+            picture = paint(replace(sample, crop=replace(sample.crop, shape=shape)), uv)
+            error = image_error(picture if shape == own else enlarged(picture, own), truth)
+            if error is not None:
+                errors.append(error.psnr_db)
+        look()
+    psnr_db = {f"{h}x{w}": round(float(np.mean(errors)), DIGITS) for (h, w), errors in found.items()}
+    return BySize(
+        date=machine.here.now().date(),
+        runtime=runtime,
+        seed=seed,
+        per_band=plan.per_band,
+        held_out=tuple(Path(name).name for name in plan.held_out),
+        psnr_db=psnr_db,
+    )
+
+
+def with_sizes(validation: Validation, by_size: BySize) -> Validation:
+    """`validation` with what was just measured beside it."""
+    return with_figures_digest(validation.model_copy(update={"by_size": by_size}))
+
+
+def enlarged(picture: U8, shape: Shape) -> U8:
+    """`picture` (h,w,4) sRGB with straight alpha, enlarged to `shape` (height, width)."""
+    alpha = picture[..., 3:] / 255.0
+    planes = np.dstack([_linear(picture[..., :3] / 255.0) * alpha, alpha]).astype(np.float32)
+    larger = np.dstack([_resized(planes[..., plane], shape) for plane in range(4)])
+    colour = _encoded(larger[..., :3] / np.maximum(larger[..., 3:], 1e-6))
+    return np.asarray(np.round(np.clip(np.dstack([colour, larger[..., 3:]]), 0, 1) * 255), np.uint8)
+
+
+def _resized(plane: NDArray[np.float32], shape: Shape) -> NDArray[np.float32]:
+    return np.asarray(Image.fromarray(plane).resize(shape[::-1], Image.Resampling.BILINEAR))
+
+
+def _linear(encoded: NDArray[np.float64]) -> NDArray[np.float64]:
+    """IEC 61966-2-1."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def _encoded(linear: NDArray[np.floating]) -> NDArray[np.floating]:
+    """IEC 61966-2-1."""
+    return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+# Sheets that compare pictures: the ground truth and what each painter made of it, side by side.
+#
+# Rule: all pictures are before the same scenery, in which a transparent person shows, and none is enlarged.
+
+SHEET_CELL = (256, 192)
+
+
+def worst_sheet(samples: Sequence[Evaluated], painters: Sequence[str]) -> NDArray[np.uint8]:
+    """A row for each of `samples`: (height, width, 3) uint8."""
+    return np.vstack([_cells(sample, painters) for sample in samples])
+
+
+def _cells(sample: Evaluated, painters: Sequence[str]) -> NDArray[np.uint8]:
+    """The ground truth and the pictures of `painters` side by side."""
+    return side_by_side((sample.truth, *(sample.pictures[name] for name in painters)))
+
+
+def side_by_side(pictures: Iterable[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """`pictures` (h,w,4), each in a cell: (height, width, 3) uint8."""
+    return np.hstack([_cell(picture) for picture in pictures])
+
+
+def _cell(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    behind = scenes()[0][np.arange(picture.shape[0])[:, None] % SIDE, np.arange(picture.shape[1]) % SIDE]
+    image = Image.fromarray((over(picture, behind) * 255).round().astype(np.uint8))
+    image.thumbnail(SHEET_CELL[::-1], Image.Resampling.LANCZOS)
+    cell = np.full((*SHEET_CELL, 3), 128, np.uint8)
+    top, left = (SHEET_CELL[0] - image.height) // 2, (SHEET_CELL[1] - image.width) // 2
+    cell[top : top + image.height, left : left + image.width] = np.asarray(image)
+    return cell

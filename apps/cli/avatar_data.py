@@ -104,10 +104,17 @@ def check_data(
 
 def _checked(capture: Capture, picture: Path) -> dict[str, Any]:
     """What is said of `capture`, whose sheet is written to `picture`."""
-    from trilane.training.capture.body_raster import BodyRaster
-    from trilane.training.capture.check import bad_frames, check_frames, coverage_of
-    from trilane.training.capture.check_facts import capture_facts, require_fits
-    from trilane.training.capture.check_sheet import chosen, overlaid, sheet
+    from trilane.training.capture.capture_samples import BodyRaster
+    from trilane.training.capture.check import (
+        bad_frames,
+        capture_facts,
+        check_frames,
+        chosen,
+        coverage_of,
+        overlaid,
+        require_fits,
+        sheet,
+    )
     from trilane.writing import write_atomically
 
     raster, coverage = BodyRaster(capture.shaped), coverage_of(capture)

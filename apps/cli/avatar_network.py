@@ -26,7 +26,7 @@ from trilane.errors import BadInputError, MissingPartError
 if TYPE_CHECKING:
     import onnx
 
-    from trilane.avatars.integer_network import NetworkFile
+    from trilane.avatars.network_file import NetworkFile
     from trilane.shapes import Shape
 
 EPILOG_NETWORK = """\b
@@ -82,7 +82,7 @@ def split(
     `trilane run --split TENSOR=UNIT` runs the parts as stages of their own.
     """
     from trilane.avatars.bundle import load_bundle
-    from trilane.avatars.network_reshape import reshaped
+    from trilane.avatars.network_file import reshaped
 
     if bool(at) != (out is not None):
         raise BadInputError("options", "--at without --out" if at else "--out without --at", "both, or neither")
@@ -106,7 +106,7 @@ def export(
 ) -> None:
     """Compile an avatar's network for a Snapdragon, without one."""
     from trilane.avatars.bundle import load_bundle
-    from trilane.avatars.network_reshape import reshaped
+    from trilane.avatars.network_file import reshaped
     from trilane.stages.dsp.runtime import resolve
 
     if not qnn:
@@ -146,8 +146,7 @@ def _untrained(
     except ModuleNotFoundError as error:
         raise MissingPartError("exporting a network needs PyTorch", extra="train") from error
 
-    from trilane.training.network import UNet
-    from trilane.training.onnx_export import export_onnx
+    from trilane.training.network import UNet, export_onnx
 
     torch.manual_seed(seed)
     unet = UNet(encoder, norm, width, channels)

@@ -51,7 +51,7 @@ def quantise(
     """Quantise a float network to bytes in, bytes out, calibrated on real frames."""
     from trilane.apps.avatar_facts import network_facts
     from trilane.avatars.network_file import parse_network
-    from trilane.training.quantising.cross_layer_equalisation import equalised
+    from trilane.training.quantising.quantise import equalised
     from trilane.training.quantising.quantise import quantise as quantise_on
     from trilane.writing import write_bytes
 
@@ -108,7 +108,7 @@ def calibrations(
     rows = list(track(table_rows, "quantising", steps, console=console, disable=not console.is_terminal))
     line = recommendation(rows)
     if plot is not None:
-        from trilane.training.quantising.calibration_plot import plot_calibrations
+        from trilane.training.quantising.calibration_table import plot_calibrations
 
         plot_calibrations(rows, line, plot)
     if json:
@@ -139,7 +139,7 @@ def _material(source: Path | None, frames: Path | None, avatar: str | None) -> t
 
 def _write_layers(path: Path, model: Any, result: Any, frame: Any) -> Any:
     """The error of every layer on `frame`, also written to `path`."""
-    from trilane.training.quantising.layer_noise import layer_report
+    from trilane.training.quantising.noise_model import layer_report
     from trilane.writing import write_bytes
 
     with spinner("measuring every layer"):

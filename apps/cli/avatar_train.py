@@ -1,12 +1,12 @@
-"""`trilane avatar train`: an avatar of a person, from a capture.
+"""`trilane avatar train`: an avatar of a person, from a capture or from settings that say who it is.
 
-Rule: this file talks to the person; the work is done in `trilane.training.captured_avatar`.
+Rule: this file talks to the person; the work is done in `trilane.training.train`.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -23,28 +23,29 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
 
-    from trilane.training.event_log import EventLog
-
 EPILOG_TRAIN = """\b
 Examples:
   trilane avatar train my-capture --out mine --minutes 600
   trilane avatar train my-capture --out smoke --minutes 1 --samples 200
   trilane avatar train my-capture --out again --config mine/training.toml
+  trilane avatar train --out further --config avatars/default/training.toml
 """
 #: Where wheels of PyTorch lie that need no GPU; the plain package index has those for NVIDIA's.
 CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 #: Share of the newest loss in the one that is shown; seconds between two lines where no bar is drawn.
 NEWEST, LINE_S = 0.05, 30.0
-#: Folder of the log for TensorBoard, in the work folder.
-LOG = "tensorboard"
-#: Width of the default avatar's network.
+#: Folder of the log for TensorBoard, in the work folder; seconds after which what was logged is on the disk.
+LOG, FLUSH_S = "tensorboard", 10
+#: Width of the networks of `default` and `hiker`.
 DEFAULT_WIDTH = 16
 
 
 def train(
     ctx: typer.Context,
-    capture: Annotated[Path, typer.Argument(help="Folder of a capture; docs/captures.md says what is in it.")],
     out: Annotated[Path, typer.Option(help="Folder of the avatar to write.")],
+    capture: Annotated[
+        Path | None, typer.Argument(help="Folder of a capture (docs/captures.md); none if the settings have a look.")
+    ] = None,
     work: Annotated[
         Path | None, typer.Option(help="Folder of samples, state and sheets; OUT-work if none. Training goes on there.")
     ] = None,
@@ -57,7 +58,9 @@ def train(
     seed: Annotated[int, typer.Option(help="Of all random numbers.")] = 1,
     threads: Annotated[int, typer.Option(help="Of PyTorch, and processes that draw; only 1 repeats to the bit.")] = 1,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda; auto takes an NVIDIA GPU that is there.")] = "auto",
-    start: Annotated[str, typer.Option(help="default: the default avatar's network; new: random weights.")] = "default",
+    start: Annotated[
+        str, typer.Option(help="Network to train further, of avatar default or hiker; new: random weights.")
+    ] = "default",
     width: Annotated[int, typer.Option(help="Of a new network; 64 is full.")] = 16,
     loss: Annotated[
         str, typer.Option(help="default: the default avatar's; thesis: L1, Dice, perceptual, GAN.")
@@ -68,7 +71,7 @@ def train(
     tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Log the losses to WORK/tensorboard too.")] = False,
     json: JsonOption = False,
 ) -> None:
-    """Train an avatar on a capture and write it as a folder for `trilane run --avatar`.
+    """Train an avatar of a capture, or of the default body in a look, and write a folder for `trilane run --avatar`.
 
     A command that was ended goes on where it was when it is given again.
     """
@@ -82,19 +85,18 @@ def train(
     }
     values = read_settings(config).model_dump(by_alias=True, exclude_none=True) if config is not None else {}
     asked = parsed_settings(values | options, "options" if config is None else config)
-    if asked.start == "default" and asked.width != DEFAULT_WIDTH:
-        raise BadInputError("--width", str(asked.width), f"{DEFAULT_WIDTH} of the default network", "or --start new")
+    if asked.start != "new" and asked.width != DEFAULT_WIDTH:
+        raise BadInputError("--width", str(asked.width), f"{DEFAULT_WIDTH} of a trained network", "or --start new")
     _require_torch()
-    from trilane.training.captured_avatar import Places, train_on_capture
-    from trilane.training.event_log import EventLog, require_tensorboard
+    from trilane.training.train import Places, train_avatar
 
-    if tensorboard:
-        require_tensorboard()
+    if tensorboard and not machine.here.has_package("tensorboard"):
+        raise MissingPartError("a log for TensorBoard needs the package tensorboard", extra="tensorboard")
     work = out.parent / f"{out.name}-work" if work is None else work
     places = Places(capture, out, work, out.name, vgg)
     log = EventLog(work / LOG) if tensorboard else None
     with stdout_kept(), _shown(log) as listener:
-        facts = train_on_capture(places, asked, listener)
+        facts = train_avatar(places, asked, listener)
     print_facts(facts, json)
 
 
@@ -124,7 +126,7 @@ def _shown(log: EventLog | None) -> Iterator[_Shown]:
 
 
 class _Shown:
-    """Shows what a training says; a `captured_avatar.Listener`."""
+    """Shows what a training says; a `train.Listener`."""
 
     def __init__(self, console: Console, progress: Progress, log: EventLog | None) -> None:
         self._console, self._progress, self._log = console, progress, log
@@ -153,3 +155,34 @@ class _Shown:
         self._line = now
         left_s = (now - self._start) / max(1, step - self._first_step) * (total - step)
         self.say(f"step {step} of {total}: {shown}" + (f", {left_s:.0f} s left" if step > self._first_step else ""))
+
+
+class EventLog:
+    """The losses of a training as a log that TensorBoard shows, in `folder`; the first step makes its file.
+
+    A training that goes on takes back what was logged after its state.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._writer: Any = None
+
+    def write(self, step: int, terms: Mapping[str, float], loss: float) -> None:
+        """The `terms` of the loss at `step`, before weighting, as `terms/NAME`, and their weighted sum, as `loss`."""
+        if self._writer is None:
+            self._writer = _writer(self._folder, step)
+        self._writer.add_scalar("loss", loss, step)
+        for name, value in terms.items():
+            self._writer.add_scalar(f"terms/{name}", value, step)
+
+    def close(self) -> None:
+        """Write what is left."""
+        if self._writer is not None:
+            self._writer.close()
+
+
+def _writer(folder: Path, step: int) -> Any:
+    """A writer, for which everything in `folder` from `step` on does not count."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    return SummaryWriter(str(folder), purge_step=step, flush_secs=FLUSH_S)

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 
     from trilane.avatars.bundle import Bundle
     from trilane.avatars.manifest import Validation
-    from trilane.training.evaluate import Evaluated
-    from trilane.training.validate import FloatNetwork, ValidationPlan
+    from trilane.training.validate import Evaluated, FloatNetwork, ValidationPlan
 
 EPILOG_VALIDATE = """\b
 Examples:
@@ -153,7 +152,6 @@ def _add_sizes(bundle: Bundle, plan: ValidationPlan) -> Bundle:
     from rich.progress import Progress
 
     from trilane.avatars.validation import VALIDATE, name_of, refused
-    from trilane.training import size_figures
     from trilane.training import validate as work
 
     validation = bundle.manifest.validation
@@ -165,8 +163,8 @@ def _add_sizes(bundle: Bundle, plan: ValidationPlan) -> Bundle:
     with stdout_kept(), Progress(console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task("painting at several sizes", total=plan.per_band * len(BANDS))
         renderer = work.open_renderer(bundle, plan.threads)
-        by_size = size_figures.measure_sizes(bundle, plan, renderer, lambda: progress.advance(task))
-    return work.revalidate(bundle, size_figures.with_sizes(validation, by_size))
+        by_size = work.measure_sizes(bundle, plan, renderer, lambda: progress.advance(task))
+    return work.revalidate(bundle, work.with_sizes(validation, by_size))
 
 
 def _psnr_db(sample: Evaluated, plan: ValidationPlan) -> float:
@@ -176,7 +174,7 @@ def _psnr_db(sample: Evaluated, plan: ValidationPlan) -> float:
 def _float_network(bundle: Bundle, weights: Path) -> FloatNetwork:
     """The network of the file `weights`. Raises BadInputError, MissingPartError."""
     try:
-        from trilane.training.float_painter import float_painter_of
+        from trilane.training.trainable_avatar import float_painter_of
     except ImportError as error:
         raise MissingPartError(f"the float network needs {error.name}", extra="train") from None
     from trilane.bench.lib.full_network import weights_name
@@ -188,7 +186,7 @@ def _float_network(bundle: Bundle, weights: Path) -> FloatNetwork:
 def _write_sheet(path: Path, samples: list[Evaluated], runtime: str) -> None:
     from PIL import Image
 
-    from trilane.training.comparison_sheet import worst_sheet
+    from trilane.training.validate import worst_sheet
     from trilane.writing import write_atomically
 
     with write_atomically(path) as draft:

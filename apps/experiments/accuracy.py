@@ -14,8 +14,7 @@ import numpy as np
 
 from trilane.apps.experiments.drawn_tensors import DrawnTensors
 from trilane.arrays import U8
-from trilane.avatars.integer_network import NetworkFile
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import NetworkFile, reshaped
 from trilane.errors import BadInputError
 from trilane.figure_sources import MEASURED
 from trilane.shapes import Shape

@@ -12,8 +12,7 @@ import onnx
 
 from trilane.arrays import F32
 from trilane.avatars.bundle import load_bundle
-from trilane.avatars.integer_network import NetworkFile
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import NetworkFile, reshaped
 from trilane.bench.lib.full_network import float_weights
 from trilane.errors import BadInputError, MissingPartError
 from trilane.stages.avatar_assets import distinct, with_network
@@ -65,7 +64,7 @@ def drawn_material(avatar: str, views: int, held_out: int) -> tuple[onnx.ModelPr
         remedy = "`trilane avatar validate --float-network` notes which it is"
         raise BadInputError(bundle.folder, "no float network that its manifest names", "one to quantise", remedy)
     try:
-        from trilane.training.calibration_views import float_model, held_out_views, training_views
+        from trilane.training.make_bundle import float_model, held_out_views, training_views
     except ImportError as error:
         raise MissingPartError(f"quantising an avatar anew needs {error.name}", extra="train") from None
     from trilane.training.validate import open_renderer

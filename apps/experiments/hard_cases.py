@@ -18,8 +18,13 @@ import onnx
 from trilane.apps.experiments.hard_networks import INPUTS, NETWORKS, calibration_frames, case_input, float_network
 from trilane.arrays import F32, U8
 from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
-from trilane.training.quantising.ideal_noise import ideal_noise_model
-from trilane.training.quantising.noise_model import NoiseModel, float_picture, noise_model, predicted_bound
+from trilane.training.quantising.noise_model import (
+    NoiseModel,
+    float_picture,
+    ideal_noise_model,
+    noise_model,
+    predicted_bound,
+)
 from trilane.training.quantising.quantise import Quantised, quantise
 
 UNIT = "mean step of 1/255"

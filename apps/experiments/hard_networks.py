@@ -99,8 +99,7 @@ def float_network(name: str) -> onnx.ModelProto:
         import torch
     except ImportError:
         raise MissingPartError("hard cases need PyTorch", extra="train") from None
-    from trilane.training.network import UNet
-    from trilane.training.onnx_export import export_onnx
+    from trilane.training.network import UNet, export_onnx
 
     norm, outlier = NETWORKS[name]
     generator = torch.Generator().manual_seed(NETWORK_SEED)

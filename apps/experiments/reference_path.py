@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from trilane.apps.experiments.causes import NOTHING, Cause, Causes, require_complete
 from trilane.apps.experiments.run_body import RunBody
 from trilane.arrays import F32, F64, U8, Mask
-from trilane.avatars.integer_network import Affine, NetworkFile
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import Affine, NetworkFile, reshaped
 from trilane.bench.lib.cast import Cast, Seen
 from trilane.bench.lib.float_raster import quantise
 from trilane.bench.lib.full_network import Paint, as_written, float_network

@@ -18,9 +18,8 @@ from onnx import helper, numpy_helper
 from trilane import machine
 from trilane.arrays import F32, F64
 from trilane.avatars.bundle import Bundle
-from trilane.avatars.digests import sha256_of
-from trilane.avatars.integer_network import NetworkFile, constants_of
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.manifest import sha256_of
+from trilane.avatars.network_file import NetworkFile, constants_of, reshaped
 from trilane.errors import MissingPartError
 from trilane.shapes import Shape
 
@@ -73,7 +72,7 @@ def trained(bundle: Bundle, weights: Path) -> Paint:
     import torch
 
     from trilane.training.network import UNet
-    from trilane.training.weights_file import load_network
+    from trilane.training.trainable_avatar import load_network
 
     entry = bundle.manifest.network
     untrained = UNet(entry.encoder, entry.norm, entry.width, entry.channels, input_skip=True)

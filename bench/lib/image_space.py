@@ -16,8 +16,7 @@ import numpy as np
 
 from trilane.arrays import F32, F64, U8, Ints, Mask
 from trilane.shapes import Shape
-from trilane.training.capture.capture_samples import CaptureRenderer, CaptureSample
-from trilane.training.capture.image_map import moved, resampled
+from trilane.training.capture.capture_samples import CaptureRenderer, CaptureSample, moved, resampled
 from trilane.training.dataset import VALIDATION_SIZE
 from trilane.training.first_texture import LARGEST_SPAN
 

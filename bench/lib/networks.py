@@ -12,8 +12,7 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from trilane.avatars.integer_network import NetworkFile
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import NetworkFile, reshaped
 from trilane.errors import MissingPartError
 from trilane.hw_profiles.network_work import graph_facts
 from trilane.training.quantising.quantise import quantise
@@ -50,7 +49,7 @@ def untrained(
     Raises MissingPartError without PyTorch, BadInputError for wrong settings.
     """
     network, torch = _unet(encoder, norm, width, channels)
-    from trilane.training.onnx_export import export_onnx
+    from trilane.training.network import export_onnx
 
     small = export_onnx(network, CALIBRATION_SIDE, CALIBRATION_SIDE)
     rng = np.random.default_rng(0)
@@ -64,7 +63,7 @@ def untrained(
 
 def untrained_float(encoder: str, norm: str, width: int, size: tuple[int, int], channels: int = 16) -> onnx.ModelProto:
     """The network that `untrained` quantises, in float: (1, C, H, W) float32. Parameters and errors as there."""
-    from trilane.training.onnx_export import export_onnx
+    from trilane.training.network import export_onnx
 
     return export_onnx(_unet(encoder, norm, width, channels)[0], *size)
 

@@ -14,11 +14,10 @@ from trilane.avatars.bundle import BUILT_IN, bundle_folder
 from trilane.bench.lib.cast import Cast
 from trilane.bench.lib.layers import Layer, blended, premultiplied
 from trilane.stages.avatar_assets import AvatarData
-from trilane.training.body_arrays import body_arrays
 from trilane.training.clothing.clothed_body import ClothedBody
-from trilane.training.clothing.landmarks import find_landmarks
 from trilane.training.clothing.layers import clothing_layers
-from trilane.training.clothing.looks import look_of
+from trilane.training.clothing.looks import find_landmarks, look_of
+from trilane.training.surface import body_arrays
 
 #: Of the clothed body, along each side of a pixel.
 SAMPLES = 4

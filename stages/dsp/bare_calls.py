@@ -15,8 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.avatars.integer_network import NetworkFile
-from trilane.avatars.network_file import parse_network, read_network
+from trilane.avatars.network_file import NetworkFile, parse_network, read_network
 from trilane.cache import cached_arrays
 from trilane.errors import BadInputError
 from trilane.pipeline.description import Pipeline, PipelineStage, UnitSettings

@@ -13,7 +13,7 @@ from functools import cache
 import onnxruntime
 from onnx import TensorProto, helper
 
-from trilane.avatars.integer_network import IntegerNetwork, check_integer_layers
+from trilane.avatars.network_file import IntegerNetwork, check_integer_layers
 from trilane.errors import BadInputError, MissingPartError
 from trilane.stages.dsp.ort import ERRORS_ONLY, LOAD_ERRORS, OrtSession
 from trilane.stages.dsp.runtime import RuntimeOptions, cuda_line

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from trilane import machine
 from trilane.arrays import U8
-from trilane.avatars.integer_network import NetworkFile, constants_of
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import NetworkFile, constants_of, reshaped
 from trilane.avatars.network_split import NetworkPart, Shapes, split
 from trilane.cache import Arrays, cached_arrays
 from trilane.errors import BadInputError

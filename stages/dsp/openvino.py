@@ -13,7 +13,7 @@ from functools import cache
 from typing import Any
 
 from trilane.arrays import U8
-from trilane.avatars.integer_network import IntegerNetwork
+from trilane.avatars.network_file import IntegerNetwork
 from trilane.cache import cache_dir
 from trilane.errors import BadInputError
 from trilane.stages.dsp.runtime import RuntimeOptions, quiet_openvino

@@ -15,7 +15,7 @@ import onnxruntime
 from onnxruntime.capi import onnxruntime_pybind11_state as state
 
 from trilane.arrays import U8
-from trilane.avatars.integer_network import IntegerNetwork, node_name
+from trilane.avatars.network_file import IntegerNetwork, node_name
 from trilane.errors import BadInputError
 from trilane.stages.dsp.runtime import RuntimeOptions
 

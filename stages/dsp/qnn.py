@@ -16,7 +16,7 @@ import onnxruntime
 import onnxruntime_qnn
 
 from trilane import machine
-from trilane.avatars.integer_network import IntegerNetwork, NetworkFile, check_integer_layers
+from trilane.avatars.network_file import IntegerNetwork, NetworkFile, check_integer_layers
 from trilane.cache import cache_dir
 from trilane.errors import BadInputError, MissingPartError
 from trilane.stages.dsp.ort import ERRORS_ONLY, LOAD_ERRORS, OrtSession

@@ -14,7 +14,7 @@ from typing import Any, Protocol, cast
 
 from trilane import machine
 from trilane.arrays import U8
-from trilane.avatars.integer_network import IntegerNetwork
+from trilane.avatars.network_file import IntegerNetwork
 from trilane.errors import BadInputError, MissingPartError, install_line, package_line, pip
 
 X86 = ("x86_64", "AMD64")

@@ -15,7 +15,7 @@ import moderngl
 import numpy as np
 
 from trilane.arrays import F32, U8, Floats
-from trilane.avatars.texture_levels import split_levels
+from trilane.avatars.bundle import split_levels
 from trilane.errors import BadInputError
 from trilane.shapes import Shape
 from trilane.stages.gpu import opengl

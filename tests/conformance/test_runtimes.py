@@ -14,8 +14,7 @@ import pytest
 from onnx import helper, numpy_helper
 from onnx.reference import ReferenceEvaluator
 
-from trilane.avatars.network_checks import check_network
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import check_network, reshaped
 from trilane.avatars.network_split import cuts, split
 from trilane.errors import BadInputError, MissingPartError
 from trilane.stages.dsp import runtime

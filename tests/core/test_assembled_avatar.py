@@ -15,10 +15,8 @@ import pytest
 from onnx import numpy_helper
 
 from trilane.apps.assembled_avatar import Parts, assemble
-from trilane.avatars.bundle import OFFSETS, bundle_folder, load_bundle
-from trilane.avatars.digests import digests_of, with_figures_digest
-from trilane.avatars.manifest import CAPTURED, UNTRAINED, Validation
-from trilane.avatars.offsets import save_offsets
+from trilane.avatars.bundle import OFFSETS, bundle_folder, load_bundle, save_offsets
+from trilane.avatars.manifest import CAPTURED, UNTRAINED, Validation, digests_of, with_figures_digest
 from trilane.errors import BadInputError
 from trilane.training.clothing.looks import LOOKS, look_of
 from trilane.training.quantising.quantise import quantise

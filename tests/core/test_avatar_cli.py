@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from trilane.apps.cli.avatar import app
 from trilane.avatars.network_file import read_network
 from trilane.errors import BadInputError
-from trilane.training.quantising.cross_layer_equalisation import equalised
+from trilane.training.quantising.quantise import equalised
 
 runner = CliRunner()
 

@@ -167,12 +167,12 @@ def test_without_loadgen_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_untrained_network_is_what_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """Work by PyTorch's modules at 64 x 64, scaled to the tensor; five frames to calibrate, the same every time."""
     torch = pytest.importorskip("torch")
-    from trilane.training import onnx_export
+    from trilane.training import network
     from trilane.training.network import UNet
 
     exported: list[Any] = []
     asked: list[Any] = []
-    monkeypatch.setattr(onnx_export, "export_onnx", lambda network, *side: exported.append((network, side)) or "small")
+    monkeypatch.setattr(network, "export_onnx", lambda network, *side: exported.append((network, side)) or "small")
     quantised = SimpleNamespace(network="quantised")
     monkeypatch.setattr(networks, "quantise", lambda *what: asked.append(what) or quantised)
     monkeypatch.setattr(networks, "reshaped", lambda *what: asked.append(what) or "integer")

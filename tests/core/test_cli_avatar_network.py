@@ -16,7 +16,7 @@ from trilane.apps.avatar_facts import bundle_facts
 from trilane.apps.cli import avatar_network
 from trilane.avatars import network_split
 from trilane.avatars.bundle import load_bundle
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import reshaped
 from trilane.avatars.network_split import Cut
 from trilane.body.body import load_body
 from trilane.hw_profiles.network_work import graph_facts
@@ -74,9 +74,8 @@ class Untrained:
         self.model = onnx.ModelProto(ir_version=8)
         torch = module("torch", manual_seed=lambda seed: self.asked.append(("seed", seed)))
         monkeypatch.setitem(sys.modules, "torch", torch)
-        monkeypatch.setitem(sys.modules, "trilane.training.network", module("network", UNet=self._unet))
-        export = module("onnx_export", export_onnx=self._export)
-        monkeypatch.setitem(sys.modules, "trilane.training.onnx_export", export)
+        network = module("network", UNet=self._unet, export_onnx=self._export)
+        monkeypatch.setitem(sys.modules, "trilane.training.network", network)
         monkeypatch.setattr("trilane.hw_profiles.network_work.graph_facts", lambda model: {"gmac": 1.5, "of": model})
 
     def _unet(self, *arguments: Any) -> Any:

@@ -15,24 +15,22 @@ import trilane.training
 from trilane import machine
 from trilane.apps.cli import avatar_train
 from trilane.errors import BadInputError
-from trilane.training import event_log
-from trilane.training.training_options import OptimiserOptions
-from trilane.training.training_settings import TrainingSettings, parsed_settings, settings_text
+from trilane.training.training_settings import OptimiserOptions, TrainingSettings, parsed_settings, settings_text
 
 Command = Callable[..., tuple[str, str]]
 
 
 class Training(ModuleType):
-    """In place of `captured_avatar`: notes what it is asked, and tells the listener what a training would."""
+    """In place of `train`: notes what it is asked, and tells the listener what a training would."""
 
     def __init__(self) -> None:
-        super().__init__("trilane.training.captured_avatar")
+        super().__init__("trilane.training.train")
         self.asked: list[Any] = []
 
     def Places(self, *places: Any) -> Any:  # noqa: N802
         return places
 
-    def train_on_capture(self, places: Any, settings: TrainingSettings, listener: Any) -> dict[str, Any]:
+    def train_avatar(self, places: Any, settings: TrainingSettings, listener: Any) -> dict[str, Any]:
         self.asked.append((places, settings))
         listener.say("3 steps: about 2.0 min")
         assert list(listener.track("drawing", iter([4, 5]), 2)) == [4, 5]
@@ -45,7 +43,7 @@ class Training(ModuleType):
 def training(monkeypatch: pytest.MonkeyPatch) -> Training:
     double = Training()
     monkeypatch.setitem(sys.modules, double.__name__, double)
-    monkeypatch.setattr(trilane.training, "captured_avatar", double, raising=False)
+    monkeypatch.setattr(trilane.training, "train", double, raising=False)
     monkeypatch.setattr(machine.here, "has_package", lambda _: True)
     return double
 
@@ -127,7 +125,7 @@ def test_a_log_is_written_beside_what_is_shown(
         def close(self) -> None:
             made.append("closed")
 
-    monkeypatch.setattr(event_log, "EventLog", Log)
+    monkeypatch.setattr(avatar_train, "EventLog", Log)
     monkeypatch.setattr(machine.here, "has_package", lambda _: True)
     words = ("avatar", "train", "their", "--out", tmp_path / "mine", "--work", tmp_path / "work")
     command(*words)
@@ -139,7 +137,7 @@ def test_a_log_is_written_beside_what_is_shown(
     def refused(*_: Any) -> None:
         raise BadInputError("capture", "nothing", "frames")
 
-    monkeypatch.setattr(training, "train_on_capture", refused)
+    monkeypatch.setattr(training, "train_avatar", refused)
     command(*words, "--tensorboard", code=2)
     assert made[5:] == [tmp_path / "work" / "tensorboard", "closed"]
     monkeypatch.setattr(machine.here, "has_package", lambda name: name != "tensorboard")
@@ -164,9 +162,9 @@ def test_without_pytorch_the_lines_that_install_it_are_said(
     ("words", "said"),
     [
         (("--samples", 2), "options: samples: found 2, expected greater than or equal to 8"),
-        (("--start", "old"), "options: start: found 'old', expected 'default' or 'new'"),
+        (("--start", "old"), "options: start: found 'old', expected 'default', 'hiker' or 'new'"),
         (("--loss", "tesis"), "options: loss: found 'tesis', expected one of default, thesis; did you mean 'thesis'"),
-        (("--width", 8), "--width: found 8, expected 16 of the default network; or --start new"),
+        (("--width", 8), "--width: found 8, expected 16 of a trained network; or --start new"),
         (("--config", "nothing.toml"), "nothing.toml: found no such file"),
     ],
 )

@@ -23,17 +23,10 @@ from trilane.apps import made
 from trilane.apps.cli import avatar_quantise, avatar_validate
 from trilane.apps.experiments import calibrated_network
 from trilane.avatars.bundle import load_bundle, write_manifest
-from trilane.avatars.digests import sha256_of
-from trilane.avatars.manifest import Validation
+from trilane.avatars.manifest import Validation, sha256_of
 from trilane.stages.dsp import runtime
 from trilane.testing.validated import validated
-from trilane.training.quantising import (
-    calibration_plot,
-    calibration_table,
-    cross_layer_equalisation,
-    layer_noise,
-    quantise,
-)
+from trilane.training.quantising import calibration_table, noise_model, quantise
 
 Command = Callable[..., tuple[str, str]]
 
@@ -51,9 +44,9 @@ class Quantising:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, network: Any) -> None:
         self.asked: list[Any] = []
         self.result = SimpleNamespace(network=network, facts={"method": "told"})
-        monkeypatch.setattr(cross_layer_equalisation, "equalised", lambda model: ("equalised", type(model).__name__))
+        monkeypatch.setattr(quantise, "equalised", lambda model: ("equalised", type(model).__name__))
         monkeypatch.setattr(quantise, "quantise", self._quantise)
-        monkeypatch.setattr(layer_noise, "layer_report", self._layers)
+        monkeypatch.setattr(noise_model, "layer_report", self._layers)
 
     def _quantise(self, model: Any, frames: Any, *settings: Any) -> Any:
         kind = model if isinstance(model, tuple) else type(model).__name__
@@ -149,7 +142,7 @@ def test_an_avatar_brings_its_network_and_views(
     table = lambda *words, **named: asked.append((words, named)) or iter(CALIBRATED)  # noqa: E731
     monkeypatch.setattr(calibration_table, "calibration_table", table)
     plots: list[Any] = []
-    monkeypatch.setattr(calibration_plot, "plot_calibrations", lambda *words: plots.append(words))
+    monkeypatch.setattr(calibration_table, "plot_calibrations", lambda *words: plots.append(words))
     words = ("avatar", "calibrations", "--avatar", "default", "--method", "minmax", "--json")
     pytest.importorskip("matplotlib")
     document = json.loads(command(*words, "--plot", tmp_path / "c.png")[0])
@@ -174,18 +167,15 @@ class Work:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.asked: list[Any] = []
         self.plan: Any = None
-        names = ("SEEDS", "BUILTIN_HELD_OUT", "open_renderer", "validate", "revalidate")
+        names = ("SEEDS", "BUILTIN_HELD_OUT", "open_renderer", "validate", "revalidate", "worst_sheet")
         fake = ModuleType("trilane.training.validate")
         fake.__dict__.update({name: getattr(self, name) for name in names})
         fake.__dict__.update({"ValidationPlan": self._make_plan, "FloatNetwork": lambda *said: ("float", *said)})
         monkeypatch.setattr(trilane.training, "validate", fake, raising=False)
         monkeypatch.setitem(sys.modules, "trilane.training.validate", fake)
-        painter = ModuleType("float_painter")
+        painter = ModuleType("trainable_avatar")
         painter.__dict__["float_painter_of"] = lambda bundle, weights: ("painter", bundle.manifest.name, weights.name)
-        monkeypatch.setitem(sys.modules, "trilane.training.float_painter", painter)
-        sheet = ModuleType("comparison_sheet")
-        sheet.__dict__["worst_sheet"] = self._sheet
-        monkeypatch.setitem(sys.modules, "trilane.training.comparison_sheet", sheet)
+        monkeypatch.setitem(sys.modules, "trilane.training.trainable_avatar", painter)
         monkeypatch.setattr(made, "made_facts", lambda words: {"revision": f"r{len(words)}", "modified": True})
 
     def _make_plan(self, **values: Any) -> Any:
@@ -209,7 +199,7 @@ class Work:
         assert validation == "the validation"
         return load_bundle(bundle.folder)
 
-    def _sheet(self, samples: list[Any], painters: Any) -> Any:
+    def worst_sheet(self, samples: list[Any], painters: Any) -> Any:
         self.asked.append(([sample.of for sample in samples], painters))
         return np.full((2, 3, 3), 9, np.uint8)
 
@@ -278,22 +268,20 @@ def test_validate_with_every_option(work: Work, tiny_bundle: Path, tmp_path: Pat
 
 
 def test_sizes_are_added_to_figures_that_are_the_avatars_own(
-    work: Work, tiny_bundle: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+    work: Work, tiny_bundle: Path, tmp_path: Path, command: Command
 ) -> None:
     """Measured for an avatar that was validated as it is, and for no other; nothing else is validated anew."""
     own = shutil.copytree(tiny_bundle, tmp_path / "own")
     words = ("avatar", "validate", own, "--sizes", "--json")
-    sizes = ModuleType("size_figures")
-    sizes.__dict__["measure_sizes"] = lambda bundle, plan, renderer, look: (
+    module = sys.modules["trilane.training.validate"]
+    module.__dict__["measure_sizes"] = lambda bundle, plan, renderer, look: (
         bundle.manifest.name,
         plan is work.plan,
         renderer,
         look() or "looked",
     )
     added: list[Any] = []
-    sizes.__dict__["with_sizes"] = lambda before, by_size: added.append((before, by_size)) or "the validation"
-    monkeypatch.setattr(trilane.training, "size_figures", sizes, raising=False)
-    monkeypatch.setitem(sys.modules, "trilane.training.size_figures", sizes)
+    module.__dict__["with_sizes"] = lambda before, by_size: added.append((before, by_size)) or "the validation"
     refused = command(*words, code=2)[1]
     assert "no validation" in refused and f"`trilane avatar validate {own}` comes first" in refused
     write_manifest(own, validated(load_bundle(own)))
@@ -327,7 +315,7 @@ def test_what_validate_refuses(
     ):
         assert command(*words, option, value, code=2)[1] == f"error: {option}: found '{value}', expected {expected}\n"
     assert work.plan is None
-    for name, said in (("float_painter", "the float network needs"), ("validate", "validating needs")):
+    for name, said in (("trainable_avatar", "the float network needs"), ("validate", "validating needs")):
         monkeypatch.setitem(sys.modules, f"trilane.training.{name}", None)
         monkeypatch.delattr(trilane.training, name, raising=False)
         _, err = command(*words, "--float-network", "w.npz", code=3)

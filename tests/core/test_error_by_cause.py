@@ -20,8 +20,7 @@ from trilane.apps.experiments.reference_path import ReferenceFrame
 from trilane.apps.experiments.run_body import RunBody
 from trilane.arrays import F64
 from trilane.avatars.bundle import bundle_folder, load_bundle
-from trilane.avatars.network_checks import check_network
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import check_network, reshaped
 from trilane.bench.lib.full_network import as_written
 from trilane.bench.lib.layers import Box, Layer
 from trilane.body.body import load_body

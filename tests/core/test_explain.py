@@ -20,7 +20,7 @@ from trilane.apps.plan_cost import ALWAYS, PIPELINED, CostModel, least_frame_ms
 from trilane.apps.plan_picture import BODY, GROUND, MESH, TENSOR, _tile, draw_plan
 from trilane.apps.scene_plan import PlannedFrame, ScenePlan, phases
 from trilane.avatars.bundle import load_bundle
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import reshaped
 from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import DETAILS, CpuSkinner
 from trilane.errors import BadInputError

@@ -13,8 +13,7 @@ from onnx import numpy_helper
 
 from trilane.arrays import F64
 from trilane.avatars.bundle import bundle_folder, load_bundle
-from trilane.avatars.network_checks import check_network
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import check_network, reshaped
 from trilane.bench.lib import full_network
 from trilane.bench.lib.full_body import FullBody
 from trilane.bench.lib.full_picture import SAMPLES, supersampled

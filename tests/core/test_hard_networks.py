@@ -100,9 +100,9 @@ def test_a_network_without_pytorch(monkeypatch: pytest.MonkeyPatch) -> None:
 def torch(monkeypatch: pytest.MonkeyPatch) -> Any:
     torch = pytest.importorskip("torch")
     torch.set_num_threads(1)
-    from trilane.training import onnx_export
+    from trilane.training import network
 
-    monkeypatch.setattr(onnx_export, "export_onnx", lambda network, *shape: (network, shape))
+    monkeypatch.setattr(network, "export_onnx", lambda network, *shape: (network, shape))
     return torch
 
 

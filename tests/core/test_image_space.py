@@ -12,7 +12,7 @@ pytest.importorskip("skimage")
 
 from trilane.bench.lib import image_space
 from trilane.bench.lib.image_space import ImageSpaceRenderer, resampled_uv
-from trilane.training.capture.image_map import Augmentation, image_map, moved
+from trilane.training.capture.capture_samples import Augmentation, image_map, moved
 
 SHAPE = (24, 32)
 

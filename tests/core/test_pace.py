@@ -13,7 +13,7 @@ import pytest
 from trilane.apps import pace as module
 from trilane.apps.pace import SLACK_NS, Pace, compare, pace_of, release_fps
 from trilane.avatars.bundle import bundle_folder, load_bundle
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import reshaped
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import application_graph
 from trilane.hw_profiles.network_work import count_work

@@ -86,7 +86,7 @@ def test_group_and_instance_normalisation_have_the_same_shapes(encoder: str) -> 
 def test_graphs_equal_the_trained_networks() -> None:
     """Parameter counts against the PyTorch definition, for every encoder that it has."""
     pytest.importorskip("torch")
-    from trilane.training.encoders import ENCODERS as TRAINED
+    from trilane.training.network import ENCODERS as TRAINED
     from trilane.training.network import UNet
 
     for encoder in sorted(set(TRAINED) & set(ENCODERS)):

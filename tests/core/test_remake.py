@@ -14,7 +14,7 @@ from trilane.apps.asked_run import AskedRun, prepare
 from trilane.apps.cli.sweep_options import SweptCommand
 from trilane.apps.remake import METHODS, Remake, calibration_of, check_remake
 from trilane.avatars.bundle import MANIFEST, load_bundle
-from trilane.avatars.digests import sha256_of
+from trilane.avatars.manifest import sha256_of
 from trilane.avatars.validation import DrawnAs, accuracy_of
 from trilane.bench.lib import full_network
 from trilane.errors import BadInputError
@@ -72,16 +72,16 @@ def test_nothing_is_asked_of_an_avatar_as_it_is(drawable_bundle: Path) -> None:
 def views(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Views are random numbers; how many were asked for, each time."""
     pytest.importorskip("torch")
-    from trilane.training import calibration_views, validate
+    from trilane.training import make_bundle, validate
 
     asked: list[int] = []
 
     def training_views(_renderer: Any, bundle: Any, count: int) -> list[Any]:
         asked.append(count)
-        shape = (*calibration_views.CALIBRATION_SHAPE, bundle.manifest.network.channels)
+        shape = (*make_bundle.CALIBRATION_SHAPE, bundle.manifest.network.channels)
         return [np.random.default_rng(number).normal(0, 1, shape).astype(np.float32) for number in range(count)]
 
-    monkeypatch.setattr(calibration_views, "training_views", training_views)
+    monkeypatch.setattr(make_bundle, "training_views", training_views)
     monkeypatch.setattr(validate, "open_renderer", lambda *_: None)
     return asked
 
@@ -110,17 +110,16 @@ def test_another_number_of_channels_is_untrained_and_has_as_many_of_the_texture(
 def test_a_calibration_quantises_the_float_network_that_the_manifest_names(
     drawable_bundle: Path, views: list[int], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    from trilane.training import calibration_views
-    from trilane.training.network import UNet
-    from trilane.training.onnx_export import export_onnx
+    from trilane.training import make_bundle
+    from trilane.training.network import UNet, export_onnx
 
     weights = tmp_path / "own.npz"
     weights.write_bytes(b"weights")
     monkeypatch.setattr(full_network, "WEIGHTS", tmp_path)
     monkeypatch.setattr(
-        calibration_views,
+        make_bundle,
         "float_model",
-        lambda *_: export_onnx(UNet(width=8, channels=4), *calibration_views.CALIBRATION_SHAPE),
+        lambda *_: export_onnx(UNet(width=8, channels=4), *make_bundle.CALIBRATION_SHAPE),
     )
     with pytest.raises(BadInputError, match="no float network"):
         remade_avatar.remade_avatar(str(drawable_bundle), Remake(calibration="entropy:1"))

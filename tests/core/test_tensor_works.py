@@ -16,7 +16,7 @@ from trilane.apps.report import Resolution
 from trilane.apps.resolution import resolution_note, resolution_of
 from trilane.avatars.bundle import load_bundle, write_manifest
 from trilane.avatars.manifest import BySize
-from trilane.avatars.size_loss import SizeLoss, size_loss
+from trilane.avatars.validation import SizeLoss, size_loss
 from trilane.errors import BadInputError
 from trilane.scene.crop import Rect
 from trilane.scene.planner import TensorBudget, work_of_side
@@ -95,7 +95,7 @@ def test_a_loss_is_that_of_the_next_smaller_size_that_was_measured() -> None:
 
 
 def test_losses_are_read_from_a_validation_of_these_files(tiny_bundle: Path, tmp_path: Path) -> None:
-    from trilane.training.size_figures import with_sizes
+    from trilane.training.validate import with_sizes
 
     own = shutil.copytree(tiny_bundle, tmp_path / "own")
     assert "validate" in size_loss(load_bundle(own)).source
@@ -147,7 +147,7 @@ def test_frames_are_counted_by_size_with_what_it_costs() -> None:
 
 def test_a_picture_is_enlarged_in_linear_light_with_its_colours_times_alpha() -> None:
     """Two pixels, white and a black that is transparent, to four: white stays white, and alpha falls by quarters."""
-    size_figures = pytest.importorskip("trilane.training.size_figures")
+    size_figures = pytest.importorskip("trilane.training.validate")
     picture = np.array([[[255, 255, 255, 255], [0, 0, 0, 0]]] * 2, np.uint8)
     larger = size_figures.enlarged(picture, (2, 4))
     assert larger[0, :, 3].tolist() == [255, 191, 64, 0]

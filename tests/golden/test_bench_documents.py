@@ -19,7 +19,7 @@ from trilane.errors import BadInputError, TrilaneError
 from trilane.stages.gpu.opengl import Driver, describe
 from trilane.stages.gpu.packed_pass import PackedPass
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
-from trilane.training.uv_image import UvRaster
+from trilane.training.sample_renderer import UvRaster
 
 Variants = Mapping[str, Callable[[], object]]
 

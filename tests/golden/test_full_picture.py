@@ -24,11 +24,10 @@ from trilane.stages.configure import Checked, Request, configure
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.gpu import opengl
 from trilane.stages.gpu.composite_painters import AvatarPainter, PicturePainter
-from trilane.training.body_arrays import body_arrays
 from trilane.training.clothing.clothed_body import ClothedBody
-from trilane.training.clothing.landmarks import find_landmarks
 from trilane.training.clothing.layers import clothing_layers
-from trilane.training.clothing.looks import LOOKS
+from trilane.training.clothing.looks import LOOKS, find_landmarks
+from trilane.training.surface import body_arrays
 
 SCENE = """
 frames = 12

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.avatars.texture_levels import pack_levels
+from trilane.avatars.bundle import pack_levels
 from trilane.errors import BadInputError
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Quantisation
 
 torch = pytest.importorskip("torch")
 
-from trilane.training.mip_levels import read_levels  # noqa: E402
 from trilane.training.random_poses import random_pose  # noqa: E402
+from trilane.training.trainable_avatar import read_levels  # noqa: E402
 
 QUANTISATION = Quantisation(1 / 127, 128)
 

@@ -16,7 +16,7 @@ from trilane.bench.lib import float_raster
 from trilane.bench.lib.split_pass import SplitPass
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement, Quantisation
 from trilane.stages.gpu.skinned_mesh import MeshArrays, PosedMesh, SkinnedMesh, mesh_arrays
-from trilane.training.uv_image import UvRaster
+from trilane.training.sample_renderer import UvRaster
 
 TIE = 1e-3
 EYE = np.eye(4)

@@ -12,13 +12,10 @@ from PIL import Image
 
 from trilane.arrays import F64
 from trilane.stages.gpu.opengl import shader_source
-from trilane.training.body_arrays import BodyArrays, body_arrays
 from trilane.training.clothing.clothed_body import PAINT, _places
-from trilane.training.clothing.garments import GARMENTS
-from trilane.training.clothing.landmarks import Landmarks, find_landmarks
-from trilane.training.clothing.layers import MATERIALS
-from trilane.training.clothing.looks import DEFAULT, HIKER, Look
-from trilane.training.clothing.surface_geometry import vertex_normals
+from trilane.training.clothing.layers import GARMENTS, MATERIALS
+from trilane.training.clothing.looks import DEFAULT, HIKER, Landmarks, Look, find_landmarks
+from trilane.training.surface import BodyArrays, body_arrays, vertex_normals
 
 #: Points of each material, and the rows and columns of their picture.
 SHAPE = (64, 96)

@@ -14,7 +14,7 @@ from trilane.body.skinning import FrameSkinner
 from trilane.errors import BadInputError
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement, Quantisation
 from trilane.stages.gpu.skinned_mesh import PosedMesh, SkinnedMesh, mesh_arrays
-from trilane.training.uv_image import UvBytes, UvRaster
+from trilane.training.sample_renderer import UvBytes, UvRaster
 
 ENCODING = Quantisation(6 / 255, 117)
 REST = np.zeros(165)

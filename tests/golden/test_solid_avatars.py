@@ -21,9 +21,8 @@ from trilane.avatars.bundle import BUILT_IN, Bundle, load_bundle
 from trilane.avatars.manifest import Validation
 from trilane.training import validate
 from trilane.training.clothing import layers
-from trilane.training.evaluate import Evaluated, integer_painter
 from trilane.training.sample_renderer import SampleRenderer
-from trilane.training.validate import ValidationPlan, open_renderer
+from trilane.training.validate import Evaluated, ValidationPlan, integer_painter, open_renderer
 
 PLAN = ValidationPlan(seeds=(90_210,), per_band=2)
 #: Share of the inside that may let more than a tenth of the background through.

@@ -14,8 +14,7 @@ pytest.importorskip("torch")
 pytest.importorskip("scipy")
 pytest.importorskip("skimage")
 
-from trilane.training.training_settings import parsed_settings, settings_text
-from trilane.training.usual_settings import SHORT
+from trilane.training.training_settings import SHORT, parsed_settings, settings_text
 
 #: As many steps as about half a minute of a processor's time takes, so that the test does not depend on its load.
 STEPS = 60

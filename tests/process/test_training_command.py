@@ -1,9 +1,12 @@
-"""An avatar from nothing by the training command: eight samples, a few steps, quantised, validated, and run."""
+"""A bundled avatar is trained further by its own settings, made small: a few samples and steps; then it is measured."""
 
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,32 +15,37 @@ pytest.importorskip("torch")
 pytest.importorskip("scipy")
 pytest.importorskip("skimage")
 
-from PIL import Image
+from trilane.avatars.bundle import bundle_folder, load_bundle
+from trilane.training.training_settings import parsed_settings, read_settings, settings_text
 
-from trilane.avatars.bundle import load_bundle
-from trilane.training.train import main
+
+def command(*words: object, code: int = 0) -> Any:
+    line = [sys.executable, "-m", "trilane", *map(str, words), "--json"]
+    done = subprocess.run(line, check=False, capture_output=True, text=True)
+    assert done.returncode == code, done.stderr
+    return json.loads(done.stdout) if code == 0 else " ".join(done.stderr.split())
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_an_avatar_is_made_and_what_made_it_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    work, out, sheet = tmp_path / "work", tmp_path / "avatar", tmp_path / "sheet.png"
-    asked = ["--work", str(work), "--out", str(out), "--sheet", str(sheet), "--minutes", "0.02", "--samples", "8"]
-    asked += ["--per-band", "1", "--width", "4", "--workers", "1", "--batch", "2", "--name", "nobody", "--seed", "3"]
-    assert main(asked) == 0
-    assert capsys.readouterr().out.strip() == str(out)
-    assert json.loads((work / "dataset.json").read_text()) == {"samples": 8, "seed": 3}
-    assert {path.name for path in work.iterdir()} >= {"training", "final.npz", "network.npz"}
-    bundle = load_bundle(out)
-    manifest = bundle.manifest
-    steps = int(np.load(work / "final.npz")["steps"])
-    facts = {"samples": 8, "steps": steps, "batch": 2, "seed": 3}
-    assert facts.items() <= manifest.provenance.items()
-    assert (manifest.name, manifest.network.width, manifest.network.encoder) == ("nobody", 4, "resnet18")
-    assert "--samples 8" in manifest.training_command and str(tmp_path) not in manifest.training_command
-    assert manifest.validation is not None and manifest.validation.integer.samples > 20
-    assert manifest.validation.psnr_db_by_band.keys() == {"far", "full_body", "upper_body", "face"}
-    with Image.open(sheet) as image:
-        assert image.size == (6 * 192, 4 * 256)
-    assert main([*asked, "--samples", "9"]) == 2
-    assert "another --work folder" in capsys.readouterr().err
+def test_a_bundled_avatar_is_trained_further_by_its_settings(tmp_path: Path) -> None:
+    out, work, config = tmp_path / "further", tmp_path / "further-work", tmp_path / "few.toml"
+    settings = read_settings(bundle_folder("hiker") / "training.toml").model_dump(by_alias=True, exclude_none=True)
+    few = {"samples": 8, "steps": 10, "batch": 2, "stand_off": False, "device": "cpu"}
+    config.write_text(settings_text(parsed_settings(settings | few, "a test")))
+    trained = command("avatar", "train", "--config", config, "--out", out)
+    assert (trained["avatar"], trained["steps"]) == (str(out), 10)
+    assert read_settings(out / "training.toml") == read_settings(config)
+    bundle, before = load_bundle(out), load_bundle("hiker")
+    facts = {"samples": 8, "steps": 10, "batch": 2, "seed": 11, "look": "hiker"}
+    assert facts.items() <= bundle.manifest.provenance.items()
+    assert bundle.manifest.betas == before.manifest.betas
+    assert bundle.manifest.training_command == "trilane avatar train --config training.toml"
+    changed = np.abs(bundle.read_texture() - before.read_texture())
+    assert 0 < changed.mean() < 0.1, "ten steps change the texture that it had"
+    words = ("avatar", "validate", out, "--float-network", work / "network.npz", "--per-band", 1, "--seed", 1)
+    validation = command(*words, "--runtime", "ort")["validation"]
+    assert validation["psnr_db_by_band"].keys() == {"far", "full_body", "upper_body", "face"}
+    assert validation["float"]["samples"] == validation["integer"]["samples"] == 4
+    refused = command("avatar", "train", "--config", config, "--out", out, "--samples", 9, code=2)
+    assert "another --work folder" in refused

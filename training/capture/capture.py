@@ -17,14 +17,23 @@ from numpy.typing import NDArray
 from trilane.arrays import F64, U8
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import Body, ShapedBody, load_body
+from trilane.body.kinematics import rodrigues
 from trilane.errors import BadInputError
 from trilane.files import read_npz
 from trilane.shapes import Shape
-from trilane.training.capture.capture_file import NAME, CaptureFile, read_capture_file
-from trilane.training.capture.faults import Fault, FaultyCaptureError
+from trilane.training.capture.capture_file import (
+    FRAME,
+    MASK,
+    NAME,
+    CaptureFile,
+    Fault,
+    FaultyCaptureError,
+    PictureFolder,
+    Pictures,
+    open_pictures,
+    read_capture_file,
+)
 from trilane.training.capture.fits import NAMES, SHAPE, Fit, read_fit
-from trilane.training.capture.pictures import FRAME, MASK, PictureFolder, Pictures, open_pictures
-from trilane.training.capture.view_coverage import camera_direction, frames_by_side
 from trilane.unexpected_value import UnexpectedValue
 
 #: One for each side of a person.
@@ -225,3 +234,40 @@ def _fits_of_file(path: Path, count: int) -> list[Mapping[str, NDArray[Any]]]:
         if array.ndim < 2 or len(array) != count:
             raise BadInputError(f"{path}[{name}]", f"shape {array.shape}", f"({count}, ...), a row for each frame")
     return [shared | {name: array[number] for name, array in arrays.items()} for number in range(count)]
+
+
+# From which sides a capture shows the person: the direction of the camera in the body's own axes.
+#
+# Rule: directions are those of the root joint; +Z is the way that the body faces, +X its left.
+
+#: Degrees about the body at which the camera sees each side: 0 from the front, 90 from the body's left.
+SIDES = {"front": 0.0, "left": 90.0, "back": 180.0, "right": -90.0}
+#: Width of an entry of the table of directions.
+STEP_DEG = 30
+
+
+def camera_direction(pose: F64, root: F64, view: F64) -> tuple[float, float]:
+    """Degrees: yaw (0 front, 90 left, in -180..180) and height above the horizon of the camera, as the body has them.
+
+    `pose` (55,3). `root` (3,): place of the posed root joint. `view` (4,4): from the world of both to the camera.
+    """
+    eye = np.linalg.inv(view)[:3, 3]
+    x, y, z = rodrigues(pose[0]).T @ (eye - root)
+    return float(np.degrees(np.arctan2(x, z))), float(np.degrees(np.arctan2(y, np.hypot(x, z))))
+
+
+def side_of(yaw_deg: float) -> str:
+    """The side that a camera at `yaw_deg` sees most of."""
+    return min(SIDES, key=lambda side: abs((yaw_deg - SIDES[side] + 180) % 360 - 180))
+
+
+def frames_by_side(yaws_deg: Sequence[float]) -> dict[str, int]:
+    """Number of frames that show each side."""
+    sides = [side_of(yaw) for yaw in yaws_deg]
+    return {side: sides.count(side) for side in SIDES}
+
+
+def widest_gap_deg(yaws_deg: Sequence[float]) -> float:
+    """The widest turn about the body, degrees, from which no frame was taken; 360 of one frame."""
+    turns = np.sort(np.asarray(yaws_deg) % 360)
+    return float(np.diff(turns, append=turns[0] + 360).max())

@@ -9,21 +9,28 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
+from PIL import Image
 
-from trilane.arrays import F32, F64, U8
+from trilane.arrays import F32, F64, U8, Mask
+from trilane.body.body import ShapedBody
+from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINTS
+from trilane.body.kinematics import Posed, Skeleton
+from trilane.body.skinning import blend_matrices
 from trilane.errors import BadInputError
-from trilane.shapes import shape_buckets
+from trilane.scene.lens import Lens
+from trilane.shapes import Shape, shape_buckets
+from trilane.stages.gpu.opengl import open_context
 from trilane.stages.gpu.packed_pass import Placement
-from trilane.training.capture.body_raster import BodyRaster
+from trilane.stages.gpu.skinned_mesh import BodyPose, SkinnedMesh, avatar_mesh
 from trilane.training.capture.capture import Capture
-from trilane.training.capture.centres import Centres, VertexCentres
-from trilane.training.capture.image_map import augmented_projection, map_between, resampled, seen_of_frame, unmirrored
-from trilane.training.capture.zoomed_view import Camera, ViewRule, screen_shape, zoomed_view
-from trilane.training.random_views import BANDS, View
-from trilane.training.sample_crop import Crop, Cropper
-from trilane.training.sample_renderer import ANYWHERE, BAND_NAMES, LEAST_PIXELS
+from trilane.training.capture.fits import Fit
+from trilane.training.random_views import ANYWHERE, BANDS, OUTPUT_ROWS, SCREENS, Crop, Cropper, View
+from trilane.training.sample_renderer import ANYWHERE_BAND, BAND_NAMES, LEAST_PIXELS, UvRaster
+from trilane.training.surface import vertex_areas
 
 #: Draws of a view before it is said that no frame has one.
 TRIES = 1000
@@ -38,7 +45,7 @@ class CaptureSample:
     """What to render. `picture`: number of the frame. `crop`: its projection draws the body, before it is mirrored.
 
     `by` (3,3): from the frame's pixels to the tensor's. `mirrored`: whether `by` mirrors, see `unmirrored`. `band`: an
-    index into BAND_NAMES, or ANYWHERE.
+    index into BAND_NAMES, or ANYWHERE_BAND.
     """
 
     picture: int
@@ -100,7 +107,7 @@ class CaptureRenderer:
         if crop is None:
             return None
         by = map_between(self._projection, crop.projection, frame, crop.shape)
-        return CaptureSample(number, crop, by, False, ANYWHERE)
+        return CaptureSample(number, crop, by, False, ANYWHERE_BAND)
 
     def placed(self, sample: CaptureSample) -> tuple[F64, Placement]:
         """The camera (4,4) of a sample that is not mirrored, and its body as the packed pass draws it."""
@@ -124,7 +131,7 @@ class CaptureRenderer:
         whole = map_between(self._projection, crop.projection, camera.shape, crop.shape)
         if mirrored:
             whole = np.array([[-1.0, 0.0, crop.shape[1]], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) @ whole
-        return CaptureSample(number, crop, whole, mirrored, BAND_NAMES.index(band) if band in BANDS else ANYWHERE)
+        return CaptureSample(number, crop, whole, mirrored, BAND_NAMES.index(band) if band in BANDS else ANYWHERE_BAND)
 
     def render(self, sample: CaptureSample) -> tuple[F32, U8]:
         """The UV image (h,w,3) float32 of u, v, coverage, and the ground truth (h,w,4) uint8, straight alpha."""
@@ -149,3 +156,267 @@ def held_out_frames(count: int, bad: Sequence[int]) -> tuple[list[int], list[int
     good = [number for number in range(count) if number not in set(bad)]
     held_out = good[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY]
     return [number for number in good if number not in set(held_out)], held_out
+
+
+# The body of a capture as the pipeline rasterises it: UV images of its fits.
+#
+# Rule: the pipeline's mesh, skinning and raster; a body that has pose blend shapes is drawn with them.
+
+
+class BodyRaster:
+    """Draws one shaped body, with an OpenGL context of its own."""
+
+    def __init__(self, shaped: ShapedBody, threads: int | None = None) -> None:
+        """Open the context. `threads`: of a software OpenGL driver. Raises MissingPartError without OpenGL."""
+        self.ctx = open_context(threads)
+        self._blended = shaped.body.posedirs is not None
+        self.mesh = SkinnedMesh(self.ctx, avatar_mesh(shaped), shaped.body.posedirs)
+        self._raster = UvRaster(self.ctx, self.mesh)
+        self.skeleton = Skeleton(shaped.joints, shaped.body.parents)
+
+    def posed(self, fit: Fit) -> Posed:
+        """The body of `fit`; valid until the next call."""
+        return self.skeleton.pose(fit.pose, fit.place)
+
+    def body_pose(self, fit: Fit) -> BodyPose:
+        """The same as the mesh takes it; valid until the next call."""
+        posed = self.posed(fit)
+        return BodyPose(posed.matrices, posed.feature if self._blended else None)
+
+    def uv(self, fit: Fit, view: F64, projection: F64, shape: Shape) -> F32:
+        """The UV image (h,w,3) of `fit`: u, v, coverage. `view`, `projection` (4,4); `shape` (height, width)."""
+        pose = self.body_pose(fit)
+        return self._raster.render(pose.joints, view, projection, shape, pose.feature)
+
+    def uv_of(self, capture: Capture, number: int) -> F32:
+        """The UV image of frame `number` of `capture`, as large as the frame."""
+        return self.uv(capture.fits[number], capture.views[number], capture.file.camera.projection(), capture.shape)
+
+
+# Affine maps from a frame to a tensor's picture, and the same maps applied to the camera: camera-space augmentation.
+#
+# Rule: one map, in pixels, resamples the ground truth from its full resolution and, brought into clip space, moves the
+# camera that rasterises the body. So both agree for any camera matrix, any turn, scale, flip and shift, and pictures of
+# any aspect; the body is rasterised anew and never resampled.
+#
+# The thesis (section 3.3, formulas 3.18 to 3.20) turns and scales the extrinsics and moves the principal point, which
+# is the same for lenses with fx = fy alone. After projection the map is exact for every lens.
+#
+# Pixels: x to the right, y down, from the picture's corner; the middle of the first pixel is (0.5, 0.5).
+
+NO_FLIP = (False, False)
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """What is done to a frame.
+
+    `centre` (x, y): the point of the frame, in its pixels, that comes to the middle of the target. `turn_rad`: about
+    it, clockwise as the picture is seen. `scale` (x, y): pixels of the target for a pixel of the frame, along its rows
+    and columns, before it is turned. `flip` (left-right, upside-down): before it is turned. `shift` (x, y): afterwards,
+    in pixels of the target.
+    """
+
+    centre: tuple[float, float]
+    turn_rad: float
+    scale: tuple[float, float]
+    flip: tuple[bool, bool] = NO_FLIP
+    shift: tuple[float, float] = (0.0, 0.0)
+
+
+def image_map(augmentation: Augmentation, target: Shape) -> F64:
+    """(3,3): from pixels of the frame to pixels of a target of shape (height, width)."""
+    c, s = np.cos(augmentation.turn_rad), np.sin(augmentation.turn_rad)
+    signed = np.where(augmentation.flip, -1.0, 1.0) * augmentation.scale
+    result = np.eye(3)
+    result[:2, :2] = np.array([[c, -s], [s, c]]) * signed
+    middle = np.array([target[1] / 2, target[0] / 2]) + augmentation.shift
+    result[:2, 2] = middle - result[:2, :2] @ np.asarray(augmentation.centre)
+    return result
+
+
+def moved(points: ArrayLike, by: F64) -> F64:
+    """`points` (..., 2) in pixels, moved by the map `by` (3,3)."""
+    return np.asarray(points, np.float64) @ by[:2, :2].T + by[:2, 2]
+
+
+def augmented_projection(projection: ArrayLike, by: F64, frame: Shape, target: Shape) -> F64:
+    """(4,4): the camera's `projection` (4,4), which draws pictures of shape `frame`, moved by `by` (3,3) to `target`.
+
+    Depth and the sense in which nothing but a flip turns triangles stay as they are.
+    """
+    plane = _ndc_from_pixels(target) @ by @ np.linalg.inv(_ndc_from_pixels(frame))
+    after = np.eye(4)
+    after[:2, :2], after[:2, 3] = plane[:2, :2], plane[:2, 2]
+    return np.asarray(after @ np.asarray(projection, np.float64))
+
+
+def map_between(before: ArrayLike, after: ArrayLike, frame: Shape, target: Shape) -> F64:
+    """(3,3): the map of which `augmented_projection` makes `after` (4,4) from `before` (4,4): its inverse."""
+    clip = np.asarray(after, np.float64) @ _inverse(np.asarray(before, np.float64))
+    plane = np.eye(3)
+    plane[:2, :2], plane[:2, 2] = clip[:2, :2], clip[:2, 3]
+    return np.asarray(_inverse(_ndc_from_pixels(target)) @ plane @ _ndc_from_pixels(frame))
+
+
+def projected(points: ArrayLike, clip: F64, shape: Shape) -> F64:
+    """(..., 2): pixels of a picture of `shape` at which `points` (..., 3) lie, by `clip` (4,4), projection @ view."""
+    homogeneous = np.asarray(points, np.float64) @ clip[:, :3].T + clip[:, 3]
+    ndc = homogeneous[..., :2] / homogeneous[..., 3:]
+    return moved(ndc, _inverse(_ndc_from_pixels(shape)))
+
+
+def unmirrored(by: F64, target: Shape) -> tuple[F64, bool]:
+    """`by` without its mirroring, and whether the columns of what is drawn with it must be reversed afterwards.
+
+    A mirrored camera would turn triangles over, and rasters leave out those that face away. Pixels' middles lie
+    symmetrically, so reversing the columns is exact.
+    """
+    if np.linalg.det(by[:2, :2]) > 0:
+        return by, False
+    reverse = np.array([[-1.0, 0.0, target[1]], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    return reverse @ by, True
+
+
+def seen_of_frame(by: F64, frame: Shape, target: Shape) -> Mask:
+    """(h,w): which pixels of the target have their middle inside the frame: of the others nothing is known."""
+    rows, columns = np.mgrid[: target[0], : target[1]] + 0.5
+    x, y = np.moveaxis(moved(np.stack([columns, rows], axis=-1), _inverse(by)), -1, 0)
+    return np.asarray((x >= 0) & (x < frame[1]) & (y >= 0) & (y < frame[0]))
+
+
+def resampled(rgba: U8, by: F64, target: Shape) -> U8:
+    """The picture (h,w,4) of shape `target` that `by` (3,3) makes of `rgba` (H,W,4), both with straight alpha.
+
+    Each side is shrunk by the greatest whole number that the map allows, as the mean of its pixels, then the picture
+    is read bilinearly once; outside of `rgba` it is 0, 0, 0, 0. Colours are weighted by alpha.
+    """
+    whole = Image.fromarray(rgba, "RGBA").convert("RGBa")
+    columns, rows = (max(1, int(1 / length)) for length in np.linalg.norm(by[:2, :2], axis=0))
+    small = whole.reduce((columns, rows)) if (columns, rows) != (1, 1) else whole
+    back = np.linalg.inv(by @ np.diag([columns, rows, 1.0]))
+    picture = small.transform(target[::-1], Image.Transform.AFFINE, tuple(back[:2].ravel()), Image.Resampling.BILINEAR)
+    return np.array(picture.convert("RGBA"))
+
+
+def _ndc_from_pixels(shape: Shape) -> F64:
+    """(3,3): from pixels of a picture of `shape`, y down, to normalised device coordinates, y up."""
+    return np.array([[2.0 / shape[1], 0.0, -1.0], [0.0, -2.0 / shape[0], 1.0], [0.0, 0.0, 1.0]])
+
+
+def _inverse(matrix: F64) -> F64:
+    return np.asarray(np.linalg.inv(matrix), np.float64)
+
+
+# Points of the body that close-ups are centred on: joints, or vertices drawn so that all of the surface is alike.
+#
+# Rule: a vertex is drawn by its share of the surface's area. SMPL-X has about as many vertices in the head as
+# elsewhere; the thesis (section 3.3) weights joints by the volume about them to make up for that, which areas do
+# exactly.
+
+
+class Centres(Protocol):
+    """Draws centres of views."""
+
+    def draw(self, rng: np.random.Generator, band: str, posed: Posed) -> F64:
+        """(3,), world metres: a point of the body `posed` for a view of `band`, of `BANDS` or `anywhere`."""
+
+
+class JointCentres:
+    """The joints of a band, each as often as any other."""
+
+    def draw(self, rng: np.random.Generator, band: str, posed: Posed) -> F64:
+        """As `Centres.draw`."""
+        names = BANDS[band][0] if band in BANDS else ANYWHERE
+        return np.array(posed.joints[JOINT_INDEX[names[rng.integers(len(names))]]])
+
+
+class VertexCentres:
+    """Vertices that the joints of a band move more than others do, by their area; `anywhere` is the whole body."""
+
+    def __init__(self, shaped: ShapedBody) -> None:
+        self._shaped = shaped
+        self._area = vertex_areas(shaped.vertices.astype(np.float64), shaped.body.faces.astype(np.int64))
+        self._joint = shaped.body.weights.argmax(axis=1)
+
+    def shares(self, band: str) -> F64:
+        """(V,): how probable each vertex is in `band`; they sum to 1."""
+        names = BANDS[band][0] if band in BANDS else JOINT_NAMES
+        area = self._area * np.isin(self._joint, [JOINT_INDEX[name] for name in names])
+        return np.asarray(area / area.sum())
+
+    def draw(self, rng: np.random.Generator, band: str, posed: Posed) -> F64:
+        """As `Centres.draw`."""
+        vertex = int(rng.choice(len(self._area), p=self.shares(band)))
+        weights = self._shaped.body.weights[vertex : vertex + 1].astype(np.float64)
+        matrix = blend_matrices(weights, posed.matrices.reshape(JOINTS, 12).astype(np.float64)).reshape(3, 4)
+        return np.asarray(matrix[:, :3] @ self._shaped.vertices[vertex] + matrix[:, 3])
+
+
+# Random views of a frame of a capture: which part of it becomes the screen, by the bands of zoom of `random_views`.
+#
+# Rule: a view is a map of the frame's pixels, applied to its camera as well (`image_map`). Bands say how many metres
+# fill the screen's height, so they mean the same as for the synthetic person; a frame is enlarged by a stated amount at
+# most.
+
+#: Metres over the screen's height in band `anywhere`, as `random_view` has them.
+ANYWHERE_M = (0.4, 2.5)
+
+
+@dataclass(frozen=True)
+class ViewRule:
+    """How views are drawn.
+
+    `turn_deg`: they are turned by up to so much. `squeeze`: rows are scaled by up to so much more or less than columns.
+    `flip_share`: share of views whose left and right are exchanged. `shift`: the centre lies up to so much of the
+    screen's height beside its middle. `most_enlarged`: pixels of the screen for a pixel of the frame, along a side.
+    """
+
+    turn_deg: float = 8.0
+    squeeze: float = 0.0
+    flip_share: float = 0.0
+    shift: float = 0.2
+    most_enlarged: float = 3.0
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A frame's camera. `view` and `projection` (4,4)."""
+
+    view: F64
+    projection: F64
+    lens: Lens
+
+    @property
+    def shape(self) -> Shape:
+        """(height, width) of the frame."""
+        return round(self.lens.height_px), round(self.lens.width_px)
+
+
+def screen_shape(rng: np.random.Generator) -> Shape:
+    """(height, width) of a random screen of `OUTPUT_ROWS` rows."""
+    return OUTPUT_ROWS, round(OUTPUT_ROWS * SCREENS[rng.integers(len(SCREENS))])
+
+
+def zoomed_view(
+    rng: np.random.Generator, band: str, posed: Posed, camera: Camera, centres: Centres, rule: ViewRule, screen: Shape
+) -> F64 | None:
+    """(3,3): a random map of `band` from the frame to a screen; None when its centre is not in the frame.
+
+    `band`: a name of `BANDS`, or `anywhere`. `posed`: the body in the frame. `screen`: (height, width).
+    """
+    least, most = BANDS[band][1:] if band in BANDS else ANYWHERE_M
+    point = centres.draw(rng, band, posed)
+    framed = float(np.exp(rng.uniform(np.log(least), np.log(most))))
+    depth = -float(camera.view[2, :3] @ point + camera.view[2, 3])
+    pixel = projected(point, camera.projection @ camera.view, camera.shape)
+    turn = np.radians(rng.uniform(-rule.turn_deg, rule.turn_deg))
+    squeeze = float(np.exp(rng.uniform(-1, 1) * np.log1p(rule.squeeze) / 2))
+    flip = bool(rng.random() < rule.flip_share)
+    shift = rng.uniform(-rule.shift, rule.shift, 2) * screen[0]
+    if depth <= 0 or not (0 <= pixel[0] < camera.shape[1] and 0 <= pixel[1] < camera.shape[0]):
+        return None
+    scale = np.array([screen[0] * depth / (framed * focal) for focal in (camera.lens.fx, camera.lens.fy)])
+    scale *= np.array([squeeze, 1 / squeeze]) * min(1.0, rule.most_enlarged / scale.max())
+    centre, beside = (float(pixel[0]), float(pixel[1])), (float(shift[0]), float(shift[1]))
+    return image_map(Augmentation(centre, turn, (float(scale[0]), float(scale[1])), (flip, False), beside), screen)

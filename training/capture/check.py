@@ -7,14 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
 
-from trilane.arrays import F32, Mask
-from trilane.training.body_arrays import body_arrays
-from trilane.training.capture.body_raster import BodyRaster
-from trilane.training.capture.capture import HALF, Capture
-from trilane.training.capture.texel_coverage import TexelCoverage
+from trilane.arrays import F32, F64, U8, Mask
+from trilane.body.joints import JOINT_INDEX, JOINT_NAMES
+from trilane.training.capture.capture import HALF, STEP_DEG, Capture, frames_by_side, widest_gap_deg
+from trilane.training.capture.capture_file import Fault, FaultyCaptureError
+from trilane.training.capture.capture_samples import BodyRaster
+from trilane.training.first_texture import LEAST_WEIGHT, grown, head_on, lay_out
+from trilane.training.surface import BodyArrays, body_arrays, vertex_normals
 
 #: Below it body and mask have less in common than either has alone with nothing: a third each, and a third shared.
 LEAST_IOU = 0.5
@@ -70,3 +75,218 @@ def bad_frames(frames: Sequence[CheckedFrame]) -> list[CheckedFrame]:
 def coverage_of(capture: Capture) -> TexelCoverage:
     """Nothing counted yet of the body of `capture`."""
     return TexelCoverage(body_arrays(capture.shaped))
+
+
+# Regions of a body's surface, by name, for reports of what a capture shows.
+#
+# Rule: every vertex is in one region; all are found from the body at rest: its joints, skin weights and normals.
+
+#: Region -> beginnings of the names of the joints that move its vertices most; the first that fits.
+BY_JOINT = {
+    "face and head": ("head", "jaw", "left_eye", "right_eye", "neck"),
+    "left hand": ("left_wrist", *(f"left_{finger}" for finger in ("index", "middle", "pinky", "ring", "thumb"))),
+    "right hand": ("right_wrist", *(f"right_{finger}" for finger in ("index", "middle", "pinky", "ring", "thumb"))),
+    "arms": ("left_shoulder", "right_shoulder", "left_elbow", "right_elbow"),
+    "legs": ("left_hip", "right_hip", "left_knee", "right_knee"),
+    "feet": ("left_ankle", "right_ankle", "left_foot", "right_foot"),
+    "torso": ("pelvis", "spine", "left_collar", "right_collar"),
+}
+SOLES, ARMPITS, CROWN = "soles", "armpits", "top of head"
+REGIONS = (*BY_JOINT, SOLES, ARMPITS, CROWN)
+#: A normal that points down, or up, by at least this much: within 45 degrees of the vertical.
+STEEP = 0.7
+#: Part of the head's height that is its top; reach of an armpit about the shoulder, of the upper arm's length.
+CROWN_SHARE, ARMPIT_REACH = 0.25, 0.5
+
+
+def vertex_regions(body: BodyArrays) -> NDArray[np.int64]:
+    """(V,): the index in `REGIONS` of each vertex."""
+    by_joint = np.array([_region_of(name) for name in JOINT_NAMES])
+    regions: NDArray[np.int64] = by_joint[body.weights.argmax(axis=1)]
+    up = vertex_normals(body.vertices, body.faces)[:, 1]
+    for name, inside in (
+        (SOLES, (regions == REGIONS.index("feet")) & (up < -STEEP)),
+        (ARMPITS, _near_armpit(body) & (up < -STEEP)),
+        (CROWN, _on_crown(body, regions) & (up > STEEP)),
+    ):
+        regions[inside] = REGIONS.index(name)
+    return regions
+
+
+def _region_of(joint: str) -> int:
+    return next(k for k, starts in enumerate(BY_JOINT.values()) if joint.startswith(starts))
+
+
+def _near_armpit(body: BodyArrays) -> Mask:
+    near = np.zeros(len(body.vertices), bool)
+    for side in ("left", "right"):
+        shoulder, elbow = (body.joints[JOINT_INDEX[f"{side}_{name}"]] for name in ("shoulder", "elbow"))
+        reach = ARMPIT_REACH * float(np.linalg.norm(elbow - shoulder))
+        near |= np.linalg.norm(body.vertices - shoulder, axis=1) < reach
+    return near
+
+
+def _on_crown(body: BodyArrays, regions: NDArray[np.int64]) -> Mask:
+    head = regions == REGIONS.index("face and head")
+    low: F64 = body.joints[JOINT_INDEX["head"], 1]
+    high = body.vertices[head, 1].max()
+    return np.asarray(head & (body.vertices[:, 1] > high - CROWN_SHARE * (high - low)))
+
+
+# Which texels of the body a capture shows: each pixel of a UV image that lies on the mask sees its texel.
+#
+# Rule: a texel counts as seen where its surface was seen less steeply than the outline; regions that no frame shows are
+# named, because their colours are filled from what is round them.
+
+#: Of a region that counts as never seen, at most this share of texels was seen.
+HARDLY = 0.05
+#: Side of the texture that coverage is counted on.
+SIDE = 256
+
+
+class TexelCoverage:
+    """Which texels of one body were seen, frame by frame."""
+
+    def __init__(self, body: BodyArrays, side: int = SIDE) -> None:
+        regions = np.eye(len(REGIONS))[vertex_regions(body)]
+        image, self.used = lay_out(regions, body.faces, body.uv, body.uv_faces, side)
+        self.region = image.argmax(axis=2)
+        self._drawn: Mask = np.zeros((side, side), bool)
+        self._side = side
+
+    def add(self, drawn: Mask) -> None:
+        """Count a frame that shows the texels `drawn` (S,S)."""
+        self._drawn |= drawn
+
+    def drawn(self, uv: F32, mask: Mask) -> Mask:
+        """(S,S): texels at which pixels of a frame lie. `uv` (h,w,3): its UV image. `mask` (h,w): its person."""
+        shown = (head_on(uv[..., :2].astype(np.float64), uv[..., 2] > 0, self._side) > LEAST_WEIGHT) & mask
+        texel = np.minimum((uv[..., :2][shown] * self._side).astype(np.int64), self._side - 1)
+        found = np.zeros_like(self._drawn)
+        found[texel[:, 1], texel[:, 0]] = True
+        return found
+
+    @property
+    def seen(self) -> Mask:
+        """(S,S): texels of the body that were seen, or lie beside one that was: a pixel spans a texel or two."""
+        return np.asarray(grown(self._drawn) & self.used)
+
+    @property
+    def unseen(self) -> Mask:
+        """(S,S): texels of the body that were not."""
+        return np.asarray(self.used & ~self.seen)
+
+    def share(self) -> float:
+        """Share of the body's texels that were seen."""
+        return float(self.seen.sum() / self.used.sum())
+
+    def share_by_region(self) -> dict[str, float]:
+        """The same of each region's texels."""
+        seen, shares = self.seen, {}
+        for number, name in enumerate(REGIONS):
+            inside = self.used & (self.region == number)
+            shares[name] = float(seen[inside].mean()) if inside.any() else 1.0
+        return shares
+
+    def never_seen(self) -> list[str]:
+        """Regions of which hardly any texel was seen."""
+        return [name for name, share in self.share_by_region().items() if share <= HARDLY]
+
+
+# What a check of a capture found, as plain data for people and for JSON.
+#
+# Rule: every figure was measured by the check.
+
+
+def require_fits(capture: Capture, frames: Sequence[CheckedFrame], sheet: object) -> None:
+    """Raises FaultyCaptureError, which points to `sheet`, when most bodies are not where the masks are."""
+    median = float(np.median([frame.iou for frame in frames]))
+    if median < LEAST_IOU:
+        found = f"bodies that overlap the masks by a median IoU of {median:.2f}"
+        expected = f"at least {LEAST_IOU}; clothed people have 0.7 to 0.9"
+        remedy = f"look at {sheet}: are `axes`, the lens, `flat_hand_mean` and the order of frames right?"
+        raise FaultyCaptureError(str(capture.folder), [Fault(capture.file.fits, found, expected, remedy)])
+
+
+def capture_facts(
+    capture: Capture, frames: Sequence[CheckedFrame], bad: Sequence[CheckedFrame], coverage: TexelCoverage
+) -> dict[str, Any]:
+    """Keys: `capture`, `frames`, `size`, `betas`, `fit`, `bad`, `views`, `texels`; see docs/captures.md."""
+    ious, outside = ([getattr(frame, name) for frame in frames] for name in ("iou", "outside"))
+    return {
+        "capture": str(capture.folder),
+        "frames": len(capture),
+        "size": [*capture.shape[::-1]],
+        "betas": [round(float(value), 4) for value in capture.betas],
+        "fit": {
+            "iou_median": float(np.median(ious)),
+            "iou_least": float(np.min(ious)),
+            "outside_median": float(np.median(outside)),
+        },
+        "bad": [{"name": capture.names[each.number], "iou": each.iou, "outside": each.outside} for each in bad],
+        "views": view_facts(capture.directions()),
+        "texels": texel_facts(coverage),
+    }
+
+
+def texel_facts(coverage: TexelCoverage) -> dict[str, Any]:
+    """`seen`: share of the body's texels. `regions`: of each region's. `never_seen`: regions hardly seen."""
+    names = coverage.never_seen()
+    return {"seen": coverage.share(), "regions": coverage.share_by_region(), "never_seen": names}
+
+
+def view_facts(directions: Sequence[tuple[float, float]]) -> dict[str, Any]:
+    """Frames by side and by direction, of the (yaw, height) of cameras in degrees.
+
+    `by_yaw`: number of frames in steps of `STEP_DEG` from behind over the right, the front and the left.
+    """
+    yaws = [yaw for yaw, _ in directions]
+    heights = [height for _, height in directions]
+    counts, _ = np.histogram(yaws, bins=np.arange(-180, 181, STEP_DEG))
+    return {
+        "by_side": frames_by_side(yaws),
+        "by_yaw": [int(count) for count in counts],
+        "widest_gap_deg": widest_gap_deg(yaws),
+        "height_deg": [min(heights), max(heights)],
+    }
+
+
+# A sheet that shows how the fits of a capture lie over its frames.
+#
+# Rule: the drawn body is red and what the mask has beyond it is blue, over the frame; each cell says its frame and IoU.
+
+COLUMNS, MOST_CELLS = 4, 16
+CELL_WIDTH = 320
+BODY_COLOUR, MASK_COLOUR = (255.0, 0.0, 0.0), (0.0, 64.0, 255.0)
+
+
+def chosen(frames: Sequence[CheckedFrame], bad: Sequence[CheckedFrame]) -> list[CheckedFrame]:
+    """Frames for the sheet: the worst of those that are `bad`, in half of it at most, then others at even steps."""
+    worst = list(bad[: MOST_CELLS // 2])
+    others = [frame for frame in frames if frame not in bad]
+    room = min(MOST_CELLS - len(worst), len(others))
+    return worst + [others[round(place)] for place in np.linspace(0, len(others) - 1, room)]
+
+
+def overlaid(picture: U8, uv: F32) -> U8:
+    """A frame with its mask as alpha (h,w,4), and the body of the UV image (h,w,3) over it: (h,w,3)."""
+    result = picture[..., :3].astype(np.float64)
+    drawn, mask = uv[..., 2] > 0, picture[..., 3] >= HALF
+    for where, colour in ((drawn, BODY_COLOUR), (mask & ~drawn, MASK_COLOUR)):
+        result[where] = (result[where] + colour) / 2
+    return np.round(result).astype(np.uint8)
+
+
+def sheet(cells: Sequence[tuple[str, U8]]) -> Image.Image:
+    """Pictures (h,w,3) of one size in rows, each under its line of text."""
+    height, width = cells[0][1].shape[:2]
+    size = (CELL_WIDTH, max(1, round(CELL_WIDTH * height / width)))
+    columns = min(COLUMNS, len(cells))
+    result = Image.new("RGB", (columns * size[0], -(-len(cells) // columns) * size[1]))
+    draw = ImageDraw.Draw(result)
+    for number, (text, picture) in enumerate(cells):
+        row, column = divmod(number, columns)
+        corner = (column * size[0], row * size[1])
+        result.paste(Image.fromarray(picture).resize(size, Image.Resampling.BOX), corner)
+        draw.text((corner[0] + 4, corner[1] + 2), text, fill="white", stroke_width=1, stroke_fill="black")
+    return result

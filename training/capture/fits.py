@@ -17,7 +17,7 @@ from trilane.body.body import Body
 from trilane.body.joints import JOINTS, LEFT_HAND, POSE_SIZE, RIGHT_HAND
 from trilane.body.kinematics import MAX_VALUE
 from trilane.scene.motion.smpl_files import WHOLE as WIDTHS
-from trilane.training.capture.faults import Fault
+from trilane.training.capture.capture_file import Fault
 
 #: The place of a part of the pose among its 165 numbers -> the names that files have for it.
 PARTS: dict[tuple[int, int], tuple[str, ...]] = {

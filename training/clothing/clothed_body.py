@@ -5,19 +5,21 @@ Rule: pictures come from the GPU stage's own raster; this file adds only the lay
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.stages.gpu.skinned_mesh import SkinnedMesh, mesh_arrays
-from trilane.training.clothing import landmarks as joint
-from trilane.training.clothing.landmarks import Landmarks
+from trilane.arrays import F32, U8, Floats
+from trilane.stages.gpu.opengl import build_program, eye_of, set_uniforms
+from trilane.stages.gpu.skinned_mesh import BodyPose, MeshDraw, SkinnedMesh, mesh_arrays
+from trilane.training.clothing import looks as joint
 from trilane.training.clothing.layers import MATERIALS, Layer
-from trilane.training.clothing.looks import DEFAULT, Look
-from trilane.training.clothing.shaded_raster import ShadedMesh, ShadedRaster
+from trilane.training.clothing.looks import DEFAULT, Landmarks, Look
 
 WEIGHTS_PER_VERTEX = 8
 PAINT = Path(str(files("trilane.training.clothing") / "paint.frag"))
@@ -88,3 +90,86 @@ def _places(landmarks: Landmarks) -> dict[str, Any]:
     return {name: tuple(float(x) for x in point) for name, point in named.items()} | {
         "eyeball_radius": landmarks.eye_radius
     }
+
+
+# Draws skinned meshes with a fragment shader of the caller, supersampled: pictures of the ground truth.
+#
+# Rule: shaders write linear light; samples are averaged in linear light, then written as sRGB with straight alpha.
+
+
+class ShadedMesh:
+    """One mesh with its fragment shader and textures.
+
+    The mesh must have `normal` and `colour`. The shader reads `v_position`, `v_normal` (world, not normalised),
+    `v_rest`, `v_uv`, `v_colour`, `gl_FrontFacing` and the uniforms `view` (mat4) and `eye` (vec3). It writes one vec4:
+    linear light and alpha, which is 1; `discard` makes holes.
+    """
+
+    def __init__(
+        self, ctx: Any, mesh: SkinnedMesh, fragment: Path, uniforms: dict[str, Any], definitions: Mapping[str, str]
+    ) -> None:
+        """Compile the shader.
+
+        `ctx`: the OpenGL context.
+        `mesh`: what to draw.
+        `fragment`: the shader's file.
+        `uniforms`: its own, which never change.
+        `definitions`: what it is compiled with.
+        Raises TrilaneError when the shader does not compile.
+        """
+        self._draw = MeshDraw(ctx, mesh, fragment, **definitions)
+        self._draw.set(uniforms)
+
+    def draw(self, joints: F32, view: Floats, projection: Floats) -> None:
+        """Draw into the target in use.
+
+        `joints`: (55,3,4) skinning matrices.
+        `view`, `projection`: (4,4) the camera.
+        """
+        self._draw.set({"view": tuple(np.asarray(view, np.float64).T.ravel()), "eye": tuple(eye_of(view))})
+        self._draw.draw(BodyPose(joints), view, projection)
+
+
+class ShadedRaster:
+    """Supersampled pictures of shaded meshes. `samples`: samples along each side of a pixel (2 is 2x2), even."""
+
+    def __init__(self, ctx: Any, samples: int) -> None:
+        self._ctx, self._samples = ctx, samples
+        self._resolve = build_program(ctx, "whole_screen.vert", "tent_filter.frag", SAMPLES=samples)
+        self._screen = ctx.vertex_array(self._resolve, [])
+        self._targets: dict[tuple[int, int], tuple[Any, Any, Any]] = {}
+
+    def render(
+        self, meshes: list[ShadedMesh], joints: F32, view: Floats, projection: Floats, shape: tuple[int, int]
+    ) -> U8:
+        """The picture (h,w,4) uint8, sRGB, straight alpha, row 0 on top; pixels that no mesh covers are 0, 0, 0, 0.
+
+        `meshes`: what to draw, depth tested.
+        `joints`: (55,3,4) skinning matrices of all meshes.
+        `view`, `projection`: (4,4) the camera.
+        `shape`: (height, width) of the picture.
+        """
+        large, samples, small = self._target(shape)
+        large.use()
+        self._ctx.enable_only(moderngl.DEPTH_TEST)
+        self._ctx.depth_func = "<"
+        large.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
+        for mesh in meshes:
+            mesh.draw(joints, view, projection)
+        small.use()
+        self._ctx.enable_only(moderngl.NOTHING)
+        samples.use(0)
+        set_uniforms(self._resolve, {"samples": 0})
+        self._screen.render(vertices=3)
+        pixels = np.empty((*shape, 4), np.uint8)
+        small.read_into(pixels, components=4, alignment=1)
+        return pixels
+
+    def _target(self, shape: tuple[int, int]) -> tuple[Any, Any, Any]:
+        if shape not in self._targets:
+            size = (shape[1] * self._samples, shape[0] * self._samples)
+            samples = self._ctx.texture(size, 4, dtype="f2")
+            large = self._ctx.framebuffer([samples], self._ctx.depth_renderbuffer(size))
+            small = self._ctx.framebuffer([self._ctx.texture(shape[::-1], 4)])
+            self._targets[shape] = (large, samples, small)
+        return self._targets[shape]

@@ -23,7 +23,9 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from trilane.arrays import F32, U8
+from trilane.avatars.network_file import LAYERS, NetworkFile
 from trilane.errors import BadInputError
+from trilane.training.quantising.calibration import MOVES
 from trilane.training.quantising.power_of_two_scales import SHARING
 from trilane.training.quantising.quantise import Quantised
 
@@ -227,3 +229,157 @@ def session(model: onnx.ModelProto) -> Any:
     settings.log_severity_level = ERRORS_ONLY
     settings.intra_op_num_threads = 1
     return onnxruntime.InferenceSession(model.SerializeToString(), settings, providers=PROVIDERS)
+
+
+# The noise model of an ideal quantiser: its steps follow from the float network and the input, not from the quantiser.
+#
+# Rule: of the integer network only the places are used where it rounds, and whether its steps are powers of two. A
+# stored tensor has 255 steps from the least to the greatest value that the float network gives it on this very input; a
+# weight has `LARGEST_WEIGHT` to either side of 0, by output channel; biases are exact. Where steps are powers of two,
+# each is `POWER_OF_TWO` times as wide: the most that rounding up to a power of two costs a stored tensor; for a weight
+# the even multiples, which rounding alike leaves, cost as much already. The picture has its own steps, of 1/255.
+
+#: Greatest ratio of the least power of two that is large enough to the step that is large enough.
+POWER_OF_TWO = 2
+BYTE_TOP, INT16_TOP = 255, 2**15 - 1
+#: AVX2 without VNNI adds two products of a byte and a weight in 16 bits and cuts off what is beyond (Intel's manual,
+#: VPMADDUBSW). A bundle gives the same picture on every CPU, so no quantiser may use weights that are larger.
+LARGEST_WEIGHT = INT16_TOP // (2 * BYTE_TOP)
+#: Operators whose output consists of values of their input.
+MOVES_VALUES = (*MOVES, "Relu", "Identity")
+Range = tuple[float, float]
+
+
+def ideal_noise_model(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> NoiseModel:
+    """The noise model with the ideal steps for the bytes `tensor` (N, H, W, C).
+
+    `model`: the float network that `quantised` was made from. Raises BadInputError as `noise_model`.
+    """
+    graph = _IdealGraph(quantised, float_ranges(model, quantised, tensor))
+    for node in quantised.network.model.graph.node:
+        graph.take(node)
+    return graph.finished()
+
+
+def float_ranges(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> dict[str, Range]:
+    """Of each stored tensor, by its Quantize node's output: least and greatest value in floats, 0 included."""
+    graph = _FloatGraph(model, quantised)
+    for node in quantised.network.model.graph.node:
+        graph.take(node)
+    plain = graph.finished()
+    plain.model.graph.output.extend(onnx.ValueInfoProto(name=name) for name in graph.stored)
+    feeds = {name: value for name, (value, _) in plain.constants.items()}
+    values = session(plain.model).run(graph.stored, {plain.model.graph.input[0].name: tensor, **feeds})
+    return {
+        name: (min(float(value.min()), 0.0), max(float(value.max()), 0.0))
+        for name, value in zip(graph.stored, values, strict=True)
+    }
+
+
+class _FloatGraph(NoiseGraph):
+    """A network in floats that rounds nothing, with the names of the tensors that would be stored.
+
+    In integers a rectifier is the lower end of its output's range, so it is put back where `model` has one.
+    """
+
+    def __init__(self, model: onnx.ModelProto, quantised: Quantised) -> None:
+        super().__init__(quantised)
+        self.rectified = {node.output[0] for node in model.graph.node if node.op_type == "Relu"}
+        self.stored: list[str] = []
+
+    def store(self, node: onnx.NodeProto) -> None:
+        self.stored.append(node.output[0])
+        kind = "Relu" if node.input[0] in self.rectified else "Identity"
+        self.nodes.append(onnx.helper.make_node(kind, [node.input[0]], [node.output[0]]))
+
+
+class _IdealGraph(NoiseGraph):
+    """A noise model with the steps of an ideal quantiser."""
+
+    def __init__(self, quantised: Quantised, ranges: dict[str, Range]) -> None:
+        super().__init__(quantised)
+        self.ranges = ranges
+        self.widened = POWER_OF_TWO if quantised.facts["rounds_alike"] else 1
+
+    def constant(self, node: onnx.NodeProto) -> tuple[F32, NDArray[np.float64]]:
+        stored = self.values[node.input[0]]
+        value = self.float_value(node.input[0], stored.shape)
+        if stored.dtype == np.int32:
+            return value, np.zeros(value.shape)
+        others = tuple(range(1, value.ndim)) if value.ndim > 1 else None
+        step = np.abs(value).max(axis=others, keepdims=True).astype(np.float64) / LARGEST_WEIGHT
+        return value, np.where(value == 0, 0.0, self.widened * step / 2)
+
+    def bytes_of(self, node: onnx.NodeProto) -> tuple[float, float, float]:
+        if self.makers[self.source.output[0].name].input[0] == node.output[0]:
+            return 0.0, 1.0, 1 / PICTURE
+        low, high = self.ranges[node.output[0]]
+        step = self.widened * max(high - low, float(np.finfo(np.float32).tiny)) / TOP
+        return self.widened * low, self.widened * high, step
+
+    def is_multiple(self, name: str, step: float) -> bool:
+        """Whether tensor `name` is a stored one that was only moved; joined and added ones have steps of their own."""
+        maker = self.makers.get(name)
+        if maker is None or maker.op_type == "DequantizeLinear":
+            return maker is not None
+        return maker.op_type in MOVES_VALUES and self.is_multiple(maker.input[0], step)
+
+
+# The noise that quantisation adds to each layer: its signal-to-noise ratio (SQNR) on one real frame.
+#
+# Rule: both networks read the same input bytes, so the rounding of the input does not count as a layer's noise.
+
+#: Greatest ratio that is reported: a layer without error has an infinite one, which JSON cannot express.
+MAX_DB = 200.0
+
+
+def layer_report(model: onnx.ModelProto, quantised: Quantised, frame: NDArray[np.float32]) -> list[dict[str, Any]]:
+    """Rows `name`, `op_type`, `sqnr_db`, worst first, of the layers that both networks have.
+
+    `model`: the float network (1, C, H, W). `frame`: (H, W, C). SQNR = 10 log10(sum x² / sum (x - q)²), where x and q
+    are a layer's output after its activation, as the integer network stores it.
+    """
+    network = quantised.network
+    tensor = np.clip(np.round(frame / network.input.scale) + network.input.zero_point, 0, 255).astype(np.uint8)
+    real = ((tensor.astype(np.float32) - network.input.zero_point) * np.float32(network.input.scale)).transpose(2, 0, 1)
+    known = {name for node in model.graph.node for name in node.output}
+    stored = {name: made for name, made in _stored(network).items() if made[1] in known}
+    exact = _outputs(model, np.ascontiguousarray(real[None]), [name for _, name in stored.values()])
+    rounded = _outputs(network.model, tensor[None], list(stored))
+    rows = []
+    for dequantised, (node, name) in stored.items():
+        sqnr = _sqnr_db(exact[name], rounded[dequantised])
+        rows.append({"name": node.name, "op_type": node.op_type, "sqnr_db": sqnr})
+    return sorted(rows, key=lambda row: row["sqnr_db"])
+
+
+def _stored(network: NetworkFile) -> dict[str, tuple[onnx.NodeProto, str]]:
+    """Each dequantised tensor to the layer that made it and to its name in the float network, after a folded ReLU."""
+    graph = network.model.graph
+    quantisers = {node.input[0]: node for node in graph.node if node.op_type == "QuantizeLinear"}
+    readers = {node.input[0]: node for node in graph.node if node.op_type == "DequantizeLinear"}
+    layers = {}
+    for node in graph.node:
+        quantiser = quantisers.get(node.output[0])
+        if node.op_type in LAYERS and quantiser is not None and quantiser.output[0] in readers:
+            layers[readers[quantiser.output[0]].output[0]] = (node, node.output[0])
+    return layers
+
+
+def _outputs(model: onnx.ModelProto, feed: NDArray[Any], names: list[str]) -> dict[str, NDArray[np.float32]]:
+    opened = copy.deepcopy(model)
+    del opened.graph.output[:]
+    opened.graph.output.extend(helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in names)
+    settings = onnxruntime.SessionOptions()
+    settings.log_severity_level = ERRORS_ONLY
+    session = onnxruntime.InferenceSession(opened.SerializeToString(), settings, providers=PROVIDERS)
+    values = session.run(names, {session.get_inputs()[0].name: feed})
+    return dict(zip(names, values, strict=True))
+
+
+def _sqnr_db(exact: NDArray[np.float32], rounded: NDArray[np.float32]) -> float:
+    signal = float(np.square(exact, dtype=np.float64).sum())
+    noise = float(np.square(exact.astype(np.float64) - rounded).sum())
+    if signal == 0 or noise == 0:
+        return MAX_DB if noise == 0 else -MAX_DB
+    return max(-MAX_DB, min(MAX_DB, 10 * math.log10(signal / noise)))

@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import copy
 import json
+import logging
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,13 +23,12 @@ import onnx
 import onnxruntime
 from numpy.typing import NDArray
 from onnx import TensorProto, TypeProto, helper, numpy_helper
+from onnxruntime.quantization import QDQQuantizer, QuantType
 from onnxruntime.quantization.shape_inference import quant_pre_process
 
 from trilane.arrays import F32
-from trilane.avatars.integer_network import FLOAT_LAYERS_KEY, NetworkFile, constants_of
-from trilane.avatars.network_checks import check_network
+from trilane.avatars.network_file import FLOAT_LAYERS_KEY, NetworkFile, check_network, constants_of
 from trilane.errors import BadInputError
-from trilane.training.quantising.byte_input_output import replace_ends_by_bytes
 from trilane.training.quantising.calibration import limit_logits, measure, norm_inputs, saturated, share_ranges, widen
 from trilane.training.quantising.power_of_two_scales import (
     CannotRoundAlikeError,
@@ -35,7 +36,6 @@ from trilane.training.quantising.power_of_two_scales import (
     power_of_two_ranges,
     power_of_two_weights,
 )
-from trilane.training.quantising.scales_and_zero_points import QUANTISED_OPERATORS, insert_scales_and_zero_points
 
 MIN_FRAMES, MAX_FRAMES = 1, 1000
 
@@ -190,3 +190,183 @@ def _describe(model: onnx.ModelProto, keep_float: Sequence[str]) -> None:
         model.opset_import.remove(entry)
     del model.metadata_props[:]
     helper.set_model_props(model, {FLOAT_LAYERS_KEY: json.dumps(list(keep_float))} if keep_float else {})
+
+
+# Cross-layer equalisation: channels of neighbouring layers get similar ranges, and the network computes the same.
+#
+# Rule: relu(s x) = s relu(x) for s > 0, so a channel may be scaled after one layer and back before the next. Source:
+# Nagel et al. 2019, "Data-Free Quantization Through Weight Equalization and Bias Correction", section 4.1.
+
+ROUNDS = 3
+#: Least and greatest factor between two layers in one round.
+SCALE_LIMITS = (1e-2, 1e2)
+
+
+def equalised(model: onnx.ModelProto) -> onnx.ModelProto:
+    """A copy of the float network with every Conv -> ReLU -> Conv chain equalised; grouped layers are not changed.
+
+    With r1 the range of the weights that make a channel and r2 of those that read it, s = sqrt(r1 r2) / r2: the first
+    layer's row is divided by s, the second layer's column is multiplied by it.
+    """
+    result = copy.deepcopy(model)
+    weights = {tensor.name: tensor for tensor in result.graph.initializer}
+    arrays = {name: numpy_helper.to_array(tensor).copy() for name, tensor in weights.items()}
+    pairs = list(_pairs(result.graph, weights))
+    for _ in range(ROUNDS):
+        for first, second in pairs:
+            _equalise(first, second, arrays)
+    for name, array in arrays.items():
+        weights[name].CopyFrom(numpy_helper.from_array(array, name))
+    return result
+
+
+def _pairs(
+    graph: onnx.GraphProto, weights: dict[str, onnx.TensorProto]
+) -> Iterator[tuple[onnx.NodeProto, onnx.NodeProto]]:
+    """Pairs of Convs with only a ReLU between them."""
+    users: dict[str, list[onnx.NodeProto]] = {}
+    for node in graph.node:
+        for name in node.input:
+            users.setdefault(name, []).append(node)
+    for first in graph.node:
+        relu = _only(users, first)
+        second = _only(users, relu) if relu is not None and relu.op_type == "Relu" else None
+        if second is not None and all(_plain(node, weights, users) for node in (first, second)):
+            yield first, second
+
+
+def _only(users: dict[str, list[onnx.NodeProto]], node: onnx.NodeProto) -> onnx.NodeProto | None:
+    """The only node that reads the output of `node`; None when there are others or none."""
+    readers = users.get(node.output[0], [])
+    return readers[0] if len(readers) == 1 else None
+
+
+def _plain(node: onnx.NodeProto, weights: dict[str, onnx.TensorProto], users: dict[str, list[onnx.NodeProto]]) -> bool:
+    """Whether `node` is a Conv of one group that shares its weights with no other node."""
+    if node.op_type != "Conv" or any(a.name == "group" and a.i != 1 for a in node.attribute):
+        return False
+    return all(name in weights and len(users[name]) == 1 for name in node.input[1:])
+
+
+def _equalise(first: onnx.NodeProto, second: onnx.NodeProto, arrays: dict[str, NDArray[np.float32]]) -> None:
+    made, read = arrays[first.input[1]], arrays[second.input[1]]
+    r1, r2 = np.abs(made).max(axis=(1, 2, 3)), np.abs(read).max(axis=(0, 2, 3))
+    alive = (r1 > 0) & (r2 > 0)
+    scale = np.where(alive, np.sqrt(r1 / np.where(alive, r2, 1)), 1).clip(*SCALE_LIMITS).astype(np.float32)
+    made /= scale[:, None, None, None]
+    read *= scale[None, :, None, None]
+    if len(first.input) > 2:
+        arrays[first.input[2]] /= scale
+
+
+# Writes scales and zero points into a network, as Quantize and Dequantize nodes round its layers.
+#
+# Rule: every tensor at `QUANTISED_OPERATORS` has unsigned bytes; weights are signed bytes with a scale per channel and
+# zero point 0; the output has the scale 1/255 and zero point 0, so its bytes are the picture.
+
+OUTPUT_SCALE = 1 / 255
+QUANTISED_OPERATORS = [
+    *("Conv", "ConvTranspose", "Gemm", "Add", "Mul", "Concat", "MaxPool", "AveragePool", "GlobalAveragePool", "Resize"),
+    *("InstanceNormalization", "Relu", "Clip", "Sigmoid", "HardSigmoid", "HardSwish"),
+    *("Reshape", "Transpose", "Slice", "Split", "Pad"),
+]
+
+
+@contextmanager
+def _no_axis_warnings() -> Iterator[None]:
+    """Suppress the quantiser's warning that vectors, of norms, have no second axis; they need none."""
+
+    def other(record: logging.LogRecord) -> bool:
+        return "is out-of-range for weight" not in record.getMessage()
+
+    logger = logging.getLogger()
+    logger.addFilter(other)
+    try:
+        yield
+    finally:
+        logger.removeFilter(other)
+
+
+def insert_scales_and_zero_points(
+    model: onnx.ModelProto, ranges: Any, overrides: dict[str, Any], reduce_range: bool, keep_float: Sequence[str]
+) -> onnx.ModelProto:
+    """`model` with Quantize and Dequantize nodes.
+
+    `model`: the float network.
+    `ranges`: of its tensors, ONNX Runtime's TensorsData.
+    `overrides`: scales of weights by name, ONNX Runtime's `TensorQuantOverrides`.
+    `reduce_range`: weights of 7 bits instead of 8.
+    `keep_float`: names of nodes that stay in float.
+    """
+    quantiser = QDQQuantizer(
+        model,
+        per_channel=True,
+        reduce_range=reduce_range,
+        weight_qType=QuantType.QInt8,
+        activation_qType=QuantType.QUInt8,
+        tensors_range=ranges,
+        nodes_to_quantize=[],
+        nodes_to_exclude=list(keep_float),
+        op_types_to_quantize=QUANTISED_OPERATORS,
+        extra_options={"WeightSymmetric": True, "TensorQuantOverrides": overrides},
+    )
+    for end in (model.graph.input[0], model.graph.output[0]):
+        quantiser.quantize_activation_tensor(end.name)
+    with _no_axis_warnings():
+        quantiser.quantize_model()
+    quantiser.model.topological_sort()
+    result: onnx.ModelProto = quantiser.model.model
+    return result
+
+
+def set_picture_scale_and_zero_point(graph: onnx.GraphProto, node: onnx.NodeProto) -> None:
+    """Give the last Quantize `node` the scale 1/255 and zero point 0."""
+    values = {"picture_scale": np.float32(OUTPUT_SCALE), "picture_zero_point": np.uint8(0)}
+    for slot, (name, value) in enumerate(values.items(), start=1):
+        node.input[slot] = name
+        graph.initializer.append(numpy_helper.from_array(np.asarray(value), name))
+
+
+# Gives an integer network bytes at both ends: NHWC input bytes, and output bytes that are the picture.
+#
+# Rule: bytes are dequantised first and transposed after; in the other order OpenVINO computes the first layer in float.
+
+
+def replace_ends_by_bytes(model: onnx.ModelProto) -> None:
+    """Replace the first Quantize and the last Dequantize by Transposes, which the runtimes fold away. In place."""
+    graph = model.graph
+    source, target = graph.input[0], graph.output[0]
+    first = next(node for node in graph.node if source.name in node.input and node.op_type == "QuantizeLinear")
+    last = next(node for node in graph.node if target.name in node.output and node.op_type == "DequantizeLinear")
+    maker = next(node for node in graph.node if last.input[0] in node.output)
+    set_picture_scale_and_zero_point(graph, maker)
+    n, c, h, w = (dim.dim_value for dim in source.type.tensor_type.shape.dim)
+    inner = [node for node in graph.node if node not in (first, last)]
+    real = _nhwc_to_real(inner, source.name, first.output[0])
+    bytes_out = helper.make_node("Transpose", [maker.output[0]], [target.name], name="bytes_out", perm=[0, 2, 3, 1])
+    del graph.node[:], graph.input[:], graph.output[:], graph.value_info[:]
+    graph.node.extend([*real, *inner, bytes_out])
+    graph.input.append(helper.make_tensor_value_info(source.name, TensorProto.UINT8, [n, h, w, c]))
+    graph.output.append(helper.make_tensor_value_info(target.name, TensorProto.UINT8, [n, h, w, 4]))
+    used = {name for node in graph.node for name in node.input}
+    initializers = [tensor for tensor in graph.initializer if tensor.name in used]
+    del graph.initializer[:]
+    graph.initializer.extend(initializers)
+
+
+def _nhwc_to_real(inner: list[onnx.NodeProto], source: str, quantised: str) -> list[onnx.NodeProto]:
+    """The nodes that dequantise and transpose the input; `inner` reads their output instead of `quantised`."""
+    readers = [node for node in inner if quantised in node.input]
+    scale, zero_point = readers[0].input[1:3]
+    nchw = readers[0].output[0]
+    for reader in readers:
+        inner.remove(reader)
+    outputs = {source, *(reader.output[0] for reader in readers)}
+    for node in inner:
+        for slot, name in enumerate(node.input):
+            if name in outputs:
+                node.input[slot] = nchw
+    return [
+        helper.make_node("DequantizeLinear", [source, scale, zero_point], [f"{nchw}_nhwc"], name="bytes_in"),
+        helper.make_node("Transpose", [f"{nchw}_nhwc"], [nchw], name="to_nchw", perm=[0, 3, 1, 2]),
+    ]

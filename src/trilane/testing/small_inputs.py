@@ -20,7 +20,7 @@ from PIL import Image
 
 from trilane.avatars.bundle import write_bundle
 from trilane.avatars.manifest import Manifest, network_entry
-from trilane.avatars.network_checks import check_network
+from trilane.avatars.network_file import check_network
 from trilane.body.joints import JOINT_PARENTS, JOINTS
 from trilane.scene.motion.motion import T_POSE
 from trilane.testing.byte_network import net

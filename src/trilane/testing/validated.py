@@ -5,8 +5,7 @@ from __future__ import annotations
 from datetime import date
 
 from trilane.avatars.bundle import Bundle
-from trilane.avatars.digests import digests_of, with_figures_digest
-from trilane.avatars.manifest import Manifest, Validation
+from trilane.avatars.manifest import Manifest, Validation, digests_of, with_figures_digest
 
 #: Of the made-up figures, PSNR in dB: that of the avatar's runtime, and of `openvino`.
 PSNR_DB, OTHER_PSNR_DB = 31.4159, 27.1828

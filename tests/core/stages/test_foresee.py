@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from trilane.avatars.bundle import load_bundle
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import reshaped
 from trilane.pipeline.description import UnitSettings
 from trilane.scene.planner import (
     Demand,

@@ -20,8 +20,7 @@ from onnx import helper
 
 from trilane import machine
 from trilane.avatars.bundle import load_bundle
-from trilane.avatars.integer_network import constants_of
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import constants_of, reshaped
 from trilane.avatars.network_split import cuts, split
 from trilane.errors import BadInputError, MissingPartError, install_line
 from trilane.pipeline.description import UnitSettings

@@ -1,0 +1,271 @@
+"""The clothed body: garments stand off, layers are skinned by the body's weights, everything is finite."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+from itertools import count, islice
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trilane.avatars.bundle import bundle_folder
+from trilane.body.body import ShapedBody, load_body
+from trilane.body.kinematics import Skeleton
+from trilane.errors import BadInputError
+from trilane.shapes import shape_buckets
+from trilane.training import subject
+from trilane.training.clothing.layers import GARMENTS, MATERIALS, clothing_layers, shoe
+from trilane.training.clothing.looks import ANKLES, DEFAULT, HIKER, LOOKS, find_landmarks, look_named, look_of
+from trilane.training.random_poses import ATTITUDES, random_pose
+from trilane.training.random_views import BANDS, Cropper, look_at, perspective, random_view
+from trilane.training.surface import (
+    BodyArrays,
+    Smoother,
+    body_arrays,
+    obscurance,
+    shell,
+    smoothstep,
+    vertex_areas,
+    vertex_normals,
+)
+
+#: Percentile of a layer's vertices, metres that it stands off the body at least, and the farthest at most. Hair is cut
+#: out of a cap that lies close on the face.
+STANDOFF = {
+    "shirt": (30, 0.015, 0.09),
+    "trousers": (30, 0.015, 0.09),
+    "hair": (98, 0.020, 0.09),
+    "shoe": (50, 0.004, 0.06),
+}
+
+
+@pytest.fixture(scope="module")
+def body():
+    shaped = load_body(bundle_folder("default") / "body.npz").shape()
+    raw = shaped.body
+    return BodyArrays(
+        shaped.vertices.astype(np.float64),
+        raw.faces.astype(np.int64),
+        raw.uv.astype(np.float64),
+        raw.uv_faces.astype(np.int64),
+        raw.weights.astype(np.float64),
+        shaped.joints,
+    )
+
+
+@pytest.fixture(scope="module")
+def layers(body):
+    landmarks = find_landmarks(body.vertices, body.joints, body.weights)
+    return {layer.material: layer for layer in clothing_layers(body, landmarks)}
+
+
+def test_every_material_has_a_layer(layers):
+    assert set(layers) == {*DEFAULT.garments, "shoe", "sole", "skin"}
+    assert set(MATERIALS) == set(GARMENTS) | {"shoe", "sole", "skin"}
+
+
+@pytest.mark.parametrize("material", STANDOFF)
+def test_layers_stand_off_the_body(layers, material):
+    percent, least, most = STANDOFF[material]
+    layer = layers[material]
+    height = np.linalg.norm(layer.vertices - layer.below, axis=1)
+    assert np.percentile(height, percent) >= least
+    assert height.max() <= most
+
+
+@pytest.mark.parametrize("material", ["skin", "shirt", "trousers", "hair"])
+def test_layers_have_the_weights_of_the_body_below(body, layers, material):
+    number = {tuple(point): index for index, point in enumerate(body.vertices)}
+    layer = layers[material]
+    below = [number[tuple(point)] for point in layer.below]
+    assert np.array_equal(layer.weights, body.weights[below])
+
+
+def test_weights_sum_to_one_and_all_is_finite(layers):
+    for layer in layers.values():
+        assert np.allclose(layer.weights.sum(axis=1), 1, atol=1e-5)
+        assert all(np.isfinite(part).all() for part in (layer.vertices, layer.normal, layer.light))
+        assert layer.light.min() >= 0 and layer.light.max() <= 1 + 1e-9
+
+
+def test_layers_are_as_they_were(held, layers):
+    """Outer ones first."""
+    assert list(layers) == ["trousers", "shirt", "hair", "shoe", "sole", "skin"]
+    for material, layer in layers.items():
+        for name in ("vertices", "faces", "below", "weights", "normal", "light", "mark"):
+            held(f"{material} {name}", getattr(layer, name))
+
+
+def test_shell_keeps_its_distance():
+    square = np.array([[x, 0.0, z] for x in range(6) for z in range(6)], np.float64)
+    corner = [(6 * x + z, 6 * x + z + 1, 6 * x + z + 6) for x in range(5) for z in range(5)]
+    faces = np.array(corner + [(b, b + 6 - 0, c) for _, b, c in corner])
+    raised = shell(square, faces, np.full(36, 0.3), np.full(36, 0.25), rounds=5)
+    up = np.sign(vertex_normals(square, faces)[:, 1])
+    assert ((raised - square)[:, 1] * up >= 0.25 - 1e-9).all()
+
+
+def test_obscurance_sees_what_stands_before_it():
+    point, up, down = np.zeros((1, 3)), np.array([[0.0, 1.0, 0.0]]), np.array([[0.0, -1.0, 0.0]])
+    above = np.array([[0.0, 0.05, 0.0]])
+    area = np.array([0.01])
+    assert obscurance(point, up, above, down, area, 0.25)[0] < 0.7
+    assert obscurance(point, down, above, down, area, 0.25)[0] == 1.0
+    assert obscurance(point, up, above * 100, down, area, 0.25)[0] == 1.0
+
+
+# The default body's clothes and its training samples stay what they were: the committed avatar was trained on them.
+
+Held = Callable[[str, Any], None]
+
+
+@pytest.fixture(scope="module")
+def shaped() -> ShapedBody:
+    return load_body(bundle_folder("default") / "body.npz").shape()
+
+
+@pytest.fixture(scope="module")
+def whole(shaped: ShapedBody) -> Any:
+    return body_arrays(shaped)
+
+
+def test_body_arrays(held: Held, whole: Any) -> None:
+    for field in fields(whole):
+        held(field.name, getattr(whole, field.name))
+
+
+def test_landmarks(held: Held, whole: Any) -> None:
+    landmarks = find_landmarks(whole.vertices, whole.joints, whole.weights)
+    for field in fields(landmarks):
+        held(field.name, getattr(landmarks, field.name))
+
+
+@pytest.mark.parametrize("name", GARMENTS)
+def test_garments(held: Held, whole: Any, name: str) -> None:
+    """On the body, and on points all over it, where no shell hides a term."""
+    landmarks = find_landmarks(whole.vertices, whole.joints, whole.weights)
+    covers, thickness = GARMENTS[name]
+    around = np.random.default_rng(5).uniform((-1, -1.2, -0.3), (1, 0.7, 0.3), (3000, 3))
+    for where, points in (("body", whole.vertices), ("around", around)):
+        offset, least, rounds = thickness(points, landmarks)
+        held(f"{where} covers", covers(points, landmarks))
+        held(f"{where} offset", offset)
+        held(f"{where} least", least)
+        held(f"{where} rounds", rounds)
+
+
+@pytest.mark.parametrize("sole", [False, True])
+@pytest.mark.parametrize("side", [1, -1])
+def test_shoes(held: Held, whole: Any, side: int, sole: bool) -> None:
+    vertices, faces = shoe(whole.vertices, whole.joints[ANKLES[side]], side, sole)
+    held("vertices", vertices)
+    held("faces", faces)
+    edges = np.sort(np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    _, uses = np.unique(edges, axis=0, return_counts=True)
+    assert set(uses) <= ({2} if sole else {1, 2}), "a sole is closed, an upper is open at the ankle alone"
+
+
+def test_surface_geometry(held: Held) -> None:
+    """On a bumpy sheet of 8 x 8 vertices."""
+    rows, columns = np.mgrid[:8, :8].reshape(2, -1).astype(float)
+    points = np.stack([columns, 0.3 * np.sin(rows + 0.5 * columns), rows], axis=1)
+    first = (8 * np.arange(7)[:, None] + np.arange(7)).ravel()
+    faces = np.vstack([np.stack([first, first + 8, first + 1], 1), np.stack([first + 1, first + 8, first + 9], 1)])
+    held("areas", vertex_areas(points, faces))
+    held("smoothed", Smoother(faces, 64).smooth(points, 3))
+    held("shell", shell(points, faces, np.full(64, 0.2), np.linspace(0.1, 0.3, 64), 4))
+    normals = np.tile([0.0, 1.0, 0.0], (64, 1))
+    held("obscurance", obscurance(points, normals, points + np.array([0.2, 0.4, 0.1]), -normals, np.full(64, 0.3), 1.5))
+    assert np.array_equal(smoothstep(1.0, 3.0, np.array([0.0, 1.5, 2.0, 4.0])), [0, 0.25**2 * (3 - 2 * 0.25), 0.5, 1])
+    assert smoothstep(3.0, 1.0, np.array([1.5]))[0] == pytest.approx(0.75**2 * (3 - 2 * 0.75))
+
+
+@pytest.mark.parametrize("attitude", ATTITUDES)
+def test_attitudes(held: Held, attitude: str) -> None:
+    poses = np.zeros((12, 55, 3))
+    for seed, pose in enumerate(poses):
+        ATTITUDES[attitude](pose, np.random.default_rng(seed))
+    held("poses", poses)
+
+
+def test_random_poses(held: Held) -> None:
+    held("poses", [random_pose(np.random.default_rng((9, number))) for number in range(80)])
+
+
+@pytest.mark.parametrize("band", [*BANDS, "anywhere"])
+def test_random_views(held: Held, shaped: ShapedBody, band: str) -> None:
+    views = [random_view(np.random.default_rng((3, number)), band, shaped.joints) for number in range(40)]
+    held("view", [view.view for view in views])
+    held("projection", [view.projection for view in views])
+    held("aspect", [view.aspect for view in views])
+
+
+def test_a_camera_by_hand() -> None:
+    """From (0, 0, 2) to the origin: x to the right, y up, z 2 before it; rolled by 90 degrees up is to the left."""
+    eye, at = np.array([0.0, 0.0, 2.0]), np.zeros(3)
+    np.testing.assert_allclose(look_at(eye, at) @ [1, 3, 0, 1], [1, 3, -2, 1], atol=1e-12)
+    np.testing.assert_allclose(look_at(eye, at, np.pi / 2) @ [1, 3, 0, 1], [3, -1, -2, 1], atol=1e-12)
+    clip = perspective(np.pi / 2, 2.0, near=1.0, far=3.0) @ [1.0, 1.0, -1.0, 1.0]
+    np.testing.assert_allclose(clip, [0.5, 1.0, -1.0, 1.0], atol=1e-12)
+    far = perspective(np.pi / 2, 2.0, near=1.0, far=3.0) @ [0.0, 0.0, -3.0, 1.0]
+    assert far[2] / far[3] == pytest.approx(1.0)
+
+
+def test_crops(held: Held, shaped: ShapedBody) -> None:
+    """Of the first twelve views that show the body."""
+    skeleton, cropper = Skeleton(shaped.joints, shaped.body.parents), Cropper(shaped)
+
+    def crops() -> Any:
+        for number in count():
+            rng = np.random.default_rng((4, number))
+            posed = skeleton.pose(random_pose(rng))
+            view = random_view(rng, "upper_body", posed.joints)
+            crop = cropper.crop(posed, view, shape_buckets("256"))
+            if crop is not None:
+                yield crop
+
+    found = list(islice(crops(), 12))
+    held("shapes", [crop.shape for crop in found])
+    held("projections", [crop.projection for crop in found])
+    held("pixels", [crop.pixels for crop in found])
+
+
+# Looks: what a look says is what the shader is compiled with, and the avatar of a look says whose it is.
+
+BODY = bundle_folder("default") / "body.npz"
+
+
+@pytest.mark.parametrize("look", LOOKS.values(), ids=LOOKS)
+def test_a_look_is_complete(look: Any) -> None:
+    """The same colours for all, each within sRGB; garments that there are; no more coefficients than a body has."""
+    assert set(look.colours) == set(DEFAULT.colours) and set(look.garments) <= set(GARMENTS)
+    assert all(0 <= share <= 1 for colour in look.colours.values() for share in colour)
+    assert len(look.betas) <= 10
+
+
+def test_where_legs_end_is_measured_from_the_joint_of_the_look() -> None:
+    """Over the ankle: 20 mm for trousers that end 20 mm over it, the shin and 55 mm for shorts."""
+    arrays = body_arrays(load_body(BODY).shape())
+    landmarks = find_landmarks(arrays.vertices, arrays.joints, arrays.weights)
+    assert DEFAULT.definitions(landmarks)["LEGS_END"] == "(0.02)"
+    shin = arrays.joints[4, 1] - arrays.joints[7, 1]
+    found = HIKER.definitions(landmarks)
+    assert float(found["LEGS_END"].strip("()")) == pytest.approx(shin + 0.055, abs=1e-12) and shin > 0.3
+    assert (found["SLEEVE_END"], found["SKIN"]) == ("(1.8)", "vec3(0.53, 0.35, 0.25)")
+
+
+def test_an_avatar_says_whose_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[Any] = []
+    monkeypatch.setattr(subject, "SampleRenderer", lambda shaped, look, **_: made.append((shaped, look)))
+    monkeypatch.setattr(subject, "load_body", {Path("b"): SimpleNamespace(shape=lambda betas: betas)}.__getitem__)
+    hiker = subject.clothed_subject(Path("b"), 2, "hiker")
+    assert hiker.person == subject.Person(Path("b"), HIKER.betas) and made == [(HIKER.betas, HIKER)]
+    assert look_of(hiker.facts) is HIKER and hiker.source.args[:2] == (Path("b"), "hiker")  # type: ignore[attr-defined]
+    assert look_of(subject.clothed_subject(Path("b"), 2).facts) is DEFAULT
+    assert look_of({}) is DEFAULT, "avatars that were trained before there were looks"
+    with pytest.raises(BadInputError, match="expected one of default, hiker"):
+        look_named("nobody")

@@ -1,0 +1,112 @@
+"""What no frame shows is filled along the surface: beside solutions of Laplace's equation on a cylinder with a seam."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("scipy")
+
+from trilane.training.first_texture import fill_along_surface, fill_beside, fill_gaps, grown, harmonic_fill, lay_out
+from trilane.training.surface import BodyArrays
+
+ROUND, RINGS, SIDE = 24, 13, 96
+#: Of the texture, what lies beside the cylinder's layout at each border.
+BORDER = 0.05
+
+
+@pytest.fixture(scope="module")
+def cylinder() -> BodyArrays:
+    """A cylinder of 24 x 12 squares; its layout begins and ends at the same line of vertices, the seam."""
+    turn = 2 * np.pi * np.arange(ROUND) / ROUND
+    chord = 2 * np.sin(np.pi / ROUND)
+    points = [(np.cos(a), chord * j, np.sin(a)) for j in range(RINGS) for a in turn]
+    places = [(k / ROUND, j / (RINGS - 1)) for j in range(RINGS) for k in range(ROUND + 1)]
+    faces, uv_faces = [], []
+    for j in range(RINGS - 1):
+        for k in range(ROUND):
+            a, b = ROUND * j + k, ROUND * j + (k + 1) % ROUND
+            p = (ROUND + 1) * j + k
+            faces += [(a, b, a + ROUND), (b, b + ROUND, a + ROUND)]
+            uv_faces += [(p, p + 1, p + ROUND + 1), (p + 1, p + ROUND + 2, p + ROUND + 1)]
+    uv = BORDER + (1 - 2 * BORDER) * np.array(places)
+    count = len(points)
+    skin = (np.zeros((count, 55)), np.zeros((55, 3)))
+    return BodyArrays(np.array(points), np.array(faces), uv, np.array(uv_faces), *skin)
+
+
+def texels() -> tuple[np.ndarray, np.ndarray]:
+    """Share of the turn and of the height (SIDE,SIDE) of each texel's centre."""
+    at = ((np.arange(SIDE) + 0.5) / SIDE - BORDER) / (1 - 2 * BORDER)
+    return np.meshgrid(at, at)
+
+
+def test_between_two_rings_a_fill_is_linear(cylinder: BodyArrays) -> None:
+    ring = np.repeat(np.arange(RINGS), ROUND)
+    line = np.column_stack([3.0 + 0.5 * ring, -1.0 * ring])
+    known = (ring <= 2) | (ring == 10)
+    filled = harmonic_fill(np.where(known[:, None], line, 99.0), known, cylinder.vertices, cylinder.faces)
+    inside = ring <= 10
+    np.testing.assert_allclose(filled[inside], line[inside], atol=1e-9)
+    np.testing.assert_allclose(filled[~inside], np.broadcast_to(line[ring == 10][0], filled[~inside].shape), atol=1e-9)
+
+
+def test_a_wave_round_the_cylinder_fades_as_the_hyperbolic_cosine(cylinder: BodyArrays) -> None:
+    """On squares the equation is 4 u = the sum of four neighbours, so with u = c(j) cos(turn) the ratio of c's is
+    cosh(m) = 2 - cos(2 pi / 24); right angles count as a hundredth instead of 0, hence the tolerance."""
+    ring, turn = np.repeat(np.arange(RINGS), ROUND), np.tile(2 * np.pi * np.arange(ROUND) / ROUND, RINGS)
+    known = (ring <= 1) | (ring >= 11)
+    wave = np.cos(turn)
+    filled = harmonic_fill((wave * known)[:, None], known, cylinder.vertices, cylinder.faces)[:, 0]
+    m = np.arccosh(2 - np.cos(2 * np.pi / ROUND))
+    wanted = np.where(known, 1.0, np.cosh(m * (ring - 6)) / np.cosh(m * 5)) * wave
+    assert np.cosh(0) / np.cosh(m * 5) < 0.52
+    np.testing.assert_allclose(filled, wanted, atol=0.01)
+
+
+def test_texels_are_filled_over_the_seam(cylinder: BodyArrays) -> None:
+    """Two strips are seen: 1 just before the seam, 0 in the middle. Behind the seam the fill falls from 1, although in
+    the texture the strip of zeros is nearer."""
+    across, up = texels()
+    _, covered = lay_out(np.zeros((RINGS * ROUND, 1)), cylinder.faces, cylinder.uv, cylinder.uv_faces, SIDE)
+    strip, middle = across > 19 / 24, (across > 10 / 24) & (across < 14 / 24)
+    image = np.where(strip, 1.0, 0.0)[..., None]
+    filled = fill_along_surface(image, ~(covered & (strip | middle)), cylinder)[..., 0]
+    inside = covered & (across > 0) & (across < 1) & (up > 0) & (up < 1)
+    wanted = np.where(across < 0.5, np.clip(1 - across * 24 / 10, 0, 1), np.clip((across * 24 - 14) / 5, 0, 1))
+    assert np.abs(filled - wanted)[inside].max() < 0.06, (
+        "the strips end between two vertices: a sixteenth of 10 at most"
+    )
+    assert np.abs(filled[:, ~inside.any(axis=0)][inside.any(axis=1)] - 1).max() < 0.1, "the margin of the seam too"
+    flat = fill_gaps(image, covered & (strip | middle))[..., 0]
+    assert np.abs(flat - wanted)[inside].max() > 0.5, "what a fill in the texture alone gives"
+
+
+def test_what_is_seen_stays_as_it_is(cylinder: BodyArrays) -> None:
+    image = np.random.default_rng(1).uniform(-1, 1, (SIDE, SIDE, 3))
+    unseen = np.zeros((SIDE, SIDE), bool)
+    unseen[30:60, 20:70] = True
+    filled = fill_along_surface(image, unseen, cylinder)
+    assert np.array_equal(filled[~unseen], image[~unseen]) and not np.array_equal(filled[unseen], image[unseen])
+    assert filled.min() >= -1 and filled.max() <= 1
+
+
+def test_a_part_of_its_own_takes_the_nearest_known_vertex(cylinder: BodyArrays) -> None:
+    """A second cylinder beside the first, nothing of it known; and a mesh of which nothing is known at all."""
+    points = np.concatenate([cylinder.vertices, cylinder.vertices + np.array([5.0, 0, 0])])
+    faces = np.concatenate([cylinder.faces, cylinder.faces + len(cylinder.vertices)])
+    values = np.concatenate([np.where(cylinder.vertices[:, 0] > 0, 2.0, 1.0), np.zeros(RINGS * ROUND)])[:, None]
+    known = np.arange(len(points)) < RINGS * ROUND
+    filled = harmonic_fill(values, known, points, faces)
+    assert np.array_equal(filled[known], values[known]) and (filled[~known] == 2.0).all()
+    assert np.array_equal(harmonic_fill(values, np.zeros(len(points), bool), points, faces), values)
+
+
+def test_texels_beside_known_ones_take_their_mean() -> None:
+    known = np.zeros((5, 6), bool)[:5, :5]
+    known[0, 0] = known[2, 1] = True
+    image = np.full((5, 5, 1), 7.0)
+    image[0, 0], image[2, 1] = 2.0, 4.0
+    filled, near = fill_beside(image, known)
+    assert filled[..., 0].tolist() == [[2, 2, 7, 7, 7], [3, 3, 4, 7, 7], [4, 4, 4, 7, 7], [4, 4, 4, 7, 7], [7] * 5]
+    assert near.tolist() == (filled[..., 0] < 7).tolist() == grown(known).tolist()

@@ -1,0 +1,430 @@
+"""Training by steps: repeats to the bit, goes on to the bit after it was ended anywhere, and says what it is given."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("scipy")
+pytest.importorskip("skimage")
+
+from trilane.errors import BadInputError  # noqa: E402
+from trilane.training import sample_files, step_loop  # noqa: E402
+from trilane.training.network import UNet, add_activation_noise  # noqa: E402
+from trilane.training.objective import drawn_behind, loss_terms, total_loss  # noqa: E402
+from trilane.training.sample_files import U16, ShapeGroup, batches, create_group, open_groups  # noqa: E402
+from trilane.training.step_loop import (  # noqa: E402
+    MaskedAdamW,
+    TrainingState,
+    first_state,
+    load_state,
+    save_state,
+    step_seconds,
+    steps,
+)
+from trilane.training.train import resumed_settings  # noqa: E402
+from trilane.training.trainable_avatar import (  # noqa: E402
+    NeuralTexture,
+    TrainableAvatar,
+    load_batch,
+)
+from trilane.training.training_settings import TrainingSettings, parsed_settings, read_settings, settings_text  # noqa: E402
+
+SMALL, LARGE = (32, 32), (64, 32)
+COUNT = 7
+#: How often an epoch has a sample of each band.
+REPEATS = (1, 2, 1, 1, 1)
+#: Steps 0 to 2 are of small samples alone, and from step 5 on batch statistics stay.
+VALUES: dict[str, Any] = {
+    "device": "cpu",
+    "samples": 9,
+    "batch": 2,
+    "seed": 5,
+    "small_until": 0.4,
+    "freeze_norms_at": 0.6,
+}
+
+
+def settings(**others: Any) -> TrainingSettings:
+    return parsed_settings(VALUES | others, "a test")
+
+
+def avatar(width: int = 4) -> TrainableAvatar:
+    torch.manual_seed(0)
+    start = np.random.default_rng(1).uniform(-0.5, 0.5, (64, 64, 4)).astype(np.float32)
+    return TrainableAvatar(NeuralTexture(start, sides=(64, 32)), UNet(width=width, channels=4))
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Any:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[ShapeGroup]:
+    """Five samples of a small shape and four of a large one."""
+    monkeypatch.setattr(sample_files, "SMALL_PIXELS", math.prod(LARGE))
+    rng = np.random.default_rng(0)
+    for shape, count in ((SMALL, 5), (LARGE, 4)):
+        group = create_group(tmp_path / "data", shape, (np.arange(count) % 2).astype(np.int8))
+        group.uv[:] = rng.integers(0, U16, group.uv.shape)
+        group.covered[:, 4:24, 6:28] = 1
+        group.rgba[:, 4:26, 5:28] = (200, 100, 50, 255)
+    return open_groups(tmp_path / "data")
+
+
+def trained(groups: list[ShapeGroup], until: int, **others: Any) -> TrainingState:
+    """The state after `until` of seven steps."""
+    asked = settings(**others)
+    state = first_state(avatar(), asked)
+    go(state, groups, asked, until)
+    return state
+
+
+def go(state: TrainingState, groups: list[ShapeGroup], asked: TrainingSettings, until: int) -> None:
+    going = steps(state, groups, asked, COUNT)
+    while state.step < until:
+        next(going)
+
+
+def bits(state: TrainingState) -> dict[str, bytes]:
+    return {name: value.detach().contiguous().numpy().tobytes() for name, value in state.tensors().items()}
+
+
+def test_half_size_tensors_have_fewer_than_160_x_160_pixels() -> None:
+    assert sample_files.SMALL_PIXELS == 25600
+
+
+def test_a_batch_is_in_shares(groups: list[ShapeGroup]) -> None:
+    group = groups[0]
+    uv, covered, target = load_batch(group, np.array([3, 1]))
+    np.testing.assert_allclose(uv, group.uv[[3, 1]] / 65535, atol=1e-7)
+    assert covered.dtype == torch.bool and (covered.numpy() == (group.covered[[3, 1]] == 1)).all()
+    np.testing.assert_allclose(target, group.rgba[[3, 1]].transpose(0, 3, 1, 2) / 255, atol=1e-7)
+
+
+def trained_again(made: TrainableAvatar, groups: list[ShapeGroup], jitter: float = 0.0) -> list[dict[str, float]]:
+    """Seven steps as `VALUES` ask for them, written out again; the terms of each. `made` changes in place.
+
+    `jitter`: of the gradients, relative.
+    """
+    add_activation_noise(made.network, 1.0)
+    made.network.to(memory_format=torch.channels_last)
+    streams = [
+        batches(some, 2, np.random.default_rng((5, 2, phase)), REPEATS)
+        for phase, some in enumerate((groups[:1], groups))
+    ]
+    kernels = [p for p in made.network.parameters() if p.ndim > 1]
+    vectors = [p for p in made.network.parameters() if p.ndim == 1]
+    parts = ((kernels, 1.5e-3, 1e-3), (vectors, 1.5e-3, 0.0), (list(made.texture.parameters()), 4e-4, 1e-3))
+    optimisers = [torch.optim.AdamW(ps, lr=1.0, betas=(0.9, 0.99), weight_decay=decay) for ps, _, decay in parts]
+    found = []
+    for step in range(COUNT):
+        share = step / COUNT
+        torch.manual_seed(step * 2**31 + 5)
+        made.train()
+        if share > 0.6:
+            for module in made.modules():
+                if isinstance(module, torch.nn.BatchNorm2d):
+                    module.train(False)
+        uv, covered, target = load_batch(*next(streams[0 if share < 0.4 else 1]))
+        terms = loss_terms(made(uv, covered), target, drawn_behind(target))
+        made.zero_grad()
+        total_loss(terms).backward()
+        length = math.sqrt(sum(float(p.grad.double().square().sum()) for p in made.parameters()))
+        for p in made.parameters():
+            p.grad *= min(1.0, 1.0 / (length + 1e-6))
+            p.grad *= 1 + jitter * torch.randn(p.shape, generator=torch.Generator().manual_seed(step))
+        falls = 0.01 + 0.99 * (1 + math.cos(math.pi * (share - 0.02) / 0.98)) / 2
+        for optimiser, (_, rate, _) in zip(optimisers, parts, strict=True):
+            optimiser.param_groups[0]["lr"] = rate * (0.02 if step == 0 else falls)
+            optimiser.step()
+        found.append({name: float(term.detach()) for name, term in terms.items()})
+    return found
+
+
+def test_a_training_does_what_the_loop_written_out_again_does(groups: list[ShapeGroup]) -> None:
+    """The first terms to float32's rounding. Later ones, and weights, to a thousandth or a twentieth of the way, or ten
+    times what rounding does: Adam divides by a gradient's size, so where that is next to nothing a rounding moves a
+    weight by a whole step."""
+    asked = settings(batches={"repeats": REPEATS})
+    state = first_state(avatar(), asked)
+    terms = list(steps(state, groups, asked, COUNT))
+    again, rounded = avatar(), avatar()
+    wanted = trained_again(again, groups)
+    jittered_terms = trained_again(rounded, groups, jitter=2.0**-22)
+    assert terms[0] == pytest.approx(wanted[0], rel=1e-5)
+    for one, other, third in zip(terms, wanted, jittered_terms, strict=True):
+        rounding = max(abs(third[name] / other[name] - 1) for name in other)
+        assert one == pytest.approx(other, rel=max(1e-3, 10 * rounding))
+    start, alike, jittered = avatar().state_dict(), again.state_dict(), rounded.state_dict()
+    for name, found in state.avatar.state_dict().items():
+        way = float((alike[name] - start[name]).double().abs().mean())
+        off, rounding = (float((one - alike[name]).double().abs().mean()) for one in (found, jittered[name]))
+        assert off <= max(5e-2 * way, 10 * rounding), f"{name}: moved by {way}, {off} from where it should be"
+        assert way > 0 or name.endswith("num_batches_tracked"), name
+
+
+def test_the_same_seed_gives_the_same_bits(groups: list[ShapeGroup]) -> None:
+    first = bits(trained(groups, COUNT))
+    torch.manual_seed(99)
+    torch.rand(5)
+    assert bits(trained(groups, COUNT)) == first
+    assert bits(trained(groups, COUNT, seed=6)) != first
+
+
+@pytest.mark.parametrize(
+    ("ended", "others"),
+    [
+        (2, {}),
+        (3, {"masked_texture": True}),
+        (5, {}),
+        (6, {}),
+        (3, {"loss": "thesis", "width": 4}),
+        (2, {"precision": "bfloat16"}),
+    ],
+    ids=str,
+)
+def test_a_training_that_was_ended_goes_on_to_the_bit(
+    groups: list[ShapeGroup], tmp_path: Path, ended: int, others: dict[str, Any]
+) -> None:
+    """In each part: before and after other samples are used and statistics stay. With discriminators too."""
+    whole = bits(trained(groups, COUNT, **others))
+    before = trained(groups, ended, **others)
+    save_state(before, tmp_path / "state.npz")
+    after = first_state(avatar(), settings(**others))
+    load_state(after, tmp_path / "state.npz")
+    assert bits(after) == bits(before) and after.step == ended
+    go(after, groups, settings(**others), COUNT)
+    assert bits(after) == whole
+    assert any(name.startswith("judges.") for name in whole) == ("loss" in others)
+
+
+def test_the_network_is_computed_in_the_precision_that_is_asked_for(groups: list[ShapeGroup]) -> None:
+    """bfloat16 rounds by up to 2**-9, in each of some twenty convolutions; weights and average stay float32."""
+    losses = {}
+    for precision in ("float32", "bfloat16"):
+        asked = settings(precision=precision)
+        state = first_state(avatar(), asked)
+        losses[precision] = next(steps(state, groups, asked, COUNT))["composite"]
+        assert {value.dtype for value in state.avatar.parameters()} == {torch.float32}
+        assert state.average.precision == "float32"
+    assert losses["float32"] != losses["bfloat16"] == pytest.approx(losses["float32"], rel=2**-5)
+
+
+def test_a_masked_texture_is_kept_where_no_sample_shows_it(groups: list[ShapeGroup]) -> None:
+    """Plain AdamW lets it decay; the coarser scale is seen everywhere."""
+    begun = avatar().texture.scales[0].detach()
+    plain, masked = (trained(groups, 3, masked_texture=each).avatar.texture.scales[0] for each in (False, True))
+    assert bool((plain != begun).all()) and 0.05 < float((masked == begun).float().mean()) < 0.95
+
+
+def test_small_samples_come_first_and_statistics_stay_at_last(
+    groups: list[ShapeGroup], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[int, bool]] = []
+    load = step_loop.load_batch
+
+    def loaded(group: ShapeGroup, *words: Any) -> Any:
+        seen.append((group.shape[0], state.avatar.network.colour[1].training))
+        return load(group, *words)
+
+    monkeypatch.setattr(step_loop, "load_batch", loaded)
+    state = first_state(avatar(), settings())
+    go(state, groups, settings(), COUNT)
+    assert [shape for shape, _ in seen[:3]] == [32] * 3 and 64 in [shape for shape, _ in seen[3:]]
+    assert [training for _, training in seen] == [True] * 5 + [False] * 2
+
+
+def test_the_average_is_the_last_weights_where_few_steps_were_done(groups: list[ShapeGroup]) -> None:
+    """A tenth of seven steps is less than one; of a time constant of all steps it is their plain mean."""
+    state = trained(groups, 3)
+    for one, other in zip(state.average.parameters(), state.avatar.parameters(), strict=True):
+        assert torch.equal(one, other)
+    asked, weights = settings(average_share=1.0), list[np.ndarray]()
+    state = first_state(avatar(), asked)
+    for _ in steps(state, groups, asked, 4):
+        weights.append(next(state.avatar.parameters()).detach().numpy().copy())
+    np.testing.assert_allclose(next(state.average.parameters()).detach(), np.mean(weights, axis=0), atol=1e-6)
+
+
+def test_a_step_is_measured_on_a_copy(groups: list[ShapeGroup]) -> None:
+    made = avatar()
+    before = {name: value.clone() for name, value in made.state_dict().items()}
+    assert step_seconds(made, groups, settings()) > 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(step_loop, "_measured", lambda *words: {1.0: 2.0, 0.0: 10.0}[words[-1]])
+        assert [step_seconds(made, groups, settings(small_until=share)) for share in (0.0, 0.25, 1.0)] == [10, 8, 2]
+    assert all(torch.equal(value, before[name]) for name, value in made.state_dict().items())
+
+
+def test_a_state_of_another_training_is_refused(groups: list[ShapeGroup], tmp_path: Path) -> None:
+    save_state(trained(groups, 1), tmp_path / "state.npz")
+    other = first_state(avatar(width=8), settings())
+    with pytest.raises(BadInputError, match=r"state\.npz: found .*expected the state of this training; remove it"):
+        load_state(other, tmp_path / "state.npz")
+    (tmp_path / "state.npz").write_bytes((tmp_path / "state.npz").read_bytes()[:1000])
+    with pytest.raises(BadInputError, match="expected the state of this training"):
+        load_state(first_state(avatar(), settings()), tmp_path / "state.npz")
+    (tmp_path / "state.npz").write_bytes(b"")
+    np.save(tmp_path / "lone.npy", np.zeros(3))
+    for name in ("state.npz", "lone.npy"):
+        with pytest.raises(BadInputError, match="expected the state of this training"):
+            load_state(first_state(avatar(), settings()), tmp_path / name)
+
+
+def test_settings_are_written_whole_and_read_again(tmp_path: Path) -> None:
+    asked = settings(start="new", steps=40, loss={"structure": 20.0, "overlap": 25.0})
+    (tmp_path / "training.toml").write_text(settings_text(asked))
+    assert read_settings(tmp_path / "training.toml") == asked
+    assert asked.loss.by_name()["composite"] == 0.4 and asked.loss.by_name()["structure"] == 20.0
+
+
+def test_the_thesis_loss_has_its_rates_where_a_training_says_no_others(tmp_path: Path) -> None:
+    asked = settings(loss="thesis")
+    weights = {"composite": 25, "overlap": 25, "perceptual": 20, "adversarial": 1, "features": 1}
+    assert {name: weight for name, weight in asked.loss.by_name().items() if weight} == weights
+    assert (asked.network_rate, asked.texture_rate, asked.discriminator_rate, asked.weight_decay) == (
+        1e-3,
+        1e-3,
+        1e-5,
+        0,
+    )
+    assert (asked.optimiser.kind, asked.optimiser.second_momentum, asked.optimiser.clip_norm) == ("adam", 0.999, 0)
+    assert settings(loss="thesis", texture_rate=0.25).texture_rate == 0.25
+    clipped = settings(loss="thesis", optimiser={"clip_norm": 2.0}).optimiser
+    assert (clipped.kind, clipped.clip_norm) == ("adam", 2.0)
+    assert settings(loss="default") == settings()
+    (tmp_path / "training.toml").write_text(settings_text(asked))
+    assert read_settings(tmp_path / "training.toml") == asked
+
+
+def test_a_new_network_is_trained_on_small_samples_first() -> None:
+    known, new = parsed_settings({}, "a test"), parsed_settings({"start": "new"}, "a test")
+    assert (known.small_until, known.freeze_norms_at) == (0.0, 0.3)
+    assert (new.small_until, new.freeze_norms_at) == (0.12, 0.6)
+    assert parsed_settings({"start": "new", "small_until": 0.5}, "a test").small_until == 0.5
+
+
+def test_a_new_network_with_little_time_takes_many_cheap_steps(tmp_path: Path) -> None:
+    def rates(**values: Any) -> tuple[float, ...]:
+        asked = parsed_settings(values, "a test")
+        return asked.batch, asked.small_until, asked.network_rate, asked.texture_rate
+
+    short = (2, 0.8, 5e-3, 1e-3)
+    assert rates(start="new", minutes=4.9) == rates(start="new", minutes=1, loss="thesis") == short
+    assert rates(start="new", minutes=1, batch=4, network_rate=0.25) == (4, 0.8, 0.25, 1e-3)
+    assert rates(start="new", minutes=5) == rates(start="new") == rates(start="new", minutes=1, steps=900)
+    assert rates(start="new") == (4, 0.12, 1.5e-3, 4e-4) and rates(minutes=1) == (4, 0.0, 1.5e-3, 4e-4)
+    asked = parsed_settings({"start": "new", "minutes": 1}, "a test").model_copy(update={"steps": 40})
+    (tmp_path / "training.toml").write_text(settings_text(asked))
+    assert read_settings(tmp_path / "training.toml") == asked
+    with pytest.raises(BadInputError, match="minutes: found '1', expected"):
+        parsed_settings({"start": "new", "minutes": "1"}, "a test")
+    with pytest.raises(BadInputError, match="optimiser: found 3, expected"):
+        parsed_settings({"loss": "thesis", "optimiser": 3}, "a test")
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        (
+            {"sample": 3},
+            "options: sample: found an unknown key, expected one of schema, samples, .*did you mean 'samples'",
+        ),
+        ({"loss": {"dice": 1.0}}, "options: loss.dice: found an unknown key, expected one of composite, "),
+        ({"loss": "thesi"}, "options: loss: found 'thesi', expected one of default, thesis; did you mean 'thesis'"),
+        ({"vgg": "mine.pth"}, "options: vgg: found 'mine.pth', expected String should match pattern"),
+        ({"samples": 3}, "options: samples: found 3, expected greater than or equal to 8"),
+        ({"start": "old"}, "options: start: found 'old', expected 'default', 'hiker' or 'new'"),
+    ],
+)
+def test_wrong_settings_are_refused(values: dict[str, Any], words: str) -> None:
+    with pytest.raises(BadInputError, match=words):
+        parsed_settings(values, "options")
+
+
+def test_a_training_goes_on_only_as_it_was_begun(tmp_path: Path) -> None:
+    path = tmp_path / "training.toml"
+    assert resumed_settings(path, settings()) == settings()
+    path.write_text(settings_text(settings(steps=50)))
+    assert resumed_settings(path, settings()).steps == 50, "steps that were counted by time stay"
+    with pytest.raises(
+        BadInputError, match=r"training\.toml: batch: found a training with 2, expected 3, as asked; use"
+    ):
+        resumed_settings(path, settings(batch=3))
+    with pytest.raises(BadInputError, match="steps: found a training with 50, expected 51"):
+        resumed_settings(path, settings(steps=51))
+
+
+# Masked Adam beside PyTorch's own for sparse gradients, and beside plain AdamW where everything has a gradient.
+
+RATE, BETAS = 0.05, (0.9, 0.99)
+
+
+def gradients(share: float) -> Any:
+    """Twelve gradients (7, 5) of which a row is 0 with the probability 1 - `share`."""
+    rng = np.random.default_rng(3)
+    shown = rng.random((12, 7, 1)) < share
+    return torch.from_numpy(rng.normal(0, 1, (12, 7, 5)) * shown)
+
+
+def start() -> Any:
+    return torch.nn.Parameter(torch.from_numpy(np.random.default_rng(4).normal(0, 1, (7, 5))))
+
+
+def stepped(optimiser: Any, parameter: Any, each: Any) -> None:
+    parameter.grad = each
+    optimiser.step()
+
+
+def test_it_is_adam_for_sparse_gradients() -> None:
+    """But for epsilon, which the two add before and after the bias is corrected; here it is next to nothing."""
+    mine, theirs = start(), start()
+    own = MaskedAdamW([{"params": [mine], "masked": True}], lr=RATE, betas=BETAS, weight_decay=0.0, eps=1e-20)
+    other = torch.optim.SparseAdam([theirs], lr=RATE, betas=BETAS, eps=1e-20)
+    for each in gradients(0.5):
+        rows = each.abs().sum(dim=1).nonzero()[:, 0]
+        stepped(own, mine, each.clone())
+        stepped(other, theirs, torch.sparse_coo_tensor(rows[None], each[rows], each.shape, check_invariants=True))
+        np.testing.assert_allclose(mine.detach(), theirs.detach(), atol=1e-12)
+    for name in ("exp_avg", "exp_avg_sq"):
+        np.testing.assert_allclose(own.state[mine][name], other.state[theirs][name], atol=1e-12)
+
+
+def test_it_is_adamw_where_all_have_a_gradient_and_in_other_groups() -> None:
+    for share, masked in ((1.0, True), (0.5, False)):
+        mine, theirs = start(), start()
+        own = MaskedAdamW([{"params": [mine], "masked": masked}], lr=RATE, betas=BETAS, weight_decay=0.1)
+        other = torch.optim.AdamW([theirs], lr=RATE, betas=BETAS, weight_decay=0.1)
+        for each in gradients(share):
+            stepped(own, mine, each.clone())
+            stepped(other, theirs, each.clone())
+        assert torch.equal(mine, theirs)
+
+
+def test_what_has_no_gradient_neither_moves_nor_decays_nor_forgets() -> None:
+    parameter = start()
+    optimiser = MaskedAdamW([{"params": [parameter], "masked": True}], lr=RATE, betas=BETAS, weight_decay=0.1)
+    first = torch.ones(7, 5, dtype=torch.float64)
+    first[2] = 0
+    begun = parameter.detach().clone()
+    stepped(optimiser, parameter, first)
+    assert torch.equal(parameter[2], begun[2]) and not (parameter[3] == begun[3]).any()
+    before, moment = parameter.detach().clone(), optimiser.state[parameter]["exp_avg"].clone()
+    then = torch.zeros(7, 5, dtype=torch.float64)
+    then[2] = 1
+    stepped(optimiser, parameter, then)
+    changed = (parameter != before).any(dim=1)
+    assert changed.tolist() == [False, False, True, False, False, False, False]
+    assert torch.equal(optimiser.state[parameter]["exp_avg"][3], moment[3])
+    parameter.grad = None
+    optimiser.step()

@@ -1,0 +1,484 @@
+"""A validation worked out by hand: what is planned, drawn, measured and written, on pictures of one grey each."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import shutil
+from dataclasses import dataclass
+from datetime import UTC, date, datetime
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("skimage")
+
+from trilane import machine
+from trilane.arrays import U8
+from trilane.avatars.bundle import Bundle, load_bundle
+from trilane.avatars.manifest import digests_of
+from trilane.body.body import load_body
+from trilane.training import dataset, validate
+from trilane.training.backgrounds import scenes
+from trilane.training.clothing.looks import LOOKS
+from trilane.training.image_error import (
+    ImageError,
+    image_error,
+)
+from trilane.training.random_poses import random_pose
+from trilane.training.sample_renderer import SampleRenderer
+from trilane.training.validate import Evaluated, FloatNetwork, ValidationPlan, worst_sheet
+
+BANDS = ("far", "full_body", "upper_body", "face")
+GREY = 100
+
+
+class Renderer:
+    """Its samples are the numbers that they were asked for; each shows a square of one grey."""
+
+    ctx = SimpleNamespace(info={"GL_RENDERER": "a renderer", "GL_VENDOR": "another word"})
+
+    def __init__(self):
+        self.planned = []
+
+    def plan(self, seed, source, band, size):
+        self.planned.append((seed, band, size))
+        return SimpleNamespace(seed=seed, source=source, band=BANDS.index(band) if band in BANDS else 4)
+
+    def training_sample(self, seed, band, size):
+        return SampleRenderer.training_sample(self, seed, band, size)  # as the real one, of a random pose
+
+    def render(self, sample):
+        """A square of 8 x 8 pixels; the first sample of seed 2 shows nobody."""
+        truth = np.zeros((32, 32, 4), np.uint8)
+        if sample.seed != (2, 2, 0, 0):
+            truth[8:16, 12:20] = (GREY, GREY, GREY, 255)
+        return np.full((32, 32, 3), sample.band, np.float32), truth
+
+
+def painter(times):
+    """Off by 10, 20, 30 and 40 by band, `times` over; the second sample of seed 2's upper bodies by 60.
+
+    Where nobody is, it paints a corner.
+    """
+
+    def paint(sample, uv):
+        assert (uv == sample.band).all()
+        _, picture = Renderer().render(sample)
+        off = 60 if sample.seed == (2, 2, 1, 2) else 10 * (sample.band + 1)
+        picture[8:16, 12:20, :3] += np.uint8(off * times)
+        if sample.seed == (2, 2, 0, 0):
+            picture[0, 0] = 255
+        return picture
+
+    return paint
+
+
+def db(off):
+    return -20 * math.log10(off / 255)
+
+
+def likeness(off):
+    """SSIM of two constant pictures: the means' part alone, with the constant 0.01 squared."""
+    a, b = GREY / 255, (GREY + off) / 255
+    return (2 * a * b + 1e-4) / (a * a + b * b + 1e-4)
+
+
+def figures(times):
+    """By band and seed the offsets that `painter` makes, and what they come to."""
+    offs = {1: [10, 10, 20, 20, 30, 30, 40, 40], 2: [10, 20, 20, 30, 60, 40, 40]}
+    offs = {seed: [off * times for off in row] for seed, row in offs.items()}
+    every = offs[1] + offs[2]
+    by_band = {"far": [10] * 3, "full_body": [20] * 4, "upper_body": [30] * 3 + [60], "face": [40] * 4}
+    means = {band: round(np.mean([db(off * times) for off in row]), 2) for band, row in by_band.items()}
+    mean = round(np.mean([db(off) for off in every]), 2)
+    least = round(db(60 * times), 2)
+    seeds = {
+        str(seed): {
+            "psnr_db": round(np.mean([db(off) for off in row]), 2),
+            "body_psnr_db": round(np.mean([db(off) for off in row]), 2),
+            "least_psnr_db": round(db(max(row)), 2),
+        }
+        for seed, row in offs.items()
+    }
+    return {
+        "psnr_db_by_band": means,
+        "body_psnr_db_by_band": means,
+        "psnr_db_by_background": dict.fromkeys(("black", "white", "noise", "scenery"), mean),
+        "see_through_by_band": dict.fromkeys(means, 0.0),
+        **dict.fromkeys(("see_through", "alpha_inside", "alpha_edge", "alpha_outside"), 0.0),
+        "iou_by_band": dict.fromkeys(means, 1.0),
+        "psnr_db": mean,
+        "body_psnr_db": mean,
+        "background": 0.0,
+        "iou": 1.0,
+        "ssim": round(np.mean([likeness(off) for off in every]), 4),
+        "least_psnr_db": least,
+        "least_body_psnr_db": least,
+        "worst": {"seed": 2, "number": 5, "band": "upper_body", "psnr_db": least, "body_psnr_db": least},
+        "by_seed": seeds,
+        "samples": 15,
+    }
+
+
+@pytest.fixture
+def parts(monkeypatch):
+    """Painters by runtime's name, and the outside world of a validation; what the painters were asked for."""
+    asked = []
+
+    def integer_painter(renderer, bundle, name, threads):
+        asked.append((renderer, bundle, name, threads))
+        return painter({"ort": 1, "openvino": 2}[name])
+
+    monkeypatch.setattr(validate, "integer_painter", integer_painter)
+    monkeypatch.setattr(validate, "load_motion", lambda spec, folder: (spec.motion, folder))
+    monkeypatch.setattr(validate, "load_runtime", lambda name: SimpleNamespace(version=lambda: f"{name} 3.2"))
+    monkeypatch.setattr(validate, "package_version", {"trilane": "9.8"}.__getitem__)
+    monkeypatch.setattr(machine.here, "now", lambda: datetime(2026, 1, 2, 23, 30, tzinfo=UTC))
+    return asked
+
+
+@pytest.mark.parametrize("with_float", [False, True])
+def test_a_validation_by_hand(parts, tiny_bundle, tmp_path, with_float):
+    (tmp_path / "jump.bvh").write_bytes(b"a motion")
+    held_out = ("builtin:walk-wave-turn", str(tmp_path / "jump.bvh"))
+    plan = ValidationPlan(held_out, (1, 2), 2, ("ort", "openvino"), "128", 3, "a1b2", True)
+    bundle, renderer, looked = load_bundle(tiny_bundle), Renderer(), []
+    network = FloatNetwork("floats of somewhere", painter(0.5)) if with_float else None
+    said = validate.validate(bundle, plan, renderer, network, lambda seed, sample: looked.append((seed, sample.number)))
+    assert parts == [(renderer, bundle, name, 3) for name in ("ort", "openvino")]
+    assert renderer.planned == [
+        ((seed, 2, number, index), band, "128")
+        for seed in (1, 2) for index, band in enumerate(BANDS) for number in (0, 1)
+    ]  # fmt: skip
+    assert looked == [(1, number) for number in range(8)] + [(2, number) for number in range(1, 8)]
+    integer, other = figures(1), figures(2)
+    wanted = {
+        "date": date(2026, 1, 2),
+        "digests": digests_of(tiny_bundle, bundle.manifest).model_dump(),
+        "made_with": {
+            "trilane": "9.8", "revision": "a1b2", "modified": True, "renderer": "a renderer",
+            "runtimes": {"ort": "ort 3.2", "openvino": "openvino 3.2"},
+        },
+        "size": "128",
+        "per_band": 2,
+        "held_out": {
+            "builtin:walk-wave-turn": "built in",
+            "jump.bvh": f"sha256 {hashlib.sha256(b'a motion').hexdigest()}",
+        },
+        "psnr_db_by_band": integer["psnr_db_by_band"],
+        "psnr_db_by_background": integer["psnr_db_by_background"],
+        "iou": 1.0,
+        "ssim": integer["ssim"],
+        "runtime": "ort",
+        "integer": integer,
+        "other_runtimes": {"openvino": other},
+    }  # fmt: skip
+    if with_float:
+        floats = figures(0.5)
+        loss = {band: round(floats["psnr_db_by_band"][band] - integer["psnr_db_by_band"][band], 2) for band in BANDS}
+        wanted |= {"float": {"network": "floats of somewhere", **floats}, "psnr_loss_db": loss}
+    found = said.model_dump(exclude_none=True)
+    assert len(found.pop("figures_digest")) == 64
+    assert found.pop("texture_filter") == "linear"
+    assert {key: value for key, value in found.items() if value} == wanted
+
+
+def test_a_validation_is_written_into_its_manifest(parts, tiny_bundle, tmp_path):
+    own = shutil.copytree(tiny_bundle, tmp_path / "own")
+    bundle = load_bundle(own)
+    said = validate.validate(bundle, ValidationPlan(seeds=(1, 2), per_band=2), Renderer())
+    written = validate.revalidate(bundle, said)
+    assert written == Bundle(bundle.folder, bundle.manifest.model_copy(update={"validation": said}))
+    assert load_bundle(own) == written
+    assert len(parts) == 1
+
+
+def test_what_a_plan_leaves_out():
+    assert ValidationPlan() == ValidationPlan(
+        ("builtin:walk-wave-turn",), (1, 2, 3, 4, 5, 6, 7, 8), 24, ("ort",), "256", 1, None, None
+    )
+    assert (validate.FLOAT, validate.BAND_NAMES) == ("float", BANDS)
+
+
+def test_motions_are_found_from_where_one_is(parts):
+    assert validate.held_out_motions(["a.bvh", "builtin:idle"]) == [("a.bvh", Path.cwd()), ("builtin:idle", Path.cwd())]
+    assert not parts
+
+
+def test_samples_are_of_the_avatars_own_shape(monkeypatch, tiny_bundle):
+    bundle = load_bundle(tiny_bundle)
+    bundle = Bundle(bundle.folder, bundle.manifest.model_copy(update={"betas": (1.0,), "expression": (2.0,)}))
+    monkeypatch.setattr(validate, "SampleRenderer", lambda shaped, *words, look: (shaped.vertices, *words, look))
+    shaped = load_body(tiny_bundle / "body.npz").shape((1.0,), (2.0,)).vertices
+    vertices, *others = validate.open_renderer(bundle, 4)
+    assert (vertices == shaped).all() and others == [4, LOOKS["default"]]
+    manifest = bundle.manifest.model_copy(update={"provenance": {"look": "hiker"}})
+    assert validate.open_renderer(Bundle(bundle.folder, manifest), 4)[1:] == (4, LOOKS["hiker"])
+
+
+# --- what samples are made of -------------------------------------------------------------------------------------
+
+
+def test_training_samples_are_drawn_by_share():
+    renderer, tracked = Renderer(), []
+    samples = dataset.plan_training(renderer, 50, 7, lambda rows: tracked.append(len(rows)) or rows)
+    rng = np.random.default_rng((7, 0))
+    bands = rng.choice([*BANDS, "anywhere"], 50, p=[0.16, 0.34, 0.22, 0.16, 0.12])
+    sizes = rng.choice(["256", "128"], 50, p=[0.85, 0.15])
+    assert renderer.planned == [((7, 1, n), str(bands[n]), str(sizes[n])) for n in range(50)]
+    assert {sample.source for sample in samples} == {random_pose} and tracked == [50]
+
+
+def test_poses_of_motions_are_at_any_time_of_any_of_them():
+    motions = [SimpleNamespace(duration_s=s, sample=lambda t, s=s: ((s, t), "no place")) for s in (2.0, 5.0, 9.0)]
+    rng = np.random.default_rng(3)
+    length_s = motions[rng.integers(3)].duration_s
+    pose = dataset.motion_poses(motions)(np.random.default_rng(3))
+    assert pose == (length_s, rng.uniform(0, length_s))
+
+
+class Packed:
+    """A packed pass of 5 channels that counts what it draws."""
+
+    channels = 5
+
+    def __init__(self, ctx, channels, quantisation, deferred):
+        self.made = (ctx, channels, quantisation, deferred)
+        self.drawn = []
+
+    def begin(self, shape):
+        return ("target", shape)
+
+    def read_into(self, shape, tensor):
+        assert tensor.shape == (shape[0] * shape[1] * 5,)
+        tensor[:] = np.arange(tensor.size) % 251
+
+
+def test_the_integer_network_is_run_as_in_the_pipeline(monkeypatch):
+    """On tensors that the packed pass has drawn; one session for each shape."""
+    made, loaded = [], []
+
+    class Session:
+        def __init__(self, network, options):
+            loaded.append((network, options.threads))
+
+        def bind(self, tensors, pictures):
+            ((tensor,), (picture,)) = tensors, pictures
+            assert tensor.shape[:3] == picture.shape[:3] and (tensor.shape[3], picture.shape[3]) == (5, 4)
+
+            def run():
+                picture[..., :4] = tensor[..., 1:]
+
+            return SimpleNamespace(run=run)
+
+    def packed_pass(*words, **options):
+        made.append(Packed(*words, **options))
+        return made[-1]
+
+    def packed_avatar(packed, mesh, texture, levels):
+        assert (mesh, texture.shape, levels) == ("mesh", (8, 8, 5), kept[-1])
+        return SimpleNamespace(draw=lambda *words: packed.drawn.append(words))
+
+    monkeypatch.setattr(validate, "PackedPass", packed_pass)
+    monkeypatch.setattr(validate, "PackedAvatar", packed_avatar)
+    monkeypatch.setattr(validate, "reshaped", lambda network, *shape: (network, shape))
+    monkeypatch.setattr(validate, "load_runtime", lambda name: SimpleNamespace(load=Session, name=name))
+    network = SimpleNamespace(input=SimpleNamespace(scale=0.5, zero_point=7))
+    kept = [None]
+    parts = {
+        "read_network": lambda: network,
+        "read_texture": lambda: np.zeros((8, 8, 5)),
+        "read_levels": lambda: kept[-1],
+    }
+    bundle = SimpleNamespace(**parts)
+    skeleton = SimpleNamespace(pose=lambda pose: SimpleNamespace(matrices=f"joints of {pose}"))
+    renderer = SimpleNamespace(ctx="context", mesh="mesh", skeleton=skeleton)
+    renderer.placed = lambda sample: SampleRenderer.placed(renderer, sample)
+    paint = validate.integer_painter(renderer, bundle, "ort", 3)
+    assert made[0].made == ("context", 5, validate.Quantisation(0.5, 7), True)
+    for number, shape in enumerate(((2, 3), (4, 2), (2, 3))):
+        crop = SimpleNamespace(shape=shape, projection=f"projection {number}")
+        sample = SimpleNamespace(pose=number, crop=crop, view=SimpleNamespace(view=f"view {number}"))
+        picture = paint(sample, None)
+        tensor = (np.arange(shape[0] * shape[1] * 5) % 251).reshape(*shape, 5)
+        assert picture.dtype == np.uint8 and (picture == tensor[..., 1:]).all()
+    placement = validate.Placement("joints of 1", "projection 1", (0, 0, 4, 2))
+    assert made[0].drawn[1] == (("target", (4, 2)), "view 1", placement)
+    assert loaded == [((network, (2, 3)), 3), ((network, (4, 2)), 3)]
+    kept.append("levels")
+    validate.integer_painter(renderer, bundle, "ort", 3)
+    assert made[1].made[3] is False, "a deferred pass cannot read smaller levels"
+
+
+@pytest.mark.parametrize(("side", "window"), [(12, 7), (8, 7), (6, 5), (3, 3)])
+def test_ssim_by_loops(side, window):
+    """Wang et al. (2004) with a flat window, as large as fits up to 7, and variances of samples."""
+    rng = np.random.default_rng(side)
+    truth, picture = (rng.integers(0, 256, (side, side, 4), dtype=np.uint8) for _ in range(2))
+    truth[..., 3] = picture[..., 3] = 255
+    a, b = truth / 255, picture / 255
+    values = []
+    for row in range(side - window + 1):
+        for column in range(side - window + 1):
+            for channel in range(3):
+                x, y = (each[row : row + window, column : column + window, channel].ravel() for each in (a, b))
+                (xx, xy), (_, yy) = np.cov(x, y)
+                means, c1, c2 = x.mean() * y.mean(), 0.01**2, 0.03**2
+                top = (2 * means + c1) * (2 * xy + c2)
+                values.append(top / ((x.mean() ** 2 + y.mean() ** 2 + c1) * (xx + yy + c2)))
+    found = image_error(picture, truth)
+    assert found.ssim == pytest.approx(np.mean(values), rel=1e-9)
+    assert found.psnr_db == found.body_psnr_db == pytest.approx(-10 * np.log10(((a - b)[..., :3] ** 2).mean()))
+    assert (found.background, found.iou) == (0.0, 1.0)
+
+
+def test_a_picture_too_small_for_a_window_is_like():
+    truth = np.full((2, 9, 4), 255, np.uint8)
+    assert image_error(truth // 2 + 128, truth).ssim == 1.0
+
+
+# The figures of smaller tensors: which views, sizes and means, with painter and renderer that are told.
+
+
+@dataclass(frozen=True)
+class Crop:
+    shape: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Sample:
+    name: str
+    crop: Crop
+
+
+def square(side: int, grey: int) -> U8:
+    """A grey square without anything transparent."""
+    picture = np.full((side, side, 4), grey, np.uint8)
+    picture[..., 3] = 255
+    return picture
+
+
+def test_every_view_is_painted_at_every_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three views, of which the second shows nobody. In the first, greys are 64 off in the own size and 128 in the
+    smaller one, in the third 32 in both: 20 log10(255 / 64) = 12.01 dB, and so on.
+    """
+    views = ["first", "nobody", "third"]
+    asked: list[Any] = []
+
+    def painter(renderer: Any, bundle: Any, runtime: str, threads: int) -> Any:
+        asked.append((renderer, bundle, runtime, threads))
+
+        def paint(sample: Any, uv: str) -> U8:
+            assert uv == f"uv of {sample.name}"
+            off = {64: 64, 32: 128}[sample.crop.shape[0]] if sample.name == "first" else 32
+            return square(sample.crop.shape[0], off)
+
+        return paint
+
+    def planned(renderer: Any, per_band: int, seed: int, motions: Any, size: str) -> list[Any]:
+        asked.append((renderer, per_band, seed, motions, size))
+        return [Sample(name=name, crop=Crop((9, 9))) for name in views]
+
+    def rendered(sample: Any) -> tuple[str, U8]:
+        truth = square(64, 0)
+        if sample.name == "nobody":
+            truth[..., 3] = 0
+        return f"uv of {sample.name}", truth
+
+    monkeypatch.setattr(validate, "integer_painter", painter)
+    monkeypatch.setattr(validate, "plan_validation", planned)
+    monkeypatch.setattr(validate, "held_out_motions", lambda names: ("motions", names))
+    renderer: Any = SimpleNamespace(render=rendered)
+    bundle: Any = SimpleNamespace(read_network=lambda: SimpleNamespace(shape=(1, 64, 64, 12)))
+    plan = ValidationPlan(
+        held_out=("/far/a.bvh", "builtin:b"), seeds=(5, 6), per_band=3, runtimes=("x", "y"), threads=2
+    )
+    before, looks = machine.here.now().date(), list[int]()
+    found = validate.measure_sizes(bundle, plan, renderer, lambda: looks.append(1))
+    assert before <= found.date <= machine.here.now().date()
+    assert asked == [(renderer, bundle, "x", 2), (renderer, 3, 5, ("motions", plan.held_out), "64x64")]
+    assert (found.runtime, found.seed, found.per_band, found.held_out) == ("x", 5, 3, ("a.bvh", "builtin:b"))
+    assert len(looks) == 3
+    db = {off: 20 * np.log10(255 / off) for off in (32, 64, 128)}
+    assert list(found.psnr_db) == ["64x64", "32x32"]
+    assert found.psnr_db == {
+        "64x64": round((db[64] + db[32]) / 2, 2),
+        "32x32": round((db[128] + db[32]) / 2, 2),
+    }
+
+
+def test_sizes_are_whole_steps_of_the_networks_own() -> None:
+    """Three quarters and a half, down to whole steps of 32 pixels, and at least one."""
+    assert validate.sizes_of((512, 256)) == [(512, 256), (384, 192), (256, 128)]
+    assert validate.sizes_of((160, 96)) == [(160, 96), (96, 64), (64, 32)]
+    assert validate.sizes_of((32, 32)) == [(32, 32)]
+
+
+def test_light_is_linear_between_its_ends() -> None:
+    """IEC 61966-2-1: linear below 0.04045, and both ways undo each other."""
+    encoded = np.linspace(0, 1, 1001)
+    linear = validate._linear(encoded)
+    assert linear[[0, 1000]].tolist() == [0.0, 1.0]
+    assert linear[40] == pytest.approx(0.04 / 12.92) and linear[500] == pytest.approx(0.2140411, rel=1e-6)
+    assert validate._encoded(linear) == pytest.approx(encoded, abs=2e-7)
+    assert validate._encoded(np.array([0.003])) == pytest.approx([0.03876])
+
+
+# Sheets of pictures side by side: which samples, in which order, how large, before what.
+
+SHEET_BANDS = ("far", "full_body", "upper_body", "face")
+#: Height and width of a cell.
+CELL = (256, 192)
+PAINTERS = ("float", "ort")
+ALPHA = ("alpha_inside", "alpha_edge", "alpha_outside", "see_through")
+
+
+def evaluated(band: str, number: int, psnr_db: float, shape: tuple[int, int] = (64, 32)) -> Evaluated:
+    """Its pictures have one grey each: ten times its number, one more for `float` and two more for `ort`."""
+
+    def flat(grey: int) -> np.ndarray:
+        return np.full((*shape, 4), (grey, grey, grey, 255), np.uint8)
+
+    def error(value: float) -> ImageError:
+        return ImageError(value, 0.0, {}, 0.0, ssim=1.0, iou=1.0, **dict.fromkeys(ALPHA, 0.0))
+
+    pictures = {name: flat(10 * number + k) for k, name in enumerate(PAINTERS, start=1)}
+    return Evaluated(number, band, flat(10 * number), pictures, {"float": error(-psnr_db), "ort": error(psnr_db)})
+
+
+def cells(sheet: np.ndarray) -> list[list[int]]:
+    """The grey in the middle of each cell."""
+    rows, columns = sheet.shape[0] // CELL[0], sheet.shape[1] // CELL[1]
+    return [[int(sheet[256 * r + 128, 192 * c + 96, 0]) for c in range(columns)] for r in range(rows)]
+
+
+def test_a_small_picture_stands_in_the_middle_of_grey() -> None:
+    sheet = worst_sheet([evaluated("far", 2, 1.0), evaluated("face", 7, 1.0)], ("ort",))
+    assert cells(sheet) == [[20, 22], [70, 72]]
+    cell = sheet[:256, :192]
+    assert (cell[96:160, 80:112] == 20).all()
+    assert (cell != 128).all(axis=2).sum() == 64 * 32, "all else is grey"
+
+
+def test_a_large_picture_is_shrunk_into_its_cell() -> None:
+    """512 x 96 to 256 x 48, and 64 x 768 to 16 x 192."""
+    for shape, rows, columns in (
+        ((512, 96), slice(0, 256), slice(72, 120)),
+        ((64, 768), slice(120, 136), slice(0, 192)),
+    ):
+        cell = worst_sheet([evaluated("far", 2, 1.0, shape)], ())
+        assert (cell[rows, columns] == 20).all()
+        assert (cell != 128).any(axis=2).sum() == (256 * 48 if shape[0] == 512 else 16 * 192)
+
+
+def test_what_is_transparent_shows_the_scenery() -> None:
+    """The middle of a cell is pixel (32, 16) of a picture; black of alpha 127 lets 128 of 255 parts through."""
+    sample = evaluated("far", 0, 1.0)
+    sample.truth[..., 3] = 0
+    sample.pictures["ort"][...] = (0, 0, 0, 127)
+    behind = scenes()[0][32, 16, 0]
+    assert cells(worst_sheet([sample], ("ort",))) == [[round(255 * behind), round(128 * behind)]]
