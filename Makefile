@@ -2,7 +2,7 @@
 # Arguments of `trilane run` go in ARGS: make run ARGS="--frames 60 --size 192"
 SHELL := /bin/bash
 .DELETE_ON_ERROR:
-.PHONY: run test test-all test-rest test-machines test-device mutants results setup format compile interpreted clean
+.PHONY: run test test-all test-rest test-machines test-device results setup format compile interpreted clean
 
 BIN := .venv/bin
 COMPILED := $(shell sed -n 's/^    "\(.*\.py\)",$$/\1/p' src/trilane/compiled.py)
@@ -34,10 +34,6 @@ test-device: .venv/ready-device
 	$(BIN)/pytest tests/device $(ARGS)
 	$(BIN)/pytest tests/golden $(ARGS)
 	$(BIN)/pytest tests/conformance/test_runtimes.py tests/conformance/test_hard_cases.py --runtime cuda $(ARGS)
-
-# Small faults put into a copy of the code, to see which the tests notice: tests/README.md.
-mutants: .venv/ready-all
-	$(BIN)/python -m trilane.testing.mutants $(ARGS)
 
 # The project's own figures. docs/results: a sweep of this machine, some minutes in which it should do nothing else. Tables and pictures of
 # docs/predict.md: computed from data beside this repository, where they are.

@@ -29,7 +29,6 @@ from typing import Any
 from trilane import machine
 from trilane.errors import BadInputError
 from trilane.near_miss import did_you_mean
-from trilane.testing.mutants.tree_copy import copied_tree, tracked_files
 
 ROOT = Path(__file__).resolve().parents[3]
 TABLE = ROOT / "tests" / "machines.toml"
@@ -162,18 +161,27 @@ def environment_python(row: Row, wanted: Sequence[str]) -> Path:
 def checkout(name: str) -> Iterator[tuple[Path, Path]]:
     """The root of a copy of the tree in a folder `name`, not compiled, and its Python; for "" this tree and Python.
 
-    The packages of the copy's environment are those of this one.
+    The copy has every file that git knows or would take, and the real inputs beside it. The packages of its environment
+    are those of this one. Raises CalledProcessError outside a checkout of git.
     """
     if not name:
         yield ROOT, Path(sys.executable)
         return
-    with copied_tree(ROOT, tracked_files(ROOT), name) as tree:
-        made = tree.root / ".venv"
+    words = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    listed = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
+    with TemporaryDirectory(prefix="trilane-copy-") as folder:
+        copy = Path(folder, name)
+        for path in (each for each in listed if os.path.lexists(ROOT / each)):
+            (copy / path).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / path, copy / path, follow_symlinks=False)
+        if (ROOT.parent / "shared").is_dir():
+            Path(folder, "shared").symlink_to(ROOT.parent / "shared")
+        made = copy / ".venv"
         venv.create(made, symlinks=True)
         (site,) = made.glob("lib/python*/site-packages")
         there = sysconfig.get_path("purelib")
         (site / "packages.pth").write_text(f"import site; site.addsitedir({there!r})\n", encoding="utf-8")
-        yield tree.root, made / "bin/python"
+        yield copy, made / "bin/python"
 
 
 @contextmanager
