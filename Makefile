@@ -8,7 +8,7 @@ BIN := .venv/bin
 COMPILED := $(shell sed -n 's/^    "\(.*\.py\)",$$/\1/p' src/trilane/compiled.py)
 
 # Every check, whatever fails; with ARGS only the tests that it names, as pytest takes them.
-checks = $(if $(ARGS),$(BIN)/pytest $(filter --slow,$(1)) $(ARGS),$(BIN)/python -m trilane.testing.checks $(1))
+checks = $(if $(ARGS),$(BIN)/pytest $(filter --slow,$(1)) $(ARGS),$(BIN)/python tests/support/checks.py $(1))
 
 run: .venv/ready-run
 	$(BIN)/trilane run $(ARGS)
@@ -27,7 +27,7 @@ test-rest: .venv/ready-all .venv/ready-core
 # Some tests once more on each machine of tests/machines.toml: one core, no compiler, another locale and more.
 # ARGS=--environments: those with packages or a Python of their own, which are installed once.
 test-machines: .venv/ready-test .venv/ready-core
-	@$(BIN)/python -m trilane.testing.machines $(ARGS)
+	@$(BIN)/python tests/support/machines.py $(ARGS)
 
 # What needs a GPU: hardware OpenGL, training on CUDA, the runtime cuda. Exit code 3 where there is none.
 test-device: .venv/ready-device

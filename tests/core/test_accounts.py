@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from support.trace_reading import ReadTrace, read_trace
 from trilane.apps.tracing.writer import write_trace
 from trilane.bench.accounts import measure, virtual_run
 from trilane.errors import BadInputError
@@ -32,7 +33,6 @@ from trilane.scheduler.events import (
 from trilane.scheduler.ledger import STARVED, JobRecord
 from trilane.scheduler.recording import Recording
 from trilane.scheduler.virtual import Simulation, simulate
-from trilane.testing.trace_reading import ReadTrace, read_trace
 
 MS = 1_000_000
 SERVICE = {"a": 2, "b": 5}

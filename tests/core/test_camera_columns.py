@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from support.camera_files import OPTICAL, lines_of, load
 from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.scene.rotations import Y_UP_FROM_Z_UP, about, matrix_from_quat, quat_from_matrix
-from trilane.testing.camera_files import OPTICAL, lines_of, load
 
 COUNT = 60
 STEPS = np.linspace(0.0, 1.0, COUNT)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from support.camera_files import LENS, RATE_HZ, VIDEO_LENS, WRITERS
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody
 from trilane.scene.camera.load import load_camera
@@ -22,7 +23,6 @@ from trilane.scene.mover import make_mover
 from trilane.scene.placed_camera import PlacedCamera
 from trilane.scene.rotations import about, matrix_from_quat
 from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
-from trilane.testing.camera_files import LENS, RATE_HZ, VIDEO_LENS, WRITERS
 
 POSES = 41
 

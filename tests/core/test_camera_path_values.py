@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
+from support.camera_files import load
 from trilane.scene.camera.path import CameraPath, look_at, one_lens, projection_matrix, view_from_pose
 from trilane.scene.lens import of_fov_y
 from trilane.scene.motion.motion import Wrap
-from trilane.testing.camera_files import load
 
 BUILT_IN = [
     ("orbit", 0.93, 1.35, 3.9, 3.4, 28.0, 20.0, "whole person, going round, coming nearer"),

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from support.camera_files import load, nerf_text, pose_z_up, rows_of
 from trilane.errors import BadInputError
 from trilane.scene.camera import text_table
 from trilane.scene.camera.load import load_camera
 from trilane.scene.camera.text_table import Layout, elapsed, layout_of, read_table
 from trilane.scene.rotations import about
 from trilane.scene.schema import CameraSpec
-from trilane.testing.camera_files import load, nerf_text, pose_z_up, rows_of
 
 
 def test_a_table_has_comments_commas_and_blank_lines(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from support.camera_files import HEIGHT, load, pixel, rows_of
 from trilane.errors import BadInputError
 from trilane.scene.camera.path import CameraPath, one_lens
 from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, RawCamera, path_from_recording
@@ -16,7 +17,6 @@ from trilane.scene.camera.upright import OF_FIRST
 from trilane.scene.lens import Lens, of_fov_y
 from trilane.scene.motion.motion import Wrap
 from trilane.scene.schema import CameraSpec
-from trilane.testing.camera_files import HEIGHT, load, pixel, rows_of
 
 SPEC = CameraSpec()
 LENSES = (of_fov_y(36.0),)

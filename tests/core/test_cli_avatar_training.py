@@ -19,6 +19,7 @@ import pytest
 from PIL import Image
 
 import trilane.training
+from support.small_inputs import validated
 from trilane.apps import made
 from trilane.apps.cli import avatar_quantise, avatar_validate
 from trilane.apps.experiments import calibrated_network
@@ -26,7 +27,6 @@ from trilane.avatars.bundle import load_bundle, write_manifest
 from trilane.avatars.digests import sha256_of
 from trilane.avatars.manifest import Validation
 from trilane.stages.dsp import runtime
-from trilane.testing.validated import validated
 from trilane.training.quantising import (
     calibration_plot,
     calibration_table,

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from support.run_report import make_report
 from trilane.apps import asked_run, made, pace, run_check, run_job
 from trilane.apps.cli import run as cli_run
 from trilane.apps.report import Report
@@ -22,7 +23,6 @@ from trilane.pipeline import unit_starter
 from trilane.stages import configure
 from trilane.stages.configure import Request
 from trilane.stages.factories import PRELOAD
-from trilane.testing.run_report import make_report
 from trilane.units import PerformanceProfile
 
 Command = Callable[..., tuple[str, str]]

@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
+from support.compared_runs import STAGES, simulated, write_run
+from support.run_report import SHARE
 from trilane.apps import asked_run
 from trilane.apps.asked_run import AskedRun
 from trilane.apps.experiments import comparing
 from trilane.errors import BadInputError
-from trilane.testing.compared_runs import STAGES, simulated, write_run
-from trilane.testing.run_report import SHARE
 
 
 @pytest.fixture

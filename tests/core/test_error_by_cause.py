@@ -12,6 +12,7 @@ import onnxruntime
 import pytest
 from PIL import Image
 
+from support.small_inputs import net
 from trilane.apps.experiments import error_by_cause, heat_maps
 from trilane.apps.experiments.causes import BODY, NEEDS, NOTHING, WHAT, Cause, Causes, needs, require_complete, up_to
 from trilane.apps.experiments.error_by_cause import region
@@ -29,7 +30,6 @@ from trilane.body.detail import DETAILS
 from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError
 from trilane.stages.avatar_assets import AvatarData
-from trilane.testing.byte_network import net
 
 OUTPUT = (12, 16)
 EYE = np.eye(4)

@@ -10,13 +10,13 @@ from typing import Any
 import psutil
 import pytest
 
+from support.told_results import ToldConfig, result_of
 from trilane.bench import faults
 from trilane.errors import BadInputError
 from trilane.pipeline.result import Failure
 from trilane.scheduler.events import UnitDied, UnitReady
 from trilane.scheduler.ledger import JobRecord
 from trilane.stages.configure import Request
-from trilane.testing.told_results import ToldConfig, result_of
 
 MS = 1_000_000
 

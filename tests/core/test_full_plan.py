@@ -11,6 +11,7 @@ import onnxruntime
 import pytest
 from onnx import numpy_helper
 
+from support.small_inputs import net
 from trilane.arrays import F64
 from trilane.avatars.bundle import bundle_folder, load_bundle
 from trilane.avatars.network_checks import check_network
@@ -23,7 +24,6 @@ from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import CpuSkinner
 from trilane.stages.gpu.avatar_mesh import avatar_mesh
 from trilane.stages.gpu.mesh_arrays import MeshArrays
-from trilane.testing.byte_network import net
 
 EYE = np.eye(4)
 

@@ -10,6 +10,7 @@ import numpy as np
 import onnx
 import pytest
 
+from support.small_pipeline import assets_of
 from trilane import machine
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.integer_network import constants_of
@@ -23,7 +24,6 @@ from trilane.stages.dsp import infer
 from trilane.stages.dsp.infer import InferStage, build
 from trilane.stages.dsp.runtime import RUNTIMES, copies_slots
 from trilane.stages.packets import pose_dtype
-from trilane.testing.assets import assets_of
 from trilane.transport.packets import SlotLayout, view_packet
 
 CHANNELS = 5

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from support.joint_chain import chained_places, degrees_between, limb_directions
 from trilane.body.joints import JOINT_NAMES
 from trilane.errors import BadInputError
 from trilane.scene.motion.array_files import load_npy
@@ -18,7 +19,6 @@ from trilane.scene.motion.motion import Motion
 from trilane.scene.motion.recorded import RawMotion
 from trilane.scene.motion.t_pose import T_POSE
 from trilane.scene.rotations import matrix_from_rotvec
-from trilane.testing.joint_chain import chained_places, degrees_between, limb_directions
 
 
 def places_of(poses: np.ndarray, pelvis: np.ndarray) -> np.ndarray:

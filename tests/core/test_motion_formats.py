@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from support.joint_chain import chained_places, degrees_between, limb_directions
 from trilane.scene.motion.builtin import walk_wave_turn
 from trilane.scene.motion.load import load_motion
 from trilane.scene.motion.motion import REST_PELVIS, SMPL_REST_PELVIS, Motion
 from trilane.scene.motion.t_pose import T_POSE
 from trilane.scene.rotations import about, matrix_from_rotvec, rotvec_from_matrix
 from trilane.scene.schema import AvatarSpec
-from trilane.testing.joint_chain import chained_places, degrees_between, limb_directions
 
 RATE, FRAMES = 30, 90
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from support.camera_files import angle, load, nerf_text, pixel, pose_z_up
 from trilane.errors import BadInputError
 from trilane.scene.camera import nerf
-from trilane.testing.camera_files import angle, load, nerf_text, pixel, pose_z_up
 
 
 def test_a_nerf_view_puts_points_at_their_pixels(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
+from support.small_inputs import net, node_of
 from trilane.avatars import network_checks
 from trilane.avatars.integer_network import (
     FLOAT_LAYERS_KEY,
@@ -22,7 +23,6 @@ from trilane.avatars.integer_network import (
 )
 from trilane.avatars.network_checks import TO_INTEGERS, check_network
 from trilane.errors import BadInputError
-from trilane.testing.byte_network import net, node_of
 
 Change = Callable[[onnx.ModelProto], None]
 

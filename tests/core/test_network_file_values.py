@@ -8,13 +8,13 @@ import onnx
 import pytest
 from onnx import TensorProto, helper
 
+from support.small_inputs import net
 from trilane.avatars import network_file
 from trilane.avatars.integer_network import (
     constants_of,
 )
 from trilane.avatars.network_file import parse_network, read_network
 from trilane.errors import BadInputError
-from trilane.testing.byte_network import net
 
 
 def test_a_network_file_is_read_or_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from onnx import helper, numpy_helper
 
+from support.small_inputs import net, node_of
 from trilane.avatars.integer_network import (
     NetworkFile,
 )
@@ -16,7 +17,6 @@ from trilane.avatars.network_checks import check_network
 from trilane.avatars.network_reshape import reshaped
 from trilane.avatars.network_split import Cut, cuts, split
 from trilane.errors import BadInputError
-from trilane.testing.byte_network import net, node_of
 
 
 def test_a_network_for_another_shape(tiny_quantised: Any) -> None:

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from support.small_pipeline import assets_of, without_bytes
 from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.description import UnitSettings
@@ -22,8 +23,6 @@ from trilane.shapes import shape_buckets
 from trilane.stages.config import RunConfig
 from trilane.stages.cpu.pose import PoseStage, build
 from trilane.stages.packets import pose_dtype
-from trilane.testing.assets import assets_of
-from trilane.testing.told_bytes import without_bytes
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 OUTPUT = (480, 640)

@@ -12,13 +12,13 @@ from typing import Any
 
 import pytest
 
+from support.told_results import ToldConfig, result_of
 from trilane.bench import pipeline, scenario
 from trilane.bench.lib.load import Load, Queries
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.host import host_units, usable_cores
 from trilane.pipeline.result import Failure
 from trilane.stages.configure import Request
-from trilane.testing.told_results import ToldConfig, result_of
 
 MS = 1_000_000
 Held = Callable[[str, Any], None]

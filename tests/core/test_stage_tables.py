@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from support.small_pipeline import assets_of
 from trilane import machine
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_split import cuts
@@ -29,7 +30,6 @@ from trilane.stages.config import NetworkCut, RunConfig
 from trilane.stages.dsp.parts import crossing_bytes
 from trilane.stages.factories import FACTORIES, PRELOAD
 from trilane.stages.packets import AVATAR_DTYPE, pose_dtype
-from trilane.testing.assets import assets_of
 
 
 def configured(folder: Path, **values: Any) -> RunConfig:

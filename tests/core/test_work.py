@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from support.small_pipeline import EDGES, OWN, STAGES, assets_of, packets, pipeline, without_bytes
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.bound_stage import BoundStage
 from trilane.pipeline.description import UnitSettings
@@ -20,9 +21,6 @@ from trilane.stages.cpu.pose import PoseStage
 from trilane.stages.cpu.present import PresentStage
 from trilane.stages.gpu.drawn_frames import DrawnFrames
 from trilane.stages.packets import pose_dtype
-from trilane.testing.assets import assets_of
-from trilane.testing.small_pipeline import EDGES, OWN, STAGES, packets, pipeline
-from trilane.testing.told_bytes import without_bytes
 from trilane.transport.packets import SlotLayout, header_dtype, view_packet
 
 UNITS = {unit: UnitSettings(cores=(0,), threads=1) for unit in ("cpu", "gpu", "dsp")}

@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from support.small_pipeline import without_bytes
 from trilane.arrays import F64, U8
 from trilane.bench.lib import float_raster
 from trilane.scene.crop import Rect
@@ -25,7 +26,6 @@ from trilane.stages.gpu.composite_painters import AvatarPainter, PicturePainter,
 from trilane.stages.gpu.contact_shadows import floor_discs
 from trilane.stages.gpu.detected_planes import PlanePainter, half_sides
 from trilane.stages.packets import pose_dtype
-from trilane.testing.told_bytes import without_bytes
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 SHAPE = (20, 27)

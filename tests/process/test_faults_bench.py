@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from support.doubles import pipeline_of_doubles as doubles
 from trilane.bench import faults
 from trilane.bench.faults import Signals
 from trilane.errors import BadInputError
-from trilane.testing.doubles import pipeline_of_doubles as doubles
 
 MS = 1_000_000
 pytestmark = pytest.mark.usefixtures("nothing_left")

@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from support.run_report import make_report
 from trilane.pipeline.journal import NAME, JournalWriter, Record, Worked, journal_of
 from trilane.scheduler.events import Settings, chain
 from trilane.scheduler.virtual import Simulation, simulate
-from trilane.testing.run_report import make_report
 
 MS: Final = 1_000_000
 #: Stage: its unit, and how long a job of it takes in the mean, ms.

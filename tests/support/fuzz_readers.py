@@ -1,4 +1,4 @@
-"""Every reader of people's files, fed with changed files: `python -m trilane.testing.fuzz_readers --seconds 600`.
+"""Every reader of people's files, fed with changed files: `support.fuzz_readers --seconds 600`.
 
 Rule: a reader gives something sound, or refuses with one sentence that names the file. Any other exception, a warning,
 a file or thread that is left open, a file that is left behind, or more than MOST_S is a finding; its seed and number
@@ -25,6 +25,8 @@ from random import Random
 
 import numpy as np
 
+from support.mutations import mutated
+from support.small_inputs import write_small_inputs
 from trilane.apps.cli.console import without_controls
 from trilane.apps.cli.inspect import lines
 from trilane.apps.inspection.inspect_file import inspect_file
@@ -39,8 +41,6 @@ from trilane.scene.load import load_scene, scene_from
 from trilane.scene.motion.load import load_motion
 from trilane.scene.schema import AvatarSpec, CameraSpec
 from trilane.stages.gpu.background import open_background
-from trilane.testing.mutations import mutated
-from trilane.testing.small_inputs import write_small_inputs
 
 MOST_S = 20.0
 DRAWN = 0.1  # of the cases

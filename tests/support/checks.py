@@ -1,19 +1,25 @@
 """Style, types and tests in one piece. Rule: every check runs, whatever failed; the last line names each failure.
 
-Use: `python -m trilane.testing.checks [--slow | --rest]`, as `make test`, `make test-all` and `make test-rest` call it.
-The file is also the pytest plugin that tells the runner what failed and what was skipped (`-p trilane.testing.checks`).
+Use: `python tests/support/checks.py [--slow | --rest]`, as `make test`, `make test-all` and `make test-rest` call it.
+The file is also the pytest plugin that tells the runner what failed and what was skipped (`-p support.checks`). With
+`--listed-skips` a test that is skipped has to be on tests/allowed-skips.toml: `[[skip]]` with `test`, a pattern of test
+names as pytest prints them, and `reason`, a pattern of what it says, both as a shell writes them.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 from threading import Event
@@ -22,6 +28,7 @@ from typing import Any, Final, NamedTuple
 import pytest
 
 BIN = Path(sys.executable).parent
+TESTS = Path(__file__).resolve().parents[1]
 STYLE = (["ruff", "check", "."], ["ruff", "format", "--check", "."], ["mypy"])
 #: Tests share the cores, a file of them on one worker. Files that wait the longest come first, small ones at the end.
 FOLDERS = ("process", "conformance", "golden", "core")
@@ -31,6 +38,7 @@ GROUPS = ([*WORKERS, *(f"tests/{folder}" for folder in FOLDERS)],)
 #: Beside the packages that decide what is skipped: the tests that `make test` skipped here, for `make test-rest`.
 SKIPPED = Path(sys.prefix) / "skipped-tests.txt"
 INTERRUPTED = 130
+LIST = TESTS / "allowed-skips.toml"
 
 
 #: Tests that this process's pytest was to run.
@@ -68,12 +76,13 @@ def check_tests(arguments: Sequence[str], told: Path) -> Outcome:
     command = [
         str(BIN / "pytest"),
         "-p",
-        "trilane.testing.checks",
+        "support.checks",
         f"--tell={told}",
         "--continue-on-collection-errors",
         *arguments,
     ]
-    code = subprocess.run(command, check=False).returncode
+    path = os.pathsep.join(filter(None, (str(TESTS), os.environ.get("PYTHONPATH"))))
+    code = subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, check=False).returncode
     if not told.is_file():
         return Outcome([f"pytest {' '.join(arguments)} (exit code {code}, nothing told)"], complete=False)
     found = json.loads(told.read_text(encoding="utf-8"))
@@ -92,7 +101,7 @@ def main(words: Sequence[str]) -> int:
     asked = parser.parse_args(words)
     begin_s = time.monotonic()
     told = SKIPPED.with_suffix(".json")
-    extra = ["--slow", "-p", "trilane.testing.skips"] if asked.slow or asked.rest else []
+    extra = ["--slow", "--listed-skips"] if asked.slow or asked.rest else []
     if asked.rest:
         if not SKIPPED.is_file():
             parser.error("nothing says what `make test` skipped here: run it first")
@@ -142,6 +151,7 @@ def interrupts() -> Iterator[Event]:
 
 def pytest_addoption(parser: Any) -> None:
     parser.addoption("--tell", type=Path, help="a JSON file for what failed, how many passed, and what was skipped")
+    parser.addoption("--listed-skips", action="store_true", help="fail for a skip that tests/allowed-skips.toml lacks")
     parser.addoption("--only-rest", type=Path, help="only slow tests and those that this file names, one in a line")
 
 
@@ -186,6 +196,73 @@ def pytest_terminal_summary(terminalreporter: Any, config: Any) -> None:
     failed = names("failed", "error") + not_run
     told = {"failed": failed, "skipped": names("skipped"), "passed": len(stats.get("passed", ())), "missing": missing}
     file.write_text(json.dumps(told), encoding="utf-8")
+
+
+@dataclass(frozen=True)
+class Allowed:
+    """`why`: what the test needs that CI does not have."""
+
+    test: str
+    reason: str
+    why: str
+
+
+@dataclass(frozen=True)
+class Skip:
+    """One test that was skipped, or a file that could not be collected without a part."""
+
+    test: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.test}: {self.reason}"
+
+
+def load_allowed(file: Path = LIST) -> list[Allowed]:
+    """Raises TypeError for a row with other keys."""
+    return [Allowed(**row) for row in tomllib.loads(file.read_text(encoding="utf-8")).get("skip", [])]
+
+
+def not_allowed(skips: Iterable[Skip], allowed: Iterable[Allowed]) -> list[Skip]:
+    """The skips that no row covers."""
+    rows = list(allowed)
+    return [
+        skip
+        for skip in skips
+        if not any(fnmatchcase(skip.test, row.test) and fnmatchcase(skip.reason, row.reason) for row in rows)
+    ]
+
+
+class SkipList:
+    """Collects what is skipped, and fails the run for what is not on the list."""
+
+    def __init__(self, allowed: list[Allowed]) -> None:
+        self._allowed = allowed
+        self.skips: list[Skip] = []
+
+    def _note(self, report: Any) -> None:
+        if report.skipped and not hasattr(report, "wasxfail"):
+            _, _, reason = report.longrepr
+            self.skips.append(Skip(report.nodeid, reason.removeprefix("Skipped: ")))
+
+    pytest_runtest_logreport = _note
+    pytest_collectreport = _note
+
+    def pytest_sessionfinish(self, session: Any, exitstatus: int) -> None:
+        if exitstatus == 0 and not_allowed(self.skips, self._allowed):
+            session.exitstatus = 1
+
+    def pytest_terminal_summary(self, terminalreporter: Any) -> None:
+        terminalreporter.section("skips and the list of those that CI allows")
+        unknown = not_allowed(self.skips, self._allowed)
+        terminalreporter.line(f"{len(self.skips)} skipped, {len(unknown)} of them not on {LIST.name}")
+        for skip in unknown:
+            terminalreporter.line(f"not on the list: {skip}")
+
+
+def pytest_configure(config: Any) -> None:
+    if config.getoption("--listed-skips"):
+        config.pluginmanager.register(SkipList(load_allowed()), "trilane-skip-list")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Malformed requests and messages for a dashboard: `python -m trilane.testing.malformed_requests URL --count 200`.
+"""Malformed requests and messages for a dashboard: `malformed_requests.py URL --count 200`.
 
 Rule: each one is drawn from a seed and its number, so a finding can be made again. The answer to each must begin with
 a status of 400 to 499, or, once a WebSocket is open, be a refusal or close that connection. What the server prints is

@@ -1,14 +1,172 @@
 """A second scheduler, with which the core is compared. Rule: written from the rules, not from the scheduler's code.
 
-It looks at every unit at every instant and marks nothing as dirty. From the rules of docs/conventions.md it works out
-every job, drop, loss, wait, latency and account.
+It looks at every unit at every instant, marks nothing as dirty and keeps counts in place of slots. From the rules of
+docs/conventions.md it works out every job, drop, loss, wait, latency and account. At the end stand pipelines, settings
+and faults drawn at random; the same seed draws the same.
 """
 
 from __future__ import annotations
 
+import random
+from collections import Counter
 from typing import Any
 
-from trilane.testing.plain_state import NO_TIME, SLOTS, PlainState, PlainUnit
+from trilane.scheduler.events import Graph, Settings, StageSpec
+
+SLOTS = {"single": 1, "double": 2, "triple": 3, "fifo:1": 1, "fifo:3": 3, "fifo:64": 64, "orphan:4": 4, "orphan": 6}
+NO_TIME = (1 << 62) - 1
+
+
+class PlainUnit:
+    def __init__(self, name: str, stages: list[int], duty: int) -> None:
+        self.name, self.stages, self.duty = name, stages, duty
+        self.queue: list[dict[str, int]] = []
+        self.is_up, self.free_ns, self.head_since_ns, self.failures = True, 0, 0, 0
+        self.hold_until_ns: int | None = None
+        self.start_ns: int | None = None
+        self.ready_ns: int | None = None
+        self.account, self.times_ns = "starved", Counter[str]()
+        self.busy: list[tuple[int, int]] = []
+
+    def room(self) -> int:
+        if not self.is_up or self.hold_until_ns is not None:
+            return 0
+        return 2 if self.duty == 1000 else 1
+
+
+class PlainState:
+    """One run of `graph` at one instant: its units, frames and counts of slots, and what can be said of them."""
+
+    def __init__(
+        self,
+        graph: Graph,
+        settings: Settings,
+        service: Any,
+        delay_ns: int,
+        faults: list[Any],
+        duties: dict[str, int],
+        will_skip: Any = None,
+    ) -> None:
+        self.will_skip = will_skip
+        self.graph, self.settings, self.service, self.delay_ns = graph, settings, service, delay_ns
+        self.last = len(graph.stages) - 1
+        self.faults = sorted(faults)
+        self.units = [
+            PlainUnit(name, [i for i, s in enumerate(graph.stages) if s.unit == name], duties.get(name, 1000))
+            for name in graph.units
+        ]
+        self.unit_of = [next(u for u in self.units if i in u.stages) for i in range(self.last + 1)]
+        self.waiting: list[list[int]] = [[] for _ in graph.stages]
+        self.epoch = [0] * self.last
+        self.estimate = [0] * len(graph.stages)
+        self.flying: dict[int, dict[str, int]] = {}
+        self.queue: list[tuple[int, int]] = []
+        self.next_frame = self.now_ns = 0
+        self.has_begun = False
+        self.jobs: list[tuple[Any, ...]] = []
+        self.ended: list[tuple[str, int, int, int, int]] = []
+        self.presented: list[tuple[int, int, int, int]] = []
+        self.dropped, self.lost = Counter[str](), Counter[str]()
+        names = [stage.name for stage in graph.stages]
+        self.begin, self.end = [names.index(name) for name in graph.bypass or ()] or (-9, -9)
+        self.passing: list[int] = []  # frames on the bypass that wait for its end
+        self.fresh, self.last_skipped = True, False
+
+    # what there is
+
+    @property
+    def is_paced(self) -> bool:
+        return bool(self.settings.period_ns or self.settings.arrivals_ns)
+
+    def release_ns(self, frame: int) -> int:
+        arrivals = self.settings.arrivals_ns
+        return arrivals[frame] if arrivals else frame * self.settings.period_ns
+
+    def used(self, edge: int) -> int:
+        """Slots of the edge that are written, waited in or read."""
+        jobs = [job for unit in self.units for job in unit.queue]
+        reads = [edge + 1 if job["stage"] != self.end or not self.skips(job["frame"]) else -1 for job in jobs]
+        count = sum(edge == job["stage"] or job["stage"] == at for job, at in zip(jobs, reads, strict=True))
+        if edge == self.begin:
+            count += len(self.passing) + sum(job["stage"] == self.end and self.skips(job["frame"]) for job in jobs)
+        return len(self.waiting[edge + 1]) + count
+
+    def skips(self, frame: int) -> bool:
+        return bool(self.flying[frame].get("skips"))
+
+    def line(self, stage: int) -> list[int]:
+        """The frames that the stage takes, in order: one on the bypass waits until no older one is before its end."""
+        frames = list(self.waiting[stage])
+        if stage == self.end:
+            before = min((number for number, row in self.flying.items() if row["at"] < stage), default=NO_TIME)
+            frames += [frame for frame in self.passing if frame < before]
+        return sorted(frames)
+
+    def has_slot(self, stage: int) -> bool:
+        if stage == self.last:
+            return True
+        rule = self.graph.edges[stage]
+        waits = self.waiting[stage + 1] or (stage == self.begin and self.passing)
+        yields = rule.startswith(("triple", "orphan")) and bool(waits)
+        return self.used(stage) < SLOTS[rule] or yields
+
+    def is_full(self) -> bool:
+        limits = [self.settings.in_flight] if self.settings.in_flight else []
+        limits += [1] if self.settings.policy == "sequential" else []
+        return bool(limits) and len(self.flying) >= min(limits)
+
+    def has_source(self) -> bool:
+        return bool(self.queue) if self.is_paced else self.next_frame < self.settings.frames
+
+    def latch_from_ns(self) -> int:
+        if self.settings.latch_ns == 0 or self.last == 0:
+            return self.now_ns
+        waits = self.waiting[1] or (self.begin == 0 and self.passing)
+        if waits or any(job["stage"] == 0 for job in self.unit_of[0].queue):
+            return NO_TIME
+        second = self.unit_of[1]
+        free_ns = second.head_since_ns if second.queue else self.now_ns
+        free_ns += sum(self.estimate[job["stage"]] for job in second.queue)
+        return free_ns - self.estimate[0] - self.settings.latch_ns
+
+    def has_input(self, stage: int) -> bool:
+        return bool(self.line(stage)) if stage else self.has_source()
+
+    def may_enter(self) -> bool:
+        return not self.is_full() and self.now_ns >= self.latch_from_ns()
+
+    def can_begin(self, stage: int) -> bool:
+        return self.has_input(stage) and (stage > 0 or self.may_enter()) and self.has_slot(stage)
+
+    def head(self, stage: int) -> tuple[int, int]:
+        """The stage's next frame and its deadline."""
+        if stage:
+            frame = self.line(stage)[0]
+            return frame, self.flying[frame]["deadline"]
+        frame, released_ns = self.queue[0] if self.queue else (self.next_frame, self.now_ns)
+        return frame, self.deadline(released_ns)
+
+    def deadline(self, released_ns: int) -> int:
+        return released_ns + self.settings.deadline_ns if self.settings.deadline_ns else NO_TIME
+
+    def is_late(self, stage: int) -> bool:
+        """now + max over s of [max(own work before s, work of older frames at s) + own work from s on] > deadline.
+
+        A frame that has still to do the stage where the bypass begins will skip if the last one there did.
+        """
+        frame, deadline_ns = self.head(stage)
+        ends = []
+        skipped = range(self.begin + 1, self.end) if self.last_skipped else range(0)
+        own = [0 if s in skipped and stage <= self.begin else ns for s, ns in enumerate(self.estimate)]
+        for s in range(stage, self.last + 1):
+            least = self.begin + 1 if s in skipped else 0
+            older = sum(number < frame and least <= row["at"] <= s for number, row in self.flying.items())
+            unit, backlog_ns = self.unit_of[s], older * self.estimate[s]
+            if older and unit.queue and unit.queue[0]["stage"] == s:
+                backlog_ns -= min(self.now_ns - unit.head_since_ns, self.estimate[s])
+            ends.append(max(sum(own[stage:s]), backlog_ns) + sum(own[s:]))
+        return deadline_ns != NO_TIME and self.now_ns + max(ends) > deadline_ns
+
 
 LEAD_NS = {"sequential": 0, "pipelined": 0, "latest": 1_000_000, "deadline": 1_000_000}
 BACK_OFF_NS = (0, 100_000_000, 400_000_000, 1_600_000_000)
@@ -277,3 +435,59 @@ class PlainScheduler(PlainState):
                     self.hand_over(unit, stage)
                     changed = True
                 changed |= self.dropped.total() > dropped  # a frame less in flight: another may begin
+
+
+def service_of(seed: int) -> Any:
+    """0.2 to 5 ms, other for each stage and frame, so that hardly two jobs end in one instant."""
+    return lambda stage, _unit, frame, _begin_ns: random.Random(f"{seed} {stage} {frame}").randint(200_000, 5_000_000)
+
+
+def drawn(seed: int) -> tuple[Graph, Settings, int, list[tuple[int, str]], dict[str, int]]:
+    draw = random.Random(seed)
+    policy = draw.choice(["sequential", "pipelined", "pipelined", "latest", "deadline"])
+    count = draw.randint(1, 5)
+    stages = tuple(StageSpec(f"s{i}", draw.choice(["cpu", "gpu", "dsp"])) for i in range(count))
+    # a frame that waits for a slot of the next edge is given up as late when its unit is looked at, which need not be
+    # the first instant in which it is late: so the edges of `deadline` are never full
+    rules = ["fifo:64"] if policy == "deadline" else [rule for rule in SLOTS if rule != "fifo:64"]
+    graph = Graph(stages, tuple(draw.choice(rules) for _ in stages[1:]), draw.choice(stages).name)
+    paced = policy in ("latest", "deadline") or draw.random() < 0.5
+    rate = draw.choice(["period_ns", "arrivals_ns"]) if paced else None
+    period_ns = draw.randint(2_000_000, 9_000_000)
+    frames = 40
+    arrivals_ns = tuple(sorted(draw.randint(0, frames * period_ns) for _ in range(frames)))
+    settings = Settings(
+        frames,
+        policy,
+        period_ns=period_ns if rate == "period_ns" else 0,
+        arrivals_ns=arrivals_ns if rate == "arrivals_ns" else (),
+        latch_ns=draw.choice([0, 0, 700_001]) if policy == "pipelined" else 0,
+        deadline_ns=draw.choice([0, 9_000_000, 16_000_001, 30_000_000]) if paced or policy == "pipelined" else 0,
+        in_flight=draw.choice([0, 0, 2, 3, 5]),
+        in_queue=draw.choice([0, 0, 1, 2]),
+        queue_timeout_ns=draw.choice([0, 0, 6_000_001]) if rate else 0,
+    )
+    faults = [(draw.randint(1, 150_000_000), draw.choice(graph.units)) for _ in range(draw.choice([0, 0, 1, 3]))]
+    yields = any(rule.startswith(("triple", "orphan")) for rule in graph.edges)
+    duties = {name: draw.choice([1000, 1000, 500, 333]) for name in graph.units} if not yields and count > 1 else {}
+    return graph, settings, draw.choice([0, 50_001]), faults, duties
+
+
+def skips_of(seed: int) -> Any:
+    """Six of ten frames skip; of those that are told to be fresh one of ten, as one in which there is nobody."""
+
+    def skips(frame: int, fresh: bool) -> bool:
+        return random.Random(f"{seed} skip {frame}").random() < (0.1 if fresh else 0.6)
+
+    return skips
+
+
+def with_bypass(seed: int, graph: Graph) -> Graph:
+    """`graph` with a bypass between two stages drawn at random, if it is long enough for one."""
+    draw, count = random.Random(f"{seed} bypass"), len(graph.stages)
+    ends = [(begin, end) for begin in range(count) for end in range(begin + 2, count)]
+    if not ends:
+        return graph
+    begin, end = draw.choice(ends)
+    names = [stage.name for stage in graph.stages]
+    return Graph(graph.stages, graph.edges, draw.choice(names[: begin + 1] + names[end:]), (names[begin], names[end]))

@@ -1,10 +1,14 @@
-"""Doubles of the avatar's five stages. Rule: they spend the time that they are told, and check what they are handed.
+"""Stages for tests. Doubles spend the time that they are told and check what they are handed.
 
-The payload of a frame is its number, repeated, and each stage checks it, so that a slot used twice is seen.
+The payload of a frame is its number, repeated, and each double checks it, so that a slot used twice is seen. Three more
+stages are nearly real: the pose stage without skips, a last stage that notes what its slots hold, and the raster stage
+that loses its OpenGL context once. Units import this module by name: tests/conftest.py tells them where it is.
 """
 
 from __future__ import annotations
 
+import ctypes
+import math
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,12 +19,16 @@ import numpy as np
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host import host_units
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage
-from trilane.pipeline.stage import Skip, UnitContext
+from trilane.pipeline.stage import Skip, Stage, UnitContext
+from trilane.scene.work import Work
+from trilane.stages.cpu import pose
+from trilane.stages.gpu import raster
+from trilane.stages.gpu.opengl_context import LIBRARY
 from trilane.transport.packets import Packet
 from trilane.units import AFTER_INFER, BEFORE_INFER, INFER, LATENCY_TO
 
 STAGES = (*BEFORE_INFER, INFER, *AFTER_INFER)
-MODULE = "trilane.testing.doubles"
+MODULE = "support.doubles"
 FACTORY = f"{MODULE}:build"
 USUAL_S = 0.001
 BAD_FRAME = 3
@@ -179,3 +187,99 @@ def pipeline_of_doubles(
         latency_to=LATENCY_TO,
         preload=(MODULE,),
     )
+
+
+class FullFrames:
+    """Forgets before each frame, and calls work full where nobody is seen."""
+
+    def __init__(self, stage: pose.PoseStage) -> None:
+        self._stage = stage
+        self._outputs: Sequence[Packet] = ()
+
+    def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
+        self._outputs = outputs
+        self._stage.bind(inputs, outputs)
+
+    def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
+        self._stage.forget()
+        metrics = dict(self._stage.run(frame, slot_in, slot_out))
+        if slot_out is not None:
+            header = self._outputs[slot_out].header
+            header["work"], header["picture"] = Work.FULL, frame
+        return metrics
+
+    def close(self) -> None:
+        self._stage.close()
+
+
+def build_full_frames(settings: Mapping[str, Any], unit: UnitContext) -> FullFrames:
+    """The pose stage of the configuration in `settings`, without skips."""
+    return FullFrames(pose.build(settings, unit))
+
+
+CORNER_PIXELS = 8
+
+
+class CornerGreys:
+    """A last stage in place of `present` that keeps no video, which would lose some of what the slot holds.
+
+    It appends a line `frame mean` to `log`, of the upper left corner of pictures that are `width` pixels wide.
+    """
+
+    def __init__(self, log: str, width: int) -> None:
+        self._log = open(log, "a", buffering=1, encoding="ascii")  # noqa: SIM115, PTH123 - closed in close()
+        self._width = width
+
+    def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:  # noqa: ARG002 - a last stage has none
+        shape = (CORNER_PIXELS, self._width, 3)
+        self._rows = [packet.payload[: math.prod(shape)].reshape(shape) for packet in inputs]
+
+    def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
+        assert slot_in is not None
+        self._log.write(f"{frame} {float(self._rows[slot_in][:, :CORNER_PIXELS].mean())}\n")
+        return {}
+
+    def close(self) -> None:
+        self._log.close()
+
+
+def build_corner_greys(settings: Mapping[str, Any], unit: UnitContext) -> CornerGreys:  # noqa: ARG001 - a factory's signature
+    """The stage that `settings` describe: `log` and `width`."""
+    return CornerGreys(settings["log"], settings["width"])
+
+
+LOSING_FACTORY = f"{MODULE}:build_losing"
+MARK = "lost-context"
+
+
+def lose_context() -> None:
+    """Leave the calling thread without a context, as a driver does that was reset."""
+    egl = ctypes.CDLL(LIBRARY)
+    egl.eglGetCurrentDisplay.restype = ctypes.c_void_p
+    egl.eglMakeCurrent.argtypes = (ctypes.c_void_p,) * 4
+    if not egl.eglMakeCurrent(egl.eglGetCurrentDisplay(), None, None, None):
+        raise OSError("eglMakeCurrent did not let go of the context")
+
+
+class LosingStage:
+    """`stage`, which loses its context before frame `BAD_FRAME`, once in a run: the file `mark` remembers it."""
+
+    def __init__(self, stage: Stage, mark: Path) -> None:
+        self._stage, self._mark = stage, mark
+
+    def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
+        self._stage.bind(inputs, outputs)
+
+    def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
+        if frame >= BAD_FRAME and not self._mark.exists():
+            self._mark.touch()
+            lose_context()
+        return self._stage.run(frame, slot_in, slot_out)
+
+    def close(self) -> None:
+        self._stage.close()
+
+
+def build_losing(settings: Mapping[str, Any], unit: UnitContext) -> LosingStage:
+    """The raster stage of `settings`; the mark is put into the folder `settings["config"]["out_dir"]`."""
+    return LosingStage(raster.build(settings, unit), Path(settings["config"]["out_dir"]) / MARK)

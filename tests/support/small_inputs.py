@@ -1,6 +1,8 @@
 """One small, sound file of every kind that people bring, to inspect, to spoil and to mutate.
 
-Rule: everything is made here, from the published layout of its format; nothing depends on the default avatar.
+Rule: everything is made here, from the published layout of its format; nothing depends on the default avatar. At the
+end stand a network of bytes whose every part has a name, the folder of a small capture, and a manifest with figures
+that are made up and digests that are real.
 """
 
 from __future__ import annotations
@@ -8,6 +10,7 @@ from __future__ import annotations
 import json
 import pickle
 from collections.abc import Callable
+from datetime import date
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,15 +19,10 @@ import av
 import numpy as np
 import onnx
 from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
 from PIL import Image
 
-from trilane.avatars.bundle import write_bundle
-from trilane.avatars.manifest import Manifest, network_entry
-from trilane.avatars.network_checks import check_network
-from trilane.body.joints import JOINT_PARENTS, JOINTS
-from trilane.scene.motion.t_pose import T_POSE
-from trilane.testing.byte_network import net
-from trilane.testing.camera_files import (
+from support.camera_files import (
     Writer,
     kitti_text,
     write_colmap_binary,
@@ -33,6 +31,12 @@ from trilane.testing.camera_files import (
     write_record3d,
     write_stray,
 )
+from trilane.avatars.bundle import Bundle, write_bundle
+from trilane.avatars.digests import digests_of, with_figures_digest
+from trilane.avatars.manifest import Manifest, Validation, network_entry
+from trilane.avatars.network_checks import check_network
+from trilane.body.joints import JOINT_PARENTS, JOINTS
+from trilane.scene.motion.t_pose import T_POSE
 
 VERTICES, FACES, CORNERS = 60, 80, 90
 #: Name, depth below the root, offset from its parent in centimetres.
@@ -288,3 +292,103 @@ def write_small_inputs(folder: Path, *names: str) -> dict[str, Path]:
     for name in names or WRITERS:
         WRITERS[name](folder / name)
     return {name: folder / name for name in names or WRITERS}
+
+
+def net(
+    shape: tuple[int, ...] = (1, 32, 64, 3),
+    out: tuple[int, ...] | None = None,
+    scales: tuple[float, float] = (0.5, 0.25),
+    zeros: tuple[int, int] = (7, 11),
+) -> onnx.ModelProto:
+    """NHWC bytes -> dequantise -> transpose -> 1x1 convolution -> quantise (middle) -> ... -> transpose -> bytes."""
+    out = (*shape[:3], 4) if out is None else out
+    rng = np.random.default_rng(3)
+    constants = {
+        "in_scale": np.float32(scales[0]), "in_zero": np.uint8(zeros[0]),
+        "out_scale": np.float32(scales[1]), "out_zero": np.uint8(zeros[1]),
+        "mid_scale": np.float32(0.125), "mid_zero": np.uint8(100),
+        "w_scale": np.float32(0.01), "w_zero": np.int8(0),
+        "w1": rng.integers(-100, 100, (4, shape[-1], 1, 1)).astype(np.int8),
+        "w2": rng.integers(-100, 100, (4, 4, 1, 1)).astype(np.int8),
+    }  # fmt: skip
+    make = helper.make_node
+    nodes = [
+        make("DequantizeLinear", ["bytes", "in_scale", "in_zero"], ["real"], "bytes_in"),
+        make("Transpose", ["real"], ["nchw"], "to_nchw", perm=[0, 3, 1, 2]),
+        make("DequantizeLinear", ["w1", "w_scale", "w_zero"], ["w1_real"], "w1_in"),
+        make("Conv", ["nchw", "w1_real"], ["conv1"], "conv1"),
+        make("QuantizeLinear", ["conv1", "mid_scale", "mid_zero"], ["mid_q"], "mid_out"),
+        make("DequantizeLinear", ["mid_q", "mid_scale", "mid_zero"], ["mid"], "mid_in"),
+        make("DequantizeLinear", ["w2", "w_scale", "w_zero"], ["w2_real"], "w2_in"),
+        make("Conv", ["mid", "w2_real"], ["conv2"], "conv2"),
+        make("QuantizeLinear", ["conv2", "out_scale", "out_zero"], ["rgba_q"], "bytes_out"),
+        make("Transpose", ["rgba_q"], ["rgba"], "to_nhwc", perm=[0, 2, 3, 1]),
+    ]
+    graph = helper.make_graph(
+        nodes,
+        "net",
+        [helper.make_tensor_value_info("bytes", TensorProto.UINT8, shape)],
+        [helper.make_tensor_value_info("rgba", TensorProto.UINT8, out)],
+        [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()],
+    )
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+
+
+def node_of(model: onnx.ModelProto, name: str) -> onnx.NodeProto:
+    """The node of that name. Raises StopIteration."""
+    return next(node for node in model.graph.node if node.name == name)
+
+
+HEIGHT, WIDTH = 64, 96
+CAMERA = f"[camera]\nwidth = {WIDTH}\nheight = {HEIGHT}\nfx = 90.0\nfy = 80.0\ncx = 50.0\ncy = 30.0\n"
+
+
+def fit(number: int, of: int = 8) -> dict[str, Any]:
+    """Of frame `number` of `of`: the body turns about its own axis before an OpenGL camera, by the names of SMPL-X."""
+    rng = np.random.default_rng(number)
+    return {
+        "global_orient": np.array([0.0, -2 * np.pi * number / of, 0.0]),
+        "body_pose": rng.normal(0, 0.2, 63),
+        "transl": np.array([0.1, 0.2, -3.0]),
+        "betas": np.full(10, 0.1 * number),
+    }
+
+
+def write_capture_folder(folder: Path, frames: int = 8, head: str = "") -> Path:
+    """The folder of a capture without faults, whose frames show all sides."""
+    for part in ("frames", "masks", "fits"):
+        (folder / part).mkdir(parents=True)
+    text = f"schema = 1\n{head}\n{CAMERA}axes = 'opengl'\n"
+    (folder / "capture.toml").write_text(text, encoding="utf-8")
+    for number in range(frames):
+        rng = np.random.default_rng((7, number))
+        frame = rng.integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+        mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+        mask[10:50, 30 + number : 60] = 255
+        Image.fromarray(frame).save(folder / "frames" / f"{number:03}.png")
+        Image.fromarray(mask).save(folder / "masks" / f"{number:03}.png")
+        np.savez(folder / "fits" / f"{number:03}.npz", **fit(number, frames))
+    return folder
+
+
+#: Of the made-up figures, PSNR in dB: that of the avatar's runtime, and of `openvino`.
+PSNR_DB, OTHER_PSNR_DB = 31.4159, 27.1828
+
+
+def validated(bundle: Bundle, size: str = "256") -> Manifest:
+    """The manifest of `bundle` with a validation of its files on `ort` and `openvino` at tensor size `size`."""
+    figures = {
+        "psnr_db_by_band": {"full_body": PSNR_DB},
+        "psnr_db_by_background": {"black": PSNR_DB},
+        "see_through": 0.0123,
+        "iou": 0.9753,
+        "ssim": 0.8642,
+    }
+    others = {
+        "openvino": figures
+        | {"psnr_db_by_band": {"full_body": OTHER_PSNR_DB}, "psnr_db_by_background": {"black": OTHER_PSNR_DB}}
+    }
+    digests = digests_of(bundle.folder, bundle.manifest)
+    about = {"date": date(2026, 1, 2), "digests": digests, "runtime": "ort", "size": size, "other_runtimes": others}
+    validation = with_figures_digest(Validation.model_validate(figures | about))
+    return bundle.manifest.model_copy(update={"validation": validation})

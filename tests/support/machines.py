@@ -30,7 +30,7 @@ from trilane import machine
 from trilane.errors import BadInputError
 from trilane.near_miss import did_you_mean
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 TABLE = ROOT / "tests" / "machines.toml"
 KEPT = ROOT / ".venv" / "machines"
 PYENV = Path("~/.pyenv/versions")
@@ -225,7 +225,7 @@ def _run(row: Row, everywhere: Sequence[str], began: float) -> Outcome:
         environment = {
             **os.environ,
             "PATH": path,
-            "PYTHONPATH": f"{root / 'tests/machines'}{os.pathsep}{root / 'src'}",
+            "PYTHONPATH": os.pathsep.join(str(root / folder) for folder in ("tests/machines", "tests", "src")),
             "TRILANE_TEST_MACHINE": json.dumps(row.machine),
             **row.environment,
         }
@@ -234,7 +234,7 @@ def _run(row: Row, everywhere: Sequence[str], began: float) -> Outcome:
         KEPT.mkdir(parents=True, exist_ok=True)
         told = KEPT / f"{row.name}.json"
         told.unlink(missing_ok=True)
-        plugins = ["-p", "no:cacheprovider", "-p", "trilane.testing.checks", f"--tell={told}"]
+        plugins = ["-p", "no:cacheprovider", "-p", "support.checks", f"--tell={told}"]
         if row.lowest:  # an old package may use what a newer one of its own has deprecated
             plugins += ["-W", "ignore::DeprecationWarning"]
         words = [*wrapper, str(python), "-m", "pytest", "--quiet", "--color=no", *plugins, *tests]

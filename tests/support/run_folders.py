@@ -6,10 +6,10 @@ import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from support.run_report import make_report
 from trilane.pipeline.journal import NAME, JournalWriter, Worked, journal_of
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.virtual import Simulation
-from trilane.testing.run_report import make_report
 
 
 def write_run(
