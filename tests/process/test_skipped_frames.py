@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from support.doubles import pipeline_of_doubles
-from trilane.bench.faults import unit_process
+from support.faults import unit_process
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline

@@ -11,7 +11,7 @@ from typing import Any
 from trilane.pipeline.stage import UnitContext
 from trilane.transport.packets import Packet
 
-FACTORY = "trilane.bench.lib.cpu_load:build"
+FACTORY = "support.cpu_load:build"
 BLOCK = bytes(1 << 16)  # hashed in some 50 us, without the interpreter's lock
 
 
