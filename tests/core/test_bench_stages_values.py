@@ -11,7 +11,8 @@ import numpy as np
 import onnx
 import pytest
 
-from trilane.bench.lib import asked_processes, handoff_stages, interleaved_processes, networks
+from trilane.bench import handoff
+from trilane.bench.lib import interleaved_processes, networks
 from trilane.bench.lib.interleaved_processes import KINDS, Runner, Variant
 from trilane.errors import TrilaneError
 from trilane.pipeline.description import UnitSettings
@@ -132,7 +133,7 @@ class Processes:
 def test_runners_have_a_process_each_and_end_them_all(monkeypatch: pytest.MonkeyPatch) -> None:
     told = Processes()
     asked: list[str] = []
-    monkeypatch.setattr(asked_processes.multiprocessing, "get_context", lambda how: asked.append(how) or told)
+    monkeypatch.setattr(interleaved_processes.multiprocessing, "get_context", lambda how: asked.append(how) or told)
     variants = {"a": Variant("ort", Path("a"), threads=3), "b": Variant("ort", Path("b"), threads=4)}
     with interleaved_processes.runners(variants) as by_name:
         assert {name: each.startup_ms for name, each in by_name.items()} == {"a": 3.0, "b": 4.0}
@@ -228,14 +229,14 @@ def test_openvino_is_asked_as_its_first_example_asks(
 
 def test_a_slot_is_written_whole_and_read_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     slept: list[float] = []
-    monkeypatch.setattr(handoff_stages.time, "sleep", slept.append)
+    monkeypatch.setattr(handoff.time, "sleep", slept.append)
     layout = SlotLayout(header_dtype(), 64)
     slots = [view_packet(memoryview(bytearray(layout.slot_bytes)), layout) for _ in range(2)]
-    pipeline = handoff_stages.handoff_pipeline(64)
-    assert [(stage.name, stage.unit) for stage in pipeline.stages] == [*handoff_stages.STAGES]
+    pipeline = handoff.handoff_pipeline(64)
+    assert [(stage.name, stage.unit) for stage in pipeline.stages] == [*handoff.STAGES]
     assert [edge.payload_bytes for edge in pipeline.edges] == [0, 64, 0]
     unit = UnitContext("a", UnitSettings(cores=(0,), threads=1), {})
-    by_name = {stage.name: handoff_stages.build(stage.settings, unit) for stage in pipeline.stages}
+    by_name = {stage.name: handoff.build(stage.settings, unit) for stage in pipeline.stages}
     for name, stage in by_name.items():
         stage.bind(slots if name == "infer" else [], slots if name == "raster" else [])
     assert by_name["pose"].run(255, None, 0) == {} and slept == [0.001] and not slots[0].payload.any()
@@ -249,7 +250,7 @@ def test_a_slot_is_written_whole_and_read_whole(monkeypatch: pytest.MonkeyPatch)
         by_name["infer"].run(255, 0, None)
     slots[1].payload[63] = 5
     with pytest.raises(TrilaneError, match="64 bytes"):
-        handoff_stages.check_bytes(slots[1].payload, 4)
+        handoff.check_bytes(slots[1].payload, 4)
     assert slept == [0.001]
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from trilane.bench import pipeline as pipeline_bench
-from trilane.bench.lib import fixture, load, timing
+from trilane.bench.lib import fixture, load
 from trilane.bench.lib.float_raster import quantise, rasterise, sample
 from trilane.bench.lib.limits import LIMITS, check_limits
 from trilane.bench.lib.load import Load, Queries
@@ -44,21 +44,21 @@ class Clock:
 def test_variants_take_turns_and_the_warm_up_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
     """`a` takes 2 s, `b` 3 s, and each its round's number of milliseconds more."""
     clock, rounds, order = Clock(), {"a": count(), "b": count()}, []
-    monkeypatch.setattr(timing, "time", clock)
+    monkeypatch.setattr(fixture, "time", clock)
 
     def run(name: str, seconds: float) -> None:
         order.append(name)
         clock.now += seconds + next(rounds[name]) / 1000
 
-    times = timing.interleaved_ms({"a": lambda: run("a", 2.0), "b": lambda: run("b", 3.0)}, 3)
+    times = fixture.interleaved_ms({"a": lambda: run("a", 2.0), "b": lambda: run("b", 3.0)}, 3)
     assert "".join(order) == "ab" * (5 + 3)
     assert times["a"] == pytest.approx([2005, 2006, 2007])
     assert times["b"] == pytest.approx([3005, 3006, 3007])
 
 
 def test_a_summary_is_median_minimum_and_ninetieth_percentile() -> None:
-    assert timing.summary_ms([float(n) for n in range(11)]) == {"median_ms": 5.0, "min_ms": 0.0, "p90_ms": 9.0}
-    assert timing.summary_ms([5.0, 1.0, 2.0, 4.0])["median_ms"] == 3.0
+    assert fixture.summary_ms([float(n) for n in range(11)]) == {"median_ms": 5.0, "min_ms": 0.0, "p90_ms": 9.0}
+    assert fixture.summary_ms([5.0, 1.0, 2.0, 4.0])["median_ms"] == 3.0
 
 
 def test_the_standing_body_is_held(held: Held) -> None:

@@ -17,8 +17,7 @@ from trilane.avatars.bundle import bundle_folder, load_bundle
 from trilane.avatars.network_checks import check_network
 from trilane.avatars.network_reshape import reshaped
 from trilane.bench.lib import full_network
-from trilane.bench.lib.full_body import FullBody
-from trilane.bench.lib.full_picture import SAMPLES, supersampled
+from trilane.bench.lib.full_picture import SAMPLES, FullBody, supersampled
 from trilane.body.body import load_body
 from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import CpuSkinner

@@ -13,7 +13,7 @@ import pytest
 from trilane.bench import raster, readback
 from trilane.bench.lib.fixture import ENCODING, standing
 from trilane.bench.lib.gpu_buffering import SubUpload
-from trilane.bench.lib.split_pass import SplitPass
+from trilane.bench.raster import SplitPass
 from trilane.errors import BadInputError, TrilaneError
 from trilane.stages.gpu.opengl_context import Driver, describe
 from trilane.stages.gpu.packed_pass import PackedPass

@@ -15,7 +15,7 @@ from support import raster_oracle
 from trilane.arrays import F64, U8
 from trilane.bench.lib import float_raster
 from trilane.bench.lib.fixture import ENCODING
-from trilane.bench.lib.split_pass import SplitPass
+from trilane.bench.raster import SplitPass
 from trilane.stages.gpu.mesh_arrays import MeshArrays, mesh_arrays
 from trilane.stages.gpu.opengl_context import describe
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement, Quantisation

@@ -23,9 +23,9 @@ from trilane.apps.experiments import reference_path
 from trilane.apps.experiments.scene_pictures import around
 from trilane.apps.run_check import FLOAT_PATH, TRUTH, check_run
 from trilane.arrays import U8
+from trilane.bench.lib.full_picture import TruePictures, true_pictures
 from trilane.bench.lib.layers import blended
 from trilane.bench.lib.stage_chain import AvatarFrames
-from trilane.bench.lib.true_picture import TruePictures, true_pictures
 from trilane.stages.configure import Checked, Request, configure
 from trilane.stages.cpu.kept_frames import KeptFrames
 
