@@ -2,13 +2,13 @@
 # Arguments of `trilane run` go in ARGS: make run ARGS="--frames 60 --size 192"
 SHELL := /bin/bash
 .DELETE_ON_ERROR:
-.PHONY: run test test-all test-rest test-machines test-device mutants results setup format compile interpreted clean
+.PHONY: run test test-all test-rest test-machines test-device results setup format compile interpreted clean
 
 BIN := .venv/bin
 COMPILED := $(shell sed -n 's/^    "\(.*\.py\)",$$/\1/p' src/trilane/compiled.py)
 
 # Every check, whatever fails; with ARGS only the tests that it names, as pytest takes them.
-checks = $(if $(ARGS),$(BIN)/pytest $(filter --slow,$(1)) $(ARGS),$(BIN)/python -m trilane.testing.checks $(1))
+checks = $(if $(ARGS),$(BIN)/pytest $(filter --slow,$(1)) $(ARGS),$(BIN)/python tests/support/checks.py $(1))
 
 run: .venv/ready-run
 	$(BIN)/trilane run $(ARGS)
@@ -27,17 +27,13 @@ test-rest: .venv/ready-all .venv/ready-core
 # Some tests once more on each machine of tests/machines.toml: one core, no compiler, another locale and more.
 # ARGS=--environments: those with packages or a Python of their own, which are installed once.
 test-machines: .venv/ready-test .venv/ready-core
-	@$(BIN)/python -m trilane.testing.machines $(ARGS)
+	@$(BIN)/python tests/support/machines.py $(ARGS)
 
 # What needs a GPU: hardware OpenGL, training on CUDA, the runtime cuda. Exit code 3 where there is none.
 test-device: .venv/ready-device
 	$(BIN)/pytest tests/device $(ARGS)
 	$(BIN)/pytest tests/golden $(ARGS)
 	$(BIN)/pytest tests/conformance/test_runtimes.py tests/conformance/test_hard_cases.py --runtime cuda $(ARGS)
-
-# Small faults put into a copy of the code, to see which the tests notice: tests/README.md.
-mutants: .venv/ready-all
-	$(BIN)/python -m trilane.testing.mutants $(ARGS)
 
 # The project's own figures. docs/results: a sweep of this machine, some minutes in which it should do nothing else. Tables and pictures of
 # docs/predict.md: computed from data beside this repository, where they are.

@@ -40,7 +40,6 @@ class AskedRun:
     `has_video`: whether the presented pictures are digested and encoded; not for runs that last.
     `check`: how many of its frames are compared with the truth or the float path when it is over; 0: none.
     `remake`: what of the avatar is made anew for the run.
-    `held_ns`: how long jobs of a stage are held, at least, by its name; in place of a chip's pace.
     """
 
     request: Mapping[str, Any] = field(default_factory=dict)
@@ -54,7 +53,6 @@ class AskedRun:
     has_video: bool = True
     check: int = 0
     remake: Remake = field(default_factory=Remake)
-    held_ns: Mapping[str, int] = field(default_factory=dict)
 
 
 def check_numbers(asked: AskedRun) -> None:
@@ -117,8 +115,6 @@ def prepare(asked: AskedRun, gl: GlFacts) -> Prepared:
 
         pace = pace_of(checked.config, *asked.paced_by)
         plan, checked = replace(plan, pace=pace), checked.changed(pace_ns=dict(pace.stage_ns))
-    if asked.held_ns:
-        checked = checked.changed(pace_ns={**checked.config.pace_ns, **asked.held_ns})
     if not asked.has_video:
         checked = checked.changed(record=False)
     return Prepared(asked, checked, plan)

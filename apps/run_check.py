@@ -54,7 +54,7 @@ def check_run(checked: Checked, folder: Path, told: Callable[[int, int], None] =
     from trilane.apps.experiments.picture_errors import figures
     from trilane.apps.experiments.reference_path import ReferencePath
     from trilane.apps.experiments.scene_pictures import around
-    from trilane.bench.lib.true_picture import true_pictures
+    from trilane.bench.lib.full_picture import true_pictures
     from trilane.stages.cpu.present import kept_frames
 
     files = kept_frames(folder)

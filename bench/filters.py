@@ -14,10 +14,7 @@ import numpy as np
 from trilane.arrays import U8
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import reshaped
-from trilane.bench.lib.drawable import load_drawable
-from trilane.bench.lib.fixture import standing
-from trilane.bench.lib.ground_truth import ground_truth
-from trilane.bench.lib.timing import interleaved_ms, summary_ms
+from trilane.bench.lib.fixture import ground_truth, interleaved_ms, load_drawable, standing, summary_ms
 from trilane.errors import BadInputError
 from trilane.figure_sources import MEASURED
 from trilane.shapes import BUCKET_STEP

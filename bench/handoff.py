@@ -1,7 +1,8 @@
 """How long from the producer's last byte written until the consumer, another process, can read them all, and has?
 
 Rule: one definition for every variant, and all run interleaved; the producer writes every byte anew, then reads the
-clock. What a run does, through the scheduler, is what is judged and set against the peers.
+clock. What a run does, through the scheduler, is what is judged and set against the peers: a chain of units, the second
+of which fills its slot and the third reads every byte of it, and the others do nothing.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext
@@ -19,12 +20,15 @@ from typing import Any
 
 import numpy as np
 
-from trilane.bench.lib.handoff_stages import PAUSE_S, READER, check_bytes, handoff_pipeline
+from trilane.arrays import U8
 from trilane.bench.lib.handoff_variants import BARE, CHANNELS, SLOT, WRITTEN, Channel
 from trilane.errors import BadInputError, TrilaneError, install_line
 from trilane.hw_profiles.host import host_units
+from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage
 from trilane.pipeline.run import run_pipeline
+from trilane.pipeline.stage import UnitContext
 from trilane.scheduler.stats import median_interval, samples_needed
+from trilane.transport.packets import Packet
 from trilane.transport.wakeup import UNIT_NS, awake, use_slice
 
 #: KiB of a tensor of 16 channels at 128, 256, 512 and 1024 squared; other sizes are not asked for.
@@ -35,9 +39,12 @@ MIN_FRAMES = 10
 ANSWER_S = 120
 LIMITS_US = {"p50": 150, "p99": 500}
 ENDS = ("producer", "consumer")
-
 #: Microseconds of each frame of a round until every byte could be read, and until it was.
 Times = tuple[list[float], list[float]]
+FACTORY = "trilane.bench.handoff:build"
+PAUSE_S = 0.001
+WRITER, READER = "raster", "infer"
+STAGES = (("pose", "cpu"), (WRITER, "gpu"), (READER, "dsp"), ("present", "cpu"))
 
 
 def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 300, rounds: int = 6) -> dict[str, Any]:
@@ -288,3 +295,51 @@ def _slower(
 
 def _ahead(slower: dict[str, dict[int, tuple[float, float]]]) -> dict[str, bool]:
     return {peer: all(low > 0 for low, _ in of_size.values()) for peer, of_size in slower.items()}
+
+
+class HandoffStage:
+    """`trilane.pipeline.stage.Stage`; what it does follows from its name."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
+        """Keep the slots."""
+        self._inputs, self._outputs = inputs, outputs
+
+    def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
+        """`pose` pauses, `raster` writes, `infer` reads. Raises TrilaneError for wrong bytes."""
+        if self._name == STAGES[0][0]:
+            time.sleep(PAUSE_S)
+        elif self._name == WRITER and slot_out is not None:
+            self._outputs[slot_out].payload[:] = frame % 251
+        elif self._name == READER and slot_in is not None:
+            check_bytes(self._inputs[slot_in].payload, frame % 251)
+        return {}
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+def check_bytes(payload: U8, value: int) -> None:
+    """Read every byte. Raises TrilaneError when one is not `value`; the size is a multiple of 8."""
+    words = payload.view(np.uint64)
+    if int(words.sum(dtype=np.uint64)) != len(words) * value * 0x0101010101010101 % 2**64:
+        raise TrilaneError(f"a slot of {payload.size} bytes holds others than were written")
+
+
+def build(settings: Mapping[str, Any], unit: UnitContext) -> HandoffStage:  # noqa: ARG001 - a factory's signature
+    """The stage that `settings["name"]` says."""
+    return HandoffStage(settings["name"])
+
+
+def handoff_pipeline(payload_bytes: int) -> Pipeline:
+    """A chain whose edge from the GPU unit to the DSP carries `payload_bytes`, and the others nothing."""
+    sizes = [payload_bytes if before == WRITER else 0 for before, _ in STAGES[:-1]]
+    return Pipeline(
+        stages=tuple(
+            PipelineStage(name=name, unit=unit, factory=FACTORY, settings={"name": name}) for name, unit in STAGES
+        ),
+        edges=tuple(PipelineEdge(payload_bytes=size) for size in sizes),
+        units=host_units(),
+    )

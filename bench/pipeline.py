@@ -16,7 +16,7 @@ from statistics import fmean, median
 from typing import Any
 
 from trilane.bench.beside import measure_beside
-from trilane.bench.lib import full_width
+from trilane.bench.lib import networks
 from trilane.bench.lib.avatar_process import Asked
 from trilane.errors import BadInputError, TrilaneError
 from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
@@ -119,7 +119,7 @@ def _measure_two(
 
 
 def _folder(avatar: str) -> str:
-    return str(full_width.full_width_bundle()) if avatar == full_width.NAME else avatar
+    return str(networks.full_width_bundle()) if avatar == networks.FULL_WIDTH else avatar
 
 
 def _measure_rounds(checked: Checked, settings: list[Setting], rounds: int) -> list[dict[str, Any]]:

@@ -10,13 +10,13 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
+from math import sqrt
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 from trilane.avatars.network_file import reshaped
-from trilane.bench.lib import full_width
-from trilane.bench.lib.rank_correlation import rank_correlation
+from trilane.bench.lib import networks
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.application import Plan, Variant, steady
 from trilane.hw_profiles.host import host_cores, rule_placement, settings_of, usable_cores
@@ -82,7 +82,7 @@ def measure(
     sizes: list[dict[str, Any]] = []
     times: list[dict[str, Any]] = []
     virtual: list[dict[str, Any]] = []
-    folder = str(full_width.full_width_bundle()) if avatar == full_width.NAME else avatar
+    folder = str(networks.full_width_bundle()) if avatar == networks.FULL_WIDTH else avatar
     with UnitStarter(PRELOAD) as starter:
         for tensor in size:
             checked = configure(Request(size=tensor, avatar=folder, frames=frames, runtime=runtime), Path.cwd())
@@ -251,3 +251,20 @@ def _virtual(checked: Checked, avatar: str, count: int) -> Mapping[str, Any]:
         "rule": described(placed.rule.placement),
         "rule_over_chosen": frame_ms(placed.rule.placement) / mine,
     }
+
+
+def rank_correlation(first: Sequence[float], second: Sequence[float]) -> float | None:
+    """Pearson's correlation of the ranks, from -1 to 1; None where one list has no order, for all of it is equal.
+
+    Spearman, American Journal of Psychology 15 (1904), 72-101. Raises ValueError for lists of different lengths.
+    """
+    pairs = list(zip(_ranks(first), _ranks(second), strict=True))
+    middle = (len(pairs) + 1) / 2
+    covariance = sum((a - middle) * (b - middle) for a, b in pairs)
+    spread = sum((a - middle) ** 2 for a, _ in pairs) * sum((b - middle) ** 2 for _, b in pairs)
+    return covariance / sqrt(spread) if spread else None
+
+
+def _ranks(values: Sequence[float]) -> list[float]:
+    ordered = sorted(values)
+    return [ordered.index(value) + (ordered.count(value) + 1) / 2 for value in values]

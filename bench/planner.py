@@ -20,11 +20,9 @@ import numpy as np
 
 from trilane.arrays import U8
 from trilane.bench.lib.cast import Cast
-from trilane.bench.lib.full_picture import FullPictures
+from trilane.bench.lib.full_picture import FullPictures, true_pictures
 from trilane.bench.lib.picture_error import PictureErrors, box_psnr_db, psnr_of_frames, require_metrics
-from trilane.bench.lib.plans import fixed, in_frames, planned
 from trilane.bench.lib.stage_chain import AvatarFrames
-from trilane.bench.lib.true_picture import true_pictures
 from trilane.errors import BadInputError, TrilaneError
 from trilane.figure_sources import MEASURED
 from trilane.pipeline.unit_starter import UnitStarter
@@ -37,11 +35,35 @@ from trilane.stages.placing import placed
 from trilane.writing import write_folder
 
 SCENES = ("portrait", "full-body", "crowd", "walk-past", "top-to-floor", "leave-and-return")
-PLANS = {"fixed": fixed, "planned": planned}
 POLICY = "pipelined"
 LEAST_FRAMES = 20
 #: By what differences from `full` are multiplied in the sheets.
 SHOWN = 8
+#: Tensor of the reference application, which fills it in every frame.
+FIXED = "512x512"
+
+
+def fixed(checked: Checked) -> Checked:
+    """The reference application's plan: one square tensor for everything, and every skin weight (12 at most)."""
+    scene = checked.config.scene.model_copy(update={"size": FIXED, "plan": "fixed"})
+    return checked.changed(scene=scene, shapes=())
+
+
+def planned(checked: Checked) -> Checked:
+    """What the scene says itself; the shapes of a planned tensor are in the configuration."""
+    return checked
+
+
+PLANS = {"fixed": fixed, "planned": planned}
+
+
+def in_frames(checked: Checked, frames: int) -> Checked:
+    """The whole of the scene in `frames` frames: fewer, at longer steps. Unchanged when it has no more than those."""
+    scene = checked.config.scene
+    if frames >= scene.frames:
+        return checked
+    fewer = {"frames": frames, "fps": scene.fps * frames / scene.frames}
+    return checked.changed(scene=scene.model_copy(update=fewer))
 
 
 def measure(

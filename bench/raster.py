@@ -1,6 +1,7 @@
 """How much faster is one packed pass than a pass for every four channels and a permute?
 
-Rule: all variants draw the same body in the same process, interleaved, and must give the same bytes.
+Rule: all variants draw the same body in the same process, interleaved, and must give the same bytes. The split passes
+share mesh, texture and triangles with the packed one.
 """
 
 from __future__ import annotations
@@ -11,15 +12,23 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from trilane.bench.lib.fixture import ENCODING, Fixture, standing
-from trilane.bench.lib.split_pass import SplitPass
-from trilane.bench.lib.timing import interleaved_ms, summary_ms
+from trilane.arrays import U8, Floats
+from trilane.bench.lib.fixture import ENCODING, Fixture, interleaved_ms, standing, summary_ms
 from trilane.body.skinning import FrameSkinner
 from trilane.errors import BadInputError, TrilaneError
 from trilane.stages.gpu.opengl import describe, open_context
-from trilane.stages.gpu.packed_pass import CHANNELS, PackedAvatar, PackedPass, Placement
-from trilane.stages.gpu.skinned_mesh import PosedMesh, SkinnedMesh
+from trilane.stages.gpu.packed_pass import (
+    CHANNELS,
+    PackedAvatar,
+    PackedPass,
+    Placement,
+    Quantisation,
+    check_texture,
+    texture_array,
+)
+from trilane.stages.gpu.skinned_mesh import MeshDraw, PosedMesh, SkinnedMesh
 from trilane.training.sample_renderer import UvBytes
 
 MAX_SIDE = 4096
@@ -152,3 +161,51 @@ def _check_equal(tensors: dict[str, Any]) -> None:
         steps = np.abs(tensor.astype(np.int16) - tensors["packed"])
         if steps.max() > 1 or (steps > 0).mean() > UNEQUAL:
             raise TrilaneError(f"{name} gave other bytes than packed: {steps.max()} steps at most")
+
+
+class SplitPass:
+    """Draws one avatar into tensors, RGBA8 by RGBA8.
+
+    `ctx`: the OpenGL context.
+    `mesh`: of the avatar.
+    `texture`: (H,W,C) floats, C a multiple of 4.
+    `quantisation`: of the tensor.
+    `shape`: (height, width) of the tensor in pixels.
+    """
+
+    def __init__(
+        self,
+        ctx: Any,
+        mesh: SkinnedMesh,
+        texture: NDArray[np.floating[Any]],
+        quantisation: Quantisation,
+        shape: tuple[int, int],
+    ) -> None:
+        check_texture(texture, texture.shape[2])
+        self._ctx, self._mesh, self._shape = ctx, mesh, shape
+        self._draw = MeshDraw(ctx, mesh, "split.frag")
+        self._texture = texture_array(ctx, texture)
+        zero_point = float(quantisation.zero_point)
+        self._draw.set({"neural": 0, "scale": quantisation.scale, "zero_point": zero_point})
+        self._background = (zero_point / 255,) * 4
+        size = shape[::-1]
+        depth = ctx.depth_renderbuffer(size)
+        self._targets = [ctx.framebuffer([ctx.texture(size, 4)], depth) for _ in range(texture.shape[2] // 4)]
+        self._planes = np.empty((len(self._targets), *shape, 4), np.uint8)
+
+    def draw(self, view: Floats, placement: Placement) -> None:
+        """Draw every pass. The avatar fills the tensor; `placement.rect` is not read."""
+        self._texture.use(0)
+        self._mesh.prepare(self._ctx)
+        for layer, target in enumerate(self._targets):
+            target.use()
+            target.clear(*self._background)
+            self._draw.set({"layer": layer})
+            self._draw.draw(placement.pose, view, placement.clip_projection)
+
+    def read_into(self, tensor: U8) -> None:
+        """Read every pass and interleave them into `tensor`, (h * w * C,) uint8."""
+        image = tensor.reshape(*self._shape, 4 * len(self._targets))
+        for layer, target in enumerate(self._targets):
+            target.read_into(self._planes[layer], components=4)
+            image[..., 4 * layer : 4 * layer + 4] = self._planes[layer]

@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from trilane.bench.lib.fixture import ENCODING, standing
+from trilane.bench.lib.fixture import ENCODING, interleaved_ms, standing, summary_ms
 from trilane.bench.lib.gpu_buffering import READBACKS, UPLOADS, Readback, Upload
-from trilane.bench.lib.timing import interleaved_ms, summary_ms
 from trilane.errors import TrilaneError
 from trilane.stages.gpu.opengl import describe, open_context
 from trilane.stages.gpu.packed_pass import CHANNELS, PackedAvatar, PackedPass, Placement

@@ -18,8 +18,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from trilane import machine
-from trilane.bench.lib.instruction_kernels import measure_issued
-from trilane.bench.lib.instruction_sets import instruction_set_of, peak_gmac_s
+from trilane.bench.lib.instruction_sets import instruction_set_of, measure_issued, peak_gmac_s
 from trilane.bench.lib.interleaved_processes import Variant, runners
 from trilane.errors import reason
 from trilane.stages.dsp.runtime import installed

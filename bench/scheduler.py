@@ -176,8 +176,7 @@ def _run_model(model: Any, graph: Graph, service: Service, frames: int) -> list[
 
 def _models() -> dict[str, Any]:
     """Way: its model. Raises ModuleNotFoundError without SimPy."""
-    from trilane.bench.lib.simpy_lean import LeanPipeline
-    from trilane.bench.lib.simpy_model import SimpyPipeline
+    from trilane.bench.lib.simpy_models import LeanPipeline, SimpyPipeline
 
     return {SIMPY: SimpyPipeline, LEAN: LeanPipeline}
 

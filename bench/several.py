@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from trilane.arrays import U8
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M, load_bundle
 from trilane.avatars.network_file import reshaped
-from trilane.bench.lib.drawable import load_drawable
-from trilane.bench.lib.ground_truth import ground_truth, shaped_body
+from trilane.bench.lib.fixture import ground_truth, load_drawable
 from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError
 from trilane.figure_sources import MEASURED
@@ -97,7 +96,7 @@ class _CrowdFixture:
 
     def __init__(self) -> None:
         bundle = load_bundle("default")
-        self.shaped = shaped_body(bundle)
+        self.shaped = bundle.shaped_body()
         self.network = bundle.read_network()
         self._studio, self._image_error = ground_truth(bundle)
         assets, ctx = load_drawable("default"), self._studio.ctx

@@ -16,6 +16,9 @@ from trilane.avatars.bundle import bundle_folder, write_bundle
 from trilane.avatars.manifest import Manifest, network_entry
 from trilane.training.quantising.quantise import Quantised, quantise
 
+#: Units and commands that tests start find `support` too.
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(Path(__file__).parent), os.environ.get("PYTHONPATH"))))
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """`make test-all` and `make test-device` use them."""

@@ -122,8 +122,7 @@ def _refuse_a_scene(scene: str, options: dict[str, object]) -> None:
 def _hard_cases(names: list[str], as_json: bool) -> bool:
     from rich.progress import Progress
 
-    from trilane.apps.experiments.hard_cases import SOURCE, UNIT, hard_cases
-    from trilane.apps.experiments.hard_networks import INPUTS, NETWORKS
+    from trilane.apps.experiments.hard_cases import INPUTS, NETWORKS, SOURCE, UNIT, hard_cases
     from trilane.apps.experiments.hard_numbers.all_rows import COUNT, hard_numbers
 
     console = stderr_console()

@@ -24,29 +24,20 @@ from trilane.apps.cli.options import JsonOption
 BENCHES = {
     "raster": ("trilane.bench.raster", "One packed pass against a pass for every four channels and a permute."),
     "readback": ("trilane.bench.readback", "Variants of moving pixels between GPU and slot."),
-    "raster-oracle": ("trilane.bench.oracle", "The packed pass against the float64 reference."),
-    "crop": ("trilane.bench.crop", "What the crop wastes, beside squares around the joints."),
     "several": ("trilane.bench.several", "What an avatar loses to others in the same tensor."),
     "filters": ("trilane.bench.filters", "MIP maps and anisotropy of the neural texture: cost and difference."),
     "infer": ("trilane.bench.infer", "A network, run continuously, on each runtime and in FP32."),
     "peers": ("trilane.bench.peers", "Trilane's runtimes beside the libraries' own examples and benchmark_app."),
     "roofline": ("trilane.bench.roofline", "The machine's INT8 and FP32 peaks and its memory bandwidth."),
     "pipeline": ("trilane.bench.pipeline", "Efficiency, idleness and gain of policies, edges and cores."),
-    "dashboard": ("trilane.bench.dashboard", "What the dashboard costs the run that it shows."),
     "placement": (
         "trilane.bench.placement",
         "Every placement of the units on the cores, beside the one that is chosen.",
     ),
     "scenario": ("trilane.bench.scenario", "MLPerf's load patterns, evaluated here and by MLCommons LoadGen."),
-    "faults": ("trilane.bench.faults", "Units killed and stopped: what is lost, how soon the pace is back."),
-    "accounts": ("trilane.bench.accounts", "Busy and idle shares of random runs, computed twice, beside CPU time."),
     "handoff": ("trilane.bench.handoff", "A slot from process to process, beside pickling, copying and iceoryx2."),
     "scheduler": ("trilane.bench.scheduler", "The scheduler in virtual time beside SimPy, and its determinism."),
     "planner": ("trilane.bench.planner", "Planned work against a fixed square: speed and image error."),
-    "compare": (
-        "trilane.apps.experiments.comparing",
-        "What `trilane compare` says of runs of one kind, and of others.",
-    ),
     "predict": (
         "trilane.apps.experiments.host_predicted",
         "What is predicted of this machine, beside real runs and calls.",
@@ -55,11 +46,6 @@ BENCHES = {
     "flicker": (
         "trilane.apps.experiments.flicker",
         "How restless the error is, by runtime, calibration and texture filter.",
-    ),
-    "joints": ("trilane.bench.joints", "What the joint transforms of a frame cost."),
-    "augmentation": (
-        "trilane.bench.augmentation",
-        "A close-up of an avatar trained on camera-space views, beside image-space ones.",
     ),
 }
 
@@ -70,7 +56,7 @@ MOST_COLUMNS = 9
 EPILOG = """\b
 Examples:
   trilane bench raster --size 512 --channels 16 --json
-  trilane bench crop --views 2000
+  trilane bench several --views 20
   trilane bench pipeline --avatar default --avatar resnet18 --size 512x512
   trilane bench handoff
 """

@@ -12,15 +12,20 @@ from typing import Any
 
 import numpy as np
 
-from trilane.apps.experiments.drawn_tensors import DrawnTensors
 from trilane.arrays import U8
 from trilane.avatars.network_file import NetworkFile, reshaped
 from trilane.errors import BadInputError
 from trilane.figure_sources import MEASURED
+from trilane.pipeline.stage import UnitContext
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import network_of
+from trilane.stages.avatar_pipeline import edge_bytes
+from trilane.stages.config import pose_dtype
 from trilane.stages.configure import Checked
+from trilane.stages.cpu.pose import build as build_pose
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
+from trilane.stages.gpu.raster import build as build_raster
+from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 #: Of 255: bounds on the difference of any two runtimes.
 MEAN_BOUND, LARGEST_BOUND = 0.5, 4
@@ -104,3 +109,37 @@ def _tensors(checked: Checked, frames: int) -> Iterator[tuple[int, U8]]:
         tensor = painter.tensor(frame)
         if painter.anybody:
             yield frame, tensor
+
+
+class DrawnTensors:
+    """The pose and raster stages of the scene in `checked`, as in a run, and the slots between them."""
+
+    def __init__(self, checked: Checked) -> None:
+        config, assets = checked.config, checked.assets
+        sizes, avatars = edge_bytes(config, assets), len(config.avatar_dirs)
+        self._posed = _packet(avatars, sizes["pose->raster"])
+        self._drawn = _packet(avatars, sizes["raster->infer"])
+        settings = {"config": config.model_dump(mode="json")}
+        self._pose = build_pose(settings, UnitContext("cpu", config.units["cpu"], assets))
+        self._raster = build_raster(settings, UnitContext("gpu", config.units["gpu"], assets))
+        self._pose.bind([], [self._posed])
+        self._raster.bind([self._posed], [self._drawn])
+        self._channels = network_of(assets).channels
+
+    def tensor(self, frame: int) -> U8:
+        """(h, w, C) of frame `frame`, valid until the next call; what no avatar of it is seen in has no pixels."""
+        self._pose.run(frame, None, 0)
+        self._raster.run(frame, 0, 0)
+        height, width = self._posed.header["tensor_shape"].tolist()
+        tensor: U8 = self._drawn.payload[: height * width * self._channels].reshape(height, width, self._channels)
+        return tensor
+
+    @property
+    def anybody(self) -> bool:
+        """Whether an avatar is seen in the last frame that was asked for."""
+        return bool(self._posed.header["avatars"]["visible"].any())
+
+
+def _packet(avatars: int, payload: int) -> Packet:
+    layout = SlotLayout(pose_dtype(avatars), payload)
+    return view_packet(memoryview(bytearray(layout.slot_bytes)), layout)

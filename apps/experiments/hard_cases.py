@@ -3,20 +3,25 @@
 Rule: a bound is the smaller of two, which follow from the network, the input and the steps: the integer network's own
 (`noise_model`), and an ideal quantiser's (`ideal_noise`), so that coarse steps do not raise the bound of their error.
 Neither follows from a runtime's picture. A row whose bound a wrong picture would keep fails, whatever its error is.
+
+Networks are seeded and untrained, and made so that a wrong picture shows: kernels are partly smooth and each level
+weakens what comes from deeper ones, as in trained networks, so that rounding errors do not drown the picture; the heads
+give every colour its own mean and contrast. No input is the same everywhere: where the expected picture is a constant
+one, a constant picture is the right answer and nothing can be told.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import onnx
 
-from trilane.apps.experiments.hard_networks import INPUTS, NETWORKS, calibration_frames, case_input, float_network
 from trilane.arrays import F32, U8
+from trilane.errors import MissingPartError
 from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
 from trilane.training.quantising.noise_model import (
     NoiseModel,
@@ -27,12 +32,45 @@ from trilane.training.quantising.noise_model import (
 )
 from trilane.training.quantising.quantise import Quantised, quantise
 
+if TYPE_CHECKING:
+    import onnx
+
+
 UNIT = "mean step of 1/255"
 SOURCE = "computed: the float network with the rounding errors of every stored tensor and weight (docs/networks.md)"
 OWN_STEPS, IDEAL_STEPS = "computed with the integer network's steps", "computed with ideal steps"
 #: Pixels by which a shifted picture is shifted.
 SHIFT = 8
 HOLDS, EXCEEDED, UNTOLD = "holds", "FAILS: error above the bound", "FAILS: a wrong picture would keep the bound"
+SIDE, CHANNELS, WIDTH = 64, 4, 8
+OUTLIER = 100.0
+#: How many times the values of usual frames "saturating" has; the input's bytes end at about three.
+EXCESS = 10.0
+CALIBRATION_FRAMES = 8
+CASE_SEED, NETWORK_SEED = 7, 0
+#: Semi-axes of the figure, of the side, and how far its centre may be from the middle.
+FIGURE_HEIGHT, FIGURE_WIDTH, OFF_CENTRE = 0.42, 0.25, 0.1
+#: Size of the figure of "little but background", of the usual one's.
+SMALL = 0.7
+#: Sides of the cells of smooth and of flat texture, in pixels.
+SMOOTH_CELL, FLAT_CELL = 8, 16
+#: Norm of a kernel's smooth part, and size of its random part.
+GAIN, RANDOM_PART = 2**0.5, 0.5
+#: Factor of deeper features, largest bias of a norm, standard deviation of logits.
+DEEP, BIAS, CONTRAST = 0.25, 0.05, 1.5
+#: Network: its norm, and whether one channel of the stem is a hundredfold.
+NETWORKS: dict[str, tuple[str, bool]] = {
+    "batch": ("batch", False),
+    "instance": ("instance", False),
+    "group": ("group", False),
+    "outlier channel": ("batch", True),
+}
+INPUTS: dict[str, Callable[[np.random.Generator], F32]] = {
+    "constant patches": lambda rng: _in_figure(rng, _flat),
+    "little but background": lambda rng: _in_figure(rng, _smooth, SMALL),
+    "saturating": lambda rng: np.float32(EXCESS) * _in_figure(rng, _smooth),
+    "usual": lambda rng: _in_figure(rng, _smooth),
+}
 
 
 @dataclass(frozen=True)
@@ -149,3 +187,95 @@ def hard_cases(runtimes: Sequence[str]) -> Iterator[dict[str, Any]]:
                     "verdict": verdict,
                     "passed": verdict == HOLDS,
                 }
+
+
+def _smooth(rng: np.random.Generator) -> F32:
+    """(SIDE, SIDE, CHANNELS), linear between normal values at the corners of cells."""
+    cells = SIDE // SMOOTH_CELL
+    corners = rng.normal(size=(cells + 1, cells + 1, CHANNELS))
+    place = np.linspace(0, cells, SIDE)
+    first = np.minimum(place.astype(int), cells - 1)
+    share = place - first
+    rows = corners[first] * (1 - share)[:, None, None] + corners[first + 1] * share[:, None, None]
+    texture: F32 = (rows[:, first] * (1 - share)[:, None] + rows[:, first + 1] * share[:, None]).astype(np.float32)
+    return texture
+
+
+def _flat(rng: np.random.Generator) -> F32:
+    """(SIDE, SIDE, CHANNELS), one normal value in each cell."""
+    cells = SIDE // FLAT_CELL
+    values = rng.normal(size=(cells, cells, CHANNELS)).astype(np.float32)
+    return values.repeat(FLAT_CELL, axis=0).repeat(FLAT_CELL, axis=1)
+
+
+def _in_figure(rng: np.random.Generator, texture: Callable[[np.random.Generator], F32], size: float = 1.0) -> F32:
+    """`texture` inside an ellipse, 0 outside."""
+    row, column = np.mgrid[:SIDE, :SIDE] / SIDE - 0.5
+    down, right = rng.uniform(-OFF_CENTRE, OFF_CENTRE, 2)
+    inside = ((row - down) / FIGURE_HEIGHT) ** 2 + ((column - right) / FIGURE_WIDTH) ** 2 < size**2
+    frame: F32 = np.where(inside[..., None], texture(rng), np.float32(0))
+    return frame
+
+
+def case_input(case: str) -> F32:
+    """(SIDE, SIDE, CHANNELS) of row `case` of `INPUTS`; no frame of the calibration."""
+    return INPUTS[case](np.random.default_rng(CASE_SEED))
+
+
+def calibration_frames() -> list[F32]:
+    """Usual frames, each (SIDE, SIDE, CHANNELS)."""
+    rng = np.random.default_rng(NETWORK_SEED)
+    return [INPUTS["usual"](rng) for _ in range(CALIBRATION_FRAMES)]
+
+
+def float_network(name: str) -> onnx.ModelProto:
+    """The float network of row `name` of `NETWORKS`. Raises MissingPartError without PyTorch."""
+    try:
+        import torch
+    except ImportError:
+        raise MissingPartError("hard cases need PyTorch", extra="train") from None
+    from trilane.training.network import UNet, export_onnx
+
+    norm, outlier = NETWORKS[name]
+    generator = torch.Generator().manual_seed(NETWORK_SEED)
+    network = UNet(norm=norm, width=WIDTH, channels=CHANNELS).eval()
+    with torch.no_grad():
+        for module in network.modules():
+            _draw(module, generator)
+        *skips, _ = network.encoder.channels
+        for level, skip in zip(network.levels, (*reversed(skips), 0), strict=True):
+            level[0].weight[:, : level[0].weight.shape[1] - skip] *= DEEP
+        if outlier:
+            network.encoder.stem[0].weight[0] *= OUTLIER
+        features = network.features(torch.from_numpy(np.stack(calibration_frames())).permute(0, 3, 1, 2))
+        for head in (network.colour, network.mask):
+            _give_contrast(head, features)
+    return export_onnx(network, SIDE, SIDE)
+
+
+def _draw(module: Any, generator: Any) -> None:
+    """New weights for a convolution, new biases for a norm. A channel's weights add up to about 0 over its inputs."""
+    import torch
+
+    if isinstance(module, torch.nn.Conv2d):
+        count, side = module.weight.shape[1], module.weight.shape[2]
+        across = torch.randn(*module.weight.shape[:2], generator=generator)
+        across -= across.mean(1, keepdim=True)
+        across *= GAIN / across.norm(dim=1, keepdim=True)
+        row = torch.tensor([math.comb(side - 1, place) / 2 ** (side - 1) for place in range(side)])
+        noise = torch.randn(module.weight.shape, generator=generator) * (RANDOM_PART / side / count**0.5)
+        module.weight.copy_(across[:, :, None, None] * row[:, None] * row + noise)
+        if module.bias is not None:
+            module.bias.zero_()
+    elif getattr(module, "bias", None) is not None:
+        module.bias.uniform_(-BIAS, BIAS, generator=generator)
+
+
+def _give_contrast(head: Any, features: Any) -> None:
+    """Scale the last layer of `head` so that on `features` its logits have deviation `CONTRAST` and means -1 to 1."""
+    import torch
+
+    logits = head(features)
+    scale = CONTRAST / logits.std(dim=(0, 2, 3))
+    head[3].weight *= scale[:, None, None, None]
+    head[3].bias.copy_(torch.linspace(-1, 1, len(scale)) - scale * logits.mean(dim=(0, 2, 3)))

@@ -6,8 +6,9 @@ its own; calls of the network in a process that the prediction did not start. No
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -15,9 +16,9 @@ from typing import Any, NamedTuple
 
 from trilane.apps.asked_prediction import answer_of, network_of, predict_networks, usual_policy, variant_of
 from trilane.apps.asked_run import AskedRun, run_asked
-from trilane.apps.experiments.comparing import quiet
 from trilane.apps.remade_avatar import remade_avatar
 from trilane.apps.remake import Remake
+from trilane.apps.run_job import Hooks
 from trilane.avatars.bundle import load_bundle
 from trilane.bench.lib.interleaved_processes import Variant, runners
 from trilane.errors import BadInputError
@@ -130,3 +131,9 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "leave_one_out_error": math.sqrt(sum(squares) / len(squares)),
         "inside_left_out": sum(one <= NORMAL_80**2 * other for one, other in zip(squares, left_out, strict=True)),
     }
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[Hooks]:
+    """Hooks of a run that nobody watches."""
+    yield Hooks(lambda *_: None, lambda _: None)

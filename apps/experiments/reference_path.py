@@ -4,28 +4,35 @@ Rule: with no cause it is the plan `full` (`bench/lib/full_picture.py`): float64
 float64 raster, float texture, unrounded tensor of the network's own area, FP32 network, blend in linear light in
 float64, not rounded. Each cause replaces one of these by what the run has; with all of them the picture is the run's.
 Motion, camera, background and contact shadows are the run's own throughout.
+
+A cause that cannot stand alone in the reference says which others have to be there: bytes for a runtime, the run's
+tensor for the stages that draw into it or read from it. Of the body, float64 is written out joint by joint and float32
+is the house's own skinning; with everything on, the CPU unit's vertices come out to the bit.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Hashable
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass, replace
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.apps.experiments.causes import NOTHING, Cause, Causes, require_complete
-from trilane.apps.experiments.run_body import RunBody
 from trilane.arrays import F32, F64, U8, Mask
 from trilane.avatars.network_file import Affine, NetworkFile, reshaped
 from trilane.bench.lib.cast import Cast, Seen
 from trilane.bench.lib.float_raster import quantise
 from trilane.bench.lib.full_network import Paint, as_written, float_network
-from trilane.bench.lib.full_picture import SAMPLES, fineness, supersampled
+from trilane.bench.lib.full_picture import SAMPLES, FullBody, fineness, supersampled
 from trilane.bench.lib.layers import Box, Layer, enlarged, grown, laid_over, placed, premultiplied, shrunk
 from trilane.bench.lib.stage_chain import AvatarFrames
+from trilane.body.body import Body
+from trilane.body.joints import JOINTS, POSE_FEATURES
+from trilane.body.kinematics import Posed, Skeleton
+from trilane.body.skinning import DETAILS, EVERYTHING, Detail, FrameSkinner
 from trilane.scene.crop import Rect, crop_projection
 from trilane.scene.planner import FrameWork
 from trilane.scene.tensor_layout import Cell
@@ -33,10 +40,135 @@ from trilane.shapes import BUCKET_STEP, Shape
 from trilane.stages.avatar_assets import AvatarData
 from trilane.stages.configure import Checked
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
-from trilane.stages.gpu.skinned_mesh import MeshArrays, avatar_mesh
+from trilane.stages.gpu.skinned_mesh import MeshArrays, avatar_mesh, enough_weights
 
 #: From so much cover on a pixel belongs to a mask.
 HALF = 0.5
+
+
+class Cause(StrEnum):
+    """Why a run's picture is not the reference's, in the order in which causes are added."""
+
+    WEIGHTS = "skin weights"
+    BLEND = "blend shapes"
+    FLOAT32 = "FP32 transforms"
+    FLOAT16 = "FP16 texture"
+    CROP = "crop and size"
+    READS = "one read a pixel"
+    PACKING = "INT8 packing"
+    RASTER = "GPU raster"
+    QUANTISATION = "quantisation"
+    RUNTIME = "runtime"
+    COMPOSITE = "composite"
+
+
+Causes = frozenset[Cause]
+NOTHING: Causes = frozenset()
+BODY: Causes = frozenset({Cause.WEIGHTS, Cause.BLEND, Cause.FLOAT32})
+_DRAWN = BODY | {Cause.FLOAT16, Cause.CROP, Cause.READS, Cause.PACKING}
+NEEDS: dict[Cause, Causes] = {
+    Cause.RASTER: _DRAWN,
+    Cause.RUNTIME: frozenset({Cause.PACKING, Cause.QUANTISATION}),
+    Cause.COMPOSITE: frozenset({Cause.CROP}),
+}
+WHAT: dict[Cause, str] = {
+    Cause.WEIGHTS: "the run's skin weights instead of all; hands and face at rest where the plan says so",
+    Cause.BLEND: "pose blend shapes left out where the plan says so; in FP16 where the GPU unit skins",
+    Cause.FLOAT32: "joints, vertices and camera in float32",
+    Cause.FLOAT16: "the neural texture in float16",
+    Cause.CROP: "the run's tensor and crop rectangles instead of a tensor for each avatar on the picture's grid",
+    Cause.READS: "one read of the texture for each tensor pixel instead of the mean of 4 x 4",
+    Cause.PACKING: "the tensor rounded and clamped to bytes",
+    Cause.RASTER: "the GPU unit's own tensor instead of the float64 rasteriser's with all of the above",
+    Cause.QUANTISATION: "the integer network, as its file says it, instead of the FP32 network",
+    Cause.RUNTIME: "the integer network as the run's runtime computes it",
+    Cause.COMPOSITE: "the composite stage instead of float64; the network's picture in bytes",
+}
+
+
+def needs(cause: Cause) -> Causes:
+    """What has to be there for `cause` to be switched on."""
+    return NEEDS.get(cause, NOTHING)
+
+
+def up_to(cause: Cause) -> Causes:
+    """`cause` and all before it."""
+    order = list(Cause)
+    return frozenset(order[: order.index(cause) + 1])
+
+
+def require_complete(causes: Iterable[Cause]) -> Causes:
+    """`causes` as a set. Raises ValueError when one lacks what it needs."""
+    found = frozenset(causes)
+    for cause in found:
+        if missing := needs(cause) - found:
+            raise ValueError(f"{cause} needs {', '.join(sorted(missing))}")
+    return found
+
+
+class RunBody:
+    """One distinct avatar. `on_cpu`: whether the CPU unit skins it, else the GPU unit does."""
+
+    def __init__(self, data: AvatarData, *, on_cpu: bool) -> None:
+        self._data, self._on_cpu = data, on_cpu
+        self._skeleton = Skeleton(data.shaped.joints, data.shaped.body.parents)
+        self._full: dict[Detail, FullBody] = {}
+        self._skinners: dict[Detail, FrameSkinner] = {}
+
+    def vertices(self, seen: Seen, level: int | None, causes: Causes) -> F64:
+        """(V,3) metres, in the world.
+
+        `seen`: the avatar in a frame. `level`: of `DETAILS`, by the run's plan; None where the run does not show it.
+        `causes`: those of them that are of the body count.
+        """
+        detail = self._detail(level, causes)
+        if Cause.FLOAT32 not in causes:
+            return self._full_body(detail).vertices(seen.pose, seen.translation, seen.world)
+        posed = self._skeleton.pose(seen.pose, seen.translation, seen.world)
+        return (self._by_cpu(detail, posed) if self._on_cpu else self._by_gpu(detail, posed)).astype(np.float64)
+
+    def _detail(self, level: int | None, causes: Causes) -> Detail:
+        """What is modelled: of the run's detail only what `causes` say."""
+        run = EVERYTHING
+        if self._on_cpu:
+            run = EVERYTHING if level is None else DETAILS[level]
+        elif level is not None:
+            run = Detail("the GPU unit's", enough_weights(self._body), hands_and_face=True, pose_blend=False)
+        weights = run if Cause.WEIGHTS in causes else EVERYTHING
+        blend = run.pose_blend if Cause.BLEND in causes else True
+        return Detail("mixed", weights.weight_count, weights.hands_and_face, blend)
+
+    @property
+    def _body(self) -> Body:
+        return self._data.shaped.body
+
+    def _full_body(self, detail: Detail) -> FullBody:
+        if detail not in self._full:
+            manifest = self._data.bundle.manifest
+            body = replace(self._body, weights=detail.weights(self._data.shaped), posedirs=self._blend(detail))
+            self._full[detail] = FullBody(body, manifest.betas, manifest.expression)
+        return self._full[detail]
+
+    def _blend(self, detail: Detail) -> F32 | None:
+        """Pose blend shapes. The GPU unit never leaves them out, but has them in float16."""
+        if detail.pose_blend or self._body.posedirs is None:
+            return self._body.posedirs
+        return None if self._on_cpu else self._body.posedirs.astype(np.float16).astype(np.float32)
+
+    def _by_cpu(self, detail: Detail, posed: Posed) -> F32:
+        if detail not in self._skinners:
+            self._skinners[detail] = FrameSkinner(self._data.shaped, detail)
+        vertices = np.empty_like(self._data.shaped.vertices, np.float32)
+        self._skinners[detail].skin_into(posed, vertices)
+        return vertices
+
+    def _by_gpu(self, detail: Detail, posed: Posed) -> F32:
+        """The vertex shader's formula, rounded to float32 after each step."""
+        rest, blend = self._data.shaped.vertices.astype(np.float32), self._blend(detail)
+        if blend is not None:
+            rest = rest + (blend.reshape(-1, POSE_FEATURES) @ posed.feature).reshape(-1, 3)
+        moved = (detail.weights(self._data.shaped) @ posed.matrices.reshape(JOINTS, 12)).reshape(-1, 3, 4)
+        return np.asarray(np.einsum("vab,vb->va", moved[:, :, :3], rest) + moved[:, :, 3], np.float32)
 
 
 @dataclass(frozen=True)

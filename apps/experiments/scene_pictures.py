@@ -83,7 +83,7 @@ class ScenePictures:
 
 def wanted_pictures(cast: Cast, ctx: Any) -> tuple[Wanted, str]:
     """What pictures of `cast` are compared with, and which of both it is. `ctx`: the OpenGL context in use."""
-    from trilane.bench.lib.true_picture import true_pictures
+    from trilane.bench.lib.full_picture import true_pictures
 
     true = true_pictures(cast, ctx)
     return (FullPictures(cast).frame, FULL) if true is None else (true.frame, TRUTH)

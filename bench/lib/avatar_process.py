@@ -13,7 +13,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from trilane.bench.lib.asked_processes import answer_of, asked_processes
+from trilane.bench.lib.interleaved_processes import answer_of, asked_processes
 from trilane.scheduler.ledger import JobRecord
 
 START_S, RUN_S = 120.0, 600.0

@@ -1,28 +1,36 @@
-"""What the GPU benches draw: the default body, standing, as high as a square picture.
+"""What the GPU benches draw, what it is compared with, and how variants are timed in turns.
 
-Rule: the same numbers every time; only size and channels vary.
+Rule: the default body stands as high as a square picture, with the same numbers every time; only size and channels
+vary. Avatars and ground truth are made by the functions of runs and of training. A busy machine
+hits all variants alike.
 """
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.avatars.bundle import bundle_folder
+from trilane.arrays import F32
+from trilane.avatars.bundle import Bundle, bundle_folder, load_bundle
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.joints import JOINT_INDEX
 from trilane.body.kinematics import Posed, Skeleton
 from trilane.body.skinning import largest_weights
+from trilane.errors import MissingPartError
+from trilane.stages.avatar_assets import load_avatar
 from trilane.stages.gpu.packed_pass import Quantisation
-from trilane.stages.gpu.skinned_mesh import MeshArrays, mesh_arrays
+from trilane.stages.gpu.skinned_mesh import MeshArrays, avatar_mesh, mesh_arrays
 
 TEXTURE_SIDE = 512
 ENCODING = Quantisation(6 / 255, 128)
 DISTANCE_M, HEIGHT_M, FRAME_M = 3.0, 0.9, 1.9
 ARMS_DOWN_RAD = 1.1
+WARM_UP = 5
 
 
 @dataclass(frozen=True)
@@ -80,3 +88,51 @@ def _texture(channels: int) -> NDArray[Any]:
     row, column = np.indices((TEXTURE_SIDE, TEXTURE_SIDE)) * (2 * np.pi / TEXTURE_SIDE)
     waves = rng.integers(1, 40, (channels, 2))
     return np.stack([np.sin(waves[c, 0] * row + c) + np.cos(waves[c, 1] * column) for c in range(channels)], axis=-1)
+
+
+@dataclass(frozen=True)
+class Drawable:
+    """An avatar as the GPU draws it, without a run around it. `texture`: (H,W,C) float32."""
+
+    arrays: MeshArrays
+    texture: F32
+    quantisation: Quantisation
+
+
+def load_drawable(name: str) -> Drawable:
+    """The avatar `name`. Raises BadInputError."""
+    avatar = load_avatar(load_bundle(name))
+    packed = avatar.bundle.manifest.network.input
+    return Drawable(avatar_mesh(avatar.shaped), avatar.texture, Quantisation(packed.scale, packed.zero_point))
+
+
+def ground_truth(bundle: Bundle) -> tuple[Any, Any]:
+    """The renderer of the bundle's body, clothed, and the `image_error` of two pictures. Raises MissingPartError."""
+    try:
+        from trilane.training.clothing.looks import look_of
+        from trilane.training.image_error import image_error
+        from trilane.training.sample_renderer import SampleRenderer
+    except ImportError as error:
+        raise MissingPartError(f"ground truth needs {error.name}", extra="train") from None
+    return SampleRenderer(bundle.shaped_body(), look=look_of(bundle.manifest.provenance)), image_error
+
+
+def interleaved_ms(variants: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, list[float]]:
+    """Milliseconds of each variant in each of `repeats` rounds, after a warm-up; a round runs every variant once."""
+    times: dict[str, list[float]] = {name: [] for name in variants}
+    for round_number in range(-WARM_UP, repeats):
+        for name, run in variants.items():
+            start = time.perf_counter_ns()
+            run()
+            if round_number >= 0:
+                times[name].append((time.perf_counter_ns() - start) / 1e6)
+    return times
+
+
+def summary_ms(times_ms: list[float]) -> dict[str, float]:
+    """Median, minimum and 90th percentile in milliseconds."""
+    return {
+        "median_ms": float(np.median(times_ms)),
+        "min_ms": float(np.min(times_ms)),
+        "p90_ms": float(np.percentile(times_ms, 90)),
+    }

@@ -5,29 +5,101 @@ neural texture is read at SAMPLES x SAMPLES points of a tensor pixel, whose mean
 tensor of its own, of about the area that its network is for, where it paints best; the tensor lies on the picture's
 grid, so that a square of pixels of one is a pixel of the other; the network is in FP32; its picture is blended in
 linear light, in float64, over the run's own background.
+
+Beside it stands the picture with the clothed body itself, drawn by what training draws its samples with: what an
+avatar's network was trained to paint, so it tells of every plan, `full` included, how good its picture is. Only the
+bundled avatars have one. Clothes are put on the skin, not on an avatar's offsets, which are these clothes already.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from math import isqrt
+from typing import Any
 
 import numpy as np
 
 from trilane.arrays import F32, F64, U8
+from trilane.avatars.bundle import BUILT_IN, bundle_folder
 from trilane.bench.lib import float_raster
 from trilane.bench.lib.cast import Cast, Seen
-from trilane.bench.lib.full_body import FullBody
 from trilane.bench.lib.full_network import Paint, float_network
 from trilane.bench.lib.layers import Layer, blended, enlarged, grown, premultiplied, shrunk
+from trilane.body.body import Body
+from trilane.body.joints import JOINTS
+from trilane.body.kinematics import rodrigues
 from trilane.scene.crop import crop_projection
 from trilane.shapes import BUCKET_STEP, Shape
 from trilane.stages.avatar_assets import AvatarData
 from trilane.stages.gpu.skinned_mesh import MeshArrays, avatar_mesh
+from trilane.training.clothing.clothed_body import ClothedBody
+from trilane.training.clothing.layers import clothing_layers
+from trilane.training.clothing.looks import find_landmarks, look_of
+from trilane.training.surface import body_arrays
 
 #: Points of a tensor pixel, along each side, at which the neural texture is read.
 SAMPLES = 4
+#: Of the clothed body, along each side of a pixel.
+CLOTHED_SAMPLES = 4
+
+
+class FullBody:
+    """The body in float64 with every blend shape and skin weight, joint by joint as the SMPL-X layout says it.
+
+    `rest` (V,3): the rest shape, metres.
+    `joints` (55,3): its joints.
+    """
+
+    def __init__(self, body: Body, betas: Sequence[float] = (), expression: Sequence[float] = ()) -> None:
+        """`body` in the shape `betas` with the `expression`; missing coefficients are 0."""
+        self._body = body
+        self._weights = body.weights.astype(np.float64)
+        self.rest = body.v_template.astype(np.float64)
+        for directions, values in ((body.shape_dirs, betas), (body.expression_dirs, expression)):
+            self.rest = self.rest + directions[:, :, : len(values)].astype(np.float64) @ np.array(values, np.float64)
+        self.joints = body.j_regressor.astype(np.float64) @ self.rest
+        if body.offsets is not None:
+            self.rest = self.rest + body.offsets
+
+    def vertices(self, pose: F64, translation: F64, world: F64) -> F64:
+        """(V,3) metres, in the world.
+
+        `pose`: (55,3) axis-angle, radians.
+        `translation`: (3,) of the root in body space, metres.
+        `world`: (4,4) from body space to the world.
+        """
+        turns = rodrigues(np.asarray(pose, np.float64).reshape(JOINTS, 3))
+        rest = self.rest
+        if self._body.posedirs is not None:
+            rest = rest + self._body.posedirs.astype(np.float64) @ (turns[1:] - np.eye(3)).reshape(-1)
+        placed = self._placed(turns, np.asarray(translation, np.float64), np.asarray(world, np.float64))
+        moved = np.einsum("vj,jab->vab", self._weights, placed)
+        return np.asarray(np.einsum("vab,vb->va", moved[:, :, :3], rest) + moved[:, :, 3])
+
+    def _placed(self, turns: F64, translation: F64, world: F64) -> F64:
+        """(55,3,4): from the rest shape to the world, for what each joint moves."""
+        placed: dict[int, F64] = {}
+
+        def place(joint: int) -> F64:
+            """(4,4) of `joint`: its parent's, then a shift to the joint, the turn, and a shift back."""
+            if joint not in placed:
+                parent = int(self._body.parents[joint])
+                above = world @ _shift(translation) if parent < 0 else place(parent)
+                turn = np.eye(4)
+                turn[:3, :3] = turns[joint]
+                at = self.joints[joint]
+                placed[joint] = above @ _shift(at) @ turn @ _shift(-at)
+            return placed[joint]
+
+        return np.stack([place(joint)[:3] for joint in range(JOINTS)])
+
+
+def _shift(by: F64) -> F64:
+    matrix = np.eye(4)
+    matrix[:3, 3] = by
+    return matrix
 
 
 @dataclass(frozen=True)
@@ -112,3 +184,36 @@ def supersampled(vertices: F64, mesh: MeshArrays, clip: F64, shape: Shape, textu
         reads[covered] = float_raster.sample(neural, image.uv[band][covered])
         tensor[row] = shrunk(reads, samples)[0]
     return tensor
+
+
+class TruePictures:
+    """Pictures of a cast of bundled avatars as the clothed bodies that they were trained on."""
+
+    def __init__(self, cast: Cast, ctx: Any) -> None:
+        """`ctx`: the OpenGL context in use. Everybody in the cast must be a bundled avatar."""
+        self._cast = cast
+        self._clothed = {folder: _clothed(data, ctx) for folder, data in cast.avatars.items()}
+
+    def frame(self, number: int, background: U8) -> U8:
+        """(h,w,3) uint8, sRGB: frame `number` over its `background` (h,w,3)."""
+        return blended(background, self.layers(number))
+
+    def layers(self, number: int) -> list[Layer]:
+        """Those who are seen in frame `number`, on the picture's grid."""
+        layers = []
+        for seen in self._cast.seen(number):
+            rgba = self._clothed[seen.folder].render(seen.joints, seen.view, seen.projection, seen.box.shape) / 255.0
+            layers.append(Layer(seen.box, seen.depth, premultiplied(rgba)))
+        return layers
+
+
+def true_pictures(cast: Cast, ctx: Any) -> TruePictures | None:
+    """Those of `cast`; None unless everybody in it is a bundled avatar. `ctx`: the OpenGL context in use."""
+    is_known = set(cast.avatars) <= {bundle_folder(name).absolute() for name in BUILT_IN}
+    return TruePictures(cast, ctx) if is_known else None
+
+
+def _clothed(data: AvatarData, ctx: Any) -> ClothedBody:
+    arrays, look = body_arrays(data.shaped.bare()), look_of(data.bundle.manifest.provenance)
+    landmarks = find_landmarks(arrays.vertices, arrays.joints, arrays.weights)
+    return ClothedBody(ctx, clothing_layers(arrays, landmarks, look), landmarks, CLOTHED_SAMPLES, look)

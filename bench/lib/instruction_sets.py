@@ -2,13 +2,30 @@
 
 Rule: how many multiply-accumulates an instruction does is its definition; how many of them a cycle takes is documented,
 and where cores with one set differ, what was measured says which of the documented rates this core has.
+
+What the cores do is measured by two loops that run by turns in short bursts on every core at once; the median of the
+bursts counts. One issues nothing but the set's instructions. In the other each of them is followed by dependent `imul`,
+each of which takes three cycles on every x86-64 core since Intel's Nehalem and AMD's Zen (uops.info IMUL_R64_R64): they
+are the longer path, so the time of the loop is that of three cycles for each, at the clock that the core holds under
+this very load. No counter of the processor is needed, which virtual machines do not have. The loops are machine code,
+because no compiler need be there; the bytes are GNU as's for the lines beside them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import ctypes
+import mmap
+import os
+import threading
+import time
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from fractions import Fraction
+from statistics import median
+
+from trilane import machine
+from trilane.scheduler.stats import median_interval
 
 
 @dataclass(frozen=True)
@@ -100,3 +117,162 @@ def instruction_set_of(flags: Iterable[str]) -> InstructionSet | None:
 def peak_gmac_s(macs_a_cycle: float, clock_ghz: float, cores: int) -> float:
     """1e9 multiply-accumulates a second: those of a cycle, by the cycles of all cores."""
     return macs_a_cycle * clock_ghz * cores
+
+
+IMUL, IMUL_CYCLES = bytes.fromhex("480fafc0"), 3  # imul %rax,%rax
+DEC, JNZ, RET = bytes.fromhex("48ffcf"), bytes.fromhex("0f85"), b"\xc3"  # dec %rdi; jnz; ret
+VZEROUPPER = "c5f877"
+BURST_CYCLES, BURSTS = 1_000_000, 60
+SYS_ARCH_PRCTL, ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA = 158, 0x1023, 18
+#: Palette 1; eight tiles of 16 rows of 64 bytes.
+TILE_CONFIG = bytes([1, *[0] * 15, *[64, 0] * 8, *[0] * 16, *[16] * 8, *[0] * 8])
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """`body`: instructions in hexadecimal, `sequences` of them without an input from one another.
+
+    `imuls`: after each instruction in the loop that tells the clock: enough that they take longer than it.
+    `cycles`: that the body takes at least, for the length of a burst.
+    """
+
+    body: str
+    sequences: int
+    imuls: int
+    cycles: int
+    before: str = ""
+    after: str = VZEROUPPER
+
+
+KERNELS = {
+    "AMX-INT8": Kernel(
+        "c4e2415ec6 c4e2415ece c4e2415ed6 c4e2415ede",  # tdpbusd %tmm7,%tmm6,%tmm0 to %tmm3
+        sequences=4,
+        imuls=8,
+        cycles=64,
+        # ldtilecfg (%rsi); tilezero %tmm0 to %tmm7
+        before="c4e2784906 c4e27b49c0 c4e27b49c8 c4e27b49d0 c4e27b49d8 c4e27b49e0 c4e27b49e8 c4e27b49f0 c4e27b49f8",
+        after="c4e27849c0",  # tilerelease
+    ),
+    "AVX512-VNNI": Kernel(  # vpdpbusd %zmm30,%zmm31,%zmm0 to %zmm11
+        "6292054050c6 6292054050ce 6292054050d6 6292054050de 6292054050e6 6292054050ee "
+        "6292054050f6 6292054050fe 6212054050c6 6212054050ce 6212054050d6 6212054050de",
+        sequences=12,
+        imuls=1,
+        cycles=6,
+    ),
+    "AVX-VNNI": Kernel(  # {vex} vpdpbusd %ymm14,%ymm15,%ymm0 to %ymm11
+        "c4c20550c6 c4c20550ce c4c20550d6 c4c20550de c4c20550e6 c4c20550ee "
+        "c4c20550f6 c4c20550fe c4420550c6 c4420550ce c4420550d6 c4420550de",
+        sequences=12,
+        imuls=1,
+        cycles=6,
+    ),
+    "AVX512-BW": Kernel(  # vpmaddubsw %zmm30,%zmm31,%zmmB; vpmaddwd %zmm29,%zmmB,%zmmB; vpaddd %zmmB,%zmmA,%zmmA
+        "6212054004e6 62111d48f5e5 62d17d48fec4 6212054004ee 62111548f5ed 62d17548fecd "
+        "6212054004f6 62110d48f5f5 62d16d48fed6 6212054004fe 62110548f5fd 62d16548fedf",
+        sequences=4,
+        imuls=1,
+        cycles=6,
+    ),
+    "AVX2": Kernel(  # vpmaddubsw %ymm14,%ymm15,%ymmB; vpmaddwd %ymm13,%ymmB,%ymmB; vpaddd %ymmB,%ymmA,%ymmA
+        "c4c20504f6 c4c14df5f5 c5fdfec6 c4c20504fe c4c145f5fd c5f5fecf c4420504c6 c4413df5c5 c4c16dfed0 "
+        "c4420504ce c44135f5cd c4c165fed9 c4420504d6 c4412df5d5 c4c15dfee2 c4420504de c44125f5dd c4c155feeb",
+        sequences=6,
+        imuls=1,
+        cycles=6,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Issued:
+    """`rate`: sequences a cycle, of the mean core. `clock_ghz`: of the mean core, and the interval of its median."""
+
+    rate: float
+    clock_ghz: float
+    clock_low_ghz: float
+    clock_high_ghz: float
+
+
+def rate_loop(kernel: Kernel) -> bytes:
+    """A function of the number of turns (%rdi) and of the tile configuration (%rsi) that issues the body."""
+    return _loop(kernel, bytes.fromhex(kernel.body))
+
+
+def clock_loop(kernel: Kernel) -> bytes:
+    """The same with `imul` after each instruction."""
+    return _loop(kernel, b"".join(bytes.fromhex(each) + IMUL * kernel.imuls for each in kernel.body.split()))
+
+
+def _loop(kernel: Kernel, body: bytes) -> bytes:
+    back = -(len(body) + len(DEC) + len(JNZ) + 4)
+    turn = body + DEC + JNZ + back.to_bytes(4, "little", signed=True)
+    return bytes.fromhex(kernel.before) + turn + bytes.fromhex(kernel.after) + RET
+
+
+def measure_issued(name: str, cores: Sequence[int]) -> Issued:
+    """What every one of `cores` does while all of them work. `name`: key of `KERNELS`, of a set that this CPU has.
+
+    Raises OSError when the kernel refuses machine code in memory or the tiles of AMX.
+    """
+    if machine.here.architecture() != "x86_64":
+        raise OSError("there are no loops for this architecture")
+    kernel = KERNELS[name]
+    if kernel.before:
+        _ask_for_tiles()
+    together = threading.Barrier(len(cores))
+    with ThreadPoolExecutor(len(cores)) as pool:
+        measured = list(pool.map(lambda core: _on_core(core, kernel, together), cores))
+    rates = [rate for rate, _ in measured]
+    clocks = [median(clock) for _, clock in measured]
+    ends = [median_interval(clock) for _, clock in measured]
+    return Issued(_mean(rates), _mean(clocks), _mean([low for low, _ in ends]), _mean([high for _, high in ends]))
+
+
+def _mean(values: list[float]) -> float:
+    return sum(values) / len(values)
+
+
+def _ask_for_tiles() -> None:
+    """Linux gives a process the registers of AMX when it asks for them."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.syscall(SYS_ARCH_PRCTL, ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA):
+        raise OSError(ctypes.get_errno(), "the tiles of AMX are refused")
+
+
+def _on_core(core: int, kernel: Kernel, together: threading.Barrier) -> tuple[float, list[float]]:
+    """Sequences a cycle, and the clock in GHz in each burst. The thread ends afterwards, and with it its core."""
+    os.sched_setaffinity(0, {core})
+    turns = BURST_CYCLES // kernel.cycles
+    chain = turns * len(kernel.body.split()) * kernel.imuls * IMUL_CYCLES
+    with _Code(rate_loop(kernel)) as issue, _Code(clock_loop(kernel)) as tell_clock:
+        together.wait()
+        rates, clocks = [], []
+        for _ in range(BURSTS):
+            rates.append(turns * kernel.sequences / issue.ns(turns))
+            clocks.append(chain / tell_clock.ns(turns))
+    return median(rates) / median(clocks), clocks
+
+
+class _Code:
+    """Machine code in memory. Raises OSError when the kernel refuses it."""
+
+    def __init__(self, code: bytes) -> None:
+        self._memory = mmap.mmap(-1, len(code), prot=mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC)
+        self._memory.write(code)
+        self._first = ctypes.c_char.from_buffer(self._memory)
+        self._call = ctypes.CFUNCTYPE(None, ctypes.c_uint64, ctypes.c_char_p)(ctypes.addressof(self._first))
+
+    def __enter__(self) -> _Code:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        del self._call, self._first
+        self._memory.close()
+
+    def ns(self, turns: int) -> int:
+        """CPU time of so many turns; other threads of this process run meanwhile."""
+        begin = time.thread_time_ns()
+        self._call(turns, TILE_CONFIG)
+        return time.thread_time_ns() - begin

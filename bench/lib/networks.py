@@ -5,20 +5,29 @@ Rule: weights and inputs are random and the same every time; how long a network 
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
 from numpy.typing import NDArray
 
+from trilane.avatars.bundle import MANIFEST, bundle_folder, load_bundle, write_bundle
+from trilane.avatars.manifest import UNTRAINED, Manifest, network_entry
 from trilane.avatars.network_file import NetworkFile, reshaped
-from trilane.errors import MissingPartError
+from trilane.cache import cache_dir
+from trilane.errors import MissingPartError, TrilaneError
 from trilane.hw_profiles.network_work import graph_facts
 from trilane.training.quantising.quantise import quantise
 
 CALIBRATION_SIDE = 64
 CALIBRATION_FRAMES = 5
+#: The paper's network as an avatar: the default avatar's body and texture around untrained weights, made once and kept.
+FULL_WIDTH = "resnet18"
+ENCODER, NORM, WIDTH = "resnet18", "batch", 64
+SIDE = 64  # the network is convolutional; a run reshapes it
 
 
 @dataclass(frozen=True)
@@ -106,3 +115,25 @@ def _defined_macs(network: Any, torch: Any, channels: int) -> float:
     for hook in hooks:
         hook.remove()
     return total / CALIBRATION_SIDE**2
+
+
+def full_width_bundle() -> Path:
+    """The folder of the full-width network's bundle, made when it is not there yet. Its pictures mean nothing.
+
+    Raises MissingPartError without PyTorch, TrilaneError when no cache folder can be written.
+    """
+    home = cache_dir("bench")
+    if home is None:
+        raise TrilaneError("the cache folder cannot be written: set XDG_CACHE_HOME to one that can")
+    default = load_bundle(bundle_folder("default"))
+    texture = default.read_texture().astype(np.float16)
+    offsets = default.read_body().offsets
+    worn = b"" if offsets is None else offsets.tobytes()
+    content = hashlib.sha256(texture.tobytes() + default.body_path.read_bytes() + worn).hexdigest()[:12]
+    folder = home / f"{ENCODER}-{NORM}-{WIDTH}-{content}"
+    if not (folder / MANIFEST).exists():
+        network = untrained(ENCODER, NORM, WIDTH, (SIDE, SIDE), texture.shape[2]).integer
+        entry = network_entry(network, ENCODER, NORM, WIDTH)
+        manifest = Manifest(name=FULL_WIDTH, network=entry, provenance={"weights": UNTRAINED})
+        write_bundle(folder, manifest, default.body_path, texture, network, offsets=offsets)
+    return folder

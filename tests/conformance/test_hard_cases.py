@@ -10,16 +10,17 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from trilane.apps.experiments.hard_cases import (  # noqa: E402
+from trilane.apps.experiments.hard_cases import (  # noqa: E402  # noqa: E402
     EXCEEDED,
     HOLDS,
     IDEAL_STEPS,
+    INPUTS,
+    NETWORKS,
     SHIFT,
     error_of,
     make_case,
     make_pair,
 )
-from trilane.apps.experiments.hard_networks import INPUTS, NETWORKS  # noqa: E402
 from trilane.training.quantising import power_of_two_scales  # noqa: E402
 from trilane.training.quantising import quantise as quantise_module  # noqa: E402
 

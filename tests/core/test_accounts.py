@@ -9,9 +9,8 @@ from typing import Any
 
 import pytest
 
+from support.trace_reading import ReadTrace, read_trace
 from trilane.apps.tracing.writer import write_trace
-from trilane.bench.accounts import measure, virtual_run
-from trilane.errors import BadInputError
 from trilane.pipeline.journal import journal_of, records_of
 from trilane.pipeline.waits import Waits
 from trilane.scheduler.accounts import LARGEST_DIFFERENCE, compared, second_accounts
@@ -20,21 +19,24 @@ from trilane.scheduler.events import (
     Dispatch,
     Event,
     FrameRequest,
+    Graph,
     JobDone,
     Pinged,
     SetDuty,
     Settings,
+    StageSpec,
     Stop,
     UnitDied,
     UnitReady,
     chain,
 )
 from trilane.scheduler.ledger import STARVED, JobRecord
+from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.recording import Recording
 from trilane.scheduler.virtual import Simulation, simulate
-from trilane.testing.trace_reading import ReadTrace, read_trace
 
 MS = 1_000_000
+EDGES = ("single", "double", "triple", "fifo:1", "fifo:3", "orphan", "orphan:4")
 SERVICE = {"a": 2, "b": 5}
 TWO_UNITS = (("a", "u"), ("b", "v"))
 #: (busy, starved, blocked, throttled, preempted, overhead) in ms.
@@ -262,6 +264,47 @@ def test_what_a_unit_lost_is_booked_under_its_causes() -> None:
     assert report["stages"]["a"]["service_ms"]["mean"] == (8 + 10 + 5 + 10 + 8) / 5  # the wall's time
 
 
+def virtual_run(draw: random.Random, frames: int) -> dict[str, Any]:
+    """The report of a simulated run whose pipeline, policy, rate, caps and deaths are drawn, with `accounts`."""
+    units = [draw.choice("abc") for _ in range(draw.randint(1, 6))]
+    graph = Graph(
+        tuple(StageSpec(f"s{index}", unit) for index, unit in enumerate(units)),
+        tuple(draw.choice(EDGES) for _ in units[1:]),
+        f"s{draw.randrange(len(units))}",
+    )
+    policy = draw.choice(list(POLICIES))
+    is_paced = POLICIES[policy].paced or draw.random() < 0.5
+    settings = Settings(
+        frames,
+        policy,
+        period_ns=draw.randint(5, 25) * MS if is_paced else 0,
+        deadline_ns=60 * MS,
+        in_flight=draw.randint(0, 4),
+        in_queue=draw.randint(0, 3),
+        queue_timeout_ns=draw.choice((0, 30 * MS)),
+        latch_ns=draw.choice((0, 0, 2 * MS)),
+        hang_ns=draw.choice((12 * MS, 200 * MS)),
+        max_failures=frames,
+    )
+    longest_ns = {f"s{index}": draw.randint(1, 14) * MS for index in range(len(units))}
+    duties: list[tuple[int, Event]] = [
+        (draw.randint(0, frames * 10 * MS), SetDuty(draw.choice(units), draw.randint(300, 1000)))
+        for _ in range(draw.randint(0, 3))
+    ]
+    done = simulate(
+        graph,
+        settings,
+        lambda stage, _unit, _frame, _begin_ns: draw.randint(MS // 20, longest_ns[stage]),
+        message_delay_ns=draw.choice((0, 50_000)),
+        restart_ns=draw.randint(10, 300) * MS,
+        faults=[(draw.randint(0, frames * 10 * MS), draw.choice(units)) for _ in range(draw.randint(0, 4))],
+        inputs=duties,
+        keep=True,
+    )
+    assert done.recording is not None
+    return {**done.report, "accounts": compared(done.report["units"], second_accounts(done.recording, done.jobs))}
+
+
 @pytest.mark.parametrize("seed", range(50))
 def test_both_computations_agree_in_random_runs(seed: int) -> None:
     report = virtual_run(random.Random(seed), 40)
@@ -346,9 +389,3 @@ def test_a_unit_without_accounts_is_no_agreement() -> None:
     assert done.recording is not None
     only = [job for job in done.jobs if job.unit == "u"]
     assert compared({"w": done.report["units"]["u"]}, second_accounts(done.recording, only))["largest_difference"] == 1
-
-
-@pytest.mark.parametrize(("sizes", "where"), [({"frames": 1}, "--frames: found 1"), ({"runs": 0}, "--runs: found 0")])
-def test_too_few_frames_or_runs_are_refused_by_name(sizes: dict[str, int], where: str) -> None:
-    with pytest.raises(BadInputError, match=where):
-        measure(**sizes)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from trilane.apps.experiments import accuracy, drawn_tensors
+from trilane.apps.experiments import accuracy
 from trilane.pipeline.stage import UnitContext
 from trilane.stages.config import pose_dtype
 
@@ -52,10 +52,10 @@ def test_frames_are_evenly_spread(asked: int, frames: list[int], monkeypatch: py
         scene=SimpleNamespace(frames=10), avatar_dirs=("a", "b"), units=units, model_dump=lambda mode: {"mode": mode}
     )
     sizes = {"pose->raster": 40, "raster->infer": 80}
-    monkeypatch.setattr(drawn_tensors, "edge_bytes", lambda given, assets: sizes if given is config else assets)
-    monkeypatch.setattr(drawn_tensors, "build_pose", build("pose"))
-    monkeypatch.setattr(drawn_tensors, "build_raster", build("raster"))
-    monkeypatch.setattr(drawn_tensors, "network_of", lambda _: SimpleNamespace(channels=3))
+    monkeypatch.setattr(accuracy, "edge_bytes", lambda given, assets: sizes if given is config else assets)
+    monkeypatch.setattr(accuracy, "build_pose", build("pose"))
+    monkeypatch.setattr(accuracy, "build_raster", build("raster"))
+    monkeypatch.setattr(accuracy, "network_of", lambda _: SimpleNamespace(channels=3))
     checked: Any = SimpleNamespace(config=config, assets="assets")
     found = [(frame, tensor.copy()) for frame, tensor in accuracy._tensors(checked, asked)]
     assert [frame for frame, _ in found] == [frame for frame in frames if frame != NOBODY_IN]
@@ -73,5 +73,5 @@ def test_frames_are_evenly_spread(asked: int, frames: list[int], monkeypatch: py
 
 
 def test_a_packet_has_the_header_of_so_many_avatars() -> None:
-    packet = drawn_tensors._packet(3, 128)
+    packet = accuracy._packet(3, 128)
     assert (packet.header.dtype, len(packet.payload)) == (pose_dtype(3), 128)

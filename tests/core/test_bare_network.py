@@ -12,6 +12,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper
 
+from support.small_inputs import net
 from trilane.errors import BadInputError
 from trilane.hw_profiles import bare_network
 from trilane.hw_profiles.bare_network import in_precision, operator_rows, predict_network, under_runtime, without_rule
@@ -24,7 +25,6 @@ from trilane.hw_profiles.network_work import Operator, Work, count_work
 from trilane.hw_profiles.performance_profiles import Corners, corners_of
 from trilane.hw_profiles.rates import FrameTimes, Load, Wanted, answers, holding, within_power
 from trilane.hw_profiles.schema import CORNERS, ENGINE_RUNTIMES, Profile, Quantity
-from trilane.testing.byte_network import net
 from trilane.units import UNITS, UnitName
 
 

@@ -12,7 +12,7 @@ from trilane.errors import BadInputError
 
 @pytest.mark.parametrize(
     "asked",
-    [{"width": -3}, {"height": 0}, {"repeats": 0}, {"threads": -1}, {"minutes": float("nan")}, {"sizes": (64, 0)}],
+    [{"width": -3}, {"batch": 0}, {"repeats": 0}, {"threads": -1}, {"minutes": float("nan")}, {"sizes": (64, 0)}],
 )
 def test_a_number_out_of_range_is_refused_by_name(asked: dict[str, object]) -> None:
     def never(**_: object) -> dict[str, object]:

@@ -1,4 +1,4 @@
-"""What benches ask of OpenGL, of random views and of the queue of requests, call by call."""
+"""What benches ask of OpenGL and of the queue of requests, call by call."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.bench import crop, joints
 from trilane.bench.lib import gpu_buffering, load
 from trilane.bench.lib.gpu_buffering import READBACKS, UPLOADS
 from trilane.bench.lib.load import Load, Queries, bound_ms, queries_needed, tail, verdict
-from trilane.errors import BadInputError, TrilaneError
-from trilane.scene.crop import Rect
+from trilane.errors import TrilaneError
 
 
 class Noted:
@@ -114,84 +112,6 @@ def test_an_upload_by_its_calls(log: list[Any], name: str, buffers: int) -> None
         expected += [(f"buffer {place}", "write", image, {}), ("texture", "write", ctx.made[place], {"alignment": 1})]
         expected += ["fence"] * (name == "ring")
     assert log == expected and len(ctx.made) == buffers
-
-
-def test_a_view_is_one_in_which_the_whole_mesh_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rectangles that reach an edge and meshes that are not seen are left out. Two joints at (1, 2, 0) and (-1, 0, 0),
-    divided by w = 4: a quarter and a half, of 40 x 80 pixels; the first rectangle that counts took 3 ms."""
-    good = Rect(-0.5, -0.25, 0.5, 0.75)
-    edges = [Rect(-1.0, 0, 0.5, 0.5), Rect(0, -1.0, 0.5, 0.5), Rect(0, 0, 1.0, 0.5), Rect(0, 0, 0.5, 1.0)]
-    rects = iter([None, *edges, good, None, Rect(-0.999, -0.999, 0.999, 0.999)])
-    looks = iter([n / 1000 for n in (0, 1) * 5] + [0.0, 0.003, 0.0, 0.001, 0.0, 0.002])
-    asked: list[Any] = []
-    posed = SimpleNamespace(joints=np.array([[1.0, 2.0, 0.0], [-1.0, 0.0, 0.0]]))
-    clip = np.eye(4)
-    clip[3, 3] = 4.0
-    monkeypatch.setattr(
-        crop, "MeshBounds", lambda _: SimpleNamespace(rect=lambda *what: asked.append(what) or next(rects))
-    )
-    monkeypatch.setattr(crop, "Skeleton", lambda *_: SimpleNamespace(pose=lambda _: posed))
-    monkeypatch.setattr(crop, "random_camera", lambda _random, output: asked.append(output) or clip)
-    grown = Rect(-1.0, -0.5, 1.0, 1.0)
-    monkeypatch.setattr(crop, "choose_bucket", lambda *what: asked.append(what) or ((1, 1), grown))
-    monkeypatch.setattr(crop, "time", SimpleNamespace(perf_counter=lambda: next(looks)))
-    first, second = crop._views(2, (40, 80), [(32, 32)])
-    assert first.mesh.tolist() == [-20.0, -5.0, 20.0, 15.0]
-    assert first.joints.tolist() == [-10.0, 0.0, 10.0, 10.0]
-    assert (first.tensor_area, first.rect_us, second.rect_us) == (80.0 * 30.0, pytest.approx(3000), pytest.approx(2000))
-    assert asked[-3:-1] == [(40, 80), (posed, clip)] and asked[-1][1:] == ((40, 80), [(32, 32)])
-    assert (good, (40, 80), [(32, 32)]) in [each for each in asked if len(each) == 3]
-
-
-def test_ways_to_crop_are_compared_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two views: meshes of 20 x 30 and 10 x 10 in tensors of 1000 and 200; joints 10 x 20 and 10 x 10 round the same
-    middles, so that squares of 20 and 10 would need 30 and 10; the widest is 1.5 times."""
-    views = [
-        crop._View(np.array([0.0, 0, 20, 30]), np.array([5.0, 5, 15, 25]), 1000.0, 7.0),
-        crop._View(np.array([0.0, 0, 10, 10]), np.array([0.0, 0, 10, 10]), 200.0, 3.0),
-    ]
-    asked: list[Any] = []
-    monkeypatch.setattr(crop, "_views", lambda *what: asked.append(what) or views)
-    result = crop.measure(views=2, size="64x96", height=50, width=70)
-
-    def row(way: str, first: float, second: float, cuts: float = 0.0) -> dict[str, Any]:
-        low, high = sorted((1 - 600 / first, 1 - 100 / second))
-        wasted = {"wasted_median": pytest.approx((low + high) / 2), "wasted_p90": pytest.approx(0.1 * low + 0.9 * high)}
-        return {"way": way, **wasted, "cuts_mesh": cuts}
-
-    assert result == {
-        "rows": [
-            row("mesh rectangle, shape buckets", 1000, 200),
-            row("square around joints", 400, 100, 0.5),
-            row("square around joints, widened for each view", 900, 100),
-            row("square around joints, widened by 1.50", 900, 225),
-        ],
-        "rect_us": {"best": 3.0, "median": 5.0},
-        "config": {"views": 2, "size": "64x96", "output": [50, 70], "buckets": [[64, 96]]},
-    }
-    assert asked == [(2, (50, 70), [(64, 96)])]
-    for bad, words in (({"views": 0}, "--views: found 0, expected at least 1"), ({"size": "33"}, "--size: ")):
-        with pytest.raises(BadInputError, match=f"^{words}"):
-            crop.measure(**bad)  # type: ignore[arg-type]
-
-
-def test_the_poses_of_a_loop_are_those_of_a_seed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each of two loops poses the same twenty; the clock goes on by 1, 2 and 3 s between its looks."""
-    posed: list[np.ndarray] = []
-    looks = iter([0.0, 1.0, 3.0, 6.0])
-    monkeypatch.setattr(joints, "Skeleton", lambda *_: SimpleNamespace(pose=posed.append))
-    monkeypatch.setattr(joints, "time", SimpleNamespace(perf_counter=lambda: next(looks)))
-    assert joints.measure(repeats=2) == {
-        "best_us": pytest.approx(50_000),
-        "median_us": pytest.approx(100_000),
-        "p90_us": pytest.approx(140_000),
-        "limit_us": 200.0,
-        "config": {"repeats": 2, "frames_per_loop": 20, "joints": 55},
-    }
-    poses = np.random.default_rng(0).normal(0.0, 0.5, (20, 165))
-    assert np.array_equal(posed, [*poses, *poses])
-    with pytest.raises(BadInputError, match=r"^--repeats: found 0, expected at least 1$"):
-        joints.measure(repeats=0)
 
 
 class Condition:

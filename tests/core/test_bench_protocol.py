@@ -23,8 +23,8 @@ from trilane.bench.lib.limits import LIMITS
 
 FILE = Path(__file__).with_name("printed") / "bench-protocol.txt"
 ROOT = Path(__file__).resolve().parents[2]
-#: They need SimPy and hold no numbers.
-LEFT_OUT = {"trilane.bench.lib.simpy_lean", "trilane.bench.lib.simpy_model"}
+#: It needs SimPy and holds no numbers.
+LEFT_OUT = {"trilane.bench.lib.simpy_models"}
 OF_THE_MACHINE = {"threads"}
 
 

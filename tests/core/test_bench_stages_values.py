@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import threading
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,7 +11,8 @@ import numpy as np
 import onnx
 import pytest
 
-from trilane.bench.lib import asked_processes, cpu_load, handoff_stages, interleaved_processes, networks
+from trilane.bench import handoff
+from trilane.bench.lib import interleaved_processes, networks
 from trilane.bench.lib.interleaved_processes import KINDS, Runner, Variant
 from trilane.errors import TrilaneError
 from trilane.pipeline.description import UnitSettings
@@ -133,7 +133,7 @@ class Processes:
 def test_runners_have_a_process_each_and_end_them_all(monkeypatch: pytest.MonkeyPatch) -> None:
     told = Processes()
     asked: list[str] = []
-    monkeypatch.setattr(asked_processes.multiprocessing, "get_context", lambda how: asked.append(how) or told)
+    monkeypatch.setattr(interleaved_processes.multiprocessing, "get_context", lambda how: asked.append(how) or told)
     variants = {"a": Variant("ort", Path("a"), threads=3), "b": Variant("ort", Path("b"), threads=4)}
     with interleaved_processes.runners(variants) as by_name:
         assert {name: each.startup_ms for name, each in by_name.items()} == {"a": 3.0, "b": 4.0}
@@ -225,53 +225,16 @@ def test_openvino_is_asked_as_its_first_example_asks(
     assert np.array_equal(feed[0], np.random.default_rng(1).integers(0, 256, (1, 2, 3, 4), dtype=np.uint8))
 
 
-@pytest.mark.parametrize(("threads", "others"), [(1, 0), (3, 2)])
-def test_a_load_computes_on_every_thread_and_then_sleeps(
-    monkeypatch: pytest.MonkeyPatch, threads: int, others: int
-) -> None:
-    computed: list[tuple[int, bool]] = []
-    slept: list[tuple[float, int]] = []
-
-    def compute(cpu_ns: int) -> None:
-        computed.append((cpu_ns, threading.current_thread() is threading.main_thread()))
-
-    monkeypatch.setattr(cpu_load, "compute", compute)
-    monkeypatch.setattr(cpu_load.time, "sleep", lambda seconds: slept.append((seconds, len(computed))))
-    unit = UnitContext("a", UnitSettings(cores=(0,), threads=threads), {})
-    stage = cpu_load.build({"cpu_ms": 2.5, "sleep_ms": 4.0, "device": False}, unit)
-    assert stage.run(0, None, None) == {} and not unit.has_device
-    assert sorted(computed) == [(2_500_000, False)] * others + [(2_500_000, True)]
-    assert slept == [(0.004, threads)]
-    stage.close()
-    if stage._others is not None:
-        with pytest.raises(RuntimeError, match="shutdown"):
-            stage._others.submit(int)
-    awake = cpu_load.build({"cpu_ms": 1.0, "sleep_ms": 0.0, "device": True}, unit)
-    awake.run(0, None, None)
-    awake.close()
-    assert len(slept) == 1 and unit.has_device
-
-
-def test_computing_ends_with_the_cpu_time_that_was_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The thread's clock goes 30 ns with each look: 100 ns are over with the fourth."""
-    looks = iter(range(1000, 2000, 30))
-    hashed: list[int] = []
-    monkeypatch.setattr(cpu_load, "time", SimpleNamespace(thread_time_ns=lambda: next(looks)))
-    monkeypatch.setattr(cpu_load, "hashlib", SimpleNamespace(sha256=lambda block: hashed.append(len(block))))
-    cpu_load.compute(100)
-    assert hashed == [65536] * 3
-
-
 def test_a_slot_is_written_whole_and_read_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     slept: list[float] = []
-    monkeypatch.setattr(handoff_stages.time, "sleep", slept.append)
+    monkeypatch.setattr(handoff.time, "sleep", slept.append)
     layout = SlotLayout(header_dtype(), 64)
     slots = [view_packet(memoryview(bytearray(layout.slot_bytes)), layout) for _ in range(2)]
-    pipeline = handoff_stages.handoff_pipeline(64)
-    assert [(stage.name, stage.unit) for stage in pipeline.stages] == [*handoff_stages.STAGES]
+    pipeline = handoff.handoff_pipeline(64)
+    assert [(stage.name, stage.unit) for stage in pipeline.stages] == [*handoff.STAGES]
     assert [edge.payload_bytes for edge in pipeline.edges] == [0, 64, 0]
     unit = UnitContext("a", UnitSettings(cores=(0,), threads=1), {})
-    by_name = {stage.name: handoff_stages.build(stage.settings, unit) for stage in pipeline.stages}
+    by_name = {stage.name: handoff.build(stage.settings, unit) for stage in pipeline.stages}
     for name, stage in by_name.items():
         stage.bind(slots if name == "infer" else [], slots if name == "raster" else [])
     assert by_name["pose"].run(255, None, 0) == {} and slept == [0.001] and not slots[0].payload.any()
@@ -285,7 +248,7 @@ def test_a_slot_is_written_whole_and_read_whole(monkeypatch: pytest.MonkeyPatch)
         by_name["infer"].run(255, 0, None)
     slots[1].payload[63] = 5
     with pytest.raises(TrilaneError, match="64 bytes"):
-        handoff_stages.check_bytes(slots[1].payload, 4)
+        handoff.check_bytes(slots[1].payload, 4)
     assert slept == [0.001]
 
 

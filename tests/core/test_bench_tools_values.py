@@ -14,8 +14,8 @@ import pytest
 
 from trilane import machine
 from trilane.avatars.bundle import load_bundle
-from trilane.bench.lib import full_width, instruction_kernels, networks
-from trilane.bench.lib.instruction_kernels import KERNELS, Issued, measure_issued
+from trilane.bench.lib import instruction_sets, networks
+from trilane.bench.lib.instruction_sets import KERNELS, Issued, measure_issued
 from trilane.bench.lib.load import Load, Queries
 from trilane.bench.lib.loadgen import LoadGenPlayer, load_generator
 from trilane.errors import MissingPartError, TrilaneError
@@ -230,12 +230,12 @@ def test_the_full_width_bundle_is_made_once(
     def write(folder: Path, *what: Any, offsets: Any) -> None:
         written.append((folder, *what, offsets))
         folder.mkdir(parents=True)
-        (folder / full_width.MANIFEST).touch()
+        (folder / networks.MANIFEST).touch()
 
-    monkeypatch.setattr(full_width, "untrained", untrained)
-    monkeypatch.setattr(full_width, "cache_dir", lambda name: tmp_path / name)
-    monkeypatch.setattr(full_width, "write_bundle", write)
-    folder = full_width.full_width_bundle()
+    monkeypatch.setattr(networks, "untrained", untrained)
+    monkeypatch.setattr(networks, "cache_dir", lambda name: tmp_path / name)
+    monkeypatch.setattr(networks, "write_bundle", write)
+    folder = networks.full_width_bundle()
     assert folder.parent == tmp_path / "bench"
     default = load_bundle("default")
     worn = default.read_body().offsets
@@ -250,10 +250,10 @@ def test_the_full_width_bundle_is_made_once(
     entry = manifest.network
     assert (manifest.name, entry.encoder, entry.norm, entry.width) == ("resnet18", "resnet18", "batch", 64)
     assert manifest.provenance == {"weights": "untrained: for speed alone"}
-    assert full_width.full_width_bundle() == folder and len(made) == 1
-    monkeypatch.setattr(full_width, "cache_dir", lambda _: None)
+    assert networks.full_width_bundle() == folder and len(made) == 1
+    monkeypatch.setattr(networks, "cache_dir", lambda _: None)
     with pytest.raises(TrilaneError, match="the cache folder cannot be written"):
-        full_width.full_width_bundle()
+        networks.full_width_bundle()
 
 
 def test_what_cores_do_is_the_median_of_bursts_and_the_mean_of_cores(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -294,17 +294,17 @@ def test_what_cores_do_is_the_median_of_bursts_and_the_mean_of_cores(monkeypatch
         def map(self, work: Any, cores: Any) -> Any:
             return map(work, cores)
 
-    monkeypatch.setattr(instruction_kernels, "_Code", Code)
-    monkeypatch.setattr(instruction_kernels, "ThreadPoolExecutor", Pool)
+    monkeypatch.setattr(instruction_sets, "_Code", Code)
+    monkeypatch.setattr(instruction_sets, "ThreadPoolExecutor", Pool)
     barrier = SimpleNamespace(wait=lambda: None)
-    monkeypatch.setattr(instruction_kernels, "threading", SimpleNamespace(Barrier=lambda n: asked.append(n) or barrier))
-    monkeypatch.setattr(instruction_kernels.os, "sched_setaffinity", lambda pid, cores: asked.extend((pid, *cores)))
+    monkeypatch.setattr(instruction_sets, "threading", SimpleNamespace(Barrier=lambda n: asked.append(n) or barrier))
+    monkeypatch.setattr(instruction_sets.os, "sched_setaffinity", lambda pid, cores: asked.extend((pid, *cores)))
     monkeypatch.setattr(machine.here, "architecture", lambda: "x86_64")
     found = measure_issued("AVX-VNNI", [2, 5])
     assert found == Issued(*(pytest.approx(value) for value in (1.5, 3.0, 3.0, 3.0)))
     assert asked == [2, 0, 2, "freed", "freed", 0, 5, "freed", "freed"]
     kernel = KERNELS["AVX-VNNI"]
-    assert code == [instruction_kernels.rate_loop(kernel), instruction_kernels.clock_loop(kernel)] * 2
+    assert code == [instruction_sets.rate_loop(kernel), instruction_sets.clock_loop(kernel)] * 2
 
 
 @pytest.mark.parametrize(("refused", "words"), [(0, ""), (1, "the tiles of AMX are refused")])
@@ -312,9 +312,9 @@ def test_tiles_are_asked_for_where_a_set_has_them(monkeypatch: pytest.MonkeyPatc
     calls: list[Any] = []
     libc = SimpleNamespace(syscall=lambda *what: calls.append(what) or refused)
     monkeypatch.setattr(
-        instruction_kernels.ctypes, "CDLL", lambda name, use_errno: libc if (name, use_errno) == (None, True) else None
+        instruction_sets.ctypes, "CDLL", lambda name, use_errno: libc if (name, use_errno) == (None, True) else None
     )
-    monkeypatch.setattr(instruction_kernels, "_on_core", lambda *_: (1.0, [2.0, 4.0, 3.0]))
+    monkeypatch.setattr(instruction_sets, "_on_core", lambda *_: (1.0, [2.0, 4.0, 3.0]))
     monkeypatch.setattr(machine.here, "architecture", lambda: "x86_64")
     if refused:
         with pytest.raises(OSError, match=words):
@@ -329,7 +329,7 @@ def test_tiles_are_asked_for_where_a_set_has_them(monkeypatch: pytest.MonkeyPatc
 @pytest.mark.skipif(machine.here.architecture() != "x86_64", reason="the loops are machine code of x86")
 def test_a_loop_runs_as_often_as_it_is_told() -> None:
     """Machine code by hand: `imul` alone is on every x86-64 core. Three cycles of at most 10 GHz each."""
-    kernel = instruction_kernels.Kernel("480fafc0", sequences=1, imuls=1, cycles=3, after="")
-    with instruction_kernels._Code(instruction_kernels.clock_loop(kernel)) as code:
+    kernel = instruction_sets.Kernel("480fafc0", sequences=1, imuls=1, cycles=3, after="")
+    with instruction_sets._Code(instruction_sets.clock_loop(kernel)) as code:
         assert code.ns(200_000) > 200_000 * 2 * 3 / 10
     assert code._memory.closed

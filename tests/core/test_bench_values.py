@@ -1,9 +1,8 @@
-"""What the benches measure with: clocks that are told the time, random views that are held, sums by hand."""
+"""What the benches measure with: clocks that are told the time, arrays that are held, sums by hand."""
 
 from __future__ import annotations
 
 import re
-import signal
 from collections.abc import Callable, Iterator
 from itertools import count
 from types import SimpleNamespace
@@ -12,9 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.bench import crop, faults, joints
 from trilane.bench import pipeline as pipeline_bench
-from trilane.bench.lib import fixture, load, timing, views
+from trilane.bench.lib import fixture, load
 from trilane.bench.lib.float_raster import quantise, rasterise, sample
 from trilane.bench.lib.limits import LIMITS, check_limits
 from trilane.bench.lib.load import Load, Queries
@@ -22,7 +20,6 @@ from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.run_metrics import StageTimes, TimeSummary
 from trilane.scheduler.ledger import JobRecord
-from trilane.units import UNITS
 
 Held = Callable[[str, Any], None]
 
@@ -47,27 +44,21 @@ class Clock:
 def test_variants_take_turns_and_the_warm_up_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
     """`a` takes 2 s, `b` 3 s, and each its round's number of milliseconds more."""
     clock, rounds, order = Clock(), {"a": count(), "b": count()}, []
-    monkeypatch.setattr(timing, "time", clock)
+    monkeypatch.setattr(fixture, "time", clock)
 
     def run(name: str, seconds: float) -> None:
         order.append(name)
         clock.now += seconds + next(rounds[name]) / 1000
 
-    times = timing.interleaved_ms({"a": lambda: run("a", 2.0), "b": lambda: run("b", 3.0)}, 3)
+    times = fixture.interleaved_ms({"a": lambda: run("a", 2.0), "b": lambda: run("b", 3.0)}, 3)
     assert "".join(order) == "ab" * (5 + 3)
     assert times["a"] == pytest.approx([2005, 2006, 2007])
     assert times["b"] == pytest.approx([3005, 3006, 3007])
 
 
 def test_a_summary_is_median_minimum_and_ninetieth_percentile() -> None:
-    assert timing.summary_ms([float(n) for n in range(11)]) == {"median_ms": 5.0, "min_ms": 0.0, "p90_ms": 9.0}
-    assert timing.summary_ms([5.0, 1.0, 2.0, 4.0])["median_ms"] == 3.0
-
-
-def test_random_views_are_held(held: Held) -> None:
-    random = np.random.default_rng(4)
-    held("poses", [views.everyday_pose(random) for _ in range(40)])
-    held("cameras", [views.random_camera(random, (480, 640)) for _ in range(40)])
+    assert fixture.summary_ms([float(n) for n in range(11)]) == {"median_ms": 5.0, "min_ms": 0.0, "p90_ms": 9.0}
+    assert fixture.summary_ms([5.0, 1.0, 2.0, 4.0])["median_ms"] == 3.0
 
 
 def test_the_standing_body_is_held(held: Held) -> None:
@@ -79,38 +70,6 @@ def test_the_standing_body_is_held(held: Held) -> None:
     world = np.array([0.0, fixture.HEIGHT_M + fixture.FRAME_M / 2, 0.0, 1.0])
     place = clip @ world
     assert place[1] / place[3] == pytest.approx(1.0), "the picture is as high as its frame"
-
-
-def test_what_crops_waste_is_held(held: Held) -> None:
-    report = crop.measure(views=25)
-    for row in report["rows"]:
-        held(row["way"].split(" by ")[0], [row[key] for key in ("wasted_median", "wasted_p90", "cuts_mesh")])
-    assert 0 < report["rect_us"]["best"] <= report["rect_us"]["median"]
-    assert report["config"]["output"] == [480, 640]
-
-
-def test_the_squares_of_a_view_by_hand() -> None:
-    """Joints 10..30 x 20..60, mesh 4..32 x 18..70: the square has side 40 round (20, 40) and would need 60."""
-    view = crop._View(np.array([4.0, 18, 32, 70]), np.array([10.0, 20, 30, 60]), 8000.0, 1.0)
-    assert crop._needed(view) == 2 * (70 - 40)
-    assert crop._area(view.mesh) == 28 * 52
-    row = crop._row("x", np.array([0.0, 0.5, 0.75]), np.array([True, False, False]))
-    assert row == {
-        "way": "x",
-        "wasted_median": 0.5,
-        "wasted_p90": pytest.approx(0.7),
-        "cuts_mesh": pytest.approx(1 / 3),
-    }
-
-
-def test_joints_are_timed_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The clock stands at 0, 1, 3, 6, 10, 15 s: loops of 20 frames take 1, 3 and 5 s."""
-    ticks = iter([0.0, 1.0, 3.0, 6.0, 10.0, 15.0])
-    monkeypatch.setattr(joints.time, "perf_counter", lambda: next(ticks))
-    found = joints.measure(repeats=3)
-    monkeypatch.undo()
-    assert (found["best_us"], found["median_us"]) == pytest.approx((1e6 / 20, 3e6 / 20))
-    assert found["p90_us"] == pytest.approx((3 + 0.8 * 2) * 1e6 / 20)
 
 
 @pytest.mark.parametrize("option", sorted(set(LIMITS) - {"threads"}))
@@ -213,44 +172,6 @@ def test_requests_reach_the_queue_by_frames() -> None:
 
     Queries(size=3).ask(Requests(lambda _: None, lambda: None), 5)
     assert asked == [15]
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_kills_are_spread_and_stops_come_early(seed: int) -> None:
-    """Of 4 kills in 50 s the k-th comes around 10 k s, within half of what `SPACE` leaves free of the 10 s."""
-    kills = faults._moments("kill", 4, 50.0, 5.0, seed)
-    assert [number for _, number in kills] == [signal.SIGKILL] * 4
-    free_s = (1 - faults.SPACE) * 10.0
-    off = [at - 10.0 * (k + 1) for k, (at, _) in enumerate(kills)]
-    assert max(map(abs, off)) <= free_s / 2 and len(set(off)) == 4
-    (stop_s, stop), (go_s, go) = faults._moments("stop", 4, 50.0, 5.0, seed)
-    assert (stop, go) == (signal.SIGSTOP, signal.SIGCONT)
-    assert 5.0 <= stop_s <= 15.0 and go_s == stop_s + 5.0
-    assert faults._moments("kill", 4, 50.0, 5.0, seed) == kills != faults._moments("kill", 4, 50.0, 5.0, seed + 1)
-
-
-CHECKED: tuple[Any, ...] = (UNITS, faults.FAULTS, 3, 60.0, 15.0, 5.0, 10.0)
-
-
-@pytest.mark.parametrize(
-    ("place", "bad", "good"),
-    [
-        (2, 0, 1),
-        (2, 1001, 1000),
-        (3, 0.99, 8.0),
-        (3, 3600.1, 3600.0),
-        (4, 0.99, 1.0),
-        (4, 1000.1, 1000.0),
-        (5, 0.0, 0.01),
-        (5, 42.0, 41.9),
-        (6, 0.09, 0.1),
-        (6, 600.1, 600.0),
-    ],
-)
-def test_the_ends_of_what_faults_can_be(place: int, bad: float, good: float) -> None:
-    faults._check(*CHECKED[:place], good, *CHECKED[place + 1 :])
-    with pytest.raises(BadInputError):
-        faults._check(*CHECKED[:place], bad, *CHECKED[place + 1 :])
 
 
 def corners() -> Iterator[np.ndarray]:
@@ -384,12 +305,3 @@ def test_what_a_unit_takes_is_without_the_time_in_which_it_had_no_core() -> None
         jobs = tuple(JobRecord("pose", "cpu", n, 0, 0, 0, 9, preempted_ns=n * 2_000_000) for n in range(2))
 
     assert pipeline_bench._units_ms(Result) == {"cpu": 4.0, "gpu": 5.0}  # type: ignore[arg-type]
-
-
-def test_the_pace_is_back_with_five_frames_within_a_fifth_more() -> None:
-    """Of a period of 10: five frames in 48 are in pace, in 49 they are not."""
-    ms = 1_000_000
-    in_pace = [100 * ms + n * 12 * ms for n in range(5)]
-    late = [*in_pace[:4], in_pace[4] + 1]
-    assert faults.back_to_pace_ms([50 * ms], in_pace, 10 * ms) == [50.0]
-    assert faults.back_to_pace_ms([50 * ms], late, 10 * ms) == []

@@ -15,6 +15,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper
 
+from support.trace_reading import read_trace
 from trilane.apps import beside as sources
 from trilane.errors import BadInputError
 from trilane.hw_profiles import beside_answer
@@ -26,7 +27,6 @@ from trilane.hw_profiles.measured_host import UNMEASURED, with_network
 from trilane.hw_profiles.network_work import Network, count_work
 from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
-from trilane.testing.trace_reading import read_trace
 from trilane.units import SUSTAINED
 
 CHIP = load_profile("snapdragon-888")

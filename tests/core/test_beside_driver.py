@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from support.plain_scheduler import drawn, service_of, skips_of, with_bypass
 from trilane.scheduler import accounts
 from trilane.scheduler.beside import ONE, BesideDriver, Member, Runs, simulate_beside
 from trilane.scheduler.events import NEVER, SetDuty, Settings, Stop, chain
@@ -15,7 +16,6 @@ from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.recording import replay
 from trilane.scheduler.turns import TURNS, Waiting
 from trilane.scheduler.virtual import simulate
-from trilane.testing.drawn_pipelines import drawn, service_of, skips_of, with_bypass
 from trilane.unexpected_value import UnexpectedValue
 
 MS = 1_000_000

@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from trilane.testing import checks
-from trilane.testing.checks import Outcome, check_tests, main, said
+from support import checks
+from support.checks import Outcome, check_tests, main, said
 
 COUNTED = "tests passed, 1 skipped, in"
 TESTS = {
@@ -64,7 +64,7 @@ def test_the_rest_is_what_was_skipped_and_what_is_slow(folder: Path) -> None:
     (folder / "test_damaged.py").unlink()
     (folder / "skipped.txt").write_text("test_whole.py\ntest_well.py::test_wants_a_part\n")
     (folder / "antigravity_none.py").touch()  # the part is there now
-    words = ["-p", "trilane.testing.checks", "--only-rest=skipped.txt", "--tell=told.json", "-q", "-rA"]
+    words = ["-p", "support.checks", "--only-rest=skipped.txt", "--tell=told.json", "-q", "-rA"]
     done = subprocess.run([sys.executable, "-m", "pytest", *words], capture_output=True, text=True, check=True)
     assert json.loads((folder / "told.json").read_text()) == {
         "failed": [],
@@ -105,7 +105,7 @@ def test_2(): pass
 RUNNER = """
 import sys
 from pathlib import Path
-from trilane.testing import checks
+from support import checks
 checks.STYLE, checks.SKIPPED = (), Path({skipped!r})
 checks.GROUPS = ({words!r}, ["--no-such-option"])
 sys.exit(checks.main([]))

@@ -19,13 +19,13 @@ import pytest
 from PIL import Image
 
 import trilane.training
+from support.small_inputs import validated
 from trilane.apps import made
 from trilane.apps.cli import avatar_quantise, avatar_validate
 from trilane.apps.experiments import calibrated_network
 from trilane.avatars.bundle import load_bundle, write_manifest
 from trilane.avatars.manifest import Validation, sha256_of
 from trilane.stages.dsp import runtime
-from trilane.testing.validated import validated
 from trilane.training.quantising import calibration_table, noise_model, quantise
 
 Command = Callable[..., tuple[str, str]]

@@ -33,21 +33,21 @@ def test_the_options_of_every_bench(check_printed: Callable[..., None]) -> None:
 
 
 def test_a_bench_is_asked_by_its_options(monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
-    """Of the bench `crop`, with another measure: options as values of their types, results beside the machine."""
-    from trilane.bench import crop
+    """Of the bench `several`, with another measure: options as values of their types, results beside the machine."""
+    from trilane.bench import several
 
     asked: list[dict[str, Any]] = []
 
-    def measure(views: int = 3, seconds: float = 1.5, size: str = "256", spin: bool = False, runs: tuple = (1, 2)):  # type: ignore[no-untyped-def, type-arg]
+    def measure(views: int = 3, seconds: float = 1.5, size: str = "256", spin: bool = False, rounds: tuple = (1, 2)):  # type: ignore[no-untyped-def, type-arg]
         """Rows."""
-        asked.append({"views": views, "seconds": seconds, "size": size, "spin": spin, "runs": runs})
+        asked.append({"views": views, "seconds": seconds, "size": size, "spin": spin, "rounds": rounds})
         return {"rows": [], "driver": {"renderer": "r"}, "share": 1 / 3, "inner": {"a": 1}, "tag": "[x]"}
 
-    monkeypatch.setattr(crop, "measure", measure)
+    monkeypatch.setattr(several, "measure", measure)
     monkeypatch.setattr(machine_facts, "machine_facts", lambda gl: {"cpu": {"model": "a cpu", "cores": 2}, "gl": gl})
-    out, _ = command("bench", "crop", "--json")
+    out, _ = command("bench", "several", "--json")
     assert json.loads(out) == {
-        "bench": "crop",
+        "bench": "several",
         "rows": [],
         "driver": {"renderer": "r"},
         "share": 1 / 3,
@@ -55,11 +55,11 @@ def test_a_bench_is_asked_by_its_options(monkeypatch: pytest.MonkeyPatch, comman
         "tag": "[x]",
         "machine": {"cpu": {"model": "a cpu", "cores": 2}, "gl": {"renderer": "r"}},
     }
-    words = ("--views", 7, "--seconds", 0.25, "--size", "64", "--spin", "--runs", 5, "--runs", 6)
-    out, _ = command("bench", "crop", *words)
-    assert [dict(row, runs=list(row["runs"])) for row in asked] == [
-        {"views": 3, "seconds": 1.5, "size": "256", "spin": False, "runs": [1, 2]},
-        {"views": 7, "seconds": 0.25, "size": "64", "spin": True, "runs": [5, 6]},
+    words = ("--views", 7, "--seconds", 0.25, "--size", "64", "--spin", "--rounds", 5, "--rounds", 6)
+    out, _ = command("bench", "several", *words)
+    assert [dict(row, rounds=list(row["rounds"])) for row in asked] == [
+        {"views": 3, "seconds": 1.5, "size": "256", "spin": False, "rounds": [1, 2]},
+        {"views": 7, "seconds": 0.25, "size": "64", "spin": True, "rounds": [5, 6]},
     ]
     lines = ["driver.renderer: r", "share: 0.3333", "inner.a: 1", "tag: [x]", "cpu: a cpu, 2 cores"]
     assert out.splitlines() == lines
@@ -74,7 +74,7 @@ def test_the_group_knows_its_benches_and_nothing_else(command: Command) -> None:
     context = typer.Context(group)
     assert group.list_commands(context) == list(BENCHES)
     assert group.get_command(context, "nothing") is None
-    assert group.get_command(context, "crop").help == BENCHES["crop"][1]
+    assert group.get_command(context, "several").help == BENCHES["several"][1]
 
 
 def test_a_table_of_many_columns_is_turned_and_has_no_header() -> None:

@@ -74,7 +74,7 @@ def test_help_without_words_and_with_either_spelling(command: Command) -> None:
     out, err = command(code=2)
     assert (out + err).strip() == long.strip()
     assert "\n    0 done, 1 the run failed, 2 wrong usage or bad input,\n" in long
-    for name, group in (("body", "vertices"), ("avatar", "inspect"), ("profiles", "check"), ("bench", "crop")):
+    for name, group in (("body", "vertices"), ("avatar", "inspect"), ("profiles", "check"), ("bench", "scheduler")):
         out, err = command(name, code=2)
         assert f"Usage: trilane {name} [OPTIONS] COMMAND" in out + err and f"  {group}" in out + err
 

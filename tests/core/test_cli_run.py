@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from support.run_report import make_report
 from trilane.apps import asked_run, made, pace, run_check, run_job
 from trilane.apps.cli import run as cli_run
 from trilane.apps.report import Report
@@ -21,7 +22,6 @@ from trilane.errors import BadInputError
 from trilane.pipeline import unit_starter
 from trilane.stages import PRELOAD, configure
 from trilane.stages.configure import Request
-from trilane.testing.run_report import make_report
 from trilane.units import PerformanceProfile
 
 Command = Callable[..., tuple[str, str]]

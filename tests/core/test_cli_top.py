@@ -15,6 +15,8 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from support.run_report import make_report
+from support.told_journal import told_journal
 from trilane.apps.cli import top as cli_top
 from trilane.apps.cli.top_view import line, screen
 from trilane.apps.live.followed_run import RunState
@@ -22,8 +24,6 @@ from trilane.apps.live.live_figures import LiveFigures
 from trilane.apps.live.run_looks import Look
 from trilane.pipeline.journal import NAME, Counted, Ended, JournalWriter, Record, Stepped
 from trilane.scheduler.events import JobDone, Start, UnitDied
-from trilane.testing.run_report import make_report
-from trilane.testing.told_journal import told_journal
 
 Command = Callable[..., tuple[str, str]]
 Check = Callable[[str, str], None]

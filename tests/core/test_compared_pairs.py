@@ -1,6 +1,6 @@
 """How often `trilane compare` is right: of pairs of one kind, and of pairs of which one stage's program was changed.
 
-The runs are simulated, and scatter from run to run and within a run as real runs did (`trilane.testing.compared_runs`).
+The runs are simulated, and scatter from run to run and within a run as real runs did (`support.compared_runs`).
 The slow test counts as many pairs as its docstring says; the others are its core.
 """
 
@@ -13,6 +13,8 @@ from typing import Any
 
 import pytest
 
+from support.compared_runs import STAGES, on_a_machine, simulated
+from support.run_report import make_report
 from trilane.apps.cli.compare_table import comparison_lines
 from trilane.apps.comparison.compared import Bounds, Comparison, compare
 from trilane.apps.comparison.difference import Outcome
@@ -24,8 +26,6 @@ from trilane.apps.comparison.verdict import NO_DIFFERENCE
 from trilane.apps.comparison.words import bounds_text
 from trilane.pipeline.journal import Worked, journal_of
 from trilane.pipeline.reckoning import reckoned
-from trilane.testing.compared_runs import STAGES, on_a_machine, simulated
-from trilane.testing.run_report import make_report
 
 
 def side(*seeds: int, factors: Mapping[str, float] | None = None, counted: bool = True) -> Side:

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
+from support.compared_runs import simulated, write_run
 from trilane.apps.comparison.difference import Outcome
 from trilane.apps.comparison.sweeps import SweepComparison, compare_sweeps
 from trilane.errors import BadInputError
-from trilane.testing.compared_runs import simulated, write_run
 
 SweepOf = Callable[..., Path]
 #: Of a trial: how much longer its network takes.

@@ -13,6 +13,8 @@ from typing import Any
 
 import pytest
 
+from support.compared_runs import STAGES, simulated, write_run
+from support.run_report import make_report
 from trilane.apps.cli import main as cli
 from trilane.apps.cli.compare_table import comparison_lines
 from trilane.apps.comparison import run_frames
@@ -28,8 +30,6 @@ from trilane.apps.comparison.verdict import NO_DIFFERENCE, TOO_FEW
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import NAME, JournalWriter, Worked, journal_of
 from trilane.scheduler.virtual import Simulation
-from trilane.testing.compared_runs import STAGES, simulated, write_run
-from trilane.testing.run_report import make_report
 
 Make = Callable[..., Path]
 

@@ -25,11 +25,11 @@ from trilane.stages.cpu.present import Segment
 
 pytest.importorskip("prometheus_client", reason="the extra dashboard is not installed")
 
+from support.run_report import make_report
 from trilane.apps.dashboard.clients import Client
 from trilane.apps.dashboard.finished_view import CUT_OFF, MOST_JOBS, NO_VIDEO, FinishedView
 from trilane.apps.dashboard.known_runs import facts_of_report
 from trilane.apps.dashboard.wire import ControlSaid, Seek
-from trilane.testing.run_report import make_report
 
 MS = 1_000_000
 FRAMES, FPS = 40, 30.0

@@ -12,12 +12,23 @@ import onnxruntime
 import pytest
 from PIL import Image
 
-from trilane.apps.experiments import error_by_cause, heat_maps
-from trilane.apps.experiments.causes import BODY, NEEDS, NOTHING, WHAT, Cause, Causes, needs, require_complete, up_to
+from support.small_inputs import net
+from trilane.apps.experiments import error_by_cause
 from trilane.apps.experiments.error_by_cause import region
 from trilane.apps.experiments.picture_errors import ErrorFigures
-from trilane.apps.experiments.reference_path import ReferenceFrame
-from trilane.apps.experiments.run_body import RunBody
+from trilane.apps.experiments.reference_path import (
+    BODY,
+    NEEDS,
+    NOTHING,
+    WHAT,
+    Cause,
+    Causes,
+    ReferenceFrame,
+    RunBody,
+    needs,
+    require_complete,
+    up_to,
+)
 from trilane.arrays import F64
 from trilane.avatars.bundle import bundle_folder, load_bundle
 from trilane.avatars.network_file import check_network, reshaped
@@ -28,7 +39,6 @@ from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import DETAILS
 from trilane.errors import BadInputError
 from trilane.stages.avatar_assets import AvatarData
-from trilane.testing.byte_network import net
 
 OUTPUT = (12, 16)
 EYE = np.eye(4)
@@ -230,28 +240,28 @@ def test_the_network_as_written_is_the_runtime_s_but_for_ties() -> None:
 
 def test_a_difference_is_shown_as_large_as_the_bar_allows() -> None:
     picture, reference = np.full((40, 60, 3), 0.5), np.full((40, 60, 3), 0.5)
-    assert heat_maps.shown_factor(np.zeros((4, 4))) == 1
+    assert error_by_cause.shown_factor(np.zeros((4, 4))) == 1
     picture[10:20, 20:40] += 0.03
-    assert heat_maps.shown_factor(np.abs(picture - reference).mean(axis=2)) == 32
-    assert heat_maps.shown_factor(np.full((4, 4), 1e-9)) == heat_maps.LARGEST_FACTOR
-    assert heat_maps.shown_factor(np.ones((4, 4))) == 1
-    sheet = heat_maps.heat_map("title", picture, reference)
-    times = -(-heat_maps.LEAST_SIDE_PX // 60)
-    top, left = 2 * heat_maps.LINE_PX, heat_maps.BORDER_PX
+    assert error_by_cause.shown_factor(np.abs(picture - reference).mean(axis=2)) == 32
+    assert error_by_cause.shown_factor(np.full((4, 4), 1e-9)) == error_by_cause.LARGEST_FACTOR
+    assert error_by_cause.shown_factor(np.ones((4, 4))) == 1
+    sheet = error_by_cause.heat_map("title", picture, reference)
+    times = -(-error_by_cause.LEAST_SIDE_PX // 60)
+    top, left = 2 * error_by_cause.LINE_PX, error_by_cause.BORDER_PX
     assert sheet[top + 15 * times, left + 30 * times].tolist() == [135] * 3  # 0.53
-    across = 60 * times + heat_maps.BORDER_PX
+    across = 60 * times + error_by_cause.BORDER_PX
     assert sheet[top + 15 * times, left + across + 30 * times].tolist() == [128] * 3
     shown, nothing = (sheet[top + row * times, left + 2 * across + 30 * times] for row in (15, 5))
-    assert shown.tolist() == heat_maps.coloured(np.array(0.96)).tolist()
-    assert nothing.tolist() == heat_maps.COLOURS[0].tolist()
+    assert shown.tolist() == error_by_cause.coloured(np.array(0.96)).tolist()
+    assert nothing.tolist() == error_by_cause.COLOURS[0].tolist()
 
 
 def test_the_bar_runs_from_its_first_to_its_last_colour(tmp_path: Path) -> None:
-    found = heat_maps.coloured(np.array([0, 0.25, 0.5, 0.125, 1, 7]))
-    assert found[[0, 1, 2, 4]].tolist() == heat_maps.COLOURS[[0, 1, 2, 4]].tolist()
+    found = error_by_cause.coloured(np.array([0, 0.25, 0.5, 0.125, 1, 7]))
+    assert found[[0, 1, 2, 4]].tolist() == error_by_cause.COLOURS[[0, 1, 2, 4]].tolist()
     assert found[3].tolist() == [44, 8, 57] and found[5].tolist() == found[4].tolist()
     file = tmp_path / "map.png"
-    heat_maps.write_heat_map(file, "t", np.zeros((8, 8, 3)), np.ones((8, 8, 3)))
+    error_by_cause.write_heat_map(file, "t", np.zeros((8, 8, 3)), np.ones((8, 8, 3)))
     with Image.open(file) as image:
         assert image.size[0] > 3 * 320
 

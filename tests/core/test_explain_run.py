@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from support.run_folders import write_run
 from trilane.apps.cli import explain_run as explain_command
 from trilane.apps.explained.advice import advice
 from trilane.apps.explained.job_table import COLUMNS, write_jobs
@@ -25,7 +26,6 @@ from trilane.pipeline.journal import NAME, Accounted, Begun, JournalWriter, Reco
 from trilane.scheduler.events import Settings, UnitDied
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.virtual import Simulation, simulate
-from trilane.testing.run_folders import write_run
 
 MS = 1_000_000
 STAGE_MS = {"pose": 1, "raster": 2, "infer": 4, "composite": 2, "present": 1}

@@ -11,17 +11,16 @@ import onnxruntime
 import pytest
 from onnx import numpy_helper
 
+from support.small_inputs import net
 from trilane.arrays import F64
 from trilane.avatars.bundle import bundle_folder, load_bundle
 from trilane.avatars.network_file import check_network, reshaped
 from trilane.bench.lib import full_network
-from trilane.bench.lib.full_body import FullBody
-from trilane.bench.lib.full_picture import SAMPLES, supersampled
+from trilane.bench.lib.full_picture import SAMPLES, FullBody, supersampled
 from trilane.body.body import load_body
 from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import CpuSkinner
 from trilane.stages.gpu.skinned_mesh import MeshArrays, avatar_mesh
-from trilane.testing.byte_network import net
 
 EYE = np.eye(4)
 

@@ -7,11 +7,11 @@ from random import Random
 
 import pytest
 
+from support import fuzz_readers
+from support.fuzz_readers import Fuzzer, findings
+from support.mutations import CHANGES, mutated
+from support.small_inputs import write_small_inputs
 from trilane.errors import BadInputError
-from trilane.testing import fuzz_readers
-from trilane.testing.fuzz_readers import Fuzzer, findings
-from trilane.testing.mutations import CHANGES, mutated
-from trilane.testing.small_inputs import write_small_inputs
 
 CASES = 60
 

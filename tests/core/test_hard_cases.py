@@ -12,8 +12,18 @@ from typer.testing import CliRunner
 
 from trilane.apps.cli.accuracy import app
 from trilane.apps.experiments import hard_cases
-from trilane.apps.experiments.hard_cases import EXCEEDED, HOLDS, IDEAL_STEPS, UNTOLD, Case, wrong_answers
-from trilane.apps.experiments.hard_networks import INPUTS, SIDE, calibration_frames, case_input
+from trilane.apps.experiments.hard_cases import (
+    EXCEEDED,
+    HOLDS,
+    IDEAL_STEPS,
+    INPUTS,
+    SIDE,
+    UNTOLD,
+    Case,
+    calibration_frames,
+    case_input,
+    wrong_answers,
+)
 from trilane.stages.dsp.runtime import RuntimeOptions
 
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.apps.experiments import hard_networks
-from trilane.apps.experiments.hard_networks import INPUTS, NETWORKS, calibration_frames, case_input, float_network
+from trilane.apps.experiments import hard_cases
+from trilane.apps.experiments.hard_cases import INPUTS, NETWORKS, calibration_frames, case_input, float_network
 from trilane.errors import MissingPartError
 
 
@@ -33,7 +33,7 @@ class Told:
 def test_a_smooth_texture_is_linear_between_its_corners() -> None:
     """9 x 9 corners of 4 values; those of `Told` grow by 36 a row and 4 a column, so the whole texture is a plane."""
     rng: Any = Told()
-    texture = hard_networks._smooth(rng)
+    texture = hard_cases._smooth(rng)
     assert rng.asked == [(9, 9, 4)]
     row, column, channel = np.mgrid[:64, :64, :4]
     np.testing.assert_allclose(texture, (36 * row + 4 * column) * 8 / 63 + channel, rtol=1e-5)
@@ -42,7 +42,7 @@ def test_a_smooth_texture_is_linear_between_its_corners() -> None:
 
 def test_a_flat_texture_has_one_value_in_each_cell() -> None:
     rng: Any = Told()
-    texture = hard_networks._flat(rng)
+    texture = hard_cases._flat(rng)
     assert rng.asked == [(4, 4, 4)]
     row, column, channel = np.mgrid[:64, :64, :4]
     assert (texture == 16 * (row // 16) + 4 * (column // 16) + channel).all()
@@ -53,9 +53,7 @@ def test_a_flat_texture_has_one_value_in_each_cell() -> None:
 def test_a_figure_is_an_ellipse(down: float, right: float, size: float) -> None:
     """Semi-axes of 0.42 and 0.25 of the side, its centre moved down and right; 0 outside."""
     rng: Any = Told(down, right)
-    frame = hard_networks._in_figure(
-        rng, lambda given: np.full((64, 64, 4), 3.0 if given is rng else 0, np.float32), size
-    )
+    frame = hard_cases._in_figure(rng, lambda given: np.full((64, 64, 4), 3.0 if given is rng else 0, np.float32), size)
     assert rng.asked == [(-0.1, 0.1, 2)]
     for row in range(64):
         for column in range(0, 64, 3):
@@ -73,7 +71,7 @@ def test_inputs_are_the_textures_in_their_figures(monkeypatch: pytest.MonkeyPatc
         calls.append((texture.__name__, size, float(rng.uniform())))
         return np.ones(1, np.float32)
 
-    monkeypatch.setattr(hard_networks, "_in_figure", in_figure)
+    monkeypatch.setattr(hard_cases, "_in_figure", in_figure)
     first = float(np.random.default_rng(7).uniform())
     values = {name: float(case_input(name)[0]) for name in INPUTS}
     assert values == {"constant patches": 1, "little but background": 1, "saturating": 10, "usual": 1}
@@ -114,10 +112,10 @@ def weights_of(name: str) -> dict[str, Any]:
 
 def test_convolutions_are_smooth_and_their_weights_add_up_to_0(torch: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without its random part, a kernel is a weight for each input times 1 2 1 / 4 along both sides."""
-    monkeypatch.setattr(hard_networks, "RANDOM_PART", 0.0)
+    monkeypatch.setattr(hard_cases, "RANDOM_PART", 0.0)
     layer = torch.nn.Conv2d(6, 5, 3)
     with torch.no_grad():
-        hard_networks._draw(layer, torch.Generator().manual_seed(3))
+        hard_cases._draw(layer, torch.Generator().manual_seed(3))
     weight = layer.weight.detach().numpy()
     across = weight.sum((2, 3))
     np.testing.assert_allclose(across.sum(1), np.zeros(5), atol=1e-6)
@@ -130,10 +128,10 @@ def test_the_random_part_of_a_kernel_is_a_half_of_the_smooth_one(torch: Any, mon
     """Its deviation is 0.5 / (3 sqrt(400)), so that 400 inputs of 9 weights add up to a norm of 0.5."""
     layer = torch.nn.Conv2d(400, 30, 3, bias=False)
     with torch.no_grad():
-        hard_networks._draw(layer, torch.Generator().manual_seed(3))
+        hard_cases._draw(layer, torch.Generator().manual_seed(3))
         drawn = layer.weight.detach().clone()
-        monkeypatch.setattr(hard_networks, "RANDOM_PART", 0.0)
-        hard_networks._draw(layer, torch.Generator().manual_seed(3))
+        monkeypatch.setattr(hard_cases, "RANDOM_PART", 0.0)
+        hard_cases._draw(layer, torch.Generator().manual_seed(3))
     random = drawn - layer.weight.detach()
     assert float(random.std()) == pytest.approx(0.5 / 60, rel=0.02)  # 108,000 of them: within 0.2 %
     assert float(random.mean()) == pytest.approx(0.0, abs=0.0005)
@@ -142,9 +140,9 @@ def test_the_random_part_of_a_kernel_is_a_half_of_the_smooth_one(torch: Any, mon
 def test_norms_get_small_biases_and_other_modules_none(torch: Any) -> None:
     norm, generator = torch.nn.BatchNorm2d(4000), torch.Generator().manual_seed(5)
     with torch.no_grad():
-        hard_networks._draw(norm, generator)
-        hard_networks._draw(torch.nn.ReLU(), generator)
-        hard_networks._draw(torch.nn.InstanceNorm2d(4), generator)  # without parameters
+        hard_cases._draw(norm, generator)
+        hard_cases._draw(torch.nn.ReLU(), generator)
+        hard_cases._draw(torch.nn.InstanceNorm2d(4), generator)  # without parameters
     low, high = norm.bias.detach().aminmax()
     assert -0.05 <= float(low) < -0.049 and 0.049 < float(high) <= 0.05
     assert (norm.weight == 1).all()
@@ -157,7 +155,7 @@ def test_a_head_gets_contrast_and_means(torch: Any) -> None:
     features = torch.randn(5, 4, 8, 8) * 7 + 2
     with torch.no_grad():
         head[3].bias.zero_()  # as `_draw` leaves it
-        hard_networks._give_contrast(head, features)
+        hard_cases._give_contrast(head, features)
         logits = head(features)
     np.testing.assert_allclose(logits.std(dim=(0, 2, 3)), [1.5] * 3, rtol=1e-4)
     np.testing.assert_allclose(logits.mean(dim=(0, 2, 3)), [-1, 0, 1], atol=1e-4)
@@ -166,9 +164,9 @@ def test_a_head_gets_contrast_and_means(torch: Any) -> None:
 def test_what_a_network_of_hard_cases_is(torch: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Deep features weakened to a quarter, skips not; one channel a hundredfold; heads fitted to the calibration."""
     contrasts: list[Any] = []
-    monkeypatch.setattr(hard_networks, "_give_contrast", lambda head, features: contrasts.append((head, features)))
+    monkeypatch.setattr(hard_cases, "_give_contrast", lambda head, features: contrasts.append((head, features)))
     plain, outlier = weights_of("batch"), weights_of("outlier channel")
-    monkeypatch.setattr(hard_networks, "DEEP", 1.0)
+    monkeypatch.setattr(hard_cases, "DEEP", 1.0)
     network, _ = float_network("batch")  # type: ignore[misc]
     even = network.state_dict()
     assert plain.keys() == outlier.keys() == even.keys()
@@ -196,8 +194,8 @@ def test_what_a_network_of_hard_cases_is(torch: Any, monkeypatch: pytest.MonkeyP
 
 
 def test_networks_have_the_norms_of_their_names(torch: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hard_networks, "_draw", lambda *_: None)
-    monkeypatch.setattr(hard_networks, "_give_contrast", lambda *_: None)
+    monkeypatch.setattr(hard_cases, "_draw", lambda *_: None)
+    monkeypatch.setattr(hard_cases, "_give_contrast", lambda *_: None)
     assert NETWORKS == {
         "batch": ("batch", False),
         "instance": ("instance", False),

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.apps.experiments.hard_numbers import all_rows, bodies, chains, rotations
+from trilane.apps.experiments.hard_numbers import all_rows, bodies, rotations
 from trilane.apps.experiments.hard_numbers.all_rows import COUNT
-from trilane.apps.experiments.hard_numbers.exact_turn import PI, exact_turn, turn_error
+from trilane.apps.experiments.hard_numbers.cameras import time_cases
 from trilane.apps.experiments.hard_numbers.hard_number import U32, HardNumber, U, gamma, worst
-from trilane.apps.experiments.hard_numbers.times import time_cases
+from trilane.apps.experiments.hard_numbers.rotations import PI, exact_turn, turn_error
 from trilane.avatars.bundle import bundle_folder
 from trilane.body import kinematics, skinning
 from trilane.body.body import ShapedBody, load_body, weights_of_one
@@ -123,9 +123,9 @@ def test_a_formula_without_care_at_zero_fails(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_chains_keep_their_bounds(shaped: ShapedBody) -> None:
-    cases = list(chains.chain_cases(shaped))
+    cases = list(rotations.chain_cases(shaped))
     assert failing(cases) == []
-    assert len(cases) == len(chains.TURNS) + 1 + len(chains.PLACES)
+    assert len(cases) == len(rotations.TURNS) + 1 + len(rotations.PLACES)
 
 
 def test_places_in_half_precision_fail(shaped: ShapedBody, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -137,8 +137,8 @@ def test_places_in_half_precision_fail(shaped: ShapedBody, monkeypatch: pytest.M
         return posed
 
     monkeypatch.setattr(Skeleton, "pose", rounded)
-    failed = failing(chains.chain_cases(shaped))
-    assert failed == [f"places of the skinning matrices, {place}" for place in chains.PLACES]
+    failed = failing(rotations.chain_cases(shaped))
+    assert failed == [f"places of the skinning matrices, {place}" for place in rotations.PLACES]
 
 
 def test_a_day_of_media_time_keeps_its_bounds() -> None:

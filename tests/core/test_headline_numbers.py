@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from support.run_folders import write_run
 from trilane.apps.explained.run import explain_run
 from trilane.apps.scene_plan import ScenePlan
 from trilane.hw_profiles.application import Plan
@@ -35,7 +36,6 @@ from trilane.scheduler.places import Place
 from trilane.scheduler.virtual import Simulation, simulate
 from trilane.stages.configure import Request, configure
 from trilane.stages.cpu.pose import FramePlan
-from trilane.testing.run_folders import write_run
 from trilane.units import UNITS
 
 FRAMES = 200

@@ -7,6 +7,8 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,11 +23,47 @@ from trilane import machine
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import read_network
 from trilane.bench import infer, peers, roofline
-from trilane.bench.lib.instruction_kernels import Issued
+from trilane.bench.lib.instruction_sets import Issued
 from trilane.bench.lib.interleaved_processes import Variant
 from trilane.bench.lib.networks import NetworkFixture, fixture_of_file
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
-from trilane.testing.told_runners import ToldRunners
+
+
+class ToldRunners:
+    """A double of `interleaved_processes.runners`: times are those that were told, and asks are kept.
+
+    `ms(name, turn)`: what the runs of a turn take, turns from 0.
+    `variants`: of each call.
+    `asked`: (name, what).
+    """
+
+    def __init__(self, ms: Callable[[str, int], list[float]]) -> None:
+        self._ms = ms
+        self.variants: list[dict[str, Any]] = []
+        self.asked: list[tuple[str, float]] = []
+
+    @contextmanager
+    def __call__(self, variants: Mapping[str, Any]) -> Iterator[dict[str, ToldRunner]]:
+        self.variants.append(dict(variants))
+        yield {name: ToldRunner(self, name, 100.0 * len(self.variants) + place) for place, name in enumerate(variants)}
+
+    def answer(self, name: str, what: float) -> list[float]:
+        self.asked.append((name, what))
+        return self._ms(name, sum(one == name for one, _ in self.asked) - 1)
+
+
+class ToldRunner:
+    """`startup_ms`: 100 for each call of `runners` so far, and the place in it."""
+
+    def __init__(self, told: ToldRunners, name: str, startup_ms: float) -> None:
+        self._told, self._name, self.startup_ms = told, name, startup_ms
+
+    def run(self, count: int) -> list[float]:
+        return self._told.answer(self._name, count)
+
+    def run_for(self, seconds: float) -> list[float]:
+        return self._told.answer(self._name, seconds)
+
 
 PEAK = {"int8_gmac_s": 1000.0, "int8_instruction_gmac_s": 4000.0}
 

@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from support.run_report import make_report
+from support.small_inputs import WRITERS, bvh_text, nerf_text, picture, write_small_inputs
 from trilane.apps.cli.inspect import lines
 from trilane.apps.inspection import drawn_paths
 from trilane.apps.inspection.inspect_file import READERS, inspect_file
@@ -21,8 +23,6 @@ from trilane.apps.inspection.inspection import Inspection, Length
 from trilane.apps.inspection.recognise import kind_of
 from trilane.body.joints import JOINT_NAMES
 from trilane.errors import BadInputError
-from trilane.testing.run_report import make_report
-from trilane.testing.small_inputs import WRITERS, bvh_text, nerf_text, picture, write_small_inputs
 
 Command = Callable[..., tuple[str, str]]
 KINDS = {

@@ -6,8 +6,16 @@ import pytest
 
 from trilane import machine
 from trilane.bench import peers, roofline
-from trilane.bench.lib.instruction_kernels import KERNELS, Issued, Kernel, clock_loop, rate_loop
-from trilane.bench.lib.instruction_sets import INSTRUCTION_SETS, instruction_set_of, peak_gmac_s
+from trilane.bench.lib.instruction_sets import (
+    INSTRUCTION_SETS,
+    KERNELS,
+    Issued,
+    Kernel,
+    clock_loop,
+    instruction_set_of,
+    peak_gmac_s,
+    rate_loop,
+)
 
 #: Multiply-accumulates a cycle of one core: bytes of a register, by registers a cycle (a third of the instructions of
 #: three do the products; where AVX512-BW has one multiplier, two cycles for the two multiplications). AMX: Intel's 2048

@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 
 import trilane
+from support.run_folders import write_run
+from support.run_report import make_report
 from trilane.apps import interface
 from trilane.apps.asked_run import AskedRun, check_numbers, prepare
 from trilane.apps.explained.job_table import COLUMNS
@@ -28,8 +30,6 @@ from trilane.scheduler.accounts import idle_slices
 from trilane.scheduler.events import Settings
 from trilane.scheduler.virtual import Simulation, simulate
 from trilane.stages.configure import Request
-from trilane.testing.run_folders import write_run
-from trilane.testing.run_report import make_report
 
 MS = 1_000_000
 STAGE_MS = {"pose": 1, "raster": 2, "infer": 4, "composite": 2, "present": 1}

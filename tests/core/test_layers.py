@@ -38,7 +38,6 @@ ROWS = (
 )
 ROW_OF = {name: row for row, names in enumerate(ROWS, start=1) for name in names}
 SHADERS = "shaders"  # no Python but its empty __init__
-TESTING = "testing"  # above all rows: only tests import it
 
 Imports = Mapping[str, set[str]]
 
@@ -88,7 +87,7 @@ def upward(graph: Imports) -> list[str]:
         top = module.split(".")[0]
         for target in targets:
             other = target.split(".")[0]
-            if top in (other, TESTING, SHADERS) or (ROW_OF[top] == ROW_OF.get(other) == 1):
+            if top in (other, SHADERS) or (ROW_OF[top] == ROW_OF.get(other) == 1):
                 continue
             if ROW_OF.get(other, len(ROWS) + 1) >= ROW_OF[top]:
                 sentences.append(f"{module} (row {ROW_OF[top]}) imports {target}")
@@ -110,7 +109,7 @@ def graph() -> dict[str, set[str]]:
 
 
 def test_every_folder_has_a_row(graph: Imports) -> None:
-    assert {module.split(".")[0] for module in graph} == {*ROW_OF, SHADERS, TESTING}
+    assert {module.split(".")[0] for module in graph} == {*ROW_OF, SHADERS}
     assert len(graph) > 200
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from support.told_journal import told_journal
 from trilane.apps.live.figures import DropCount, Figures, Moved, Shares
 from trilane.apps.live.live_figures import LiveFigures
 from trilane.pipeline.journal import SCHEMA, Accounted, Begun, Counted, Ended, Record, Stepped, Worked, journal_of
@@ -30,7 +31,6 @@ from trilane.scheduler.events import (
     chain,
 )
 from trilane.scheduler.virtual import VirtualDriver, simulate
-from trilane.testing.told_journal import told_journal
 
 MS = 1_000_000
 S = 1_000_000_000

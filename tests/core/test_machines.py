@@ -12,9 +12,8 @@ from typing import Any
 
 import pytest
 
-from trilane import machine
-from trilane.testing import machines
-from trilane.testing.machines import (
+from support import machines
+from support.machines import (
     TABLE,
     CannotRunError,
     Outcome,
@@ -28,6 +27,7 @@ from trilane.testing.machines import (
     path_without,
     run_row,
 )
+from trilane import machine
 
 ROOT = Path(__file__).resolve().parents[2]
 ROW = Row("some", "a machine")

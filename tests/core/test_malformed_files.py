@@ -23,10 +23,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.apps.inspection.inspect_file import inspect_file
-from trilane.errors import BadInputError
-from trilane.testing.fuzz_readers import READERS, open_files
-from trilane.testing.small_inputs import (
+from support.fuzz_readers import READERS, open_files
+from support.small_inputs import (
     arkit_text,
     body_arrays,
     bvh_text,
@@ -35,6 +33,8 @@ from trilane.testing.small_inputs import (
     tum_text,
     write_small_inputs,
 )
+from trilane.apps.inspection.inspect_file import inspect_file
+from trilane.errors import BadInputError
 
 Content = bytes | str | Callable[[Path], Any]
 MOTION, CAMERA, BACKGROUND, BODY, SCENE, NETWORK, AVATAR = (

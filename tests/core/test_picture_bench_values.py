@@ -12,10 +12,10 @@ import pytest
 
 from trilane.avatars.bundle import load_bundle
 from trilane.bench import filters, several
-from trilane.bench.lib import drawable, ground_truth
-from trilane.bench.lib.ground_truth import shaped_body
+from trilane.bench.lib import fixture
 from trilane.errors import BadInputError, MissingPartError
 from trilane.scene.crop import Rect, crop_projection
+from trilane.stages.avatar_assets import shaped_body
 from trilane.stages.dsp.runtime import RuntimeOptions
 from trilane.stages.gpu.opengl import Driver
 
@@ -252,14 +252,14 @@ def test_the_moments_of_a_crowd_are_held(held: Held) -> None:
 
 
 def test_a_drawable_is_the_bundles_avatar() -> None:
-    found, bundle = drawable.load_drawable("default"), load_bundle("default")
+    found, bundle = fixture.load_drawable("default"), load_bundle("default")
     packed = bundle.manifest.network.input
     assert (found.quantisation.scale, found.quantisation.zero_point) == (packed.scale, packed.zero_point)
     assert found.texture.dtype == np.float32 and found.texture.shape == bundle.read_texture().shape
     np.testing.assert_array_equal(found.texture, bundle.read_texture().astype(np.float32))
     assert found.arrays.position.shape[1] == 3
     with pytest.raises(BadInputError):
-        drawable.load_drawable("nobody")
+        fixture.load_drawable("nobody")
 
 
 def test_ground_truth_is_drawn_as_training_draws_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -272,10 +272,10 @@ def test_ground_truth_is_drawn_as_training_draws_it(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(sample_renderer, "SampleRenderer", lambda shaped, look: ("studio", shaped, look))
     manifest = SimpleNamespace(provenance={"look": "hiker"})
     bundle: Any = SimpleNamespace(shaped_body=lambda: "shaped", manifest=manifest)
-    assert ground_truth.ground_truth(bundle) == (("studio", "shaped", LOOKS["hiker"]), image_error)
+    assert fixture.ground_truth(bundle) == (("studio", "shaped", LOOKS["hiker"]), image_error)
 
 
 def test_ground_truth_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "trilane.training.image_error", None)
     with pytest.raises(MissingPartError, match=r"ground truth needs trilane\.training\.image_error; .*train"):
-        ground_truth.ground_truth(load_bundle("default"))
+        fixture.ground_truth(load_bundle("default"))

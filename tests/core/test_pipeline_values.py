@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from support.small_pipeline import EDGES, OWN, STAGES, UNITS, ToldTime, packets, pipeline, spec_of
 from trilane import machine
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline import (
@@ -22,8 +23,6 @@ from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, 
 from trilane.pipeline.regions import edge_regions
 from trilane.pipeline.stage import UnitContext
 from trilane.pipeline.unit_spec import UnitSpec
-from trilane.testing.small_pipeline import EDGES, OWN, STAGES, UNITS, packets, pipeline, spec_of
-from trilane.testing.told_time import ToldTime
 from trilane.transport.packets import Packet, header_dtype
 
 MS = 1_000_000

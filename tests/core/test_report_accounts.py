@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
+from support.small_pipeline import pipeline
 from trilane.pipeline import accounts
 from trilane.pipeline.cpu_use import CpuTimes
 from trilane.pipeline.run_log import RunLog
-from trilane.testing.small_pipeline import pipeline
 from trilane.transport.messages import Done
 
 MS = 1_000_000

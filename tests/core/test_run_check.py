@@ -16,7 +16,8 @@ from trilane.apps.cli import main as cli
 from trilane.apps.cli import sweep as cli_sweep
 from trilane.apps.experiments.error_by_cause import region
 from trilane.apps.experiments.picture_errors import ErrorFigures
-from trilane.apps.run_check import FLOAT_PATH, TRUTH, asked_frames, check_run, differs, require_parts, summed_up
+from trilane.apps.experiments.scene_pictures import TRUTH
+from trilane.apps.run_check import FLOAT_PATH, asked_frames, check_run, differs, require_parts, summed_up
 from trilane.arrays import U8
 from trilane.bench.lib.layers import Box
 from trilane.errors import MissingPartError, TrilaneError
@@ -113,11 +114,11 @@ def test_kept_frames_are_compared_where_the_avatars_are(tmp_path: Path, monkeypa
 def black_float_path(monkeypatch: pytest.MonkeyPatch, truth: U8 | None) -> None:
     """`truth`: the true picture of every frame; None where nobody knows it."""
     from trilane.apps.experiments import reference_path
-    from trilane.bench.lib import true_picture
+    from trilane.bench.lib import full_picture
 
     true = None if truth is None else SimpleNamespace(frame=lambda _number, _background: truth)
     monkeypatch.setattr(reference_path, "ReferencePath", Black)
-    monkeypatch.setattr(true_picture, "true_pictures", lambda cast, gl: true if (cast, gl) == ("cast", "gl") else 1 / 0)
+    monkeypatch.setattr(full_picture, "true_pictures", lambda cast, gl: true if (cast, gl) == ("cast", "gl") else 1 / 0)
 
 
 BOX = np.s_[10:190, 10:190]

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from support.run_report import SHARE, SHOWN, make_report
 from trilane import machine
 from trilane.apps import report as report_module
 from trilane.apps.report import Report, read_report, write_report
@@ -21,7 +22,6 @@ from trilane.apps.report_sources import NO_FIGURES_UNDER, sources_of
 from trilane.apps.run_folder import RunFolder, default_place
 from trilane.errors import BadInputError, TrilaneError, UnwrittenError
 from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
-from trilane.testing.run_report import SHARE, SHOWN, make_report
 from trilane.writing import WRITABLE, write_atomically
 
 

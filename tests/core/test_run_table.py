@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
+from support.run_report import SHARE, SHOWN, TIMES, make_report
 from trilane.apps.cli.run_table import run_table
 from trilane.apps.report import Report
 from trilane.figure_sources import NO_FIGURES
-from trilane.testing.run_report import SHARE, SHOWN, TIMES, make_report
 
 
 def table_text(report: dict[str, Any]) -> str:

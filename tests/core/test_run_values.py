@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from support.small_pipeline import ToldTime, pipeline
 from trilane import machine
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline import (
@@ -33,8 +34,6 @@ from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.unit_processes import UnitMessage
 from trilane.scheduler import release
 from trilane.scheduler.events import FrameRequest, Settings, Stop
-from trilane.testing.small_pipeline import pipeline
-from trilane.testing.told_time import ToldTime
 from trilane.transport.messages import (
     Close,
     Closed,

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from support.small_pipeline import pipeline
 from trilane.errors import BadInputError, UnwrittenError
 from trilane.pipeline import accounts, run, surroundings
 from trilane.pipeline.cpu_use import CpuTimes
@@ -38,7 +39,6 @@ from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.events import Settings, StageAlone
 from trilane.scheduler.stats import energy_score
 from trilane.scheduler.virtual import VirtualDriver
-from trilane.testing.small_pipeline import pipeline
 from trilane.transport.messages import Done
 
 MS = 1_000_000

@@ -6,11 +6,9 @@ from typing import Any
 
 import pytest
 
+from support.plain_scheduler import RESTART_NS, PlainScheduler, PlainUnit, drawn, service_of, skips_of, with_bypass
 from trilane.scheduler.events import Dispatch, SetDuty
 from trilane.scheduler.virtual import VirtualDriver
-from trilane.testing.drawn_pipelines import drawn, service_of, skips_of, with_bypass
-from trilane.testing.plain_scheduler import RESTART_NS, PlainScheduler
-from trilane.testing.plain_state import PlainUnit
 
 CAUSES = ("starved", "blocked", "throttled", "overhead")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from trilane.testing.skips import Allowed, Skip, SkipList, load_allowed, not_allowed
+from support.checks import Allowed, Skip, SkipList, load_allowed, not_allowed
 
 ROW = Allowed("tests/*::test_video*", "no codec *", "a codec")
 

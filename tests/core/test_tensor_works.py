@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from support.small_inputs import validated
 from trilane.apps.report import Resolution
 from trilane.apps.resolution import resolution_note, resolution_of
 from trilane.avatars.bundle import load_bundle, write_manifest
@@ -24,7 +25,6 @@ from trilane.scene.schema import Scene
 from trilane.stages.config import RunConfig
 from trilane.stages.configure import Request, configure
 from trilane.stages.foresee import tensor_works
-from trilane.testing.validated import validated
 
 ALL = (1000, 563, 250)
 LOSS = SizeLoss("from somewhere", {1000: 0.0, 562: 1.0, 250: 3.0})

@@ -17,6 +17,7 @@ import psutil
 import pytest
 from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace
 
+from support.trace_reading import ReadTrace, read_trace
 from trilane.apps.tracing.frame_book import FrameBook, Gone, Presented
 from trilane.apps.tracing.packets import PLAIN_BYTES, PacketSink, packets_in
 from trilane.apps.tracing.tiles import MOST_WAITING, Lanes, Tiles
@@ -54,7 +55,6 @@ from trilane.scheduler.events import (
 )
 from trilane.scheduler.ledger import BLOCKED, STARVED, JobRecord
 from trilane.scheduler.virtual import Simulation, simulate
-from trilane.testing.trace_reading import ReadTrace, read_trace
 
 MS = 1_000_000
 STAGES = (("pose", "cpu"), ("raster", "gpu"), ("infer", "dsp"), ("composite", "gpu"), ("present", "cpu"))

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from support.trace_reading import read_trace
 from trilane.apps.tracing.files import write_predicted
 from trilane.hw_profiles.application import application_graph
 from trilane.pipeline.journal import NAME, JournalWriter, journal_of
 from trilane.scheduler.events import Settings
 from trilane.scheduler.virtual import Simulation, simulate
-from trilane.testing.trace_reading import read_trace
 
 Command = Callable[..., tuple[str, str]]
 FRAMES = 8

@@ -15,13 +15,13 @@ from typing import Any
 import pytest
 import zmq
 
+from support.small_pipeline import spec_of
 from trilane import machine
 from trilane.pipeline import (
     fork_server,
     unit_loop,
 )
 from trilane.pipeline.description import UnitSettings
-from trilane.testing.small_pipeline import spec_of
 from trilane.transport.link import HeartbeatSocket
 from trilane.transport.messages import (
     Close,

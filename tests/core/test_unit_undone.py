@@ -10,11 +10,11 @@ from typing import Any
 import psutil
 import pytest
 
+from support.small_pipeline import OWN, pipeline
 from trilane.errors import TrilaneError
 from trilane.pipeline import unit_processes
 from trilane.pipeline.regions import EdgeRegion
 from trilane.pipeline.unit_processes import UnitProcesses
-from trilane.testing.small_pipeline import OWN, pipeline
 from trilane.transport.packets import header_dtype
 
 REGIONS = {

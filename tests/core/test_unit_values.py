@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from support.small_pipeline import OWN, STAGES, UNITS, packets, pipeline, spec_of
 from trilane import machine
 from trilane.errors import BadInputError, MissingPartError, TrilaneError, UnitLostError
 from trilane.pipeline import (
@@ -29,7 +30,6 @@ from trilane.pipeline.job_times import LOSS_NS
 from trilane.pipeline.regions import edge_regions
 from trilane.pipeline.stage import UnitContext
 from trilane.pipeline.unit_spec import UnitSpec
-from trilane.testing.small_pipeline import OWN, STAGES, UNITS, packets, pipeline, spec_of
 from trilane.transport.messages import (
     Close,
     Closed,

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import pytest
 
-from trilane.bench import oracle, readback
+from support import raster_oracle
+from trilane.bench import readback
+from trilane.stages.gpu.opengl import describe, open_context
 
 
 @pytest.mark.usefixtures("hardware_gl")
 def test_the_packed_tensor_is_the_oracles() -> None:
-    """Within the bounds that the bench states for every driver."""
-    found = oracle.measure(views=20, size=256)
-    assert found["driver"]["hardware"]
-    assert found["background_bytes_wrong"] == oracle.BOUNDS["background_bytes_wrong"]
-    assert found["coverage_differs"] <= oracle.BOUNDS["coverage_differs"]
-    assert found["within_one_step"] >= oracle.BOUNDS["within_one_step"]
+    """A thousandth of the pixels may lie on the other side of an edge, and of the values be off by more than a step."""
+    ctx = open_context()
+    assert describe(ctx).hardware
+    pixels, uncovered, values, near, wrong = raster_oracle.compare(ctx, 20, (256, 256)).sum(axis=0)
+    assert wrong == 0
+    assert uncovered <= 1e-3 * pixels
+    assert near >= 0.999 * values
 
 
 @pytest.mark.usefixtures("hardware_gl")

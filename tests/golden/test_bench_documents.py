@@ -1,5 +1,4 @@
-"""`bench raster`, `readback` and `raster-oracle`: their documents on times that are told, and bytes that are wrong on
-purpose."""
+"""`bench raster` and `readback`: their documents on times that are told."""
 
 from __future__ import annotations
 
@@ -11,10 +10,10 @@ import moderngl
 import numpy as np
 import pytest
 
-from trilane.bench import oracle, raster, readback
+from trilane.bench import raster, readback
 from trilane.bench.lib.fixture import ENCODING, standing
 from trilane.bench.lib.gpu_buffering import SubUpload
-from trilane.bench.lib.split_pass import SplitPass
+from trilane.bench.raster import SplitPass
 from trilane.errors import BadInputError, TrilaneError
 from trilane.stages.gpu.opengl import Driver, describe
 from trilane.stages.gpu.packed_pass import PackedPass
@@ -44,7 +43,7 @@ def summary(place: float) -> dict[str, float]:
 @pytest.fixture(params=[True, False], ids=["hardware", "software"])
 def driver(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Driver:
     told = Driver("v", "r", "3.3", request.param)
-    for module in (raster, readback, oracle):
+    for module in (raster, readback):
         monkeypatch.setattr(module, "describe", lambda _ctx: told)
     return told
 
@@ -53,7 +52,7 @@ def driver(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> D
 def opened(gl: Any, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The benches draw in the shared context; the threads that they asked for."""
     threads: list[int] = []
-    for module in (raster, readback, oracle):
+    for module in (raster, readback):
         monkeypatch.setattr(module, "open_context", lambda *asked: threads.extend(asked) or gl)
     return threads
 
@@ -258,66 +257,3 @@ def test_variants_that_give_other_bytes_are_refused(kind: str, monkeypatch: pyte
     monkeypatch.setitem(table, "wrong", Wrong)  # type: ignore[arg-type]
     with pytest.raises(TrilaneError, match=f"{kind} wrong gave other bytes than (direct|were written)"):
         readback.measure(sizes=(32,), channels=(4,), repeats=1)
-
-
-def test_the_oracles_figures_are_of_all_views_and_the_worst(
-    driver: Driver, opened: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """100 and 300 mesh pixels of which 1 and 9 differ; 800 of 1000 and 2900 of 3000 values are near."""
-    rows = np.array([[100, 1, 1000, 800, 2], [300, 9, 3000, 2900, 5], [0, 0, 0, 0, 0]])
-    asked: list[Any] = []
-    monkeypatch.setattr(oracle, "_compare", lambda _ctx, *what: asked.append(what) or rows[: what[0]])
-    assert oracle.measure(views=2, size=64) == {
-        "pixels": 400,
-        "coverage_differs": 10 / 400,
-        "within_one_step": 3700 / 4000,
-        "background_bytes_wrong": 7,
-        "worst_coverage": 9 / 300,
-        "worst_within_one": 800 / 1000,
-        "bounds": {"coverage_differs": 1e-3, "within_one_step": 0.999, "background_bytes_wrong": 0},
-        "driver": asdict(driver),
-        "config": {"views": 2, "size": 64, "channels": 16},
-    }
-    assert asked == [(2, (64, 64))] and opened == []
-    monkeypatch.setattr(oracle, "_compare", lambda *_: rows[2:])
-    empty = oracle.measure(views=1, size=2048)
-    assert (empty["coverage_differs"], empty["within_one_step"], empty["worst_coverage"]) == (0.0, 0.0, 0.0)
-    for bad, words in (({"views": 0}, "at least 1"), ({"size": 0}, "1 to 2048"), ({"size": 2049}, "1 to 2048")):
-        ((option, value),) = bad.items()
-        with pytest.raises(BadInputError, match=f"^--{option}: found {value}, expected {words}$"):
-            oracle.measure(**bad)
-
-
-@pytest.mark.parametrize("more", [0, 100, 156])
-def test_the_oracle_sees_bytes_that_are_wrong(gl: Any, more: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wider than high. With 100 or 156 added to every byte none is near and all of the background is wrong; two pixels
-    at edges may be those of another triangle."""
-    passes: list[Any] = []
-
-    class Wrong(PackedPass):
-        def __init__(self, *asked: Any, **options: Any) -> None:
-            super().__init__(*asked, **options)
-            passes.append((asked[1:], options))
-
-        def read_into(self, shape: Any, tensor: Any) -> None:
-            super().read_into(shape, tensor)
-            tensor += np.uint8(more)
-
-    begun: list[Any] = []
-    pose = oracle.everyday_pose
-    monkeypatch.setattr(
-        oracle, "everyday_pose", lambda seeded: begun.append(seeded.bit_generator.state) or pose(seeded)
-    )
-    monkeypatch.setattr(oracle, "PackedPass", Wrong)
-    rows = oracle._compare(gl, 3, (64, 96))
-    assert passes == [((16, ENCODING), {"deferred": not describe(gl).hardware})]
-    assert rows.shape == (3, 5) and rows.dtype == np.int64
-    assert begun[0] == np.random.default_rng(0).bit_generator.state
-    for pixels, differ, values, near, wrong in rows:
-        assert 50 < pixels < 64 * 96 / 2 and differ <= 2
-        assert 16 * (pixels - differ) <= values <= 16 * pixels and values % 16 == 0
-        if more:
-            assert near <= 2 * 16 and abs(wrong - 16 * (64 * 96 - pixels)) <= 16 * differ
-        else:
-            assert wrong == 0 and near >= values - 2 * 16
-    assert len({*rows[:, 0].tolist()}) == 3, "every view is another"

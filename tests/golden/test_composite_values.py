@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from support.small_pipeline import without_bytes
 from trilane.arrays import F64, U8
 from trilane.bench.lib import float_raster
 from trilane.scene.crop import Rect
@@ -31,7 +32,6 @@ from trilane.stages.gpu.composite_painters import (
     floor_discs,
     half_sides,
 )
-from trilane.testing.told_bytes import without_bytes
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 SHAPE = (20, 27)

@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation, binary_erosion
 
-from trilane.apps.experiments.causes import BODY, NOTHING, Cause, needs, up_to
 from trilane.apps.experiments.error_by_cause import error_by_cause
-from trilane.apps.experiments.reference_path import Moment, ReferencePath
+from trilane.apps.experiments.reference_path import BODY, NOTHING, Cause, Moment, ReferencePath, needs, up_to
 from trilane.arrays import F32, F64
 from trilane.bench.lib.cast import Cast
 from trilane.bench.lib.full_picture import FullPictures

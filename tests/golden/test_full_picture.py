@@ -14,11 +14,10 @@ from trilane.arrays import F32, F64
 from trilane.avatars.bundle import BUILT_IN, CLOTHES_STANDOFF_M
 from trilane.bench.lib import full_picture
 from trilane.bench.lib.cast import Cast
-from trilane.bench.lib.full_picture import FullPictures
+from trilane.bench.lib.full_picture import SAMPLES, FullPictures, true_pictures
 from trilane.bench.lib.layers import Box, Layer, blended, premultiplied, to_light
-from trilane.bench.lib.plans import FIXED, fixed, in_frames, planned
 from trilane.bench.lib.stage_chain import AvatarFrames
-from trilane.bench.lib.true_picture import SAMPLES, true_pictures
+from trilane.bench.planner import FIXED, fixed, in_frames, planned
 from trilane.body.body import load_body
 from trilane.stages.configure import Checked, Request, configure
 from trilane.stages.cpu.mesh_bounds import MeshBounds

@@ -12,6 +12,8 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from support.doubles import lose_context
+from support.small_pipeline import assets_of
 from trilane.avatars.bundle import load_bundle
 from trilane.errors import BadInputError, TrilaneError, UnitLostError
 from trilane.pipeline.description import UnitSettings
@@ -23,8 +25,6 @@ from trilane.stages.gpu import raster as raster_stage
 from trilane.stages.gpu.composite import CompositeStage
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Quantisation
 from trilane.stages.gpu.raster import RasterStage
-from trilane.testing.assets import assets_of
-from trilane.testing.lost_context import lose_context
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 TENSOR = (96, 64)

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
+from support.camera_files import LENS, WRITERS, Writer, write_nerf
 from trilane.arrays import F64, U8
 from trilane.scene.camera.files import load_camera
 from trilane.scene.footage import filmed
@@ -25,7 +26,6 @@ from trilane.stages.config import pose_dtype
 from trilane.stages.gpu.background import open_background
 from trilane.stages.gpu.composite import CompositeStage
 from trilane.stages.gpu.survey import survey
-from trilane.testing.camera_files import LENS, WRITERS, Writer, write_nerf
 
 #: Of the camera in a world with Y up: x right, y down, z ahead (optical), and where it stands.
 YAW, PITCH = 0.3, 0.12

@@ -20,6 +20,7 @@ from typing import Any
 import pytest
 
 import trilane
+from support.machines import lowest_versions
 from trilane import machine
 from trilane.apps.run_folder import RunFolder
 from trilane.cache import cache_dir
@@ -29,7 +30,6 @@ from trilane.pipeline.hardware_counters import availability
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.stages.dsp.runtime import installed
 from trilane.stages.machine_facts import cpu_facts, package_version, runtime_facts
-from trilane.testing.machines import lowest_versions
 from trilane.writing import write_bytes, write_folder
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,9 +10,9 @@ from pathlib import Path
 import psutil
 import pytest
 
+from support import doubles
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.stages import PRELOAD
-from trilane.testing import doubles
 
 SHM = Path("/dev/shm")  # noqa: S108 - looked at, not written to
 OPEN_FILES = Path("/proc/self/fd")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from trilane.bench.lib.cpu_load import FACTORY
+from support.cpu_load import FACTORY
 from trilane.hw_profiles.host import usable_cores
 from trilane.pipeline import accounts
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings

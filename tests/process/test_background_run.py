@@ -83,7 +83,7 @@ def run(background: Path, bundle: Path, folder: Path, killer: KillsGpu) -> RunRe
     notes = PipelineStage(
         name="present",
         unit="cpu",
-        factory="trilane.testing.corner_greys:build",
+        factory="support.doubles:build_corner_greys",
         settings={"log": str(folder / "greys"), "width": WIDTH},
     )
     pipeline = pipeline.model_copy(update={"stages": (*pipeline.stages[:-1], notes)})

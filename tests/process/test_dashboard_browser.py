@@ -19,9 +19,9 @@ pytest.importorskip("uvicorn", reason="the extra dashboard is not installed")
 pytest.importorskip("websockets", reason="the extra dashboard is not installed")
 playwright = pytest.importorskip("playwright.sync_api", reason="the extra browser is not installed")
 
+from support.dashboard_double import DoubleView, Served  # noqa: E402
 from trilane import machine  # noqa: E402
 from trilane.apps.dashboard.wire import PICTURE_KIND, ControlSaid, Seek  # noqa: E402
-from trilane.testing.dashboard_double import DoubleView, Served  # noqa: E402
 
 pytestmark = pytest.mark.slow
 

@@ -11,8 +11,8 @@ pytest.importorskip("uvicorn", reason="the extra dashboard is not installed")
 pytest.importorskip("prometheus_client", reason="the extra dashboard is not installed")
 pytest.importorskip("websockets", reason="the extra dashboard is not installed")
 
-from trilane.testing.dashboard_double import DoubleView, Served
-from trilane.testing.malformed_requests import Server, is_refused, send_one
+from support.dashboard_double import DoubleView, Served
+from support.malformed_requests import Server, is_refused, send_one
 
 COUNT = 30
 

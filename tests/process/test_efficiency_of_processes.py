@@ -14,7 +14,7 @@ from typing import Any
 import psutil
 import pytest
 
-from trilane.bench.lib.cpu_load import FACTORY
+from support.cpu_load import FACTORY
 from trilane.hw_profiles.host import usable_cores
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
 from trilane.pipeline.run import run_pipeline

@@ -24,13 +24,13 @@ import onnx
 import pytest
 from numpy.typing import NDArray
 
+from support.small_inputs import validated
+from support.told_journal import told_journal
 from trilane import machine
 from trilane.apps.cli import main as cli
 from trilane.avatars.bundle import load_bundle, write_manifest
 from trilane.pipeline.journal import NAME as JOURNAL
 from trilane.pipeline.journal import Counted, JournalWriter
-from trilane.testing.told_journal import told_journal
-from trilane.testing.validated import validated
 
 FILE = Path(__file__).with_name("json_keys.toml")
 DATA = tomllib.loads(FILE.read_text(encoding="utf-8"))

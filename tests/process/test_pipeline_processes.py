@@ -18,9 +18,11 @@ from typing import Any
 import psutil
 import pytest
 
+from support.doubles import HANG, LOSING_FACTORY
+from support.doubles import pipeline_of_doubles as doubles
+from support.faults import unit_process
 from trilane import machine
 from trilane.apps.pace import Pace, compare
-from trilane.bench.faults import unit_process
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.application import Variant, application_graph, settings_of
 from trilane.hw_profiles.governor import Governor
@@ -33,9 +35,6 @@ from trilane.scheduler.events import Dispatch, JobDone, Pong, UnitDied
 from trilane.scheduler.recording import Recording, replay
 from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.configure import Request, configure
-from trilane.testing import lost_context
-from trilane.testing.doubles import HANG
-from trilane.testing.doubles import pipeline_of_doubles as doubles
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
 #: A unit that is silent for so long has stopped; a busy machine keeps one from its core for some hundredths of it.
@@ -355,7 +354,7 @@ def test_late_poses_arrive_and_are_newer(run: Run) -> None:
 
 def test_a_lost_context_costs_a_restart_and_a_frame(run: Run, tmp_path: Path, drawable_bundle: Path) -> None:
     checked = configure(Request(avatar=str(drawable_bundle), frames=12, size="64", runtime="ort"), tmp_path)
-    losing = with_factory(avatar_pipeline(checked.config, checked.assets), "raster", lost_context.FACTORY)
+    losing = with_factory(avatar_pipeline(checked.config, checked.assets), "raster", LOSING_FACTORY)
     result = run(losing, 12, assets=checked.assets)
     assert result.failure is None
     assert by_cause(result.lost) == {"died:gpu": 1}
@@ -430,7 +429,7 @@ SCRIPT = """
 import sys
 from trilane.pipeline.run import run_pipeline
 from trilane.scheduler.events import SchedulerStalled
-from trilane.testing.doubles import pipeline_of_doubles
+from support.doubles import pipeline_of_doubles
 
 result = run_pipeline(pipeline_of_doubles(infer=int(sys.argv[3])), int(sys.argv[1]),
                       hang_ns=int(float(sys.argv[2]) * 1e9), on_progress=lambda done, _: print(done, flush=True))

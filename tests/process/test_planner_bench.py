@@ -11,8 +11,8 @@ import pytest
 from trilane.bench import planner
 from trilane.bench.lib.cast import Cast
 from trilane.bench.lib.full_picture import FullPictures
-from trilane.bench.lib.plans import fixed
 from trilane.bench.lib.stage_chain import AvatarFrames
+from trilane.bench.planner import fixed
 from trilane.errors import BadInputError
 from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.configure import Checked, Request, configure

@@ -11,6 +11,8 @@ from typing import Any
 
 import pytest
 
+from support.doubles import pipeline_of_doubles
+from support.trace_reading import Slice, read_trace
 from trilane.apps.report import read_report
 from trilane.apps.run_job import Hooks, Outcome, Plan, run_to_folder
 from trilane.errors import TrilaneError
@@ -24,8 +26,6 @@ from trilane.scheduler.recording import read, replay
 from trilane.stages.config import RunConfig
 from trilane.stages.configure import Checked
 from trilane.stages.machine_facts import machine_facts
-from trilane.testing.doubles import pipeline_of_doubles
-from trilane.testing.trace_reading import Slice, read_trace
 
 FRAMES = 24
 pytestmark = pytest.mark.usefixtures("no_new_process", "behaviour")

@@ -7,12 +7,12 @@ import signal
 
 import pytest
 
+from support.doubles import pipeline_of_doubles as doubles
 from trilane.bench import scenario
 from trilane.bench.lib import load
 from trilane.bench.lib.load import Load
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.requests import FrameRequestQueue
-from trilane.testing.doubles import pipeline_of_doubles as doubles
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
 

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from trilane.bench.faults import unit_process
+from support.doubles import pipeline_of_doubles
+from support.faults import unit_process
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline
 from trilane.scheduler.recording import read, replay
 from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.configure import Request, configure
-from trilane.testing.doubles import pipeline_of_doubles
 from trilane.units import BYPASS
 
 FRAMES, KILL_AT = 50, 12
@@ -55,7 +55,7 @@ def test_a_unit_that_dies_between_skipping_frames_costs_no_more_than_its_jobs(
     unit: str, policy: str, edge: str, tmp_path: Path
 ) -> None:
     doubles = with_pose(
-        pipeline_of_doubles(tmp_path / "log", infer=10, composite=6), "trilane.testing.doubles:build_skipping", BYPASS
+        pipeline_of_doubles(tmp_path / "log", infer=10, composite=6), "support.doubles:build_skipping", BYPASS
     )
     kill, victims = kills(unit)
     result = run_pipeline(doubles.with_rule(edge), 60, policy=policy, pace_fps=100, on_progress=kill)
@@ -80,7 +80,7 @@ def avatar(bundle: Path, folder: Path, position: str, frames: int, *, skips: boo
     checked = configure(asked, folder)
     pipeline = avatar_pipeline(checked.config, checked.assets, "double")
     if not skips:
-        pipeline = with_pose(pipeline, "trilane.testing.full_frames:build", None)
+        pipeline = with_pose(pipeline, "support.doubles:build_full_frames", None)
     return run_pipeline(pipeline, frames, assets=checked.assets, **options)  # type: ignore[arg-type]
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from support.doubles import SLOW_FRAMES, STEPPED_WORKS, stepped_pipeline
 from trilane.pipeline.run import run_pipeline
 from trilane.scheduler.events import StageAlone
 from trilane.scheduler.recording import replay
-from trilane.testing.doubles import SLOW_FRAMES, STEPPED_WORKS, stepped_pipeline
 
 
 def test_slow_frames_are_given_less_work() -> None:

@@ -23,7 +23,7 @@ from trilane.apps.sweeps.ray_engine import cluster
 from trilane.apps.sweeps.store import TRIALS
 from trilane.errors import BadInputError
 
-FAKE = "trilane.testing.sweep_trial"
+FAKE = "support.sweep_trial"
 #: `trilane` that tries the module in place of Trilane.
 #: SIGINT is heard even where the tests run in a background in which it is ignored.
 PROGRAM = (

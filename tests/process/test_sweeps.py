@@ -1,6 +1,6 @@
 """Sweeps of real processes: alone or packed, interrupted, killed and taken up again, with none left behind.
 
-`trilane.testing.sweep_trial`, which says when it began and ended, is tried in place of Trilane.
+`support.sweep_trial`, which says when it began and ended, is tried in place of Trilane.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from trilane.apps.sweeps.store import TRIALS, Store, read_trials
 from trilane.apps.sweeps.sweep import run_sweep
 from trilane.apps.sweeps.trial import Clock, Trial
 
-FAKE = "trilane.testing.sweep_trial"
+FAKE = "support.sweep_trial"
 #: `trilane` that tries the module in place of Trilane.
 #: SIGINT is heard even where the tests run in a background in which it is ignored.
 PROGRAM = (

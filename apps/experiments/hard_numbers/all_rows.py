@@ -35,12 +35,9 @@ def kept_going(kind: str, cases: Iterable[HardNumber]) -> Iterator[HardNumber]:
 
 def _cases() -> Iterator[HardNumber]:
     from trilane.apps.experiments.hard_numbers.bodies import body_cases
-    from trilane.apps.experiments.hard_numbers.cameras import camera_cases
-    from trilane.apps.experiments.hard_numbers.chains import chain_cases
-    from trilane.apps.experiments.hard_numbers.rotations import rotation_cases
-    from trilane.apps.experiments.hard_numbers.scenes import scene_cases
-    from trilane.apps.experiments.hard_numbers.tensors import tensor_cases
-    from trilane.apps.experiments.hard_numbers.times import time_cases
+    from trilane.apps.experiments.hard_numbers.cameras import camera_cases, time_cases
+    from trilane.apps.experiments.hard_numbers.rotations import chain_cases, rotation_cases
+    from trilane.apps.experiments.hard_numbers.tensors import scene_cases, tensor_cases
     from trilane.avatars.bundle import load_bundle
     from trilane.stages.avatar_assets import load_avatar
     from trilane.stages.gpu.opengl import open_context

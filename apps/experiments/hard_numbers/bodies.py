@@ -14,8 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from trilane.apps.experiments.hard_numbers.chains import MM, random_pose
 from trilane.apps.experiments.hard_numbers.hard_number import EXACT, HIGHAM, U32, HardNumber, U, gamma, worst
+from trilane.apps.experiments.hard_numbers.rotations import MM, random_pose
 from trilane.arrays import F64
 from trilane.body.body import Body, ShapedBody, weights_of_one
 from trilane.body.joints import JOINTS, POSE_FEATURES

@@ -1,4 +1,4 @@
-"""Cameras: extreme lenses and distances, one inside the body, crops of a pixel.
+"""Cameras: extreme lenses and distances, one inside the body, crops of a pixel, and a day of media time.
 
 Rule: the rectangle of a body is right when no vertex on the screen lies outside it; where one lands in float32 is held
 against float64, with the roundings of the shader counted.
@@ -6,23 +6,32 @@ against float64, with the roundings of the shader counted.
 In the shader. With clip coordinates C = M [x, 1], M and x in float32, each coordinate is off by gamma_6 of |M| |x| in
 float32 (four products, two roundings of the inputs), X / W by that of X plus X / W times that of W, over W, and a
 rounding of the quotient. A pixel is half a tensor's side for each 1 of X / W.
+
+A day of media time. Frame 5,000,000 shows what the same moment of the motion's period shows; the reference reduces the
+frame's time by the period in fractions, which are exact. frame / fps rounds by U of itself, the remainder is exact, so
+the moment is off by at most U t, and what is shown by that times the fastest that it moves between two samples, and by
+a few roundings of what is shown.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from fractions import Fraction
 
 import numpy as np
 
-from trilane.apps.experiments.hard_numbers.chains import random_pose
-from trilane.apps.experiments.hard_numbers.hard_number import EXACT, HIGHAM, U32, HardNumber, gamma, worst
+from trilane.apps.experiments.hard_numbers.hard_number import EXACT, HIGHAM, U32, HardNumber, U, gamma, worst
+from trilane.apps.experiments.hard_numbers.rotations import random_pose
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody
 from trilane.body.joints import JOINTS
-from trilane.body.kinematics import Posed, Skeleton
+from trilane.body.kinematics import Posed, Skeleton, rodrigues
 from trilane.body.skinning import CpuSkinner
-from trilane.scene.camera.path import look_at, projection_matrix
+from trilane.scene.camera.path import load_builtin, look_at, projection_matrix
 from trilane.scene.crop import Rect, crop_projection
+from trilane.scene.motion.builtin import walk_wave_turn
+from trilane.scene.motion.motion import Wrap
+from trilane.scene.schema import CameraSpec
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 
 NEAR_M, FAR_M = 0.05, 1000.0
@@ -44,6 +53,10 @@ SIDE = 512
 #: Crops as parts of the screen's width.
 CROPS = {"a whole screen": 2.0, "a tenth": 0.2, "a 4096th": 2 / 4096}
 PROOF = "no vertex on the screen may be outside: 0, by the proof in stages/cpu/mesh_bounds.py"
+FRAME = 5_000_000
+RATES = (24.0, 30.0, 59.94)
+SOURCE = "rounding of the frame's time, times the fastest that is shown"
+Shown = Callable[[float], F64]
 
 
 def camera_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
@@ -132,3 +145,34 @@ def _on_screen(skinner: CpuSkinner, skeleton: Skeleton) -> Iterator[HardNumber]:
         errors = np.abs(found[:, :2] / found[:, 3:] - place) * SIDE / 2
         name = f"vertices on the screen in float32, {metres:g} m away"
         yield HardNumber(name, *worst(errors, bounds * SIDE / 2), "pixels of 512", HIGHAM)
+
+
+def time_cases() -> Iterator[HardNumber]:
+    """Rows of the built-in walk and camera at each rate."""
+    motion, camera = walk_wave_turn(), load_builtin("orbit", CameraSpec())
+    assert camera is not None
+    shown: dict[str, tuple[Shown, F64, Wrap, str]] = {
+        "turns of the walk": (lambda t: rodrigues(motion.sample(t)[0]), motion.times_s, motion.wrap, "entry of R"),
+        "place of the walk": (lambda t: motion.sample(t)[1], motion.times_s, motion.wrap, "m"),
+        "the orbiting camera": (camera.sample, camera.times_s, camera.wrap, "entry of the view"),
+    }
+    for name, (at, times_s, wrap, unit) in shown.items():
+        speed = _fastest(at, times_s)
+        for fps in RATES:
+            reached = FRAME / fps
+            error = float(np.abs(at(reached) - at(_moment(fps, times_s, wrap))).max())
+            bound = 2 * U * reached * speed + 64 * U * (1 + np.pi)
+            yield HardNumber(f"{name}, frame {FRAME:,} at {fps:g} a second", error, bound, unit, SOURCE)
+
+
+def _moment(fps: float, times_s: F64, wrap: Wrap) -> float:
+    """The time within one period of frame `FRAME`."""
+    length = Fraction(float(times_s[-1])) * (1 if wrap is Wrap.LOOP else 2)
+    phase = (Fraction(FRAME) / Fraction(fps)) % length
+    return float(phase if wrap is Wrap.LOOP or phase <= length / 2 else length - phase)
+
+
+def _fastest(at: Shown, times_s: F64) -> float:
+    """The greatest change in a second of any number, between neighbouring samples."""
+    values = np.array([at(float(t)).ravel() for t in times_s])
+    return float(np.abs(np.diff(values, axis=0) / np.diff(times_s)[:, None]).max())

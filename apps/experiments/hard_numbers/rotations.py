@@ -1,26 +1,39 @@
-"""Rotations at the angles where formulas break, and a million at random.
+"""Rotations at the angles where formulas break, a million at random, and the longest chain of joints.
 
-Rule: the reference has sixty digits (`exact_turn`), and the bound follows from the formula of body/kinematics.py.
+Rule: nothing of the references is shared with the code that is tested. That of a rotation has sixty digits, by Python's
+decimal numbers: R - I = a [v]x + b [v]x^2, a = sin(t) / t, b = (1 - cos(t)) / t^2, t = |v|, with series in t^2 after t
+was reduced by multiples of 2 pi. That of a chain walks from joint to joint in extended precision, where
+body/kinematics.py jumps by powers of two. Both bounds follow from the formulas of body/kinematics.py.
 
-The bound. h = |v| / 2 is off by at most 2.5 U of itself (a sum of three squares, its root). Each part of the quaternion
-is then off by at most e = U (2.5 h + 7.5 s), s = min(1, h), its first part by at most f = U (2.5 h + 2). An entry of
-R - I is a sum of at most two products of parts, doubled, so it is off by at most
+The bound of a rotation. h = |v| / 2 is off by at most 2.5 U of itself (a sum of three squares, its root). Each part of
+the quaternion is then off by at most e = U (2.5 h + 7.5 s), s = min(1, h), its first part by at most f = U (2.5 h + 2).
+An entry of R - I is a sum of at most two products of parts, doubled, so it is off by at most
 
     (4 s + 2) e + 2 s f + 6 s U        where U^2 and smaller are left out and the whole is taken 1.01 times for them.
 
 Below the least normal number each of the eight roundings may add the least number that there is.
+
+The bound of a chain. A local rotation is off by at most 3 b in norm, b the bound of a rotation and U for adding I. A
+product of two rows and columns rounds by gamma_4 of at most sqrt(3) * sqrt(3) (rotations) or sqrt(3) |place| + |place|
+(places). Over d joints these add up: the place of the last joint is off by at most
+
+    L sum (3 b + 12 U) + d gamma_4 (sqrt(3) + 1) (|root| + L)        L: length of the chain's bones, root: of the body.
+
+Skinning matrices are float32: an entry is off by U32 of itself beside that.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from decimal import Decimal, localcontext
 
 import numpy as np
+from numpy.typing import NDArray
 
-from trilane.apps.experiments.hard_numbers.exact_turn import exact_turn, turn_error
-from trilane.apps.experiments.hard_numbers.hard_number import HIGHAM, HardNumber, U, worst
+from trilane.apps.experiments.hard_numbers.hard_number import HIGHAM, U32, HardNumber, U, gamma, worst
 from trilane.arrays import F64
-from trilane.body.kinematics import rodrigues, turn
+from trilane.body.body import ShapedBody
+from trilane.body.kinematics import Skeleton, rodrigues, turn
 from trilane.scene.rotations import quat_from_rotvec, rotvec_from_quat
 
 ANGLES = {
@@ -43,6 +56,22 @@ ANGLES = {
 RETURNED = ("1e-12", "1e-6", "1e-3", "pi - 1e-7")
 RANDOM, CHUNK, SEED = 1_000_000, 100_000, 17
 LEAST = 2.0**-1074
+DIGITS = 80
+PI = Decimal("3.14159265358979323846264338327950288419716939937510582097494459230781640628620899862803482534211706798")
+#: Where sin(t) / t and (1 - cos(t)) / t^2 are taken by the first terms of their series, to all digits.
+TINY = Decimal("1e-30")
+MM = 1e3
+Wide = NDArray[np.longdouble]
+#: What is done with every joint of the chain -> the angle of each about the axis (1, 2, 3) / sqrt(14).
+TURNS = {
+    "all turned by 1e-7": 1e-7,
+    "all turned by pi - 1e-7": np.pi - 1e-7,
+    "all turned by pi": np.pi,
+    "all turned by 100 pi + 1": 100 * np.pi + 1,
+}
+#: Metres of the root joint from the origin.
+PLACES = {"at the origin": 0.0, "200 m away": 200.0, "10 km away": 1e4}
+CHAIN_SEED = 23
 
 
 def rotation_cases() -> Iterator[HardNumber]:
@@ -113,3 +142,138 @@ def _random_cases() -> Iterator[HardNumber]:
     name = f"{RANDOM:,} random rotations"
     yield HardNumber(f"{name}: R^T R", *worst(*np.transpose(square)), "entry of R^T R - I", HIGHAM)
     yield HardNumber(f"{name}: determinant", *worst(*np.transpose(volume)), "det R - 1", HIGHAM)
+
+
+def exact_turn(rotvec: Sequence[float]) -> list[list[Decimal]]:
+    """R - I of the axis-angle vector `rotvec` (3,), radians, below 1e9 of magnitude."""
+    with localcontext() as context:
+        context.prec = DIGITS
+        x, y, z = (Decimal(float(value)) for value in rotvec)
+        squared = x * x + y * y + z * z
+        sine, cosine = _factors(squared)
+        return [
+            [-cosine * (y * y + z * z), cosine * x * y - sine * z, cosine * x * z + sine * y],
+            [cosine * x * y + sine * z, -cosine * (x * x + z * z), cosine * y * z - sine * x],
+            [cosine * x * z - sine * y, cosine * y * z + sine * x, -cosine * (x * x + y * y)],
+        ]
+
+
+def turn_error(found: F64, exact: Sequence[Sequence[Decimal]]) -> float:
+    """The largest difference of an entry of `found` (3, 3); NaN where one is no number."""
+    if not np.isfinite(found).all():
+        return float("nan")
+    with localcontext() as context:
+        context.prec = DIGITS
+        differences = [abs(Decimal(float(found[i, j])) - exact[i][j]) for i in range(3) for j in range(3)]
+        return float(max(differences))
+
+
+def _factors(squared: Decimal) -> tuple[Decimal, Decimal]:
+    """sin(t) / t and (1 - cos(t)) / t^2 of t^2."""
+    angle = squared.sqrt()
+    if angle < TINY:
+        return 1 - squared / 6, Decimal("0.5") - squared / 24
+    turned = angle % (2 * PI)
+    if turned > PI:
+        turned -= 2 * PI
+    sine, cosine_below_one = _series(turned)
+    return sine / angle, cosine_below_one / squared
+
+
+def _series(angle: Decimal) -> tuple[Decimal, Decimal]:
+    """sin and 1 - cos of an angle of at most pi, by Taylor's series."""
+    term, sine, missing = angle, angle, Decimal(0)
+    power = Decimal(1)
+    for n in range(1, 60):
+        power = -power * angle * angle / ((2 * n - 1) * (2 * n))
+        missing -= power
+        term = -term * angle * angle / ((2 * n) * (2 * n + 1))
+        sine += term
+    return sine, missing
+
+
+def chain_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
+    """Rows of the longest chain, and of the matrices that the GPU gets."""
+    skeleton = Skeleton(shaped.joints, shaped.body.parents)
+    axis = np.array([1.0, 2.0, 3.0]) / np.sqrt(14.0)
+    poses = {name: np.tile(axis * angle, (len(shaped.joints), 1)) for name, angle in TURNS.items()}
+    poses["turned at random, up to 2 pi"] = random_pose(len(shaped.joints))
+    for name, pose in poses.items():
+        wanted = walked(shaped, pose, np.zeros(3))[:, :, 3]
+        errors, bounds = np.abs(skeleton.pose(pose).joints - wanted).max(axis=1), joint_bounds(shaped, pose, 0.0)
+        yield HardNumber(f"joints of the whole body {name}", *_in_mm(worst(errors, bounds)), "mm", HIGHAM)
+    pose = poses["turned at random, up to 2 pi"]
+    for name, metres in PLACES.items():
+        root = metres * axis
+        wanted = walked(shaped, pose, root)
+        wanted[:, :, 3] -= np.einsum("jab,jb->ja", wanted[:, :, :3], shaped.joints)
+        own = joint_bounds(shaped, pose, metres)[:, None]
+        rest = np.linalg.norm(shaped.joints, axis=1)[:, None]
+        bounds = own + _rotation_bounds(shaped, pose)[:, None] * rest + gamma(5) * (np.abs(wanted[:, :, 3]) + 2 * rest)
+        bounds = bounds + U32 * (np.abs(wanted[:, :, 3]) + bounds)
+        errors = np.abs(skeleton.pose(pose, root).matrices[:, :, 3] - wanted[:, :, 3])
+        yield HardNumber(f"places of the skinning matrices, {name}", *_in_mm(worst(errors, bounds)), "mm", HIGHAM)
+
+
+def walked(shaped: ShapedBody, pose: F64, root: F64) -> Wide:
+    """World transforms (55, 3, 4) of the joints, one after the other from the root, in extended precision."""
+    wide = np.longdouble
+    found: Wide = np.zeros((len(shaped.joints), 3, 4), wide)
+    for joint, parent in enumerate(shaped.body.parents):
+        own = np.zeros((3, 4), wide)
+        own[:, :3] = _wide_rotation(pose[joint].astype(wide))
+        own[:, 3] = shaped.joints[joint].astype(wide) - (shaped.joints[parent].astype(wide) if parent >= 0 else 0)
+        if parent < 0:
+            own[:, 3] += root.astype(wide)
+            found[joint] = own
+        else:
+            above = found[parent]
+            found[joint, :, :3] = above[:, :3] @ own[:, :3]
+            found[joint, :, 3] = above[:, :3] @ own[:, 3] + above[:, 3]
+    return found
+
+
+def joint_bounds(shaped: ShapedBody, pose: F64, root_m: float) -> F64:
+    """How far each joint (55,) may be off, metres."""
+    parents, joints = shaped.body.parents, shaped.joints
+    length, depth = np.zeros(len(joints)), np.zeros(len(joints))
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            length[joint] = length[parent] + np.linalg.norm(joints[joint] - joints[parent])
+            depth[joint] = depth[parent] + 1
+    length += np.linalg.norm(joints[0])
+    return np.asarray(
+        length * _rotation_bounds(shaped, pose) + (depth + 2) * gamma(4) * (np.sqrt(3) + 1) * (root_m + length)
+    )
+
+
+def _rotation_bounds(shaped: ShapedBody, pose: F64) -> F64:
+    """By how much each joint's world rotation (55,) may be off, in norm."""
+    local = 3 * (turn_bound(np.linalg.norm(pose, axis=1)) + U) + 12 * U
+    total = np.zeros(len(local))
+    for joint, parent in enumerate(shaped.body.parents):
+        total[joint] = local[joint] + (total[parent] if parent >= 0 else 0.0)
+    return total
+
+
+def _wide_rotation(v: Wide) -> Wide:
+    """The matrix (3, 3) of an axis-angle vector, by 1 - cos = 2 sin^2, in the vector's precision."""
+    angle = np.sqrt(v @ v)
+    if angle == 0:
+        return np.eye(3, dtype=v.dtype)
+    cross = np.zeros((3, 3), v.dtype)
+    cross[[2, 0, 1], [1, 2, 0]] = v
+    cross[[1, 2, 0], [2, 0, 1]] = -v
+    half = np.sin(angle / 2) / angle
+    turned: Wide = np.eye(3, dtype=v.dtype) + np.sin(angle) / angle * cross + 2 * half * half * (cross @ cross)
+    return turned
+
+
+def random_pose(joints: int) -> F64:
+    rng = np.random.default_rng(CHAIN_SEED)
+    axis = rng.normal(size=(joints, 3))
+    return np.asarray(axis / np.linalg.norm(axis, axis=1, keepdims=True) * rng.uniform(0, 2 * np.pi, (joints, 1)))
+
+
+def _in_mm(found: tuple[float, float]) -> tuple[float, float]:
+    return found[0] * MM, found[1] * MM

@@ -1,18 +1,23 @@
-"""Tensors: values that quantising, packing and FP16 texels find hard, drawn by the GPU unit's own packed pass.
+"""Tensors: values that quantising, packing and FP16 texels find hard, and scenes whose frames are all unlike.
 
 Rule: a texture whose channels are constant makes every covered pixel of a tensor a known byte: q = clamp(round(x /
 scale) + zero point, 0, 255), rounded to even. Values are FP16 numbers and, where halves are asked for, the scale is a
 power of two, so that x / scale is exact however a driver divides; else x / scale is at least a tenth of a step from a
 half, which no driver's division crosses (2.5 units in the last place, Vulkan 1.3 and OpenCL 3.0 for float32).
+
+Scenes change everything from one frame to the next: camera, pose, rectangle, tensor shape, who is in view. A frame is
+the same to the byte whatever was drawn before it; the reference is what stages draw that were made for it alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from trilane.apps.experiments.accuracy import DrawnTensors
 from trilane.apps.experiments.hard_numbers.hard_number import EXACT, HardNumber, worst
 from trilane.arrays import F64, U8
 from trilane.body.body import ShapedBody
@@ -20,6 +25,7 @@ from trilane.body.joints import JOINTS
 from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError
 from trilane.scene.camera.path import look_at, projection_matrix
+from trilane.stages.configure import Checked, Request, configure
 from trilane.stages.gpu.packed_pass import (
     PackedAvatar,
     PackedPass,
@@ -53,6 +59,9 @@ NUMBERS: dict[str, tuple[float, int, Sequence[float]]] = {
     "a scale so large that all is 0": (1e30, 117, [LARGEST, -LARGEST] * 8),
 }
 HALF_ULP = "FP16 rounds to the nearest: 2^-11 of a number, 2^-25 at least"
+#: Scene -> frames, each as unlike the one before as the scene has them.
+JUMPS = {"walk-past": (0, 180, 30, 299, 0), "leave-and-return": (0, 150, 20, 240), "top-to-floor": (0, 90, 180, 0)}
+RUNTIME = "ort"
 
 
 def tensor_cases(shaped: ShapedBody, ctx: Any) -> Iterator[HardNumber]:
@@ -111,3 +120,22 @@ def _is_taken(value: float) -> bool:
     except BadInputError:
         return False
     return True
+
+
+def scene_cases() -> Iterator[HardNumber]:
+    """A row for each scene of `JUMPS`."""
+    for scene, frames in JUMPS.items():
+        checked = configure(Request(scene, runtime=RUNTIME), Path.cwd())
+        last = checked.config.scene.frames - 1
+        numbers = [min(frame, last) for frame in frames]
+        name = f"{scene}: frames {', '.join(map(str, numbers))} one after the other"
+        yield HardNumber(name, float(_differing(checked, numbers)), 0.0, "bytes of the tensor", EXACT)
+
+
+def _differing(checked: Checked, numbers: list[int]) -> int:
+    """How many bytes of the tensors differ from those of stages that drew no other frame."""
+    used, found = DrawnTensors(checked), 0
+    for number in numbers:
+        after, fresh = used.tensor(number), DrawnTensors(checked).tensor(number)
+        found += after.size if after.shape != fresh.shape else int(np.count_nonzero(after != fresh))
+    return found

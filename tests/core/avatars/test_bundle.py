@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from support.small_inputs import net
 from trilane.avatars.bundle import Bundle, bundle_folder, load_bundle, write_bundle
 from trilane.avatars.manifest import BANDS, Manifest, NetworkEntry, network_entry, parse_manifest
 from trilane.avatars.network_file import check_network
 from trilane.errors import BadInputError
-from trilane.testing.byte_network import net
 
 
 @pytest.fixture

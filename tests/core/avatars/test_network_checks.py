@@ -11,6 +11,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
+from support.small_inputs import net, node_of
 from trilane.avatars import network_file
 from trilane.avatars.network_file import (
     FLOAT_LAYERS_KEY,
@@ -23,7 +24,6 @@ from trilane.avatars.network_file import (
     node_name,
 )
 from trilane.errors import BadInputError
-from trilane.testing.byte_network import net, node_of
 
 Change = Callable[[onnx.ModelProto], None]
 

@@ -10,10 +10,10 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
+from support.small_inputs import net
 from trilane.avatars import network_file
 from trilane.avatars.network_file import check_network, constants_of, parse_network, read_network
 from trilane.errors import BadInputError
-from trilane.testing.byte_network import net
 
 
 def initializer(model, name):

@@ -14,12 +14,12 @@ import pytest
 from onnx import helper, numpy_helper
 from typer.testing import CliRunner
 
+from support.small_inputs import net, node_of
 from trilane.apps.cli.avatar import app
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import NetworkFile, check_network, reshaped
 from trilane.avatars.network_split import Cut, cuts, split
 from trilane.errors import BadInputError
-from trilane.testing.byte_network import net, node_of
 
 QUIET = 3
 

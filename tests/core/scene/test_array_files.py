@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from support.joint_chain import chained_places, degrees_between, limb_directions
 from trilane.body.joints import JOINT_NAMES
 from trilane.errors import BadInputError
 from trilane.scene.motion.array_files import load_npy, load_npz, load_pickle, places_in
@@ -20,7 +21,6 @@ from trilane.scene.motion.motion import REST_PELVIS, SMPL_REST_PELVIS, T_POSE, M
 from trilane.scene.motion.recorded import RawMotion
 from trilane.scene.rotations import matrix_from_rotvec
 from trilane.scene.schema import AvatarSpec
-from trilane.testing.joint_chain import chained_places, degrees_between, limb_directions
 
 ROWS = np.arange(4 * 72).reshape(4, 72) / 1000.0
 PLACES = np.arange(12.0).reshape(4, 3)

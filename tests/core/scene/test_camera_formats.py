@@ -13,15 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from trilane.errors import BadInputError
-from trilane.scene.camera import json_files
-from trilane.scene.camera.colmap import MODELS, checked_camera
-from trilane.scene.camera.path import axes_towards
-from trilane.scene.camera.recorded import LengthUnit, looked_at_from, metres_per_unit
-from trilane.scene.lens import Bent, Lens, distortion_note, largest_px
-from trilane.scene.rotations import about
-from trilane.scene.schema import CameraSpec
-from trilane.testing.camera_files import (
+from support.camera_files import (
     EUROC_NAMES,
     LENS,
     WRITERS,
@@ -36,6 +28,14 @@ from trilane.testing.camera_files import (
     write_record3d,
     write_stray,
 )
+from trilane.errors import BadInputError
+from trilane.scene.camera import json_files
+from trilane.scene.camera.colmap import MODELS, checked_camera
+from trilane.scene.camera.path import axes_towards
+from trilane.scene.camera.recorded import LengthUnit, looked_at_from, metres_per_unit
+from trilane.scene.lens import Bent, Lens, distortion_note, largest_px
+from trilane.scene.rotations import about
+from trilane.scene.schema import CameraSpec
 
 TURNS = about(1, np.linspace(0.0, 0.8, 5)) @ about(0, -0.1)
 PLACES = np.column_stack([np.linspace(0, 1, 5), np.full(5, 1.5), np.linspace(2, 3, 5)])

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from support.camera_files import load
 from trilane.scene.camera.path import CameraPath, look_at, one_lens, projection_matrix, view_from_pose
 from trilane.scene.lens import Known, Lens, PictureCut, centred, cover, of_fov_x, of_fov_y
 from trilane.scene.motion.motion import Wrap
-from trilane.testing.camera_files import load
 
 BUILT_IN = [
     ("orbit", 0.93, 1.35, 3.9, 3.4, 28.0, 20.0, "whole person, going round, coming nearer"),

@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from support.camera_files import OPTICAL, lines_of, load, nerf_text, pose_z_up
+from trilane.apps.comparison.rows import rows_of
 from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.scene.camera import pose_table
@@ -17,7 +19,6 @@ from trilane.scene.camera.files import load_camera
 from trilane.scene.camera.pose_table import TableLayout, elapsed, layout_of, read_table
 from trilane.scene.rotations import Y_UP_FROM_Z_UP, about, matrix_from_quat, quat_from_matrix
 from trilane.scene.schema import CameraSpec
-from trilane.testing.camera_files import OPTICAL, lines_of, load, nerf_text, pose_z_up, rows_of
 
 COUNT = 60
 STEPS = np.linspace(0.0, 1.0, COUNT)

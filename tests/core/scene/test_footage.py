@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from support.camera_files import WRITERS, load
 from trilane.scene.camera.path import CameraPath, Optics
 from trilane.scene.footage import Footage, Stored, cut_note, film_of, filmed, in_order
 from trilane.scene.lens import Known, Lens, centred
 from trilane.scene.motion.motion import Wrap
-from trilane.testing.camera_files import WRITERS, load
 
 LENS = centred(640, 480, 500)
 OUTPUT = (480, 640)

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from support.joint_chain import chained_places, degrees_between, limb_directions
 from trilane.errors import BadInputError
 from trilane.scene.camera.files import load_camera
 from trilane.scene.motion.builtin import walk_wave_turn
@@ -21,7 +22,6 @@ from trilane.scene.motion.files import as_played, load_motion
 from trilane.scene.motion.motion import REST_PELVIS, SMPL_REST_PELVIS, T_POSE, Motion, Wrap, wrapped_time
 from trilane.scene.rotations import about, matrix_from_rotvec, rotvec_from_matrix
 from trilane.scene.schema import AvatarSpec, CameraSpec, scene_from
-from trilane.testing.joint_chain import chained_places, degrees_between, limb_directions
 
 HALF = np.pi / 2
 

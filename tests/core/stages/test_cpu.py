@@ -13,6 +13,7 @@ import av
 import numpy as np
 import pytest
 
+from support.small_pipeline import assets_of, without_bytes
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M
 from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import FrameSkinner
@@ -31,8 +32,6 @@ from trilane.stages.cpu import present as present_stage
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.cpu.pose import PoseStage
 from trilane.stages.cpu.present import PresentStage, Segment
-from trilane.testing.assets import assets_of
-from trilane.testing.told_bytes import without_bytes
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 # --- crop ------------------------------------------------------------------------------------------------------------

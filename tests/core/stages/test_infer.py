@@ -18,6 +18,7 @@ import onnxruntime
 import pytest
 from onnx import helper
 
+from support.small_pipeline import assets_of
 from trilane import machine
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import constants_of, reshaped
@@ -30,7 +31,6 @@ from trilane.stages.config import NetworkCut, RunConfig, pose_dtype
 from trilane.stages.dsp import cuda, infer, ort, runtime
 from trilane.stages.dsp.infer import InferStage, build
 from trilane.stages.dsp.runtime import RUNTIMES, RuntimeOptions, copies_slots
-from trilane.testing.assets import assets_of
 from trilane.transport.packets import SlotLayout, view_packet
 
 

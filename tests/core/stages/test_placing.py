@@ -13,7 +13,7 @@ import numpy as np
 import psutil
 import pytest
 
-from trilane.bench.lib.rank_correlation import rank_correlation
+from trilane.bench.placement import rank_correlation
 from trilane.machine import Machine
 from trilane.pipeline import other_programs
 from trilane.pipeline.other_programs import OtherPrograms, busy_s

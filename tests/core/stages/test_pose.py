@@ -12,6 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from support.small_pipeline import EDGES, OWN, assets_of, packets, pipeline, without_bytes
+from trilane.bench.handoff import STAGES
 from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.bound_stage import BoundStage
@@ -26,9 +28,6 @@ from trilane.stages.config import RunConfig, pose_dtype
 from trilane.stages.cpu.pose import PoseStage, build
 from trilane.stages.cpu.present import PresentStage
 from trilane.stages.gpu.composite import DrawnFrames
-from trilane.testing.assets import assets_of
-from trilane.testing.small_pipeline import EDGES, OWN, STAGES, packets, pipeline
-from trilane.testing.told_bytes import without_bytes
 from trilane.transport.packets import Packet, SlotLayout, header_dtype, view_packet
 
 OUTPUT = (480, 640)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from support.small_pipeline import without_bytes
 from trilane.apps import video
 from trilane.apps.video import contact_sheet, join_segments, run_checksum
 from trilane.pipeline.description import UnitSettings
@@ -19,7 +20,6 @@ from trilane.pipeline.moved_bytes import BYTES
 from trilane.scene.schema import OutputSpec, Scene
 from trilane.stages.config import RunConfig, pose_dtype
 from trilane.stages.cpu.present import SEGMENTS, PresentStage
-from trilane.testing.told_bytes import without_bytes
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 WIDTH, HEIGHT, FPS = 96, 64, 30.0

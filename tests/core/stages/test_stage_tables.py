@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from support.small_pipeline import assets_of
 from trilane import machine
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_split import cuts
@@ -32,7 +33,6 @@ from trilane.stages.dsp.infer import crossing_bytes
 from trilane.stages.dsp.runtime import RuntimeOptions
 from trilane.stages.gpu.composite import CompositeStage
 from trilane.stages.gpu.raster import RasterStage
-from trilane.testing.assets import assets_of
 from trilane.transport.packets import Packet
 
 

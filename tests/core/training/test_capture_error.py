@@ -13,11 +13,11 @@ import pytest
 
 pytest.importorskip("skimage")
 
+from support.small_inputs import write_capture_folder
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.manifest import CAPTURED
 from trilane.avatars.validation import refused
 from trilane.errors import BadInputError
-from trilane.testing.capture_folder import write_capture_folder
 from trilane.training import train
 from trilane.training.capture.capture import open_capture
 from trilane.training.capture.capture_samples import CaptureRenderer, ViewRule, moved, projected

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from support.small_inputs import CAMERA, HEIGHT, WIDTH, fit, write_capture_folder
 from trilane.body.body import ShapedBody
 from trilane.errors import BadInputError
-from trilane.testing.capture_folder import CAMERA, HEIGHT, WIDTH, fit, write_capture_folder
 from trilane.training.capture import check
 from trilane.training.capture.capture import frames_by_side, open_capture, side_of, widest_gap_deg
 from trilane.training.capture.capture_file import (

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from support.small_inputs import write_capture_folder
 from trilane.body.body import ShapedBody
 from trilane.body.joints import JOINT_INDEX
 from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError
 from trilane.scene.lens import Lens
-from trilane.testing.capture_folder import write_capture_folder
 from trilane.training import subject
 from trilane.training.capture import capture_samples
 from trilane.training.capture.capture import Capture, open_capture
