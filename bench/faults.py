@@ -27,7 +27,8 @@ from trilane.pipeline.run import run_pipeline
 from trilane.pipeline.shared_assets import Assets
 from trilane.scheduler.events import UnitDied, UnitReady
 from trilane.stages.avatar_pipeline import avatar_pipeline
-from trilane.stages.configure import Request, configure
+from trilane.stages.configure import configure
+from trilane.stages.run_options import RunOptions
 from trilane.units import UNITS
 
 FAULTS = ("kill", "stop")
@@ -63,7 +64,7 @@ def measure(
     """
     _check(unit, fault, times, seconds, fps, stop_s, hang_s)
     frames = round(seconds * fps)
-    checked = configure(Request(size=size, avatar=avatar, frames=frames, runtime=runtime), Path.cwd())
+    checked = configure(RunOptions(size=size, avatar=avatar, frames=frames, runtime=runtime), Path.cwd())
     rows = []
     for name, kind in product(unit, fault):
         signals = Signals(name, _moments(kind, times, seconds, stop_s, seed))

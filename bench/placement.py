@@ -35,10 +35,11 @@ from trilane.scheduler.stats import median_interval
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.choosing import choice
-from trilane.stages.configure import Checked, Request, configure
+from trilane.stages.configure import Checked, configure
 from trilane.stages.factories import PRELOAD
 from trilane.stages.placing import FIRST, considered, times_rows
 from trilane.stages.rehearsing import measured_times, tried
+from trilane.stages.run_options import RunOptions
 from trilane.units import BURST
 
 MIN_FRAMES = 20
@@ -87,7 +88,7 @@ def measure(
     folder = str(full_width.full_width_bundle()) if avatar == full_width.NAME else avatar
     with UnitStarter(PRELOAD) as starter:
         for tensor in size:
-            checked = configure(Request(size=tensor, avatar=folder, frames=frames, runtime=runtime), Path.cwd())
+            checked = configure(RunOptions(size=tensor, avatar=folder, frames=frames, runtime=runtime), Path.cwd())
             for count in counts:
                 trial = _Trial(checked, host_cores(usable_cores()[:count]), starter)
                 trial.run(rounds, finalists, further, runs)

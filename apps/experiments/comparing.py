@@ -106,13 +106,15 @@ class _Runs:
         self._count = 0
 
     def run(self, policy: str = "pipelined", held_ns: int = 0) -> Side:
-        from trilane.apps.asked_run import AskedRun, run_asked
+        from trilane.apps.asked_run import run_asked
+        from trilane.stages.run_options import RunOptions
 
         self._count += 1
         out = self._folder / str(self._count)
-        request = {"frames": self._frames, "size": self._size, "policy": policy, "cores": self.cores}
-        held = {STAGE: held_ns} if held_ns else {}
-        run_asked(AskedRun(request, baseline_frames=0, held_ns=held, out=out, command=("trilane", "bench")), quiet)
+        options = RunOptions(
+            frames=self._frames, size=self._size, policy=policy, cores=self.cores, baseline_frames=0, out=out
+        )
+        run_asked(options, quiet, ("trilane", "bench"), {STAGE: held_ns} if held_ns else {})
         return read_side(str(out))
 
     def pin(self, side: Side) -> None:

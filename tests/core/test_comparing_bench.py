@@ -10,23 +10,23 @@ from typing import Any
 import pytest
 
 from trilane.apps import asked_run
-from trilane.apps.asked_run import AskedRun
 from trilane.apps.experiments import comparing
 from trilane.errors import BadInputError
+from trilane.stages.run_options import RunOptions
 from trilane.testing.compared_runs import STAGES, simulated, write_run
 from trilane.testing.run_report import SHARE
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[AskedRun]:
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[RunOptions, dict[str, int]]]:
     """Every run that is asked for; it is simulated, and a held stage takes as long as it is held."""
-    seen: list[AskedRun] = []
+    seen: list[tuple[RunOptions, dict[str, int]]] = []
 
-    def run(wanted: AskedRun, _hooks: Any) -> None:
-        seen.append(wanted)
+    def run(wanted: RunOptions, _hooks: Any, _command: Any, held_ns: dict[str, int]) -> None:
+        seen.append((wanted, held_ns))
         assert wanted.out is not None
-        factors = {stage: ns / 9e6 for stage, ns in wanted.held_ns.items()}
-        done = simulated(len(seen), policy=wanted.request["policy"], frames=wanted.request["frames"], factors=factors)
+        factors = {stage: ns / 9e6 for stage, ns in held_ns.items()}
+        done = simulated(len(seen), policy=wanted.policy, frames=wanted.frames or 0, factors=factors)
         cores = {"cpu": [0], "gpu": [1], "dsp": [0, 1]}
         units = {unit: {**SHARE, **row, "cores": cores[unit]} for unit, row in done.report["units"].items()}
         write_run(wanted.out, done, units=units, other_programs=0.25)
@@ -35,7 +35,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[AskedRun]:
     return seen
 
 
-def test_pairs_a_policy_and_a_held_stage(asked: list[AskedRun]) -> None:
+def test_pairs_a_policy_and_a_held_stage(asked: list[tuple[RunOptions, dict[str, int]]]) -> None:
     said = comparing.measure(pairs=2, frames=80)
     assert (said["pairs"], said["starvation_named"], said["stage_named"]) == (2, True, True)
     assert said["outcomes"] == {"differs": 0, "no difference": 2, "cannot tell": 0}
@@ -43,12 +43,12 @@ def test_pairs_a_policy_and_a_held_stage(asked: list[AskedRun]) -> None:
     assert [*said["scatter"].values()] == pytest.approx(wanted) and [*said["scatter"]] == [*STAGES]
     assert [row["question"] for row in said["rows"]] == ["same", "same", "sequential", "held"]
     assert {row["others"] for row in said["rows"]} == {0.25}
-    assert [wanted.request["policy"] for wanted in asked].count("sequential") == 1
-    assert asked[0].request["cores"] == ()
-    assert {wanted.request["cores"] for wanted in asked[1:]} == {("cpu=0", "gpu=1", "dsp=0,1")}
-    base, longer = (wanted.held_ns["infer"] for wanted in asked[-2:])
+    assert [wanted.policy for wanted, _ in asked].count("sequential") == 1
+    assert asked[0][0].cores == ()
+    assert {wanted.cores for wanted, _ in asked[1:]} == {("cpu=0", "gpu=1", "dsp=0,1")}
+    base, longer = (held_ns["infer"] for _, held_ns in asked[-2:])
     assert (longer, said["config"]["held_ms"]) == (round(1.05 * base), base / 1e6)
-    assert not any(Path(str(wanted.out)).exists() for wanted in asked)
+    assert not any(Path(str(wanted.out)).exists() for wanted, _ in asked)
 
 
 def typical(seed: int, stage: str) -> float:

@@ -15,15 +15,15 @@ from trilane.errors import BadInputError
 from trilane.pipeline.result import Failure
 from trilane.scheduler.events import UnitDied, UnitReady
 from trilane.scheduler.ledger import JobRecord
-from trilane.stages.configure import Request
+from trilane.stages.run_options import RunOptions
 from trilane.testing.told_results import ToldConfig, result_of
 
 MS = 1_000_000
 
 
 @pytest.fixture
-def configured(monkeypatch: pytest.MonkeyPatch) -> list[Request]:
-    asked: list[Request] = []
+def configured(monkeypatch: pytest.MonkeyPatch) -> list[RunOptions]:
+    asked: list[RunOptions] = []
     monkeypatch.setattr(faults, "configure", lambda request, _: asked.append(request) or ToldConfig(request))
     return asked
 
@@ -79,7 +79,7 @@ def test_the_row_of_a_run_under_signals_by_hand() -> None:
     assert (row["ready_ms"], row["back_ms"], row["back_max_ms"], row["not_back"]) == (None, None, None, 0)
 
 
-def test_faults_run_every_unit_under_every_fault(monkeypatch: pytest.MonkeyPatch, configured: list[Request]) -> None:
+def test_faults_run_every_unit_under_every_fault(monkeypatch: pytest.MonkeyPatch, configured: list[RunOptions]) -> None:
     seen: list[Any] = []
 
     def run_under(signals: faults.Signals, *asked: Any) -> dict[str, Any]:
@@ -110,7 +110,7 @@ def test_faults_run_every_unit_under_every_fault(monkeypatch: pytest.MonkeyPatch
         "accuracy": {"x": "accuracy of x"},
         "config": {"seconds": 20.0, "fps": 12.5, "size": "256x256", "runtime": "told", "seed": 4},
     }
-    assert configured == [Request(size="256x256", avatar="x", frames=250, runtime="auto")]
+    assert configured == [RunOptions(size="256x256", avatar="x", frames=250, runtime="auto")]
     assert [(signals.unit, signals.moments) for signals, _ in seen] == [
         (unit, faults._moments(fault, 3, 20.0, 2.0, 4)) for unit, fault in pairs
     ]

@@ -13,7 +13,8 @@ import numpy as np
 
 from trilane.apps.experiments.drawn_tensors import DrawnTensors
 from trilane.apps.experiments.hard_numbers.hard_number import EXACT, HardNumber
-from trilane.stages.configure import Checked, Request, configure
+from trilane.stages.configure import Checked, configure
+from trilane.stages.run_options import RunOptions
 
 #: Scene -> frames, each as unlike the one before as the scene has them.
 JUMPS = {"walk-past": (0, 180, 30, 299, 0), "leave-and-return": (0, 150, 20, 240), "top-to-floor": (0, 90, 180, 0)}
@@ -23,7 +24,7 @@ RUNTIME = "ort"
 def scene_cases() -> Iterator[HardNumber]:
     """A row for each scene of `JUMPS`."""
     for scene, frames in JUMPS.items():
-        checked = configure(Request(scene, runtime=RUNTIME), Path.cwd())
+        checked = configure(RunOptions(scene=scene, runtime=RUNTIME), Path.cwd())
         last = checked.config.scene.frames - 1
         numbers = [min(frame, last) for frame in frames]
         name = f"{scene}: frames {', '.join(map(str, numbers))} one after the other"

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from trilane.scheduler.ledger import JobRecord
-from trilane.stages.configure import Request
+from trilane.stages.run_options import RunOptions
 
 
 class ToldConfig:
@@ -14,7 +14,7 @@ class ToldConfig:
 
     runtime = "told"
 
-    def __init__(self, request: Request, **values: Any) -> None:
+    def __init__(self, request: RunOptions, **values: Any) -> None:
         self.request, self.values = request, values
         self.accuracy = {request.avatar: f"accuracy of {request.avatar}"}
         self.assets = f"assets of {request.avatar}"
