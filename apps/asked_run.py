@@ -6,134 +6,81 @@ so what this process needs is imported inside.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING
 
-from trilane.apps.remake import Remake, check_remake
 from trilane.errors import BadInputError
+from trilane.stages.run_options import RunOptions
 
 if TYPE_CHECKING:
-    from trilane.apps.run_job import Hooks, Outcome, Plan, Watched
+    from trilane.apps.run_job import Hooks, Outcome, Prepared, Watched
     from trilane.pipeline.unit_starter import UnitStarter
-    from trilane.stages.configure import Checked, GlFacts, Request
-
-MOST_LATCH_MS: Final = 1000
-MOST_CHECKED: Final = 1000
+    from trilane.stages.configure import Checked, GlFacts
 
 
-@dataclass(frozen=True)
-class AskedRun:
-    """What was asked for.
-
-    `request`: fields of `trilane.stages.configure.Request`; what is not there is as it has it.
-    `edge`: rule of every edge.
-    `baseline_frames`: of the `sequential` run that follows; 0: none.
-    `paced_by`: a chip at whose pace jobs are held, and how many times slower; None: as fast as it goes.
-    `performance_profile`: whose caps hold; None: no cap.
-    `latch_ms`: how long before it is needed a pose is sampled.
-    `out`: the run folder; None: `runs/TIME-SCENE`.
-    `command`: the words by which it was asked for.
-    `has_video`: whether the presented pictures are digested and encoded; not for runs that last.
-    `check`: how many of its frames are compared with the truth or the float path when it is over; 0: none.
-    `remake`: what of the avatar is made anew for the run.
-    """
-
-    request: Mapping[str, Any] = field(default_factory=dict)
-    edge: str = "double"
-    baseline_frames: int = 60
-    paced_by: tuple[str, float] | None = None
-    performance_profile: str | None = None
-    latch_ms: float = 0.0
-    out: Path | None = None
-    command: tuple[str, ...] = ()
-    has_video: bool = True
-    check: int = 0
-    remake: Remake = field(default_factory=Remake)
-
-
-def check_numbers(asked: AskedRun) -> None:
-    """Raises BadInputError for numbers of what was asked for that are none, or outside of what holds."""
-    latch_ms, frames, check = asked.latch_ms, asked.baseline_frames, asked.check
-    if not _is_number(latch_ms, (int, float)) or not 0 <= latch_ms <= MOST_LATCH_MS:  # NaN is not either
-        raise BadInputError("latch_ms", repr(latch_ms), f"milliseconds, from 0 to {MOST_LATCH_MS}")
-    if not _is_number(frames, (int,)) or frames < 0:
-        raise BadInputError("baseline_frames", repr(frames), "a whole number of frames, 0 or more")
-    if not _is_number(check, (int,)) or not 0 <= check <= MOST_CHECKED:
-        raise BadInputError("check", repr(check), f"a whole number of frames, from 0 to {MOST_CHECKED}")
-    check_remake(asked.remake)
-
-
-def _is_number(value: object, kinds: tuple[type, ...]) -> bool:
-    """A program hands over anything; a truth value is no number."""
-    return isinstance(value, kinds) and not isinstance(value, bool)
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """What was `asked` for, `checked`, and how it is to be run."""
-
-    asked: AskedRun
-    checked: Checked
-    plan: Plan
-
-
-def run_asked(asked: AskedRun, hooks: Callable[[], AbstractContextManager[Hooks]]) -> Outcome:
-    """Check what was asked for, run it and leave its run folder.
+def run_asked(
+    options: RunOptions,
+    hooks: Callable[[], AbstractContextManager[Hooks]],
+    command: tuple[str, ...] = (),
+) -> Outcome:
+    """Check the options, run what they ask for and leave its run folder.
 
     `hooks`: opened when the input is checked and the units start.
+    `command`: as `prepare` takes it.
     Raises BadInputError and MissingPartError for what cannot be run, TrilaneError when no frame was presented.
     """
-    check_numbers(asked)
+    options.check_together()
     with early_processes() as (starter, gl):
-        return run_prepared(prepare(asked, gl), hooks=hooks, starter=starter, gl=gl)
+        return run_prepared(prepare(options, gl, command), hooks=hooks, starter=starter, gl=gl)
 
 
-def prepare(asked: AskedRun, gl: GlFacts) -> Prepared:
-    """Check what was asked for. Raises BadInputError and MissingPartError for what cannot be run."""
-    check_numbers(asked)
-    from trilane.apps.run_job import Plan
-    from trilane.stages.configure import Request, configure, requested_edge
+def prepare(options: RunOptions, gl: GlFacts, command: tuple[str, ...] = ()) -> Prepared:
+    """Check the options. Raises BadInputError and MissingPartError for what cannot be run.
 
-    rule, request = requested_edge(asked.edge), Request(**asked.request)
-    said: tuple[str, ...] = ()
-    if asked.remake.is_asked:
-        request, remade = _with_remade_avatar(request, asked.remake, is_checked=asked.check > 0)
-        said = (remade,)
-    checked = configure(request, Path.cwd(), gl)
+    `command`: words by which the run was asked for.
+    """
+    options.check_together()
+    from trilane.apps.run_job import Prepared
+    from trilane.stages.configure import configure
+
+    requested, said = _with_remade_avatar(options) if options.remakes_avatar else (options, ())
+    checked = configure(requested, Path.cwd(), gl)
     if said:
         checked = replace(checked, notes=(*said, *checked.notes))
-    plan = Plan(request.policy, asked.baseline_frames, None, asked.performance_profile, asked.latch_ms, rule)
-    if asked.check:
+    if options.check:
         _require_check(checked)
-        plan = replace(plan, check=asked.check)
-    if asked.paced_by is not None:
+    pace = None
+    if options.profile is not None:
         from trilane.apps.pace import pace_of
 
-        pace = pace_of(checked.config, *asked.paced_by)
-        plan, checked = replace(plan, pace=pace), checked.changed(pace_ns=dict(pace.stage_ns))
-    if not asked.has_video:
+        pace = pace_of(checked.config, options.profile, options.slow_motion)
+        checked = checked.changed(pace_ns=dict(pace.stage_ns))
+    if not options.video:
         checked = checked.changed(record=False)
-    return Prepared(asked, checked, plan)
+    return Prepared(options, checked, pace, command)
 
 
-def _with_remade_avatar(request: Request, remake: Remake, *, is_checked: bool) -> tuple[Request, str]:
-    """`request` with the avatar made anew, and a sentence on it. Raises BadInputError, MissingPartError."""
+def _with_remade_avatar(options: RunOptions) -> tuple[RunOptions, tuple[str, ...]]:
+    """`options` with the folder of the avatar that they ask for, and a sentence on it.
+
+    Raises BadInputError, MissingPartError.
+    """
     from trilane.apps.remade_avatar import is_untrained, remade_avatar
     from trilane.avatars.bundle import load_bundle
     from trilane.stages.configure import requested_scene
 
-    avatars = requested_scene(request).avatars
+    avatars = requested_scene(options).avatars
     if len(avatars) > 1:
         expected = "one avatar, whose network is made anew"
         raise BadInputError("--width, --channels, --calibration", f"a scene of {len(avatars)} avatars", expected)
-    folder, said = remade_avatar(str(avatars[0].bundle), remake)
-    if is_checked and is_untrained(load_bundle(folder)):
+    folder, said = remade_avatar(str(avatars[0].bundle), options)
+    if options.check and is_untrained(load_bundle(folder)):
         raise BadInputError("--check", "a network that is made untrained", "pictures that mean something")
-    return replace(request, avatar=str(folder)), f"avatar: {said}"
+    return options.changed(avatar=folder), (f"avatar: {said}",)
 
 
 def _require_check(checked: Checked) -> None:
@@ -177,17 +124,14 @@ def run_prepared(
     from trilane.apps.run_job import run_to_folder
     from trilane.stages.configure import required_machine
 
-    asked, checked, plan = prepared.asked, prepared.checked, prepared.plan
-    target = asked.out or default_place(checked.config.scene.name)
+    target = prepared.options.out or default_place(prepared.checked.config.scene.name)
     with hooks() as told:
-        for note in checked.notes:
+        for note in prepared.checked.notes:
             told.message(note)
         try:
-            made = made_facts(list(asked.command))
+            made = made_facts(prepared.command)
             machine = required_machine(gl)
-            return run_to_folder(
-                checked, target, plan, told, machine=machine, made=made, starter=starter, watched=watched
-            )
+            return run_to_folder(prepared, target, told, machine=machine, made=made, starter=starter, watched=watched)
         except KeyboardInterrupt:
             told.message("interrupted: nothing was written")
             raise

@@ -21,7 +21,8 @@ from trilane.scene.planner import FrameWork
 from trilane.scene.schema import ENDING
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import network_of
-from trilane.stages.configure import Request, configure
+from trilane.stages.configure import configure
+from trilane.stages.run_options import RunOptions
 from trilane.units import INFER, UnitName
 
 NETWORK_ENDING = ".onnx"
@@ -102,7 +103,7 @@ def _bare(each: Asked, name: str) -> Tenant:
 
 
 def _avatar(each: Asked, name: str, variant: Variant) -> Tenant:
-    checked = configure(Request(each.what, skinning="gpu"), Path.cwd())
+    checked = configure(RunOptions(scene=each.what, skinning="gpu"), Path.cwd())
     scene, file = checked.config.scene, network_of(checked.assets)
     plan = ScenePlan(checked.config, checked.assets)
     plans = [plan.decide(frame).plan for frame in range(min(scene.frames, MOST_FRAMES))]

@@ -17,10 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.apps.asked_run import AskedRun, run_asked
+from trilane.apps.asked_run import run_asked
 from trilane.apps.explained.job_table import COLUMNS, figure_names, job_rows
 from trilane.apps.explained.run import explain_run, explained_jobs, open_journal
-from trilane.apps.remake import Remake
 from trilane.apps.report import Report, read_report
 from trilane.apps.run_html import prediction_html, run_html
 from trilane.errors import BadInputError, MissingPartError, TrilaneError, did_you_mean
@@ -28,13 +27,15 @@ from trilane.pipeline.journal import Record, Stepped
 from trilane.pipeline.journal_slices import JournalSlices
 from trilane.scheduler.accounts import IdleSlice
 from trilane.scheduler.events import Event
-from trilane.scheduler.policy import POLICIES
+from trilane.stages.run_options import RunOptions
 from trilane.units import PERFORMANCE_PROFILES
 
 if TYPE_CHECKING:
     import pandas
 
 INTERRUPTED = 130
+#: Defaults of a program's run that are not those of the command line.
+DEFAULTS = {"baseline_frames": 0}
 FRAME_TYPE = np.dtype(
     [("frame", np.int64), ("presented_ns", np.int64), ("frame_ns", np.int64), ("latency_ns", np.int64)]
 )
@@ -141,71 +142,29 @@ def load_run(folder: str | Path) -> Run:
 def run(
     scene: str | Path = "default",
     *,
-    frames: int | None = None,
-    size: int | str | None = None,
-    policy: str = "pipelined",
-    edge: str = "double",
-    avatar: str | Path | None = None,
-    motion: str | Path | None = None,
-    camera: str | Path | None = None,
-    background: str | Path | None = None,
-    fps: float | None = None,
-    output: str | None = None,
-    runtime: str = "auto",
-    cores: Mapping[str, Sequence[int]] | None = None,
-    performance_profile: str | None = None,
-    latch_ms: float = 0.0,
-    baseline_frames: int = 0,
-    check: int = 0,
-    width: int | None = None,
-    channels: int | None = None,
-    calibration: str | None = None,
-    out: str | Path | None = None,
     on_progress: Callable[[str, int, int], None] | None = None,
     on_message: Callable[[str], None] | None = None,
+    **options: Any,
 ) -> Run:
     """Run a scene on the three units, each a process of its own, and load what it wrote.
 
-    `scene`: a scene file, or the name of one that comes with Trilane. The other arguments are the options of
-    `trilane run` of that name; None leaves what the scene says.
-    `cores`: numbers of the cores of a unit, such as {"dsp": [0, 1]}; else they follow from measured times.
-    `baseline_frames`: of a `sequential` run that follows, to compare with.
-    `check`: how many of its frames are compared with the truth or the float path when it is over; the report's
-    `check` is the error of this run then (extra `metrics`).
-    `width`, `channels`, `calibration`: of an avatar made anew, as `trilane run` takes them (docs/sweeps.md).
-    `out`: the run folder to write, runs/TIME-SCENE below the working directory where it is None.
+    `scene`: a scene file, or the name of one that comes with Trilane.
+    `options`: fields of `trilane.stages.run_options.RunOptions`; `trilane run --help` explains them. None leaves what
+    the scene says. No `sequential` run follows unless `baseline_frames` asks for one.
+    `cores` may be a mapping, such as {"dsp": [0, 1]}.
     `on_progress(policy, presented, requested)`, `on_message(text)`: called from this thread.
     Raises BadInputError and MissingPartError for what cannot be run, RunFailedError for a run that ended early and
     keeps its folder, TrilaneError for one that presented no frame, KeyboardInterrupt after an interrupted one was
     written.
     """
-    given = _given(locals())
-    _check_name("policy", policy, POLICIES)
-    if performance_profile is not None:
-        _check_name("performance_profile", performance_profile, PERFORMANCE_PROFILES)
     from trilane.apps.run_job import Hooks
 
-    paths = {"scene": scene, "avatar": avatar, "motion": motion, "camera": camera, "background": background}
-    request = {
-        **{name: None if value is None else str(value) for name, value in paths.items()},
-        "frames": frames,
-        "size": None if size is None else str(size),
-        "policy": policy,
-        "fps": fps,
-        "output": output,
-        "runtime": runtime,
-        "cores": tuple(f"{unit}={','.join(map(str, own))}" for unit, own in (cores or {}).items()),
-    }
-    command = ("trilane.run", *(f"{name}={value!r}" for name, value in given.items()))
-    place = None if out is None else _place("out", out)
-    remake = Remake(width, channels, calibration)
-    asked = AskedRun(
-        *(request, edge, baseline_frames, None, performance_profile, latch_ms, place, command),
-        check=check,
-        remake=remake,
-    )
+    parameters = inspect.signature(run).parameters
+    given = inspect.signature(run).bind(scene, **options).arguments
+    asked = RunOptions.checked(DEFAULTS | given)
+    told = (f"{name}={value!r}" for name, value in given.items() if value != parameters[name].default)
     hooks = Hooks(on_progress or (lambda *_: None), on_message or (lambda _: None))
-    outcome = run_asked(asked, lambda: nullcontext(hooks))
+    outcome = run_asked(asked, lambda: nullcontext(hooks), ("trilane.run", *told))
     done = Run(outcome.folder, outcome.report)
     if outcome.exit_code == INTERRUPTED:
         raise KeyboardInterrupt(f"what was done is in {outcome.folder}")
@@ -213,6 +172,22 @@ def run(
         message = outcome.report.failure or "the run ended early"
         raise RunFailedError(f"{message}; what was done is in {outcome.folder}", done, outcome.exit_code)
     return done
+
+
+def _signature() -> inspect.Signature:
+    """The parameters of `run`, with one for each option."""
+    scene, *told, _ = inspect.signature(run, eval_str=True).parameters.values()
+    options = [
+        inspect.Parameter(
+            name, scene.KEYWORD_ONLY, default=DEFAULTS.get(name, field.default), annotation=field.annotation
+        )
+        for name, field in RunOptions.model_fields.items()
+        if name != scene.name
+    ]
+    return inspect.Signature([scene, *options, *told], return_annotation=Run)
+
+
+run.__signature__ = _signature()  # type: ignore[attr-defined]
 
 
 @dataclass(frozen=True)
@@ -326,13 +301,6 @@ def _place(where: str, given: str | Path) -> Path:
     if isinstance(given, str) and not given.strip():
         raise BadInputError(where, repr(given), "the name of a folder")
     return Path(given)
-
-
-def _given(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """The arguments of `run` that are not what they are by default, and tell of the run."""
-    defaults = {name: parameter.default for name, parameter in inspect.signature(run).parameters.items()}
-    told = {name: value for name, value in arguments.items() if not name.startswith("on_")}
-    return {name: value for name, value in told.items() if value != defaults[name]}
 
 
 def _check_name(where: str, name: str, names: Sequence[str] | Mapping[str, Any]) -> None:

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.apps.remake import METHOD, VIEWS, Remake, calibration_of
 from trilane.arrays import F32
 from trilane.avatars.bundle import MANIFEST, TEXTURE_KEYS, Bundle, load_bundle, write_bundle
 from trilane.avatars.manifest import UNTRAINED, Manifest, digests_of, network_entry, sha256_of
@@ -27,6 +26,7 @@ from trilane.bench.lib.full_network import float_weights, weights_name
 from trilane.cache import cache_dir
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
 from trilane.files import read_npz
+from trilane.stages.run_options import METHOD, VIEWS, RunOptions, calibration_of
 
 if TYPE_CHECKING:
     import onnx
@@ -41,7 +41,7 @@ VERSION = 1
 
 @dataclass(frozen=True)
 class _Recipe:
-    """A `Remake` of one avatar, complete. `trained`: whether width and channels are the avatar's own."""
+    """What of an avatar is made anew, complete. `trained`: whether width and channels are the avatar's own."""
 
     width: int
     channels: int
@@ -54,14 +54,14 @@ class _Recipe:
         return calibrated if self.trained else f"width {self.width}, {self.channels} channels, untrained; {calibrated}"
 
 
-def remade_avatar(name: str, remake: Remake) -> tuple[Path, str]:
-    """The folder of avatar `name` made anew by `remake`, made now where it is not kept, and a sentence on what it is.
+def remade_avatar(name: str, options: RunOptions) -> tuple[Path, str]:
+    """The folder of avatar `name` made anew as `options` ask, and a sentence on what it is. What is kept is used again.
 
     Raises BadInputError for an avatar whose float network is needed and not here, MissingPartError without PyTorch,
     TrilaneError where nothing can be kept.
     """
     bundle = load_bundle(name)
-    recipe = _recipe(bundle, remake)
+    recipe = _recipe(bundle, options)
     if recipe.trained and recipe.method is None:
         return bundle.folder, "as its files are: it has this width and these channels"
     home = cache_dir("avatars")
@@ -79,11 +79,11 @@ def is_untrained(bundle: Bundle) -> bool:
     return bundle.manifest.provenance.get("weights") == UNTRAINED
 
 
-def _recipe(bundle: Bundle, remake: Remake) -> _Recipe:
+def _recipe(bundle: Bundle, options: RunOptions) -> _Recipe:
     own = bundle.manifest.network
-    width, channels = remake.width or own.width, remake.channels or own.channels
+    width, channels = options.width or own.width, options.channels or own.channels
     trained = (width, channels) == (own.width, own.channels)
-    asked = None if remake.calibration is None else calibration_of(remake.calibration)
+    asked = None if options.calibration is None else calibration_of(options.calibration)
     method, views = asked or ((None, 0) if trained else (METHOD, VIEWS))
     return _Recipe(width, channels, trained, method, views)
 

@@ -290,6 +290,9 @@ class Resolution(Record):
     loss_source: str
 
 
+OptionValue = str | int | float | bool | tuple[str, ...] | None
+
+
 class Preamble(Record):
     """The keys that a report begins with.
 
@@ -313,6 +316,7 @@ class Report(RunMetrics, Preamble):
     """The whole document: the keys of `Preamble`, those of `RunMetrics` that it has not, and these.
 
     `made`: when, by which command line and which Trilane; null where it was run by a program.
+    `options`: every option of the run by its name, as it was asked for; empty where another Trilane left them out.
     `pids`: process of each unit at the end.
     `startup_ms`: until each unit was ready.
     `stage_metrics`: `figures` in the file: mean of each metric that a stage gave with its jobs.
@@ -334,6 +338,7 @@ class Report(RunMetrics, Preamble):
     caps: Caps
     temperature_c: Temperature
     made: Made | None = None
+    options: dict[str, OptionValue] = Field(default={})
     pids: dict[str, int]
     startup_ms: dict[str, float]
     stage_metrics: dict[str, dict[str, float]] = Field(alias="figures")
@@ -366,8 +371,8 @@ def build_report(
     `config`: that it ran.
     `machine`: what `machine_facts` said.
     `baseline`: of the same scene under another policy, None without one.
-    `facts`: what others know of the run: `video`, `checksum`, and any of `made`, `placement`, `resolution`, `pace`,
-    `accuracy`, `check`, `notes`.
+    `facts`: what others know of the run: `video`, `checksum`, and any of `made`, `options`, `placement`, `resolution`,
+    `pace`, `accuracy`, `check`, `notes`.
     """
     metrics = result.report
     sensor = {"sensor": here.sensor_c()}

@@ -49,7 +49,7 @@ SOURCES = {
     "check": MEASURED,
 }
 #: Keys whose numbers are settings, names of things or facts of the machine.
-NO_FIGURES_UNDER = ("schema", "machine", "config", "plan", "pids")
+NO_FIGURES_UNDER = ("schema", "machine", "config", "options", "plan", "pids")
 
 
 def sources_of(document: Mapping[str, Any]) -> dict[str, str]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import shutil
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +33,7 @@ from trilane.scheduler.policy import policy_named
 from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.configure import Checked
 from trilane.stages.placing import placed
+from trilane.stages.run_options import RunOptions
 
 if TYPE_CHECKING:
     from trilane.apps.pace import Pace
@@ -44,25 +45,18 @@ NO_VIDEO = "no video, no contact sheet and no checksum: the frames were presente
 
 
 @dataclass(frozen=True)
-class Plan:
-    """How to run.
+class Prepared:
+    """A run whose options were checked.
 
-    `policy`: of the scheduler.
-    `baseline_frames`: of a sequential run after it, to compare with; 0: none.
-    `pace`: of a chip, to keep; None: as fast as it goes.
-    `performance_profile`: whose caps hold; None: no cap.
-    `latch_ms`: how long before it is needed a pose is sampled; not in the run that is compared with.
-    `edge`: rule of every edge.
-    `check`: how many of its frames are compared with the truth or the float path when it is over.
+    `checked`: configuration that follows from `options`.
+    `pace`: chip's pace at which jobs are held; None: as fast as it goes.
+    `command`: words by which the run was asked for.
     """
 
-    policy: str = "pipelined"
-    baseline_frames: int = 60
+    options: RunOptions
+    checked: Checked
     pace: Pace | None = None
-    performance_profile: str | None = None
-    latch_ms: float = 0.0
-    edge: str = "double"
-    check: int = 0
+    command: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -97,9 +91,8 @@ class Outcome:
 
 
 def run_to_folder(
-    checked: Checked,
+    prepared: Prepared,
     target: Path,
-    plan: Plan,
     hooks: Hooks,
     *,
     machine: Mapping[str, Any],
@@ -107,32 +100,31 @@ def run_to_folder(
     starter: UnitStarter | None = None,
     watched: Watched | None = None,
 ) -> Outcome:
-    """Run what was checked and leave the run folder at `target`.
+    """Run what was prepared and leave the run folder at `target`.
 
-    `checked`: configuration, data, notes and the avatars' figures.
     `target`: must not exist yet.
-    `plan`: how to run.
     `hooks`: who is told.
     `machine`: what `machine_facts` said.
     `made`: what `trilane.apps.made.made_facts` said of the command line; None where there is none.
-    `starter`: a fork server that was started earlier; without one, the units stay where `checked` has them.
+    `starter`: a fork server that was started earlier; without one, the units stay where they were prepared.
     `watched`: by whom; None: by nobody.
     Raises BadInputError when `target` cannot be written, and TrilaneError when no frame was presented or the folder,
     which stays then, could not be written on.
     """
+    options, checked, pace = prepared.options, prepared.checked, prepared.pace
     with RunFolder(target) as folder:
         if starter is not None:
-            checked = placed(checked, plan.policy, starter, str(machine.get("gl")), hooks.message)
+            checked = placed(checked, options.policy, starter, str(machine.get("gl")), hooks.message)
             hooks.message(checked.notes[-1])
         if watched is not None:
             checked = checked.changed(window=watched.window)
             watched.begins(folder.work, checked)
         threading.Thread(target=_import_writers, name="imports", daemon=True).start()
-        job = _Job(checked, plan, hooks, starter, watched)
+        job = _Job(replace(prepared, checked=checked), hooks, starter, watched)
         result = job.run(
             folder.work,
             {
-                "config": config_facts(checked.config, plan.policy, plan.edge),
+                "config": config_facts(checked.config, options.policy, options.edge),
                 "machine": machine,
                 "made": made,
                 "accuracy": dict(checked.accuracy),
@@ -140,18 +132,23 @@ def run_to_folder(
         )
         with Interrupts() as late:  # from here on a signal waits until the folder is whole
             baseline, stopped = job.run_baseline(folder.work) if _is_complete(result) else (None, False)
-            facts = {"made": made, "accuracy": dict(checked.accuracy), "notes": _notes(checked)}
+            facts = {
+                "made": made,
+                "options": options.as_json(),
+                "accuracy": dict(checked.accuracy),
+                "notes": _notes(checked),
+            }
             if checked.placement is not None:
                 facts["placement"] = checked.placement
             if result.rungs:
                 facts["resolution"] = resolution_of(result.rungs, result.rung_switches, checked.config, checked.losses)
-            if plan.pace is not None:
+            if pace is not None:
                 from trilane.apps.pace import compare
 
                 scene = checked.config.scene
                 jobs = list(jobs_of(folder.work / journal.NAME))
-                facts["pace"] = compare(plan.pace, plan.policy, scene.frames, jobs, edge=plan.edge, fps=scene.fps)
-            if plan.check:
+                facts["pace"] = compare(pace, options.policy, scene.frames, jobs, edge=options.edge, fps=scene.fps)
+            if options.check:
                 ended = lambda: result.interrupted or stopped or late.count > 0  # noqa: E731
                 facts |= _checked_frames(checked, folder.work, hooks, ended)
             facts |= _write_files(folder.work, checked.config.scene.fps)
@@ -165,11 +162,9 @@ def run_to_folder(
 class _Job:
     """The runs of one job: the one that was asked for, and the sequential one to compare with."""
 
-    def __init__(
-        self, checked: Checked, plan: Plan, hooks: Hooks, starter: UnitStarter | None, watched: Watched | None
-    ) -> None:
-        self._checked, self._plan, self._hooks, self._starter = checked, plan, hooks, starter
-        self._watched = watched
+    def __init__(self, prepared: Prepared, hooks: Hooks, starter: UnitStarter | None, watched: Watched | None) -> None:
+        self._options, self._checked, self._pace = prepared.options, prepared.checked, prepared.pace
+        self._hooks, self._starter, self._watched = hooks, starter, watched
 
     def run(self, folder: Path, facts: Mapping[str, Any]) -> RunResult:
         """The run that was asked for, with its journal, which begins with `facts`.
@@ -179,21 +174,21 @@ class _Job:
         file, watched = JournalFile(folder / journal.NAME, facts, _sensors), self._watched
         frames, controls = (None, None) if watched is None else (watched.frames, watched.controls)
         total = frames or self._checked.config.scene.frames
-        kept = asked_frames(total, self._plan.check) if self._plan.check else ()
-        return self._run(folder, self._plan.policy, frames, self._plan.latch_ms, file, controls, kept)
+        kept = asked_frames(total, self._options.check) if self._options.check else ()
+        return self._run(folder, self._options, frames, file, controls, kept)
 
     def run_baseline(self, folder: Path) -> tuple[RunResult | None, bool]:
         """The first frames of the same scene again, one frame at a time; its pictures are not kept.
 
         None when it was not asked for or did not complete; and whether it was interrupted.
         """
-        if not self._plan.baseline_frames or self._plan.policy == BASELINE_POLICY:
+        if not self._options.baseline_frames or self._options.policy == BASELINE_POLICY:
             return None, False
         place = folder / BASELINE_POLICY
         place.mkdir()
-        frames = min(self._plan.baseline_frames, self._checked.config.scene.frames)
+        frames = min(self._options.baseline_frames, self._checked.config.scene.frames)
         try:
-            result = self._run(place, BASELINE_POLICY, frames, 0.0)
+            result = self._run(place, self._options.changed(policy=BASELINE_POLICY, latch_ms=0.0), frames)
         except KeyboardInterrupt:
             self._hooks.message(f"interrupted: the {BASELINE_POLICY} run to compare with is left out")
             return None, True
@@ -207,22 +202,21 @@ class _Job:
     def _run(
         self,
         folder: Path,
-        policy: str,
+        options: RunOptions,
         frames: int | None,
-        latch_ms: float,
         file: JournalFile | None = None,
         controls: RunControls | None = None,
         kept: tuple[int, ...] = (),
     ) -> RunResult:
-        profile = self._plan.performance_profile
+        policy, profile = options.policy, options.performance_profile
         result = run_avatar(
             self._checked.config.model_copy(update={"out_dir": folder, "kept": kept}),
             self._checked.assets,
             policy=policy,
-            edge=self._plan.edge,
+            edge=options.edge,
             frames=frames,
             pace_fps=self._release_fps(policy),
-            latch_ms=latch_ms,
+            latch_ms=options.latch_ms,
             governor=None if profile is None else Governor(load_runnable(HOST), profile),
             journal=file,
             controls=controls,
@@ -238,11 +232,11 @@ class _Job:
 
     def _release_fps(self, policy: str) -> float | None:
         """At a chip's pace, the rate of policies that need one; else they have the scene's."""
-        if self._plan.pace is None or not policy_named(policy).paced:
+        if self._pace is None or not policy_named(policy).paced:
             return None
         from trilane.apps.pace import release_fps
 
-        return release_fps(self._plan.pace, self._checked.config.scene.fps)
+        return release_fps(self._pace, self._checked.config.scene.fps)
 
 
 def _checked_frames(checked: Checked, work: Path, hooks: Hooks, interrupted: Callable[[], bool]) -> dict[str, Any]:

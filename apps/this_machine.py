@@ -26,10 +26,11 @@ from trilane.pipeline.unit_starter import UnitStarter
 from trilane.stages import PRELOAD
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.avatar_pipeline import one_shape
-from trilane.stages.configure import Request, configure, requested_runtime
+from trilane.stages.configure import configure, requested_runtime
 from trilane.stages.dsp.bare_calls import calls_of
 from trilane.stages.machine_facts import gl_facts
 from trilane.stages.placing import rehearsed
+from trilane.stages.run_options import RunOptions
 from trilane.units import BURST
 
 MEASURING = "measuring {} on this machine: at most half a minute, once for this machine and these packages ..."
@@ -44,11 +45,11 @@ def with_avatar(chip: Profile, avatar: str, say: Say) -> tuple[Profile, Network]
 
     `say`: is told what takes time, and what cannot be measured. Raises BadInputError for what is no avatar.
     """
-    measured, network = with_run(chip, Request(avatar=avatar), say)
+    measured, network = with_run(chip, RunOptions(avatar=avatar), say)
     return measured, network._replace(facts={"avatar": avatar})
 
 
-def with_run(chip: Profile, request: Request, say: Say) -> tuple[Profile, Network]:
+def with_run(chip: Profile, request: RunOptions, say: Say) -> tuple[Profile, Network]:
     """`chip`, this machine, with what a run that was asked for is placed by, and the network of its usual tensor.
 
     Its avatars share the tensor; each has an equal part of the time of their poses. `say`: as of `with_avatar`. Raises
@@ -75,7 +76,7 @@ def with_first(chip: Profile, text: str, say: Say) -> Profile:
     what = asked(text).what
     if what.endswith(NETWORK_ENDING):
         return with_file(chip, read_graph(Path(what)), {}, say)
-    return with_run(chip, Request(what), say)[0]
+    return with_run(chip, RunOptions(scene=what), say)[0]
 
 
 def with_file_in_application(chip: Profile, graph: GraphFile, shapes: Mapping[str, Sequence[int]], say: Say) -> Profile:

@@ -26,7 +26,8 @@ from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.policy import policy_named
 from trilane.scheduler.stats import NS_PER_MS, median_interval, percentile, samples_needed
 from trilane.stages.avatar_pipeline import run_avatar
-from trilane.stages.configure import Checked, Request, configure
+from trilane.stages.configure import Checked, configure
+from trilane.stages.run_options import RunOptions
 from trilane.transport.slots import edge_rule
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import BEFORE_INFER, LATENCY_TO
@@ -150,7 +151,7 @@ def _pairs(policies: Sequence[str], edges: Sequence[str]) -> list[tuple[str, str
 
 
 def _config(avatar: str, size: str, cores: int, frames: int, runtime: str, video: bool) -> Checked:
-    checked = configure(Request(size=size, avatar=_folder(avatar), frames=frames, runtime=runtime), Path.cwd())
+    checked = configure(RunOptions(size=size, avatar=_folder(avatar), frames=frames, runtime=runtime), Path.cwd())
     units = host_units(usable_cores()[:cores])
     return checked.changed(units=units, record=video)
 

@@ -35,8 +35,9 @@ from trilane.scheduler.stats import median_interval
 from trilane.stages import PRELOAD
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.avatar_pipeline import measured_times, run_avatar, tried
-from trilane.stages.configure import Checked, Request, configure
+from trilane.stages.configure import Checked, configure
 from trilane.stages.placing import FIRST, choice, considered, times_rows
+from trilane.stages.run_options import RunOptions
 from trilane.units import BURST
 
 MIN_FRAMES = 20
@@ -85,7 +86,7 @@ def measure(
     folder = str(networks.full_width_bundle()) if avatar == networks.FULL_WIDTH else avatar
     with UnitStarter(PRELOAD) as starter:
         for tensor in size:
-            checked = configure(Request(size=tensor, avatar=folder, frames=frames, runtime=runtime), Path.cwd())
+            checked = configure(RunOptions(size=tensor, avatar=folder, frames=frames, runtime=runtime), Path.cwd())
             for count in counts:
                 trial = _Trial(checked, host_cores(usable_cores()[:count]), starter)
                 trial.run(rounds, finalists, further, runs)

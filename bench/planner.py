@@ -29,9 +29,10 @@ from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.stats import median_interval
 from trilane.stages import PRELOAD
 from trilane.stages.avatar_pipeline import run_avatar
-from trilane.stages.configure import Checked, Request, configure
+from trilane.stages.configure import Checked, configure
 from trilane.stages.gpu.opengl import describe
 from trilane.stages.placing import placed
+from trilane.stages.run_options import RunOptions
 from trilane.writing import write_folder
 
 SCENES = ("portrait", "full-body", "crowd", "walk-past", "top-to-floor", "leave-and-return")
@@ -136,7 +137,7 @@ class _Scene:
 
     def __init__(self, name: str, frames: int, runtime: str, *, video: bool) -> None:
         """Raises BadInputError, MissingPartError."""
-        asked = Request(scene=name, runtime=runtime, hud=False)
+        asked = RunOptions(scene=name, runtime=runtime, hud=False)
         checked = in_frames(configure(asked, Path.cwd()).changed(record=video), frames)
         self.name = checked.config.scene.name
         self.driver: dict[str, Any] = {}

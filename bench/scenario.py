@@ -21,7 +21,8 @@ from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.run import run_pipeline
 from trilane.pipeline.shared_assets import Assets
 from trilane.stages.avatar_pipeline import avatar_pipeline
-from trilane.stages.configure import Request, configure
+from trilane.stages.configure import configure
+from trilane.stages.run_options import RunOptions
 
 JUDGES = ("trilane", "loadgen")
 MAX_FRAMES = 1_000_000
@@ -54,7 +55,7 @@ def measure(
     _check(scenario, judge, {"--seconds": seconds, "--rate": rate, "--limit-ms": limit_ms, "--samples": samples})
     if "loadgen" in judge:
         load_generator()
-    request = Request(size=size, avatar=avatar, frames=MAX_FRAMES, runtime=runtime)
+    request = RunOptions(size=size, avatar=avatar, frames=MAX_FRAMES, runtime=runtime)
     checked = configure(request, Path.cwd()).changed(record=False)
     pipeline = avatar_pipeline(checked.config, checked.assets, edge)
     rows, summaries = [], {}

@@ -1,4 +1,4 @@
-"""What was asked for on the command line, as a RunConfig whose every part was looked at.
+"""The options of a run as a RunConfig whose every part was looked at.
 
 Rule: motion, camera, background, avatar and runtime are opened and checked here, in the parent, so that a bad
 input ends the command before a process is started or a file is made.
@@ -33,34 +33,12 @@ from trilane.stages.config import NetworkCut, RunConfig
 from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve
 from trilane.stages.foresee import foresee, tensor_works
 from trilane.stages.machine_facts import gl_facts, machine_facts
-from trilane.transport.slots import RULES, edge_rule
-from trilane.unexpected_value import UnexpectedValue
+from trilane.stages.run_options import RunOptions
 
 ROOM = "room"
 COMMAND_LINE = "command line"
 
 GlFacts = Callable[[], dict[str, Any] | None]
-
-
-@dataclass(frozen=True)
-class Request:
-    """The options of `trilane run`; None leaves what the scene says."""
-
-    scene: str = "default"
-    motion: str | None = None
-    camera: str | None = None
-    background: str | None = None
-    avatar: str | None = None
-    frames: int | None = None
-    size: str | None = None
-    runtime: str = "auto"
-    hud: bool | None = None
-    skinning: str = "auto"
-    split: tuple[str, ...] = ()
-    fps: float | None = None
-    output: str | None = None
-    cores: tuple[str, ...] = ()
-    policy: str = "pipelined"
 
 
 @dataclass(frozen=True)
@@ -86,26 +64,27 @@ class Checked:
         return replace(self, config=self.config.model_copy(update=values))
 
 
-def requested_scene(request: Request) -> Scene:
+def requested_scene(options: RunOptions) -> Scene:
     """The scene file with the options laid over it. Raises BadInputError.
 
-    A motion or camera from the command line drops what the scene says of its own file's format.
+    An option that is a key of the scene replaces its value. A motion or camera from the options drops what the scene
+    says of its own file's format.
     """
-    values = load_scene(find_scene(request.scene))
+    values = load_scene(find_scene(options.scene))
     here = Path.cwd()
-    laid_over = {key: getattr(request, key) for key in ("frames", "fps", "size", "hud")}
-    values.update({key: value for key, value in laid_over.items() if value is not None})
-    if request.output is not None:
-        values["output"] = _output(request.output)
-    if request.background is not None:
-        values["background"] = located(request.background, here)
-    if request.camera is not None:
-        values["camera"] |= {"source": located(request.camera, here), "format": "auto"}
+    as_keys: dict[str, Callable[[str], Any]] = {
+        "output": _output,
+        "background": lambda text: located(text, here),
+        "camera": lambda text: values["camera"] | {"source": located(text, here), "format": "auto"},
+    }
+    for name, value in options:
+        if name in Scene.model_fields and value is not None:
+            values[name] = as_keys[name](value) if name in as_keys else value
     first = dict(values["avatars"][0])
-    if request.motion is not None:
-        first |= {"motion": located(request.motion, here), "up_axis": "auto", "units": "auto"}
-    if request.avatar is not None:
-        first["bundle"] = located(request.avatar, here)
+    if options.motion is not None:
+        first |= {"motion": located(options.motion, here), "up_axis": "auto", "units": "auto"}
+    if options.avatar is not None:
+        first["bundle"] = located(options.avatar, here)
     values["avatars"] = [first, *values["avatars"][1:]]
     return scene_from(COMMAND_LINE, values)
 
@@ -118,29 +97,18 @@ def _output(text: str) -> dict[str, int]:
     return {"width": int(match[1]), "height": int(match[2])}
 
 
-def requested_edge(text: str) -> str:
-    """`text`, the rule of every edge. Raises BadInputError."""
-    try:
-        edge_rule(text)
-    except UnexpectedValue as error:
-        name = text.partition(":")[0]
-        remedy = "" if name in RULES else did_you_mean(name, RULES)
-        raise BadInputError("--edge", repr(text), error.expected, remedy) from None
-    return text
-
-
-def configure(request: Request, out_dir: Path, gl: GlFacts = gl_facts) -> Checked:
+def configure(options: RunOptions, out_dir: Path, gl: GlFacts = gl_facts) -> Checked:
     """Look at every part of what was asked for. Raises BadInputError or MissingPartError."""
-    scene = requested_scene(request)
+    scene = requested_scene(options)
     if scene.plan == "full":
         raise BadInputError(
-            f"{find_scene(request.scene)}: plan",
+            f"{find_scene(options.scene)}: plan",
             "full",
             "planned or fixed",
             "`trilane bench planner` draws the full plan to compare",
         )
-    asked = asked_cores(request.cores)
-    runtime, reason = requested_runtime(request.runtime)
+    asked = asked_cores(options.cores)
+    runtime, reason = requested_runtime(options.runtime)
     footage = _footage(scene)
     bundles = {spec.bundle: load_bundle(spec.bundle) for spec in scene.avatars}
     avatars = {bundle.folder.absolute(): load_avatar(bundle) for bundle in bundles.values()}
@@ -150,11 +118,11 @@ def configure(request: Request, out_dir: Path, gl: GlFacts = gl_facts) -> Checke
     staged = stage_scene(scene, bodies, Path.cwd(), footage)
     _check_pictures(scene, staged)
     network = avatars[folders[0]].network
-    cuts = requested_cuts(request.split, network)
-    unit, why = skinning_unit(request.skinning, gl)
+    cuts = requested_cuts(options.split, network)
+    unit, why = skinning_unit(options.skinning, gl)
     whole = TensorBudget(network.shape[1] * network.shape[2], scene.most_side**2)
     losses = tuple(size_loss(avatar.bundle) for avatar in avatars.values())
-    works, sizes = tensor_works(scene, request.policy, losses)
+    works, sizes = tensor_works(scene, options.policy, losses)
     budgets = [whole.scaled(work) for work in works]
     foreseen = foresee(scene, staged, bodies, network, budgets) if scene.plans_tensor else None
     config = RunConfig(

@@ -152,9 +152,10 @@ def _sources(rows: list[dict[str, Any]]) -> Iterator[str]:
 
 def _scene(scene: str, avatar: str | None, size: str | None, frames: int, names: list[str], as_json: bool) -> bool:
     from trilane.apps.experiments.accuracy import runtime_differences
-    from trilane.stages.configure import Request, configure, required_machine
+    from trilane.stages.configure import configure, required_machine
+    from trilane.stages.run_options import RunOptions
 
-    checked = configure(Request(scene, avatar=avatar, size=size, runtime="ort"), Path.cwd())
+    checked = configure(RunOptions(scene=scene, avatar=avatar, size=size, runtime="ort"), Path.cwd())
     machine = required_machine()
     with stderr_console().status(f"{frames} frames on {', '.join(names)}"), stdout_kept():
         result = runtime_differences(checked, names, frames)

@@ -32,11 +32,12 @@ def show_by_cause(scene: str, request: dict[str, Any], frames: int, files: Files
     """Measure and print. `request`: options of the run. Raises BadInputError, MissingPartError."""
     from trilane.apps.experiments.error_by_cause import error_by_cause
     from trilane.apps.experiments.lpips_error import Lpips
-    from trilane.stages.configure import Request, configure, required_machine
+    from trilane.stages.configure import configure, required_machine
+    from trilane.stages.run_options import RunOptions
     from trilane.writing import write_folder
 
     out, lpips = files.out, None if files.lpips_weights is None else Lpips(files.lpips_weights)
-    checked = configure(Request(scene, **request), Path.cwd())
+    checked = configure(RunOptions(scene=scene, **request), Path.cwd())
     machine = required_machine()
     if out is not None:
         with write_folder(out):

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from trilane.apps.cli.console import print_facts, stderr_console, stdout_console, stdout_kept
-from trilane.apps.cli.options import SIZE_HELP, AvatarArgument, JsonOption
+from trilane.apps.cli.options import AvatarArgument, JsonOption
 from trilane.avatars.manifest import BANDS, CAPTURED
 from trilane.errors import BadInputError, MissingPartError
 from trilane.figure_sources import from_validation
+from trilane.stages.run_options import SIZE_HELP
 
 if TYPE_CHECKING:
     from rich.table import Table

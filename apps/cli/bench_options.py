@@ -6,7 +6,8 @@ themselves are the parameters of each bench's `measure`.
 
 from __future__ import annotations
 
-from trilane.apps.cli.options import ENCODER_HELP, NORM_HELP, POLICY_HELP, RUNTIME_HELP, SIZE_HELP, WIDTH_HELP
+from trilane.apps.cli.options import ENCODER_HELP, NORM_HELP, POLICY_HELP
+from trilane.stages.run_options import RUNTIME_HELP, SIZE_HELP, WIDTH_HELP
 
 FIXED_SIZE = "Tensor size in pixels: HEIGHTxWIDTH."
 SQUARE_SIZE = "Side of the square tensor in pixels."

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from enum import Enum
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 import typer
 from pydantic import ValidationError
@@ -44,8 +44,9 @@ def _wrong_value(parameter: Any, error: ValidationError) -> BadInputError:
     first, kind = error.errors()[0], parameter.type_descriptor.annotation
     where = parameter.opts[0]
     found = first["input"]
-    if isinstance(kind, type) and issubclass(kind, Enum):
-        words = [str(each.value) for each in kind]
+    choices = [each.value for each in kind] if isinstance(kind, type) and issubclass(kind, Enum) else get_args(kind)
+    if choices and get_origin(kind) in (None, Literal):
+        words = [str(each) for each in choices]
         return BadInputError(where, repr(found), f"one of {', '.join(words)}", did_you_mean(str(found), words))
     expected = first["msg"].removeprefix("Input should be ").partition(",")[0]
     return BadInputError(where, repr(found), expected)

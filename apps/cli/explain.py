@@ -5,7 +5,6 @@ Rule: this module reads options and shows results; everything is decided and com
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +14,6 @@ from trilane.apps.cli.commands import Commands, given
 from trilane.apps.cli.console import print_json, spinner, stderr_console, stdout_console, without_controls
 from trilane.apps.cli.explain_run import MOST_SLOWEST, SLOWEST, explain_folder, refuse_options, run_folder
 from trilane.apps.cli.options import (
-    PROFILE_HELP,
     CameraOption,
     CoresOption,
     FpsOption,
@@ -27,6 +25,7 @@ from trilane.apps.cli.options import (
     SceneSizeOption,
     SkinningOption,
 )
+from trilane.stages.run_options import PROFILE_HELP, RunOptions
 from trilane.units import PerformanceProfile
 
 if TYPE_CHECKING:
@@ -96,7 +95,7 @@ def explain(
     from trilane.apps.explanation import explain as explained
     from trilane.apps.plan_picture import draw_plan
     from trilane.errors import BadInputError
-    from trilane.stages.configure import Request, configure
+    from trilane.stages.configure import configure
     from trilane.writing import require_writable
 
     if picture is not None:
@@ -104,8 +103,19 @@ def explain(
             raise BadInputError("--picture", f"'{picture}'", "a name that ends in .png")
         require_writable(picture)
     with spinner("planning"):
-        asked = Request(scene, motion, camera, None, avatar, frames, size, skinning=skinning)
-        checked = configure(replace(asked, fps=fps, output=output, cores=tuple(cores or ())), Path.cwd())
+        options = RunOptions(
+            scene=scene,
+            motion=motion,
+            camera=camera,
+            avatar=avatar,
+            frames=frames,
+            fps=fps,
+            output=output,
+            size=size,
+            skinning=skinning,
+            cores=tuple(cores or ()),
+        )
+        checked = configure(options, Path.cwd())
         explanation = explained(checked, profile, str(performance_profile))
     for note in checked.notes:
         stderr_console().print(note, soft_wrap=True, markup=False)

@@ -166,12 +166,13 @@ def _require_checks(trials: Sequence[Trial]) -> None:
     """
     from trilane.apps.run_check import require_parts
     from trilane.avatars.bundle import load_bundle
-    from trilane.stages.configure import Request, requested_scene
+    from trilane.stages.configure import requested_scene
+    from trilane.stages.run_options import RunOptions
 
     runs = [trial.options for trial in trials if trial.command == ("run",) and trial.options.get("check")]
     for scene, avatar in {(options.get("scene", "default"), options.get("avatar")) for options in runs}:
         with suppress(BadInputError):
-            asked = Request(scene=str(scene), avatar=None if avatar is None else str(avatar))
+            asked = RunOptions.checked({"scene": scene, "avatar": avatar})
             require_parts(load_bundle(each.bundle) for each in requested_scene(asked).avatars)
 
 

@@ -6,34 +6,27 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from trilane.apps.asked_run import AskedRun
-from trilane.apps.dashboard.controls import NO_PROFILE
+from trilane.apps.dashboard.controls import OF_A_NEW_RUN
 from trilane.avatars.bundle import BUILT_IN, MANIFEST
-from trilane.scheduler.policy import POLICIES
 from trilane.stages.dsp.runtime import installed
-from trilane.units import PERFORMANCE_PROFILES
+from trilane.stages.run_options import RunOptions, option_of
 
-EDGES: Final = ("single", "double", "triple", "fifo:4", "orphan")
-SIZES: Final = ("auto", "96", "128", "192", "256", "384", "512")
 MOST_AVATARS: Final = 20
 
 
 def choices_of(config: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
     """By control. `config`: what is in force."""
-    choices = {
-        "policy": tuple(POLICIES),
-        "edge": EDGES,
-        "performance_profile": (NO_PROFILE, *PERFORMANCE_PROFILES),
-        "size": SIZES,
-        "runtime": tuple(installed()),
-        "avatar": (*BUILT_IN, *_neighbours(str(config["avatar"]))),
-    }
-    return {name: tuple(dict.fromkeys([*words, str(config[name])])) for name, words in choices.items()}
+    found = {"runtime": installed(), "avatar": (*BUILT_IN, *_neighbours(str(config["avatar"])))}
+    choices = {}
+    for name in OF_A_NEW_RUN:
+        offered = option_of(RunOptions.model_fields[name]).offered or ()
+        choices[name] = tuple(dict.fromkeys([*offered, *found.get(name, ()), str(config[name])]))
+    return choices
 
 
-def reasons_against(asked: AskedRun) -> dict[str, str]:
-    """Why a control of a new run cannot be used with what was asked for, by name."""
-    if asked.paced_by is not None:
+def reasons_against(options: RunOptions) -> dict[str, str]:
+    """Why a control of a new run cannot be used beside `options`, by name."""
+    if options.pace:
         return {"performance_profile": "the run is held to a chip's pace, which is capped already"}
     return {}
 

@@ -6,14 +6,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
+from trilane.stages.run_options import RunOptions, option_of
+
 ACTION, CHOICE, NUMBER, DRAG = "action", "choice", "number", "drag"
 LEAST_ZOOM, MOST_ZOOM = 0.25, 4.0
 MOST_DRAG_DEG: Final = 360.0
-NO_PROFILE: Final = "none"
 #: Controls that the server itself answers, by the window.
 OF_THE_CAMERA: Final = ("orbit", "zoom", "recentre")
 #: Controls for which a run begins anew.
-OF_A_NEW_RUN: Final = ("policy", "edge", "performance_profile", "size", "runtime", "avatar")
+OF_A_NEW_RUN: Final = tuple(
+    name for name, field in RunOptions.model_fields.items() if option_of(field).offered is not None
+)
 
 Value = str | float | list[float] | None
 

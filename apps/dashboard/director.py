@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
-from trilane.apps.asked_run import AskedRun, Prepared
 from trilane.apps.dashboard.channel import Asked, Message, Refused, RunBegins, StateIs
 from trilane.apps.dashboard.choices import choices_of, reasons_against
-from trilane.apps.dashboard.controls import NO_PROFILE, OF_A_NEW_RUN, controls_of_run
+from trilane.apps.dashboard.controls import OF_A_NEW_RUN, controls_of_run
 from trilane.apps.dashboard.known_runs import facts_of_checked
 from trilane.apps.live.followed_run import run_name
+from trilane.apps.run_job import Prepared
 from trilane.errors import TrilaneError
 from trilane.pipeline.controls import ALL, RunControls
 from trilane.stages.configure import Checked
+from trilane.stages.run_options import NOTHING, RunOptions, kind_of
 from trilane.units import UNITS
 
 RUNNING, PAUSED, RESTARTING, ENDED, FAILED = "running", "paused", "restarting", "ended", "failed"
@@ -30,7 +31,7 @@ class Director:
     `prepare`: checks a run. `send`: hands a message to the server.
     """
 
-    def __init__(self, prepare: Callable[[AskedRun], Prepared], send: Callable[[Message], None]) -> None:
+    def __init__(self, prepare: Callable[[RunOptions], Prepared], send: Callable[[Message], None]) -> None:
         self._prepare, self._send = prepare, send
         self._lock = threading.Lock()
         self._now: Prepared | None = None
@@ -46,9 +47,10 @@ class Director:
     def show(self, machine: Mapping[str, Any], folder: Path, checked: Checked) -> None:
         """The run writes into `folder`; it runs `checked`."""
         assert self._now is not None
-        facts = facts_of_checked(run_name(folder), checked, self._now.plan, machine)
+        options = self._now.options
+        facts = facts_of_checked(run_name(folder), checked, options, machine)
         choices = choices_of(facts.config)
-        controls = controls_of_run(UNITS, choices, reasons_against(self._now.asked))
+        controls = controls_of_run(UNITS, choices, reasons_against(options))
         self._send(RunBegins(str(folder), asdict(facts), [asdict(control) for control in controls]))
         self._send(StateIs(RUNNING, ""))
 
@@ -78,7 +80,8 @@ class Director:
             current = self._next or self._now
         assert current is not None
         try:
-            prepared = self._prepare(changed(current.asked, name, value))
+            asked = None if value == NOTHING else kind_of(RunOptions.model_fields[name])(value)
+            prepared = self._prepare(current.options.changed(**{name: asked}))
         except TrilaneError as error:
             self._send(Refused(name, str(error)))
             return
@@ -86,12 +89,3 @@ class Director:
             self._next = prepared
         self._send(StateIs(RESTARTING, f"{name.replace('_', ' ')} {value}: the run begins anew"))
         controls.stop()
-
-
-def changed(asked: AskedRun, control: str, value: str) -> AskedRun:
-    """What was asked for, with the control at `value`."""
-    if control == "edge":
-        return replace(asked, edge=value)
-    if control == "performance_profile":
-        return replace(asked, performance_profile=None if value == NO_PROFILE else value)
-    return replace(asked, request={**asked.request, control: value})

@@ -6,24 +6,22 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from trilane.apps.dashboard.controls import OF_A_NEW_RUN
 from trilane.apps.dashboard.run_facts import RunFacts
 from trilane.apps.report import Report, config_facts, read_report
-from trilane.apps.run_job import Plan
 from trilane.pipeline.journal import Begun
 from trilane.stages.configure import Checked
+from trilane.stages.run_options import NOTHING, RunOptions
 
 
-def config_in_force(config: Mapping[str, Any], performance_profile: str | None) -> dict[str, Any]:
-    """The value of each control that is set before a run. `config`: as in report.json."""
+def config_in_force(config: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
+    """The value of each control that is set before a run.
+
+    `config`: as in report.json, which says what an option left open. `options`: by name, as they were asked for.
+    """
     scene = config["scene"]
-    return {
-        "policy": config["policy"],
-        "edge": config["edge"],
-        "performance_profile": performance_profile or "none",
-        "size": scene["size"],
-        "runtime": config["runtime"],
-        "avatar": scene["avatars"][0]["bundle"],
-    }
+    chosen = {**config, "size": scene["size"], "avatar": scene["avatars"][0]["bundle"]}
+    return {name: chosen.get(name) or options.get(name) or NOTHING for name in OF_A_NEW_RUN}
 
 
 def machine_line(machine: Mapping[str, Any]) -> str:
@@ -38,11 +36,11 @@ def machine_line(machine: Mapping[str, Any]) -> str:
 BOUND: Final = ("bottleneck", "bound", "efficiency", "core_efficiency", "machine_efficiency")
 
 
-def facts_of_checked(name: str, checked: Checked, plan: Plan, machine: Mapping[str, Any]) -> RunFacts:
+def facts_of_checked(name: str, checked: Checked, options: RunOptions, machine: Mapping[str, Any]) -> RunFacts:
     """Of a run that begins."""
     config = checked.config
     scene = config.scene
-    said = config_facts(config, plan.policy, plan.edge)
+    said = config_facts(config, options.policy, options.edge)
     return RunFacts(
         name,
         scene.name,
@@ -50,7 +48,7 @@ def facts_of_checked(name: str, checked: Checked, plan: Plan, machine: Mapping[s
         machine_line(machine),
         scene.fps,
         (scene.output.width, scene.output.height),
-        config_in_force(said, plan.performance_profile),
+        config_in_force(said, dict(options)),
         {"tensor_shapes": [list(shape) for shape in config.buckets], "notes": list(checked.notes)},
         checked.placement,
         checked.accuracy,
@@ -69,7 +67,7 @@ def facts_of_report(name: str, report: Report) -> RunFacts:
         machine_line(document["machine"]),
         scene["fps"],
         (scene["output"]["width"], scene["output"]["height"]),
-        config_in_force(document["config"], caps.get("performance_profile")),
+        config_in_force(document["config"], {**(document["options"] or {}), **caps}),
         {**document["plan"], "notes": document["notes"]},
         document.get("placement"),
         document["accuracy"],

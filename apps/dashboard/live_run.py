@@ -15,31 +15,40 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from trilane.apps.asked_run import AskedRun, Prepared, early_processes, prepare, run_prepared
+from trilane.apps.asked_run import early_processes, prepare, run_prepared
 from trilane.apps.dashboard.channel import Refused, StateIs
 from trilane.apps.dashboard.director import ENDED, FAILED, Director
 from trilane.apps.dashboard.serve import listen
 from trilane.apps.dashboard.server_link import ServerLink
-from trilane.apps.run_job import Hooks, Outcome, Watched
+from trilane.apps.run_job import Hooks, Outcome, Prepared, Watched
 from trilane.errors import TrilaneError
 from trilane.stages.configure import GlFacts, required_machine
+from trilane.stages.run_options import RunOptions
 
 ENDLESS: Final = 1_000_000_000  # frames: a year at 30 a second
 
 OpenHooks = Callable[[], AbstractContextManager[Hooks]]
 
 
-def run_live(asked: AskedRun, hooks: OpenHooks, port: int | None, tell: Callable[[str], None]) -> Outcome:
-    """Run what was asked for, and then what the page asks for, until it is interrupted; the last run's outcome.
+def run_live(
+    options: RunOptions, hooks: OpenHooks, command: tuple[str, ...], port: int | None, tell: Callable[[str], None]
+) -> Outcome:
+    """Run what the options ask for, and then what the page asks for, until it is interrupted; the last run's outcome.
 
-    `asked`: with a number of frames in its request each run ends after so many.
-    `hooks`: as of `run_asked`. `port`: as of `listen`. `tell`: given the page's address, and sentences for a person.
+    `options`: with a number of frames each run ends after so many.
+    `hooks`, `command`: as `run_asked` takes them. `port`: as `listen` takes it.
+    `tell`: is given the page's address, and sentences for a person.
     Raises as `run_asked`.
     """
     with early_processes() as (starter, gl):
-        first = prepare(replace(asked, baseline_frames=0), gl)
+        first = prepare(options.changed(baseline_frames=0), gl, command)
         output = first.checked.config.scene.output
-        runs = _Runs(gl, partial(run_prepared, hooks=hooks, starter=starter, gl=gl), tell)
+        runs = _Runs(
+            partial(prepare, gl=gl, command=command),
+            gl,
+            partial(run_prepared, hooks=hooks, starter=starter, gl=gl),
+            tell,
+        )
         with contextlib.closing(listen(port)) as place:
             runs.link = ServerLink(place, output.height, output.width, runs.director.do, tell)
             tell(f"dashboard: {place.url}")
@@ -52,10 +61,16 @@ class _Runs:
 
     link: ServerLink
 
-    def __init__(self, gl: GlFacts, run: Callable[..., Outcome], tell: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        prepare: Callable[[RunOptions], Prepared],
+        gl: GlFacts,
+        run: Callable[..., Outcome],
+        tell: Callable[[str], None],
+    ) -> None:
         self._gl, self._run, self._tell = gl, run, tell
         self._count = 0
-        self.director = Director(lambda asked: prepare(asked, gl), lambda message: self.link.send(message))
+        self.director = Director(prepare, lambda message: self.link.send(message))
 
     def run_all(self, first: Prepared) -> Outcome:
         """Until no other is asked for, or one fails. Raises TrilaneError when the first has presented no frame."""
@@ -80,13 +95,13 @@ class _Runs:
             now, before = following, now
 
     def _run_one(self, prepared: Prepared) -> Outcome:
-        asked = prepared.asked
+        options = prepared.options
         controls = self.director.begin(prepared)
         show = partial(self.director.show, required_machine(self._gl))
-        frames = None if asked.request.get("frames") else ENDLESS
+        frames = None if options.frames else ENDLESS
         self._count += 1
-        if asked.out is not None:
-            prepared = replace(prepared, asked=replace(asked, out=_numbered(asked.out, self._count)))
+        if options.out is not None:
+            prepared = replace(prepared, options=options.changed(out=_numbered(options.out, self._count)))
         return self._run(prepared, watched=Watched(frames, self.link.window, controls, show))
 
 

@@ -21,7 +21,8 @@ from trilane.bench.lib.picture_error import psnr_of_frames
 from trilane.errors import BadInputError
 from trilane.figure_sources import MEASURED
 from trilane.scheduler.stats import median_interval
-from trilane.stages.configure import Checked, Request, configure
+from trilane.stages.configure import Checked, configure
+from trilane.stages.run_options import RunOptions
 
 #: Jobs that an interval of 95 % needs: the median lies between the least and the largest of n with 1 - 2 / 2^n.
 LEAST_JOBS = 6
@@ -88,7 +89,7 @@ def measure(
     refuse_twice("--runtime", runtime)
     if rounds < 1:
         raise BadInputError("--rounds", str(rounds), "at least 1")
-    asked = [Request(scene=scene, size=one, runtime=name, hud=False) for one, name in product(size, runtime)]
+    asked = [RunOptions(scene=scene, size=one, runtime=name, hud=False) for one, name in product(size, runtime)]
     checked = [configure(one, Path.cwd()) for one in asked]
     first, shown = checked[0], checked[0].config.scene
     numbers, cast, rows = spread(shown.frames, frames), Cast(first), _rows(asked, checked)
@@ -124,7 +125,7 @@ def refuse_twice(option: str, values: Sequence[str]) -> None:
         raise BadInputError(option, ", ".join(values) or "none", "one or more, each once")
 
 
-def _rows(asked: Sequence[Request], checked: Sequence[Checked]) -> list[Row]:
+def _rows(asked: Sequence[RunOptions], checked: Sequence[Checked]) -> list[Row]:
     rows: list[Row] = []
     for request, one in zip(asked, checked, strict=True):
         pictures = ScenePictures(one, rows[0].pictures.gpu if rows else None)

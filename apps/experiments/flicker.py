@@ -22,8 +22,9 @@ from trilane.arrays import F64, U8
 from trilane.bench.lib.cast import Cast
 from trilane.errors import BadInputError, did_you_mean
 from trilane.figure_sources import MEASURED
-from trilane.stages.configure import Checked, Request, configure
+from trilane.stages.configure import Checked, configure
 from trilane.stages.gpu.packed_pass import FILTERS
+from trilane.stages.run_options import RunOptions
 from trilane.training.quantising.calibration import METHODS
 
 STEPS = 255
@@ -88,7 +89,7 @@ def measure(
     _refuse_unknown("--texture-filter", texture_filter, FILTERS)
     _refuse_unknown("--calibration", calibration, (AS_IT_IS, *METHODS))
     checked = {
-        name: configure(Request(scene=scene, size=size, runtime=name, hud=False), Path.cwd()) for name in runtime
+        name: configure(RunOptions(scene=scene, size=size, runtime=name, hud=False), Path.cwd()) for name in runtime
     }
     first = next(iter(checked.values()))
     shown = first.config.scene

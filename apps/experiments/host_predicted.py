@@ -15,9 +15,8 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from trilane.apps.asked_prediction import answer_of, network_of, predict_networks, usual_policy, variant_of
-from trilane.apps.asked_run import AskedRun, run_asked
+from trilane.apps.asked_run import run_asked
 from trilane.apps.remade_avatar import remade_avatar
-from trilane.apps.remake import Remake
 from trilane.apps.run_job import Hooks
 from trilane.avatars.bundle import load_bundle
 from trilane.bench.lib.interleaved_processes import Variant, runners
@@ -28,6 +27,7 @@ from trilane.hw_profiles.network_time import NORMAL_80
 from trilane.hw_profiles.placed_host import NETWORK
 from trilane.hw_profiles.rates import NOTHING
 from trilane.stages.configure import requested_runtime
+from trilane.stages.run_options import RunOptions
 from trilane.units import BURST
 
 RUN, ALONE = "run", "network"
@@ -63,7 +63,7 @@ def measure(
     rows: list[dict[str, Any]] = []
     with TemporaryDirectory(prefix="trilane-predict-") as folder:
         for asked in (None, *width):
-            made = str(remade_avatar(avatar, Remake(width=asked))[0]) if asked else avatar
+            made = str(remade_avatar(avatar, RunOptions(width=asked))[0]) if asked else avatar
             name = f"width {asked}" if asked else avatar
             predicted = _of_run(made)
             measured_ms, others = _run(made, frames, Path(folder) / str(len(rows)))
@@ -86,9 +86,8 @@ def _of_run(avatar: str) -> Predicted:
 
 def _run(avatar: str, frames: int, out: Path) -> tuple[float, float | None]:
     """Milliseconds between the frames of a run, and what other programs had of the cores."""
-    request = {"avatar": avatar, "frames": frames}
-    asked = AskedRun(request, baseline_frames=0, out=out, command=("trilane", "bench"))
-    report = run_asked(asked, quiet).report
+    options = RunOptions(avatar=avatar, frames=frames, baseline_frames=0, out=out)
+    report = run_asked(options, quiet, ("trilane", "bench")).report
     return report.frame_time_ms.mean, report.other_programs
 
 

@@ -23,8 +23,8 @@ START_S, RUN_S = 120.0, 600.0
 class Asked:
     """A run of the default scene.
 
-    `avatar`, `size`, `frames`, `runtime`: as `trilane.stages.configure.Request` has them. `cores`: that its units share
-    by the rule for any run. `video`: whether one is encoded. `edge`: the rule of all edges.
+    `avatar`, `size`, `frames`, `runtime`: as `trilane.stages.run_options.RunOptions` has them. `cores`: cores that its
+    units share by the rule for any run. `video`: whether one is encoded. `edge`: the rule of all edges.
     """
 
     avatar: str
@@ -77,10 +77,11 @@ def serve(pipe: Connection, asked: Asked) -> None:
     """The process: say that it is ready, then run under each policy that comes, until `pipe` closes."""
     from trilane.hw_profiles.host import host_units
     from trilane.stages.avatar_pipeline import run_avatar
-    from trilane.stages.configure import Request, configure
+    from trilane.stages.configure import configure
+    from trilane.stages.run_options import RunOptions
 
     try:
-        request = Request(avatar=asked.avatar, size=asked.size, frames=asked.frames, runtime=asked.runtime)
+        request = RunOptions(avatar=asked.avatar, size=asked.size, frames=asked.frames, runtime=asked.runtime)
         checked = configure(request, Path.cwd()).changed(units=host_units(asked.cores), record=asked.video)
         seats = {unit: ",".join(map(str, settings.cores)) for unit, settings in checked.config.units.items()}
         pipe.send(True)

@@ -15,6 +15,7 @@ from trilane.bench.lib.avatar_process import Asked, AvatarProcess, Ran, avatar_p
 from trilane.errors import TrilaneError
 from trilane.scheduler.ledger import JobRecord
 from trilane.stages import avatar_pipeline, configure
+from trilane.stages.run_options import RunOptions
 
 ASKED = Asked("default", "64x64", 20, "ort", (3, 5), video=True, edge="latest")
 JOBS = (JobRecord("pose", "cpu", 0, 1, 2, 3, 4), JobRecord("infer", "dsp", 0, 4, 5, 6, 7))
@@ -84,7 +85,7 @@ def test_the_process_runs_under_each_policy_until_its_pipe_closes(runs: list[Any
     serve(pipe, ASKED)
     answer = [tuple(job) for job in JOBS], {"cpu": "3", "gpu": "3", "dsp": "5"}
     assert pipe.sent == [True, answer, answer]
-    request = configure.Request(avatar="default", size="64x64", frames=20, runtime="ort")
+    request = RunOptions(avatar="default", size="64x64", frames=20, runtime="ort")
     assert runs == [
         (request, Path.cwd()),
         *((True, True, "assets", {"policy": policy, "edge": "latest"}) for policy in ("sequential", "pipelined")),

@@ -17,9 +17,9 @@ from trilane.apps.experiments.accuracy import runtime_differences
 from trilane.apps.experiments.hard_numbers import all_rows
 from trilane.errors import BadInputError
 from trilane.stages import configure
-from trilane.stages.configure import Request
 from trilane.stages.dsp import runtime
 from trilane.stages.dsp.runtime import RuntimeOptions
+from trilane.stages.run_options import RunOptions
 
 Command = Callable[..., tuple[str, str]]
 ROW = {"first": "ort", "second": "qnn", "mean": 0.0123456, "largest": 3, "worst_frame": 7}
@@ -36,7 +36,7 @@ RESULT = {
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     found: list[Any] = []
 
-    def configured(request: Request, out_dir: Path) -> str:
+    def configured(request: RunOptions, out_dir: Path) -> str:
         found.append((request, out_dir == Path.cwd()))
         return "checked"
 
@@ -60,12 +60,12 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 def test_a_scene_is_compared_as_the_options_say(asked: list[Any], command: Command) -> None:
     document = json.loads(command("accuracy", "--json")[0])
     assert document == {"schema": 1, **RESULT, "machine": {"cpu": "a processor"}}
-    assert asked == [(Request("default", runtime="ort"), True), ("checked", ["ort", "qnn"], 8)]
+    assert asked == [(RunOptions(scene="default", runtime="ort"), True), ("checked", ["ort", "qnn"], 8)]
     asked.clear()
     words = ("--avatar", "a", "--size", "64", "--frames", 3, "--runtime", "cuda", "--runtime", "ort")
     command("accuracy", "closeup", *words)
     assert asked == [
-        (Request("closeup", avatar="a", size="64", runtime="ort"), True),
+        (RunOptions(scene="closeup", avatar="a", size="64", runtime="ort"), True),
         ("checked", ["cuda", "ort"], 3),
     ]
 

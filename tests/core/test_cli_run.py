@@ -6,7 +6,7 @@ import io
 import json
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,11 +17,11 @@ from support.run_report import make_report
 from trilane.apps import asked_run, made, pace, run_check, run_job
 from trilane.apps.cli import run as cli_run
 from trilane.apps.report import Report
-from trilane.apps.run_job import Outcome, Plan
+from trilane.apps.run_job import Outcome, Prepared
 from trilane.errors import BadInputError
 from trilane.pipeline import unit_starter
 from trilane.stages import PRELOAD, configure
-from trilane.stages.configure import Request
+from trilane.stages.run_options import RunOptions
 from trilane.units import PerformanceProfile
 
 Command = Callable[..., tuple[str, str]]
@@ -47,8 +47,8 @@ class Asked:
     report: dict[str, Any]
     exit_code: int = 0
     raises: BaseException | None = None
-    request: Request | None = None
-    plan: Plan | None = None
+    options: RunOptions | None = None
+    pace: Any = None
     target: Path | None = None
     changes: list[dict[str, Any]] = field(default_factory=list)
     others: dict[str, Any] = field(default_factory=dict)
@@ -81,14 +81,18 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Asked:
 
     checked = SimpleNamespace(config=config, notes=("the motion is short",), changed=changed)
 
-    def configured(request: Request, out_dir: Path, gl: Any) -> Any:
-        found.request = request
+    def configured(options: RunOptions, out_dir: Path, gl: Any) -> Any:
+        found.options = options
         found.others |= {"out_dir": out_dir, "gl": (gl(), gl())}
         return checked
 
-    def run_to_folder(given: Any, target: Path, plan: Plan, hooks: Any, **others: Any) -> Outcome:
-        found.plan, found.target = plan, target
-        found.others |= others | {"checked": given is checked, "still open": "starter closed" not in found.others}
+    def run_to_folder(given: Prepared, target: Path, hooks: Any, **others: Any) -> Outcome:
+        assert given.options == found.options
+        found.pace, found.target = given.pace, target
+        found.others |= others | {
+            "checked": given.checked is checked,
+            "still open": "starter closed" not in found.others,
+        }
         hooks.progress("pipelined", 1, 3)
         hooks.message("[red] is no markup")
         if found.raises is not None:
@@ -104,14 +108,13 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Asked:
     monkeypatch.setattr(configure, "required_machine", lambda gl: ("machine", gl()))
     monkeypatch.setattr(run_job, "run_to_folder", run_to_folder)
     monkeypatch.setattr(pace, "pace_of", pace_of)
-    monkeypatch.setattr(made, "made_facts", lambda words: {"command": words})
+    monkeypatch.setattr(made, "made_facts", lambda words: {"command": [*words]})
     return found
 
 
 def test_what_a_run_without_options_asks_for(asked: Asked, command: Command) -> None:
     out, err = command("run")
-    assert asked.request == Request()
-    assert asked.plan == Plan("pipelined", 60, None, None, 0.0)
+    assert asked.options == RunOptions() == RunOptions(policy="pipelined", baseline_frames=60, latch_ms=0.0)
     assert (asked.changes, asked.others["checked"], asked.others["still open"]) == ([], True, True)
     assert asked.others["machine"] == ("machine", GL)
     assert asked.others["made"] == {"command": ["trilane", "run"]}
@@ -129,7 +132,7 @@ def test_what_a_run_without_options_asks_for(asked: Asked, command: Command) -> 
 
 def test_a_run_that_is_steered_is_not_compared(asked: Asked, command: Command) -> None:
     assert "--check with --dashboard" in command("run", "--check", "2", "--dashboard", code=2)[1]
-    assert asked.request is None
+    assert asked.options is None
 
 
 def test_a_picture_with_a_hud_is_not_compared(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -150,10 +153,25 @@ def test_every_option_arrives_where_it_belongs(asked: Asked, command: Command) -
         *("--split", "x=cpu", "--split", "y=gpu", "--latch", 2.5, "--performance-profile", "power_saver"),
         *("--baseline", 9, "--out", "place", "--json"),
     )
-    request = Request("beach.toml", "m", "c", "b", "a", 7, "192", "ort", True, "gpu", ("x=cpu", "y=gpu"))
-    assert asked.request == replace(request, policy="latest")
-    assert asked.plan == Plan("latest", 9, None, "power_saver", 2.5)
-    assert type(asked.plan.performance_profile) is str and type(asked.plan.policy) is str
+    assert asked.options == RunOptions(
+        scene="beach.toml",
+        motion="m",
+        camera="c",
+        background="b",
+        avatar="a",
+        frames=7,
+        size="192",
+        hud=True,
+        policy="latest",
+        runtime="ort",
+        skinning="gpu",
+        split=("x=cpu", "y=gpu"),
+        latch_ms=2.5,
+        performance_profile="power_saver",
+        baseline_frames=9,
+        out=Path("place"),
+    )
+    assert type(asked.options.performance_profile) is str and type(asked.options.policy) is str
     assert asked.target == Path("place")
     assert json.loads(out) == json.loads(json.dumps(Report.model_validate(asked.report).as_json()))
 
@@ -161,7 +179,7 @@ def test_every_option_arrives_where_it_belongs(asked: Asked, command: Command) -
 @pytest.mark.parametrize("hud", [True, False])
 def test_the_hud_is_asked_for_or_refused(hud: bool, asked: Asked, command: Command) -> None:
     command("run", "--hud" if hud else "--no-hud")
-    assert asked.request == Request(hud=hud)
+    assert asked.options == RunOptions(hud=hud)
 
 
 def test_a_run_that_lasts_needs_no_video(asked: Asked, command: Command) -> None:
@@ -171,14 +189,14 @@ def test_a_run_that_lasts_needs_no_video(asked: Asked, command: Command) -> None
 
 def test_a_pace_holds_the_jobs(asked: Asked, command: Command) -> None:
     command("run", "--profile", "chip", "--pace", "--slow-motion", 24)
-    assert asked.plan is not None and asked.plan.pace is not None
-    assert vars(asked.plan.pace)["name"] == ("chip", 24.0)
+    assert asked.pace is not None
+    assert asked.pace.name == ("chip", 24.0)
     assert asked.changes == [{"pace_ns": {"infer": 5}}]
 
 
 def test_a_pace_is_that_of_the_chip_when_no_slow_motion_is_given(asked: Asked, command: Command) -> None:
     command("run", "--profile", "chip", "--pace")
-    assert asked.plan is not None and vars(asked.plan.pace)["name"] == ("chip", 1.0)
+    assert asked.pace is not None and asked.pace.name == ("chip", 1.0)
 
 
 PAIR = "give both; `trilane predict --profile` answers without running"
@@ -198,7 +216,7 @@ REFUSED = {
 @pytest.mark.parametrize("options", REFUSED, ids=" ".join)
 def test_options_that_leave_no_room_for_each_other(options: tuple[str, ...], asked: Asked, command: Command) -> None:
     assert command("run", *options, code=2) == ("", f"error: {REFUSED[options]}\n")
-    assert asked.plan is None
+    assert asked.options is None
 
 
 OUT_OF_RANGE = {
@@ -213,25 +231,32 @@ def test_a_number_out_of_range_is_wrong_usage(options: tuple[str, str], asked: A
     option, found = options
     said = f"error: {option}: found '{found}', expected {OUT_OF_RANGE[options]}\n"
     assert command("run", *options, code=2) == ("", said)
-    assert asked.request is None
+    assert asked.options is None
+
+
+def test_a_word_that_is_none_is_refused_with_the_nearest(asked: Asked, command: Command) -> None:
+    said = "expected one of sequential, pipelined, latest, deadline; did you mean 'latest'?"
+    assert command("run", "--policy", "latst", code=2) == ("", f"error: --policy: found 'latst', {said}\n")
+    assert asked.options is None
 
 
 @pytest.mark.parametrize("options", [("--latch", "0"), ("--latch", "1000"), ("--baseline", "0")], ids=" ".join)
 def test_the_ends_of_a_range_are_in_it(options: tuple[str, ...], asked: Asked, command: Command) -> None:
     command("run", *options)
-    assert asked.plan in (Plan(latch_ms=0.0), Plan(latch_ms=1000.0), Plan(baseline_frames=0))
+    ends = (RunOptions(latch_ms=0.0), RunOptions(latch_ms=1000.0), RunOptions(baseline_frames=0))
+    assert asked.options in ends
 
 
 @pytest.mark.parametrize("policy", ["pipelined", "sequential", "latest", "deadline"])
 def test_every_policy_has_its_name(policy: str, asked: Asked, command: Command) -> None:
     command("run", "--policy", policy)
-    assert asked.plan == Plan(policy)
+    assert asked.options == RunOptions(policy=policy)
 
 
 @pytest.mark.parametrize("cap", list(PerformanceProfile))
 def test_every_cap_has_its_name(cap: PerformanceProfile, asked: Asked, command: Command) -> None:
     command("run", "--performance-profile", cap.value)
-    assert asked.plan == Plan(performance_profile=cap.value)
+    assert asked.options == RunOptions(performance_profile=cap.value)
 
 
 def test_a_failed_run_says_why_and_ends_with_its_code(asked: Asked, command: Command) -> None:
@@ -268,6 +293,7 @@ def test_a_bar_for_each_run_when_stderr_is_a_terminal(monkeypatch: pytest.Monkey
 
 def test_the_call_is_closed_though_the_command_fails(asked: Asked, command: Command) -> None:
     before = Call.closed
-    command("run", "--edge", "none", code=2)
+    asked.raises = BadInputError("dsp", "no core", "one")
+    command("run", code=2)
     assert Call.closed == before + 1
     assert asked.others["starter closed"]

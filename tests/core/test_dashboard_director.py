@@ -6,23 +6,24 @@ from typing import Any
 
 import pytest
 
-from trilane.apps.asked_run import AskedRun, Prepared
 from trilane.apps.dashboard.channel import Asked, Message, Refused, StateIs
 from trilane.apps.dashboard.choices import choices_of, reasons_against
-from trilane.apps.dashboard.director import Director, changed
+from trilane.apps.dashboard.director import Director
 from trilane.apps.dashboard.live_run import _numbered
+from trilane.apps.run_job import Prepared
 from trilane.errors import BadInputError
 from trilane.pipeline.controls import RunControls
 from trilane.scheduler.events import Hold, Stop
+from trilane.stages.run_options import RunOptions
 
-ASKED = AskedRun({"policy": "pipelined", "size": None})
+ASKED = RunOptions()
 
 
-def prepared(asked: AskedRun) -> Prepared:
+def prepared(options: RunOptions) -> Prepared:
     """As `prepare`, for which tensors of 17 are wrong."""
-    if asked.request["size"] == "17":
+    if options.size == "17":
         raise BadInputError("size", "17", "multiples of 32")
-    return Prepared(asked, None, None)  # type: ignore[arg-type]
+    return Prepared(options, None)  # type: ignore[arg-type]
 
 
 @pytest.fixture
@@ -67,7 +68,7 @@ def test_a_new_configuration_is_checked_and_then_the_run_stops(
     assert isinstance(told[0], StateIs) and told[0].state == "restarting" and "policy latest" in told[0].why
     following = director.take_next()
     assert following is not None and director.take_next() is None
-    assert (following.asked.request["policy"], following.asked.edge) == ("latest", "triple")
+    assert following.options == RunOptions(policy="latest", edge="triple")
 
 
 def test_one_that_cannot_be_run_changes_nothing(run: tuple[Director, RunControls], told: list[Message]) -> None:
@@ -86,12 +87,17 @@ def test_what_is_no_control_of_a_run_does_nothing(
     assert (controls.taken(), told, director.take_next()) == (([], []), [], None)
 
 
-def test_a_control_changes_its_own_setting_alone() -> None:
-    assert changed(ASKED, "edge", "single") == AskedRun(ASKED.request, edge="single")
-    assert changed(ASKED, "avatar", "a/b").request == {**ASKED.request, "avatar": "a/b"}
-    capped = changed(ASKED, "performance_profile", "burst")
-    assert capped.performance_profile == "burst"
-    assert changed(capped, "performance_profile", "none") == ASKED
+def test_a_control_changes_its_own_option_alone(run: tuple[Director, RunControls]) -> None:
+    director, _ = run
+    for control, value, expected in (
+        ("avatar", "a/b", RunOptions(avatar="a/b")),
+        ("performance_profile", "burst", RunOptions(avatar="a/b", performance_profile="burst")),
+        ("performance_profile", "none", RunOptions(avatar="a/b")),
+    ):
+        director.do(Asked(control, value))
+        following = director.take_next()
+        assert following is not None and following.options == expected
+        director.begin(following)
 
 
 def test_what_is_in_force_can_be_chosen_and_a_pace_is_capped_already(tmp_path: Any) -> None:
@@ -107,7 +113,7 @@ def test_what_is_in_force_can_be_chosen_and_a_pace_is_capped_already(tmp_path: A
     assert all(config[name] in words and len(set(words)) == len(words) for name, words in choices.items())
     assert choices["avatar"] == ("default", "hiker", str(tmp_path / "one"), str(tmp_path / "two"))
     assert reasons_against(ASKED) == {}
-    assert set(reasons_against(AskedRun(paced_by=("snapdragon-888", 1.0)))) == {"performance_profile"}
+    assert set(reasons_against(RunOptions(profile="snapdragon-888", pace=True))) == {"performance_profile"}
 
 
 def test_each_run_has_a_folder_of_its_own(tmp_path: Any) -> None:

@@ -9,12 +9,16 @@ from typing import Any
 import pytest
 
 from trilane import machine
-from trilane.apps.asked_run import AskedRun, Prepared
 from trilane.apps.dashboard import live_run, serve
 from trilane.apps.dashboard.channel import Asked, Message, Refused, StateIs
 from trilane.apps.dashboard.live_run import ENDLESS, _Runs
-from trilane.apps.run_job import Watched
+from trilane.apps.run_job import Prepared, Watched
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
+from trilane.stages.run_options import RunOptions
+
+
+def prepared(options: RunOptions) -> Prepared:
+    return Prepared(options, None)  # type: ignore[arg-type]
 
 
 class World:
@@ -25,23 +29,21 @@ class World:
         self.told: list[Message] = []
         self.sentences: list[str] = []
         self._script = iter(script)
-        monkeypatch.setattr(live_run, "prepare", lambda asked, _gl: Prepared(asked, None, None))  # type: ignore[arg-type]
         monkeypatch.setattr(live_run, "required_machine", lambda _gl: {})
-        self.runs = _Runs(lambda: None, self._run, self.sentences.append)
+        self.runs = _Runs(prepared, lambda: None, self._run, self.sentences.append)
         self.runs.link = SimpleNamespace(send=self.told.append, window=None)  # type: ignore[assignment]
 
     def _run(self, prepared: Prepared, watched: Watched) -> Any:
-        out = prepared.asked.out
-        self.begun.append((prepared.asked.request["policy"], out and str(out), watched.frames))
+        out = prepared.options.out
+        self.begun.append((prepared.options.policy, out and str(out), watched.frames))
         exit_code, failure = next(self._script)() or (0, None)
         return SimpleNamespace(exit_code=exit_code, folder=str(out), report=SimpleNamespace(failure=failure))
 
     def ask(self, policy: str) -> None:
         self.runs.director.do(Asked("policy", policy))
 
-    def run_all(self, **request: Any) -> Any:
-        asked = AskedRun({"policy": "pipelined", **request}, out=None)
-        return self.runs.run_all(Prepared(asked, None, None))  # type: ignore[arg-type]
+    def run_all(self, **options: Any) -> Any:
+        return self.runs.run_all(prepared(RunOptions(**options)))
 
     @property
     def states(self) -> list[str]:

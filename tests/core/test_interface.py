@@ -6,7 +6,6 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +16,7 @@ import trilane
 from support.run_folders import write_run
 from support.run_report import make_report
 from trilane.apps import interface
-from trilane.apps.asked_run import AskedRun, check_numbers, prepare
 from trilane.apps.explained.job_table import COLUMNS
-from trilane.apps.remake import Remake
 from trilane.apps.report import Report, read_report
 from trilane.apps.run_html import run_html
 from trilane.apps.run_job import Outcome
@@ -29,7 +26,7 @@ from trilane.pipeline.journal import Stepped
 from trilane.scheduler.accounts import idle_slices
 from trilane.scheduler.events import Settings
 from trilane.scheduler.virtual import Simulation, simulate
-from trilane.stages.configure import Request
+from trilane.stages.run_options import RunOptions
 
 MS = 1_000_000
 STAGE_MS = {"pose": 1, "raster": 2, "infer": 4, "composite": 2, "present": 1}
@@ -51,8 +48,8 @@ def asked(monkeypatch: pytest.MonkeyPatch, folder: Path) -> list[Any]:
     """What `run` asked for; the run ends with the exit code that is put in front."""
     found: list[Any] = [0]
 
-    def run_asked(given: AskedRun, hooks: Any) -> Outcome:
-        found.append(given)
+    def run_asked(options: RunOptions, hooks: Any, command: tuple[str, ...]) -> Outcome:
+        found.extend([options, command])
         with hooks() as told:
             told.progress("pipelined", 1, 2)
             told.message("a note")
@@ -75,8 +72,7 @@ def test_importing_trilane_imports_nothing_else() -> None:
 def test_a_run_without_arguments_is_that_of_the_command_line_without_a_baseline(asked: list[Any], folder: Path) -> None:
     run = trilane.run()
     assert (run.folder, run.report.frames.presented) == (folder, 3)
-    assert Request(**asked[1].request) == Request()
-    assert asked[1] == AskedRun(asked[1].request, baseline_frames=0, command=("trilane.run",))
+    assert asked[1:] == [RunOptions(baseline_frames=0), ("trilane.run",)]
 
 
 def test_arguments_are_handed_on(asked: list[Any], tmp_path: Path) -> None:
@@ -103,8 +99,9 @@ def test_arguments_are_handed_on(asked: list[Any], tmp_path: Path) -> None:
         on_progress=lambda *given: said.append(given),
         on_message=said.append,
     )
-    request = Request(
-        str(tmp_path / "s.toml"),
+    _, options, words = asked
+    assert options == RunOptions(
+        scene=str(tmp_path / "s.toml"),
         avatar=str(tmp_path),
         frames=3,
         size="96",
@@ -113,13 +110,18 @@ def test_arguments_are_handed_on(asked: list[Any], tmp_path: Path) -> None:
         output="64x48",
         cores=("dsp=0,1", "cpu=1"),
         policy="latest",
+        edge="triple",
+        performance_profile="burst",
+        latch_ms=2.0,
+        baseline_frames=4,
+        check=2,
+        width=8,
+        channels=4,
+        calibration="entropy:9",
+        out=Path("there"),
     )
-    given = asked[1]
-    assert Request(**given.request) == request
-    assert given.command[:2] == ("trilane.run", f"scene={tmp_path / 's.toml'!r}")
-    assert "size=96" in given.command
-    expected = AskedRun(given.request, "triple", 4, None, "burst", 2.0, Path("there"), given.command)
-    assert given == replace(expected, check=2, remake=Remake(8, 4, "entropy:9"))
+    assert words[:2] == ("trilane.run", f"scene={tmp_path / 's.toml'!r}")
+    assert "size=96" in words
     assert said == [("pipelined", 1, 2), "a note"]
 
 
@@ -305,10 +307,9 @@ def test_numbers_outside_of_what_holds_are_refused_before_a_process_starts(
     monkeypatch.setattr("trilane.apps.asked_run.early_processes", pytest.fail)
     with pytest.raises(BadInputError, match=f"^{said}"):
         trilane.run(**{argument: value})
-    with pytest.raises(BadInputError, match=f"^{said}"):
-        prepare(AskedRun(**{argument: value}), pytest.fail)
 
 
 def test_the_limits_themselves_hold() -> None:
     for latch_ms in (0, 1000):
-        check_numbers(AskedRun(latch_ms=latch_ms, baseline_frames=0, check=latch_ms))
+        options = RunOptions.checked({"latch_ms": latch_ms, "baseline_frames": 0, "check": latch_ms})
+        assert (options.latch_ms, options.baseline_frames, options.check) == (latch_ms, 0, latch_ms)

@@ -18,8 +18,8 @@ from trilane.pipeline.trial import Round
 from trilane.scheduler.placement import Ranked
 from trilane.scheduler.places import Core, Place, Work
 from trilane.stages import PRELOAD
-from trilane.stages.configure import Request
 from trilane.stages.placing import TriedPlacement
+from trilane.stages.run_options import RunOptions
 
 HERE = {"cpu": Place((0,), 1), "gpu": Place((1,), 1)}
 A, B, C, RULE = ({**HERE, "dsp": dsp} for dsp in (Place((0,), 1), Place((1,), 1), Place((0, 1), 1), Place((0, 1), 2)))
@@ -195,7 +195,7 @@ def test_every_size_is_placed_on_every_number_of_cores(monkeypatch: pytest.Monke
     found = placement.measure(
         "a", ("32x32", "64x64"), (1, 0), frames=20, rounds=3, finalists=1, further=5, runs=2, runtime="ort"
     )
-    requests = [Request(size=size, avatar="a", frames=20, runtime="ort") for size in ("32x32", "64x64")]
+    requests = [RunOptions(size=size, avatar="a", frames=20, runtime="ort") for size in ("32x32", "64x64")]
     trials = [(request, ("cores", cores), PRELOAD) for request in requests for cores in ((4,), (4, 6))]
     assert asked == [part for trial in trials for part in (trial, (3, 1, 5, 2))]
     named = [{"size": size, "cores": count} for size in ("32x32", "64x64") for count in (1, 2)]

@@ -16,6 +16,7 @@ from trilane.apps.cli import bench
 from trilane.apps.experiments import accuracy, error_by_cause, hard_cases
 from trilane.apps.experiments.hard_numbers import all_rows
 from trilane.stages import configure, machine_facts
+from trilane.stages.run_options import RunOptions
 
 MACHINE = {"cpu": {"model": "a processor", "cores": 2}}
 Printed = Callable[..., str]
@@ -113,8 +114,8 @@ def test_errors_by_cause(
     assert out.is_dir()
     printed("accuracy", "far", "--by-cause", "--size", "64", "--frames", 3)
     assert asked == [
-        (configure.Request("default", runtime="ort"), 2, out, None),
-        (configure.Request("far", size="64"), 3, None, None),
+        (RunOptions(scene="default", runtime="ort"), 2, out, None),
+        (RunOptions(scene="far", size="64"), 3, None, None),
     ]
 
 

@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.apps import asked_run, remade_avatar
-from trilane.apps.asked_run import AskedRun, prepare
+from trilane.apps import remade_avatar
+from trilane.apps.asked_run import prepare
 from trilane.apps.cli.sweep_options import SweptCommand
-from trilane.apps.remake import METHODS, Remake, calibration_of, check_remake
 from trilane.avatars.bundle import MANIFEST, load_bundle
 from trilane.avatars.manifest import sha256_of
 from trilane.avatars.validation import DrawnAs, accuracy_of
 from trilane.bench.lib import full_network
 from trilane.errors import BadInputError
+from trilane.stages.run_options import METHODS, RunOptions, calibration_of
 from trilane.training.quantising import calibration
 
-OWN = Remake(width=8, channels=4)
+OWN = RunOptions(width=8, channels=4)
 
 
 def test_the_methods_are_those_of_the_quantiser() -> None:
@@ -40,7 +40,7 @@ def test_a_calibration_is_a_method_and_a_number_of_views(text: str, meant: Any) 
 )
 def test_other_calibrations_are_refused(text: str) -> None:
     with pytest.raises(BadInputError, match="--calibration"):
-        check_remake(Remake(calibration=text))
+        RunOptions.checked({"calibration": text}, as_typed=True)
 
 
 @pytest.mark.parametrize(
@@ -48,11 +48,11 @@ def test_other_calibrations_are_refused(text: str) -> None:
     [("width", 0), ("width", 257), ("width", True), ("channels", 5), ("channels", 20), ("channels", 8.0)],
 )
 def test_other_numbers_are_refused(name: str, value: Any) -> None:
-    check_remake(Remake(width=256, channels=16))
-    with pytest.raises(BadInputError, match=f"--{name}: found {value!r}"):
-        check_remake(Remake(**{name: value}))
-    with pytest.raises(BadInputError, match=f"--{name}: found {value!r}"):
-        prepare(AskedRun(remake=Remake(**{name: value})), pytest.fail)
+    RunOptions.checked({"width": 256, "channels": 16})
+    with pytest.raises(BadInputError, match=f"^--{name}: found {value!r}"):
+        RunOptions.checked({name: value}, as_typed=True)
+    with pytest.raises(BadInputError, match=f"^{name}: found {value!r}"):
+        RunOptions.checked({name: value})
 
 
 @pytest.mark.parametrize(("name", "value"), [("calibration", "entrpy"), ("channels", 5), ("width", 300)])
@@ -62,8 +62,8 @@ def test_a_sweep_refuses_them_before_its_first_trial(name: str, value: Any) -> N
 
 
 def test_nothing_is_asked_of_an_avatar_as_it_is(drawable_bundle: Path) -> None:
-    assert not Remake().is_asked and not Remake(calibration="as-it-is").is_asked
-    assert Remake(width=8).is_asked
+    assert not RunOptions().remakes_avatar and not RunOptions(calibration="as-it-is").remakes_avatar
+    assert RunOptions(width=8).remakes_avatar
     folder, said = remade_avatar.remade_avatar(str(drawable_bundle), OWN)
     assert folder == drawable_bundle and "as its files are" in said
 
@@ -90,7 +90,7 @@ def test_another_number_of_channels_is_untrained_and_has_as_many_of_the_texture(
     drawable_bundle: Path, views: list[int]
 ) -> None:
     """Channels 4 to 7 are the first four once more. It is made once, by another recipe again."""
-    remake = Remake(width=4, channels=8, calibration="minmax:2")
+    remake = RunOptions(width=4, channels=8, calibration="minmax:2")
     folder, said = remade_avatar.remade_avatar(str(drawable_bundle), remake)
     assert said == "made anew: width 4, 8 channels, untrained; minmax on 2 views; its times count, its pictures do not"
     made, own = load_bundle(folder), load_bundle(drawable_bundle)
@@ -101,10 +101,12 @@ def test_another_number_of_channels_is_untrained_and_has_as_many_of_the_texture(
     facts = accuracy_of(made, DrawnAs("ort", "256", "linear"))
     assert facts["source"] == "no figures" and "untrained" in facts["why"]
     assert remade_avatar.remade_avatar(str(drawable_bundle), remake)[0] == folder and views == [2]
-    other = remade_avatar.remade_avatar(str(drawable_bundle), Remake(width=4, channels=8, calibration="minmax:1"))[0]
+    other = remade_avatar.remade_avatar(str(drawable_bundle), RunOptions(width=4, channels=8, calibration="minmax:1"))[
+        0
+    ]
     assert other != folder and views == [2, 1]
     with pytest.raises(BadInputError, match="--check: found a network that is made untrained"):
-        prepare(AskedRun({"avatar": str(drawable_bundle)}, remake=remake, check=1), pytest.fail)
+        prepare(remake.changed(avatar=str(drawable_bundle), check=1), pytest.fail)
 
 
 def test_a_calibration_quantises_the_float_network_that_the_manifest_names(
@@ -122,7 +124,7 @@ def test_a_calibration_quantises_the_float_network_that_the_manifest_names(
         lambda *_: export_onnx(UNet(width=8, channels=4), *make_bundle.CALIBRATION_SHAPE),
     )
     with pytest.raises(BadInputError, match="no float network"):
-        remade_avatar.remade_avatar(str(drawable_bundle), Remake(calibration="entropy:1"))
+        remade_avatar.remade_avatar(str(drawable_bundle), RunOptions(calibration="entropy:1"))
     manifest = json.loads((drawable_bundle / MANIFEST).read_text())
     named = tmp_path / "named"
     named.mkdir()
@@ -130,7 +132,7 @@ def test_a_calibration_quantises_the_float_network_that_the_manifest_names(
         (named / file.name).write_bytes(file.read_bytes())
     manifest["quantisation"]["float_network"] = f"own.npz, sha256 {sha256_of([weights])}"
     (named / MANIFEST).write_text(json.dumps(manifest))
-    folder, said = remade_avatar.remade_avatar(str(named), Remake(calibration="minmax:1", width=8))
+    folder, said = remade_avatar.remade_avatar(str(named), RunOptions(calibration="minmax:1", width=8))
     made = load_bundle(folder)
     assert said == "made anew: minmax on 1 view" and not remade_avatar.is_untrained(made)
     assert full_network.float_weights(made) == weights
@@ -141,4 +143,4 @@ def test_a_calibration_quantises_the_float_network_that_the_manifest_names(
 def test_of_several_avatars_none_is_made_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(remade_avatar, "remade_avatar", pytest.fail)
     with pytest.raises(BadInputError, match="a scene of 2 avatars"):
-        asked_run.prepare(AskedRun({"scene": "pair"}, remake=Remake(width=8)), pytest.fail)
+        prepare(RunOptions(scene="pair", width=8), pytest.fail)

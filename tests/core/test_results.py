@@ -11,7 +11,8 @@ import numpy as np
 from trilane.apps.cli.sweep import _of_file
 from trilane.apps.sweeps.definition import trials_of
 from trilane.bench.lib.cast import Cast
-from trilane.stages.configure import Request, configure
+from trilane.stages.configure import configure
+from trilane.stages.run_options import RunOptions
 
 RESULTS = Path(__file__).resolve().parents[2] / "docs" / "results"
 EXAMPLES = RESULTS.parent / "examples"
@@ -43,7 +44,7 @@ def test_the_sweep_of_networks_has_60_trials_by_six_axes() -> None:
 
 
 def test_the_camera_of_the_slow_scene_moves_and_nobody_else() -> None:
-    checked = configure(Request(str(EXAMPLES / "slow-camera.toml"), runtime="ort"), EXAMPLES)
+    checked = configure(RunOptions(scene=str(EXAMPLES / "slow-camera.toml"), runtime="ort"), EXAMPLES)
     cast = Cast(checked)
     (first,), (last,) = cast.seen(0), cast.seen(9)
     assert np.abs(first.pose - last.pose).max() < 1e-4

@@ -18,7 +18,7 @@ from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.host import host_units, usable_cores
 from trilane.pipeline.result import Failure
 from trilane.scheduler.ledger import JobRecord
-from trilane.stages.configure import Request
+from trilane.stages.run_options import RunOptions
 
 MS = 1_000_000
 Held = Callable[[str, Any], None]
@@ -29,7 +29,7 @@ class ToldConfig:
 
     runtime = "told"
 
-    def __init__(self, request: Request, **values: Any) -> None:
+    def __init__(self, request: RunOptions, **values: Any) -> None:
         self.request, self.values = request, values
         self.accuracy = {request.avatar: f"accuracy of {request.avatar}"}
         self.assets = f"assets of {request.avatar}"
@@ -71,8 +71,8 @@ def result_of(policy: str, frame_ms: float, **changes: Any) -> SimpleNamespace:
 
 
 @pytest.fixture
-def configured(monkeypatch: pytest.MonkeyPatch) -> list[Request]:
-    asked: list[Request] = []
+def configured(monkeypatch: pytest.MonkeyPatch) -> list[RunOptions]:
+    asked: list[RunOptions] = []
     for module in (pipeline, scenario):
         monkeypatch.setattr(module, "configure", lambda request, _: asked.append(request) or ToldConfig(request))
     return asked
@@ -95,7 +95,7 @@ FIGURES = {
 
 
 def test_a_rounds_runs_are_set_against_the_sequential_ones(
-    monkeypatch: pytest.MonkeyPatch, configured: list[Request]
+    monkeypatch: pytest.MonkeyPatch, configured: list[RunOptions]
 ) -> None:
     """Sequential frames of 20, 22 and 24 ms (hops 5, 7, 9), between them 10 ms pipelined. First round: gain 2.1, bound
     (15 + 6) / 10; second: 2.3 and (15 + 8) / 10. No frame of theirs is composited: none has a latency."""
@@ -136,7 +136,7 @@ def test_a_rounds_runs_are_set_against_the_sequential_ones(
     }
     assert result["accuracy"] == {"x": "accuracy of x"}
     assert result["config"] == {"frames": 30, "rounds": 2, "runtime": "told", "video": False}
-    assert configured == [Request(size="64x64", avatar="x", frames=30, runtime="auto")]
+    assert configured == [RunOptions(size="64x64", avatar="x", frames=30, runtime="auto")]
     values = {"out_dir": None, "record": False, "units": host_units(cores)}
     one = {"policy": "sequential", "edge": "double", "pace_fps": None}
     other = {"policy": "latest", "edge": "orphan", "pace_fps": 1.25 * 1000 / 10}
@@ -145,7 +145,7 @@ def test_a_rounds_runs_are_set_against_the_sequential_ones(
 
 
 def test_every_avatar_size_and_number_of_cores_is_measured(
-    monkeypatch: pytest.MonkeyPatch, configured: list[Request]
+    monkeypatch: pytest.MonkeyPatch, configured: list[RunOptions]
 ) -> None:
     monkeypatch.setattr(pipeline, "run_avatar", lambda *_, policy, **__: result_of(policy, 20.0))
     monkeypatch.setattr(pipeline.full_width, "full_width_bundle", lambda: Path("/made"))
@@ -214,7 +214,7 @@ def test_latencies_make_a_scenarios_row() -> None:
         assert (row["judge"], row["verdict"], row["because"]) == ("loadgen", verdict, "")
 
 
-def test_every_scenario_is_asked_of_every_judge(monkeypatch: pytest.MonkeyPatch, configured: list[Request]) -> None:
+def test_every_scenario_is_asked_of_every_judge(monkeypatch: pytest.MonkeyPatch, configured: list[RunOptions]) -> None:
     ran: list[Any] = []
 
     def run_scenario(*asked: Any) -> tuple[dict[str, Any], str]:
@@ -239,7 +239,7 @@ def test_every_scenario_is_asked_of_every_judge(monkeypatch: pytest.MonkeyPatch,
     assert ran == [
         (made, "assets of x", Load(name, 3.0, 4.0, 5.0, 6, 7), judge, "pipelined") for name in names for judge in judges
     ]
-    assert configured == [Request(size="256x256", avatar="x", frames=1_000_000, runtime="auto")]
+    assert configured == [RunOptions(size="256x256", avatar="x", frames=1_000_000, runtime="auto")]
     assert looked == ["there"]
     scenario.measure(scenario=names[:1], avatar="x")
     assert len(looked) == 1

@@ -16,7 +16,7 @@ from trilane.apps import run_job
 from trilane.apps.pace import Pace
 from trilane.apps.report import read_report
 from trilane.apps.run_check import asked_frames
-from trilane.apps.run_job import Hooks, Outcome, Plan, run_to_folder
+from trilane.apps.run_job import Hooks, Outcome, Prepared, run_to_folder
 from trilane.errors import BadInputError, TrilaneError
 from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
 from trilane.hw_profiles.application import application_graph
@@ -33,6 +33,7 @@ from trilane.scheduler.virtual import simulate
 from trilane.stages.config import RunConfig, pose_dtype
 from trilane.stages.configure import Checked
 from trilane.stages.cpu.present import KEPT_FOLDER, SEGMENTS, PresentStage
+from trilane.stages.run_options import RunOptions
 from trilane.transport.packets import SlotLayout, view_packet
 from trilane.units import PerformanceProfile
 
@@ -145,15 +146,18 @@ def with_a_place(given: Checked, _policy: str, _starter: Any, _driver: str, _say
     return replace(given, notes=(*given.notes, PLACED))
 
 
-def go(runs: Runs, target: Path, plan: Plan | None = None, made: Mapping[str, Any] | None = None) -> Outcome:
+def go(
+    runs: Runs, target: Path, made: Mapping[str, Any] | None = None, pace: Pace | None = None, **options: Any
+) -> Outcome:
     starter: Any = "the starter"
-    return run_to_folder(checked(), target, plan or Plan(), runs.hooks, machine=MACHINE, made=made, starter=starter)
+    prepared = Prepared(RunOptions(**options), checked(), pace)
+    return run_to_folder(prepared, target, runs.hooks, machine=MACHINE, made=made, starter=starter)
 
 
 def test_a_run_and_its_baseline(runs: Callable[..., Runs], tmp_path: Path) -> None:
     """The baseline is of at most so many frames, one at a time, without a latch, and leaves no picture."""
     double = runs(a_result(), a_result(4, "sequential"))
-    outcome = go(double, tmp_path / "run", Plan("deadline", 4, latch_ms=3.0), MADE)
+    outcome = go(double, tmp_path / "run", MADE, policy="deadline", baseline_frames=4, latch_ms=3.0)
     assert (outcome.exit_code, outcome.folder) == (0, tmp_path / "run")
     first, second = double.calls
     assert [(call["policy"], call["frames"], call["latch_ms"]) for call in double.calls] == [
@@ -181,6 +185,7 @@ def test_what_the_report_says_of_a_run(runs: Callable[..., Runs], tmp_path: Path
     assert document["clock"] == "host"
     assert document["machine"] == {**MACHINE, "gl": None}
     assert document["made"] == MADE
+    assert document["options"] == RunOptions().as_json() and document["options"]["baseline_frames"] == 60
     assert "out_dir" not in document["config"]
     assert document["config"]["policy"] == "pipelined"
     assert document["config"]["scene"]["frames"] == FRAMES
@@ -232,7 +237,7 @@ def test_frames_of_the_run_alone_are_kept_and_compared(
 
     monkeypatch.setattr(run_job, "check_run", check)
     double = runs(run, a_result(4, "sequential"))
-    outcome = go(double, tmp_path / "run", Plan(baseline_frames=4, check=2))
+    outcome = go(double, tmp_path / "run", baseline_frames=4, check=2)
     assert [call["config"].kept for call in double.calls] == [asked_frames(FRAMES, 2), ()]
     assert ("check", 1, 2) in double.said
     assert not (outcome.folder / KEPT_FOLDER).exists()
@@ -242,18 +247,18 @@ def test_frames_of_the_run_alone_are_kept_and_compared(
     assert "kept" not in document["config"]
 
 
-@pytest.mark.parametrize("plan", [Plan(baseline_frames=0), Plan("sequential")])
+@pytest.mark.parametrize("options", [{"baseline_frames": 0}, {"policy": "sequential"}])
 def test_no_baseline_where_none_is_asked_for_or_the_run_is_one(
-    plan: Plan, runs: Callable[..., Runs], tmp_path: Path
+    options: dict[str, Any], runs: Callable[..., Runs], tmp_path: Path
 ) -> None:
     double = runs(a_result())
-    outcome = go(double, tmp_path / "run", plan)
+    outcome = go(double, tmp_path / "run", **options)
     assert (len(double.calls), outcome.report.baseline, outcome.exit_code) == (1, None, 0)
 
 
 def test_a_baseline_has_no_more_frames_than_the_scene(runs: Callable[..., Runs], tmp_path: Path) -> None:
     double = runs(a_result(), a_result(policy="sequential"))
-    go(double, tmp_path / "run", Plan(baseline_frames=1000))
+    go(double, tmp_path / "run", baseline_frames=1000)
     assert double.calls[1]["frames"] == FRAMES
 
 
@@ -337,14 +342,14 @@ def test_policies_that_need_a_rate_are_as_slow_as_the_chip(
 ) -> None:
     """The scene has 30 frames a second, of which the chip's pace leaves a quarter."""
     job = object.__new__(run_job._Job)
-    job._plan = Plan(pace=slow_motion and Pace("chip", "burst", slow_motion, {}))  # type: ignore[arg-type]
+    job._pace = None if slow_motion is None else Pace("chip", "burst", slow_motion, {})
     job._checked = SimpleNamespace(config=SimpleNamespace(scene=SimpleNamespace(fps=30.0)))  # type: ignore[assignment]
     assert job._release_fps(policy) == fps
 
 
 def test_a_run_at_a_chips_pace_is_compared(runs: Callable[..., Runs], tmp_path: Path) -> None:
     pace = Pace("chip", "burst", 2.0, STAGE_NS)
-    report = go(runs(a_result(), a_result(policy="sequential")), tmp_path / "run", Plan(pace=pace)).report
+    report = go(runs(a_result(), a_result(policy="sequential")), tmp_path / "run", pace=pace).report
     assert report.pace is not None
     assert (report.pace.profile, report.pace.virtual_ms, report.pace.ratio) == ("chip", 4.0, 1.0)
     assert (report.sources["pace"], report.sources["pace.ratio"]) == (COMPUTED, COMPARED)
@@ -358,7 +363,7 @@ def test_a_cap_is_kept_by_a_governor_of_this_machine(runs: Callable[..., Runs], 
         report=metrics_of({**capped.report.as_json(), "caps": caps, "temperature_c": {"kind": "modelled"}}),
     )
     double = runs(capped, a_result(policy="sequential"))
-    report = go(double, tmp_path / "run", Plan(performance_profile=PerformanceProfile.BALANCED)).report
+    report = go(double, tmp_path / "run", performance_profile=PerformanceProfile.BALANCED.value).report
     governors = [call["governor"] for call in double.calls]
     assert all(isinstance(governor, Governor) for governor in governors) and governors[0] is not governors[1]
     assert report.caps.as_json() == caps
@@ -374,7 +379,7 @@ def test_the_video_is_joined_and_what_it_lacks_is_told(runs: Callable[..., Runs]
         return a_result(metrics={"pose": {"visible": 0.0}})
 
     double = runs(recorded)
-    outcome = go(double, tmp_path / "run", Plan(baseline_frames=0))
+    outcome = go(double, tmp_path / "run", baseline_frames=0)
     assert outcome.report.video is not None
     assert (outcome.report.video.frames, outcome.report.video.seconds) == (5, pytest.approx(0.2))
     assert len(outcome.report.checksum or "") == 64
@@ -389,7 +394,9 @@ def test_the_video_is_joined_and_what_it_lacks_is_told(runs: Callable[..., Runs]
 
 def test_a_run_without_a_video_says_why(runs: Callable[..., Runs], tmp_path: Path) -> None:
     double, unrecorded = runs(a_result()), checked().changed(record=False)
-    report = run_to_folder(unrecorded, tmp_path / "run", Plan(baseline_frames=0), double.hooks, machine=MACHINE).report
+    report = run_to_folder(
+        Prepared(RunOptions(baseline_frames=0), unrecorded), tmp_path / "run", double.hooks, machine=MACHINE
+    ).report
     assert (report.video, report.checksum) == (None, None)
     assert report.notes == (*checked().notes, run_job.NO_VIDEO)
     assert not double.calls[0]["config"].record
@@ -401,5 +408,5 @@ def test_a_whole_video_is_worth_no_word(runs: Callable[..., Runs], tmp_path: Pat
         return a_result()
 
     double = runs(recorded)
-    assert go(double, tmp_path / "run", Plan(baseline_frames=0)).report.sources["video"] == MEASURED
+    assert go(double, tmp_path / "run", baseline_frames=0).report.sources["video"] == MEASURED
     assert double.said[3:] == []

@@ -23,8 +23,9 @@ from trilane.scene.crop import Rect
 from trilane.scene.planner import TensorBudget, work_of_side
 from trilane.scene.schema import Scene
 from trilane.stages.config import RunConfig
-from trilane.stages.configure import Request, configure
+from trilane.stages.configure import configure
 from trilane.stages.foresee import tensor_works
+from trilane.stages.run_options import RunOptions
 
 ALL = (1000, 563, 250)
 LOSS = SizeLoss("from somewhere", {1000: 0.0, 562: 1.0, 250: 3.0})
@@ -77,7 +78,7 @@ def test_a_budget_without_figures_names_the_command(tiny_bundle: Path, tmp_path:
     file = tmp_path / "scene.toml"
     file.write_text(f'size = "auto"\nerror_budget_db = 1.0\n[[avatars]]\nbundle = "{tiny_bundle}"\n')
     with pytest.raises(BadInputError, match=r"error_budget_db.*no valid validation.*--sizes") as caught:
-        configure(Request(str(file), runtime="ort"), tmp_path, lambda: None)
+        configure(RunOptions(scene=str(file), runtime="ort"), tmp_path, lambda: None)
     assert caught.value.exit_code == 2
 
 
@@ -86,7 +87,7 @@ def test_a_budget_of_nothing_or_of_a_fixed_size_is_refused(said: str, found: str
     file = tmp_path / "scene.toml"
     file.write_text(f"size = {said}\nerror_budget_db = {0 if said == chr(34) + 'auto' + chr(34) else 1}\n")
     with pytest.raises(BadInputError, match=found):
-        configure(Request(str(file), runtime="ort"), tmp_path, lambda: None)
+        configure(RunOptions(scene=str(file), runtime="ort"), tmp_path, lambda: None)
 
 
 def test_a_loss_is_that_of_the_next_smaller_size_that_was_measured() -> None:

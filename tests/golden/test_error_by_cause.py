@@ -19,7 +19,8 @@ from trilane.arrays import F32, F64
 from trilane.bench.lib.cast import Cast
 from trilane.bench.lib.full_picture import FullPictures
 from trilane.stages.config import posed_vertices
-from trilane.stages.configure import Checked, Request, configure
+from trilane.stages.configure import Checked, configure
+from trilane.stages.run_options import RunOptions
 
 FRAME = 5
 #: Of the texture everywhere; float16 and bytes cannot hold it.
@@ -44,7 +45,7 @@ def checked(drawable_bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     folder = tmp_path_factory.mktemp("scene")
     file = folder / "small.toml"
     file.write_text(SCENE.format(bundle=drawable_bundle), encoding="utf-8")
-    return configure(Request(scene=str(file), runtime="ort", skinning="cpu"), folder)
+    return configure(RunOptions(scene=str(file), runtime="ort", skinning="cpu"), folder)
 
 
 @pytest.fixture(scope="module")

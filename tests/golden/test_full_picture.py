@@ -19,10 +19,11 @@ from trilane.bench.lib.layers import Box, Layer, blended, premultiplied, to_ligh
 from trilane.bench.lib.stage_chain import AvatarFrames
 from trilane.bench.planner import FIXED, fixed, in_frames, planned
 from trilane.body.body import load_body
-from trilane.stages.configure import Checked, Request, configure
+from trilane.stages.configure import Checked, configure
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.gpu import opengl
 from trilane.stages.gpu.composite_painters import AvatarPainter, PicturePainter
+from trilane.stages.run_options import RunOptions
 from trilane.training.clothing.clothed_body import ClothedBody
 from trilane.training.clothing.layers import clothing_layers
 from trilane.training.clothing.looks import LOOKS, find_landmarks
@@ -44,7 +45,7 @@ def checked(drawable_bundle: Path, tmp_path: Path) -> Checked:
     """A small scene of the avatar with the tiny network."""
     file = tmp_path / "small.toml"
     file.write_text(SCENE.format(bundle=drawable_bundle), encoding="utf-8")
-    return configure(Request(scene=str(file), runtime="ort", skinning="cpu"), tmp_path)
+    return configure(RunOptions(scene=str(file), runtime="ort", skinning="cpu"), tmp_path)
 
 
 def test_blending_is_what_the_painter_does_on_the_same_grid(gl: Any) -> None:
@@ -119,7 +120,7 @@ def test_the_truth_is_what_the_training_draws(name: str, tmp_path: Path, gl: Any
     """The clothes of the avatar's look on the skin; on the offsets, which are these clothes, they would stand off."""
     file = tmp_path / "own.toml"
     file.write_text(SCENE.format(bundle=name), encoding="utf-8")
-    cast = Cast(configure(Request(scene=str(file), runtime="ort", skinning="cpu"), tmp_path))
+    cast = Cast(configure(RunOptions(scene=str(file), runtime="ort", skinning="cpu"), tmp_path))
     (data,), (seen,), look = cast.avatars.values(), cast.seen(5), LOOKS[name]
     true = true_pictures(cast, gl)
     assert true is not None and data.shaped.body.offsets is not None

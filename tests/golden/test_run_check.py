@@ -26,8 +26,9 @@ from trilane.arrays import U8
 from trilane.bench.lib.full_picture import TruePictures, true_pictures
 from trilane.bench.lib.layers import blended
 from trilane.bench.lib.stage_chain import AvatarFrames
-from trilane.stages.configure import Checked, Request, configure
+from trilane.stages.configure import Checked, configure
 from trilane.stages.cpu.present import KeptFrames
+from trilane.stages.run_options import RunOptions
 
 SCENE = """
 frames = 12
@@ -44,7 +45,7 @@ NUMBER, ALPHA, SHIFT, TINT = 5, 0.7, 3, 20
 def scene(folder: Path, avatar: str, camera: str = "builtin:static") -> Checked:
     file = folder / "scene.toml"
     file.write_text(SCENE.format(avatar=avatar, camera=camera), encoding="utf-8")
-    return configure(Request(scene=str(file), runtime="ort"), folder)
+    return configure(RunOptions(scene=str(file), runtime="ort"), folder)
 
 
 class Pictures:

@@ -21,7 +21,8 @@ from trilane.pipeline.fork_server import process_name
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline
 from trilane.stages.avatar_pipeline import avatar_pipeline
-from trilane.stages.configure import Request, configure
+from trilane.stages.configure import configure
+from trilane.stages.run_options import RunOptions
 
 FPS, PICTURES, FRAMES, KILL_AT = 30, 60, 72, 20
 WIDTH, HEIGHT = 96, 64
@@ -75,8 +76,8 @@ class KillsGpu:
 def run(background: Path, bundle: Path, folder: Path, killer: KillsGpu) -> RunResult:
     """The avatar's pipeline, but for its last stage, which notes the grey of a corner that no avatar reaches into."""
     (folder / "scene.toml").write_text(SCENE, encoding="utf-8")
-    asked = Request(
-        str(folder / "scene.toml"), background=str(background), avatar=str(bundle), frames=FRAMES, runtime="ort"
+    asked = RunOptions(
+        scene=str(folder / "scene.toml"), background=str(background), avatar=str(bundle), frames=FRAMES, runtime="ort"
     )
     checked = configure(asked, folder)
     pipeline = avatar_pipeline(checked.config, checked.assets, "double")

@@ -34,7 +34,8 @@ from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.events import Dispatch, JobDone, Pong, UnitDied
 from trilane.scheduler.recording import Recording, replay
 from trilane.stages.avatar_pipeline import avatar_pipeline
-from trilane.stages.configure import Request, configure
+from trilane.stages.configure import configure
+from trilane.stages.run_options import RunOptions
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
 #: A unit that is silent for so long has stopped; a busy machine keeps one from its core for some hundredths of it.
@@ -353,7 +354,7 @@ def test_late_poses_arrive_and_are_newer(run: Run) -> None:
 
 
 def test_a_lost_context_costs_a_restart_and_a_frame(run: Run, tmp_path: Path, drawable_bundle: Path) -> None:
-    checked = configure(Request(avatar=str(drawable_bundle), frames=12, size="64", runtime="ort"), tmp_path)
+    checked = configure(RunOptions(avatar=str(drawable_bundle), frames=12, size="64", runtime="ort"), tmp_path)
     losing = with_factory(avatar_pipeline(checked.config, checked.assets), "raster", LOSING_FACTORY)
     result = run(losing, 12, assets=checked.assets)
     assert result.failure is None

@@ -15,8 +15,9 @@ from trilane.hw_profiles.host import rule_placement, usable_cores
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.places import Times
 from trilane.stages import PRELOAD, placing
-from trilane.stages.configure import Checked, Request, configure
+from trilane.stages.configure import Checked, configure
 from trilane.stages.dsp.bare_calls import calls_of
+from trilane.stages.run_options import RunOptions
 
 SEVERAL = pytest.mark.skipif(len(usable_cores()) < 2, reason="there is one core")
 
@@ -24,7 +25,7 @@ SEVERAL = pytest.mark.skipif(len(usable_cores()) < 2, reason="there is one core"
 @pytest.fixture
 def checked(drawable_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Checked:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    asked = Request(avatar=str(drawable_bundle), size="64x64", frames=4, runtime="ort", skinning="cpu")
+    asked = RunOptions(avatar=str(drawable_bundle), size="64x64", frames=4, runtime="ort", skinning="cpu")
     return configure(asked, tmp_path)
 
 

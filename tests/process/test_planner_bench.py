@@ -15,9 +15,10 @@ from trilane.bench.lib.stage_chain import AvatarFrames
 from trilane.bench.planner import fixed
 from trilane.errors import BadInputError
 from trilane.stages.avatar_pipeline import run_avatar
-from trilane.stages.configure import Checked, Request, configure
+from trilane.stages.configure import Checked, configure
 from trilane.stages.cpu.pose import PoseStage
 from trilane.stages.cpu.present import SEGMENTS, kept_frames
+from trilane.stages.run_options import RunOptions
 
 #: Three seconds from frame to frame.
 SCENE = """
@@ -39,7 +40,7 @@ def small(bundle: Path, folder: Path, policy: str = "pipelined") -> Checked:
     """Who walks out of the picture and back."""
     file = folder / "small.toml"
     file.write_text(SCENE.format(bundle=bundle), encoding="utf-8")
-    return configure(Request(scene=str(file), runtime="ort", policy=policy), folder)
+    return configure(RunOptions(scene=str(file), runtime="ort", policy=policy), folder)
 
 
 def test_frames_made_here_are_those_that_a_run_presents(drawable_bundle: Path, tmp_path: Path) -> None:
@@ -124,7 +125,7 @@ def silhouette(folder: Path, x: float, z: float) -> tuple[float, float]:
     log, file = folder / "log.txt", folder / "scene.toml"
     log.write_text("\n".join(LOG.format(time=time / 30, x=x, z=z) for time in range(9)), encoding="utf-8")
     file.write_text(CAMERA.format(log=log), encoding="utf-8")
-    frames = AvatarFrames(configure(Request(scene=str(file), runtime="ort"), folder))
+    frames = AvatarFrames(configure(RunOptions(scene=str(file), runtime="ort"), folder))
     moved = np.abs(frames.frame(0).astype(int) - frames.background(0)).max(axis=2) > STEPS
     rows, columns = np.flatnonzero(moved.any(axis=1)), np.flatnonzero(moved.any(axis=0))
     return float(np.ptp(rows)) + 1, float(columns.min() + columns.max() + 1) / 2

@@ -14,7 +14,7 @@ import pytest
 from support.doubles import pipeline_of_doubles
 from support.trace_reading import Slice, read_trace
 from trilane.apps.report import read_report
-from trilane.apps.run_job import Hooks, Outcome, Plan, run_to_folder
+from trilane.apps.run_job import Hooks, Outcome, Prepared, run_to_folder
 from trilane.errors import TrilaneError
 from trilane.hw_profiles.host import host_units
 from trilane.pipeline.result import RunResult
@@ -26,6 +26,7 @@ from trilane.scheduler.recording import read, replay
 from trilane.stages.config import RunConfig
 from trilane.stages.configure import Checked
 from trilane.stages.machine_facts import machine_facts
+from trilane.stages.run_options import RunOptions
 
 FRAMES = 24
 pytestmark = pytest.mark.usefixtures("no_new_process", "behaviour")
@@ -59,7 +60,7 @@ def behaviour(starter: UnitStarter, monkeypatch: pytest.MonkeyPatch) -> dict[str
     return asked
 
 
-def run_mocks(target: Path, listener: Listener, plan: Plan | None = None, frames: int = FRAMES) -> Outcome:
+def run_mocks(target: Path, listener: Listener, frames: int = FRAMES, **options: Any) -> Outcome:
     config = RunConfig(
         scene=Scene(frames=frames, output=OutputSpec(width=64, height=64)),
         out_dir=target,
@@ -68,7 +69,8 @@ def run_mocks(target: Path, listener: Listener, plan: Plan | None = None, frames
     )
     hooks = Hooks(listener.progress, listener.messages.append)
     checked = Checked(config, assets={}, notes=("x",), accuracy={})
-    return run_to_folder(checked, target, plan or Plan(baseline_frames=8), hooks, machine=machine_facts())
+    asked = RunOptions(**{"baseline_frames": 8, **options})
+    return run_to_folder(Prepared(asked, checked), target, hooks, machine=machine_facts())
 
 
 def test_a_run_leaves_one_whole_folder_and_no_process(tmp_path: Path) -> None:
@@ -98,13 +100,13 @@ def test_the_report_has_the_keys_of_the_schema_and_the_baseline(tmp_path: Path, 
 
 
 def test_the_events_of_a_run_replay_to_the_same_answers(tmp_path: Path) -> None:
-    outcome = run_mocks(tmp_path / "run", Listener(), Plan(baseline_frames=0))
+    outcome = run_mocks(tmp_path / "run", Listener(), baseline_frames=0)
     assert list(replay(read(outcome.folder / "events.jsonl"))) == []
 
 
 def test_the_trace_of_a_run_adds_up_to_its_report(tmp_path: Path) -> None:
     """Read as any program would; `read_trace` refuses slices of one track that lie over each other."""
-    outcome = run_mocks(tmp_path / "run", Listener(), Plan(baseline_frames=0))
+    outcome = run_mocks(tmp_path / "run", Listener(), baseline_frames=0)
     trace = read_trace((outcome.folder / "trace.pftrace").read_bytes())
     in_order = list(outcome.report.stages)
     through: dict[int, list[str]] = defaultdict(list)
@@ -134,12 +136,12 @@ def lost_ns(one: Slice) -> int:
 
 
 def test_a_run_has_the_edge_that_was_asked_for(tmp_path: Path) -> None:
-    report = read_report(run_mocks(tmp_path / "run", Listener(), Plan(baseline_frames=0, edge="fifo:3")).folder)
+    report = read_report(run_mocks(tmp_path / "run", Listener(), baseline_frames=0, edge="fifo:3").folder)
     assert (report.edge, report.config["edge"], report.config["policy"]) == ("fifo:3", "fifo:3", "pipelined")
 
 
 def test_no_baseline_beside_a_sequential_run(tmp_path: Path) -> None:
-    assert run_mocks(tmp_path / "run", Listener(), Plan("sequential", 8)).report.baseline is None
+    assert run_mocks(tmp_path / "run", Listener(), policy="sequential").report.baseline is None
 
 
 def test_an_interrupted_run_keeps_what_was_presented(tmp_path: Path) -> None:
@@ -152,7 +154,7 @@ def test_an_interrupted_run_keeps_what_was_presented(tmp_path: Path) -> None:
 
 
 def test_an_interrupted_baseline_loses_nothing_of_the_run(tmp_path: Path) -> None:
-    outcome = run_mocks(tmp_path / "run", Listener("sequential", 1), Plan(baseline_frames=2000), frames=60)
+    outcome = run_mocks(tmp_path / "run", Listener("sequential", 1), baseline_frames=2000, frames=60)
     assert outcome.exit_code == 130
     assert not outcome.report.interrupted
     assert outcome.report.baseline is None

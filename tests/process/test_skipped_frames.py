@@ -16,7 +16,8 @@ from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline
 from trilane.scheduler.recording import read, replay
 from trilane.stages.avatar_pipeline import avatar_pipeline
-from trilane.stages.configure import Request, configure
+from trilane.stages.configure import configure
+from trilane.stages.run_options import RunOptions
 from trilane.units import BYPASS
 
 FRAMES, KILL_AT = 50, 12
@@ -76,7 +77,7 @@ def test_a_unit_that_dies_between_skipping_frames_costs_no_more_than_its_jobs(
 def avatar(bundle: Path, folder: Path, position: str, frames: int, *, skips: bool, **options: object) -> RunResult:
     folder.mkdir()
     (folder / "scene.toml").write_text(SCENE.format(position=position), encoding="utf-8")
-    asked = Request(str(folder / "scene.toml"), avatar=str(bundle), frames=frames, runtime="ort")
+    asked = RunOptions(scene=str(folder / "scene.toml"), avatar=str(bundle), frames=frames, runtime="ort")
     checked = configure(asked, folder)
     pipeline = avatar_pipeline(checked.config, checked.assets, "double")
     if not skips:

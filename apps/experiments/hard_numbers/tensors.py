@@ -25,7 +25,7 @@ from trilane.body.joints import JOINTS
 from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError
 from trilane.scene.camera.path import look_at, projection_matrix
-from trilane.stages.configure import Checked, Request, configure
+from trilane.stages.configure import Checked, configure
 from trilane.stages.gpu.packed_pass import (
     PackedAvatar,
     PackedPass,
@@ -35,6 +35,7 @@ from trilane.stages.gpu.packed_pass import (
     texture_array,
 )
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh, mesh_arrays
+from trilane.stages.run_options import RunOptions
 
 SHAPE = (64, 64)
 CHANNELS = 16
@@ -125,7 +126,7 @@ def _is_taken(value: float) -> bool:
 def scene_cases() -> Iterator[HardNumber]:
     """A row for each scene of `JUMPS`."""
     for scene, frames in JUMPS.items():
-        checked = configure(Request(scene, runtime=RUNTIME), Path.cwd())
+        checked = configure(RunOptions(scene=scene, runtime=RUNTIME), Path.cwd())
         last = checked.config.scene.frames - 1
         numbers = [min(frame, last) for frame in frames]
         name = f"{scene}: frames {', '.join(map(str, numbers))} one after the other"

@@ -24,7 +24,8 @@ from trilane.avatars.manifest import digests_of, sha256_of, with_figures_digest
 from trilane.avatars.validation import DrawnAs, accuracy_of, validation_facts
 from trilane.errors import BadInputError
 from trilane.figure_sources import NO_FIGURES
-from trilane.stages.configure import Request, configure
+from trilane.stages.configure import configure
+from trilane.stages.run_options import RunOptions
 
 
 def _shuffle_texture(folder: Path) -> None:
@@ -248,7 +249,7 @@ def test_a_run_of_a_spoilt_copy_beside_the_avatar_shows_only_the_avatars_source(
     copy = shutil.copytree(own, tmp_path / "copy")
     spoil(copy, "texture")
     (tmp_path / "both.toml").write_text(f'[[avatars]]\nbundle = "{own}"\n[[avatars]]\nbundle = "{copy}"\n')
-    checked = configure(Request(str(tmp_path / "both.toml"), runtime="ort"), tmp_path, gl=lambda: None)
+    checked = configure(RunOptions(scene=str(tmp_path / "both.toml"), runtime="ort"), tmp_path, gl=lambda: None)
     facts = {name.rpartition("/")[2]: facts for name, facts in checked.accuracy.items()}
     assert facts["copy"]["changed"] == ["texture"]
     assert facts["own"]["changed"] == [] and "share" in facts["own"]["why"]
@@ -256,7 +257,7 @@ def test_a_run_of_a_spoilt_copy_beside_the_avatar_shows_only_the_avatars_source(
 
 @pytest.mark.parametrize(("size", "runtime", "shown"), [("256", "ort", True), ("192", "ort", False)])
 def test_a_run_asks_for_what_it_draws(own, tmp_path, size, runtime, shown):
-    checked = configure(Request(avatar=str(own), size=size, runtime=runtime), tmp_path, gl=lambda: None)
+    checked = configure(RunOptions(avatar=str(own), size=size, runtime=runtime), tmp_path, gl=lambda: None)
     assert (checked.accuracy["tiny"]["source"] == SOURCE) == shown
 
 

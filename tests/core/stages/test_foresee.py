@@ -26,8 +26,9 @@ from trilane.scene.staging import Staged, stage_scene
 from trilane.shapes import shape_buckets
 from trilane.stages.avatar_assets import AvatarData, load_avatar
 from trilane.stages.config import RunConfig
-from trilane.stages.configure import Request, configure
+from trilane.stages.configure import configure
 from trilane.stages.foresee import MB, Foreseen, bytes_per_pixel, foresee, foreseen_rects
+from trilane.stages.run_options import RunOptions
 
 OWN = TensorBudget(own=128 * 128, most=512 * 512)
 
@@ -173,7 +174,7 @@ def test_a_network_that_takes_more_than_the_limit_is_told_of() -> None:
 
 
 def test_a_configuration_has_the_shapes_the_note_and_the_networks_pixels(tiny_bundle: Path, tmp_path: Path) -> None:
-    asked = Request("default", avatar=str(tiny_bundle), frames=30, runtime="ort", size="auto")
+    asked = RunOptions(scene="default", avatar=str(tiny_bundle), frames=30, runtime="ort", size="auto")
     planned = configure(asked, tmp_path, lambda: {"hardware": False})
     assert planned.config.shapes and list(planned.config.shapes) == planned.config.buckets
     assert planned.config.own_pixels == 64 * 64
@@ -181,7 +182,7 @@ def test_a_configuration_has_the_shapes_the_note_and_the_networks_pixels(tiny_bu
     names = ", ".join(f"{height}x{width}" for height, width in planned.config.shapes)
     seen = f"somebody is seen in 30 of 30 frames looked at; {len(planned.config.changes[0]) - 1} changes foreseen"
     assert f"tensor: planned in shapes {names} ({seen})" in planned.notes
-    fixed = configure(Request("default", avatar=str(tiny_bundle), runtime="ort"), tmp_path, lambda: None)
+    fixed = configure(RunOptions(scene="default", avatar=str(tiny_bundle), runtime="ort"), tmp_path, lambda: None)
     assert (fixed.config.shapes, fixed.config.buckets) == ((), shape_buckets("256"))
     assert not any(note.startswith("tensor:") for note in fixed.notes)
 

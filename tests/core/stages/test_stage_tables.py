@@ -33,6 +33,7 @@ from trilane.stages.dsp.infer import crossing_bytes
 from trilane.stages.dsp.runtime import RuntimeOptions
 from trilane.stages.gpu.composite import CompositeStage
 from trilane.stages.gpu.raster import RasterStage
+from trilane.stages.run_options import RunOptions
 from trilane.transport.packets import Packet
 
 
@@ -210,7 +211,7 @@ def test_what_is_packed_is_what_the_units_find(tiny_bundle: Path) -> None:
 
 
 def test_rate_and_output_are_laid_over_the_scene() -> None:
-    scene = configure.requested_scene(configure.Request("walk-past", fps=24.0, output="320x482"))
+    scene = configure.requested_scene(RunOptions(scene="walk-past", fps=24.0, output="320x482"))
     assert (scene.name, scene.fps, scene.output.width, scene.output.height) == ("walk-past", 24.0, 320, 482)
     for output, sentence in (
         ("320", "--output: found '320', expected WIDTHxHEIGHT in pixels, such as 640x480"),
@@ -219,13 +220,13 @@ def test_rate_and_output_are_laid_over_the_scene() -> None:
         ("64x67", "command line: output.height: found 67, expected a multiple of 2 from 64 to 4096"),
     ):
         with pytest.raises(BadInputError) as raised:
-            configure.requested_scene(configure.Request(output=output))
+            configure.requested_scene(RunOptions(output=output))
         assert str(raised.value) == sentence
 
 
 def test_an_edge_is_one_of_the_rules() -> None:
     for edge in ("single", "double", "triple", "fifo", "fifo:1", "fifo:64", "orphan", "orphan:4"):
-        assert configure.requested_edge(edge) == edge
+        assert RunOptions(edge=edge).edge == edge
     kinds = "single, double, triple, fifo:N or orphan:N"
     for edge, sentence in (
         ("doubel", f"expected {kinds}; did you mean 'double'?"),
@@ -236,7 +237,7 @@ def test_an_edge_is_one_of_the_rules() -> None:
         ("fifo:65", "expected fifo:N with N from 1 to 64"),
     ):
         with pytest.raises(BadInputError) as raised:
-            configure.requested_edge(edge)
+            RunOptions.checked({"edge": edge}, as_typed=True)
         assert str(raised.value) == f"--edge: found {edge!r}, {sentence}"
 
 
@@ -257,12 +258,20 @@ def test_options_are_laid_over_the_scene(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(configure, "scene_from", lambda where, given: seen.update(where=where, **given) or "scene")
     monkeypatch.setattr(configure, "located", lambda text, here: f"{here.name}/{text}")
     monkeypatch.chdir(tmp_path)
-    assert configure.requested_scene(configure.Request()) == "scene"
+    assert configure.requested_scene(RunOptions()) == "scene"
     assert asked == ["default"]
     assert seen == {"where": "command line"} | values
     seen.clear()
-    request = configure.Request(
-        "mine", "m.bvh", "c.json", "b.png", str(tiny_bundle), frames=5, size="128", hud=False, runtime="ort"
+    request = RunOptions(
+        scene="mine",
+        motion="m.bvh",
+        camera="c.json",
+        background="b.png",
+        avatar=str(tiny_bundle),
+        frames=5,
+        size="128",
+        hud=False,
+        runtime="ort",
     )
     configure.requested_scene(request)
     here = tmp_path.name
@@ -332,12 +341,12 @@ def test_a_configuration_has_the_runtime_that_was_chosen(
     tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(configure, "requested_runtime", lambda asked: ("qnn", f"not {asked}"))
-    checked = configure.configure(configure.Request(avatar=str(tiny_bundle), runtime="ort"), tmp_path, lambda: None)
+    checked = configure.configure(RunOptions(avatar=str(tiny_bundle), runtime="ort"), tmp_path, lambda: None)
     assert checked.config.runtime == "qnn" and "runtime: qnn (not ort)" in checked.notes
 
 
 def test_a_request_becomes_a_checked_configuration(tiny_bundle: Path, tmp_path: Path) -> None:
-    request = configure.Request(avatar=str(tiny_bundle), size="64", runtime="ort", frames=3)
+    request = RunOptions(avatar=str(tiny_bundle), size="64", runtime="ort", frames=3)
     software = configure.configure(request, tmp_path, lambda: {"hardware": False})
     config = software.config
     vertices = len(avatar_assets.shaped_body(software.assets, 0).vertices)
@@ -361,7 +370,7 @@ def test_the_accuracy_of_a_run_is_of_each_avatar_as_the_run_draws_it(
     scene = tmp_path / "two.toml"
     rows = "".join(f'[[avatars]]\nbundle = "{folder}"\n' for folder in (tiny_bundle, other))
     scene.write_text('name = "two"\nsize = "64"\ntexture_filter = "mipmap"\n' + rows)
-    request = configure.Request(scene=str(scene), runtime="ort", frames=1)
+    request = RunOptions(scene=str(scene), runtime="ort", frames=1)
     drawn = DrawnAs("ort", "64", "mipmap", 2)
     assert configure.configure(request, tmp_path, lambda: None).accuracy == {
         f"tiny in {folder}": {"of": folder, "drawn": drawn} for folder in (tiny_bundle.absolute(), other)
