@@ -27,6 +27,7 @@ from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.application import Variant, application_graph, settings_of
 from trilane.hw_profiles.governor import Governor
 from trilane.hw_profiles.load import load_runnable
+from trilane.pipeline.controls import RunControls
 from trilane.pipeline.description import Pipeline, UnitSettings
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline
@@ -226,18 +227,33 @@ def fork_server() -> psutil.Process:
 def test_units_outlive_their_fork_server_and_come_from_a_fresh_one(number: signal.Signals, is_replaced: bool) -> None:
     """A unit is killed when the fork server was found gone or stopped, or before anybody has looked."""
     units: list[psutil.Process] = []
+    presented: list[int] = [0]
+    killed_at: list[int] = []
+    controls = RunControls()
+
+    def kill() -> None:
+        units[0].kill()
+        killed_at.append(presented[0])
 
     def hurt() -> None:
         units.append(unit_process("dsp"))  # which is nobody's child any more when its fork server has ended
         fork_server().send_signal(number)
         if not is_replaced:
-            units[0].kill()
+            kill()
+
+    hurt_once = When(5, hurt)
+
+    def shown(count: int, requested: int) -> None:
+        presented[0] = count
+        hurt_once(count, requested)
+        if killed_at and count >= killed_at[0] + 10:  # at most a few were past the unit: it is back
+            controls.stop()
 
     def heard(text: str) -> None:
         if is_replaced and "fork server" in text:
-            units[0].kill()
+            kill()
 
-    result = run_pipeline(doubles(infer=30), 60, on_progress=When(5, hurt), on_message=heard)
+    result = run_pipeline(doubles(infer=30), 100_000, controls=controls, on_progress=shown, on_message=heard)
     assert result.failure is None
     assert set(map(str, result.lost)) == {"died:dsp"}
     assert 1 <= sum(result.lost.values()) <= len(in_hand(result, "dsp")) <= 2
