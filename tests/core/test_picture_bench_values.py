@@ -198,11 +198,10 @@ def crowd(monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Session, list[Any]]:
         named.append((ctx, channels, quantisation, deferred))
         return packed
 
-    bundle = SimpleNamespace(read_network=lambda: "network")
+    bundle = SimpleNamespace(read_network=lambda: "network", shaped_body=lambda: "shaped")
     body = SimpleNamespace(render=lambda *asked: rendered.append(asked) or 50)
     assets = SimpleNamespace(texture=np.zeros((2, 2, 8)), arrays="arrays", quantisation="quantisation")
     monkeypatch.setattr(several, "load_bundle", lambda name: named.append(name) or bundle)
-    monkeypatch.setattr(several, "shaped_body", lambda of: ("shaped", of))
     studio = SimpleNamespace(ctx="context", clothed_body=body)
     monkeypatch.setattr(several, "ground_truth", lambda of: named.append(of) or (studio, error))
     monkeypatch.setattr(several, "load_drawable", lambda name: named.append(name) or assets)
@@ -214,7 +213,7 @@ def crowd(monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Session, list[Any]]:
     fixture = several._CrowdFixture()
     mesh = ("mesh", "context", "arrays")
     assert named[:4] == ["default", bundle, "default", ("context", 8, "quantisation", True)]
-    assert named[4][0] == mesh and named[4][1] is assets.texture and fixture.shaped == ("shaped", bundle)
+    assert named[4][0] == mesh and named[4][1] is assets.texture and fixture.shaped == "shaped"
     return fixture, session, rendered
 
 
@@ -242,7 +241,7 @@ def test_an_avatar_is_compared_with_itself_on_its_own(monkeypatch: pytest.Monkey
 
 
 def test_the_moments_of_a_crowd_are_held(held: Held) -> None:
-    fixture: Any = SimpleNamespace(shaped=shaped_body(load_bundle("default")))
+    fixture: Any = SimpleNamespace(shaped=load_bundle("default").shaped_body())
     seen = [*several._views(fixture, 2, 3, "256", 8)]
     assert len(seen) == 3 and all(len(view.joints) == 2 for view in seen)
     held("joints", [view.joints for view in seen])

@@ -148,7 +148,7 @@ def test_every_avatar_size_and_number_of_cores_is_measured(
     monkeypatch: pytest.MonkeyPatch, configured: list[RunOptions]
 ) -> None:
     monkeypatch.setattr(pipeline, "run_avatar", lambda *_, policy, **__: result_of(policy, 20.0))
-    monkeypatch.setattr(pipeline.full_width, "full_width_bundle", lambda: Path("/made"))
+    monkeypatch.setattr(pipeline.networks, "full_width_bundle", lambda: Path("/made"))
     monkeypatch.setattr(pipeline, "usable_cores", lambda: (4, 6, 7))
     units: list[Any] = []
     monkeypatch.setattr(pipeline, "host_units", lambda cores: units.append(cores) or {})
