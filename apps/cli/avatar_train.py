@@ -44,7 +44,7 @@ def train(
     ctx: typer.Context,
     out: Annotated[Path, typer.Option(help="Folder of the avatar to write.")],
     capture: Annotated[
-        Path | None, typer.Argument(help="Folder of a capture (docs/captures.md); none if the settings have a look.")
+        Path | None, typer.Argument(help="Folder of a capture; none if the settings have a look.")
     ] = None,
     work: Annotated[
         Path | None, typer.Option(help="Folder of samples, state and sheets; OUT-work if none. Training goes on there.")
@@ -71,7 +71,9 @@ def train(
     tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Log the losses to WORK/tensorboard too.")] = False,
     json: JsonOption = False,
 ) -> None:
-    """Train an avatar of a capture, or of the default body in a look, and write a folder for `trilane run --avatar`.
+    """Train an avatar and write it as a folder for `trilane run --avatar`.
+
+    Without a capture, the settings name a look of the default body.
 
     A command that was ended goes on where it was when it is given again.
     """

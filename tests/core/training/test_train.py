@@ -217,7 +217,7 @@ def clothed_body(log: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
         renderer = SimpleNamespace(
             training_sample=lambda *_: SimpleNamespace(crop=crop), render=lambda _: log.append("render")
         )
-        return Subject(Person(body), "shaped", renderer, "opener", {"look": look}, "truth")  # type: ignore[arg-type]
+        return Subject(Person(body), "shaped", renderer, SimpleNamespace, {"look": look}, "truth")  # type: ignore[arg-type]
 
     def draw(_: Any, samples: Any, folder: Path, *__: Any) -> None:
         group = create_group(folder, SHAPE, np.zeros(len(samples), np.int8))
