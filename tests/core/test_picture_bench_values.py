@@ -15,7 +15,6 @@ from trilane.bench import filters, several
 from trilane.bench.lib import fixture
 from trilane.errors import BadInputError, MissingPartError
 from trilane.scene.crop import Rect, crop_projection
-from trilane.stages.avatar_assets import shaped_body
 from trilane.stages.dsp.runtime import RuntimeOptions
 from trilane.stages.gpu.opengl import Driver
 
