@@ -39,7 +39,6 @@ BENCHES = {
     ),
     "scenario": ("trilane.bench.scenario", "MLPerf's load patterns, evaluated here and by MLCommons LoadGen."),
     "faults": ("trilane.bench.faults", "Units killed and stopped: what is lost, how soon the pace is back."),
-    "accounts": ("trilane.bench.accounts", "Busy and idle shares of random runs, computed twice, beside CPU time."),
     "handoff": ("trilane.bench.handoff", "A slot from process to process, beside pickling, copying and iceoryx2."),
     "scheduler": ("trilane.bench.scheduler", "The scheduler in virtual time beside SimPy, and its determinism."),
     "planner": ("trilane.bench.planner", "Planned work against a fixed square: speed and image error."),

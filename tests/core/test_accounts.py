@@ -10,11 +10,8 @@ from typing import Any
 import pytest
 
 from trilane.apps.tracing.writer import write_trace
-from trilane.bench.accounts import measure, virtual_run
-from trilane.errors import BadInputError
 from trilane.pipeline.journal import journal_of, records_of
-from trilane.pipeline.waits import Waits
-from trilane.scheduler.accounts import LARGEST_DIFFERENCE, compared, second_accounts
+from trilane.pipeline.timeline import ExplainedJob, Timeline
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
     Dispatch,
@@ -32,6 +29,7 @@ from trilane.scheduler.events import (
 from trilane.scheduler.ledger import STARVED, JobRecord
 from trilane.scheduler.recording import Recording
 from trilane.scheduler.virtual import Simulation, simulate
+from trilane.testing.second_accounts import drawn_run, largest_difference, second_accounts
 from trilane.testing.trace_reading import ReadTrace, read_trace
 
 MS = 1_000_000
@@ -63,9 +61,9 @@ def times(done: Simulation, stage: str) -> list[tuple[float, ...]]:
 
 def agrees(done: Simulation) -> None:
     assert done.recording is not None
-    found = compared(done.report["units"], second_accounts(done.recording, done.jobs))
-    assert found["largest_difference"] < 1e-12
-    assert all(sum(row.values()) == pytest.approx(1, abs=1e-12) for row in found["units"].values())
+    second = second_accounts(done.recording, done.jobs)
+    assert largest_difference(done.report["units"], second) < 1e-12
+    assert all(sum(row.values()) == pytest.approx(1, abs=1e-12) for row in second.values())
 
 
 def always(ms: float) -> dict[str, float]:
@@ -186,7 +184,7 @@ def fed(settings: Settings, steps: list[tuple[int, tuple[Event, ...]]], jobs: li
     for now_ns, events in steps:
         recording.add(now_ns, events, core.step(now_ns, events).actions, core)
     report = core.report(clock="host")
-    assert compared(report["units"], second_accounts(recording, jobs))["largest_difference"] < 1e-12
+    assert largest_difference(report["units"], second_accounts(recording, jobs)) < 1e-12
     return report
 
 
@@ -235,10 +233,12 @@ def test_a_frame_that_is_released_late_is_overhead_since_it_was_due() -> None:
     settings = Settings(3, period_ns=10 * MS)
     assert parts(fed(settings, steps, jobs), "u") == (2 + 2 + 1, 8 + 5, 0, 0, 0, 3)
     graph = chain((("a", "u"),), "single", "a")
-    core, recording, waits = Core(graph, settings), Recording(graph, settings), Waits(graph)
+    core, recording = Core(graph, settings), Recording(graph, settings)
+    timeline = Timeline(graph, settings, waits=True)
     for now_ns, events in steps:
         recording.add(now_ns, events, core.step(now_ns, events).actions, core)
-    explained = [one for record in records_of(recording, jobs) if (one := waits.add(record))]
+    facts = [fact for record in records_of(recording, jobs) for fact in timeline.add(record)]
+    explained = [fact for fact in facts if isinstance(fact, ExplainedJob)]
     assert [dict(one.waits_ns) for one in explained] == [{}, {"overhead": 3 * MS}, {}]
 
 
@@ -263,13 +263,12 @@ def test_what_a_unit_lost_is_booked_under_its_causes() -> None:
 
 
 @pytest.mark.parametrize("seed", range(50))
-def test_both_computations_agree_in_random_runs(seed: int) -> None:
-    report = virtual_run(random.Random(seed), 40)
-    assert report["accounts"]["largest_difference"] <= 1e-12
-    for unit, row in report["units"].items():
+def test_the_timeline_adds_up_to_the_ledger_in_random_runs(seed: int) -> None:
+    done = drawn_run(random.Random(seed), 40)
+    agrees(done)
+    for row in done.report["units"].values():
         assert min(row["busy"], *row["idle"].values()) >= 0
         assert row["busy"] + sum(row["idle"].values()) == pytest.approx(1, abs=1e-12)
-        assert sum(report["accounts"]["units"][unit].values()) == pytest.approx(1, abs=1e-12)
 
 
 def test_the_slices_of_the_trace_file_add_up_to_the_report() -> None:
@@ -317,9 +316,8 @@ def test_time_under_another_cause_shows(cause: str, wrong: str) -> None:
     for row in done.report["units"].values():
         row["idle"][cause], row["idle"][wrong] = row["idle"][cause] / 2, row["idle"][wrong] + row["idle"][cause] / 2
     assert done.recording is not None
-    moved = compared(done.report["units"], second_accounts(done.recording, done.jobs))["largest_difference"]
+    moved = largest_difference(done.report["units"], second_accounts(done.recording, done.jobs))
     assert moved == pytest.approx(max(row["idle"][cause] for row in done.report["units"].values()))
-    assert moved > LARGEST_DIFFERENCE
 
 
 def test_a_job_that_is_too_long_or_missing_shows() -> None:
@@ -328,9 +326,7 @@ def test_a_job_that_is_too_long_or_missing_shows() -> None:
     first, *others = done.jobs
     share = 1e6 / (done.report["duration_s"] * 1e9)
     for jobs in ([first._replace(begin_ns=first.begin_ns - MS), *others], others):
-        found = compared(done.report["units"], second_accounts(done.recording, jobs))
-        assert found["largest_difference"] >= share - 1e-12
-        assert not found["agree"]
+        assert largest_difference(done.report["units"], second_accounts(done.recording, jobs)) >= share - 1e-12
 
 
 def test_a_change_of_cause_that_was_never_noted_shows() -> None:
@@ -338,17 +334,11 @@ def test_a_change_of_cause_that_was_never_noted_shows() -> None:
     done = a_run()
     assert done.recording is not None
     done.recording.accounts[:] = [row for row in done.recording.accounts if row[2] != STARVED]
-    assert not compared(done.report["units"], second_accounts(done.recording, done.jobs))["agree"]
+    assert largest_difference(done.report["units"], second_accounts(done.recording, done.jobs)) > 0.001
 
 
 def test_a_unit_without_accounts_is_no_agreement() -> None:
     done = run()
     assert done.recording is not None
     only = [job for job in done.jobs if job.unit == "u"]
-    assert compared({"w": done.report["units"]["u"]}, second_accounts(done.recording, only))["largest_difference"] == 1
-
-
-@pytest.mark.parametrize(("sizes", "where"), [({"frames": 1}, "--frames: found 1"), ({"runs": 0}, "--runs: found 0")])
-def test_too_few_frames_or_runs_are_refused_by_name(sizes: dict[str, int], where: str) -> None:
-    with pytest.raises(BadInputError, match=where):
-        measure(**sizes)
+    assert largest_difference({"w": done.report["units"]["u"]}, second_accounts(done.recording, only)) == 1
