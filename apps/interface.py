@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 from trilane.apps.asked_run import run_asked
 from trilane.apps.explained.job_table import COLUMNS, figure_names, job_rows
-from trilane.apps.explained.run import explain_run, explained_jobs, open_journal
+from trilane.apps.explained.run import explain_run, open_journal
 from trilane.apps.report import Report, read_report
 from trilane.apps.run_html import prediction_html, run_html
 from trilane.errors import BadInputError, MissingPartError, TrilaneError, did_you_mean
 from trilane.pipeline.journal import Record, Stepped
-from trilane.pipeline.journal_slices import JournalSlices
-from trilane.scheduler.accounts import IdleSlice
+from trilane.pipeline.timeline import Presented, Timeline
+from trilane.pipeline.unit_history import IdleSlice
 from trilane.scheduler.events import Event
 from trilane.stages.run_options import RunOptions
 from trilane.units import PERFORMANCE_PROFILES
@@ -85,9 +85,9 @@ class Run:
     def idle(self) -> list[IdleSlice]:
         """The time in which units did no job, in the order of the ends; how long of it they had no core."""
         begun, records = open_journal(self.folder)
-        slices = JournalSlices(begun.graph)
-        found = [piece for record in records for piece in slices.add(record)]
-        return found + slices.end()
+        timeline = Timeline(begun.graph, begun.settings, idle=True)
+        facts = [fact for record in records for fact in timeline.add(record)]
+        return [fact for fact in facts if isinstance(fact, IdleSlice)] + timeline.end()
 
     def frames(self) -> NDArray[Any]:
         """The presented frames, in order: a structured array of shape (frames,), all int64.
@@ -96,18 +96,11 @@ class Run:
         to the end of the stage that the pipeline names. Raises BadInputError.
         """
         begun, records = open_journal(self.folder)
-        first, last = begun.graph.stages[0].name, begun.graph.stages[-1].name
-        sampled: dict[int, int] = {}
-        latency: dict[int, int] = {}
-        rows: list[tuple[int, int, int, int]] = []
-        for one in explained_jobs(begun, records):
-            stage, frame, end_ns = one.job.stage, one.job.frame, one.job.end_ns
-            if stage == first:
-                sampled[frame] = one.sampled_ns
-            if stage == begun.graph.latency_to:
-                latency[frame] = end_ns - sampled.pop(frame, end_ns)
-            if stage == last:
-                rows.append((frame, end_ns, end_ns - rows[-1][1] if rows else -1, latency.pop(frame, -1)))
+        timeline = Timeline(begun.graph, begun.settings)
+        shown = (fact for record in records for fact in timeline.add(record) if isinstance(fact, Presented))
+        rows = [
+            (one.frame, one.end_ns, -1 if one.interval_ns is None else one.interval_ns, one.latency_ns) for one in shown
+        ]
         return np.array(rows, FRAME_TYPE)
 
     def to_pandas(self) -> pandas.DataFrame:

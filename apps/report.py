@@ -423,8 +423,6 @@ def read_report(path: Path) -> Report:
             raise BadInputError(file, f"{size} bytes", f"a report of at most {MAX_REPORT_BYTES}")
         document = from_json(file.read_bytes())
         _refuse_newer(file, document)
-        if isinstance(document, dict):
-            document.pop("isolated_ms", None)  # of an older Trilane, which measured stages by themselves
         return Report.model_validate(document)
     except OSError as error:
         raise BadInputError.of_os_error(file, error, EXPECTED) from None

@@ -24,7 +24,6 @@ from trilane.hw_profiles.governor import Governor
 from trilane.hw_profiles.load import load_runnable
 from trilane.pipeline import journal
 from trilane.pipeline.controls import RunControls
-from trilane.pipeline.journal_slices import jobs_of
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run_record import JournalFile
 from trilane.pipeline.signals import Interrupts
@@ -146,7 +145,8 @@ def run_to_folder(
                 from trilane.apps.pace import compare
 
                 scene = checked.config.scene
-                jobs = list(jobs_of(folder.work / journal.NAME))
+                records = journal.read_journal(folder.work / journal.NAME)
+                jobs = [record.job for record in records if isinstance(record, journal.Worked)]
                 facts["pace"] = compare(pace, options.policy, scene.frames, jobs, edge=options.edge, fps=scene.fps)
             if options.check:
                 ended = lambda: result.interrupted or stopped or late.count > 0  # noqa: E731

@@ -21,16 +21,18 @@ from trilane.bench.lib.avatar_process import Asked
 from trilane.errors import BadInputError, TrilaneError
 from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
 from trilane.hw_profiles.host import host_units, usable_cores
+from trilane.pipeline.journal import records_of
 from trilane.pipeline.result import RunResult
+from trilane.pipeline.timeline import Presented, Timeline
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.policy import policy_named
+from trilane.scheduler.recording import Recording
 from trilane.scheduler.stats import NS_PER_MS, median_interval, percentile, samples_needed
 from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.configure import Checked, configure
 from trilane.stages.run_options import RunOptions
 from trilane.transport.slots import edge_rule
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import BEFORE_INFER, LATENCY_TO
 
 SEQUENTIAL = "sequential"
 MIN_FRAMES = 20
@@ -65,8 +67,8 @@ def measure(
 ) -> dict[str, Any]:
     """A row for each avatar, size, number of cores, policy and edge; figures are medians over the `rounds`.
 
-    Rows: `frame_ms`, `fps`; `latency_p50_ms`, `latency_p99_ms`: from the beginning of a frame's pose to its composited
-    picture, over the frames of all rounds (no p99 of fewer than 299); `efficiency`: the slowest unit's work over the
+    Rows: `frame_ms`, `fps`; `latency_p50_ms`, `latency_p99_ms`: from a frame's sampled pose to its composited picture,
+    over the presented frames of all rounds (no p99 of fewer than 299); `efficiency`: the slowest unit's work over the
     frame time, by CPU time; `slowest`: the unit that takes longest for a frame in the `sequential` runs before and
     after, without the time in which it had no core, and `alone_ms`: how long; `busiest`: the unit with the most work,
     `idle`: its share without a job from its first job's begin to its last one's end, and the causes: `starved` (no
@@ -199,7 +201,7 @@ def _figures(result: RunResult) -> dict[str, Any]:
     return {
         "fps": metrics.fps,
         "frame_ms": metrics.frame_time_ms.mean,
-        LATENCIES: latencies_ns(result.jobs),
+        LATENCIES: latencies_ns(result.recording, result.jobs),
         "efficiency": metrics.efficiency,
         UNITS_MS: _units_ms(result),
         "hops_ms": metrics.frame_time_ms.mean - stages_ms if metrics.policy == SEQUENTIAL else None,
@@ -234,10 +236,11 @@ def idle_between_jobs(jobs: Sequence[JobRecord]) -> dict[str, float]:
     return {"idle": sum(shares.values()), **shares}
 
 
-def latencies_ns(jobs: Sequence[JobRecord]) -> list[int]:
-    """Of each composited frame: from the beginning of its first stage to the end of the one with which latency ends."""
-    begins = {job.frame: job.begin_ns for job in jobs if job.stage == BEFORE_INFER[0][0]}
-    return [job.end_ns - begins[job.frame] for job in jobs if job.stage == LATENCY_TO]
+def latencies_ns(recording: Recording, jobs: Sequence[JobRecord]) -> list[int]:
+    """The latency of each presented frame of a run that is in memory."""
+    timeline = Timeline(recording.graph, recording.settings)
+    facts = (fact for record in records_of(recording, jobs) for fact in timeline.add(record))
+    return [fact.latency_ns for fact in facts if isinstance(fact, Presented)]
 
 
 def _latency_ms(runs: list[dict[str, Any]]) -> dict[str, float | None]:

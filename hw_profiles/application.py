@@ -23,7 +23,6 @@ from trilane.hw_profiles.performance_profiles import Corners
 from trilane.hw_profiles.reference_networks import CHANNELS_PER_PASS
 from trilane.hw_profiles.schema import Profile, Unit
 from trilane.hw_profiles.unit_times import time_on
-from trilane.scheduler.accounts import compared, second_accounts
 from trilane.scheduler.events import Graph, Settings, chain
 from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.release import run_settings
@@ -181,7 +180,6 @@ class Steady:
     frames that are not shown. `unit_of`: unit of each stage. `stages_ms`: time of a job of each stage.
     `busy`: share of the time in which each unit works; `idle`: shares of the rest by cause. They sum to 1 per unit. Of
     units that share a core, `preempted` is the share in which another one of them works on it.
-    `accounts`: how they compare with those that the slices of the run give; empty when that was not asked.
     """
 
     frame_ms: float
@@ -191,7 +189,6 @@ class Steady:
     stages_ms: Mapping[str, float]
     busy: Mapping[str, float]
     idle: Mapping[str, Mapping[str, float]]
-    accounts: Mapping[str, Any]
     dropped: float
 
 
@@ -201,7 +198,7 @@ def application_graph(edge: str = "double", infer: Iterable[tuple[str, str]] = (
 
 
 @lru_cache(maxsize=4096)
-def _settled(times: StageTimes, variant: Variant, display_ns: int, quick: bool, twice: bool) -> tuple[Any, bool]:
+def _settled(times: StageTimes, variant: Variant, display_ns: int, quick: bool) -> tuple[Any, bool]:
     """The report of a run, and whether the display limits its rate.
 
     `times`: stage, unit and nanoseconds of a job.
@@ -209,13 +206,12 @@ def _settled(times: StageTimes, variant: Variant, display_ns: int, quick: bool, 
     `display_ns`: the shortest time between two shown jobs.
     `quick`: whether to run only QUICK_FRAMES where that is enough, which is with one buffer between stages: with two,
     the buffers fill first, and meanwhile frames come faster.
-    `twice`: whether the report has `accounts`, its shares of time computed a second time.
     """
     frames = _frames_of(variant, quick)
-    report = _report(times, variant, settings_of(variant, frames, display_ns), twice)
+    report = _simulated(times, variant, settings_of(variant, frames, display_ns)).report
     if POLICIES[variant.policy].paced or report["frame_time_ms"]["mean"] * NS_PER_MS >= display_ns:
         return report, False
-    return _report(times, variant, settings_of(variant, frames, display_ns, held=True), twice), True
+    return _simulated(times, variant, settings_of(variant, frames, display_ns, held=True)).report, True
 
 
 def _frames_of(variant: Variant, quick: bool) -> int:
@@ -235,14 +231,7 @@ def settings_of(variant: Variant, frames: int, display_ns: int, *, held: bool = 
     return run_settings(variant.policy, frames, scene_period_ns, display_ns if held else 0)
 
 
-def _report(times: StageTimes, variant: Variant, settings: Settings, twice: bool) -> Any:
-    done = _simulated(times, variant, settings, keep=twice)
-    if done.recording is not None:
-        done.report["accounts"] = compared(done.report["units"], second_accounts(done.recording, done.jobs))
-    return done.report
-
-
-def _simulated(times: StageTimes, variant: Variant, settings: Settings, *, keep: bool) -> Simulation:
+def _simulated(times: StageTimes, variant: Variant, settings: Settings, *, keep: bool = False) -> Simulation:
     """A run of jobs that take `times`. Raises BadInputError for an unknown edge."""
     service = {name: ns for name, _, ns in times}
     try:
@@ -259,7 +248,7 @@ def simulated(profile: Profile, plan: Plan, corners: Corners) -> Simulation:
     `profile`, `plan`, `corners`: as of `steady`.
     """
     times, display_ns = _rounded(profile, plan, corners), _display_ns(profile, plan)
-    _, held = _settled(times, plan.variant, display_ns, quick=False, twice=True)
+    _, held = _settled(times, plan.variant, display_ns, quick=False)
     settings = settings_of(plan.variant, _frames_of(plan.variant, quick=False), display_ns, held=held)
     return _simulated(times, plan.variant, settings, keep=True)
 
@@ -281,7 +270,7 @@ def _display_ns(profile: Profile, plan: Plan) -> int:
     return round(plan.variant.batch * _display_ms(profile, plan) * NS_PER_MS)
 
 
-def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = False, twice: bool = False) -> Steady:
+def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = False) -> Steady:
     """Frame time, latency and shares of time, by the scheduler in virtual time.
 
     `profile`: of the chip.
@@ -289,12 +278,11 @@ def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = Fals
     `corners`: at which the units stay.
     `quick`: whether a short run will do where it can. Its frame time is right to a hundredth; its shares of time
     include filling and draining.
-    `twice`: whether to compute the shares of time a second time.
     """
     times, worker = stage_times_ms(profile, plan, corners), workers_of(profile)
     batch, display = plan.variant.batch, _display_ms(profile, plan)
     rounded = _rounded(profile, plan, corners)
-    report, capped = _settled(rounded, plan.variant, _display_ns(profile, plan), quick, twice)
+    report, capped = _settled(rounded, plan.variant, _display_ns(profile, plan), quick)
     shares = {unit: _shares(unit, worker, times, report["units"]) for unit in UNITS}
     frame = max(report["frame_time_ms"]["mean"], *times.values()) / batch
     return Steady(
@@ -305,7 +293,6 @@ def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = Fals
         stages_ms={name: ms for (name, _), ms in times.items()},
         busy={unit: busy for unit, (busy, _) in shares.items()},
         idle={unit: idle for unit, (_, idle) in shares.items()},
-        accounts=report.get("accounts", {}),
         dropped=1 - report["frames"]["presented"] / report["frames"]["requested"],
     )
 

@@ -33,7 +33,6 @@ from trilane.hw_profiles.network_work import Network
 from trilane.hw_profiles.on_chip import spilled
 from trilane.hw_profiles.performance_profiles import Corners
 from trilane.hw_profiles.schema import Profile, Unit
-from trilane.scheduler.accounts import compared, second_accounts
 from trilane.scheduler.beside import ONE, Member, Runs, simulate_beside
 from trilane.scheduler.events import Graph, Settings, Stop, chain
 from trilane.scheduler.policy import POLICIES
@@ -129,12 +128,12 @@ class Together:
 
 
 def together(
-    profile: Profile, tenants: Sequence[Tenant], corners: Corners, turns: str = ROUND_ROBIN, *, twice: bool = False
+    profile: Profile, tenants: Sequence[Tenant], corners: Corners, turns: str = ROUND_ROBIN, *, keep: bool = False
 ) -> Together:
     """The `tenants` on the chip `profile`, its units at `corners`.
 
     `turns`: whose job a unit takes that several wait for.
-    `twice`: whether the report of each has `accounts`, its shares of time computed a second time.
+    `keep`: whether the steps and jobs of each are recorded.
     """
     costs = _Costs(profile, tenants, corners)
     stop = round(NS_PER_S * _seconds(tenants, costs)), Stop()
@@ -147,11 +146,7 @@ def together(
         for number, tenant in enumerate(tenants)
     ]
     cores = [unit.core for unit in profile.units.values() if unit.core]
-    runs = simulate_beside(members, turns=turns, divided=cores, speed=costs.speed, keep=twice)
-    if twice:
-        for run in runs:
-            assert run.recording is not None
-            run.report["accounts"] = compared(run.report["units"], second_accounts(run.recording, run.jobs))
+    runs = simulate_beside(members, turns=turns, divided=cores, speed=costs.speed, keep=keep)
     seconds = max(run.report["duration_s"] for run in runs)
     shares: list[dict[str, float]] = [{unit: _busy_s(run, unit) / seconds for unit in UNITS} for run in runs]
     busy: dict[str, float] = {unit: sum(each[unit] for each in shares) for unit in UNITS}

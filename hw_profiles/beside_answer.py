@@ -40,7 +40,7 @@ def predict_beside(
     """
     corners = corners_of(profile, performance_profile)
     at = cache(lambda where: together(profile, tenants, where, turns))
-    now = together(profile, tenants, corners, turns, twice=True)
+    now = together(profile, tenants, corners, turns)
     moments = warm_up(profile, at, performance_profile, minutes, governor) if minutes else []
     last = at(moments[-1].corners) if moments else now
     powers = unit_power_w(profile, now, corners)
@@ -95,7 +95,6 @@ def _row(
             unit: {"busy": row["busy"], "idle": row["idle"], "jobs": row["jobs"]}
             for unit, row in report["units"].items()
         },
-        "accounts": {key: report["accounts"][key] for key in ("largest_difference", "agree")},
     }
 
 

@@ -86,7 +86,7 @@ def predict(
     Raises BadInputError for an unknown name or a time out of range.
     """
     profile, plan, corners, placed = _settled_on(profile, plan, performance_profile, wanted)
-    now = steady(profile, plan, corners, twice=True)
+    now = steady(profile, plan, corners)
     moments = over_time(profile, plan, performance_profile, minutes, governor) if minutes else []
     frame = _mean([m.frame_ms for m in moments]) if moments else now.frame_ms
     power = _mean([m.power_w for m in moments]) if moments else settled_power_w(profile, now, corners)
@@ -193,7 +193,6 @@ def _settled(plan: Plan, now: Steady) -> dict[str, Any]:
         "display_capped": now.capped,
         "stages": {s: {"unit": now.unit_of[s], "service_ms": {"mean": ms}} for s, ms in now.stages_ms.items()},
         "units": {u: {"busy": now.busy[u], "idle": dict(now.idle[u])} for u in UNITS},
-        "accounts": {key: now.accounts[key] for key in ("largest_difference", "agree")},
         "efficiency": max(per_unit.values()) / plan.variant.batch / now.frame_ms,
     }
 

@@ -1,19 +1,17 @@
 """What the report of a real run says beside the ledger's shares. Rule: figures that must agree stand side by side.
 
-CPU time beside wall time, the sums over the units that share cores, and the shares computed a second time; where they
-contradict each other, or were not measured, a message says so.
+CPU time beside wall time, and the sums over the units that share cores; where they contradict each other, or were not
+measured, a message says so.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from trilane.pipeline.core_meter import counts_run_delay
 from trilane.pipeline.cpu_use import CpuTimes, use_of_cores
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.run_log import RunLog
-from trilane.scheduler.accounts import compared
 
 NO_RUN_DELAY = (
     "this kernel does not count how long threads wait for a core (CONFIG_SCHED_INFO): the time in which a unit had a "
@@ -21,28 +19,17 @@ NO_RUN_DELAY = (
 )
 
 
-def add_accounts(
-    report: dict[str, Any],
-    pipeline: Pipeline,
-    cpu: CpuTimes,
-    second: Mapping[str, Mapping[str, float]],
-    log: RunLog,
-) -> None:
-    """Add `cpu_s`, `cpu_ms`, `core_shares` and `accounts` to a ledger's report.
+def add_accounts(report: dict[str, Any], pipeline: Pipeline, cpu: CpuTimes, log: RunLog) -> None:
+    """Add `cpu_s`, `cpu_ms` and `core_shares` to a ledger's report.
 
     `pipeline`: that ran.
     `cpu`: CPU time of its units and stages.
-    `second`: its second accounts.
     `log`: is told what was not measured, and what contradicts itself.
     """
     for unit, row in report["units"].items():
         row.update(cpu_s=cpu.of_unit_s(unit), cpu_in_jobs_s=cpu.in_jobs_ns[unit] / 1e9)
     for stage, row in report["stages"].items():
         row["cpu_ms"] = cpu.stage_ns[stage].summary_ms()
-    report["accounts"] = compared(report["units"], second)
-    if not report["accounts"]["agree"]:
-        found = report["accounts"]["largest_difference"]
-        log.say(f"the shares of units, computed twice, differ by {found:.2%} of the time: please report this")
     cores = {unit: pipeline.units[unit].cores for unit in report["units"]}
     cpu_s = {unit: cpu.of_unit_s(unit) for unit in cores}
     uses = use_of_cores(cores, cpu_s, {unit: report["units"][unit]["busy"] for unit in cores}, report["duration_s"])

@@ -18,19 +18,8 @@ from collections.abc import Iterator, Mapping, Reversible, Sequence
 from typing import Any, Final, NamedTuple
 
 from trilane.pipeline.sharing import Sharing
-from trilane.pipeline.waits import (
-    DOWN,
-    HELD,
-    KEPT,
-    LOST,
-    OVERHEAD,
-    PREEMPTED,
-    THROTTLED,
-    UNKNOWN,
-    Down,
-    ExplainedJob,
-    Key,
-)
+from trilane.pipeline.timeline import Down, ExplainedJob
+from trilane.pipeline.unit_history import DOWN, HELD, KEPT, LOST, OVERHEAD, PREEMPTED, THROTTLED, UNKNOWN, Key
 from trilane.scheduler.events import Graph, Settings
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.uncertainty import LEAST_FRAMES, batch_interval
@@ -73,7 +62,7 @@ class Piece(NamedTuple):
 class Paths:
     """Keeps the last jobs of a run, and walks back through them.
 
-    `graph`, `settings`: of the run. `downs`: of its units so far, as `Waits` notes them. `kept`: jobs.
+    `graph`, `settings`: of the run. `downs`: of its units so far, as `Timeline` notes them. `kept`: jobs.
     """
 
     def __init__(self, graph: Graph, settings: Settings, downs: Reversible[Down] = (), kept: int = KEPT) -> None:
@@ -114,14 +103,6 @@ class Paths:
             kept.pop(key, None)
         if self._last_of_frame.get(key[1]) == key:
             del self._last_of_frame[key[1]]
-
-    def is_presented(self, explained: ExplainedJob) -> bool:
-        """Whether it is the job that presents its frame."""
-        return explained.job.stage == self._last
-
-    def job(self, key: Key) -> ExplainedJob | None:
-        """The job of a stage and frame, where it is kept."""
-        return self._jobs.get(key)
 
     def walk(self, last: ExplainedJob, until_ns: int) -> Iterator[Piece]:
         """The pieces from the end of `last` back to `until_ns`, the last first."""

@@ -10,6 +10,7 @@ record, or without `Ended`, is of a run that was killed, or that still goes on.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -22,9 +23,8 @@ from trilane.errors import BadInputError, UnwrittenError
 from trilane.files import require_file
 from trilane.pipeline import journal_values as values
 from trilane.pipeline.journal_values import RunValues
-from trilane.scheduler.accounts import in_order
 from trilane.scheduler.core import Core
-from trilane.scheduler.events import Action, Event, Graph, Settings
+from trilane.scheduler.events import Action, Event, Graph, JobDone, Settings
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.recording import Recording, row_of
 from trilane.unexpected_value import UnexpectedValue
@@ -247,9 +247,18 @@ def records_of(recording: Recording, jobs: Iterable[JobRecord]) -> Iterator[Reco
 
 def _steps_of(recording: Recording, jobs: Iterable[JobRecord]) -> Iterator[tuple[Stepped, list[Record]]]:
     """Each step's record, with the records of what it changed and of the jobs that it ended."""
-    for now_ns, events, actions, accounts, ended in in_order(recording, jobs):
-        changed = [Accounted(since_ns, unit, account) for since_ns, unit, account in accounts]
-        yield Stepped(now_ns, events, actions), [*changed, *(Worked(job, {}) for job in ended)]
+    accounts = deque(recording.accounts)
+    left: dict[str, deque[JobRecord]] = {unit: deque() for unit in recording.graph.units}
+    for job in sorted(jobs, key=lambda job: job.begin_ns):
+        left[job.unit].append(job)
+    for step in recording.steps:
+        others: list[Record] = []
+        while accounts and accounts[0][0] <= step[0]:
+            others.append(Accounted(*accounts.popleft()))
+        for event in step[1]:
+            while type(event) is JobDone and left[event.unit] and left[event.unit][0].end_ns <= event.t_end_ns:
+                others.append(Worked(left[event.unit].popleft(), {}))
+        yield Stepped(*step), others
 
 
 def journal_of(

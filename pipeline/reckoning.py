@@ -6,16 +6,14 @@ What is held of a run while it is read is bounded, however long it lasts.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Reversible
 from typing import Any, NamedTuple
 
 from trilane.pipeline.cpu_use import Efficiencies
 from trilane.pipeline.critical_path import Budget, Part, Paths
-from trilane.pipeline.journal import Begun, Record, Worked, config_of
-from trilane.pipeline.journal_slices import JournalSlices
+from trilane.pipeline.journal import Begun, Record, config_of
 from trilane.pipeline.sharing import Sharing, Taken
-from trilane.pipeline.waits import ExplainedJob, Waits
-from trilane.scheduler.accounts import ShareSums
+from trilane.pipeline.timeline import Down, ExplainedJob, Timeline
 from trilane.scheduler.events import Graph, Settings
 from trilane.scheduler.places import Place, Placement
 
@@ -33,45 +31,36 @@ class Reckoned(NamedTuple):
 
 
 class Reckoning:
-    """Takes the records of a run after the first, in order.
+    """Takes the jobs of a run in order, with their waits explained.
 
-    `graph`, `settings`: of the run. `places`: of its units, as far as they are known. `paths`, `sharing`: of the
-    records so far.
+    `graph`, `settings`: of the run. `places`: of its units, as far as they are known. `downs`: of its units so far, as
+    `Timeline` notes them. `paths`, `sharing`: of the jobs so far.
     """
 
-    def __init__(self, graph: Graph, settings: Settings, places: Placement) -> None:
-        self._waits = Waits(graph)
-        self.paths = Paths(graph, settings, self._waits.downs)
+    def __init__(self, graph: Graph, settings: Settings, places: Placement, downs: Reversible[Down]) -> None:
+        self.paths = Paths(graph, settings, downs)
         self.sharing = Sharing({unit: place.cores for unit, place in places.items()})
         self._budget = Budget(self.paths, self.sharing)
         own = {unit: Place((-1 - number,), 1) for number, unit in enumerate(graph.units)}  # as if it had a core
         self._efficiencies = Efficiencies({**own, **places})
         self._unit_of = {stage.name: stage.unit for stage in graph.stages}
 
-    @classmethod
-    def of(cls, begun: Begun) -> Reckoning:
-        """Of the run whose journal begins so. Raises BadInputError for a configuration that is none of a run."""
-        return cls(begun.graph, begun.settings, places_of(begun))
-
     @property
     def bound(self) -> Mapping[str, Any] | None:
         """As in a report, by the path so far; None until 63 frames were presented."""
         return self._budget.bound(self._unit_of).get("bound")
 
-    def add(self, record: Record) -> ExplainedJob | None:
-        """The next record; the job that it ends, if any, with its wait explained."""
-        explained = self._waits.add(record)
-        if explained is not None:
-            self.paths.add(explained)
-            self.sharing.add(explained.job)
-            presents = self.paths.is_presented(explained)
-            self._efficiencies.add(explained.job, presents=presents)
-            if presents:
-                self._budget.present(explained)
-        return explained
+    def add(self, explained: ExplainedJob) -> None:
+        """The next job that has ended."""
+        self.paths.add(explained)
+        self.sharing.add(explained.job)
+        presents = explained.presented is not None
+        self._efficiencies.add(explained.job, presents=presents)
+        if presents:
+            self._budget.present(explained)
 
     def close(self) -> Reckoned:
-        """After the last record."""
+        """After the last job."""
         budget = self._budget.close()
         figures = {**self._efficiencies.close(), **self._budget.bound(self._unit_of)}
         return Reckoned(budget, self.sharing.close(), figures)
@@ -92,17 +81,12 @@ def places_of(begun: Begun) -> dict[str, Place]:
     }
 
 
-def reckoned(
-    graph: Graph, settings: Settings, places: Placement, records: Iterable[Record]
-) -> tuple[dict[str, dict[str, float]], Reckoned]:
-    """The second accounts of a run, and what bounded it. `records`: those of the run after the first."""
-    sums, slices, reckoning = ShareSums(), JournalSlices(graph), Reckoning(graph, settings, places)
+def reckoned(graph: Graph, settings: Settings, places: Placement, records: Iterable[Record]) -> Reckoned:
+    """What bounded a run. `records`: those of the run after the first."""
+    timeline = Timeline(graph, settings, waits=True)
+    reckoning = Reckoning(graph, settings, places, timeline.downs)
     for record in records:
-        if isinstance(record, Worked):
-            sums.add_job(record.job)
-        for piece in slices.add(record):
-            sums.add_idle(piece)
-        reckoning.add(record)
-    for piece in slices.end():
-        sums.add_idle(piece)
-    return sums.shares(slices.span), reckoning.close()
+        for fact in timeline.add(record):
+            if isinstance(fact, ExplainedJob):
+                reckoning.add(fact)
+    return reckoning.close()

@@ -25,7 +25,7 @@ class RunResult:
 
     `report`: what the run measured; who calls it adds the machine and the configuration.
     `jobs`, `recording`: of a run without a journal; of one with it they are empty, and the journal has them
-    (`trilane.pipeline.journal_slices.jobs_of`).
+    (`trilane.pipeline.journal.Worked`).
     `lost`, `dropped`: frames by cause. `startup_ms`: of each unit. `metrics`: of each stage, the means
     over the jobs that gave them.
     `rungs`: of a run with a ladder of work, how many presented frames had each, and `rung_switches`, how often one had

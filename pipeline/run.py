@@ -139,9 +139,8 @@ def run_pipeline(
         _add_caps(report, governor)
         for unit, row in report["units"].items():
             row.update(pid=run.pids[unit], **pipeline.units[unit].model_dump(mode="json"))
-        second, bounded = record.reckoned(pipeline.places())
-        report.update(bounded.figures)
-        add_accounts(report, pipeline, clock.cpu, second, log)
+        report.update(record.reckoned(pipeline.places()).figures)
+        add_accounts(report, pipeline, clock.cpu, log)
         add_bytes(report, clock.metrics)
         metrics = metrics_of(report)
         record.end(metrics.as_json())

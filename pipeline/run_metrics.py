@@ -7,11 +7,14 @@ is left out of the file. Times are in ms, shares between 0 and 1.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, Self
+from typing import Any, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
 from trilane.pipeline.description import Model
+
+#: Stages measured by themselves, and the shares of `units` computed a second time.
+GONE: Final = frozenset({"isolated_ms", "accounts"})
 
 
 class Record(Model):
@@ -207,19 +210,6 @@ class CoreShare(Record):
     busy: float
 
 
-class Accounts(Record):
-    """The busy and idle shares a second time, from the slices of the trace (scheduler/accounts.py).
-
-    `units`: of each unit that has slices, its shares.
-    `largest_difference`: from the shares of `units` of the report, over all units and causes.
-    `agree`: whether that is at most `LARGEST_DIFFERENCE` of the time.
-    """
-
-    units: dict[str, dict[str, float]]
-    largest_difference: float
-    agree: bool
-
-
 class UnitCap(Record):
     """The cap of one unit. `corner`: at the run's end; `duty`: share of the time then; `duty_mean`: over the run."""
 
@@ -311,7 +301,6 @@ class RunMetrics(Record):
     without a path.
     `bound`: its share of the path, and the stage that has most of it.
     `core_shares`: what was done on each set of cores that a unit has, and on all; on the host clock.
-    `accounts`: the shares of `units` computed a second time.
     `policy`, `edge`: of the scheduler; `idle_cores`: whether cores without work stayed awake; on the host clock.
     `other_programs`: their share of the time of the run's cores; null where a unit died.
     `caps`, `temperature_c`: of a capped run.
@@ -337,13 +326,20 @@ class RunMetrics(Record):
     bottleneck: str | None = None
     bound: Bound | None = None
     core_shares: tuple[CoreShare, ...] = ()
-    accounts: Accounts | None = None
     policy: str = ""
     edge: str = ""
     idle_cores: str = ""
     other_programs: float | None = None
     caps: Caps | None = None
     temperature_c: Temperature | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _leave_out_what_is_gone(cls, document: Any) -> Any:
+        """Older Trilanes wrote keys that nobody makes now."""
+        if not isinstance(document, dict):
+            return document
+        return {key: value for key, value in document.items() if key not in GONE}
 
 
 def metrics_of(ledger_report: Mapping[str, Any]) -> RunMetrics:

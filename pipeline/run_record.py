@@ -92,8 +92,8 @@ class RunRecord(Protocol):
     def say(self, text: str) -> None:
         """Note a message to a person."""
 
-    def reckoned(self, places: Placement) -> tuple[dict[str, dict[str, float]], Reckoned]:
-        """The second accounts of the whole run, and what bounded it; the loop is over. `places`: of its units."""
+    def reckoned(self, places: Placement) -> Reckoned:
+        """What bounded the whole run; the loop is over. `places`: of its units."""
 
     def end(self, report: Mapping[str, Any]) -> None:
         """The run is over, with this report."""
@@ -117,7 +117,7 @@ class KeptRun:
     def say(self, text: str) -> None:
         """Messages are kept by the log of the run."""
 
-    def reckoned(self, places: Placement) -> tuple[dict[str, dict[str, float]], Reckoned]:
+    def reckoned(self, places: Placement) -> Reckoned:
         if self._source is not None:
             self.jobs += [worked.job for worked in self._source.ended() if worked is not None]
         recording = self.recording
@@ -189,7 +189,7 @@ class JournaledRun:
         self._writer.add(Said(time.monotonic_ns(), text))
         self._writer.flush()
 
-    def reckoned(self, places: Placement) -> tuple[dict[str, dict[str, float]], Reckoned]:
+    def reckoned(self, places: Placement) -> Reckoned:
         self.flush()
         records = read_journal(self._file.path)
         next(records)  # the header

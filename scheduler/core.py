@@ -185,7 +185,7 @@ class Core:
             self.flow.mark_lost(frame, loss)
         self._finish(outcome)
 
-    def _count_drop_at_source(self, cause: DropCause) -> None:
+    def _count_drop_at_source(self, _frame: int, _release_ns: int, cause: DropCause) -> None:
         self.ledger.dropped[Drop(f"source->{self.graph.stages[0].name}", cause)] += 1
 
     # events of jobs
@@ -211,12 +211,9 @@ class Core:
             unit.hold_until_ns = end_ns + service_ns * (FULL_DUTY - unit.duty) // unit.duty
             unit.update_queue_capacity()
             self._reset_alarm()
-        position = stage.position
-        frame.ready_ns, frame.position = end_ns, self._bypass_end if skips else position + 1
-        if position == 0:
-            frame.pose_ns = pose_ns
-        if position == self._latency_position:
-            frame.latency_ns = end_ns - frame.pose_ns
+        frame.end_stage(stage.position, self._latency_position, pose_ns, end_ns)
+        if skips:
+            frame.position = self._bypass_end
         self.flow.mark_dirty(unit)
         self.flow.pass_on(stage, job, end_ns)
 

@@ -13,14 +13,14 @@ class Source:
     """Frames 0..n-1. A released frame waits in `queue` until it is taken, turned away, or out of time.
 
     Without a rate (no period, no arrivals, no requests) a frame counts as released in the moment in which it can be
-    taken. `drop` is called with the cause of each frame that is dropped here. `due_ns`: when the next frame is
-    released or the oldest waiting one runs out of time. `is_empty`: whether no frame can be taken now.
+    taken. `drop` is called with each frame that is dropped here, its release time and the cause. `due_ns`: when the
+    next frame is released or the oldest waiting one runs out of time. `is_empty`: whether no frame can be taken now.
 
     While frames are held, `hold` alone releases them, a few at a time. Afterwards the next one is due at once, and
     those that follow it as long after it as they would have been.
     """
 
-    def __init__(self, settings: Settings, drop: Callable[[DropCause], None]) -> None:
+    def __init__(self, settings: Settings, drop: Callable[[int, int, DropCause], None]) -> None:
         self._settings = settings
         self._drop = drop
         self._next = 0
@@ -73,8 +73,7 @@ class Source:
             changed = True
         timeout = self._settings.queue_timeout_ns
         while timeout and self.queue and self.queue[0][1] + timeout <= now_ns:
-            self.queue.popleft()
-            self._drop(DropCause.TIMEOUT)
+            self._drop(*self.queue.popleft(), DropCause.TIMEOUT)
             changed = True
         self._set_due()
         return changed
@@ -104,14 +103,12 @@ class Source:
     def keep_newest(self) -> None:
         """The others that wait are stale."""
         while len(self.queue) > 1:
-            self.queue.popleft()
-            self._drop(DropCause.STALE)
+            self._drop(*self.queue.popleft(), DropCause.STALE)
         self._set_due()
 
     def drop_late_head(self) -> None:
         """The frame that has waited longest cannot be in time."""
-        self.queue.popleft()
-        self._drop(DropCause.LATE)
+        self._drop(*self.queue.popleft(), DropCause.LATE)
         self._set_due()
 
     def take(self, now_ns: int) -> tuple[int, int]:
@@ -127,7 +124,7 @@ class Source:
     def _admit(self, frame: int, release_ns: int) -> None:
         limit = self._settings.in_queue
         if limit and len(self.queue) >= limit:
-            self._drop(DropCause.QUEUE_FULL)
+            self._drop(frame, release_ns, DropCause.QUEUE_FULL)
         else:
             self.queue.append((frame, release_ns))
 

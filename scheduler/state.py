@@ -117,19 +117,30 @@ class StageState:
 
 
 class FrameState:
-    """`position`: of its next stage. `ready_ns`: when its last stage ended.
+    """`position`: of its next stage. `release_ns`: when it was released. `ready_ns`: when its last stage ended.
 
     `latency_ns`: from the pose to the composited frame, once known. `skips`: whether it takes the bypass. `rung`:
     of its work.
     """
 
-    __slots__ = ("deadline_ns", "latency_ns", "pose_ns", "position", "ready_ns", "rung", "skips")
+    __slots__ = ("deadline_ns", "latency_ns", "pose_ns", "position", "ready_ns", "release_ns", "rung", "skips")
 
     def __init__(self, release_ns: int, deadline_ns: int, rung: int = 0) -> None:
-        self.position, self.ready_ns = 0, release_ns
+        self.position, self.release_ns, self.ready_ns = 0, release_ns, release_ns
         self.deadline_ns, self.rung = deadline_ns, rung
         self.pose_ns = self.latency_ns = 0
         self.skips = False
+
+    def end_stage(self, position: int, latency_position: int, pose_ns: int, end_ns: int) -> None:
+        """The stage at `position` has ended; latency ends with the one at `latency_position`.
+
+        `pose_ns`: when the pose was sampled, which the first stage says.
+        """
+        self.position, self.ready_ns = position + 1, end_ns
+        if position == 0:
+            self.pose_ns = pose_ns
+        if position == latency_position:
+            self.latency_ns = end_ns - self.pose_ns
 
 
 def build(graph: Graph) -> tuple[list[StageState], dict[str, UnitState], list[EdgeSlots]]:

@@ -123,7 +123,7 @@ def _write_trace(
     from trilane.hw_profiles.beside import together
     from trilane.hw_profiles.performance_profiles import corners_of
 
-    runs = together(chip, found, corners_of(chip, performance_profile), turns, twice=True).runs
+    runs = together(chip, found, corners_of(chip, performance_profile), turns, keep=True).runs
     named = {tenant.name: run for tenant, run in zip(found, runs, strict=True)}
     write_predicted(named, {key: answer[key] for key in ("machine", "config")}, target)
 
@@ -155,12 +155,6 @@ def _show(answer: dict[str, Any]) -> None:
     _show_chip(console, answer)
     for note in answer["notes"]:
         console.print(f"note            {note}", soft_wrap=True)
-    for row in answer["pipelines"]:
-        if not row["accounts"]["agree"]:
-            found = row["accounts"]["largest_difference"]
-            console.print(
-                f"{row['name']}: the shares of units, computed twice, differ by {found:.2%}: please report this"
-            )
 
 
 def _pipelines(answer: dict[str, Any]) -> Table:

@@ -203,12 +203,11 @@ def _slowest(document: Mapping[str, Any]) -> Table:
         caption_justify="left",
     )
     for row in document["slowest"]:
-        latency = "-" if row["latency_ms"] is None else f"{row['latency_ms']:.1f}"
         reasons = [f"{reason['longer_ms']:.1f} ms: {reason['text']}" for reason in row["why"]]
         table.add_row(
             str(row["frame"]),
             f"{row['frame_ms']:.1f}",
-            latency,
+            f"{row['latency_ms']:.1f}",
             "\n".join([*row["notes"], *reasons]) or "hardly longer than the median",
         )
     return table

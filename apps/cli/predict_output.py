@@ -204,9 +204,6 @@ def show_answer(answer: dict[str, Any], as_json: bool) -> None:
         error = f"±{100 * answer['expected_error']:.0f} % of the network's time"
         console.print(f"expected error  {error} (confidence {answer['confidence']:.2f})")
     console.print(_unit_table(answer))
-    if not answer["accounts"]["agree"]:
-        found = answer["accounts"]["largest_difference"]
-        console.print(f"the shares of units, computed twice, differ by {found:.2%} of the time: please report this")
     if "alternatives" in answer:
         console.print(_alternatives_table(answer))
 

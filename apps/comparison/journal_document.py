@@ -17,8 +17,8 @@ from trilane.apps.comparison.configuration import NOT_KNOWN, PARTS
 from trilane.apps.comparison.difference import STATISTICS
 from trilane.apps.comparison.run_frames import Key, RunFrames
 from trilane.errors import BadInputError
-from trilane.pipeline.journal import Begun, read_journal
-from trilane.pipeline.reckoning import Reckoning
+from trilane.pipeline.journal import read_journal
+from trilane.pipeline.reckoning import places_of, reckoned
 from trilane.pipeline.run_metrics import RunMetrics
 
 #: Facts of the first record that a report has too.
@@ -60,13 +60,8 @@ def document_of(frames: RunFrames, path: Path) -> dict[str, Any]:
 def _at_the_end(frames: RunFrames, path: Path) -> dict[str, Any]:
     """What the last record says of the whole run; where there is none, what bounded it and how full its cores were."""
     if frames.ended is None:
-        records = read_journal(path)
-        begun = next(records)
-        assert isinstance(begun, Begun)  # the reader sees to it
-        reckoning = Reckoning.of(begun)
-        for record in records:
-            reckoning.add(record)
-        return dict(reckoning.close().figures)
+        begun, records = frames.begun, read_journal(path)
+        return dict(reckoned(begun.graph, begun.settings, places_of(begun), records).figures)
     try:
         return RunMetrics.model_validate(from_json(to_json(dict(frames.ended.report)))).as_json()
     except ValidationError as error:

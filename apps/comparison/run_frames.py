@@ -17,20 +17,19 @@ import numpy as np
 from trilane.apps.comparison.difference import MOST_FRAMES, Series
 from trilane.arrays import F64, I64
 from trilane.errors import BadInputError
-from trilane.pipeline.journal import Accounted, Begun, Counted, Ended, Record, Stepped, Worked, read_journal
-from trilane.scheduler.accounts import BUSY, CAUSES, IdleCutter, IdleSlice
-from trilane.scheduler.events import Dispatch, JobDone
+from trilane.pipeline.journal import Begun, Counted, Ended, Record, Worked, read_journal
+from trilane.pipeline.timeline import Presented, Timeline
+from trilane.pipeline.unit_history import BUSY, IDLE_CAUSES, OVERHEAD, PREEMPTED, IdleSlice
 from trilane.scheduler.ledger import JobRecord
 
 NS_PER_MS = 1e6
-STATES = (BUSY, *CAUSES)
+STATES = (BUSY, *IDLE_CAUSES)
 INSTRUCTIONS, INSTRUCTION_TIME = "instructions", "time of an instruction"
 #: Figures of jobs that stages report or the processor counts, and the measures that they are here.
 REPORTED = {f"bytes_{name}": f"bytes {name.replace('_', ' ')}" for name in ("read", "written", "uploaded", "read_back")}
 REPORTED["instructions"] = INSTRUCTIONS
 #: Frames that may have been begun before the first of which all is kept.
 IN_FLIGHT = 100
-OVERHEAD, PREEMPTED = "overhead", "preempted"
 
 
 class Key(NamedTuple):
@@ -75,13 +74,11 @@ def frames_of(records: Iterable[Record]) -> RunFrames | None:
     for record in records:
         story.add(record)
     graph, jobs, idle = story.graph, story.jobs, story.idle()
-    last = graph.stages[-1].name
-    ends = sorted((job.end_ns, job.frame) for job in jobs if job.stage == last)
-    if len(ends) < 2:
+    if len(story.shown) < 2:
         return None
-    end_ns, numbers = (np.array(column, np.int64) for column in zip(*ends, strict=True))
-    series = {Key("frame time"): _plain(numbers[1:], np.diff(end_ns))}
-    series |= _latencies(graph.latency_to, jobs, story.sampled_ns)
+    shown = [(one.frame, one.end_ns, one.latency_ns) for one in story.shown]
+    numbers, end_ns, latency_ns = (np.array(column, np.int64) for column in zip(*shown, strict=True))
+    series = {Key("frame time"): _plain(numbers[1:], np.diff(end_ns)), Key("latency"): _plain(numbers, latency_ns)}
     for stage in graph.stages:
         series |= _stage(stage.name, [job for job in jobs if job.stage == stage.name])
     for unit in graph.units:
@@ -96,47 +93,37 @@ class _Story:
 
     def __init__(self) -> None:
         self.jobs: list[JobRecord] = []
-        self.sampled_ns: dict[int, int] = {}
+        self.shown: list[Presented] = []
         self.figures: dict[Key, list[tuple[int, float]]] = defaultdict(list)
         self.ended: Ended | None = None
         self.counted: Counted | None = None
         self.presented = 0
-        self._first_jobs: dict[int, int] = {}
         self._idle: list[IdleSlice] = []
 
     def idle(self) -> list[IdleSlice]:
         """Every idle slice of the run; to be asked once, after the last record."""
-        return [*self._idle, *self._cutter.end()]
+        return [*self._idle, *self._timeline.end()]
 
     def add(self, record: Record) -> None:
         if isinstance(record, Begun):
             self.begun, self.graph = record, record.graph
-            self._cutter = IdleCutter(record.graph)
-        elif isinstance(record, Stepped):
-            self._step(record)
-        elif isinstance(record, Accounted):
-            self._cutter.account(*record)
-        elif isinstance(record, Worked):
+            self._timeline = Timeline(record.graph, record.settings, idle=True)
+            return
+        for fact in self._timeline.add(record):
+            if isinstance(fact, IdleSlice):
+                self._idle.append(fact)
+            elif isinstance(fact, Presented):
+                self.shown.append(fact)
+                self.presented += 1
+        if isinstance(record, Worked):
             self._work(record)
         elif isinstance(record, Counted):
             self.counted = record
         elif isinstance(record, Ended):
             self.ended = record
 
-    def _step(self, step: Stepped) -> None:
-        self._idle += self._cutter.step(step.now_ns, step.events, step.actions)
-        first = self.graph.stages[0].name
-        for action in step.actions:
-            if type(action) is Dispatch and action.job.stage == first:
-                self._first_jobs[action.job.id] = action.job.frame
-        for event in step.events:
-            if type(event) is JobDone and event.job in self._first_jobs:
-                self.sampled_ns[self._first_jobs.pop(event.job)] = event.t_sampled_ns
-
     def _work(self, record: Worked) -> None:
         self.jobs.append(record.job)
-        self.presented += record.job.stage == self.graph.stages[-1].name
-        self._cutter.job(record.job)
         most = (MOST_FRAMES + IN_FLIGHT) * len(self.graph.stages)
         if len(self.jobs) >= 2 * most:
             self._forget(self.jobs[-most])
@@ -149,19 +136,13 @@ class _Story:
         self.jobs = self.jobs[self.jobs.index(first) :]
         oldest = min(job.frame for job in self.jobs)
         self._idle = [piece for piece in self._idle if piece.end_ns >= first.begin_ns]
-        self.sampled_ns = {frame: ns for frame, ns in self.sampled_ns.items() if frame >= oldest}
+        self.shown = [one for one in self.shown if one.frame >= oldest]
         for key, rows in self.figures.items():
             self.figures[key] = [row for row in rows if row[0] >= oldest]
 
 
 def _plain(frames: I64, ns: I64) -> Series:
     return Series(frames, ns / NS_PER_MS, np.ones(len(frames)))
-
-
-def _latencies(stage: str, jobs: Sequence[JobRecord], sampled_ns: Mapping[int, int]) -> dict[Key, Series]:
-    ends = sorted((job.end_ns, job.frame) for job in jobs if job.stage == stage and job.frame in sampled_ns)
-    frames = np.array([frame for _, frame in ends], np.int64)
-    return {Key("latency"): _plain(frames, np.array([end - sampled_ns[frame] for end, frame in ends], np.int64))}
 
 
 def _stage(name: str, jobs: Sequence[JobRecord]) -> dict[Key, Series]:

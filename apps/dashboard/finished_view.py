@@ -22,14 +22,14 @@ from trilane.apps.dashboard.meter import Meter
 from trilane.apps.dashboard.run_facts import RunFacts
 from trilane.apps.dashboard.text_store import TextStore
 from trilane.apps.dashboard.time_table import TimeTable
-from trilane.apps.dashboard.timeline import Timeline, described, note, slices
+from trilane.apps.dashboard.timeline import TimelineRows, described, note, slices
 from trilane.apps.dashboard.video_frames import VideoFrames
 from trilane.apps.dashboard.view import Message
 from trilane.apps.dashboard.wire import ControlSaid, Seek, shown
 from trilane.apps.live.followed_run import CUT_OFF, FollowedRun, RunState
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import NAME, Begun, Ended, Record, Stepped, journal_in, read_journal
-from trilane.scheduler.accounts import CAUSES, UNEXPLAINED
+from trilane.pipeline.unit_history import IDLE_CAUSES, UNEXPLAINED
 
 FIRST_SPAN_MS: Final = 5000.0
 FIGURES_EVERY_MS: Final = 1000.0
@@ -39,7 +39,7 @@ MOST_NOTES: Final = 100
 OVER: Final = "the run is over"
 NO_VIDEO: Final = "there are no pictures: video.mp4 is missing or cannot be read"
 
-CAUSE_NAMES: Final = (*CAUSES, UNEXPLAINED)
+CAUSE_NAMES: Final = (*IDLE_CAUSES, UNEXPLAINED)
 TIMES: Final = [("begin", "<f8"), ("end", "<f8")]
 JOB: Final = np.dtype([("unit", "u1"), ("stage", "u1"), ("frame", "<u4"), *TIMES, ("wait", "<f8")])
 IDLE: Final = np.dtype([("unit", "u1"), ("cause", "u1"), *TIMES])
@@ -58,7 +58,7 @@ class FinishedRun:
         self.end_ms = 0.0
         self.jobs, self.idle, self.presented, self.figures = map(TimeTable, (JOB, IDLE, PRESENTED, FIGURES))
         self._written = TextStore()
-        self._timeline, self._meter = Timeline(begun), Meter(begun, finds_bound=facts.bound is None)
+        self._timeline, self._meter = TimelineRows(begun), Meter(begun, finds_bound=facts.bound is None)
         self._last_stage = len(begun.graph.stages) - 1
         self._due_ms = 0.0
         self.metrics = ""

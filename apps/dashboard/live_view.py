@@ -22,7 +22,7 @@ from trilane.apps.dashboard.clients import Client
 from trilane.apps.dashboard.controls import OF_THE_CAMERA, Control, Value, control_of
 from trilane.apps.dashboard.meter import Meter
 from trilane.apps.dashboard.run_facts import RunFacts
-from trilane.apps.dashboard.timeline import IdleRow, JobRow, Timeline, described, note, slices
+from trilane.apps.dashboard.timeline import IdleRow, JobRow, TimelineRows, described, note, slices
 from trilane.apps.dashboard.video_frames import jpeg_of
 from trilane.apps.dashboard.view import Message
 from trilane.apps.dashboard.wire import ControlSaid, Seek, shown
@@ -49,7 +49,7 @@ class Course:
 
     def __init__(self, begun: Begun) -> None:
         self.begun = begun
-        self.timeline, self.meter = Timeline(begun), Meter(begun)
+        self.timeline, self.meter = TimelineRows(begun), Meter(begun)
         self.jobs: deque[JobRow] = deque(maxlen=MOST_JOBS)
         self.idle: deque[IdleRow] = deque(maxlen=MOST_IDLE)
         self.notes: deque[Message] = deque(maxlen=MOST_NOTES)

@@ -10,8 +10,8 @@ from typing import Any
 
 from trilane.pipeline.journal import Begun, Record, Stepped, Worked
 from trilane.pipeline.journal import Said as SaidRecord
-from trilane.pipeline.journal_slices import JournalSlices
-from trilane.scheduler.accounts import IdleSlice
+from trilane.pipeline.timeline import Timeline
+from trilane.pipeline.unit_history import IdleSlice
 from trilane.scheduler.events import Graph
 
 MS = 1e-6  # of a nanosecond
@@ -22,7 +22,7 @@ JobRow = tuple[int, int, int, float, float, float]
 IdleRow = tuple[int, str, float, float]
 
 
-class Timeline:
+class TimelineRows:
     """Jobs, idle slices and notes that came since the last `take`. `begun`: the run's first record.
 
     `now_ms`: of the last step.
@@ -32,7 +32,7 @@ class Timeline:
         graph = begun.graph
         self._units = {unit: place for place, unit in enumerate(graph.units)}
         self._stages = {stage.name: place for place, stage in enumerate(graph.stages)}
-        self._slices = JournalSlices(graph)
+        self._timeline = Timeline(graph, begun.settings, idle=True)
         self._start_ns: int | None = None
         self.now_ms = 0.0
         self._jobs: list[JobRow] = []
@@ -49,11 +49,11 @@ class Timeline:
             self._jobs.append((self._units[job.unit], self._stages[job.stage], job.frame, *times))
         elif isinstance(record, SaidRecord):
             self._notes.append((self._ms(record.now_ns), record.text))
-        self._add_idle(self._slices.add(record))
+        self._add_idle(fact for fact in self._timeline.add(record) if isinstance(fact, IdleSlice))
 
     def end(self) -> None:
         """After the last record: the slices that are left."""
-        self._add_idle(self._slices.end())
+        self._add_idle(self._timeline.end())
 
     def take(self) -> tuple[list[JobRow], list[IdleRow], list[tuple[float, str]]]:
         """What came since the last call."""

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from trilane.pipeline.critical_path import ASLEEP, RELEASE, TAKEN, WORK
-from trilane.pipeline.waits import DOWN, HELD, LOST, OVERHEAD, PREEMPTED, THROTTLED
+from trilane.pipeline.unit_history import DOWN, HELD, LOST, OVERHEAD, PREEMPTED, THROTTLED
 
 #: Of the frame time; what bounds less of it is not worth an attempt.
 LEAST_SHARE: Final = 0.1

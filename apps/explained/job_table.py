@@ -15,7 +15,7 @@ from typing import Any, Final
 from trilane.apps.explained.run import explained_jobs, open_journal
 from trilane.errors import BadInputError, MissingPartError
 from trilane.pipeline.journal import Worked
-from trilane.pipeline.waits import ExplainedJob
+from trilane.pipeline.timeline import ExplainedJob
 from trilane.writing import write_atomically
 
 #: Column -> its value of a job, and its type. Times are ns of the run's clock, lengths of time ns; docs/explain.md says

@@ -20,7 +20,8 @@ from trilane.pipeline.critical_path import WHATS, Part
 from trilane.pipeline.journal import NAME, Begun, Ended, Record, config_of, journal_in, read_journal
 from trilane.pipeline.reckoning import Reckoning, places_of
 from trilane.pipeline.sharing import Taken
-from trilane.pipeline.waits import PREEMPTED, ExplainedJob, Waits
+from trilane.pipeline.timeline import ExplainedJob, Timeline
+from trilane.pipeline.unit_history import PREEMPTED
 from trilane.scheduler.stats import NS_PER_MS
 
 SCHEMA = 1
@@ -30,10 +31,9 @@ GOES_ON = "the run still goes on: what follows is of its frames so far"
 
 def explained_jobs(begun: Begun, records: Iterable[Record]) -> Iterator[ExplainedJob]:
     """Every job of a journal with its wait explained. `records`: those that follow `begun`."""
-    waits = Waits(begun.graph)
+    timeline = Timeline(begun.graph, begun.settings, waits=True)
     for record in records:
-        if explained := waits.add(record):
-            yield explained
+        yield from (fact for fact in timeline.add(record) if isinstance(fact, ExplainedJob))
 
 
 def open_journal(folder: Path) -> tuple[Begun, Iterator[Record]]:
@@ -60,7 +60,8 @@ class Explanation:
 
     def __init__(self, begun: Begun, report: Report | None, slowest: int) -> None:
         self._begun, self._report, self._places = begun, report, places_of(begun)
-        self._reckoning = Reckoning(begun.graph, begun.settings, self._places)
+        self._timeline = Timeline(begun.graph, begun.settings, waits=True)
+        self._reckoning = Reckoning(begun.graph, begun.settings, self._places, self._timeline.downs)
         self._slow = SlowFrames(begun.graph, self._reckoning.paths, self._reckoning.sharing, slowest)
         self._waits: dict[str, dict[str, int]] = {stage.name: {} for stage in begun.graph.stages}
         self._jobs = dict.fromkeys(self._waits, 0)
@@ -68,17 +69,19 @@ class Explanation:
 
     def add(self, record: Record) -> None:
         """The next record."""
-        if explained := self._reckoning.add(record):
-            self._count(explained)
+        for fact in self._timeline.add(record):
+            if isinstance(fact, ExplainedJob):
+                self._count(fact)
 
     def _count(self, explained: ExplainedJob) -> None:
         job = explained.job
+        self._reckoning.add(explained)
         self._slow.add(explained)
         self._jobs[job.stage] += 1
         sums = self._waits[job.stage]
         for cause, ns in explained.waits_ns.items():
             sums[cause] = sums.get(cause, 0) + ns
-        if self._reckoning.paths.is_presented(explained):
+        if explained.presented is not None:
             self._frames += 1
             self._first_ns, self._last_ns = self._first_ns or job.end_ns, job.end_ns
 
@@ -205,11 +208,11 @@ def _wait_row(stage: str, unit: str, jobs: int, waits_ns: Mapping[str, int]) -> 
 
 def _slow_row(shown: Shown, usual: Usual) -> dict[str, Any]:
     return {
-        "frame": shown.frame,
-        "presented_ns": shown.presented_ns,
+        "frame": shown.now.frame,
+        "presented_ns": shown.now.end_ns,
         "frame_ms": shown.frame_ns / NS_PER_MS,
         "longer_ms": (shown.frame_ns - usual.frame_ns) / NS_PER_MS,
-        "latency_ms": None if shown.latency_ns is None else shown.latency_ns / NS_PER_MS,
+        "latency_ms": shown.now.latency_ns / NS_PER_MS,
         "why": [reason._asdict() for reason in reasons(shown, usual)],
         "notes": notes(shown),
     }

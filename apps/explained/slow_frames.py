@@ -22,7 +22,8 @@ from trilane.pipeline.critical_path import (
     parts,
 )
 from trilane.pipeline.sharing import Sharing
-from trilane.pipeline.waits import DOWN, HELD, LOST, OVERHEAD, PREEMPTED, THROTTLED, ExplainedJob
+from trilane.pipeline.timeline import ExplainedJob, Presented
+from trilane.pipeline.unit_history import DOWN, HELD, LOST, OVERHEAD, PREEMPTED, THROTTLED
 from trilane.scheduler.events import Graph
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.stats import NS_PER_MS
@@ -37,26 +38,17 @@ T = TypeVar("T")
 
 
 class Shown(NamedTuple):
-    """A presented frame.
+    """A presented frame, and the one that was presented before it.
 
-    `frame`, `presented_ns`: which, and when. `before`: the frame that was presented before it.
-    `frame_ns`: since then. `latency_ns`: from its sampled pose to the end of the stage that the pipeline names, None
-    where that is not kept.
-    `parts_ns`: of its frame time. `longest`: of each part, the job that most of it belongs to.
-    `rung`, `skips`: of its work, and whether it took the bypass; `rung_before`, `skipped_before`: of the frame before.
+    `frame_ns`: from the one to the other. `parts_ns`: of it. `longest`: of each part, the job that most of it belongs
+    to.
     """
 
-    frame: int
-    presented_ns: int
-    before: int
+    now: Presented
+    before: Presented
     frame_ns: int
-    latency_ns: int | None
     parts_ns: Mapping[Part, int]
     longest: Mapping[Part, JobRecord]
-    rung: int
-    rung_before: int
-    skips: bool
-    skipped_before: bool
 
 
 class Usual(NamedTuple):
@@ -103,21 +95,18 @@ class SlowFrames:
 
     def __init__(self, graph: Graph, paths: Paths, sharing: Sharing, most: int) -> None:
         self._paths, self._sharing, self._most = paths, sharing, most
-        self._first, self._latency_to = graph.stages[0].name, graph.latency_to
         self._unit_of = {stage.name: stage.unit for stage in graph.stages}
-        self._said_by = graph.bypass[0] if graph.bypass is not None else ""
         self._waiting: deque[ExplainedJob] = deque()
-        self._before: ExplainedJob | None = None
+        self._before: Presented | None = None
         self._slowest: list[tuple[int, int, Shown]] = []
         self._frames: Sample[tuple[int, Mapping[Part, int]]] = Sample()
         self._services: dict[str, Sample[int]] = {stage.name: Sample() for stage in graph.stages}
-        self._facts: deque[tuple[int, int, bool]] = deque(maxlen=2)
 
     def add(self, explained: ExplainedJob) -> None:
         """The next job that has ended."""
         job = explained.job
         self._services[job.stage].add(job.end_ns - job.begin_ns)
-        if self._paths.is_presented(explained):
+        if explained.presented is not None:
             self._waiting.append(explained)
         if len(self._waiting) > DELAY:
             self._look(self._waiting.popleft())
@@ -140,12 +129,12 @@ class SlowFrames:
         )
 
     def _look(self, shown: ExplainedJob) -> None:
-        frame = shown.job.frame
-        self._facts.append((frame, self._rung(frame), self._skips(frame)))
-        before, self._before = self._before, shown
+        now = shown.presented
+        assert now is not None
+        before, self._before = self._before, now
         if before is None:
             return
-        begin_ns, end_ns = before.job.end_ns, shown.job.end_ns
+        begin_ns, end_ns = before.end_ns, now.end_ns
         sums: dict[Part, int] = {}
         longest: dict[Part, tuple[int, JobRecord]] = {}
         for piece in self._paths.walk(shown, begin_ns):
@@ -157,44 +146,14 @@ class SlowFrames:
         if len(self._slowest) == self._most and self._slowest[0][0] >= end_ns - begin_ns:
             return
         jobs = {part: job for part, (_, job) in longest.items()}
-        self._keep(self._shown(shown, begin_ns, sums, jobs))
-
-    def _shown(
-        self, shown: ExplainedJob, begin_ns: int, sums: Mapping[Part, int], jobs: Mapping[Part, JobRecord]
-    ) -> Shown:
-        (before, rung_before, skipped_before), (frame, rung, skips) = self._facts
-        return Shown(
-            frame,
-            shown.job.end_ns,
-            before,
-            shown.job.end_ns - begin_ns,
-            self._latency_ns(frame),
-            sums,
-            jobs,
-            rung,
-            rung_before,
-            skips,
-            skipped_before,
-        )
+        self._keep(Shown(now, before, end_ns - begin_ns, sums, jobs))
 
     def _keep(self, shown: Shown) -> None:
-        entry = (shown.frame_ns, -shown.frame, shown)
+        entry = (shown.frame_ns, -shown.now.frame, shown)
         if len(self._slowest) < self._most:
             heappush(self._slowest, entry)
         else:
             heappushpop(self._slowest, entry)
-
-    def _latency_ns(self, frame: int) -> int | None:
-        first, last = self._paths.job((self._first, frame)), self._paths.job((self._latency_to, frame))
-        return None if first is None or last is None else last.job.end_ns - first.sampled_ns
-
-    def _rung(self, frame: int) -> int:
-        first = self._paths.job((self._first, frame))
-        return first.rung if first is not None else 0
-
-    def _skips(self, frame: int) -> bool:
-        said = self._paths.job((self._said_by, frame))
-        return said is not None and said.skips
 
 
 def _median(values: Sequence[int]) -> float:
@@ -220,21 +179,22 @@ def reasons(shown: Shown, usual: Usual) -> list[Reason]:
 def notes(shown: Shown) -> list[str]:
     """What else was unlike the frame before."""
     said = []
-    missing = shown.frame - shown.before - 1
+    now, before = shown.now, shown.before
+    missing = now.frame - before.frame - 1
     if missing > 0:
-        which = f"frame {shown.before + 1}" if missing == 1 else f"frames {shown.before + 1} to {shown.frame - 1}"
+        which = f"frame {before.frame + 1}" if missing == 1 else f"frames {before.frame + 1} to {now.frame - 1}"
         said.append(f"{which} before it {'was' if missing == 1 else 'were'} dropped or lost")
-    if shown.rung != shown.rung_before:
-        said.append(f"its work changed from rung {shown.rung_before} to {shown.rung}")
-    if shown.skips != shown.skipped_before:
-        said.append("it took the bypass" if shown.skips else "the frame before took the bypass, it did not")
+    if now.rung != before.rung:
+        said.append(f"its work changed from rung {before.rung} to {now.rung}")
+    if now.skips != before.skips:
+        said.append("it took the bypass" if now.skips else "the frame before took the bypass, it did not")
     return said
 
 
 def _text(shown: Shown, usual: Usual, part: Part, longer_ns: float) -> str:
     what, stage = part
     job, unit = shown.longest[part], usual.unit_of[stage]
-    whose = "" if job.frame == shown.frame else f" of frame {job.frame}"
+    whose = "" if job.frame == shown.now.frame else f" of frame {job.frame}"
     if what == WORK:
         return _work(shown, usual, job, longer_ns)
     if what == PREEMPTED:
@@ -257,7 +217,7 @@ def _work(shown: Shown, usual: Usual, job: JobRecord, longer_ns: float) -> str:
     """Of a stage that had a larger part: its job was long, or more of it lay between the two frames."""
     service_ns, usual_ns = job.end_ns - job.begin_ns, usual.service_ns.get(job.stage, 0.0)
     times = f"{service_ns / NS_PER_MS:.1f} ms, median {usual_ns / NS_PER_MS:.1f}"
-    whose = "" if job.frame == shown.frame else f" of frame {job.frame}"
+    whose = "" if job.frame == shown.now.frame else f" of frame {job.frame}"
     if service_ns - usual_ns >= longer_ns / 2:
         return f"{job.stage}{whose} was slow: {times}"
     if whose:

@@ -1,6 +1,8 @@
 """Figures of a run at any moment, from its journal as it grows. Rule: pure, and of bounded memory.
 
-Of the last `WINDOW_NS` every time is kept, so that percentiles are exact; of the whole run sums and counts alone.
+Of the last `WINDOW_NS` every time is kept, so that percentiles are exact; of the whole run sums and counts alone. Where
+a unit's time goes follows the ledger (scheduler/ledger.py): its accounts and jobs are spans of time, told as they
+change and end, and what was assigned but neither ran nor was preempted is overhead.
 """
 
 from __future__ import annotations
@@ -9,15 +11,15 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
-from trilane.apps.live.figures import DropCount, Figures, FrameFigures, Moved, Note, StageFigures, UnitFigures
+from trilane.apps.live.figures import DropCount, Figures, FrameFigures, Moved, Note, Shares, StageFigures, UnitFigures
 from trilane.apps.live.followed_run import RunState
-from trilane.apps.live.frame_flow import Done, FrameFlow, Presented
 from trilane.apps.live.time_histogram import TimeHistogram
-from trilane.apps.live.unit_time import UnitTime
 from trilane.figure_sources import COMPUTED, MEASURED
 from trilane.pipeline.journal import Accounted, Begun, Counted, Ended, Record, Said, Sampled, Stepped, Worked
-from trilane.pipeline.reckoning import Reckoning
-from trilane.scheduler.events import NEVER, Event, Finish, Start, UnitDied, UnitReady
+from trilane.pipeline.reckoning import Reckoning, places_of
+from trilane.pipeline.timeline import Done, ExplainedJob, Presented, Timeline
+from trilane.pipeline.unit_history import BUSY, IDLE_CAUSES, NAMES, OVERHEAD, PREEMPTED
+from trilane.scheduler.events import NEVER, Finish, JobDone, Start
 from trilane.scheduler.ledger import STARVED
 from trilane.scheduler.stats import NS_PER_MS, summary_ms
 
@@ -41,6 +43,80 @@ OF_THE_RUN = (
     "bound",
     "memory_bytes",
 )
+
+
+ASSIGNED = "assigned"
+PARTS = (ASSIGNED, *NAMES.values(), BUSY, PREEMPTED)
+
+
+class _Span(NamedTuple):
+    """A piece of time of which `ns` count as `name`; where in it they lie is not known."""
+
+    begin_ns: int
+    end_ns: int
+    name: str
+    ns: int
+
+
+class _UnitTime:
+    """The time of one unit from `begin_ns` on; spans are kept for `window_ns`."""
+
+    def __init__(self, begin_ns: int, window_ns: int, account: int = STARVED) -> None:
+        self._begin_ns, self._window_ns = begin_ns, window_ns
+        self._state, self._since_ns = NAMES.get(account, ASSIGNED), begin_ns
+        self._last_end_ns = 0
+        self._spans: deque[_Span] = deque()
+        self._totals = dict.fromkeys(PARTS, 0)
+
+    def enter(self, now_ns: int, account: int) -> None:
+        """From `now_ns` on its time goes to `account`."""
+        self._keep(self._since_ns, now_ns, self._state, now_ns - self._since_ns)
+        self._state, self._since_ns = NAMES.get(account, ASSIGNED), now_ns
+
+    def add_job(self, job: JobDone) -> None:
+        """A job has ended; what was lost of the time before it was lost while the unit had it and did no other."""
+        begin_ns, end_ns = job.t_begin_ns, job.t_end_ns
+        held_from_ns = max(self._last_end_ns, self._since_ns)
+        if begin_ns > held_from_ns:
+            self._keep(held_from_ns, begin_ns, PREEMPTED, min(job.preempted_before_ns, begin_ns - held_from_ns))
+        if end_ns > self._last_end_ns:
+            begin_ns = max(begin_ns, self._last_end_ns)
+            ran_ns = end_ns - begin_ns
+            self._last_end_ns = end_ns
+            self._keep(begin_ns, end_ns, BUSY, ran_ns - min(job.preempted_ns + job.asleep_ns, ran_ns))
+            self._keep(begin_ns, end_ns, PREEMPTED, min(job.preempted_ns, ran_ns))
+
+    def shares(self, now_ns: int, running_since_ns: int | None) -> tuple[Shares, Shares]:
+        """Of the window, and of the run. `running_since_ns`: when the job that it holds was handed to it, if any."""
+        opened = [_Span(self._since_ns, now_ns, self._state, now_ns - self._since_ns)]
+        if running_since_ns is not None:
+            begin_ns = min(max(running_since_ns, self._last_end_ns, self._since_ns), now_ns)
+            opened.append(_Span(begin_ns, now_ns, BUSY, now_ns - begin_ns))
+        from_ns = max(now_ns - self._window_ns, self._begin_ns)
+        run, window = dict(self._totals), dict.fromkeys(PARTS, 0)
+        for span in opened:
+            run[span.name] += span.ns
+        for begin_ns, end_ns, name, ns in (*self._spans, *opened):
+            if begin_ns >= from_ns:
+                window[name] += ns
+            elif end_ns > from_ns:
+                window[name] += ns * (end_ns - from_ns) // (end_ns - begin_ns)
+        return _shares(window, now_ns - from_ns), _shares(run, now_ns - self._begin_ns)
+
+    def _keep(self, begin_ns: int, end_ns: int, name: str, ns: int) -> None:
+        if ns:
+            self._totals[name] += ns
+            self._spans.append(_Span(begin_ns, end_ns, name, ns))
+            while self._spans[0].end_ns < end_ns - self._window_ns:
+                self._spans.popleft()
+
+
+def _shares(sums: Mapping[str, int], total_ns: int) -> Shares:
+    if total_ns <= 0:
+        return Shares(0.0, dict.fromkeys(IDLE_CAUSES, 0.0))
+    overhead_ns = max(sums[ASSIGNED] - sums[BUSY] - sums[PREEMPTED], 0)  # parts that were cut are rounded down
+    idle_ns = {**sums, OVERHEAD: overhead_ns}
+    return Shares(sums[BUSY] / total_ns, {cause: idle_ns[cause] / total_ns for cause in IDLE_CAUSES})
 
 
 class _Work(NamedTuple):
@@ -82,18 +158,15 @@ class LiveFigures:
     """
 
     def __init__(self, begun: Begun, *, finds_bound: bool = True) -> None:
-        self._reckoning = Reckoning.of(begun) if finds_bound else None
-        self._bound: Mapping[str, Any] | None = None
         self._graph, self._facts, self._settings = begun.graph, begun.facts, begun.settings
-        self._flow = FrameFlow(begun.graph, begun.settings)
+        self._timeline = line = Timeline(begun.graph, begun.settings, waits=finds_bound)
+        self._reckoning = Reckoning(begun.graph, begun.settings, places_of(begun), line.downs) if finds_bound else None
+        self._bound: Mapping[str, Any] | None = None
         self._first_ns: int | None = None
-        self._start_ns: int | None = None
         self._last_ns = 0
         self._finished_ns = NEVER
         self._is_over = False
-        self._up: set[str] = set()
-        self._accounts = dict.fromkeys(begun.graph.units, STARVED)
-        self._times: dict[str, UnitTime] = {}
+        self._times: dict[str, _UnitTime] = {}
         self._jobs, self._restarts = Counter[str](), Counter[str]()
         self._stages = {stage.name: _StageBook() for stage in begun.graph.stages}
         self._recent: deque[Presented] = deque()
@@ -125,9 +198,16 @@ class LiveFigures:
 
     def add(self, record: Record) -> None:
         """A record of the journal, but for the first."""
+        facts = self._timeline.add(record)
         self._adders[type(record)](record)
-        if self._reckoning is not None:
-            self._reckoning.add(record)
+        for fact in facts:
+            if isinstance(fact, Done):
+                self._jobs[fact.handed.job.unit] += 1
+                self._times[fact.handed.job.unit].add_job(fact.event)
+            elif isinstance(fact, Presented):
+                self._add_presented(fact)
+            elif isinstance(fact, ExplainedJob) and self._reckoning is not None:
+                self._reckoning.add(fact)
 
     def now(self, now_ns: int | None = None, state: RunState | None = None) -> Figures:
         """At `now_ns`, of the run's clock; where it is None or earlier, at the last record.
@@ -136,12 +216,12 @@ class LiveFigures:
         After the step that finished the run it is the moment of that step: what follows are no frames.
         """
         now_ns = min(max(now_ns or 0, self._last_ns), self._finished_ns)
-        start_ns = now_ns if self._start_ns is None else self._start_ns
+        start_ns = now_ns if self._timeline.start_ns is None else self._timeline.start_ns
         window_s = min(now_ns - start_ns, WINDOW_NS) / NS_PER_S
         recent = [each for each in self._recent if each.end_ns > now_ns - WINDOW_NS]
         clock = str(self._facts.get("clock", ""))
         state = state or (RunState.FINISHED if self._is_over else RunState.GOES_ON)
-        up = self._up if state is RunState.GOES_ON and not self._is_over else set()
+        goes_on = state is RunState.GOES_ON and not self._is_over
         return Figures(
             t_ms=self._since_first_ms(now_ns),
             window_s=window_s,
@@ -154,7 +234,7 @@ class LiveFigures:
             frame_time_ms=summary_ms(each.interval_ns for each in recent if each.interval_ns is not None),
             latency_ms=summary_ms(each.latency_ns for each in recent),
             frames=self._frame_figures(),
-            units={unit: self._unit_figures(unit, now_ns, unit in up) for unit in self._graph.units},
+            units={unit: self._unit_figures(unit, now_ns, goes_on) for unit in self._graph.units},
             stages=self._stage_figures(now_ns),
             temperature_c=self._values(TEMPERATURE),
             duty=self._values(DUTY),
@@ -174,29 +254,14 @@ class LiveFigures:
         self._last_ns = step.now_ns
         if self._first_ns is None:
             self._first_ns = step.now_ns
-        for event in step.events:
-            self._hear(step.now_ns, event)
-        for outcome in self._flow.step(step.now_ns, step.events, step.actions):
-            if isinstance(outcome, Done):
-                self._jobs[outcome.job.unit] += 1
-                self._times[outcome.job.unit].add_job(outcome.event)
-            else:
-                self._add_presented(outcome)
+        if not self._times and self._timeline.start_ns is not None:
+            units = self._timeline.units.values()
+            self._times = {unit.name: _UnitTime(step.now_ns, WINDOW_NS, unit.account) for unit in units}
         for action in step.actions:
             if type(action) is Start:
                 self._restarts[action.unit] += 1
             elif type(action) is Finish:
                 self._finished_ns = step.now_ns
-                self._flow.end()
-
-    def _hear(self, now_ns: int, event: Event) -> None:
-        if type(event) is UnitReady:
-            self._up.add(event.unit)
-            if self._start_ns is None and self._up.issuperset(self._graph.units):
-                self._start_ns = now_ns
-                self._times = {unit: UnitTime(now_ns, WINDOW_NS, self._accounts[unit]) for unit in self._graph.units}
-        elif type(event) is UnitDied:
-            self._up.discard(event.unit)
 
     def _add_presented(self, presented: Presented) -> None:
         if presented.interval_ns is None:
@@ -209,7 +274,6 @@ class LiveFigures:
             self._recent.popleft()
 
     def _add_account(self, entry: Accounted) -> None:
-        self._accounts[entry.unit] = entry.account
         if entry.unit in self._times:
             self._times[entry.unit].enter(entry.now_ns, entry.account)
 
@@ -220,7 +284,6 @@ class LiveFigures:
 
     def _add_counts(self, counts: Counted) -> None:
         self._lost, self._dropped = counts.lost, counts.dropped
-        self._flow.count(counts.lost, counts.dropped)
 
     def _add_sample(self, sample: Sampled) -> None:
         self._sampled.update(sample.values)
@@ -239,26 +302,28 @@ class LiveFigures:
 
     def _run_fps(self) -> float:
         span_ns = self._recent[-1].end_ns - self._first_end_ns if self._recent else 0
-        return (self._flow.presented - 1) * NS_PER_S / span_ns if span_ns else 0.0
+        return (self._timeline.presented - 1) * NS_PER_S / span_ns if span_ns else 0.0
 
     def _frame_figures(self) -> FrameFigures:
-        flow = self._flow
+        line = self._timeline
         dropped = tuple(_drop_count(key, count) for key, count in self._dropped.items())
-        counts = (self._settings.frames, flow.presented, flow.skipped, flow.in_flight, flow.not_begun)
+        counts = (self._settings.frames, line.presented, line.skipped, len(line.frames), line.not_begun)
         return FrameFigures(*counts, dict(self._lost), dropped)
 
-    def _unit_figures(self, unit: str, now_ns: int, is_up: bool) -> UnitFigures:
-        held = next(iter(self._flow.held[unit]), None)
-        times = self._times.get(unit) or UnitTime(now_ns, WINDOW_NS)
-        window, run = times.shares(now_ns, held and held.since_ns)
+    def _unit_figures(self, name: str, now_ns: int, goes_on: bool) -> UnitFigures:
+        unit = self._timeline.units[name]
+        held = unit.held[0] if unit.held else None
+        times = self._times.get(name) or _UnitTime(now_ns, WINDOW_NS)
+        window, run = times.shares(now_ns, held and held.at_ns)
         stage, frame = (held.job.stage, held.job.frame) if held else ("", -1)
-        return UnitFigures(window, run, self._jobs[unit], self._restarts[unit], is_up, stage, frame)
+        return UnitFigures(window, run, self._jobs[name], self._restarts[name], goes_on and unit.is_up, stage, frame)
 
     def _stage_figures(self, now_ns: int) -> dict[str, StageFigures]:
-        running_ns = None if self._start_ns is None else self._last_ns - self._start_ns
-        waiting = self._flow.waiting | {self._graph.stages[0].name: self._flow.waiting_at_source(running_ns)}
+        line = self._timeline
         return {
-            stage.name: self._stages[stage.name].now(stage.unit, waiting[stage.name], now_ns - WINDOW_NS)
+            stage.name: self._stages[stage.name].now(
+                stage.unit, 0 if line.is_over else len(line.waiting(stage.name)), now_ns - WINDOW_NS
+            )
             for stage in self._graph.stages
         }
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import Final
 
-from trilane.apps.tracing.frame_book import UNKNOWN, FrameBook, Gone, Presented
 from trilane.apps.tracing.sink import Sink
 from trilane.apps.tracing.tiles import Lanes
 from trilane.pipeline.journal import Begun
+from trilane.pipeline.timeline import UNKNOWN, Gone, Presented
 from trilane.scheduler.events import NEVER
 
 NS_PER_US: Final = 1000
@@ -49,10 +49,10 @@ class FrameTracks:
         self._slice(ACTUAL, frame.release_ns, frame.end_ns, name, notes)
         self._before_ns = frame.end_ns
 
-    def count(self, at_ns: int, book: FrameBook) -> None:
+    def count(self, at_ns: int, in_flight: int) -> None:
         """How many frames are in flight."""
-        if len(book.in_flight) != self._flying:
-            self._flying = len(book.in_flight)
+        if in_flight != self._flying:
+            self._flying = in_flight
             self._sink.count(self._in_flight, at_ns, self._flying)
 
     def _expect(self, frame: int, release_ns: int) -> int:

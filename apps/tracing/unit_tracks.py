@@ -10,11 +10,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from trilane.apps.tracing.frame_book import FrameBook
 from trilane.apps.tracing.sink import Flow, Sink
 from trilane.apps.tracing.tiles import Tiles
 from trilane.pipeline.journal import Worked
-from trilane.scheduler.accounts import CAUSES, UNEXPLAINED, IdleSlice
+from trilane.pipeline.unit_history import IDLE_CAUSES, UNEXPLAINED, IdleSlice
 from trilane.scheduler.events import Graph
 from trilane.scheduler.ledger import JobRecord
 
@@ -37,7 +36,7 @@ class UnitTracks:
 
     def __init__(self, sink: Sink, graph: Graph, parent: int, rank: int, flows_from: int = 1) -> None:
         self._sink, self._flows_from = sink, flows_from
-        sink.recurring([*CAUSES, UNEXPLAINED, *(stage.name for stage in graph.stages)])
+        sink.recurring([*IDLE_CAUSES, UNEXPLAINED, *(stage.name for stage in graph.stages)])
         self._units = {unit: sink.track(unit, parent, rank + place) for place, unit in enumerate(graph.units)}
         self._tiles: dict[str, Tiles[JobRecord | IdleSlice]] = {unit: Tiles() for unit in graph.units}
         self._first, self._last = graph.stages[0].name, graph.stages[-1].name
@@ -67,16 +66,16 @@ class UnitTracks:
         self._tiles[piece.unit].add(piece.begin_ns, piece.end_ns, piece)
         self._write(piece.unit)
 
-    def count(self, at_ns: int, book: FrameBook) -> None:
+    def count(self, at_ns: int, waiting: Mapping[str, int]) -> None:
         """How many frames wait before each stage."""
-        for stage, waiting in book.waiting.items():
+        for stage, frames in waiting.items():
             counter, depth = self._depths.get(stage, (0, 0))
-            if len(waiting) == depth:
+            if frames == depth:
                 continue
             if not counter:
                 counter = self._sink.counter_track(WAITING, self._stages[stage], 0)
-            self._depths[stage] = counter, len(waiting)
-            self._sink.count(counter, at_ns, len(waiting))
+            self._depths[stage] = counter, frames
+            self._sink.count(counter, at_ns, frames)
 
     def close(self) -> None:
         """Write what still waits."""

@@ -11,13 +11,13 @@ from dataclasses import asdict
 from typing import IO, Any, Final
 
 from trilane.apps.tracing.chrome import ChromeSink
-from trilane.apps.tracing.frame_book import FrameBook
 from trilane.apps.tracing.frame_tracks import FrameTracks
 from trilane.apps.tracing.packets import PacketSink
 from trilane.apps.tracing.sink import Sink
 from trilane.apps.tracing.unit_tracks import UnitTracks
-from trilane.pipeline.journal import Begun, Counted, Ended, Record, Said, Sampled, Stepped, Worked
-from trilane.pipeline.journal_slices import JournalSlices
+from trilane.pipeline.journal import Begun, Ended, Record, Said, Sampled, Stepped, Worked
+from trilane.pipeline.timeline import Gone, Presented, Timeline
+from trilane.pipeline.unit_history import IdleSlice
 
 NAME: Final = "trace.pftrace"
 CHROME_NAME: Final = "trace.json"
@@ -40,23 +40,27 @@ class RunTracks:
         self._messages = sink.track("messages", process, MESSAGE_RANK)
         self._frames = FrameTracks(sink, begun, process, FRAME_RANK)
         self._units = UnitTracks(sink, begun.graph, process, UNIT_RANK, number * FLOWS_PER_PIPELINE + 1)
-        self._book = FrameBook(begun, self._frames.add)
-        self._slices = JournalSlices(begun.graph)
+        self._timeline = Timeline(begun.graph, begun.settings, idle=True)
         self._process, self._samples = process, dict[str, int]()
         self._now_ns: int | None = None
         self._end_ns = 0
 
     def add(self, record: Record) -> None:
         """The next record of the journal."""
-        for piece in self._slices.add(record):
-            self._units.idle(piece)
+        if isinstance(record, Stepped):
+            self._end_step(record.now_ns)
+        had_started = self._timeline.start_ns is not None
+        facts = self._timeline.add(record)
+        for fact in facts:
+            if isinstance(fact, IdleSlice):
+                self._units.idle(fact)
+            elif isinstance(fact, Presented | Gone):
+                self._frames.add(fact)
         match record:
-            case Stepped():
-                self._step(record)
+            case Stepped() if not had_started and self._timeline.start_ns is not None:
+                self._units.start(record.now_ns)
             case Worked():
                 self._units.work(record)
-            case Counted():
-                self._book.count(record)
             case Sampled():
                 self._sample(record)
             case Said():
@@ -66,28 +70,26 @@ class RunTracks:
 
     def close(self) -> None:
         """Write what is still held; the run has ended, or nothing more of it is known."""
-        for piece in self._slices.end():
+        for piece in self._timeline.end():
             self._units.idle(piece)
         self._units.close()
         self._count()
         if self._now_ns is not None:
             self._sink.end(self._run, max(self._now_ns, self._end_ns))
 
-    def _step(self, step: Stepped) -> None:
+    def _end_step(self, now_ns: int) -> None:
+        """The step before the one at `now_ns` is whole; before the first the run begins."""
         if self._now_ns is None:
-            self._sink.begin(self._run, step.now_ns, "run", _facts_of(self._begun))
+            self._sink.begin(self._run, now_ns, "run", _facts_of(self._begun))
         self._count()
-        has_started = self._book.start_ns is not None
-        self._now_ns = step.now_ns
-        self._book.step(step)
-        if not has_started and self._book.start_ns is not None:
-            self._units.start(step.now_ns)
+        self._now_ns = now_ns
 
     def _count(self) -> None:
         """The counters after the last step, now that all that belongs to it was told."""
         if self._now_ns is not None:
-            self._frames.count(self._now_ns, self._book)
-            self._units.count(self._now_ns, self._book)
+            line, stages = self._timeline, self._begun.graph.stages
+            self._frames.count(self._now_ns, len(line.frames))
+            self._units.count(self._now_ns, {stage.name: len(line.waiting(stage.name)) for stage in stages})
 
     def _sample(self, sampled: Sampled) -> None:
         for name, value in sampled.values.items():

@@ -9,34 +9,30 @@ from typing import Any
 
 import pytest
 
+from support.second_accounts import drawn_run, largest_difference, second_accounts
 from support.trace_reading import ReadTrace, read_trace
 from trilane.apps.tracing.writer import write_trace
 from trilane.pipeline.journal import journal_of, records_of
-from trilane.pipeline.waits import Waits
-from trilane.scheduler.accounts import LARGEST_DIFFERENCE, compared, second_accounts
+from trilane.pipeline.timeline import ExplainedJob, Timeline
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
     Dispatch,
     Event,
     FrameRequest,
-    Graph,
     JobDone,
     Pinged,
     SetDuty,
     Settings,
-    StageSpec,
     Stop,
     UnitDied,
     UnitReady,
     chain,
 )
 from trilane.scheduler.ledger import STARVED, JobRecord
-from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.recording import Recording
 from trilane.scheduler.virtual import Simulation, simulate
 
 MS = 1_000_000
-EDGES = ("single", "double", "triple", "fifo:1", "fifo:3", "orphan", "orphan:4")
 SERVICE = {"a": 2, "b": 5}
 TWO_UNITS = (("a", "u"), ("b", "v"))
 #: (busy, starved, blocked, throttled, preempted, overhead) in ms.
@@ -65,9 +61,9 @@ def times(done: Simulation, stage: str) -> list[tuple[float, ...]]:
 
 def agrees(done: Simulation) -> None:
     assert done.recording is not None
-    found = compared(done.report["units"], second_accounts(done.recording, done.jobs))
-    assert found["largest_difference"] < 1e-12
-    assert all(sum(row.values()) == pytest.approx(1, abs=1e-12) for row in found["units"].values())
+    second = second_accounts(done.recording, done.jobs)
+    assert largest_difference(done.report["units"], second) < 1e-12
+    assert all(sum(row.values()) == pytest.approx(1, abs=1e-12) for row in second.values())
 
 
 def always(ms: float) -> dict[str, float]:
@@ -188,7 +184,7 @@ def fed(settings: Settings, steps: list[tuple[int, tuple[Event, ...]]], jobs: li
     for now_ns, events in steps:
         recording.add(now_ns, events, core.step(now_ns, events).actions, core)
     report = core.report(clock="host")
-    assert compared(report["units"], second_accounts(recording, jobs))["largest_difference"] < 1e-12
+    assert largest_difference(report["units"], second_accounts(recording, jobs)) < 1e-12
     return report
 
 
@@ -237,10 +233,12 @@ def test_a_frame_that_is_released_late_is_overhead_since_it_was_due() -> None:
     settings = Settings(3, period_ns=10 * MS)
     assert parts(fed(settings, steps, jobs), "u") == (2 + 2 + 1, 8 + 5, 0, 0, 0, 3)
     graph = chain((("a", "u"),), "single", "a")
-    core, recording, waits = Core(graph, settings), Recording(graph, settings), Waits(graph)
+    core, recording = Core(graph, settings), Recording(graph, settings)
+    timeline = Timeline(graph, settings, waits=True)
     for now_ns, events in steps:
         recording.add(now_ns, events, core.step(now_ns, events).actions, core)
-    explained = [one for record in records_of(recording, jobs) if (one := waits.add(record))]
+    facts = [fact for record in records_of(recording, jobs) for fact in timeline.add(record)]
+    explained = [fact for fact in facts if isinstance(fact, ExplainedJob)]
     assert [dict(one.waits_ns) for one in explained] == [{}, {"overhead": 3 * MS}, {}]
 
 
@@ -264,55 +262,13 @@ def test_what_a_unit_lost_is_booked_under_its_causes() -> None:
     assert report["stages"]["a"]["service_ms"]["mean"] == (8 + 10 + 5 + 10 + 8) / 5  # the wall's time
 
 
-def virtual_run(draw: random.Random, frames: int) -> dict[str, Any]:
-    """The report of a simulated run whose pipeline, policy, rate, caps and deaths are drawn, with `accounts`."""
-    units = [draw.choice("abc") for _ in range(draw.randint(1, 6))]
-    graph = Graph(
-        tuple(StageSpec(f"s{index}", unit) for index, unit in enumerate(units)),
-        tuple(draw.choice(EDGES) for _ in units[1:]),
-        f"s{draw.randrange(len(units))}",
-    )
-    policy = draw.choice(list(POLICIES))
-    is_paced = POLICIES[policy].paced or draw.random() < 0.5
-    settings = Settings(
-        frames,
-        policy,
-        period_ns=draw.randint(5, 25) * MS if is_paced else 0,
-        deadline_ns=60 * MS,
-        in_flight=draw.randint(0, 4),
-        in_queue=draw.randint(0, 3),
-        queue_timeout_ns=draw.choice((0, 30 * MS)),
-        latch_ns=draw.choice((0, 0, 2 * MS)),
-        hang_ns=draw.choice((12 * MS, 200 * MS)),
-        max_failures=frames,
-    )
-    longest_ns = {f"s{index}": draw.randint(1, 14) * MS for index in range(len(units))}
-    duties: list[tuple[int, Event]] = [
-        (draw.randint(0, frames * 10 * MS), SetDuty(draw.choice(units), draw.randint(300, 1000)))
-        for _ in range(draw.randint(0, 3))
-    ]
-    done = simulate(
-        graph,
-        settings,
-        lambda stage, _unit, _frame, _begin_ns: draw.randint(MS // 20, longest_ns[stage]),
-        message_delay_ns=draw.choice((0, 50_000)),
-        restart_ns=draw.randint(10, 300) * MS,
-        faults=[(draw.randint(0, frames * 10 * MS), draw.choice(units)) for _ in range(draw.randint(0, 4))],
-        inputs=duties,
-        keep=True,
-    )
-    assert done.recording is not None
-    return {**done.report, "accounts": compared(done.report["units"], second_accounts(done.recording, done.jobs))}
-
-
 @pytest.mark.parametrize("seed", range(50))
-def test_both_computations_agree_in_random_runs(seed: int) -> None:
-    report = virtual_run(random.Random(seed), 40)
-    assert report["accounts"]["largest_difference"] <= 1e-12
-    for unit, row in report["units"].items():
+def test_the_timeline_adds_up_to_the_ledger_in_random_runs(seed: int) -> None:
+    done = drawn_run(random.Random(seed), 40)
+    agrees(done)
+    for row in done.report["units"].values():
         assert min(row["busy"], *row["idle"].values()) >= 0
         assert row["busy"] + sum(row["idle"].values()) == pytest.approx(1, abs=1e-12)
-        assert sum(report["accounts"]["units"][unit].values()) == pytest.approx(1, abs=1e-12)
 
 
 def test_the_slices_of_the_trace_file_add_up_to_the_report() -> None:
@@ -360,9 +316,8 @@ def test_time_under_another_cause_shows(cause: str, wrong: str) -> None:
     for row in done.report["units"].values():
         row["idle"][cause], row["idle"][wrong] = row["idle"][cause] / 2, row["idle"][wrong] + row["idle"][cause] / 2
     assert done.recording is not None
-    moved = compared(done.report["units"], second_accounts(done.recording, done.jobs))["largest_difference"]
+    moved = largest_difference(done.report["units"], second_accounts(done.recording, done.jobs))
     assert moved == pytest.approx(max(row["idle"][cause] for row in done.report["units"].values()))
-    assert moved > LARGEST_DIFFERENCE
 
 
 def test_a_job_that_is_too_long_or_missing_shows() -> None:
@@ -371,9 +326,7 @@ def test_a_job_that_is_too_long_or_missing_shows() -> None:
     first, *others = done.jobs
     share = 1e6 / (done.report["duration_s"] * 1e9)
     for jobs in ([first._replace(begin_ns=first.begin_ns - MS), *others], others):
-        found = compared(done.report["units"], second_accounts(done.recording, jobs))
-        assert found["largest_difference"] >= share - 1e-12
-        assert not found["agree"]
+        assert largest_difference(done.report["units"], second_accounts(done.recording, jobs)) >= share - 1e-12
 
 
 def test_a_change_of_cause_that_was_never_noted_shows() -> None:
@@ -381,11 +334,11 @@ def test_a_change_of_cause_that_was_never_noted_shows() -> None:
     done = a_run()
     assert done.recording is not None
     done.recording.accounts[:] = [row for row in done.recording.accounts if row[2] != STARVED]
-    assert not compared(done.report["units"], second_accounts(done.recording, done.jobs))["agree"]
+    assert largest_difference(done.report["units"], second_accounts(done.recording, done.jobs)) > 0.001
 
 
 def test_a_unit_without_accounts_is_no_agreement() -> None:
     done = run()
     assert done.recording is not None
     only = [job for job in done.jobs if job.unit == "u"]
-    assert compared({"w": done.report["units"]["u"]}, second_accounts(done.recording, only))["largest_difference"] == 1
+    assert largest_difference({"w": done.report["units"]["u"]}, second_accounts(done.recording, only)) == 1

@@ -19,7 +19,9 @@ from trilane.bench.lib.load import Load, Queries
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.run_metrics import StageTimes, TimeSummary
+from trilane.scheduler.events import Settings, chain
 from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.virtual import simulate
 
 Held = Callable[[str, Any], None]
 
@@ -261,16 +263,12 @@ def test_a_row_is_medians_sums_and_the_commonest_name() -> None:
 
 
 def test_latency_is_from_the_pose_to_the_composited_picture() -> None:
-    """Frame 1 was dropped after its pose."""
-    spans = [
-        ("pose", 0, 2, 5),
-        ("pose", 1, 10, 12),
-        ("composite", 0, 20, 24),
-        ("pose", 2, 30, 33),
-        ("composite", 2, 40, 47),
-    ]
-    jobs = [JobRecord(stage, "u", frame, 0, 0, begin, end) for stage, frame, begin, end in spans]
-    assert pipeline_bench.latencies_ns(jobs) == [22, 17]
+    """A pose of 3, a picture of 5, and 2 to present it, one frame at a time."""
+    took = {"pose": 3, "composite": 5, "present": 2}
+    graph = chain((("pose", "u"), ("composite", "v"), ("present", "u")), "double", "composite")
+    run = simulate(graph, Settings(3, "sequential"), lambda stage, *_: took[stage], keep=True)
+    assert run.recording is not None
+    assert pipeline_bench.latencies_ns(run.recording, run.jobs) == [8, 8, 8]
 
 
 def test_sequential_comes_first_and_once() -> None:

@@ -182,7 +182,6 @@ def test_more_than_a_unit_can_do_is_dropped_and_late_and_counted() -> None:
         assert row["in_time"] < 0.05
         assert row["frame_time_ms"]["mean"] == pytest.approx(2e3 / fps, rel=0.01)
         assert row["alone"]["in_time"] > 0.95
-        assert row["accounts"]["agree"]
         shares = row["units"]["dsp"]
         assert shares["busy"] + sum(shares["idle"].values()) == pytest.approx(1)
         assert shares["idle"]["preempted"] == pytest.approx(0.5, abs=0.02)
@@ -360,22 +359,18 @@ def test_too_high_a_rate_of_a_tenant_is_refused() -> None:
         bare("dsp", float("nan"))
 
 
-def test_accounts_that_differ_and_what_joins_the_stages_are_shown_and_asked(
+def test_what_joins_the_stages_is_asked(
     command: Callable[..., tuple[str, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[Any] = []
 
     def told(chip: Any, found: Any, *over: Any) -> Any:
         asked.append((chip.name, found, *over))
-        answer = predict_beside(CHIP, [bare("dsp", 10, 32), bare("gpu", 10, 32)])
-        answer["pipelines"][1]["accounts"] = {"agree": False, "largest_difference": 0.0123}
-        return answer
+        return predict_beside(CHIP, [bare("dsp", 10, 32), bare("gpu", 10, 32)])
 
     monkeypatch.setattr(sources, "tenants", lambda texts, variant: (tuple(texts), variant))
     monkeypatch.setattr(beside_answer, "predict_beside", told)
-    out, _ = command("predict", "a.toml", "--beside", "b.toml", "--edge", "triple", "--turns", "deadline")
-    said = [line for line in out.splitlines() if "differ" in line]
-    assert said == ["additions on gpu: the shares of units, computed twice, differ by 1.23%: please report this"]
+    command("predict", "a.toml", "--beside", "b.toml", "--edge", "triple", "--turns", "deadline")
     command("predict", "a.toml", "--policy", "pipelined", "--minutes", 3, "--governor", "step_wise")
     command("predict", "a.toml", "--policy", "reference", "--performance-profile", "burst")
     chip, usual = "snapdragon-888", ("sustained_high_performance", 0.0, None, "round-robin")

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from support.plain_scheduler import drawn, service_of, skips_of, with_bypass
-from trilane.scheduler import accounts
+from support.second_accounts import largest_difference, second_accounts
 from trilane.scheduler.beside import ONE, BesideDriver, Member, Runs, simulate_beside
 from trilane.scheduler.events import NEVER, SetDuty, Settings, Stop, chain
 from trilane.scheduler.ledger import JobRecord
@@ -251,8 +251,7 @@ def test_the_accounts_and_the_turns_of_drawn_pipelines_hold(seed: int, turns: st
     for each in done:
         assert each.recording is not None
         assert list(replay(each.recording)) == []
-        second = accounts.second_accounts(each.recording, each.jobs)
-        assert accounts.compared(each.report["units"], second)["largest_difference"] < 1e-12
+        assert largest_difference(each.report["units"], second_accounts(each.recording, each.jobs)) < 1e-12
         for row in each.report["units"].values():
             assert row["busy"] + sum(row["idle"].values()) == pytest.approx(1, abs=1e-12)
             assert min(row["idle"].values()) >= 0

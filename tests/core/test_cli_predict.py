@@ -309,13 +309,12 @@ def an_answer(**changes: Any) -> dict[str, Any]:
         "expected_error": 0.123,
         "confidence": 0.877,
         "units": {"gpu": {"busy": 0.65, "idle": idle}, "dsp": {"busy": 0.25, "idle": {"throttled": 0.755}}},
-        "accounts": {"agree": True, "largest_difference": 0.0},
         **changes,
     }
 
 
 def everything() -> dict[str, Any]:
-    """Of an avatar for ten minutes, hot, held by the display, with notes, shares that differ and alternatives."""
+    """Of an avatar for ten minutes, hot, held by the display, with notes and alternatives."""
     config = {**an_answer()["config"], "avatar": "someone", "network": "a.onnx", "minutes": 10.0}
     return an_answer(
         config=config,
@@ -325,7 +324,6 @@ def everything() -> dict[str, Any]:
         caps={"throttled_share": 0.125},
         rate=RATE,
         power_limit=LIMIT,
-        accounts={"agree": False, "largest_difference": 0.0321},
         alternatives=[
             {
                 "name": "newest",

@@ -129,7 +129,7 @@ def bounded(seed: int, **factors: float) -> Told:
     run = simulated(seed, factors=factors)
     assert run.recording is not None
     begun, *records = journal_of(run.recording, run.jobs, {}, run.report)
-    _, found = reckoned(run.recording.graph, run.recording.settings, {}, records)
+    found = reckoned(run.recording.graph, run.recording.settings, {}, records)
     return Told(f"run {seed}", Kind.RUN, make_report(**run.report, **found.figures), frames_of([begun, *records]))
 
 

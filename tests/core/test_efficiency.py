@@ -171,7 +171,7 @@ def ran(times: Mapping[str, int], frames: int = 200) -> tuple[float, Reckoned]:
     run = simulate(graph, settings, lambda stage, *_: times[stage], keep=True)
     assert run.recording is not None
     places = {"cpu": Place((0,), 1), "gpu": Place((1,), 1), "dsp": Place((2,), 1)}
-    _, found = reckoned(graph, settings, places, records_of(run.recording, run.jobs))
+    found = reckoned(graph, settings, places, records_of(run.recording, run.jobs))
     return 1e6 * run.report["frame_time_ms"]["mean"], found
 
 
@@ -230,7 +230,7 @@ def test_time_that_another_stage_had_a_core_is_that_stages_and_the_rest_is_nobod
         one._replace(preempted_ns=6, cpu_ns=4) if one.stage == "infer" and one.frame < 198 else one for one in run.jobs
     ]
     places = {"cpu": ON_0, "dsp": ON_0}
-    _, found = reckoned(graph, settings, places, records_of(run.recording, jobs))
+    found = reckoned(graph, settings, places, records_of(run.recording, jobs))
     total = sum(found.budget.values())
     shares = {part: ns / total for part, ns in found.budget.items()}
     assert shares == {
@@ -251,7 +251,7 @@ def test_what_other_programs_take_is_no_units_and_no_work() -> None:
         one._replace(preempted_ns=one.cpu_ns * 3 // 4, cpu_ns=one.cpu_ns // 4) if one.unit == "gpu" else one
         for one in run.jobs
     ]
-    _, found = reckoned(graph, settings, {"gpu": ON_1, "cpu": ON_0}, records_of(run.recording, jobs))
+    found = reckoned(graph, settings, {"gpu": ON_1, "cpu": ON_0}, records_of(run.recording, jobs))
     assert found.figures["bottleneck"] == "other programs"
     assert found.figures["bound"]["unit"]["share"] == pytest.approx(0.75, abs=0.01)
     assert found.figures["bound"]["stage"]["name"] == "composite"
@@ -270,7 +270,7 @@ def test_a_stage_that_shares_a_core_costs_what_it_takes_though_nothing_waits_for
     both_ns = times["pose"] + times["infer"]
     assert 1e6 * run.report["frame_time_ms"]["mean"] == pytest.approx(both_ns, rel=0.01)
     places = {"cpu": ON_0, "gpu": ON_1, "dsp": ON_0}
-    _, found = reckoned(graph, settings, places, records_of(run.recording, run.jobs))
+    found = reckoned(graph, settings, places, records_of(run.recording, run.jobs))
     total = sum(found.budget.values())
     of_pose = sum(ns for (_, stage), ns in found.budget.items() if stage == "pose") / total
     of_infer = sum(ns for (_, stage), ns in found.budget.items() if stage == "infer") / total

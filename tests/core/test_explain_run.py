@@ -23,6 +23,7 @@ from trilane.apps.live.followed_run import CUT_OFF
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.application import application_graph
 from trilane.pipeline.journal import NAME, Accounted, Begun, JournalWriter, Record, Stepped, Worked
+from trilane.pipeline.timeline import Presented
 from trilane.scheduler.events import Settings, UnitDied
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.virtual import Simulation, simulate
@@ -100,13 +101,16 @@ def test_a_frame_that_skips_or_has_another_rung_says_so(tmp_path: Path) -> None:
 
 
 def test_what_was_unlike_the_frame_before_is_noted() -> None:
-    shown = Shown(7, 100, 3, 50, None, {}, {}, rung=2, rung_before=0, skips=True, skipped_before=False)
+    now = Presented(7, 20, 100, 50, 70, skips=True, rung=2)
+    before = Presented(3, 10, 50, None, 40, skips=False, rung=0)
+    shown = Shown(now, before, 50, {}, {})
     assert notes(shown) == [
         "frames 4 to 6 before it were dropped or lost",
         "its work changed from rung 0 to 2",
         "it took the bypass",
     ]
-    assert notes(shown._replace(before=5, rung=0, skips=False)) == ["frame 6 before it was dropped or lost"]
+    alike = shown._replace(now=now._replace(skips=False, rung=0), before=before._replace(frame=5))
+    assert notes(alike) == ["frame 6 before it was dropped or lost"]
 
 
 def test_dropped_frames_and_late_input_are_named(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 from trilane.pipeline.critical_path import MARGIN, Budget, Paths, Piece, parts
 from trilane.pipeline.journal import journal_of
 from trilane.pipeline.sharing import Sharing
-from trilane.pipeline.waits import ExplainedJob, Waits
+from trilane.pipeline.timeline import ExplainedJob, Timeline
 from trilane.scheduler.events import Graph, Settings, chain
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.virtual import Simulation, simulate
@@ -32,15 +32,14 @@ def walked(run: Simulation, kept: int = 4096) -> tuple[Paths, Budget, list[Expla
     assert run.recording is not None
     records = journal_of(run.recording, run.jobs, {}, {})
     next(records)
-    waits = Waits(run.recording.graph)
-    paths = Paths(run.recording.graph, run.recording.settings, waits.downs, kept)
+    timeline = Timeline(run.recording.graph, run.recording.settings, waits=True)
+    paths = Paths(run.recording.graph, run.recording.settings, timeline.downs, kept)
     budget, shown = Budget(paths), []
-    for record in records:
-        if (one := waits.add(record)) is not None:
-            paths.add(one)
-            if paths.is_presented(one):
-                shown.append(one)
-                budget.present(one)
+    for one in (fact for record in records for fact in timeline.add(record) if isinstance(fact, ExplainedJob)):
+        paths.add(one)
+        if one.presented is not None:
+            shown.append(one)
+            budget.present(one)
     return paths, budget, shown
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Iterable
 
 import pytest
 
-from trilane.pipeline.journal import Accounted, Record, Stepped, Worked, journal_of
-from trilane.pipeline.waits import Down, ExplainedJob, Waits
+from trilane.pipeline.journal import Accounted, Counted, Record, Stepped, Worked, journal_of
+from trilane.pipeline.timeline import Down, ExplainedJob, Gone, Timeline
 from trilane.scheduler.events import (
     Dispatch,
     Graph,
@@ -31,9 +32,12 @@ def job(number: int, stage: str, unit: str, frame: int, rung: int = 0) -> Dispat
     return Dispatch(Job(number, unit, stage, frame, 0, 0, 0, rung=rung))
 
 
+def jobs_of(timeline: Timeline, records: Iterable[Record]) -> list[ExplainedJob]:
+    return [fact for record in records for fact in timeline.add(record) if isinstance(fact, ExplainedJob)]
+
+
 def explained(*records: Record, graph: Graph = GRAPH, kept: int = 100) -> list[ExplainedJob]:
-    waits = Waits(graph, kept)
-    return [one for record in (UP, *records) if (one := waits.add(record)) is not None]
+    return jobs_of(Timeline(graph, Settings(1000), waits=True, kept=kept), (UP, *records))
 
 
 def before_infer(*accounts: tuple[int, int]) -> list[Record]:
@@ -69,7 +73,7 @@ def test_what_the_unit_had_no_job_for_is_why_the_job_waited(account: int, cause:
     assert draw.figures == {"texels": 7.0}
     expected = {"overhead": 220} if cause == "overhead" else {cause: 190, "overhead": 30}
     assert found.waits_ns == expected
-    assert (found.cause, found.behind, found.rung, found.sampled_ns) == (cause, None, 2, 0)
+    assert (found.cause, found.behind, found.rung, found.presented) == (cause, None, 2, None)
 
 
 def test_accounts_that_change_are_told_apart() -> None:
@@ -108,7 +112,7 @@ def test_a_unit_that_is_busy_names_the_job_that_it_does() -> None:
 
 def test_a_job_that_is_lost_with_its_process_and_the_restart_are_told_apart() -> None:
     """infer of frame 0 hangs from its hand-over at 110 until its unit is killed at 400; the unit is up again at 900."""
-    waits = Waits(GRAPH)
+    timeline = Timeline(GRAPH, Settings(9), waits=True)
     records: list[Record] = [
         UP,
         *before_infer((110, STARVED)),
@@ -121,9 +125,9 @@ def test_a_job_that_is_lost_with_its_process_and_the_restart_are_told_apart() ->
         Stepped(960, (JobDone("dsp", 3, 905, 950, 0),), ()),
         Worked(JobRecord("infer", "dsp", 1, 112, 900, 905, 950), {}),
     ]
-    found = [one for record in records if (one := waits.add(record)) is not None][-1]
+    found = jobs_of(timeline, records)[-1]
     assert found.waits_ns == {"lost": 400 - 112, "down": 500, "overhead": 5}
-    assert list(waits.downs) == [Down("dsp", 400, 900)]
+    assert list(timeline.downs) == [Down("dsp", 400, 900)]
 
 
 def test_time_without_a_core_is_counted_once() -> None:
@@ -164,13 +168,15 @@ def test_what_was_lost_began_after_the_last_job() -> None:
 
 
 def test_frames_that_never_come_to_an_end_are_forgotten() -> None:
-    """Their jobs are heard of, and lost before they are booked."""
-    waits = Waits(GRAPH, kept=10)
-    waits.add(UP)
+    """Their first jobs are heard of and dropped before they are booked; of those that ended, the last ten are kept."""
+    timeline = Timeline(GRAPH, Settings(100), waits=True, kept=10)
+    timeline.add(UP)
     for number in range(100):
-        waits.add(Stepped(number, (), (job(number, "draw", "gpu", number),)))
-        waits.add(Stepped(number, (JobDone("gpu", number, number, number, 0),), ()))
-    assert (len(waits._ended), len(waits._heard_ns), len(waits._handed)) == (10, 10, 0)
+        timeline.add(Stepped(number, (), (job(number, "draw", "gpu", number),)))
+        timeline.add(Stepped(number, (JobDone("gpu", number, number, number, 0),), ()))
+        (gone,) = timeline.add(Counted(number, {}, {"draw->infer:stale": number + 1}))
+        assert gone == Gone(number, number, number, "dropped", "draw->infer:stale")
+    assert (len(timeline._ended), timeline.frames, timeline._heard_ns, timeline.waiting("infer")) == (10, {}, {}, [])
 
 
 def test_the_ends_that_were_heard_of_in_the_step_of_the_hand_over_are_kept() -> None:
@@ -213,10 +219,9 @@ def test_causes_sum_to_the_wait_in_runs_with_faults(seed: int) -> None:
         keep=True,
     )
     assert run.recording is not None
-    waits = Waits(graph)
     records = journal_of(run.recording, run.jobs, {}, {})
     next(records)
-    found = [one for record in records if (one := waits.add(record)) is not None]
+    found = jobs_of(Timeline(graph, run.recording.settings, waits=True), records)
     assert [one.job for one in found] == list(run.jobs)
     for one in found:
         assert sum(one.waits_ns.values()) == one.job.begin_ns - one.job.ready_ns

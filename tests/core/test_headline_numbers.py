@@ -59,7 +59,7 @@ def service(times_us: Mapping[str, int]) -> Callable[..., int]:
 
 def found_of(run: Simulation, settings: Settings) -> Reckoned:
     assert run.recording is not None
-    return reckoned(graph(), settings, PLACES, records_of(run.recording, run.jobs))[1]
+    return reckoned(graph(), settings, PLACES, records_of(run.recording, run.jobs))
 
 
 def shares(found: Reckoned) -> dict[tuple[str, str], float]:

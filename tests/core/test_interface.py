@@ -15,6 +15,7 @@ import pytest
 import trilane
 from support.run_folders import write_run
 from support.run_report import make_report
+from support.second_accounts import idle_slices
 from trilane.apps import interface
 from trilane.apps.explained.job_table import COLUMNS
 from trilane.apps.report import Report, read_report
@@ -23,7 +24,6 @@ from trilane.apps.run_job import Outcome
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
 from trilane.hw_profiles.application import application_graph
 from trilane.pipeline.journal import Stepped
-from trilane.scheduler.accounts import idle_slices
 from trilane.scheduler.events import Settings
 from trilane.scheduler.virtual import Simulation, simulate
 from trilane.stages.run_options import RunOptions
@@ -171,7 +171,7 @@ def test_frames_idle_time_and_events_are_those_of_the_run(folder: Path, simulate
     assert frames["presented_ns"][:3].tolist() == [10 * MS, 14 * MS, 18 * MS]
     assert frames["frame_ns"][:3].tolist() == [-1, 4 * MS, 4 * MS]
     assert frames["latency_ns"][:2].tolist() == [9 * MS, 12 * MS]  # frame 1 is posed from 1 to 2, and mixed until 13
-    assert sorted(run.idle) == sorted(idle_slices(recording, simulated.jobs))
+    assert sorted(run.idle) == sorted(idle_slices(recording, simulated.jobs)[0])
     assert run.events == [(now_ns, event) for now_ns, events, _ in recording.steps for event in events]
     assert sum(isinstance(record, Stepped) for record in run.records()) == len(recording.steps)
     assert run.explain(2)["frames"] == 30

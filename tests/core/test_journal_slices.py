@@ -4,25 +4,23 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
+from support.second_accounts import idle_slices
 from trilane.pipeline.journal import (
+    Accounted,
     Begun,
     Counted,
     Ended,
-    JournalWriter,
     Record,
     Stepped,
     Worked,
     journal_of,
-    read_journal,
 )
-from trilane.pipeline.journal_slices import JournalSlices
 from trilane.pipeline.journal_values import RunValues
-from trilane.pipeline.reckoning import reckoned
-from trilane.scheduler.accounts import UNEXPLAINED, IdleCutter, IdleSlice, Span, compared, idle_slices
+from trilane.pipeline.timeline import Span, Timeline
+from trilane.pipeline.unit_history import UNEXPLAINED, IdleSlice
 from trilane.scheduler.events import Settings, UnitReady, chain
 from trilane.scheduler.ledger import ASSIGNED, JobRecord
 from trilane.scheduler.virtual import Simulation, simulate
@@ -56,13 +54,13 @@ def test_slices_come_as_soon_as_they_are_known() -> None:
 
     The timeline is that of test_accounts.py: u is blocked from 4 to 7 and from 11 to 34, v down from 9 to 29.
     """
-    slices, seen = JournalSlices(TWO), []
+    timeline, seen = Timeline(TWO, Settings(5), idle=True), []
     for record in records(a_run()):
-        found = slices.add(record)
+        found = [fact for fact in timeline.add(record) if isinstance(fact, IdleSlice)]
         assert not found or isinstance(record, Stepped)
         if isinstance(record, Stepped):
             seen += [(record.now_ns // MS, one.unit, one.cause, one.begin_ns // MS, one.end_ns // MS) for one in found]
-    rest = [(one.unit, one.cause, one.begin_ns // MS, one.end_ns // MS) for one in slices.end()]
+    rest = [(one.unit, one.cause, one.begin_ns // MS, one.end_ns // MS) for one in timeline.end()]
     assert seen == [
         (4, "v", "starved", 0, 2),
         (9, "u", "blocked", 4, 7),
@@ -70,7 +68,7 @@ def test_slices_come_as_soon_as_they_are_known() -> None:
         (36, "u", "blocked", 11, 34),
     ]
     assert rest == [("u", "starved", 36, 44)]
-    assert slices.span == Span(0, 44 * MS)
+    assert timeline.span == Span(0, 44 * MS)
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -88,24 +86,12 @@ def test_slices_are_in_the_order_of_their_ends_and_units_never_overlap(seed: int
         message_delay_ns=MS // 3,
     )
     assert done.recording is not None
-    slices = idle_slices(done.recording, done.jobs)
+    slices, _ = idle_slices(done.recording, done.jobs)
     assert [one.end_ns for one in slices] == sorted(one.end_ns for one in slices)
     for unit in "uv":
         pieces = [(one.begin_ns, one.end_ns) for one in (*slices, *done.jobs) if one.unit == unit]
         ends = [0, *(end for _, end in sorted(pieces))]
         assert all(begin >= end for (begin, _), end in zip(sorted(pieces), ends, strict=False))
-
-
-def test_a_journal_has_the_second_accounts_of_the_run_in_memory(tmp_path: Path) -> None:
-    done = a_run()
-    with JournalWriter(tmp_path / "j") as journal:
-        for record in records(done):
-            journal.add(record)
-    begun, *rest = read_journal(tmp_path / "j")
-    assert isinstance(begun, Begun)
-    shares, _ = reckoned(begun.graph, begun.settings, {}, rest)
-    assert compared(done.report["units"], shares)["largest_difference"] < 1e-12
-    assert reckoned(begun.graph, begun.settings, {}, [])[0] == {}
 
 
 def test_a_run_in_memory_as_a_journal() -> None:
@@ -129,21 +115,20 @@ def test_what_is_held_of_a_long_run_is_what_is_in_flight() -> None:
     """Of 400 frames no more slices wait for their turn than of 40."""
     most = []
     for frames in (40, 400):
-        slices, held = JournalSlices(TWO), 0
+        timeline, held = Timeline(TWO, Settings(frames, in_flight=1), idle=True), 0
         for record in records(a_run(frames, in_flight=1)):
-            slices.add(record)
-            held = max(held, len(slices._cutter._held))
+            timeline.add(record)
+            held = max(held, len(timeline._cutter._held))
         most.append(held)
     assert most[0] == most[1] < 5
 
 
 def test_time_that_nobody_explains_has_its_own_name() -> None:
     """A unit that is up and has no job, whose account says that it has one."""
-    cutter = IdleCutter(chain((("a", "u"),), "single", "a"))
-    assert cutter.step(5, (UnitReady("u"),), ()) == []
-    cutter.account(5, "u", ASSIGNED)
-    cutter.step(9, (), ())
-    assert cutter.end() == [IdleSlice("u", UNEXPLAINED, 5, 9)]
+    timeline = Timeline(chain((("a", "u"),), "single", "a"), Settings(1), idle=True)
+    told = (Stepped(5, (UnitReady("u"),), ()), Accounted(5, "u", ASSIGNED), Stepped(9, (), ()))
+    assert [timeline.add(record) for record in told] == [[], [], []]
+    assert timeline.end() == [IdleSlice("u", UNEXPLAINED, 5, 9)]
 
 
 def test_a_journal_of_before_jobs_had_their_cpu_time_is_read() -> None:

@@ -70,7 +70,6 @@ def settled(plan: Plan, capped: bool = False) -> Steady:
         stages_ms=stages,
         busy={"cpu": 0.1, "gpu": 0.6, "dsp": 0.8},
         idle={unit: {"starved": 0.01 * n, "blocked": 0.02} for n, unit in enumerate(UNITS)},
-        accounts={"largest_difference": 0.0, "agree": True, "rows": ["more"]},
         dropped=0.125,
     )
 
@@ -82,7 +81,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
     def steady(profile: Profile, plan: Plan, corners: Any, **options: bool) -> Steady:
         asked.append((profile.name, plan, corners, options))
-        return settled(plan, options.get("twice", False))
+        return settled(plan, capped=len(asked) == 1)
 
     monkeypatch.setattr(predict, "steady", steady)
     monkeypatch.setattr(over_time, "steady", steady)
@@ -110,7 +109,7 @@ def test_an_answer_about_the_settled_application(asked: list[Any]) -> None:
     plan = Plan(NETWORK, "dsp", Variant("pipelined", "double", 2, 24.0), 0.25)
     found = predict.predict(profile, plan, "burst")
     corners = tuple(profile.performance_profiles["burst"].corner(unit) for unit in UNITS)
-    assert asked == [("snapdragon-888", plan, corners, {"twice": True})]
+    assert asked == [("snapdragon-888", plan, corners, {})]
     power = sum(power_of(profile, corners).values()) + 1.5
     assert found.pop("power") == [profile, plan, corners, AROUND]
     assert found.pop("power_w") == pytest.approx(power)
@@ -152,7 +151,6 @@ def test_an_answer_about_the_settled_application(asked: list[Any]) -> None:
             "gpu": {"busy": 0.6, "idle": {"starved": 0.01, "blocked": 0.02}},
             "dsp": {"busy": 0.8, "idle": {"starved": 0.02, "blocked": 0.02}},
         },
-        "accounts": {"largest_difference": 0.0, "agree": True},
         "efficiency": 20.0 / 2 / 25.0,
         "base_power_w": 1.5,
         "base_power_kind": "assumed",

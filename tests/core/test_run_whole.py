@@ -29,7 +29,6 @@ from trilane.pipeline.journal import (
     Worked,
     read_journal,
 )
-from trilane.pipeline.journal_slices import jobs_of
 from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run_metrics import metrics_of
@@ -195,7 +194,6 @@ def test_the_steps_of_a_run_and_its_report(world: World) -> None:
         ((0, 1, 3), ("left", "right")),
     ]
     assert report.core_shares[1].cpu == pytest.approx(0.012 / (2 * report.duration_s))
-    assert report.accounts is not None and report.accounts.agree
     assert (report.caps, report.xrbench.energy) == (None, None)
 
 
@@ -212,7 +210,7 @@ def test_a_run_with_a_journal_keeps_nothing_and_writes_the_same(world: World, tm
     assert (begun.facts["clock"], begun.facts["began_at"][-6:]) == ("host", "+00:00")
     assert [tuple(each) for each in records if isinstance(each, Stepped)] == kept.recording.steps
     assert [tuple(each) for each in records if isinstance(each, Accounted)] == kept.recording.accounts
-    assert sorted(jobs_of(tmp_path / "j")) == sorted(kept.jobs)
+    assert sorted(each.job for each in records if isinstance(each, Worked)) == sorted(kept.jobs)
     now_ns = 0
     for each in records:
         now_ns = each.now_ns if isinstance(each, Stepped) else now_ns
@@ -222,7 +220,6 @@ def test_a_run_with_a_journal_keeps_nothing_and_writes_the_same(world: World, tm
     assert samples[0].values["temperature_c.sensor"] == 41.5
     assert samples[0].values["memory_bytes.scheduler"] > 1 << 20
     assert isinstance(ended, Ended) and metrics_of(ended.report) == result.report
-    assert result.report.accounts == kept.report.accounts
 
 
 def test_messages_and_frames_left_out_are_in_the_journal(

@@ -18,7 +18,6 @@ import pytest
 from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace
 
 from support.trace_reading import ReadTrace, read_trace
-from trilane.apps.tracing.frame_book import FrameBook, Gone, Presented
 from trilane.apps.tracing.packets import PLAIN_BYTES, PacketSink, packets_in
 from trilane.apps.tracing.tiles import MOST_WAITING, Lanes, Tiles
 from trilane.apps.tracing.writer import TraceWriter, write_chrome_trace, write_trace, write_tracks
@@ -36,6 +35,7 @@ from trilane.pipeline.journal import (
     Worked,
     journal_of,
 )
+from trilane.pipeline.timeline import Gone, Presented, Timeline
 from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
@@ -44,6 +44,7 @@ from trilane.scheduler.events import (
     Finish,
     FrameRequest,
     Graph,
+    Hold,
     Job,
     JobDone,
     Settings,
@@ -121,6 +122,8 @@ RUNS: dict[str, dict[str, Any]] = {
     },
     "queue": {"period_ns": 5 * MS, "deadline_ns": 40 * MS, "in_queue": 3, "queue_timeout_ns": 31 * MS},
     "asked": {"asked": True, "inputs": [(at * MS, FrameRequest(3)) for at in range(0, 200, 10)]},
+    "held": {"period_ns": 9 * MS, "inputs": [(30 * MS, Hold(0)), (90 * MS, Hold(2)), (150 * MS, Hold(-1))]},
+    "held and stopped": {"inputs": [(40 * MS, Hold(0)), (60 * MS, Hold(3)), (61 * MS, Stop())]},
     "stopped": {"inputs": [(130 * MS, Stop())]},
     "aborted": {"inputs": [(130 * MS, Abort())]},
     "bypass": {"graph": with_bypass(), "skips": lambda frame, _fresh: frame % 3 == 1},
@@ -169,41 +172,38 @@ def test_slices_of_a_unit_add_up_to_the_report(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_the_frame_book_agrees_with_the_core(name: str) -> None:
+def test_the_timeline_agrees_with_the_core(name: str) -> None:
     """After each step: which frames wait before each stage, and which are in flight, as a core has it that replays."""
     done = run_named(name)
     assert done.recording is not None
     core = Core(done.recording.graph, done.recording.settings)
     left: list[Presented | Gone] = []
-    book: FrameBook | None = None
+    timeline = Timeline(core.graph, core.settings)
     stepped = False
 
-    def check(book: FrameBook) -> None:
+    def check() -> None:
         if core.finished:
             return
-        assert book.in_flight == set(core.frames)
-        assert list(book.waiting["pose"]) == [frame for frame, _ in core.source.queue]
+        assert timeline.frames.keys() == core.frames.keys()
+        assert timeline.waiting("pose") == [frame for frame, _ in core.source.queue]
         for stage in core.stages[1:]:
             assert stage.input is not None
             waiting = [stage.input.frame[slot] for slot in stage.input.ready]
             if stage.bypassed is not None:
                 waiting += [stage.bypassed.frame[slot] for slot in stage.bypassed.passing]
-            assert sorted(book.waiting[stage.name]) == sorted(waiting)
+            assert sorted(timeline.waiting(stage.name)) == sorted(waiting)
 
     for record in records_of(done):
-        if isinstance(record, Begun):
-            book = FrameBook(record, left.append)
-        assert book is not None
         if isinstance(record, Stepped | Ended) and stepped:
-            check(book)
+            check()
+        left += [fact for fact in timeline.add(record) if isinstance(fact, Presented | Gone)]
         if isinstance(record, Stepped):
-            book.step(record)
             core.step(record.now_ns, record.events)
             stepped = True
-        elif isinstance(record, Counted):
-            book.count(record)
     frames = done.report["frames"]
-    assert [one.frame for one in left if isinstance(one, Presented)] == core.ledger.presented_frames
+    shown = [one for one in left if isinstance(one, Presented)]
+    assert [one.frame for one in shown] == core.ledger.presented_frames
+    assert [one.latency_ns for one in shown] == core.ledger.latency_ns
     gone = [one for one in left if isinstance(one, Gone)]
     assert Counter(one.cause for one in gone) == {**frames["dropped"], **frames["lost_by_cause"]}
     known = [one.frame for one in left if one.frame >= 0]

@@ -1,0 +1,384 @@
+"""A run as frames, jobs, waits and idle time, from its journal. Rule: nobody else interprets a journal's events.
+
+The scheduler's own parts tell what it knew: its source says which frames are released and wait (frame_source.py), and
+its record of a frame when that was sampled and how long it took (state.py). A frame waits before the first stage from
+its release on, before another stage from the step in which the scheduler heard that the stage before had ended, until
+it is handed to a unit, dropped or lost. Frames overtake nobody, so that those which are dropped where several wait are
+the oldest, but for one that is turned away before the first stage.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from itertools import pairwise
+from typing import Any, Final, NamedTuple
+
+from trilane.pipeline.journal import Accounted, Counted, Record, Stepped, Worked
+from trilane.pipeline.unit_history import KEPT, Handed, IdleCutter, IdleSlice, Key, UnitHistory
+from trilane.scheduler.causes import DropCause, OutcomeKind
+from trilane.scheduler.events import (
+    NEVER,
+    Action,
+    Dispatch,
+    Finish,
+    FrameRequest,
+    Graph,
+    Hold,
+    Job,
+    JobDone,
+    JobFailed,
+    Kill,
+    Settings,
+    Stop,
+    UnitDied,
+    UnitReady,
+)
+from trilane.scheduler.frame_source import Source
+from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.state import FrameState
+
+SOURCE: Final = "source"
+UNKNOWN: Final = -1  # of a frame that is gone, and nobody knows which it was
+
+
+class Presented(NamedTuple):
+    """A frame that went through.
+
+    `release_ns`: when it was released. `end_ns`: of its last job. `interval_ns`: since that of the frame presented
+    before it, None of the first. `latency_ns`: from its sampled pose to the end of the stage that the pipeline names.
+    `skips`: whether it took the bypass. `rung`: of its work.
+    """
+
+    frame: int
+    release_ns: int
+    end_ns: int
+    interval_ns: int | None
+    latency_ns: int
+    skips: bool
+    rung: int
+
+
+class Gone(NamedTuple):
+    """A frame that was not presented. `frame`: UNKNOWN where it cannot be told. `cause`: as in the report."""
+
+    frame: int
+    release_ns: int
+    at_ns: int
+    kind: str
+    cause: str
+
+
+class Done(NamedTuple):
+    """A job whose end the scheduler has heard of."""
+
+    handed: Handed
+    event: JobDone
+
+
+class ExplainedJob(NamedTuple):
+    """A job that is in the journal with its times, and why it waited.
+
+    `figures`: what its stage reported of it.
+    `waits_ns`: cause to ns, those that are not 0; they sum to `job.begin_ns - job.ready_ns`.
+    `behind`: the job that its unit did the longest in that time, None without one.
+    `after`: the jobs whose end the scheduler heard of in the step in which it handed this job over.
+    `presented`: the frame, of the job that presents it.
+    `rung`: of the frame's work. `skips`: the frame takes the bypass, said by the stage at which that begins.
+    """
+
+    job: JobRecord
+    figures: Mapping[str, float]
+    waits_ns: Mapping[str, int]
+    behind: JobRecord | None
+    after: tuple[Key, ...]
+    presented: Presented | None
+    rung: int
+    skips: bool
+
+    @property
+    def key(self) -> Key:
+        return self.job.stage, self.job.frame
+
+    @property
+    def cause(self) -> str:
+        """Of most of its wait; "" where it did not wait."""
+        return max(self.waits_ns, key=self.waits_ns.__getitem__, default="")
+
+
+class Span(NamedTuple):
+    """From the step in which the last unit got ready to the one that finished the run."""
+
+    begin_ns: int
+    end_ns: int
+
+
+class Down(NamedTuple):
+    """A unit's process was down; it was up again at `end_ns`."""
+
+    unit: str
+    begin_ns: int
+    end_ns: int
+
+
+#: What a record means. A `Done` comes with the step that heard of it, an `ExplainedJob` with the job's own record.
+Fact = Done | Presented | Gone | ExplainedJob | IdleSlice
+
+
+class Timeline:
+    """Takes the records of a run in order; `add` hands back what each means, `end`, after the last, what is left.
+
+    `graph`, `settings`: of the run. `waits`: whether jobs are explained; it takes longer than all else.
+    `idle`: whether idle time is cut into slices, which come in the order of their ends.
+    `kept`: jobs and changes of each unit that are looked back on to explain a wait.
+
+    `frames`: those in flight. `start_ns`: when the last unit got ready; None before. `is_over`: whether the run is.
+    `span`: from the start to the end of the run; None until then, and of one that never started.
+    `presented`, `skipped`: frames that reached the end, and of these those that took the bypass to it.
+    `downs`: the last times in which a unit was down after its start, in the order of their ends.
+    """
+
+    def __init__(
+        self, graph: Graph, settings: Settings, *, waits: bool = False, idle: bool = False, kept: int = KEPT
+    ) -> None:
+        names = [stage.name for stage in graph.stages]
+        self._explains, self._kept = waits, kept
+        self._first, self._last, self._bypass = names[0], names[-1], graph.bypass
+        self._positions = {name: place for place, name in enumerate(names)}
+        self._latency_position = self._positions[graph.latency_to]
+        self._next = dict(pairwise(names))
+        self.units = {unit: UnitHistory(unit, kept if waits else 0) for unit in graph.units}
+        self.frames: dict[int, FrameState] = {}
+        self.start_ns: int | None = None
+        self.span: Span | None = None
+        self.is_over = False
+        self.presented = self.skipped = 0
+        self.downs: deque[Down] = deque(maxlen=kept)
+        self._source = Source(settings, self._drop_at_source)
+        self._turned_away: dict[str, deque[tuple[int, int]]] = {cause: deque() for cause in DropCause}
+        self._waiting: dict[str, list[int]] = {name: [] for name in names[1:]}
+        self._heard_ns: dict[int, int] = {}
+        self._lost: deque[tuple[int, int]] = deque()  # and for which no cause was counted yet
+        self._counts: dict[tuple[str, str], int] = {}
+        self._requested = settings.frames
+        self._ended: dict[Key, tuple[Handed, JobDone, Presented | None]] = {}
+        self._last_end_ns: int | None = None
+        self._now_ns = 0
+        self._cutter = IdleCutter(self.units.values()) if idle else None
+        self._handlers: dict[type, Callable[[Any], None]] = {
+            JobFailed: self._on_failed,
+            UnitReady: self._on_ready,
+            UnitDied: self._on_died,
+            FrameRequest: lambda event: self._source.request(event.frames, self._now_ns),
+            Hold: lambda event: self._source.hold(event.frames, self._now_ns),
+            Stop: lambda _: self._source.stop(),
+        }
+
+    def add(self, record: Record) -> list[Fact]:
+        """What the next record after the first means."""
+        if isinstance(record, Stepped):
+            return self._step(record)
+        if isinstance(record, Counted):
+            return [*self._count(record)]
+        if isinstance(record, Accounted):
+            self._account(record)
+        elif isinstance(record, Worked):
+            return self._work(record)
+        return []
+
+    def end(self) -> list[IdleSlice]:
+        """After the last record: the idle slices until the last step."""
+        return self._cutter.end() if self._cutter is not None else []
+
+    def waiting(self, stage: str) -> list[int]:
+        """The frames that wait before `stage`, the oldest first; before the first stage those that are released."""
+        return [frame for frame, _ in self._source.queue] if stage == self._first else [*self._waiting[stage]]
+
+    @property
+    def not_begun(self) -> int:
+        """Frames of the run that were never in flight, and not dropped before they could be."""
+        return self._requested - self._source.left
+
+    # records
+
+    def _step(self, step: Stepped) -> list[Fact]:
+        facts: list[Fact] = [*self._cutter.settle()] if self._cutter is not None else []
+        if self.is_over:
+            return facts
+        self._now_ns = step.now_ns
+        after: list[Key] = []
+        for event in step.events:
+            if type(event) is JobDone:  # most of them
+                facts += self._end(event, after)
+            elif (handler := self._handlers.get(type(event))) is not None:
+                handler(event)
+        if self.start_ns is not None:
+            self._source.advance(step.now_ns)
+            if self._cutter is not None:
+                self._cutter.step(step.now_ns)
+        for action in step.actions:
+            self._act(action, tuple(after))
+        return facts
+
+    def _act(self, action: Action, after: tuple[Key, ...]) -> None:
+        if type(action) is Dispatch:
+            self._begin(action.job, after)
+        elif type(action) is Kill:
+            self.units[action.unit].fall(self._now_ns, is_gone=False)
+        elif type(action) is Finish:
+            self._finish(action.outcome.kind)
+
+    def _account(self, accounted: Accounted) -> None:
+        now_ns, name, account = accounted
+        unit = self.units[name]
+        if self._cutter is not None:
+            self._cutter.account(now_ns, unit, account)
+        unit.enter(now_ns, account)
+
+    def _work(self, worked: Worked) -> list[Fact]:
+        job = worked.job
+        unit = self.units[job.unit]
+        if self._cutter is not None:
+            self._cutter.job(unit, job)
+        if not self._explains:
+            return []
+        handed, event, presented = self._ended.pop((job.stage, job.frame), (None, None, None))
+        waits_ns, behind = unit.explain(job, handed.heard_ns if handed is not None else 0)
+        after, rung = (handed.after, handed.job.rung) if handed is not None else ((), 0)
+        skips = event is not None and event.skips
+        return [ExplainedJob(job, worked.figures, waits_ns, behind, after, presented, rung, skips)]
+
+    def _count(self, counted: Counted) -> Iterator[Gone]:
+        """Frames that were lost or dropped since the last such record."""
+        for kind, counts, gone in (("lost", counted.lost, self._lost_for), ("dropped", counted.dropped, self._dropped)):
+            for cause, count in counts.items():
+                for _ in range(count - self._counts.get((kind, cause), 0)):
+                    yield Gone(*gone(cause, counted.now_ns), counted.now_ns, kind, cause)
+                self._counts[kind, cause] = count
+
+    def _lost_for(self, _cause: str, now_ns: int) -> tuple[int, int]:
+        """The frame that was lost first, and when it was released."""
+        return self._lost.popleft() if self._lost else (UNKNOWN, now_ns)
+
+    def _dropped(self, cause: str, now_ns: int) -> tuple[int, int]:
+        """The frame that was dropped for `cause`, as `producer->consumer:kind`, and when it was released."""
+        edge, _, kind = cause.rpartition(":")
+        producer, _, consumer = edge.partition("->")
+        if producer == SOURCE:
+            queue = self._turned_away.get(kind) or self._source.queue
+            return queue.popleft() if queue else (UNKNOWN, now_ns)
+        is_bypass = (producer, consumer) == self._bypass
+        for frame in self._waiting.get(consumer, ()):
+            if self._frame(frame).skips == is_bypass:
+                return frame, self._leave(frame)
+        return UNKNOWN, now_ns
+
+    def _drop_at_source(self, frame: int, release_ns: int, cause: DropCause) -> None:
+        self._turned_away[cause].append((frame, release_ns))
+
+    # jobs and frames
+
+    def _begin(self, job: Job, after: tuple[Key, ...]) -> None:
+        """The job is handed to its unit."""
+        heard_ns = self._heard_ns.get(job.frame, 0)
+        self.units[job.unit].held.append(Handed(job, self._now_ns, heard_ns, after))
+        if job.stage == self._first:
+            self.frames[job.frame] = FrameState(self._take(job.frame), NEVER, job.rung)
+        elif job.frame in self._waiting[job.stage]:
+            self._waiting[job.stage].remove(job.frame)
+
+    def _frame(self, number: int) -> FrameState:
+        """A frame in flight; of one that a journal without its begin has, what is known from now on."""
+        if (frame := self.frames.get(number)) is None:
+            frame = self.frames[number] = FrameState(self._now_ns, NEVER)
+        return frame
+
+    def _take(self, frame: int) -> int:
+        """The frame is in flight from now on; when it was released."""
+        for released in self._source.queue:
+            if released[0] == frame:  # it is not always the oldest: that others are dropped is counted after the step
+                self._source.queue.remove(released)
+                return released[1]
+        return self._source.take(self._now_ns)[1]
+
+    def _end(self, event: JobDone, after: list[Key]) -> Iterator[Fact]:
+        """A job has ended: its frame waits for the next stage, or is presented."""
+        handed = self.units[event.unit].take(event.job)
+        if handed is None:
+            return
+        job = handed.job
+        after.append((job.stage, job.frame))
+        self._heard_ns[job.frame] = self._now_ns
+        frame = self._frame(job.frame)
+        frame.end_stage(self._positions[job.stage], self._latency_position, event.t_sampled_ns, event.t_end_ns)
+        frame.skips |= event.skips
+        yield Done(handed, event)
+        presented = None
+        if job.stage == self._last:
+            yield (presented := self._present(job.frame, frame, event.t_end_ns))
+        else:
+            skips_to = self._bypass[1] if event.skips and self._bypass is not None else ""
+            self._waiting[skips_to or self._next[job.stage]].append(job.frame)
+        if self._explains:
+            self._ended[job.stage, job.frame] = handed, event, presented
+            if len(self._ended) > self._kept:  # of a job whose frame was lost meanwhile there is no record
+                del self._ended[next(iter(self._ended))]
+
+    def _present(self, number: int, frame: FrameState, end_ns: int) -> Presented:
+        self._leave(number)
+        self.presented += 1
+        self.skipped += frame.skips
+        interval_ns = None if self._last_end_ns is None else end_ns - self._last_end_ns
+        self._last_end_ns = end_ns
+        return Presented(number, frame.release_ns, end_ns, interval_ns, frame.latency_ns, frame.skips, frame.rung)
+
+    def _on_failed(self, event: JobFailed) -> None:
+        handed = self.units[event.unit].take(event.job)
+        if handed is not None:
+            self._lose(handed.job.frame)
+            self._source.stop()
+
+    def _on_ready(self, event: UnitReady) -> None:
+        down_ns = self.units[event.unit].rise(self._now_ns)
+        if down_ns is not None:
+            self.downs.append(Down(event.unit, down_ns, self._now_ns))
+        if self.start_ns is None and all(unit.is_up for unit in self.units.values()):
+            self.start_ns = self._now_ns
+            self._source.start(self._now_ns)
+
+    def _on_died(self, event: UnitDied) -> None:
+        """The frame that its unit worked on is lost; what it only held waits again, unless it was to begin."""
+        unit = self.units[event.unit]
+        unit.fall(self._now_ns, is_gone=True)
+        for place, handed in enumerate(unit.held):
+            job = handed.job
+            if place == 0 or job.stage == self._first:
+                self._lose(job.frame)
+            else:
+                self._waiting[job.stage].append(job.frame)
+                self._waiting[job.stage].sort()
+        unit.held.clear()
+
+    def _finish(self, kind: OutcomeKind) -> None:
+        """The run is over, and what was in flight is lost. What is dropped in this step is counted after it."""
+        self.is_over = True
+        if self.start_ns is not None:
+            self.span = Span(self.start_ns, self._now_ns)
+        if kind in (OutcomeKind.ABORTED, OutcomeKind.GAVE_UP):
+            for frame in sorted(self.frames):
+                self._lose(frame)
+        for unit in self.units.values():
+            unit.held.clear()
+
+    def _lose(self, frame: int) -> None:
+        """The frame is no more; why, the next count says."""
+        self._lost.append((frame, self._leave(frame)))
+
+    def _leave(self, number: int) -> int:
+        """The frame is nowhere any more; when it was released."""
+        for waiting in self._waiting.values():
+            if number in waiting:
+                waiting.remove(number)
+        self._heard_ns.pop(number, None)
+        frame = self.frames.pop(number, None)
+        return self._now_ns if frame is None else frame.release_ns
