@@ -64,7 +64,7 @@ def _between(low: float | None, high: float | None) -> str:
 
 
 def _of_path(part: PathShare) -> str:
-    return f"{' or '.join([part.name, *(part.rivals or [])])} {part.share:.0%} of the path"
+    return f"{part.names} {part.share:.0%} of the path"
 
 
 def _error(facts: Mapping[str, Any]) -> tuple[str, str]:

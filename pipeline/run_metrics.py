@@ -271,6 +271,11 @@ class PathShare(Record):
     share_high: float | None = None
     rivals: list[str] | None = None
 
+    @property
+    def names(self) -> str:
+        """What may be the largest part: the name and its rivals."""
+        return " or ".join([self.name, *(self.rivals or [])])
+
 
 class Bound(Record):
     """What bounded the frame time. `unit`: its name is the report's `bottleneck`. `stage`: null where no stage did."""

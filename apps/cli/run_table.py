@@ -270,8 +270,7 @@ def _part_of_path(part: PathShare | None) -> str:
         return DASH
     if part.share_low is None or part.share_high is None:
         return f"{part.name} {_percent(part.share)}"
-    names = " or ".join([part.name, *(part.rivals or [])])
-    return f"{names} {_percent(part.share)} ({_percent(part.share_low)} to {_percent(part.share_high)})"
+    return f"{part.names} {_percent(part.share)} ({_percent(part.share_low)} to {_percent(part.share_high)})"
 
 
 def _number(value: float | None, digits: int = 1) -> str:

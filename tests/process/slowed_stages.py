@@ -21,6 +21,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from trilane.pipeline.run_metrics import PathShare
+
 SHARE = 0.2
 #: Python imports a module of this name when it starts, in the units' processes too.
 HOOK = """
@@ -75,7 +77,7 @@ def main(folder: Path, rounds: int, command: list[str]) -> None:
         print(f"{stage:10} CPU time {more:+.1%}  frame time {statistics.median(cost[stage]):+.1%}  ({each})")
     print("costs most:", max(stages, key=lambda stage: statistics.median(cost[stage])))
     bounds = [report["bound"]["stage"] for report in plains]
-    named = [" or ".join([bound["name"], *(bound.get("rivals") or [])]) for bound in bounds]
+    named = [PathShare.model_validate(bound).names for bound in bounds]
     print("named:", {name: named.count(name) for name in sorted(set(named))})
     print(f"other programs: {statistics.median(report['other_programs'] for report in plains):.1%} of the cores")
     shutil.rmtree(folder)

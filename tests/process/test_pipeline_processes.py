@@ -217,9 +217,20 @@ def test_a_killed_unit_is_restarted_and_the_run_goes_on(run: Run, unit: str, slo
 
 
 def fork_server() -> psutil.Process:
-    """The one that began last."""
-    servers = [p for p in psutil.Process().children() if "trilane.pipeline.fork_server" in p.cmdline()]
+    """The one that began last. A process that has just begun has no command line yet, even after Popen has returned."""
+    end = time.monotonic() + PATIENCE_S
+    while not all((lines := {child: command_line(child) for child in psutil.Process().children()}).values()):
+        assert time.monotonic() < end
+        time.sleep(0.001)
+    servers = [child for child, line in lines.items() if "trilane.pipeline.fork_server" in line]
     return max(servers, key=psutil.Process.create_time)
+
+
+def command_line(process: psutil.Process) -> list[str]:
+    try:
+        return process.cmdline()
+    except psutil.NoSuchProcess:  # a zombie too
+        return ["ended"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
