@@ -15,7 +15,7 @@ from pydantic import Field, ValidationError
 
 from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_text
-from trilane.scene.schema import Table
+from trilane.scene.schema import LISTED, Table
 
 # Options of a training, in tables of `training.toml`: the optimiser, how batches are made, what makes it harder.
 #
@@ -56,7 +56,7 @@ class BatchOptions(Table):
     same_zoom: bool = False
     full_body_statistics: bool = False
     full_body_from: float = Field(default=1.0, ge=0, le=1)
-    repeats: tuple[Repeats, Repeats, Repeats, Repeats, Repeats] = (1, 1, 1, 1, 1)
+    repeats: Annotated[tuple[Repeats, Repeats, Repeats, Repeats, Repeats], LISTED] = (1, 1, 1, 1, 1)
 
 
 class RegularisationOptions(Table):

@@ -67,7 +67,7 @@ def facts_of_report(name: str, report: Report) -> RunFacts:
         machine_line(document["machine"]),
         scene["fps"],
         (scene["output"]["width"], scene["output"]["height"]),
-        config_in_force(document["config"], {**(document["options"] or {}), **caps}),
+        config_in_force(document["config"], {**(document.get("options") or {}), **caps}),
         {**document["plan"], "notes": document["notes"]},
         document.get("placement"),
         document["accuracy"],

@@ -32,7 +32,7 @@ BEGUN, RECORDS = told_journal()
 #: Unit v dies in its second frame, and the run ends.
 END: tuple[Record, ...] = (
     Stepped(1070 * MS, (UnitDied("v"),), (Start("v"),)),
-    Counted(1070 * MS, {"died:v": 1}, {"source->a:late": 2}),
+    Counted(1070 * MS, {"died:v": 1}, {}),
     Ended(1090 * MS, {}),
 )
 FIGURES = LiveFigures(BEGUN)

@@ -214,7 +214,7 @@ def test_stages_whose_shares_may_be_equal_are_rivals_and_a_surely_smaller_one_is
     run = simulate(graph, settings, service, keep=True)
     assert run.recording is not None
     places = {"cpu": Place((0,), 1), "gpu": Place((1,), 1), "dsp": Place((2,), 1)}
-    _, found = reckoned(graph, settings, places, records_of(run.recording, run.jobs))
+    found = reckoned(graph, settings, places, records_of(run.recording, run.jobs))
     stage = found.figures["bound"]["stage"]
     assert {stage["name"], *stage["rivals"]} == {"raster", "composite"}
     assert ran(STAGE_NS)[1].figures["bound"]["stage"]["rivals"] == []

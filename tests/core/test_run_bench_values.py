@@ -17,7 +17,9 @@ from trilane.bench.lib.load import Load, Queries
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.host import host_units, usable_cores
 from trilane.pipeline.result import Failure
+from trilane.scheduler.events import Settings, chain
 from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.recording import Recording
 from trilane.stages.run_options import RunOptions
 
 MS = 1_000_000
@@ -60,6 +62,7 @@ def result_of(policy: str, frame_ms: float, **changes: Any) -> SimpleNamespace:
     jobs = [("gpu", 0, 0, 0, 10), ("gpu", 14, 17, 20, 50), ("host", 0, 0, 30, 40)]
     told = {
         "report": report,
+        "recording": Recording(chain((("pose", "host"), ("raster", "gpu")), "double", "raster"), Settings(20)),
         "jobs": [JobRecord("raster", unit, 0, *instants) for unit, *instants in jobs],
         "dropped": {"a": 2, "b": 3},
         "lost": {"c": 1, "d": 6},
@@ -98,7 +101,7 @@ def test_a_rounds_runs_are_set_against_the_sequential_ones(
     monkeypatch: pytest.MonkeyPatch, configured: list[RunOptions]
 ) -> None:
     """Sequential frames of 20, 22 and 24 ms (hops 5, 7, 9), between them 10 ms pipelined. First round: gain 2.1, bound
-    (15 + 6) / 10; second: 2.3 and (15 + 8) / 10. No frame of theirs is composited: none has a latency."""
+    (15 + 6) / 10; second: 2.3 and (15 + 8) / 10. No step of theirs is recorded: no frame has a latency."""
     sequential = iter([20.0, 22.0, 24.0])
     asked: list[dict[str, Any]] = []
 

@@ -53,7 +53,7 @@ def largest_difference(units: Mapping[str, Mapping[str, Any]], second: Mapping[s
     if units.keys() != second.keys():
         return 1.0
     rows = [(unit, {BUSY: row["busy"], **row["idle"]}) for unit, row in units.items()]
-    return max(abs(share - second[unit][name]) for unit, row in rows for name, share in row.items())
+    return float(max(abs(share - second[unit][name]) for unit, row in rows for name, share in row.items()))
 
 
 def drawn_run(draw: random.Random, frames: int) -> Simulation:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from support.camera_files import OPTICAL, lines_of, load, nerf_text, pose_z_up
-from trilane.apps.comparison.rows import rows_of
+from support.camera_files import rows_of
 from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.scene.camera import pose_table

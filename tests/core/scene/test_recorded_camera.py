@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from support.camera_files import HEIGHT, RATE_HZ, VIDEO_LENS, WRITERS, load, pixel, rows_of
+from support.camera_files import HEIGHT, LENS, RATE_HZ, VIDEO_LENS, WRITERS, load, pixel, rows_of
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody
 from trilane.errors import BadInputError
@@ -34,7 +34,6 @@ from trilane.scene.motion.motion import Wrap
 from trilane.scene.mover import make_mover
 from trilane.scene.rotations import about, matrix_from_quat, matrix_from_rotvec
 from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
-from trilane.scene.staging import LENS
 
 SPEC = CameraSpec()
 LENSES = (of_fov_y(36.0),)

@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from support.small_pipeline import EDGES, OWN, assets_of, packets, pipeline, without_bytes
-from trilane.bench.handoff import STAGES
+from support.small_pipeline import EDGES, OWN, STAGES, assets_of, packets, pipeline, without_bytes
 from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.bound_stage import BoundStage

@@ -274,7 +274,7 @@ def test_settings_have_the_digest_of_the_weights(tmp_path: Path) -> None:
     assert chosen.vgg == digest and with_vgg(chosen, file) == chosen and with_vgg(thesis, None) == thesis
     with pytest.raises(BadInputError, match=f"found no file of weights, expected that with SHA-256 {digest}; give it"):
         with_vgg(chosen, None)
-    with pytest.raises(BadInputError, match="--vgg: found a loss without `objective`"):
+    with pytest.raises(BadInputError, match="--vgg: found a loss without `perceptual`"):
         with_vgg(parsed_settings({}, ""), file)
     file.write_bytes(b"abd")
     with pytest.raises(BadInputError, match=rf"vgg.pth: found SHA-256 .*expected that of the settings, {digest}"):

@@ -191,7 +191,7 @@ def test_options_are_written_and_read_again() -> None:
         ({"norm": "layer"}, "norm: found 'layer', expected 'batch', 'instance', 'group' or 'none'"),
         (
             {"norm": "group", "start": "default"},
-            'norm: found group, expected batch of the default network; or start = "new"',
+            'norm: found group, expected batch of a trained network; or start = "new"',
         ),
         (
             {"norm": "group", "bytes_from": 0.9},
