@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from support.camera_files import OPTICAL, lines_of, load, nerf_text, pose_z_up
-from support.camera_files import rows_of
+from support.camera_files import OPTICAL, lines_of, load, nerf_text, pose_z_up, rows_of
 from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.scene.camera import pose_table
