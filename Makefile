@@ -2,10 +2,9 @@
 # Arguments of `trilane run` go in ARGS: make run ARGS="--frames 60 --size 192"
 SHELL := /bin/bash
 .DELETE_ON_ERROR:
-.PHONY: run test test-all test-rest test-machines test-device results setup format compile interpreted clean
+.PHONY: run test test-all test-rest test-machines test-device results setup format clean
 
 BIN := .venv/bin
-COMPILED := $(shell sed -n 's/^    "\(.*\.py\)",$$/\1/p' src/trilane/compiled.py)
 
 # Every check, whatever fails; with ARGS only the tests that it names, as pytest takes them.
 checks = $(if $(ARGS),$(BIN)/pytest $(filter --slow,$(1)) $(ARGS),$(BIN)/python tests/support/checks.py $(1))
@@ -13,20 +12,20 @@ checks = $(if $(ARGS),$(BIN)/pytest $(filter --slow,$(1)) $(ARGS),$(BIN)/python 
 run: .venv/ready-run
 	$(BIN)/trilane run $(ARGS)
 
-test: .venv/ready-test .venv/ready-core
+test: .venv/ready-test
 	@$(call checks)
 
 # All that a machine without a GPU can run: every extra is installed, and a skip that is not on the list fails.
-test-all: .venv/ready-all .venv/ready-core
+test-all: .venv/ready-all
 	@$(call checks,--slow)
 
 # What the last `make test` left out: slow tests, and those that it skipped for want of an extra.
-test-rest: .venv/ready-all .venv/ready-core
+test-rest: .venv/ready-all
 	@$(call checks,--rest)
 
-# Some tests once more on each machine of tests/machines.toml: one core, no compiler, another locale and more.
+# Some tests once more on each machine of tests/machines.toml: one core, another locale and more.
 # ARGS=--environments: those with packages or a Python of their own, which are installed once.
-test-machines: .venv/ready-test .venv/ready-core
+test-machines: .venv/ready-test
 	@$(BIN)/python tests/support/machines.py $(ARGS)
 
 # What needs a GPU: hardware OpenGL, training on CUDA, the runtime cuda. Exit code 3 where there is none.
@@ -51,41 +50,25 @@ format: .venv/ready-test
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# The scheduler's core in C; or as Python until the next `make compile`, to edit it without compiling each time.
-compile: .venv/ready-test
-	rm -f .venv/interpreted
-	$(BIN)/python setup.py --quiet build_ext --inplace
-	@$(BIN)/python -c 'import sys; from trilane.compiled import form; sys.exit(form() != "compiled")' || \
-	  { echo "make compile: not compiled (see above); it takes a C compiler: sudo apt-get install -y gcc python3-dev"; exit 3; }
-	touch .venv/ready-core .venv/ready-run
-
-interpreted:
-	rm -f src/*.so src/trilane/*/*.so
-	if [ -d .venv ]; then touch .venv/interpreted; fi
-
 # The stamps are newer than what they depend on once the set-up is complete, so a second `make` starts at once.
-.venv/ready-run: scripts/setup.sh pyproject.toml setup.py $(COMPILED)
+.venv/ready-run: scripts/setup.sh pyproject.toml
 	scripts/setup.sh openvino
 	touch $@
 
-.venv/ready-test: scripts/setup.sh pyproject.toml setup.py
+.venv/ready-test: scripts/setup.sh pyproject.toml
 	scripts/setup.sh openvino,metrics,dev
-	touch $@ .venv/ready-core .venv/ready-run
+	touch $@ .venv/ready-run
 
-.venv/ready-all: scripts/setup.sh scripts/tested-versions.txt pyproject.toml setup.py
+.venv/ready-all: scripts/setup.sh scripts/tested-versions.txt pyproject.toml
 	PIP_CONSTRAINT=scripts/tested-versions.txt scripts/setup.sh all,dev
-	touch $@ .venv/ready-test .venv/ready-core .venv/ready-run
+	touch $@ .venv/ready-test .venv/ready-run
 
-.venv/ready-device: scripts/setup.sh pyproject.toml setup.py
+.venv/ready-device: scripts/setup.sh pyproject.toml
 	nvidia-smi >/dev/null || { echo "make test-device: no GPU of NVIDIA here (nvidia-smi finds none)"; exit 3; }
 	scripts/setup.sh train,dev
 	$(BIN)/python -m pip uninstall --quiet --yes onnxruntime
 	$(BIN)/python -m pip install --quiet onnxruntime-gpu
 	touch $@
 
-.venv/ready-core: $(COMPILED) | .venv/ready-test
-	$(BIN)/python setup.py --quiet build_ext --inplace
-	touch $@ .venv/ready-run
-
 clean:
-	rm -rf .venv build dist src/*.so src/trilane/*/*.so
+	rm -rf .venv build dist

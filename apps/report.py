@@ -74,7 +74,6 @@ class Machine(Record):
 
     `system`: operating system and kernel.
     `python`, `trilane`: versions; null for a Trilane that was never installed.
-    `scheduler_core`: compiled, interpreted or stale.
     `cpu`: the processor.
     `hardware_counters`: what was counted of each job, or `absent` and why; null in reports of before it was said.
     `memory_bytes`: physical memory.
@@ -85,7 +84,6 @@ class Machine(Record):
     system: str
     python: str
     trilane: str | None
-    scheduler_core: str
     cpu: Cpu
     hardware_counters: str | None = None
     memory_bytes: int

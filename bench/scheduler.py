@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from trilane.compiled import form
 from trilane.errors import BadInputError, TrilaneError, install_line
 from trilane.hw_profiles.application import application_graph
 from trilane.scheduler.events import Graph, Settings
@@ -72,7 +71,7 @@ def measure(minutes: float = 15.0, rounds: int = 7, seeds: int = 10, events: str
     events_each = frames * (len(graph.stages) + 1)
     processed = {**dict.fromkeys(ways, events_each), **_processed(graph, service, frames, [*simpy_ways])}
     rows = [_row(way, frames, events_each, runs, processed[way]) for way, runs in seconds.items()]
-    config = {"core": form(), "minutes": minutes, "fps": FPS, "rounds": rounds, "seeds": seeds, "repeats": REPEATS}
+    config = {"minutes": minutes, "fps": FPS, "rounds": rounds, "seeds": seeds, "repeats": REPEATS}
     return {
         "rows": rows,
         **compared(seconds),

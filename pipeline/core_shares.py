@@ -44,4 +44,4 @@ def lost_in_job(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int, has_device
     """
     preempted = preempted_ns(wall_ns, cpu_ns, delay_ns, cores)
     asleep = 0 if has_device else wall_ns - preempted - cpu_ns
-    return tuple.__new__(Lost, (preempted, asleep if asleep > 0 else 0))
+    return Lost(preempted, asleep if asleep > 0 else 0)

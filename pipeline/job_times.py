@@ -90,7 +90,7 @@ class JobClock:
         """The answer to the job that has ended. `skips`: its frame takes the bypass."""
         lost = (self._preempted_ns, self._asleep_ns, self._preempted_before_ns)
         times = (self._begin_ns, self._end_ns, sampled_ns, *lost, int(skips), self._cpu_ns, self._cpu_before_ns)
-        return tuple.__new__(Done, (job_id, *times, metrics))
+        return Done(job_id, *times, metrics)
 
     def answered(self) -> None:
         """To be called when the job was answered, for what took place in it and since is read now.

@@ -258,7 +258,7 @@ class RealtimeClock:
         self._unbooked.append((job, dispatch_ns, None if frame is None else frame.ready_ns, message))
         if frame is not None and self._requests is not None and job.stage == self._last_stage:
             self._requests.answered(job.frame)
-        return tuple.__new__(JobDone, (unit, *message[:7], message.skips > 0))  # the constructor is slow
+        return JobDone(unit, *message[:7], message.skips > 0)
 
     def _failed(self, unit: str, message: Failed) -> Event | None:
         self._log.fail_with(message)
@@ -271,7 +271,7 @@ class RealtimeClock:
         self._open[job.id] = (job, now_ns)
         place = self._processes.places[job.stage]
         fields = (job.id, place, job.frame, job.slot_in, job.slot_out, job.epoch, now_ns, int(job.fresh), job.rung)
-        self._processes.send(job.unit, tuple.__new__(RunJob, fields))
+        self._processes.send(job.unit, RunJob(*fields))
 
     def _tell_unanswered(self) -> None:
         """Whoever asked for frames learns at once of those that will not come."""

@@ -13,8 +13,8 @@ from pydantic import Field, model_validator
 
 from trilane.pipeline.description import Model
 
-#: Stages measured by themselves, and the shares of `units` computed a second time.
-GONE: Final = frozenset({"isolated_ms", "accounts"})
+#: Stages measured by themselves, the shares of `units` computed a second time, and whether the core was compiled.
+GONE: Final = frozenset({"isolated_ms", "accounts", "scheduler_core"})
 
 
 class Record(Model):
@@ -23,6 +23,14 @@ class Record(Model):
     def as_json(self) -> dict[str, Any]:
         """The keys that were set, as JSON takes them, in the order of the fields."""
         return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _leave_out_what_is_gone(cls, document: Any) -> Any:
+        """Older Trilanes wrote keys that nobody makes now."""
+        if not isinstance(document, dict):
+            return document
+        return {key: value for key, value in document.items() if key not in GONE}
 
 
 class FrameCounts(Record):
@@ -337,14 +345,6 @@ class RunMetrics(Record):
     other_programs: float | None = None
     caps: Caps | None = None
     temperature_c: Temperature | None = None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _leave_out_what_is_gone(cls, document: Any) -> Any:
-        """Older Trilanes wrote keys that nobody makes now."""
-        if not isinstance(document, dict):
-            return document
-        return {key: value for key, value in document.items() if key not in GONE}
 
 
 def metrics_of(ledger_report: Mapping[str, Any]) -> RunMetrics:

@@ -204,7 +204,7 @@ class UnitProcesses:
         except MessageError as error:
             raise _bad_message(process, error) from None
         if message is not None:
-            return [tuple.__new__(UnitMessage, (process.unit, message))]  # on a frame's way; the constructor is slow
+            return [UnitMessage(process.unit, message)]
         if process.link.job_pipe.ended:
             self._unregister(process.link.job_pipe.fileno())  # else the poller would report it for ever
         return []

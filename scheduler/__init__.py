@@ -3,7 +3,3 @@
 It may use `transport/` and the modules in `src/trilane`; it imports no clock and no NumPy, and its only
 files are recordings.
 """
-
-from trilane.compiled import check
-
-check()

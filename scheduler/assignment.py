@@ -86,4 +86,4 @@ class Assignment:
             unit.head_since_ns = now_ns
             unit.deadline_ns = now_ns + self._hang_ns
         unit.queue.append(job)
-        actions.append(tuple.__new__(Dispatch, (job,)))
+        actions.append(Dispatch(job))

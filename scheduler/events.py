@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 from trilane.scheduler.causes import Outcome
 from trilane.unexpected_value import UnexpectedValue
 
-NEVER: Final = (1 << 62) - 1  # ns; the largest integer that mypyc keeps unboxed
+NEVER: Final = (1 << 62) - 1  # ns, later than any time
 
 
 class Job(NamedTuple):

@@ -62,7 +62,7 @@ class Flow:
         if bypass is not None and stage is bypass.begin:
             fresh, bypass.must_be_fresh = bypass.must_be_fresh, False
         slots = (slot_in, slot_out, epoch, fresh, self.frames[frame].rung)
-        job = tuple.__new__(Job, (self._jobs, stage.unit.name, stage.name, frame, *slots))
+        job = Job(self._jobs, stage.unit.name, stage.name, frame, *slots)
         self._jobs += 1
         return job
 

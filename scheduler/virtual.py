@@ -173,7 +173,7 @@ class VirtualDriver:
             begin_ns = unit.free_ns
         end_ns = unit.free_ns = begin_ns + self._service(stage, name, frame, begin_ns)
         skips = stage == self._bypass_begin and self._skips(frame, fresh)
-        done = tuple.__new__(JobDone, (name, job_id, begin_ns, end_ns, begin_ns, 0, 0, 0, skips))
+        done = JobDone(name, job_id, begin_ns, end_ns, begin_ns, 0, 0, 0, skips)
         self._sequence += 1
         heappush(self._heap, (end_ns + self._message_delay_ns, EVENT, self._sequence, done, unit.epoch))
         if self.recording is not None:

@@ -69,6 +69,8 @@ has_browser() { command -v chromium >/dev/null || command -v chromium-browser >/
 has_pip() { .venv/bin/python -m pip --version >/dev/null 2>&1; }
 
 { is_new_enough .venv/bin/python && has_pip; } || make_venv
+# Earlier versions compiled the scheduler here; Python would import what they left in place of the sources.
+rm -f src/*.so src/trilane/*/*.so
 say "installing packages (${extras:-no extras}); the first time takes a minute or more and up to 1 GB, with all extras minutes and 3 GB"
 .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable ".${extras:+[$extras]}" ||
   lacks "pip could not install the packages (see above): no network, or no wheel for this Python and machine" \
@@ -81,8 +83,4 @@ if ! has_egl; then
 fi
 if wants_browser && ! has_browser; then
   (apt_or_lacks "no Chromium for the tests of the dashboard's page" chromium) || say "without it they are skipped"
-fi
-if [ ! -e .venv/interpreted ] && [ "$(.venv/bin/python -c 'from trilane.compiled import form; print(form())')" = interpreted ]; then
-  say "not compiled, for want of a C compiler: the scheduler runs as Python, less than half as fast in virtual time"
-  say "to have it compiled: sudo apt-get install -y gcc python3-dev && make compile"
 fi

@@ -13,7 +13,6 @@ from functools import cache
 from typing import Any
 
 from trilane import machine
-from trilane.compiled import form
 from trilane.pipeline.hardware_counters import availability
 
 #: Instructions that decide how fast INT8 and FP32 networks run; a network's speed means nothing without them.
@@ -115,7 +114,6 @@ def machine_facts(gl: dict[str, Any] | None = None) -> dict[str, Any]:
         "system": machine.here.system(),
         "python": machine.here.python(),
         "trilane": package_version("trilane"),
-        "scheduler_core": form(),
         "cpu": cpu_facts(),
         "hardware_counters": availability(),
         "memory_bytes": machine.here.memory_bytes(),

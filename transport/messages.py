@@ -169,7 +169,7 @@ def unpack(data: bytes | memoryview) -> Message:
     fields = integers.unpack_from(data, 1)
     if rest is not None:
         fields += (_unpack_rest(data[end:], rest) if len(data) > end else rest(),)
-    message: Message = tuple.__new__(kind, fields)
+    message: Message = kind(*fields)
     return message
 
 

@@ -18,13 +18,12 @@ from trilane import machine
 from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import print_json, stdout_console
 from trilane.apps.cli.options import JsonOption
-from trilane.errors import EGL_LINE, clone, install_line, package_line, reason
+from trilane.errors import EGL_LINE, install_line, package_line, reason
 
 app = Commands()
 
 MISSING = 3
 SHM = Path("/dev/shm")  # noqa: S108 - looked at, never written
-REINSTALL = "install Trilane again from its sources, where there are gcc and python3-dev"
 EPILOG = "\b\nExamples:\n  trilane doctor\n  trilane doctor --json"
 
 
@@ -128,17 +127,6 @@ def _wakeup() -> Check:
         return Check("idle cores", idle_cores, works=idle_cores == AWAKE, needed=False, install=install)
 
 
-def _core() -> Check:
-    """A stale core stops every run; an interpreted one works, less than half as fast in virtual time."""
-    from trilane.compiled import MEND, STALE, form
-
-    state = form()
-    if state == "stale":
-        return Check("scheduler core", STALE, works=False, install=MEND)
-    install = "make compile  # it takes gcc and python3-dev" if clone() else REINSTALL
-    return Check("scheduler core", state, works=state == "compiled", needed=False, install=install)
-
-
 def _counters() -> Check:
     """Not needed: without them a trace has no instructions and cache misses."""
     from trilane.pipeline.hardware_counters import absence, availability, remedy
@@ -150,7 +138,7 @@ def _counters() -> Check:
 
 def checks(gl: dict[str, Any] | None) -> list[Check]:
     """Every check, in the order in which they are shown; `gl` is what `gl_facts` said."""
-    machine = [_python(), _cpu(), _int8(), _counters(), _memfd(), _dev_shm(), _wakeup(), _core(), _gl(gl)]
+    machine = [_python(), _cpu(), _int8(), _counters(), _memfd(), _dev_shm(), _wakeup(), _gl(gl)]
     return [*machine, _runtimes(), *_packages()]
 
 

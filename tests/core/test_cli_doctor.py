@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from trilane import compiled, machine
+from trilane import machine
 from trilane.apps.cli import doctor
 from trilane.apps.cli.doctor import Check
 from trilane.pipeline import hardware_counters
@@ -45,7 +45,6 @@ def well_equipped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> pytest.Mon
     monkeypatch.setattr(machine_facts, "gl_facts", lambda: GL)
     monkeypatch.setattr(machine_facts, "machine_facts", lambda gl: {"gl": gl})
     monkeypatch.setattr(wakeup, "awake", awake)
-    monkeypatch.setattr(compiled, "form", lambda: "compiled")
     monkeypatch.setattr(hardware_counters, "absence", lambda: None)
     monkeypatch.setattr(hardware_counters, "availability", lambda: "instructions, cache_misses")
     monkeypatch.setattr(doctor, "SHM", tmp_path)
@@ -60,7 +59,6 @@ PYTHON = "apt-get install python3.11 python3.11-venv"
 ACL = f'apt-get install acl; setfacl -m "u:$USER:w" {wakeup.LATENCY_FILE}'
 PARANOID = "sysctl kernel.perf_event_paranoid=2"
 MEMFD = "needs Linux 3.17 or newer with memfd_create allowed"
-COMPILE = "make compile  # it takes gcc and python3-dev"
 
 
 @pytest.mark.usefixtures("well_equipped")
@@ -73,7 +71,6 @@ def test_a_machine_that_has_everything(tmp_path: Path) -> None:
         Check("memfd", "anonymous shared memory works", True, True, ""),
         Check(str(tmp_path), "3 MiB free; Trilane leaves nothing there", True, False, ""),
         Check("idle cores", wakeup.AWAKE, True, False, ACL),
-        Check("scheduler core", "compiled", True, False, COMPILE),
         Check("EGL and OpenGL", "a [driver], 4.5 (hardware)", True, True, ""),
         Check("inference runtimes", "onnxruntime: CPU, QNN; openvino: GPU", True, True, ""),
         Check("numpy", "numpy-1.2", True, True, "pip install numpy"),
@@ -99,13 +96,10 @@ def test_a_machine_that_has_nothing(well_equipped: pytest.MonkeyPatch, tmp_path:
     well_equipped.setattr(machine_facts, "cpu_facts", lambda: {**CPU, "flags": []})
     well_equipped.setattr(machine_facts, "runtime_facts", broken)
     well_equipped.setattr(wakeup, "awake", asleep)
-    well_equipped.setattr(compiled, "form", lambda: "interpreted")
-    well_equipped.setattr(doctor, "clone", lambda: None)
     well_equipped.setattr(hardware_counters, "absence", lambda: "kernel.perf_event_paranoid is 3")
     well_equipped.setattr(doctor, "SHM", tmp_path / "none")
     well_equipped.setattr(os, "memfd_create", refused)
     no_mesa = "apt-get install libegl1 libgl1-mesa-dri"
-    again = "install Trilane again from its sources, where there are gcc and python3-dev"
     assert doctor.checks(None) == [
         Check("Python", "3.11.9", False, True, PYTHON),
         Check("CPU", "a processor, 3 of 8 cores allowed, none of those that matter", True, True, ""),
@@ -114,7 +108,6 @@ def test_a_machine_that_has_nothing(well_equipped: pytest.MonkeyPatch, tmp_path:
         Check("memfd", "operation not permitted", False, True, MEMFD),
         Check(str(tmp_path / "none"), "absent", False, False, "mount -t tmpfs tmpfs /dev/shm"),
         Check("idle cores", "may sleep", False, False, ACL),
-        Check("scheduler core", "interpreted", False, False, again),
         Check("EGL and OpenGL", "no OpenGL 3.3 context can be made", False, True, no_mesa),
         Check("inference runtimes", "ImportError: no libonnxruntime.so", False, True, "pip install onnxruntime"),
         Check("numpy", "missing", False, True, "pip install numpy"),
@@ -133,11 +126,6 @@ def test_any_instruction_for_dot_products_is_enough(flag: str, well_equipped: py
 def test_a_runtime_without_a_place_to_run_does_not_work(well_equipped: pytest.MonkeyPatch) -> None:
     well_equipped.setattr(machine_facts, "runtime_facts", lambda: {"onnxruntime": []})
     assert not doctor._runtimes().works
-
-
-def test_a_stale_core_stops_a_run(well_equipped: pytest.MonkeyPatch) -> None:
-    well_equipped.setattr(compiled, "form", lambda: "stale")
-    assert doctor._core() == Check("scheduler core", compiled.STALE, False, True, compiled.MEND)
 
 
 @pytest.mark.usefixtures("well_equipped")

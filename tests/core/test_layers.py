@@ -15,7 +15,6 @@ ROWS = (
     (
         "arrays",
         "cache",
-        "compiled",
         "errors",
         "machine",
         "figure_sources",

@@ -46,7 +46,6 @@ MACHINE = {
     "system": "Linux",
     "python": "3.11",
     "trilane": None,
-    "scheduler_core": "interpreted",
     "cpu": {"model": "a processor", "architecture": "x86_64", "flags": [], "cores": 2, "cores_allowed": [0, 1]},
     "memory_bytes": 1,
     "gl": None,

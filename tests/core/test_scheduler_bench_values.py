@@ -76,7 +76,7 @@ def test_a_document_of_two_rounds(rounds: list[str], monkeypatch: pytest.MonkeyP
         "agree": 36,
         "same_traces": 2,
         "different_traces": 2,
-        "config": {"core": scheduler.form(), "minutes": 0.01, "fps": 60, "rounds": 2, "seeds": 3, "repeats": 10},
+        "config": {"minutes": 0.01, "fps": 60, "rounds": 2, "seeds": 3, "repeats": 10},
     }
 
 

@@ -24,7 +24,6 @@ from support.machines import lowest_versions
 from trilane import machine
 from trilane.apps.run_folder import RunFolder
 from trilane.cache import cache_dir
-from trilane.compiled import form
 from trilane.hw_profiles.load import load_profile
 from trilane.pipeline.hardware_counters import availability
 from trilane.pipeline.unit_starter import UnitStarter
@@ -68,12 +67,6 @@ def test_one_core() -> None:
 def test_no_vnni() -> None:
     for facts in here_and_in_units(cpu_facts):
         assert not DOT_PRODUCTS & set(facts["flags"])
-
-
-def test_no_compiler() -> None:
-    assert form() == "interpreted"
-    assert not list(filter(machine.here.program, ("cc", "gcc", "clang", "c++", "x86_64-linux-gnu-gcc")))
-    assert machine.here.program("sh")
 
 
 def test_no_openvino() -> None:

@@ -158,7 +158,7 @@ def environment_python(row: Row, wanted: Sequence[str]) -> Path:
 
 @contextmanager
 def checkout(name: str) -> Iterator[tuple[Path, Path]]:
-    """The root of a copy of the tree in a folder `name`, not compiled, and its Python; for "" this tree and Python.
+    """The root of a copy of the tree in a folder `name` and its Python; for "" this tree and Python.
 
     The copy has every file that git knows or would take, and the real inputs beside it. The packages of its environment
     are those of this one. Raises CalledProcessError outside a checkout of git.

@@ -31,7 +31,6 @@ MACHINE = {
     "system": "Linux",
     "python": "3.11",
     "trilane": None,
-    "scheduler_core": "interpreted",
     "cpu": {
         "model": "a processor",
         "architecture": "x86_64",

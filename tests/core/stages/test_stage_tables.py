@@ -451,7 +451,6 @@ def test_facts_name_what_is_installed_and_nothing_else(monkeypatch: pytest.Monke
     facts = machine_facts.machine_facts({"vendor": "v"})
     assert facts["packages"] == {"numpy": "1", "torch": "2"}
     assert (facts["trilane"], facts["gl"]) == ("3", {"vendor": "v"})
-    assert facts["scheduler_core"] == machine_facts.form()
     assert facts["memory_bytes"] == machine.here.memory_bytes() and facts["cpu"] == machine_facts.cpu_facts()
     assert list(machine_facts.runtime_facts()) == ["onnxruntime"]
     assert machine_facts.machine_facts()["gl"] is None
