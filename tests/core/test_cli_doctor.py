@@ -50,7 +50,6 @@ def well_equipped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> pytest.Mon
     monkeypatch.setattr(doctor, "SHM", tmp_path)
     monkeypatch.setattr(doctor, "package_line", lambda name: f"pip install {name}")
     monkeypatch.setattr(doctor, "install_line", lambda extra: f"pip install trilane[{extra}]")
-    monkeypatch.setattr(doctor, "clone", lambda: Path("/clone"))
     monkeypatch.setattr(shutil, "disk_usage", lambda place: SimpleNamespace(free=3 * 2**20 + (place != tmp_path)))
     return monkeypatch
 
