@@ -1,6 +1,7 @@
-"""Why a run ended, a frame was lost or one was dropped. Rule: a kind and where it happened; nobody parses a string.
+"""The reasons why a run ended and why a frame was lost or dropped.
 
-`str()` of each is its key in the report and in messages.
+Rule: a reason is a kind and where it happened, so nobody parses a string. `str()` of each is its key in the report and
+in messages.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ class OutcomeKind(StrEnum):
 
 
 class Outcome(NamedTuple):
-    """How a run ended. `unit`: the one that could not be kept alive, for GAVE_UP alone."""
+    """How a run ended. `unit`: unit that could not be kept alive, for GAVE_UP alone."""
 
     kind: OutcomeKind
     unit: str = ""
@@ -39,7 +40,7 @@ class LossKind(StrEnum):
 
 
 class Loss(NamedTuple):
-    """Why a frame in flight was lost. `where`: the unit, for FAILED the stage, for ABORTED nothing."""
+    """Why a frame in flight was lost. `where`: name of the unit; of the stage for FAILED; empty for ABORTED."""
 
     kind: LossKind
     where: str = ""
@@ -51,8 +52,11 @@ class Loss(NamedTuple):
 class DropCause(StrEnum):
     """Why a waiting frame was taken out.
 
-    STALE: a newer one took its place. LATE: it could not be in time. POOL: an edge had no other slot. QUEUE_FULL and
-    TIMEOUT: it was turned away, or waited too long, before the first stage.
+    - STALE: a newer frame took its place.
+    - LATE: it could not be in time.
+    - POOL: an edge had no other slot.
+    - QUEUE_FULL: it was turned away before the first stage.
+    - TIMEOUT: it waited too long before the first stage.
     """
 
     STALE = "stale"
