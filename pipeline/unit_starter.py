@@ -196,8 +196,9 @@ class UnitStarter:
         return StartedUnit(int(answer), received[0], lifeline)
 
     def _received(self) -> tuple[bytes, list[int]]:
-        """Return the answer and its descriptors, both empty from a server that has ended, was stopped, or takes too
-        long.
+        """Return the answer and its descriptors.
+
+        Both are empty if the server has ended, was stopped, or takes too long.
         """
         end = time.monotonic() + ANSWER_S
         while time.monotonic() < end:
