@@ -157,6 +157,7 @@ class _Turns:
             self._begun.append(presented)
             for unit, cores in place.items():
                 self._processes.move(unit, cores)
+            # The scheduler shares the cores of the first stage's unit, as it does in a run.
             os.sched_setaffinity(0, place[self._scheduler_unit])
         return self._clock.wait(deadline_ns)
 
