@@ -40,7 +40,7 @@ class CpuTimes:
     """The CPU time of each unit and of each stage's jobs, in ns.
 
     `cores`: number of cores of each unit.
-    `sketch`: as for `trilane.scheduler.samples.Samples`.
+    `sketch`: function that makes a sketch, as for `trilane.scheduler.samples.Samples`.
     """
 
     def __init__(self, cores: Mapping[str, int], sketch: Callable[[], Sketch] | None = None) -> None:
@@ -53,9 +53,8 @@ class CpuTimes:
     def add(self, unit: str, stage: str, done: Done, run_begin_ns: int) -> None:
         """Book a job.
 
-        CPU time before a unit's first job counts at most the time that its cores had since the run began.
-
-        CPU time between two jobs counts as it was read: an impossible figure must stay visible (`is_possible`).
+        CPU time before a unit's first job counts at most the time that its cores had since the run began. CPU time
+        between two jobs counts as it was read: an impossible figure must stay visible (`is_possible`).
         """
         self.in_jobs_ns[unit] += done.cpu_ns
         self.stage_ns[stage].add(done.cpu_ns)
@@ -96,12 +95,12 @@ def use_of_cores(
 class Efficiencies:
     """How much of the time between the first and the last presented frame was work of jobs; no share can pass 1.
 
-    Jobs are added in the order of their ends. A job that began before that time or ended after it counts only the CPU
-    time that must lie within: its CPU time less the time that its cores had outside. So what a unit or a set of cores
-    is credited with fits into the time.
+    Jobs are added in the order of their ends. A job may begin before that time or end after it. Then it counts only the
+    CPU time that must lie within: its CPU time less the time that its cores had outside. So what a unit or a set of
+    cores is credited with fits into the time.
 
-    A unit's work counts a job with its CPU time divided by its threads, plus the busy time beyond its CPU time: then a
-    device of its own worked while the threads slept.
+    A unit's work counts the CPU time of a job divided by the unit's threads. It also counts the busy time beyond the
+    CPU time, because a device of its own worked then while the threads slept.
 
     `places`: cores and threads of each unit.
     """
@@ -130,8 +129,8 @@ class Efficiencies:
 
         Called after all jobs.
 
-        The first is the work of the slowest unit. The second is the CPU time of the fullest set of cores by the units
-        that have no other cores, which no division of the work avoids. The third is the CPU time of all units on all
+        The first is the work of the slowest unit. The second is the CPU time of the fullest set of cores, by the units
+        that have no other cores; no division of the work avoids it. The third is the CPU time of all units on all
         cores. Each is a share of the time that these had.
         """
         had_ns = self._last_ns - (self._first_ns or 0)

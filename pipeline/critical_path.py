@@ -239,9 +239,9 @@ def _divided_preempted(stage: str, ns: int, taken: Mapping[str, int], lacked_ns:
 class Budget:
     """What bounded a whole run: the path that ends with its last frame.
 
-    A path is walked back from every STEP-th presented frame, except for what lies in the last MARGIN frames before it:
-    paths that end with different frames meet there. So the cost per frame does not grow with the run. `ns_of` counts
-    from the first presented frame.
+    A path is walked back from every STEP-th presented frame. What lies in the last MARGIN frames before it is left to
+    the next walk; paths that end with different frames meet within that margin. So the cost per frame does not grow
+    with the run. `ns_of` counts from the first presented frame.
 
     `sharing`: knows who had a core that a job lacked.
     """

@@ -4,8 +4,8 @@ Rule: the processor counts, or the figure is said to be absent. Counts are of us
 opens them and all threads that it and its threads begin later, which the kernel adds up (`inherit`). A processor with
 fewer counters than events counts each for a part of the time; such counts are scaled to the whole time.
 
-Each event is opened and read by itself, because `inherit` and a group do not go together (`man 2 perf_event_open`):
-some kernels refuse to read such a group (ECHILD). A figure that cannot be read is missing from its job, which goes on.
+Each event is opened and read by itself, because `inherit` and a group do not go together (`man 2 perf_event_open`).
+Some kernels refuse to read such a group (ECHILD). A figure that cannot be read is missing from its job, which goes on.
 """
 
 from __future__ import annotations

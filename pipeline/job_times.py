@@ -3,9 +3,13 @@
 Rule: the kernel is asked where no frame waits for the answer.
 
 A piece of time is a job, or the time between two jobs. Every ns of CPU time is in one piece. Run delay is read after
-the answer to a job, and before the answer only if the job may have lost more than LOSS_NS. Nothing is read before a job
-except in three cases: the unit has had it for longer than HELD_NS, its stage's last job lost time, or other threads may
-have run between the jobs. docs/decisions/preempted-time.md says what the two thresholds can hide.
+the answer to a job, and before the answer only if the job may have lost more than LOSS_NS. Before a job something is
+read in three cases only:
+- the unit has had the job for longer than HELD_NS;
+- its stage's last job lost time;
+- other threads may have run between the jobs.
+
+docs/decisions/preempted-time.md says what the two thresholds can hide.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Measures, before a run, what units need for a frame. Rule: frames go through in the order of a run, one at a time.
 
-Every frame goes through all stages before the next one, and through the slots of an edge in turn. The reason is that
+Every frame goes through all stages before the next one, and through the slots of an edge in turn. That matters because
 the time of a stage depends on what it did last, on what its slot holds, and on how long it rested. Only time in which
 the unit had its cores counts, because others may use the machine meanwhile.
 """
@@ -78,7 +78,8 @@ def on_rungs(chain: Chain, frames: Sequence[int], rungs: int, follow: Sequence[s
 
     Each time is the median over `frames`. All frames go through one rung before the next, so that no frame follows
     itself. With several frames, the first of each rung warms up. A stage is left out unless it takes less on every
-    further rung; for example, nobody may be on the screen in any of the frames. Raises as `Chain.frame` does.
+    further rung. That happens, for example, where nobody is on the screen in any of the frames. Raises as `Chain.frame`
+    does.
     """
     medians: dict[str, list[float]] = {name: [] for name in follow}
     for rung in range(rungs):
@@ -112,7 +113,7 @@ def rehearse(
     `pipeline`: pipeline of which all units are measured, on `frames`.
     `variants`: the same pipeline with other settings of some units; only these are measured again, between the other
     stages.
-    `assets`, `starter`: as for a run.
+    `assets`, `starter`: arrays and fork server, as for a run.
 
     Raises TrilaneError when a unit cannot start or a stage fails, and KeyboardInterrupt when interrupted.
     """

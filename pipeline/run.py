@@ -85,23 +85,22 @@ def run_pipeline(
 
     `policy`: sequential, pipelined, latest or deadline.
     `fps`: rate that the frames are meant for, in frames a second; a longer frame time counts as a missed deadline.
-    `pace_fps`: rate at which frames are released. None releases them as fast as they are taken, or at `fps` under
-    `latest` and `deadline`, which need a rate.
+    `pace_fps`: rate at which frames are released, in frames a second. None releases them as fast as they are taken, or
+    at the rate `fps` under `latest` and `deadline`, which need one.
     `assets`: arrays that every stage may read.
     `hang_ns`: longest time of a job in ns; a unit whose job takes longer is restarted.
-    `latch_ms`: time in ms by which the first stage is expected to end before the second can take its frame; 0: the
-    first stage begins at once.
-    `works`: work of each rung of a ladder in thousandths, the most first. A frame that would be late is given less work
-    (`trilane.scheduler.work_ladder`), and the first stage is told (`SteppedStage`). Used where frames are released at a
-    rate.
+    `latch_ms`: margin in ms by which the first stage should end before the second can take its frame; 0: it begins at
+    once.
+    `works`: work of each rung of a ladder in thousandths, the most first; used where frames are released at a rate. A
+    frame that would be late is given less work (`trilane.scheduler.work_ladder`), and the first stage is told
+    (`SteppedStage`).
     `follow`: names of the stages whose time follows the work.
     `requests`: queue through which others ask for frames, at most `frames`; it is closed when this returns.
     `controls`: queue of what others ask of the run, closed when this returns. At the run's end, the frames that it has
     released count as requested.
     `governor`: governor that holds the units to shares of the time, and adds what it did to the report.
     `journal`: file for everything that happens, written while it happens, with nothing kept in memory. None keeps it
-    all in
-    `RunResult.recording` and `RunResult.jobs`.
+    all, in `RunResult.recording` and `RunResult.jobs`.
     `starter`: fork server that was started earlier; None makes one for this run.
     `on_progress(presented, requested)`, `on_message(text)`: functions that are called from this thread.
 

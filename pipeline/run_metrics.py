@@ -311,19 +311,19 @@ class RunMetrics(Record):
     `frame_time_ms`: times between presented frames.
     `latency_ms`: times from the sampled pose to the end of the stage that the pipeline names (the composited frame).
     `fps`: presented frames a second; 0 for fewer than two.
-    `fps_low`, `fps_high`: bounds of its 95 % interval, from that of the mean frame time; null when there are too few
-    frames.
+    `fps_low`, `fps_high`: bounds of the 95 % interval of `fps`, from that of the mean frame time; null when there are
+    too few frames.
     `deadline_misses`: number of frames presented after their deadline, or of frame times above the target.
     `xrbench`: XRBench's scores.
     `stages`: times of each stage, in the order of the pipeline.
-    `bytes`: bytes that all stages that count them moved for a presented frame; absent where no stage counts them.
+    `bytes`: bytes that the stages moved for a presented frame, over all stages that count them; absent where none does.
     `units`: shares of each unit.
-    `efficiency`: work of the slowest unit's jobs, as a share of the time from the first presented frame to the last;
-    null for fewer than two.
+    `efficiency`: work of the slowest unit's jobs, as a share of the time between the first and the last presented
+    frame; null for fewer than two.
     `core_efficiency`: the same share for the fullest cores.
     `machine_efficiency`: the same share for all cores of the run.
-    `bottleneck`: what most of the critical path is: a unit, `other programs`, `release`, `overhead`, or `held`; null
-    without a path.
+    `bottleneck`: name of what most of the critical path is: a unit, `other programs`, `release`, `overhead`, or `held`;
+    null without a path.
     `bound`: share of the bottleneck in the path, and the stage that has most of it.
     `core_shares`: use of each set of cores that a unit has, and of all cores; on the host clock.
     `policy`, `edge`: policy and edge rule of the scheduler.

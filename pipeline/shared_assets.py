@@ -1,7 +1,8 @@
 """Shares arrays of the parent with every unit of a run. Rule: written once, sealed, mapped, never copied.
 
-One region of anonymous memory holds them all: 8 bytes with the length of the index, the index as JSON, then the arrays,
-each on its own page. A unit maps it read-only. The kernel frees it when the last process that has it ends.
+One region of anonymous memory holds them all. It begins with 8 bytes for the length of the index, then the index as
+JSON, then the arrays, each on its own page. A unit maps it read-only. The kernel frees it when the last process that
+has it ends.
 """
 
 from __future__ import annotations

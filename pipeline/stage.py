@@ -26,7 +26,7 @@ class Skip(dict[str, float]):
 class Stage(Protocol):
     """One stage inside a unit's process, made by a `StageFactory`.
 
-    The stage at the end of `Pipeline.bypass` takes frames from two edges: `inputs` holds the slots of its own edge,
+    The stage at the end of `Pipeline.bypass` takes frames from two edges. Its `inputs` holds the slots of its own edge,
     then those of the edge at which skipping frames leave.
     """
 
@@ -37,7 +37,8 @@ class Stage(Protocol):
         """Do `frame` from `inputs[slot_in]` to `outputs[slot_out]`, and return metrics for the log, often none.
 
         The first stage of a pipeline has no input, the last no output. The header of the output slot already holds the
-        frame's number and sampling time; where both edges have the same header, it holds all of the input's fields.
+        frame's number and sampling time. Where both edges have the same header, it already holds all of the input's
+        fields.
         """
 
     def close(self) -> None:

@@ -39,8 +39,8 @@ def on_cores(cores: tuple[int, ...]) -> Iterator[None]:
 def prompt_answers() -> Iterator[None]:
     """Make the scheduler answer at once inside the `with` block.
 
-    It then does not wait for another unit's time slice on its core, for a thread that draws a progress bar, or for
-    garbage collection: a run makes no garbage in cycles.
+    It then waits neither for another unit's time slice on its core, nor for a thread that draws a progress bar. It does
+    not wait for garbage collection either, because a run makes no garbage in cycles.
     """
     switch_s, collects = sys.getswitchinterval(), gc.isenabled()
     sys.setswitchinterval(SWITCH_S)

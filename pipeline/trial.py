@@ -70,7 +70,7 @@ def try_in_turns(
 
     `groups`: placements to try; each round begins with another one.
     `windows`: first of the SLICE frames that every placement does, for each round.
-    `assets`, `starter`: as for a run.
+    `assets`, `starter`: arrays and fork server, as for a run.
 
     Raises TrilaneError when a unit cannot start or a stage fails, and KeyboardInterrupt when interrupted.
     """

@@ -169,7 +169,7 @@ def _close(unit: str, link: Link, stages: Iterable[BoundStage]) -> int:
 
 
 def _fail(link: Link, job_id: int, where: str, error: Exception) -> int:
-    """Answer with one sentence; the traceback goes to stderr, whose end the parent keeps."""
+    """Answer with one sentence, and return the exit code; the traceback goes to stderr, whose end the parent keeps."""
     traceback.print_exception(error)
     known = isinstance(error, TrilaneError)
     text = str(error) if known else f"{where}: {type(error).__name__}: {error}"

@@ -177,7 +177,7 @@ class UnitProcesses:
         return messages
 
     def why_ended(self, unit: str) -> str:
-        """Return what a unit that has ended wrote last, to be put behind a sentence."""
+        """Return the end of a sentence that says what an ended unit wrote last; empty if it wrote nothing."""
         end = after_stderr(self.stderr_tails.get(unit, ""))
         return f"; {end}" if end else ""
 

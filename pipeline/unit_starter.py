@@ -1,6 +1,6 @@
 """The parent's end of the fork server. Rule: it starts units, and leaves no process when it is closed.
 
-Units outlive the server. A server that has ended or was stopped is replaced: the caller calls `renew` from time to
+Units outlive the server. A server that has ended or was stopped is replaced. The caller calls `renew` from time to
 time, so that a fresh server has imported what units need before the next unit is wanted.
 """
 
@@ -37,7 +37,7 @@ class StartedUnit(NamedTuple):
     """A unit's process; its owner closes both descriptors.
 
     `pidfd`: descriptor that is readable when the process has ended.
-    `lifeline`: descriptor at whose end the process ends: when it is closed, or when this process ends.
+    `lifeline`: descriptor that keeps the process alive: it ends when this is closed, or when this process ends.
     """
 
     pid: int

@@ -1,7 +1,7 @@
 """Runs several pipelines in virtual time on the same hardware, each with a core of its own.
 
-Rule: nothing here decides which job a pipeline does next; its core decides that. This module decides two things: whose
-job a unit takes when several have handed one to it (turns.py), and how fast jobs go that run at the same time.
+Rule: nothing here decides which job a pipeline does next; its core decides that. This module decides whose job a unit
+takes when several pipelines have handed it one (turns.py). It also decides how fast jobs go that run at the same time.
 
 Theory of operation. Each pipeline has its own `Core` with its own policy, ledger and recording, like two applications
 on one phone, and none knows of the others. Each unit of a pipeline has a *seat*: the hardware that does its jobs. On a
@@ -10,8 +10,8 @@ at once, each with an equal share. An example is a core of this machine, between
 unit does its own jobs in the order in which they were handed to it.
 
 At one instant, all events and all deadlines of the cores at that time come first; each is a step of one core. Only then
-do jobs begin, so that no ready job is passed over because it was named later. Jobs that run change their speed when
-others begin or end, so the rest of a job is kept as a whole number of ns / `ONE`.
+do jobs begin, so that no ready job is passed over because it was named later. Running jobs change their speed when
+others begin or end. The rest of a job is kept as a whole number of ns / `ONE`.
 
 Accounts. A job that waits while another pipeline has its seat was preempted before (`JobDone.preempted_before_ns`). On
 a divided seat it is preempted within (`preempted_ns`). A job that the memory slows down is busy all the while.
@@ -75,7 +75,7 @@ Speed = Callable[[Runs, Sequence[Runs]], int]
 
 
 class _Waits(NamedTuple):
-    """A job that was handed to its unit. `order`: place of the hand-over among all events of the run."""
+    """A job that was handed to its unit. `order`: number that grows with each hand-over."""
 
     job: Job
     order: int

@@ -53,7 +53,7 @@ class Choice:
         return sink is None or bool(sink.free) or sink.can_claim()
 
     def preferred(self, runnable: Sequence[StageState], now_ns: int) -> StageState:
-        """Return the stage of `runnable` that a unit takes by the policy."""
+        """Return the stage of `runnable` whose job the policy chooses for the unit."""
         return self._stages[self._policy.choose([self._candidate(stage, now_ns) for stage in runnable]).position]
 
     def is_full(self) -> bool:

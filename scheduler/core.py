@@ -319,7 +319,7 @@ class Core:
     # events of the run
 
     def _on_stalled(self, event: SchedulerStalled) -> None:
-        # The units could not be heard in that time, so their deadlines and estimates do not count it.
+        # The units could not be heard in that time, so their deadlines and expected ends do not count it.
         for unit in self.units.values():
             unit.deadline_ns = watchdog.extended_deadline_ns(unit, event.ns)
             unit.head_since_ns += event.ns

@@ -124,7 +124,7 @@ class Flow:
         self.drop([edge.drop(slot)], self._producer(stage, edge).position, cause)
 
     def mark_lost(self, frame: int, loss: Loss) -> None:
-        """Count a frame in flight as lost; the caller frees its slots."""
+        """Count a frame in flight as lost; its slots, if it has any, are not freed here."""
         state = self.frames.pop(frame)
         self._ledger.lost[loss] += 1
         self.mark_dirty(self.stages[0].unit)

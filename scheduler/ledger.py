@@ -96,9 +96,9 @@ class _UnitBook:
 class Books:
     """How a run is accounted for.
 
-    `target_period_ns`: frame time above which a deadline counts as missed, instead of the frames' deadlines; 0: the
-    frames' deadlines count.
-    `sketch`: as for `trilane.scheduler.samples.Samples`.
+    `target_period_ns`: longest frame time that is not a missed deadline; the frames' own deadlines then do not count.
+    0: only the frames' own deadlines count.
+    `sketch`: function that makes a sketch, as for `trilane.scheduler.samples.Samples`.
     """
 
     target_period_ns: int = 0

@@ -48,10 +48,10 @@ def ranked(cores: Sequence[Core], times: Times, rules: Rules, fixed: Placement |
 
 
 def chosen(found: Sequence[Ranked], rule: Ranked) -> Ranked:
-    """Return the placement of `found`, which is `ranked`, to take; it is never predicted longer than `rule`.
+    """Return the placement of `found` to take; `found` is in the order of `ranked`.
 
-    `rule`: placement for any run; it stays unless another one is shorter by more than WORTH. Then the choice is the
-    placement within WORTH of the shortest that shares least.
+    It is never predicted longer than `rule`, the placement for any run. The rule stays unless another placement is
+    shorter by more than WORTH. Otherwise the choice is the placement within WORTH of the shortest that shares least.
     """
     near = [each for each in found if each.frame_ns * (1 - WORTH) <= found[0].frame_ns]
     if rule.frame_ns * (1 - WORTH) <= found[0].frame_ns:
@@ -60,7 +60,7 @@ def chosen(found: Sequence[Ranked], rule: Ranked) -> Ranked:
 
 
 def worth_trying(found: Sequence[Ranked], rule: Ranked) -> list[Ranked]:
-    """Return those of `found`, which is `ranked`, that may be the best.
+    """Return the placements of `found` that may be the best; `found` is in the order of `ranked`.
 
     The `chosen` one comes first, and the `rule` is always among them.
     """

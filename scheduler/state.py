@@ -21,7 +21,7 @@ class UnitState:
     """The state of one unit.
 
     `life`: state in the table of unit_life.py.
-    `deadline_ns`: time after which what that state waits for is late.
+    `deadline_ns`: time from which on the event that this state waits for is late.
     `queue`: the running job, then the one dispatched ahead.
     `queue_capacity`: number of jobs that it may hold now (`update_queue_capacity`).
     `head_since_ns`: time since which the running job could run.

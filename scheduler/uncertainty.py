@@ -49,7 +49,10 @@ def batch_interval(values: Sequence[float]) -> float | None:
 
 
 def _half_width(values: Sequence[float], batches: int) -> float:
-    """Return Student's t over the means of `batches` batches; the first values, which fill none, do not count."""
+    """Return half the width of the 95 % interval: Student's t over the means of `batches` batches.
+
+    The first values, which fill no batch, do not count.
+    """
     length = len(values) // batches
     first = len(values) - batches * length
     means = [fmean(values[first + batch * length : first + (batch + 1) * length]) for batch in range(batches)]

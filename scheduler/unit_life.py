@@ -26,7 +26,7 @@ REFUSED: Final = -2  # the event cannot happen
 
 
 class DeadlinePassed:
-    """The event that the unit's deadline has passed, which no driver tells."""
+    """The event that a unit's deadline has passed; the core finds it out itself, no driver sends it."""
 
 
 class UnitLifeError(Exception):

@@ -5,12 +5,15 @@ work, and each further rung is less work at the price of a worse picture. Some s
 network); the others are taken to need the same time.
 
 The time of a stage on a rung is the time that it took there alone, times its load. The time alone comes from
-`set_alone`, or else is proportional to the work. The load is the ratio of the stage's time to its time alone, as the
-median of its last three jobs, so that one slow job decides nothing.
+`set_alone`, or else is proportional to the work. The load is the ratio of the stage's time to its time alone. It is the
+median of the stage's last three jobs, so that one slow job decides nothing.
 
-The use of a rung is the larger of two shares: the busiest unit's time for a frame as a share of the period, and the
-time of all stages as a share of the deadline. The wanted rung is the first whose use is at most `FULL`. Without such a
-rung it is the first that no other betters by more than a twentieth, because less work would then save nothing.
+The use of a rung is the larger of two shares:
+- the busiest unit's time for a frame, as a share of the period;
+- the time of all stages, as a share of the deadline.
+
+The wanted rung is the first whose use is at most `FULL`. Without such a rung it is the first that no other betters by
+more than a twentieth, because less work would then save nothing.
 
 The ladder steps down at once. It takes one step up after `patience` frames in which the use of the rung above was at
 most `ROOM`. A step up that did not last as long doubles the patience, up to `MOST_PATIENCE`.

@@ -151,6 +151,6 @@ class Link:
         return self.heartbeat_socket.receive()
 
     def close(self) -> None:
-        """Close both; heartbeats that were sent are delivered within `linger_ms`, or dropped."""
+        """Close both; heartbeats that were sent are delivered within `linger_ms`."""
         self.heartbeat_socket.close()
         self.job_pipe.close()

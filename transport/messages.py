@@ -1,9 +1,9 @@
 """The messages between the scheduler and its units, and the job pipe over which jobs and their answers go.
 
-There is a fixed list of messages with typed fields; anything else is refused. The bytes of a message: one byte that
-says which message it is, its integer fields with 64 bits each, and at the end, packed with msgpack, the field of
-another type. That last part is left out when the field is empty. Integers are not packed with msgpack because reading
-them would then take twice the time in a process that has just been woken. Nothing is ever pickled.
+There is a fixed list of messages with typed fields; anything else is refused. The first byte of a message says which
+message it is. Its integer fields follow with 64 bits each. At the end comes the field of another type, packed with
+msgpack, or nothing when that field is empty. Integers are not packed with msgpack, because reading them would then take
+twice the time in a process that has just been woken. Nothing is ever pickled.
 
 A job pipe is two pipes, one each way, in packet mode (O_DIRECT of pipe(2)), in which every read returns one whole
 message. One message wakes one process, with no thread between. Heartbeats do not go over it (see
