@@ -157,6 +157,7 @@ class Paths:
         key, job = now.key, now.job
         own = [self._before.get(key), self._input.get(key)]
         mine = self._jobs.get(own[0]) if own[0] else None
+        # It was handed over while its unit did another job, so it waited for that one.
         if mine is not None and mine.job.end_ns > job.dispatch_ns:
             return mine, False
         heard = [other for other in now.after if other in own or other[0] in self._next[job.stage]]

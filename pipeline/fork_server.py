@@ -55,6 +55,8 @@ def serve(requests: socket.socket) -> None:
             break
         request = json.loads(packet)
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGCHLD})  # a unit that dies at once keeps its process id
+        # This process has one thread. A lock that another thread held at a fork would stay locked in the child for
+        # ever.
         pid = os.fork()
         if pid == 0:
             requests.close()
@@ -88,6 +90,7 @@ def _run_unit(request: dict[str, Any], fds: Sequence[int]) -> int:
         os.setpgid(0, 0)
         ctypes.CDLL(None).prctl(PR_SET_NAME, process_name(request["unit"]).encode(), 0, 0, 0)
         os.sched_setaffinity(0, request["cores"])
+        # Set before the unit's own imports, because libraries read it when they are loaded.
         os.environ |= dict.fromkeys(THREAD_LIMITS, str(request["threads"]))
         spec = json.loads(os.pread(spec_fd, os.fstat(spec_fd).st_size, 0))
         os.close(spec_fd)
@@ -143,6 +146,7 @@ def die_with_parent(parent_pid: int, number: int = signal.SIGKILL) -> None:
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(PR_SET_PDEATHSIG, number, 0, 0, 0) != 0:
         raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG)")
+    # A parent that ended before the call above sends no signal any more.
     if os.getppid() != parent_pid:
         os._exit(1)
 

@@ -114,6 +114,7 @@ class RealtimeClock:
         self._tell_unanswered()
         events = self._listen(deadline_ns) if self._begun else self._begin()
         now_ns = time.monotonic_ns()
+        # This process was stopped. Unless the core is told, it restarts healthy units.
         if now_ns - self._step_ns > LONGEST_STEP_NS:
             events.insert(0, SchedulerStalled(now_ns - self._step_ns))
         self._step_ns = now_ns
@@ -258,6 +259,7 @@ class RealtimeClock:
     def _done(self, unit: str, message: Done) -> Event:
         job, dispatch_ns = self._open.pop(message.id)
         frame = self._core.frames.get(job.frame)
+        # `ended` books the job later, so that the next one is sent first.
         self._unbooked.append((job, dispatch_ns, None if frame is None else frame.ready_ns, message))
         if frame is not None and self._requests is not None and job.stage == self._last_stage:
             self._requests.answered(job.frame)

@@ -125,6 +125,7 @@ def run_pipeline(
             awake(governor is None or governor.is_prompt) as idle_cores,
             unit_processes(pipeline, assets or {}, starter, UnitProcesses) as processes,
         ):
+            # A run with a journal may last for days, so the ledger keeps sketches instead of all values.
             target_ns, sketch = 0 if settings.deadline_ns else round(1e9 / fps), None if journal is None else DdSketch
             core = Core(pipeline.graph(), settings, Books(target_ns, sketch))
             clock = RealtimeClock(core, processes, interrupts, log, requests, governor, on_progress, sketch)
@@ -182,6 +183,7 @@ class _Run:
         self._startup_ms = start_units(self._processes, self._core.graph.units, self._interrupts)
         self.pids = self._processes.pids
         graph, settings = self._core.graph, self._core.settings
+        # The last stage writes files, so the frames before the run leave it out.
         chain = Chain(graph, dict.fromkeys(graph.units, self._processes), self._interrupts, whole=False)
         if settings.works:
             few = _spread(settings.frames, FRAMES_ON_RUNGS)

@@ -8,6 +8,7 @@ from trilane.errors import TrilaneError
 from trilane.pipeline.result import Failure
 from trilane.transport.messages import Failed
 
+# The memory of a run must not grow with its length; the journal has all messages.
 MOST_MESSAGES = 1000
 
 

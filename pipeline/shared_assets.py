@@ -45,6 +45,7 @@ def share_assets(assets: Assets) -> int:
         os.pwrite(fd, len(head).to_bytes(LENGTH_BYTES, "little") + head, 0)
         for name, array in assets.items():
             _write_all(fd, np.ascontiguousarray(array), start + index[name]["offset"])
+        # Sealed, so that no unit can change what another one reads.
         fcntl.fcntl(fd, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_WRITE)
     except OSError as error:
         os.close(fd)

@@ -326,6 +326,7 @@ class Timeline:
         after.append((job.stage, job.frame))
         self._heard_ns[job.frame] = self._now_ns
         frame = self._frame(job.frame)
+        # The scheduler's own record computes the latency, so that it is defined once.
         frame.end_stage(self._positions[job.stage], self._latency_position, event.t_sampled_ns, event.t_end_ns)
         frame.skips |= event.skips
         yield Done(handed, event)

@@ -50,6 +50,7 @@ def serve(raw_spec: dict[str, Any], number_of: Mapping[int, int]) -> int:
     spec = UnitSpec.model_validate(raw_spec).renumbered(number_of)
     context = context_on_cores(spec.scheduler_cores)
     link = Link(context, JobPipe(spec.job_pipe, waits=True), LINGER_MS)
+    # `context_on_cores` leaves this thread with the I/O thread's slice; a unit's is longer.
     use_slice(UNIT_NS)
     link.connect(spec.endpoint)
     try:

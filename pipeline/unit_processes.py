@@ -58,6 +58,7 @@ class _Process:
 
     def kill(self) -> None:
         with contextlib.suppress(ProcessLookupError):
+            # Through a pidfd the signal can never reach another process that was given the same number.
             signal.pidfd_send_signal(self.pidfd, signal.SIGKILL)
 
     def wait(self) -> None:

@@ -125,7 +125,9 @@ class UnitStarter:
             stdout=subprocess.DEVNULL,
             stderr=self._stderr,
             pass_fds=[theirs.fileno()],
+            # One thread for each library: a fork copies only the thread that forks.
             env={**os.environ, **dict.fromkeys(THREAD_LIMITS, "1")},
+            # Ctrl-C then reaches the parent alone, which decides what is finished first.
             process_group=0,
         )
 

@@ -63,6 +63,7 @@ class Flow:
         if bypass is not None and stage is bypass.begin:
             fresh, bypass.must_be_fresh = bypass.must_be_fresh, False
         slots = (slot_in, slot_out, epoch, fresh, self.frames[frame].rung)
+        # Here and in other places on a frame's way: the constructor of a named tuple takes longer.
         job = tuple.__new__(Job, (self._jobs, stage.unit.name, stage.name, frame, *slots))
         self._jobs += 1
         return job

@@ -78,6 +78,7 @@ class FrameTimes:
             self._blocks.append(self._open_ns / self._open_frames)
             self._open_ns = self._open_frames = 0
         if len(self._blocks) == MOST_BLOCKS:
+            # Two neighbours become one block, so that the memory stays bounded.
             pairs = zip(self._blocks[::2], self._blocks[1::2], strict=True)
             self._blocks = [(before + after) / 2 for before, after in pairs]
             self._block_frames *= 2

@@ -14,6 +14,7 @@ from typing import Final, Protocol
 
 from trilane.scheduler.stats import percentile, summary_row
 
+# At 8 bytes a value, runs of some minutes stay exact, and runs of days stay small (docs/decisions/journal.md).
 MOST_EXACT: Final = 20_000
 #: Number of kept values that go to the sketch with each further value, so that no step of the scheduler takes long.
 MOVED_AT_ONCE: Final = 4

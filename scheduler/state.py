@@ -87,6 +87,7 @@ class UnitState:
         if self.life != READY or self.hold_until_ns != NEVER:
             self.queue_capacity = 0
         else:
+            # A capped unit pauses after each job, so it holds none ahead.
             self.queue_capacity = HELD_JOBS if self.duty == FULL_DUTY else 1
 
     def expected_end_ns(self) -> int:

@@ -112,6 +112,7 @@ class EdgeSlots:
             dropped = self.drop((self.passing or self.ready)[0])
         if not self.free:
             raise SlotError("no slot to claim")
+        # The slot that was given back last: its memory may still be in the caches.
         slot = self.free.pop()
         self._move("claim", slot)
         self.frame[slot] = frame
