@@ -76,7 +76,10 @@ class BoundStage:
 
     @property
     def works_asleep(self) -> bool:
-        """Whether the job goes on while its threads sleep: on hardware of its own, or held to the pace of a chip."""
+        """Whether the job goes on while its threads sleep.
+
+        It does on hardware other than the cores, and when it is held to the pace of a chip.
+        """
         return self._pace_ns > 0 or self._unit.has_device
 
     def sampled_ns(self, slot_in: int, slot_out: int) -> int:

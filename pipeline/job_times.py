@@ -27,7 +27,7 @@ JOBS_PER_LOOK: Final = 64  # jobs between two searches for new threads, where no
 
 
 class Meter(Protocol):
-    """`trilane.pipeline.core_meter.CoreMeter`."""
+    """The part of `trilane.pipeline.core_meter.CoreMeter` that a `JobClock` uses."""
 
     @property
     def threads(self) -> int: ...
@@ -87,7 +87,7 @@ class JobClock:
         cpu_ns = self._meter.cpu_ns()
         end_ns = self._end_ns = self._now_ns()
         wall_ns = end_ns - self._begin_ns
-        if not self._knows_cpu and cpu_ns > wall_ns:  # of one thread: the rest is of the time since the last answer
+        if not self._knows_cpu and cpu_ns > wall_ns:  # one thread cannot have more
             self._cpu_before_ns += cpu_ns - wall_ns
             cpu_ns = wall_ns
         self._cpu_ns = cpu_ns

@@ -263,12 +263,12 @@ class RealtimeClock:
         self._unbooked.append((job, dispatch_ns, None if frame is None else frame.ready_ns, message))
         if frame is not None and self._requests is not None and job.stage == self._last_stage:
             self._requests.answered(job.frame)
-        return tuple.__new__(JobDone, (unit, *message[:7], message.skips > 0))  # the constructor is slow
+        return tuple.__new__(JobDone, (unit, *message[:7], message.skips > 0))  # its constructor is slow
 
     def _failed(self, unit: str, message: Failed) -> Event | None:
         self._log.fail_with(message)
         if message.id < 0:
-            return None  # the unit could not be built again; the end of its process follows
+            return None  # its stages could not be built again; the end of the process follows
         self._open.pop(message.id)
         return JobFailed(unit, message.id)
 

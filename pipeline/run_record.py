@@ -72,7 +72,7 @@ class Source(Protocol):
 
 
 class Caps(Protocol):
-    """The governor of a run."""
+    """The part of a run's governor that is recorded."""
 
     @property
     def temperatures_c(self) -> Mapping[str, float]:

@@ -80,7 +80,7 @@ class Gone(NamedTuple):
 
 
 class Done(NamedTuple):
-    """A job whose end the scheduler has heard of."""
+    """A job that has ended, as the scheduler has heard."""
 
     handed: Handed
     event: JobDone
@@ -224,7 +224,7 @@ class Timeline:
         self._now_ns = step.now_ns
         after: list[Key] = []
         for event in step.events:
-            if type(event) is JobDone:  # most of them
+            if type(event) is JobDone:  # most events
                 facts += self._end(event, after)
             elif (handler := self._handlers.get(type(event))) is not None:
                 handler(event)

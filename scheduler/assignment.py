@@ -41,7 +41,7 @@ class Assignment:
         until then has waited for the scheduler since.
         """
         dirty = self._flow.dirty
-        for unit in dirty:  # a dispatch may append to the list, also a unit that was looked at before
+        for unit in dirty:  # a dispatch may append to it, even a unit looked at before
             while len(unit.queue) < unit.queue_capacity:
                 stage = self._next_stage(unit, now_ns)
                 if stage is None:

@@ -1,17 +1,17 @@
-"""Runs several pipelines in virtual time on the same hardware, each with a core of its own.
+"""Runs several pipelines in virtual time on the same hardware, each with a scheduler (`Core`) of its own.
 
-Rule: nothing here decides which job a pipeline does next; its core decides that. This module decides whose job a unit
+Rule: nothing here decides which job a pipeline does next; its `Core` decides that. This module decides whose job a unit
 takes when several pipelines have handed it one (turns.py). It also decides how fast jobs go that run at the same time.
 
 Theory of operation. Each pipeline has its own `Core` with its own policy, ledger and recording, like two applications
 on one phone, and none knows of the others. Each unit of a pipeline has a *seat*: the hardware that does its jobs. On a
 seat with turns one job runs at a time; the others wait, and their units are preempted. On a *divided* seat all jobs run
-at once, each with an equal share. An example is a core of this machine, between whose processes the kernel switches. A
-unit does its own jobs in the order in which they were handed to it.
+at once, each with an equal share. An example is a processor core of this machine, between whose processes the kernel
+switches. A unit does its own jobs in the order in which they were handed to it.
 
-At one instant, all events and all deadlines of the cores at that time come first; each is a step of one core. Only then
-do jobs begin, so that no ready job is passed over because it was named later. Running jobs change their speed when
-others begin or end. The rest of a job is kept as a whole number of ns / `ONE`.
+At one instant, all events and all deadlines of the schedulers come first; each is a step of one `Core`. Only then do
+jobs begin, so that no ready job is passed over because it was named later. Running jobs change their speed when others
+begin or end. The rest of a job is kept as a whole number of ns / `ONE`.
 
 Accounts. A job that waits while another pipeline has its seat was preempted before (`JobDone.preempted_before_ns`). On
 a divided seat it is preempted within (`preempted_ns`). A job that the memory slows down is busy all the while.
@@ -132,7 +132,7 @@ class _Line:
 
 
 class BesideDriver:
-    """The driver of several cores in virtual time. Equal inputs give equal runs."""
+    """The driver of several `Core`s in virtual time. Equal inputs give equal runs."""
 
     def __init__(
         self,
@@ -148,7 +148,7 @@ class BesideDriver:
         `turns`: name of a rule of `TURNS`, for every seat that is not among the `divided` ones.
         `divided`: names of the divided seats.
         `speed`: speed of jobs beside each other; None: only shares of its seat slow a job.
-        `keep`: whether to record the steps of each core, and the jobs that end.
+        `keep`: whether to record the steps of each `Core`, and the jobs that end.
 
         Raises ValueError for an unknown policy, edge or rule of turns.
         """
@@ -166,7 +166,7 @@ class BesideDriver:
                 self._push(at_ns, line.number, event)
 
     def run(self) -> list[Outcome]:
-        """Run until every core finishes; raises RuntimeError when nothing can ever happen again."""
+        """Run until every `Core` finishes; raises RuntimeError when nothing can ever happen again."""
         while not all(line.core.finished for line in self.lines):
             self._advance(self._next_ns())
             while self._step_one():
@@ -195,7 +195,7 @@ class BesideDriver:
                 running.had += passed_ns * running.held
 
     def _step_one(self) -> bool:
-        """Tell one core of one thing that happens now: an event, a job's end or its deadline.
+        """Tell one `Core` of one thing that happens now: an event, a job's end or its deadline.
 
         Return False if there is none.
         """

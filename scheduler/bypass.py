@@ -64,7 +64,7 @@ def is_older_before(stage: StageState, frame: int, frames: Mapping[int, FrameSta
 
 
 def side_of(stage: StageState, slot_in: int) -> tuple[EdgeSlots, int]:
-    """Return the edge and its slot that `Job.slot_in` means for a job of `stage`, which has an input."""
+    """Return the edge and the slot that `slot_in` of a job of `stage` refers to; the stage must have an input."""
     own = stage.input
     assert own is not None
     if stage.bypassed is None or slot_in < len(own.state):
@@ -90,6 +90,6 @@ def stale_slot(stage: StageState, frames: Mapping[int, FrameState]) -> int:
 
 
 def _parts(stage: StageState, frame: int, bypassed: EdgeSlots, frames: Mapping[int, FrameState]) -> bool:
-    """Return whether a frame that does not skip is still on its way between the two oldest that wait to skip."""
+    """Return whether a frame between the two oldest that wait to skip is still on its way to the stage."""
     newer = bypassed.frame[bypassed.passing[1]]
     return any(frame < number < newer and state.position < stage.position for number, state in frames.items())

@@ -11,7 +11,13 @@ from typing import NamedTuple
 
 
 class OutcomeKind(StrEnum):
-    """How a run ended: every frame went through; `Stop`; `Abort`; a unit failed too often."""
+    """How a run ended.
+
+    - DONE: every frame went through.
+    - STOPPED: `Stop` was asked for.
+    - ABORTED: `Abort` was asked for.
+    - GAVE_UP: a unit failed too often.
+    """
 
     DONE = "done"
     STOPPED = "stopped"
@@ -30,7 +36,12 @@ class Outcome(NamedTuple):
 
 
 class LossKind(StrEnum):
-    """What ended a frame in flight: its unit died, hung or was given up; its stage failed; the run was aborted."""
+    """What ended a frame in flight.
+
+    - DIED, HUNG, GAVE_UP: its unit died, hung, or was given up.
+    - FAILED: its stage raised an error.
+    - ABORTED: the run was aborted.
+    """
 
     DIED = "died"
     HUNG = "hung"
@@ -67,7 +78,7 @@ class DropCause(StrEnum):
 
 
 class Drop(NamedTuple):
-    """Where a frame was dropped, as `producer->consumer`, and why."""
+    """A reason to drop a frame. `edge`: place of the drop, as `producer->consumer`."""
 
     edge: str
     cause: DropCause

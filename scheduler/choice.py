@@ -57,7 +57,7 @@ class Choice:
         return self._stages[self._policy.choose([self._candidate(stage, now_ns) for stage in runnable]).position]
 
     def is_full(self) -> bool:
-        """Whether as many frames are in flight as may be."""
+        """Whether the number of frames in flight has reached its limit."""
         return 0 < self._in_flight <= len(self._frames)
 
     def latch_from_ns(self, now_ns: int) -> int:

@@ -1,7 +1,7 @@
 """Computes the earliest time at which a frame can be presented.
 
 Rule: the bound is never later than the truth, so that no frame is given up that could be in time. It is a lower bound
-as far as service times are what they were lately.
+if service times stay what they were lately.
 
 At every stage older frames go first. So a frame begins at a stage after the older frames' work there, or after its own
 work at the stages before, whichever ends later. With a bypass, a frame that has not come to its beginning is taken to

@@ -2,7 +2,7 @@
 
 Theory of operation. A driver calls `step` with the time and the events since the last step. The core answers with
 actions to do now and with the time at which it wants to be asked again. The same steps give the same answers, so a run
-can be replayed from its events alone. One step does five things:
+can be replayed from its events alone. One step does five things, in this order:
 - Each event moves slots, frames and units.
 - When the alarm has gone off, units whose deadline or hold is over are killed, started again or let work.
 - The source releases the frames that are due.
@@ -16,12 +16,13 @@ free behind it. Nothing else holds back the stages before a slow one.
 Bypass. A frame may skip the stages between two others, when the first of these says so. It then waits for the second in
 the slot that it has, and overtakes no frame (bypass.py).
 
-Dirty units. A step looks only at units for which something has changed: the unit's own job ended, a frame came to one
-of its stages, a slot got free behind one, its life or duty changed. Whoever changes such a thing calls `mark_dirty`. A
-dispatch may make a unit dirty that this step has already looked at; the step then looks at it again.
+Dirty units. A step looks only at units for which something has changed. The unit's own job ended, a frame came to one
+of its stages, a slot got free behind one, or its life or duty changed. Whoever changes such a thing calls `mark_dirty`.
+A dispatch may make a unit dirty that this step has already looked at; the step then looks at it again.
 
-The alarm is a time before which no unit's deadline or hold can be over (watchdog.py). Asking all units finds it, which
-is done only when it has gone off or was reset. Events that put a deadline off leave it as it is, so it may be early.
+The alarm is a time before which no unit's deadline or hold can be over (watchdog.py). It is found by asking all units,
+and only when it has gone off or was reset. Events that put a deadline off leave the alarm as it is, so it may go off
+too early.
 
 Dispatch ahead and leading. A unit holds its next job while one runs, so that no message delay lies between them. A
 policy that wants the newest frame hands the next job over only `lead_ns` before the running one should end. Latching is

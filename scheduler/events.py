@@ -122,7 +122,7 @@ class FrameRequest(NamedTuple):
 
 
 class Hold(NamedTuple):
-    """Release only `frames` more frames from now on, and none of them by its time; -1 ends the hold.
+    """Release `frames` more frames now, and no others until the next `Hold`; -1 ends the hold.
 
     Frames that were released before go on. A rate goes on from the moment at which the hold ends.
     """
@@ -268,7 +268,7 @@ class Settings:
     `asked`: whether `FrameRequest` alone releases frames.
     `latch_ns`: margin by which a frame's first stage is expected to end before the second can take it. The first stage
     begins that late so that the pose is newer and waits less.
-    `deadline_ns`: time from a frame's release to its presentation.
+    `deadline_ns`: longest time from a frame's release to its presentation.
     `works`: work of each rung of the ladder (work_ladder.py) in thousandths, 1000 first, falling; empty: no ladder.
     `follow`: names of the stages whose time follows the work.
     `in_flight`: limit of frames between pose and presentation.
@@ -276,7 +276,7 @@ class Settings:
     `queue_timeout_ns`: longest wait of a released frame.
     `hang_ns`: longest time of a job, and longest time for which an idle unit may leave a ping unanswered.
     `start_ns`: longest time of a unit's start.
-    `max_failures`: failures in a row, with no finished job between them, after which a unit is given up.
+    `max_failures`: number of failures in a row, with no finished job between them, after which a unit is given up.
     """
 
     frames: int

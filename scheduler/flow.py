@@ -22,7 +22,10 @@ class Flow:
     """
 
     def __init__(self, graph: Graph, ledger: Ledger, drops: bool) -> None:
-        """`drops`: whether the policy drops waiting frames, so that each further waiting frame matters."""
+        """Begin with no frame in flight.
+
+        `drops`: whether the policy drops waiting frames, so that each further waiting frame matters.
+        """
         self.stages, self.units, self.edges = build(graph)
         self.stage_named = {stage.name: stage for stage in self.stages}
         self.frames: dict[int, FrameState] = {}

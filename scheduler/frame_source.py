@@ -1,4 +1,4 @@
-"""Releases frames and queues them within limits. Rule: each frame that comes here leaves it once, or is counted."""
+"""Releases frames and queues them within limits. Rule: each frame leaves here once, or is counted."""
 
 from __future__ import annotations
 

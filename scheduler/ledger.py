@@ -63,7 +63,7 @@ class _UnitBook:
         self.restarts = 0
 
     def add_job(self, begin_ns: int, end_ns: int, preempted_ns: int, asleep_ns: int, preempted_before_ns: int) -> None:
-        """Book a job, and the time without a core before it in which the unit had it and did no other job."""
+        """Book a job, and the time before it in which the unit had it, did no other job and had no core."""
         self.jobs += 1
         held_from_ns = max(self.last_end_ns, self.since_ns)
         if begin_ns > held_from_ns:
@@ -265,7 +265,7 @@ class Ledger:
             "xrbench": {
                 "real_time": self._lateness.real_time_score,
                 "qoe": self.presented_count / requested if requested else 0.0,
-                "energy": None,  # filled in by a caller that knows the power
+                "energy": None,  # a caller that knows the power fills it in
             },
             "stages": {stage.name: self._stage_row(stage.name, stage.unit) for stage in self._graph.stages},
             "units": {unit: book.shares() for unit, book in self._units.items()},

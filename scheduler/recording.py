@@ -102,7 +102,7 @@ def read(path: Path) -> Recording:
             if header["schema"] != SCHEMA:
                 raise ValueError(f"schema {header['schema']!r}; this Trilane reads {SCHEMA}")
             recording = Recording(graph_of(header["graph"]), settings_of(header["settings"]))
-            Core(recording.graph, recording.settings)  # says what is wrong with them
+            Core(recording.graph, recording.settings)  # raises an error that says what is wrong
             for number, line in enumerate(file, start=1):  # noqa: B007 - named in the message below
                 row = json.loads(line)
                 now_ns = row["t"]

@@ -40,7 +40,10 @@ class Samples:
     """
 
     def __init__(self, sketch: Callable[[], Sketch] | None = None) -> None:
-        """`sketch`: function that makes the sketch for more than MOST_EXACT values; None: all values are kept."""
+        """Begin without values.
+
+        `sketch`: function that makes the sketch for more than MOST_EXACT values; None: all values are kept.
+        """
         self.count = self.total = self.largest = 0
         self.kept = array("q")
         self._make_sketch = sketch

@@ -58,7 +58,7 @@ class WorkLadder:
         `works`: work of each rung in thousandths, ALL first, falling.
         `follow`: names of the stages whose time follows the work.
         `period_ns`: period of frames, more than 0.
-        `deadline_ns`: time from a frame's release to its presentation; 0: none.
+        `deadline_ns`: longest time from a frame's release to its presentation; 0: none.
         """
         self.rung = 0
         self.patience = PATIENCE

@@ -81,7 +81,7 @@ class HeartbeatSocket:
     """
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], linger_ms: int = 0) -> None:
-        """A socket of `context`. On closing it tries for `linger_ms` to deliver what was sent."""
+        """Make a socket of `context`, which tries for `linger_ms` ms after its closing to deliver what was sent."""
         self.socket: zmq.Socket[bytes] = context.socket(zmq.PAIR)
         self.socket.setsockopt(zmq.LINGER, linger_ms)
         self.socket.setsockopt(zmq.MAXMSGSIZE, MAX_BYTES)
@@ -130,7 +130,7 @@ class Link:
         self.heartbeat_socket = HeartbeatSocket(context, linger_ms)
 
     def bind(self, endpoint: str) -> None:
-        """Wait for the unit's heartbeats at `endpoint` (the scheduler's end)."""
+        """Receive the unit's heartbeats at `endpoint` (the scheduler's end)."""
         self.heartbeat_socket.socket.bind(endpoint)
 
     def connect(self, endpoint: str) -> None:
@@ -139,7 +139,7 @@ class Link:
 
     @property
     def heartbeat_fd(self) -> int:
-        """A descriptor that is readable when `heartbeats` is to be called."""
+        """A descriptor that is readable when `heartbeats` should be called."""
         return self.heartbeat_socket.fileno()
 
     def send_heartbeat(self, message: Heartbeat) -> None:
