@@ -36,8 +36,8 @@ def most_preempted_ns(wall_ns: int, cpu_ns: int, cores: int) -> int:
 def preempted_ns(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int) -> int:
     """Return how much of `wall_ns` a unit with `cores` cores waited for them.
 
-    Its threads were ready for cpu + delay. So m = (cpu + delay) / wall of them were ready at a time, but at least one,
-    and their waiting took delay / m. It is never more than what the CPU time leaves of the cores. With one core this is
+    Its threads were ready for cpu + delay. So m = (cpu + delay) / wall of them were ready at a time, but at least one.
+    Their waiting took delay / m, and never more than what the CPU time leaves of the cores. With one core this is
     min(delay, wall - cpu).
     """
     if not delay_ns:

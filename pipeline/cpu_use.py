@@ -129,8 +129,8 @@ class Efficiencies:
 
         Called after all jobs.
 
-        The first is the work of the slowest unit. The second is the CPU time of the fullest set of cores, by the units
-        that have no other cores; no division of the work avoids it. The third is the CPU time of all units on all
+        The first is the work of the slowest unit. The second is the CPU time on the fullest set of cores, of the units
+        that have no other cores. No division of the work avoids it. The third is the CPU time of all units on all
         cores. Each is a share of the time that these had.
         """
         had_ns = self._last_ns - (self._first_ns or 0)

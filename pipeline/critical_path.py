@@ -1,7 +1,7 @@
 """What bounds the frame time: the critical path of jobs and waits that ends with a presented frame, walked backwards.
 
-Rule: a job begins when the last thing that it needs is there: its input, its unit, a slot, room in flight, or its
-frame's release. The path goes on with the job that brought that thing. Time between the two belongs to no job:
+Rule: a job begins when the last thing that it needs is there. It needs its input, its unit, a slot, room in flight, and
+its frame's release. The path goes on with the job that brought the last thing. Time between the two belongs to no job:
 overhead, a cap, a restart. So the pieces of a path follow each other without gaps and sum to the time that it spans.
 
 The last thing is known, not guessed. A job that was handed over while its unit did another waited for that one. Any
@@ -231,7 +231,10 @@ def parts(piece: Piece, begin_ns: int, end_ns: int, sharing: Sharing | None = No
 
 
 def _divided_preempted(stage: str, ns: int, taken: Mapping[str, int], lacked_ns: int) -> dict[Part, int]:
-    """Divide `ns` without a core among the stages that had it, in proportion `taken` to `lacked_ns`, and the rest."""
+    """Divide `ns` without a core by who had it: each stage gets the share that `taken` has in `lacked_ns`.
+
+    The rest was taken by no stage, and counts as preempted.
+    """
     found = {(TAKEN, other): ns * of_other // lacked_ns for other, of_other in taken.items()}
     left_ns = ns - sum(found.values())
     return {part: ns for part, ns in (found | {(PREEMPTED, stage): left_ns}).items() if ns}
@@ -336,7 +339,7 @@ class Budget:
         self._keep()
 
     def _keep(self) -> None:
-        """Store blocks that are whole; at MOST_BLOCKS, merge each two of them into one."""
+        """Store blocks that are whole; at MOST_BLOCKS, merge each two neighbours into one."""
         while len(self._open) >= self._merged:
             block: dict[Part, int] = {}
             for each in self._open[: self._merged]:

@@ -244,7 +244,7 @@ def read_journal(path: Path) -> Iterator[Record]:
 
 
 def records_of(recording: Recording, jobs: Iterable[JobRecord]) -> Iterator[Record]:
-    """Yield the records of a run in memory, as far as the question of what bounded it needs them."""
+    """Yield the records of a run in memory that are needed to say what bounded it."""
     for stepped, others in _steps_of(recording, jobs):
         yield stepped
         yield from others
@@ -271,7 +271,7 @@ def journal_of(
 ) -> Iterator[Record]:
     """Yield the records of a run in memory, such as one in virtual time (`Simulation` with `keep`).
 
-    A second core that hears the same events counts the frames lost and dropped.
+    A second `Core` that hears the same events counts the frames lost and dropped.
 
     `facts`: facts of `Begun`.
     `report`: report of `Ended`.

@@ -1,6 +1,6 @@
 """Checks the values of a journal's records.
 
-Rule: a check takes a value as it was read, from an untrusted file, and returns what it stands for, or raises
+Rule: a check takes a value as it was read, from an untrusted file. It returns what the value stands for, or raises
 UnexpectedValue in plain words. What a check remembers of a run does not grow with the run.
 """
 

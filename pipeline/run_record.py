@@ -228,10 +228,10 @@ class JournaledRun:
 
 @contextmanager
 def recorded(file: JournalFile | None, graph: Graph, settings: Settings, caps: Caps | None) -> Iterator[RunRecord]:
-    """Yield the record of one run: in `file`, or in memory without one. Raises BadInputError when the file cannot be
-    made.
+    """Yield the record of one run, which goes to `file`, or stays in memory without one.
 
-    What was noted until the end of the run is in the file, whatever becomes of the run.
+    What was noted until the end of the run is in the file, whatever becomes of the run. Raises BadInputError when the
+    file cannot be made.
     """
     if file is None:
         yield KeptRun(graph, settings)

@@ -67,7 +67,7 @@ class Sharing:
     def taken(self, unit: str, begin_ns: int, end_ns: int, lacked_ns: int) -> dict[str, int]:
         """Return, by stage, how long its jobs had the core that `unit` lacked for `lacked_ns` of a piece of time.
 
-        The time is divided in proportion to how long the jobs ran then, and never exceeds that.
+        The time is divided in proportion to how long the jobs ran then; no stage gets more than its jobs ran.
         """
         if not lacked_ns:
             return {}

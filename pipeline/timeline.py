@@ -1,8 +1,8 @@
-"""Turns the journal of a run into frames, jobs, waits and idle time. Rule: no other module interprets a journal's
-events.
+"""Turns the journal of a run into frames, jobs, waits and idle time.
 
-The scheduler's own parts tell what it knew: its source says which frames are released and wait (frame_source.py). Its
-record of a frame says when the pose was sampled and how long the frame took (state.py).
+Rule: no other module interprets a journal's events. The scheduler's own parts tell what it knew: its source says which
+frames are released and wait (frame_source.py). Its record of a frame says when the pose was sampled and how long the
+frame took (state.py).
 
 A frame waits before the first stage from its release on. It waits before another stage from the step in which the
 scheduler heard that the stage before had ended. The wait ends when the frame is handed to a unit, dropped or lost.
@@ -137,8 +137,7 @@ Fact = Done | Presented | Gone | ExplainedJob | IdleSlice
 
 
 class Timeline:
-    """Takes the records of a run in order; `add` returns what each means, and `end` returns the rest after the last
-    one.
+    """Takes the records of a run in order: `add` returns what each means, and `end` returns the rest.
 
     `graph`, `settings`: graph and settings of the run.
     `waits`: whether to explain the waits of jobs; this takes longer than everything else.

@@ -107,7 +107,7 @@ class UnitHistory:
     def fall(self, now_ns: int, *, is_gone: bool) -> None:
         """Note that the process is gone or is to be ended.
 
-        If it was up, the time without a job since its running job was handed over counts as lost.
+        If it was up and had a job, the time since the hand-over of that job counts as lost.
         """
         if self.is_up:
             if self.held:
@@ -128,8 +128,7 @@ class UnitHistory:
         self._change(now_ns)
 
     def explain(self, job: JobRecord, heard_ns: int) -> tuple[dict[str, int], JobRecord | None]:
-        """Return the wait of the unit's next job in ns by cause, and the job that the unit did the longest in that
-        time.
+        """Return the wait of the unit's next job in ns by cause, and the job that the unit did the longest meanwhile.
 
         Causes with 0 ns are left out. `heard_ns`: time at which the scheduler heard of the job's input.
         """
@@ -196,9 +195,7 @@ class UnitHistory:
         found[OVERHEAD] += end_ns - begin_ns - explained_ns
 
     def _causes(self, begin_ns: int, end_ns: int) -> Iterator[tuple[str, int, int]]:
-        """Yield (cause, begin, end) over a piece of time, the last first; time before the first known change is left
-        out.
-        """
+        """Yield (cause, begin, end) over a piece of time, the last first; time before the first change is left out."""
         for since_ns, cause in reversed(self._changes):
             if since_ns < end_ns:
                 yield cause, max(since_ns, begin_ns), end_ns

@@ -57,7 +57,7 @@ class ForkedCall:
         self._is_open = True
 
     def result(self) -> Any | None:
-        """Return once what the function returned; None when it failed, its process died, or no answer came in time.
+        """Return the function's result, once; None when it failed, its process died, or no answer came in time.
 
         If the call's fork server had to be replaced, the call is made once more.
         """

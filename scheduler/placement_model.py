@@ -1,15 +1,15 @@
 """Predicts the frame time of a placement from what its units need. Rule: one formula; nothing is tried.
 
 A placement gives each unit cores and threads. Its frame time is predicted from `Work`: the time that the unit needs for
-a frame, and the time for which each of its cores is taken meanwhile. Let T be the frame time. In a pipelined run:
+a frame, and the time for which it takes each of its cores. Let T be the frame time. In a pipelined run these hold:
 
 - *A unit does one job at a time.* Its jobs of a frame take at most T.
 - *A core does one thing at a time.* What the units need of it is at most T. A unit with one thread and several cores
   *floats*: the kernel runs it where there is room. So for every set of cores, work that cannot go elsewhere is at most
   what they can do in T, less what the kernel misses. By Hall's condition the work can then be divided, and only then.
 - *Each of a job's parallel regions waits for its slowest thread.* Let others have core c for the share o(c) of the
-  time. A job of several threads goes on only while all its cores are free. As if the others came independently, that is
-  a share of the product of 1 - o(c) over its cores. The job takes that much longer, and this time is at most T too.
+  time. A job of several threads goes on only while all its cores are free. If the others come independently, that is
+  the product of 1 - o(c) over its cores, as a share of the time. The job takes that much longer, and at most T too.
 - *Siblings* of one physical core together do `SIBLINGS` times the work that one does alone.
 
 The least such T is the answer. A sequential run has one stage at work at any time: T is the sum, and nothing waits.

@@ -79,9 +79,9 @@ def header_line(graph: Graph, settings: Settings) -> str:
 
 
 def step_line(now_ns: int, events: Iterable[Event], actions: Iterable[Action]) -> str:
-    """Return the line of a step:
+    """Return the line of a step, an object of `t`, `events` and `actions`.
 
-    `t`, `events`, `actions`; each event or action is an object of its name and its fields.
+    Each event or action is an object of its name and its fields.
     """
     told = [{"event": type(event).__name__, **_fields_of(event)} for event in events]
     answered = [{"action": type(action).__name__, **_fields_of(action)} for action in actions]

@@ -53,10 +53,7 @@ def back_off_ns(failures: int) -> int:
 
 
 def extended_deadline_ns(unit: UnitState, ns: int) -> int:
-    """Return the unit's deadline after the scheduler did nothing for `ns`: that much later.
-
-    A restart is not put off.
-    """
+    """Return the unit's deadline, put off by the `ns` for which the scheduler did nothing; a restart is not put off."""
     if unit.deadline_ns == NEVER or unit.life not in (STARTING, READY):
         return unit.deadline_ns
     return unit.deadline_ns + ns

@@ -5,8 +5,8 @@ work, and each further rung is less work at the price of a worse picture. Some s
 network); the others are taken to need the same time.
 
 The time of a stage on a rung is the time that it took there alone, times its load. The time alone comes from
-`set_alone`, or else is proportional to the work. The load is the ratio of the stage's time to its time alone. It is the
-median of the stage's last three jobs, so that one slow job decides nothing.
+`set_alone`, or else is proportional to the work. The load is the ratio of the stage's time to its time alone. The
+median over its last three jobs counts, so that one slow job decides nothing.
 
 The use of a rung is the larger of two shares:
 - the busiest unit's time for a frame, as a share of the period;

@@ -112,7 +112,7 @@ def context_on_cores(cores: Sequence[int]) -> zmq.Context[zmq.Socket[bytes]]:
     """Return a ZeroMQ context for a unit, whose I/O thread runs on `cores` and preempts other work there when it wakes.
 
     On the unit's own cores that thread would wait behind the unit's next job. Call this from the thread that makes the
-    first socket: the I/O thread inherits the short time slice set here, and the caller keeps it too.
+    first socket. The I/O thread inherits the short time slice set here, and the caller keeps it too.
     """
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     for core in cores:
