@@ -1,7 +1,7 @@
-"""What the report of a real run says beside the ledger's shares. Rule: figures that must agree stand side by side.
+"""Adds CPU times to the report of a run on the host clock. Rule: figures that must agree stand side by side.
 
-CPU time beside wall time, and the sums over the units that share cores; where they contradict each other, or were not
-measured, a message says so.
+CPU time stands beside wall time, and beside the sums over the units that share cores. Where they contradict each other,
+or were not measured, a message says so.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ NO_RUN_DELAY = (
 def add_accounts(report: dict[str, Any], pipeline: Pipeline, cpu: CpuTimes, log: RunLog) -> None:
     """Add `cpu_s`, `cpu_ms` and `core_shares` to a ledger's report.
 
-    `pipeline`: that ran.
+    `pipeline`: pipeline that ran.
     `cpu`: CPU time of its units and stages.
-    `log`: is told what was not measured, and what contradicts itself.
+    `log`: log for what was not measured, and what contradicts itself.
     """
     for unit, row in report["units"].items():
         row.update(cpu_s=cpu.of_unit_s(unit), cpu_in_jobs_s=cpu.in_jobs_ns[unit] / 1e9)

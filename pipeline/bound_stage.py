@@ -1,4 +1,7 @@
-"""A stage on its slots, as a unit's loop runs it. Rule: headers are passed on here; no stage has to think of them."""
+"""A stage bound to its slots, as a unit's loop runs it.
+
+Rule: headers are passed on here; no stage has to think of them.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ WAKE_UP_NS = 150_000  # a sleep ends about this much late
 
 
 class BoundStage:
-    """`stage` with its slots."""
+    """A stage with its slots."""
 
     def __init__(
         self,
@@ -27,7 +30,12 @@ class BoundStage:
         unit: UnitContext,
         may_skip: bool = False,
     ) -> None:
-        """`pace_ns`: how long a job is held, at least. `unit`: that it runs on. `may_skip`: a bypass begins at it."""
+        """Bind `stage` to its slots.
+
+        `pace_ns`: least time in ns for which a job is held.
+        `unit`: context of the unit that it runs on.
+        `may_skip`: whether a bypass begins at it.
+        """
         self.name, self._pace_ns, self._may_skip = name, pace_ns, may_skip
         self._stage, self._outputs, self._unit = stage, outputs, unit
         self._is_first, self._rung = not inputs, 0
@@ -37,10 +45,14 @@ class BoundStage:
     def run(
         self, frame: int, slot_in: int, slot_out: int, epoch: int, fresh: bool = False, rung: int = 0
     ) -> Mapping[str, float]:
-        """Do the job, and hold it until its pace has passed; the stage's metrics, a `Skip` where the frame skips.
+        """Do the job, hold it until its pace has passed, and return the stage's metrics.
 
-        A slot is -1 where the stage has no such edge. `fresh`: the stage must not count on earlier frames. `rung`: of
-        the frame's work, which the first stage is told. Raises TrilaneError for a `Skip` of a stage that may not.
+        The metrics are a `Skip` if the frame skips. A slot is -1 where the stage has no such edge.
+
+        `fresh`: whether the stage must ignore what earlier frames left behind.
+        `rung`: rung of the frame's work, which the first stage is told.
+
+        Raises TrilaneError for a `Skip` of a stage that may not skip.
         """
         if fresh and self._may_skip:
             cast(SkippingStage, self._stage).forget()
@@ -64,11 +76,14 @@ class BoundStage:
 
     @property
     def works_asleep(self) -> bool:
-        """Whether the job goes on while its threads sleep: on hardware of its own, or held to the pace of a chip."""
+        """Whether the job goes on while its threads sleep.
+
+        It does on hardware other than the cores, and when it is held to the pace of a chip.
+        """
         return self._pace_ns > 0 or self._unit.has_device
 
     def sampled_ns(self, slot_in: int, slot_out: int) -> int:
-        """Of a pipeline's first stage: when the frame in its output slot was sampled; else 0."""
+        """Return when the frame in the output slot of a pipeline's first stage was sampled; 0 for other stages."""
         return int(self._outputs[slot_out].header["t_sampled_ns"]) if slot_in < 0 <= slot_out else 0
 
     def close(self) -> None:
@@ -76,14 +91,17 @@ class BoundStage:
 
 
 def hold_until(end_ns: int) -> None:
-    """Return at `end_ns` of CLOCK_MONOTONIC, or at once when that has passed: sleep, then watch the clock."""
+    """Return at `end_ns` of CLOCK_MONOTONIC, or at once if that has passed: sleep first, then watch the clock."""
     while (left_ns := end_ns - time.monotonic_ns()) > 0:
         if left_ns > WAKE_UP_NS:
             time.sleep((left_ns - WAKE_UP_NS) / 1e9)
 
 
 def _header_copier(inputs: list[Packet], outputs: list[Packet]) -> Callable[[int, int], None]:
-    """Copies the header from an input slot to an output slot; of different headers the frame's fields alone."""
+    """Return a function that copies the header from an input slot to an output slot.
+
+    If the headers differ, it copies only the frame's fields.
+    """
     if inputs and outputs and inputs[0].header.dtype != outputs[0].header.dtype:
         return lambda slot_in, slot_out: _copy_fields(inputs[slot_in].header, outputs[slot_out].header)
     sources, targets = [_bytes_of(packet) for packet in inputs], [_bytes_of(packet) for packet in outputs]

@@ -1,7 +1,7 @@
 """What somebody asks of a run while it goes on. Rule: any thread may ask; the run does it between two of its steps.
 
-What is asked becomes an event of the scheduler, so the recording holds it and a replay does the same. A kill becomes
-one when the unit's end is heard.
+A request becomes an event of the scheduler, so the recording holds it and a replay does the same. A kill becomes an
+event when the unit's end is heard.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ ALL = -1
 
 
 class RunControls:
-    """The way into one run. Once the run is over nothing that is asked does anything."""
+    """The way into one run; once the run is over, requests do nothing."""
 
     def __init__(self) -> None:
         self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
@@ -25,11 +25,11 @@ class RunControls:
         self._closed = False
 
     def hold(self, frames: int) -> None:
-        """Release `frames` more frames and then none; `ALL`: go on."""
+        """Release `frames` more frames and then none; `ALL` ends the hold."""
         self._ask(Hold(frames))
 
     def stop(self) -> None:
-        """Finish the frames in flight and end."""
+        """Finish the frames in flight, and end the run."""
         self._ask(Stop())
 
     def kill(self, unit: str) -> None:
@@ -40,14 +40,14 @@ class RunControls:
                 os.eventfd_write(self.fd, 1)
 
     def taken(self) -> tuple[list[Event], list[str]]:
-        """By the run: events and units to kill that were asked for since the last call."""
+        """Return the events and the units to kill that were asked for since the last call; called by the run."""
         with self._lock:
             taken = self._events, self._kills
             self._events, self._kills = [], []
             return taken
 
     def close(self) -> None:
-        """By the run: it is over."""
+        """Note that the run is over; called by the run."""
         with self._lock:
             if not self._closed:
                 self._closed = True

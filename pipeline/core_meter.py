@@ -1,8 +1,10 @@
-"""How long this process ran, and how long its threads waited for a core. Rule: the kernel's own counts, read in place.
+"""Measures how long this process ran, and how long its threads waited for a core.
 
-CPU time is CLOCK_PROCESS_CPUTIME_ID, of all threads. The run delay of a thread is the second number of
-`/proc/self/task/TID/schedstat` (Documentation/scheduler/sched-stats.rst of the kernel): ns in which it was ready and
-another thread had the core. Its file is opened once and read again.
+Rule: the kernel counts; files stay open.
+
+CPU time is CLOCK_PROCESS_CPUTIME_ID, over all threads. The run delay of a thread is the time in ns in which it was
+ready and another thread had the core. It is the second number of `/proc/self/task/TID/schedstat`
+(Documentation/scheduler/sched-stats.rst of the kernel). The file is opened once and read again.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ LINKS_BESIDE_THREADS = 2  # a folder has a link for each folder in it, `.` and i
 
 
 def counts_run_delay(process: str = PROCESS) -> bool:
-    """Whether this kernel says how long threads waited for a core (CONFIG_SCHED_INFO)."""
+    """Return whether this kernel says how long threads waited for a core (CONFIG_SCHED_INFO)."""
     try:
         with open(f"{process}/schedstat", "rb") as file:  # noqa: PTH123 - as the meter reads it
             return int(file.read(LINE_BYTES).split()[0]) > 0
@@ -27,15 +29,15 @@ def counts_run_delay(process: str = PROCESS) -> bool:
 
 
 class CoreMeter:
-    """Counts from its making on. Threads that appear later are found by `look`; those in `others` are left out.
+    """Counts from its creation on. `look` finds threads that appear later; those in `others` are left out.
 
-    `process`: the kernel's folder of this process.
+    `process`: path of the kernel's folder of this process.
     """
 
     def __init__(self, others: Set[int] = frozenset(), process: str = PROCESS) -> None:
         self._others, self._tasks = others, f"{process}/task"
-        self._files: dict[int, int] = {}  # of each thread
-        self._seen_ns: dict[int, int] = {}  # of each file, the delay when it was last read
+        self._files: dict[int, int] = {}  # file of each thread
+        self._seen_ns: dict[int, int] = {}  # delay of each file when it was last read
         self._threads = self._born_ns = 0
         self._folder = os.open(self._tasks, os.O_RDONLY | os.O_CLOEXEC) if counts_run_delay(process) else -1
         self._cpu_ns = time.process_time_ns()
@@ -44,17 +46,17 @@ class CoreMeter:
 
     @property
     def threads(self) -> int:
-        """How many the last look has found."""
+        """The number of threads that the last look found."""
         return len(self._files)
 
     def cpu_ns(self) -> int:
-        """CPU time of all threads since the last call."""
+        """Return the CPU time of all threads since the last call, in ns."""
         cpu_ns = time.process_time_ns()
         passed_ns, self._cpu_ns = cpu_ns - self._cpu_ns, cpu_ns
         return passed_ns
 
     def delay_ns(self) -> int:
-        """Run delay of the threads since the last call, summed up."""
+        """Return the sum of the threads' run delays since the last call, in ns."""
         delay_ns, self._born_ns = self._born_ns, 0
         for file, seen_ns in self._seen_ns.items():
             try:
@@ -67,7 +69,7 @@ class CoreMeter:
         return delay_ns
 
     def look(self) -> None:
-        """Find the threads that have begun and ended since the last look; quick when their number is the same."""
+        """Find the threads that have begun and ended since the last look; this is quick if their number is the same."""
         if self._folder < 0:
             return
         threads = os.fstat(self._folder).st_nlink - LINKS_BESIDE_THREADS

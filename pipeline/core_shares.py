@@ -1,9 +1,12 @@
-"""What of a piece of time a unit worked, waited for a core and slept. Rule: pure; busy is never more than the CPU time.
+"""Divides a piece of time of a unit into work, waiting for a core, and sleep. Rule: pure; busy is at most the CPU time.
 
-Of each piece three numbers are known: how long it took (`wall_ns`), the CPU time of all threads of the unit's process
-in it (`cpu_ns`), and how long these threads were ready but had no core (`delay_ns`: the kernel's run delay, summed over
-the threads). docs/decisions/preempted-time.md derives what follows from them, and proves that units which share cores
-are never busy for more than those cores.
+Three numbers are known of each piece, in ns:
+- `wall_ns`: its length;
+- `cpu_ns`: CPU time of all threads of the unit's process in it;
+- `delay_ns`: time in which these threads were ready but had no core, the kernel's run delay, summed over the threads.
+
+docs/decisions/preempted-time.md derives what follows from them. It proves that units which share cores are never busy
+for more than those cores.
 """
 
 from __future__ import annotations
@@ -12,22 +15,29 @@ from typing import NamedTuple
 
 
 class Lost(NamedTuple):
-    """Parts of a piece of time in which a unit did not work, in ns: it waited for a core; it slept."""
+    """Parts of a piece of time in which a unit did not work, in ns.
+
+    `preempted_ns`: time for which it waited for a core.
+    `asleep_ns`: time for which it slept.
+    """
 
     preempted_ns: int
     asleep_ns: int
 
 
 def most_preempted_ns(wall_ns: int, cpu_ns: int, cores: int) -> int:
-    """The most of `wall_ns` that a unit with `cores` cores can have waited for them: what its CPU time leaves of it."""
+    """Return the most of `wall_ns` that a unit with `cores` cores can have waited for them.
+
+    This is what its CPU time leaves of the time.
+    """
     return max(wall_ns - -(-cpu_ns // cores), 0)
 
 
 def preempted_ns(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int) -> int:
-    """How much of `wall_ns` a unit with `cores` cores waited for them.
+    """Return how much of `wall_ns` a unit with `cores` cores waited for them.
 
-    Its threads were ready for cpu + delay, m = (cpu + delay) / wall of them at a time, but at least one; their waiting
-    took delay / m. It is never more than what the CPU time leaves of the cores. With one core this is
+    Its threads were ready for cpu + delay. So m = (cpu + delay) / wall of them were ready at a time, but at least one.
+    Their waiting took delay / m, and never more than what the CPU time leaves of the cores. With one core this is
     min(delay, wall - cpu).
     """
     if not delay_ns:
@@ -37,10 +47,10 @@ def preempted_ns(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int) -> int:
 
 
 def lost_in_job(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int, has_device: bool) -> Lost:
-    """What a job of `wall_ns` lost. The rest, in which the unit was busy, is at most `cpu_ns` without a device.
+    """Return what a job of `wall_ns` lost. The unit was busy in the rest, which is at most `cpu_ns` without a device.
 
-    `has_device`: the work is done by something else than the cores (a graphics card, a modelled chip), so that the unit
-    works while its threads sleep.
+    `has_device`: whether something else than the cores works (a graphics card, a modelled chip), so that the unit works
+    while its threads sleep.
     """
     preempted = preempted_ns(wall_ns, cpu_ns, delay_ns, cores)
     asleep = 0 if has_device else wall_ns - preempted - cpu_ns

@@ -1,8 +1,8 @@
-"""The CPU time of units beside their wall time. Rule: it is counted in the run alone, and by core it cannot exceed it.
+"""Compares the CPU time of units with their wall time. Rule: only the run counts, and no core does more than it can.
 
-A unit's CPU time is that of all threads of its process, those that a runtime lets spin between jobs included. Whatever
-the units do, those that may only run on a set of cores cannot have more CPU time than these cores had time: where the
-figures say otherwise, a thread has run elsewhere or a clock is wrong. Efficiencies are of the CPU time of jobs alone.
+A unit's CPU time is that of all threads of its process, including those that a runtime lets spin between jobs. Units
+that may only run on a set of cores cannot have more CPU time than these cores had time. Where the figures say
+otherwise, a thread has run elsewhere or a clock is wrong. Efficiencies use the CPU time of jobs alone.
 """
 
 from __future__ import annotations
@@ -16,11 +16,14 @@ from trilane.scheduler.places import Place, Placement, busiest_core_ns
 from trilane.scheduler.samples import Samples, Sketch
 from trilane.transport.messages import Done
 
-CLOCKS_DIFFER = 0.001  # CLOCK_MONOTONIC is slewed by up to 500 ppm, the clock of CPU times is not
+CLOCKS_DIFFER = 0.001  # CLOCK_MONOTONIC is slewed by up to 500 ppm, but the clock of CPU times is not
 
 
 class CoreUse(NamedTuple):
-    """Units that run on `cores` and nowhere else. `cpu`, `busy`: sums of theirs, as shares of what the cores had."""
+    """The use of a set of cores by the units that run on `cores` and nowhere else.
+
+    `cpu`, `busy`: sums of the units' CPU time and busy time, as shares of the time that the cores had.
+    """
 
     cores: tuple[int, ...]
     units: tuple[str, ...]
@@ -34,9 +37,10 @@ class CoreUse(NamedTuple):
 
 
 class CpuTimes:
-    """CPU time of each unit, and of each stage's jobs, in ns. `cores`: how many each unit has.
+    """The CPU time of each unit and of each stage's jobs, in ns.
 
-    `sketch`: as of `trilane.scheduler.samples.Samples`.
+    `cores`: number of cores of each unit.
+    `sketch`: function that makes a sketch, as for `trilane.scheduler.samples.Samples`.
     """
 
     def __init__(self, cores: Mapping[str, int], sketch: Callable[[], Sketch] | None = None) -> None:
@@ -47,9 +51,10 @@ class CpuTimes:
         self._begun: set[str] = set()
 
     def add(self, unit: str, stage: str, done: Done, run_begin_ns: int) -> None:
-        """Book a job. Of the CPU time before a unit's first job at most what its cores had since the run began counts.
+        """Book a job.
 
-        What is between two jobs counts as it was read: a figure that cannot be must stay visible (`is_possible`).
+        CPU time before a unit's first job counts at most the time that its cores had since the run began. CPU time
+        between two jobs counts as it was read: an impossible figure must stay visible (`is_possible`).
         """
         self.in_jobs_ns[unit] += done.cpu_ns
         self.stage_ns[stage].add(done.cpu_ns)
@@ -60,16 +65,22 @@ class CpuTimes:
         self.between_ns[unit] += before_ns
 
     def of_unit_s(self, unit: str) -> float:
-        """In jobs and between them, from the begin of the run to the end of the unit's last job."""
+        """Return the unit's CPU time in seconds, in jobs and between them.
+
+        It counts from the begin of the run to the end of the unit's last job.
+        """
         return (self.in_jobs_ns[unit] + self.between_ns[unit]) / 1e9
 
 
 def use_of_cores(
     cores: Mapping[str, Sequence[int]], cpu_s: Mapping[str, float], busy: Mapping[str, float], duration_s: float
 ) -> list[CoreUse]:
-    """One row for each set of cores that a unit has, and one for all cores.
+    """Return one row for each set of cores that a unit has, and one for all cores.
 
-    `cores`: of each unit. `cpu_s`: its CPU time. `busy`: its share of the time. `duration_s`: of the run.
+    `cores`: cores of each unit.
+    `cpu_s`: CPU time of each unit in seconds.
+    `busy`: busy share of each unit.
+    `duration_s`: time of the run in seconds.
     """
     sets = {frozenset(own) for own in cores.values()} | {frozenset().union(*cores.values())}
     rows = []
@@ -82,14 +93,16 @@ def use_of_cores(
 
 
 class Efficiencies:
-    """How much of the time between the first and the last presented frame was work of jobs; none can pass 1.
+    """How much of the time between the first and the last presented frame was work of jobs; no share can pass 1.
 
-    `places`: of each unit. To be told the jobs in the order of their ends, and with those that present a frame, that.
+    Jobs are added in the order of their ends. A job may begin before that time or end after it. Then it counts only the
+    CPU time that must lie within: its CPU time less the time that its cores had outside. So what a unit or a set of
+    cores is credited with fits into the time.
 
-    Of a job that began before that time or ended after it, only the CPU time counts that must lie within, whatever the
-    rest of the job had: all of it but as much as its cores had time outside. So what a unit or a set of cores is
-    credited with fits into the time. The slowest unit counts a job with its CPU time for each of its threads, and with
-    what it was busy beyond its CPU time: then a device of its own worked while the threads slept.
+    A unit's work counts the CPU time of a job divided by the unit's threads. It also counts the busy time beyond the
+    CPU time, because a device of its own worked then while the threads slept.
+
+    `places`: cores and threads of each unit.
     """
 
     def __init__(self, places: Placement) -> None:
@@ -98,10 +111,10 @@ class Efficiencies:
         self._cpu_ns: dict[str, float] = dict.fromkeys(places, 0.0)
         self._first_ns: int | None = None
         self._last_ns = 0
-        self._unsettled: list[JobRecord] = []  # since the last presented frame
+        self._unsettled: list[JobRecord] = []  # jobs since the last presented frame
 
     def add(self, job: JobRecord, *, presents: bool) -> None:
-        """The next job that has ended. `presents`: its end is that of a presented frame."""
+        """Take the next job that has ended. `presents`: whether its end is that of a presented frame."""
         self._unsettled.append(job)
         if not presents:
             return
@@ -112,10 +125,13 @@ class Efficiencies:
         self._book(settled, self._first_ns)
 
     def close(self) -> dict[str, float | None]:
-        """After the last job: `efficiency`, `core_efficiency`, `machine_efficiency` of a report; None for one frame.
+        """Return `efficiency`, `core_efficiency` and `machine_efficiency` of a report; None for one frame.
 
-        The work of the slowest unit; the CPU time of the fullest set of cores by the units that have no others, which
-        no division of the work avoids; that of all units on all cores. Each over the time that these had.
+        Called after all jobs.
+
+        The first is the work of the slowest unit. The second is the CPU time on the fullest set of cores, of the units
+        that have no other cores. No division of the work avoids it. The third is the CPU time of all units on all
+        cores. Each is a share of the time that these had.
         """
         had_ns = self._last_ns - (self._first_ns or 0)
         if self._first_ns is None or had_ns <= 0:
@@ -130,7 +146,7 @@ class Efficiencies:
         }
 
     def _book(self, jobs: Sequence[JobRecord], first_ns: int) -> None:
-        """What must lie between the first and the last presented frame."""
+        """Book the part of each job that must lie between the first and the last presented frame."""
         for job in jobs:
             cores, threads = self._places[job.unit]
             length_ns = job.end_ns - job.begin_ns

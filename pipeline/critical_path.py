@@ -1,14 +1,14 @@
-"""What bounds the frame time: the path of jobs and waits that ends with a presented frame, walked backwards.
+"""What bounds the frame time: the critical path of jobs and waits that ends with a presented frame, walked backwards.
 
-Rule: a job begins when the last thing that it needs is there: its input, its unit, a slot or room in flight, or its
-frame's release. The path goes on with the job that brought that thing, and what lies between is no job's: overhead, a
-cap, a restart. So the pieces of a path follow each other without gap, and their sum is the time that it spans.
+Rule: a job begins when the last thing that it needs is there. It needs its input, its unit, a slot, room in flight, and
+its frame's release. The path goes on with the job that brought the last thing. Time between the two belongs to no job:
+overhead, a cap, a restart. So the pieces of a path follow each other without gaps and sum to the time that it spans.
 
-Which thing was last is known, not guessed: a job that was handed over while its unit did another waited for that one;
-any other waited for one of the ends that the scheduler heard of in the step in which it handed the job over.
+The last thing is known, not guessed. A job that was handed over while its unit did another waited for that one. Any
+other job waited for one of the ends that the scheduler heard of in the step in which it handed the job over.
 
-Units that share cores slow each other without bringing each other anything. So time in which a job on the path had no
-core is the time of the stage whose job had it (`Sharing`); what is left of it was no job's of this run.
+Units that share cores slow each other down without bringing each other anything. So time in which a job on the path had
+no core belongs to the stage whose job had the core (`Sharing`). The rest of that time was no job's of this run.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.uncertainty import LEAST_FRAMES, batch_interval
 
 WORK, TAKEN, ASLEEP, RELEASE = "work", "taken", "asleep", "release"
-#: What a piece of a path can be, and what it means.
+#: The kinds of a piece of a path, and what each means.
 WHATS = {
     WORK: "the stage worked",
     TAKEN: "the stage worked, on the core that a stage on the path waited for",
@@ -39,18 +39,22 @@ WHATS = {
     RELEASE: "no frame was released yet: the rate from outside",
     UNKNOWN: "before what is known",
 }
-#: Of a gap between two jobs, in the order in which it is divided; the rest is overhead.
+#: The causes into which a gap between two jobs is divided, in this order; the rest is overhead.
 OF_GAPS = (LOST, DOWN, THROTTLED, HELD, PREEMPTED)
 MARGIN: Final = 32  # presented frames after which paths that end with different frames have met
 STEP: Final = 3 * LEAST_FRAMES
 MOST_BLOCKS: Final = 128
-#: Of a piece: its time is the stage's, and its unit's. All other time is called by what it was.
+#: Kinds of pieces whose time is the stage's and its unit's. All other time is named after its kind.
 OF_STAGES = frozenset({WORK, TAKEN, ASLEEP, THROTTLED, LOST, DOWN})
 OTHER_PROGRAMS = "other programs"
 
 
 class Piece(NamedTuple):
-    """A part of a path. `job`: whose it is, or before which it lies. `stage`: its, or one of a unit that was down."""
+    """A piece of a path.
+
+    `job`: job to which it belongs, or before which it lies.
+    `stage`: stage of that job, or a stage of the unit that was down.
+    """
 
     what: str
     stage: str
@@ -62,7 +66,9 @@ class Piece(NamedTuple):
 class Paths:
     """Keeps the last jobs of a run, and walks back through them.
 
-    `graph`, `settings`: of the run. `downs`: of its units so far, as `Timeline` notes them. `kept`: jobs.
+    `graph`, `settings`: graph and settings of the run.
+    `downs`: times in which units were down so far, as `Timeline` notes them.
+    `kept`: number of jobs that are kept.
     """
 
     def __init__(self, graph: Graph, settings: Settings, downs: Reversible[Down] = (), kept: int = KEPT) -> None:
@@ -83,7 +89,7 @@ class Paths:
         self._presented: deque[Key] = deque(maxlen=kept)
 
     def add(self, explained: ExplainedJob) -> None:
-        """The next job of the run that has ended."""
+        """Take the next job of the run that has ended."""
         job, key = explained.job, explained.key
         self._jobs[key] = explained
         if before := self._last_of_unit.get(job.unit):
@@ -105,7 +111,7 @@ class Paths:
             del self._last_of_frame[key[1]]
 
     def walk(self, last: ExplainedJob, until_ns: int) -> Iterator[Piece]:
-        """The pieces from the end of `last` back to `until_ns`, the last first."""
+        """Yield the pieces from the end of `last` back to `until_ns`, the last first."""
         now: ExplainedJob | None = last
         end_ns = last.job.end_ns
         while now is not None and end_ns > until_ns:
@@ -118,7 +124,7 @@ class Paths:
             now, end_ns = before, from_ns
 
     def _gap(self, now: ExplainedJob, from_ns: int, released: bool, is_first: bool) -> Iterator[Piece]:
-        """The pieces between `from_ns` and the begin of `now`, the last first."""
+        """Yield the pieces between `from_ns` and the begin of `now`, the last first."""
         job = now.job
         if released:
             ready_ns = min(max(job.ready_ns, from_ns), job.begin_ns)
@@ -131,7 +137,10 @@ class Paths:
             yield from _divided(now, from_ns, HELD if is_latched else OVERHEAD)
 
     def _unreleased(self, job: JobRecord, from_ns: int, end_ns: int) -> Iterator[Piece]:
-        """The time before a frame was released; a unit that was down then is why no frame before it got through."""
+        """Yield the time before a frame was released.
+
+        A unit that was down then explains why no frame before it got through.
+        """
         for down in reversed(self._downs):
             if end_ns <= from_ns or down.end_ns <= from_ns:
                 break
@@ -144,10 +153,11 @@ class Paths:
         yield Piece(RELEASE, job.stage, job, from_ns, end_ns)
 
     def _bound_by(self, now: ExplainedJob) -> tuple[ExplainedJob | None, bool]:
-        """The job whose end let `now` begin, and whether `now` had to wait for its release after that."""
+        """Return the job whose end let `now` begin, and whether `now` then still had to wait for its release."""
         key, job = now.key, now.job
         own = [self._before.get(key), self._input.get(key)]
         mine = self._jobs.get(own[0]) if own[0] else None
+        # It was handed over while its unit did another job, so it waited for that one.
         if mine is not None and mine.job.end_ns > job.dispatch_ns:
             return mine, False
         heard = [other for other in now.after if other in own or other[0] in self._next[job.stage]]
@@ -157,18 +167,21 @@ class Paths:
         return found, False
 
     def _shown_by(self, by_ns: int) -> ExplainedJob | None:
-        """The job that presented the last frame before that time."""
+        """Return the job that presented the last frame before `by_ns`."""
         shown = (self._jobs[key] for key in reversed(self._presented) if key in self._jobs)
         return next((each for each in shown if each.job.end_ns <= by_ns), None)
 
     def _latest(self, keys: list[Key], job: JobRecord) -> ExplainedJob | None:
-        """Of some jobs the one that ended last before `job` began."""
+        """Return the job of `keys` that ended last before `job` began."""
         ended = [self._jobs[key] for key in keys if key in self._jobs and self._jobs[key].job.end_ns <= job.begin_ns]
         return max(ended, key=lambda each: each.job.end_ns, default=None)
 
 
 def _divided(now: ExplainedJob, from_ns: int, rest: str) -> Iterator[Piece]:
-    """The gap before a job by its causes. Where in it each lay is not kept: `rest`, of what has no other, is last."""
+    """Yield the gap before a job, by causes.
+
+    Where in the gap each cause lay is not kept: the time without a cause, `rest`, is placed last.
+    """
     end_ns = now.job.begin_ns
     left_ns = end_ns - from_ns
     taken: list[tuple[str, int]] = []
@@ -187,15 +200,15 @@ def _clipped(piece: Piece, until_ns: int) -> Iterator[Piece]:
         yield piece._replace(begin_ns=max(piece.begin_ns, until_ns))
 
 
-#: What a piece is, and of which stage.
+#: The kind of a piece, and its stage.
 Part = tuple[str, str]
 
 
 def parts(piece: Piece, begin_ns: int, end_ns: int, sharing: Sharing | None = None) -> dict[Part, int]:
-    """The ns of a piece between two times, by what they are and of which stage.
+    """Return the ns of a piece between two times, by kind and stage.
 
-    Where in a job it was preempted or asleep is not known: each part of the job has the same share of it.
-    `sharing`: knows who had a core that was lacked; without it nobody of the run had.
+    Where in a job it was preempted or asleep is not known, so each part of the job gets the same share of it.
+    `sharing`: knows who had a core that the job lacked; without it, no job of the run had it.
     """
     ns = min(piece.end_ns, end_ns) - max(piece.begin_ns, begin_ns)
     if ns <= 0:
@@ -218,18 +231,23 @@ def parts(piece: Piece, begin_ns: int, end_ns: int, sharing: Sharing | None = No
 
 
 def _divided_preempted(stage: str, ns: int, taken: Mapping[str, int], lacked_ns: int) -> dict[Part, int]:
-    """Of `ns` without a core the part of each stage that had it, as `taken` of `lacked_ns` was, and the rest."""
+    """Divide `ns` without a core by who had it: each stage gets the share that `taken` has in `lacked_ns`.
+
+    The rest was taken by no stage, and counts as preempted.
+    """
     found = {(TAKEN, other): ns * of_other // lacked_ns for other, of_other in taken.items()}
     left_ns = ns - sum(found.values())
     return {part: ns for part, ns in (found | {(PREEMPTED, stage): left_ns}).items() if ns}
 
 
 class Budget:
-    """What bounded a whole run: the path that ends with its last frame, in time that does not grow with the run.
+    """What bounded a whole run: the path that ends with its last frame.
 
-    A path is walked back from every STEP-th presented frame, but for what lies in the last MARGIN frames before it:
-    paths that end with different frames meet. `total_ns` and `ns_of` are of the time from the first presented frame.
-    `sharing`: knows who had a core that was lacked.
+    A path is walked back from every STEP-th presented frame. What lies in the last MARGIN frames before it is left to
+    the next walk; paths that end with different frames meet within that margin. So the cost per frame does not grow
+    with the run. `ns_of` counts from the first presented frame.
+
+    `sharing`: knows who had a core that a job lacked.
     """
 
     def __init__(self, paths: Paths, sharing: Sharing | None = None) -> None:
@@ -237,13 +255,13 @@ class Budget:
         self._since: deque[int] = deque()
         self._from_ns: int | None = None
         self._newest: ExplainedJob | None = None
-        self._blocks: list[dict[Part, int]] = []  # of equally many frames each, as they follow each other
-        self._merged = 1  # how many were made one
+        self._blocks: list[dict[Part, int]] = []  # of equally many frames each, in order
+        self._merged = 1  # number of blocks that were merged into one
         self._open: list[dict[Part, int]] = []
         self.ns_of: dict[Part, int] = {}
 
     def present(self, shown: ExplainedJob) -> None:
-        """The job that presented the next frame."""
+        """Take the job that presented the next frame."""
         self._newest = shown
         if self._from_ns is None:
             self._from_ns = shown.job.end_ns
@@ -253,7 +271,7 @@ class Budget:
             self._cut([self._since.popleft() for _ in range(STEP)][LEAST_FRAMES - 1 :: LEAST_FRAMES])
 
     def close(self) -> dict[Part, int]:
-        """After the last frame: ns by what they are and of which stage."""
+        """Return ns by kind and stage; called after the last frame."""
         if self._newest is not None and self._since:
             ends_ns = [*self._since][LEAST_FRAMES - 1 :: LEAST_FRAMES]
             is_whole = len(self._since) % LEAST_FRAMES == 0
@@ -262,9 +280,10 @@ class Budget:
         return self.ns_of
 
     def bound(self, unit_of: Mapping[str, str]) -> dict[str, Any]:
-        """`bottleneck` and `bound` of a report, after `close`; nothing where there is no path.
+        """Return `bottleneck` and `bound` of a report; empty where there is no path. Called after `close`.
 
-        `unit_of`: of each stage. What is no unit's is called by what it was: other programs, release, overhead, held.
+        `unit_of`: unit of each stage. Time that is no unit's is named after its kind: other programs, release,
+        overhead, held.
         """
         stages = {part: part[1] for part in self.ns_of if part[0] in OF_STAGES}
         if not self.ns_of:
@@ -276,9 +295,9 @@ class Budget:
         return {"bottleneck": unit["name"], "bound": {"unit": unit, "stage": self._largest(stages)}}
 
     def _largest(self, name_of: Mapping[Part, str]) -> dict[str, Any] | None:
-        """The name that most of the path has, its share, and the 95 % interval of that, by its scatter over frames.
+        """Return the name with most of the path, its share, and the share's 95 % interval by its scatter over frames.
 
-        Its rivals are the names whose share may be as large: the 95 % interval of the difference holds 0.
+        Its rivals are the names whose share may be as large: the 95 % interval of the difference contains 0.
         """
         sums = _by_name(self.ns_of, name_of)
         if not sums:
@@ -301,7 +320,7 @@ class Budget:
         return {"name": name, "share": share, "share_low": low, "share_high": high, "rivals": rivals}
 
     def _cut(self, ends_ns: Sequence[int], *, is_whole: bool = True) -> None:
-        """Count the path between what is counted already and the last of `ends_ns`, in blocks that end with each.
+        """Count the path from what is counted already to the last of `ends_ns`, in blocks that end with each of them.
 
         `is_whole`: whether the last block has as many frames as the others.
         """
@@ -320,7 +339,7 @@ class Budget:
         self._keep()
 
     def _keep(self) -> None:
-        """Blocks that are whole; with too many of them two become one."""
+        """Store blocks that are whole; at MOST_BLOCKS, merge each two neighbours into one."""
         while len(self._open) >= self._merged:
             block: dict[Part, int] = {}
             for each in self._open[: self._merged]:

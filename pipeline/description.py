@@ -1,6 +1,7 @@
-"""A pipeline as data: stages, the edges between them, and the units that they run on. Rule: it knows no stage's work.
+"""Describes a pipeline as data: stages, the edges between them, and the units that they run on.
 
-A `Pipeline` is plain data, which JSON can carry to a unit's process; a stage's work is behind the name of its factory.
+Rule: it knows nothing of a stage's work, which is behind the name of the stage's factory. A `Pipeline` is plain data,
+so that JSON can carry it to a unit's process.
 """
 
 from __future__ import annotations
@@ -29,14 +30,14 @@ from trilane.transport.packets import FRAME_FIELDS, header_dtype
 from trilane.transport.slots import edge_rule
 from trilane.unexpected_value import UnexpectedValue, unexpected_in
 
-LONGEST_FOUND = 120  # of a value, in a message
-LONGEST_NAME = 40  # of a stage or unit: a socket of that name has to fit into a path of 107 bytes
-MOST_EDGES = 200  # of one unit: their memory, and what else a unit gets, has to fit into one message of 250 descriptors
+LONGEST_FOUND = 120  # of a wrong value, in characters, as a message shows it
+LONGEST_NAME = 40  # of a stage or unit; a socket of that name must fit into a path of 107 bytes
+MOST_EDGES = 200  # of one unit; their memory and all else that it gets must fit into one message of 250 descriptors
 FACTORY = r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"
 
 
 class Model(BaseModel):
-    """Strict base: unknown keys are errors, values never change."""
+    """Strict base class: unknown keys are errors, and values never change."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -66,7 +67,10 @@ HeaderDtype = Annotated[
 
 
 class Described(Model):
-    """Base of what a person writes to describe a pipeline: what is wrong is a BadInputError that names the field."""
+    """Base class of what a person writes to describe a pipeline.
+
+    For a mistake it raises a BadInputError that names the field.
+    """
 
     @model_validator(mode="wrap")
     @classmethod
@@ -78,7 +82,7 @@ class Described(Model):
 
 
 def _bad_input(what: str, error: ValidationError) -> BadInputError:
-    """The first defect that `error` lists of a `what`."""
+    """Return the error for the first defect that `error` lists of a `what`."""
     first = error.errors()[0]
     place = ".".join([what, *(str(part) for part in first["loc"])])
     unexpected = unexpected_in(first)
@@ -91,7 +95,12 @@ def _bad_input(what: str, error: ValidationError) -> BadInputError:
 
 
 class UnitSettings(Described):
-    """What a unit may use of the host. `cores`: of this machine; `spin`: may threads spin between jobs."""
+    """What a unit may use of the host.
+
+    `cores`: cores of this machine.
+    `threads`: number of threads, from 1.
+    `spin`: whether threads may spin between jobs.
+    """
 
     cores: tuple[int, ...] = Field(min_length=1)
     threads: int = Field(ge=1)
@@ -99,9 +108,11 @@ class UnitSettings(Described):
 
 
 class PipelineStage(Described):
-    """One stage. `factory`: `module:name` of a `trilane.pipeline.stage.StageFactory`, importable in the unit's process.
+    """One stage.
 
-    `settings`: handed to the factory, as JSON takes them. `pace_ns`: how long a job is held, at least.
+    `factory`: `module:name` of a `trilane.pipeline.stage.StageFactory`, importable in the unit's process.
+    `settings`: JSON values that are handed to the factory.
+    `pace_ns`: least time in ns for which a job is held.
     """
 
     name: str = Field(pattern=r"^[\w-]+$", max_length=LONGEST_NAME)
@@ -112,9 +123,11 @@ class PipelineStage(Described):
 
 
 class PipelineEdge(Described):
-    """The slots between a stage and the next. `rule`: single, double, triple, fifo:N or orphan[:N].
+    """The slots between a stage and the next.
 
-    `header`: of every packet, made by `trilane.transport.packets.header_dtype`. `payload_bytes`: of every packet.
+    `payload_bytes`: bytes of every packet's payload.
+    `header`: dtype of every packet's header, made by `trilane.transport.packets.header_dtype`.
+    `rule`: single, double, triple, fifo:N or orphan[:N].
     """
 
     payload_bytes: int = Field(ge=0)
@@ -123,15 +136,15 @@ class PipelineEdge(Described):
 
 
 class Pipeline(Described):
-    """A chain of `stages`, joined by `edges` (one fewer).
+    """A chain of `stages`, joined by `edges`, one fewer. Raises BadInputError naming the wrong field, as its parts do.
 
-    `units`: cores and threads of each unit that a stage names; the scheduler runs on the cores of the first stage's.
-    `latency_to`: the stage with whose end a frame's latency ends; the last one when it is not given.
-    `bypass`: names of two stages. A frame for which the first returns a `Skip` goes from it to the second, past those
-    between; the edges behind the first and before the second have the same header.
-    `module_folders`: where a unit's process looks for the modules of factories before anywhere else.
+    `units`: cores and threads of each unit that a stage names; the scheduler runs on the cores of the first stage's
+    unit.
+    `latency_to`: stage at whose end a frame's latency ends; without it, the last stage.
+    `bypass`: names of two stages. A frame for which the first returns a `Skip` goes on to the second, past those
+    between. The edges behind the first and before the second have the same header.
+    `module_folders`: folders where a unit's process first looks for the modules of factories.
     `preload`: modules that are imported once, before the units' processes are forked; none from `module_folders`.
-    Raises BadInputError naming the field that is wrong, as its parts do.
     """
 
     stages: tuple[PipelineStage, ...] = Field(min_length=1)
@@ -151,7 +164,7 @@ class Pipeline(Described):
         return self
 
     def _check(self) -> None:
-        """Raises UnexpectedValue for parts that do not fit each other."""
+        """Raise UnexpectedValue for parts that do not fit each other."""
         missing = {stage.unit for stage in self.stages} - set(self.units)
         if missing:
             raise UnexpectedValue(f"no settings of unit {', '.join(sorted(missing))}", "them in `units`")
@@ -166,13 +179,13 @@ class Pipeline(Described):
             self._check_headers(self.edges_into(self.bypass[1]))
 
     def _check_headers(self, names: tuple[str, ...]) -> None:
-        """Raises UnexpectedValue when the edges at a bypass's end have different headers."""
+        """Raise UnexpectedValue when the edges at a bypass's end have different headers."""
         headers = {edge.header for name, edge in zip(self.edge_names, self.edges, strict=True) if name in names}
         if len(headers) > 1:
             raise UnexpectedValue(f"different headers of edges {', '.join(names)}", "one, as a bypass joins them")
 
     def graph(self) -> Graph:
-        """What the scheduler knows of it."""
+        """Return what the scheduler knows of the pipeline."""
         stages = tuple(StageSpec(stage.name, stage.unit) for stage in self.stages)
         rules = tuple(edge.rule for edge in self.edges)
         return Graph(stages, rules, self.latency_to or self.stages[-1].name, self.bypass)
@@ -187,7 +200,10 @@ class Pipeline(Described):
         return list(self.joints)
 
     def edges_into(self, stage: str) -> tuple[str, ...]:
-        """Names of the edges from which the stage takes frames: its own, then the one that a bypass to it begins on."""
+        """Return the names of the edges from which the stage takes frames.
+
+        Its own edge is first; where a bypass ends at the stage, the edge on which the bypass begins follows.
+        """
         begin, end = self.bypass or ("", "")
         own = [name for name, (_, after) in self.joints.items() if after.name == stage]
         bypassed = [name for name, (before, _) in self.joints.items() if before.name == begin and stage == end]
@@ -195,13 +211,13 @@ class Pipeline(Described):
 
     @property
     def rule(self) -> str:
-        """The rule of every edge, or all of them in order when they differ."""
+        """The rule of every edge; when rules differ, all of them in order, joined by commas."""
         rules = [edge.rule for edge in self.edges]
         return ",".join(dict.fromkeys(rules) if len(set(rules)) == 1 else rules)
 
     @property
     def scheduler_cores(self) -> tuple[int, ...]:
-        """Where the scheduler runs: with the unit of the first stage."""
+        """The cores of the scheduler, which are those of the first stage's unit."""
         return self.units[self.stages[0].unit].cores
 
     @property
@@ -210,7 +226,10 @@ class Pipeline(Described):
         return tuple(sorted({core for settings in self.units.values() for core in settings.cores}))
 
     def places(self) -> dict[str, Place]:
-        """Cores and threads of each unit; one that is held to a pace works all the while, as one thread would."""
+        """Return the cores and threads of each unit.
+
+        A unit that is held to a pace counts as one thread, because it works all the while, as one thread would.
+        """
         paced = {stage.unit for stage in self.stages if stage.pace_ns}
         return {
             unit: Place(settings.cores, 1 if unit in paced else settings.threads)
@@ -222,7 +241,7 @@ class Pipeline(Described):
         return tuple(stage for stage in self.stages if stage.unit == unit)
 
     def with_rule(self, rule: str) -> Pipeline:
-        """The same with `rule` for every edge. Raises BadInputError for an unknown one."""
+        """Return the same pipeline with `rule` for every edge; raises BadInputError for an unknown rule."""
         try:
             edge_rule(rule)
         except UnexpectedValue as error:

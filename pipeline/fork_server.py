@@ -1,14 +1,14 @@
-"""The process that units are forked from. Rule: one thread; it ends with its parent, and its units outlive it.
+"""The process that units are forked from. Rule: it has one thread; it ends with its parent, and its units outlive it.
 
 `python -P -m trilane.pipeline.fork_server --socket FD --parent PID --preload MODULE,...` imports once what every unit
-needs, then forks a unit for each request, so that a unit starts in milliseconds instead of importing everything again.
+needs, then forks a unit for each request. So a unit starts in milliseconds instead of importing everything again.
 
-A request is one packet on a SOCK_SEQPACKET socket: JSON, and with it the descriptors of the unit's spec (in a memory
-file), of its stderr, of its lifeline, and of what the spec names. The answer is the unit's process number, and with it
-its pidfd. A request with `call` names a function instead, whose result goes to the pipe that comes with it; it has no
-answer.
+A request is one packet on a SOCK_SEQPACKET socket: JSON with descriptors. The descriptors are the unit's spec (in a
+memory file), its stderr, its lifeline, and those that the spec names. The answer is the unit's process id with its
+pidfd. A request with `call` names a function instead; its result goes to the pipe that comes with the request, and it
+has no answer.
 
-A lifeline is a pipe whose other end the parent alone has: the kernel kills the unit when that end is closed.
+A lifeline is a pipe whose other end only the parent has: the kernel kills the unit when that end is closed.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from typing import Any
 
 PR_SET_PDEATHSIG, PR_SET_NAME = 1, 15  # <linux/prctl.h>
 F_SETSIG = 10  # <linux/fcntl.h>
-#: Signals that end a run: the parent decides how.
+#: Signals that end a run; the parent decides how.
 OF_THE_PARENT = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
-MAX_FDS = 250  # that one packet carries: SCM_MAX_FD of Linux is 253
+MAX_FDS = 250  # descriptors that one packet carries; SCM_MAX_FD of Linux is 253
 PACKET_BYTES = 1 << 16
 ALWAYS = "trilane.pipeline.unit_loop"
-#: Libraries that make threads of their own read these when they are loaded.
+#: Variables that libraries with threads of their own read when they are loaded.
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 
 def process_name(unit: str) -> str:
-    """What the kernel calls the process of `unit` (`ps -o comm`): 15 bytes at most."""
+    """Return the kernel's name for the process of `unit` (`ps -o comm`): 15 bytes at most."""
     return f"trilane-{unit}"[:15]
 
 
@@ -54,7 +54,9 @@ def serve(requests: socket.socket) -> None:
         if not packet:
             break
         request = json.loads(packet)
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGCHLD})  # a unit that dies at once keeps its number
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGCHLD})  # a unit that dies at once keeps its process id
+        # This process has one thread. A lock that another thread held at a fork would stay locked in the child for
+        # ever.
         pid = os.fork()
         if pid == 0:
             requests.close()
@@ -71,14 +73,14 @@ def serve(requests: socket.socket) -> None:
 
 
 def _reap(options: int) -> None:
-    """Take leave of the units that have ended; with options 0, of all of them when they end."""
+    """Wait for the units that have ended; with options 0, for all units until they end."""
     with contextlib.suppress(ChildProcessError):
         while os.waitpid(-1, options)[0]:
             pass
 
 
 def _run_unit(request: dict[str, Any], fds: Sequence[int]) -> int:
-    """In the forked process: the unit's whole life, and its exit code."""
+    """Run the whole life of a unit in the forked process, and return its exit code."""
     try:
         spec_fd, stderr_fd, lifeline, *passed = fds
         _die_with(lifeline)
@@ -88,6 +90,7 @@ def _run_unit(request: dict[str, Any], fds: Sequence[int]) -> int:
         os.setpgid(0, 0)
         ctypes.CDLL(None).prctl(PR_SET_NAME, process_name(request["unit"]).encode(), 0, 0, 0)
         os.sched_setaffinity(0, request["cores"])
+        # Set before the unit's own imports, because libraries read it when they are loaded.
         os.environ |= dict.fromkeys(THREAD_LIMITS, str(request["threads"]))
         spec = json.loads(os.pread(spec_fd, os.fstat(spec_fd).st_size, 0))
         os.close(spec_fd)
@@ -101,7 +104,7 @@ def _run_unit(request: dict[str, Any], fds: Sequence[int]) -> int:
 
 
 def _call(request: dict[str, Any], fds: Sequence[int], server_pid: int) -> int:
-    """In a forked process: write what the function `module:name` returns, as JSON, to the descriptor `fds[0]`."""
+    """In a forked process, write the result of the function `module:name` as JSON to `fds[0]`; return the exit code."""
     _leave_server()
     die_with_parent(server_pid)
     module, _, name = request["call"].partition(":")
@@ -115,16 +118,16 @@ def _call(request: dict[str, Any], fds: Sequence[int], server_pid: int) -> int:
 
 
 def _leave_server() -> None:
-    """In a forked process: take signals as any process does, but for Ctrl-C, which is the parent's."""
+    """In a forked process, take signals as any process does, except for Ctrl-C, which the parent handles."""
     for number in (signal.SIGCHLD, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
         signal.signal(number, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGCHLD})
 
 
 def _die_with(lifeline: int) -> None:
-    """Have the kernel kill this process when the pipe's other end is closed; end it where it is closed already.
+    """Let the kernel kill this process when the pipe's other end is closed; end it now if that end is closed already.
 
-    Unlike a parent-death signal this does not depend on which process, and which of its threads, forked this one.
+    Unlike a parent-death signal, this does not depend on which process or thread forked this one.
     """
     fcntl.fcntl(lifeline, F_SETSIG, signal.SIGKILL)
     fcntl.fcntl(lifeline, fcntl.F_SETOWN, os.getpid())
@@ -136,10 +139,14 @@ def _die_with(lifeline: int) -> None:
 
 
 def die_with_parent(parent_pid: int, number: int = signal.SIGKILL) -> None:
-    """Send this process the signal `number` when the one that made it ends; end it if that has ended already."""
+    """Let the kernel send this process the signal `number` when its parent ends.
+
+    End the process now if the parent has ended already.
+    """
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(PR_SET_PDEATHSIG, number, 0, 0, 0) != 0:
         raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG)")
+    # A parent that ended before the call above sends no signal any more.
     if os.getppid() != parent_pid:
         os._exit(1)
 
@@ -155,10 +162,10 @@ def main() -> None:
         signal.signal(number, signal.SIG_IGN)
     importlib.import_module(ALWAYS)
     for module in filter(None, arguments.preload.split(",")):
-        with contextlib.suppress(ImportError):  # who needs it says what is missing
+        with contextlib.suppress(ImportError):  # whoever needs it says what is missing
             importlib.import_module(module)
     gc.collect()
-    gc.freeze()  # a unit's collector then leaves alone, and does not copy, the pages that all units share
+    gc.freeze()  # a unit's collector then leaves alone, and so does not copy, the pages that all units share
     serve(socket.socket(fileno=arguments.socket))
     os._exit(0)  # taking all the modules down again would keep the parent waiting
 

@@ -1,11 +1,11 @@
-"""Instructions and cache misses of a unit's jobs, by perf_event_open. Rule: counted by the processor, or said absent.
+"""Counts instructions and cache misses of a unit's jobs through perf_event_open.
 
-Counts are of user mode, of the thread that opens them and of all threads that it and its threads begin later: the
-kernel adds up those of the threads (`inherit`). Where the processor has fewer counters than events it counts for a part
-of the time; the counts are scaled to the whole.
+Rule: the processor counts, or the figure is said to be absent. Counts are of user mode. They cover the thread that
+opens them and all threads that it and its threads begin later, which the kernel adds up (`inherit`). A processor with
+fewer counters than events counts each for a part of the time; such counts are scaled to the whole time.
 
-Each event is opened and read by itself, because `inherit` and a group do not go together (`man 2 perf_event_open`):
-some kernels refuse to read such a group (ECHILD). A figure that cannot be read is missing from its job, which goes on.
+Each event is opened and read by itself, because `inherit` and a group do not go together (`man 2 perf_event_open`).
+Some kernels refuse to read such a group (ECHILD). A figure that cannot be read is missing from its job, which goes on.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 
 from trilane import machine
 
-MOST_PARANOID: Final = 2  # at which a process may still count its own user mode
+MOST_PARANOID: Final = 2  # setting up to which a process may still count its own user mode
 
 # linux/perf_event.h
 ATTR: Final = struct.Struct("=IIQQQQQIIQ")  # type, size, config, period, sample_type, read_format, flags, 0, 0, 0
@@ -31,7 +31,11 @@ HARDWARE: Final = 0
 
 
 class Counted(NamedTuple):
-    """What is counted: name of the figure, the kernel's type and number of the event."""
+    """An event to count.
+
+    `name`: name of the figure.
+    `kind`, `config`: the kernel's type and number of the event.
+    """
 
     name: str
     kind: int
@@ -39,7 +43,12 @@ class Counted(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """One reading of a counter: its count, for how long it was asked for, for how long the processor had it."""
+    """One reading of a counter.
+
+    `value`: its count.
+    `enabled_ns`: time for which the count was asked for.
+    `running_ns`: time for which the processor counted.
+    """
 
     value: int
     enabled_ns: int
@@ -50,9 +59,9 @@ KINDS: Final = (Counted("instructions", HARDWARE, 1), Counted("cache_misses", HA
 
 
 class HardwareCounters:
-    """Counts from its making on, of this thread and those that come from it, every kind that the kernel lets it.
+    """Counts every event that the kernel allows, from now on, for this thread and the threads that come from it.
 
-    Raises OSError where it can count none of `kinds`.
+    Raises OSError when none of `kinds` can be counted.
     """
 
     def __init__(self, kinds: Sequence[Counted] = KINDS) -> None:
@@ -70,15 +79,18 @@ class HardwareCounters:
 
     @property
     def names(self) -> list[str]:
-        """Of the figures that are counted."""
+        """The names of the figures that are counted."""
         return list(self._files)
 
     def begin(self) -> None:
-        """A job begins."""
+        """Note that a job begins."""
         self._before = self._read()
 
     def figures(self) -> dict[str, float]:
-        """Of the job that has begun, by name, without those that the processor did not count or nobody could read."""
+        """Return the figures of the job that has begun, by name.
+
+        Figures that the processor did not count, or that nobody could read, are left out.
+        """
         figures = {}
         for name, now in self._read().items():
             before = self._before.get(name)
@@ -105,19 +117,19 @@ class HardwareCounters:
 
 
 class NoCounters:
-    """In place of counters, where there are none."""
+    """Takes the place of counters where there are none."""
 
     def begin(self) -> None: ...
 
     def figures(self) -> dict[str, float]:
-        """Nothing was counted."""
+        """Return no figures, as nothing was counted."""
         return {}
 
     def close(self) -> None: ...
 
 
 def counters_here() -> HardwareCounters | NoCounters:
-    """Those of this thread, where `absence` does not say why there are none."""
+    """Return counters of this thread, or `NoCounters` where `absence` gives a reason."""
     try:
         return HardwareCounters()
     except OSError:
@@ -125,7 +137,7 @@ def counters_here() -> HardwareCounters | NoCounters:
 
 
 def absence() -> str | None:
-    """Why nothing can be counted here, as part of a sentence; None where something can."""
+    """Return why nothing can be counted here, as part of a sentence; None where something can be."""
     try:
         with closing(HardwareCounters()):
             return None
@@ -134,7 +146,7 @@ def absence() -> str | None:
 
 
 def availability() -> str:
-    """What is counted, or that nothing is and why: a fact of the machine."""
+    """Return what is counted, or that nothing is and why, as a fact of the machine."""
     try:
         with closing(HardwareCounters()) as counters:
             return ", ".join(counters.names)
@@ -143,7 +155,7 @@ def availability() -> str:
 
 
 def _open(kind: Counted) -> int:
-    """The file of a counter. Raises OSError."""
+    """Open a counter and return its file; raises OSError."""
     flags = INHERIT | EXCLUDE_KERNEL | EXCLUDE_HYPERVISOR
     attributes = ATTR.pack(kind.kind, ATTR.size, kind.config, 0, 0, ENABLED_TIME | RUNNING_TIME, flags, 0, 0, 0)
     return machine.here.open_counter(attributes, CLOSE_ON_EXEC)
@@ -161,7 +173,7 @@ def _reason(error: OSError) -> str:
 
 
 def paranoid_level() -> int | None:
-    """What the kernel's setting is, None where it has none."""
+    """Return the kernel's setting; None where it has none."""
     try:
         return int((machine.here.proc / "sys/kernel/perf_event_paranoid").read_text())
     except (OSError, ValueError):
@@ -169,7 +181,7 @@ def paranoid_level() -> int | None:
 
 
 def remedy(why: str) -> str:
-    """The line that mends what `absence` found, or what it takes."""
+    """Return the command that mends what `absence` found, or what it takes."""
     if "perf_event_paranoid" in why:
         return f"sysctl kernel.perf_event_paranoid={MOST_PARANOID}"
     return "needs a machine of its own" if "virtual" in why else "allow perf_event_open"

@@ -1,4 +1,7 @@
-"""How long a run was held by who watched it. Rule: its figures have that time in them, and the run says how much."""
+"""Measures how long a run was held by its viewer.
+
+Rule: the run's figures include that time, and the run says how much.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +13,14 @@ NS_PER_S = 1e9
 
 
 class HeldTime:
-    """Fed what somebody asked of the run. A hold that lets some frames through lasts until the run goes on."""
+    """Takes what somebody asked of the run. A hold that lets some frames through lasts until the run goes on."""
 
     def __init__(self) -> None:
         self._total_ns = 0
         self._since_ns: int | None = None
 
     def hear(self, now_ns: int, events: Iterable[Event]) -> None:
-        """`events` were asked for at `now_ns`."""
+        """Take `events`, which were asked for at `now_ns`."""
         for event in events:
             if not isinstance(event, Hold):
                 continue
@@ -27,11 +30,11 @@ class HeldTime:
                 self._since_ns = now_ns
 
     def until(self, now_ns: int) -> int:
-        """Of the run so far, ns."""
+        """Return for how many ns the run was held up to `now_ns`."""
         return self._total_ns + (0 if self._since_ns is None else now_ns - self._since_ns)
 
     def sentence(self, now_ns: int) -> str:
-        """For the report; empty where the run was never held."""
+        """Return the sentence for the report; empty if the run was never held."""
         held_s = self.until(now_ns) / NS_PER_S
         if not held_s:
             return ""

@@ -1,9 +1,15 @@
-"""What a unit's process measures around its jobs. Rule: the kernel is asked where no frame waits for the answer.
+"""Measures in a unit's process what happens around its jobs.
+
+Rule: the kernel is asked where no frame waits for the answer.
 
 A piece of time is a job, or the time between two jobs. Every ns of CPU time is in one piece. Run delay is read after
-the answer to a job; before that only if the job may have lost more than LOSS_NS. Nothing is read before a job, unless
-the unit has had it for longer than HELD_NS, its stage's last job lost time, or other threads may have run between the
-jobs. docs/decisions/preempted-time.md says what the two thresholds can hide.
+the answer to a job, and before the answer only if the job may have lost more than LOSS_NS. Before a job something is
+read in three cases only:
+- the unit has had the job for longer than HELD_NS;
+- its stage's last job lost time;
+- other threads may have run between the jobs.
+
+docs/decisions/preempted-time.md says what the two thresholds can hide.
 """
 
 from __future__ import annotations
@@ -17,11 +23,11 @@ from trilane.transport.messages import Done
 
 LOSS_NS: Final = 20_000
 HELD_NS: Final = 100_000  # longer than a hand-over takes
-JOBS_PER_LOOK: Final = 64  # for new threads, where no job loses time
+JOBS_PER_LOOK: Final = 64  # jobs between two searches for new threads, where no job loses time
 
 
 class Meter(Protocol):
-    """`trilane.pipeline.core_meter.CoreMeter`."""
+    """The part of `trilane.pipeline.core_meter.CoreMeter` that a `JobClock` uses."""
 
     @property
     def threads(self) -> int: ...
@@ -34,23 +40,27 @@ class Meter(Protocol):
 
 
 class JobClock:
-    """For a unit with `cores` cores and `stages` stages. `meter`: counts for its process. `now_ns`: the time."""
+    """Measures the jobs of a unit with `cores` cores and `stages` stages.
+
+    `meter`: counts of the unit's process.
+    `now_ns`: function that returns the time in ns.
+    """
 
     def __init__(self, meter: Meter, cores: int, stages: int, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self._meter, self._cores, self._now_ns = meter, cores, now_ns
         self._loses = [False] * stages  # whether the stage's last job may have lost more than LOSS_NS
-        self._used_cores = 1  # at a time, at most, by the threads that there are
+        self._used_cores = 1  # most cores that the present threads use at a time
         self._stage = self._jobs = 0
         self._begin_ns = self._end_ns = self._cpu_ns = self._cpu_before_ns = 0
         self._preempted_ns = self._asleep_ns = self._preempted_before_ns = 0
-        self._delay_before_ns = 0  # since the last job's end, as far as it was read
-        self._was_read = False  # the run delay, at the last job's end
-        self._knows_cpu = True  # of the time before the job
+        self._delay_before_ns = 0  # run delay since the last job's end, as far as it was read
+        self._was_read = False  # whether the run delay was read at the last job's end
+        self._knows_cpu = True  # whether the CPU time of the time before the job is known
         self._has_one_thread = False
         self.restart()
 
     def restart(self) -> None:
-        """The time between two jobs begins now, with the threads that there are."""
+        """Begin the time between two jobs now, with the threads that exist."""
         self._look()
         self._meter.delay_ns()
         self._meter.cpu_ns()
@@ -58,7 +68,7 @@ class JobClock:
         self._end_ns = self._now_ns()
 
     def begin(self, stage: int, dispatch_ns: int) -> None:
-        """A job of the unit's `stage`-th stage begins, which was dispatched at `dispatch_ns`."""
+        """Note that a job of the unit's `stage`-th stage begins, which was dispatched at `dispatch_ns`."""
         self._stage = stage
         begin_ns = self._now_ns()
         is_long = begin_ns - max(dispatch_ns, self._end_ns) > HELD_NS
@@ -73,11 +83,11 @@ class JobClock:
         self._begin_ns = begin_ns
 
     def end(self, works_asleep: bool) -> None:
-        """The job has ended. `works_asleep`: it went on while its threads slept."""
+        """Note that the job has ended. `works_asleep`: whether it went on while its threads slept."""
         cpu_ns = self._meter.cpu_ns()
         end_ns = self._end_ns = self._now_ns()
         wall_ns = end_ns - self._begin_ns
-        if not self._knows_cpu and cpu_ns > wall_ns:  # of one thread: the rest is of the time since the last answer
+        if not self._knows_cpu and cpu_ns > wall_ns:  # one thread cannot have more
             self._cpu_before_ns += cpu_ns - wall_ns
             cpu_ns = wall_ns
         self._cpu_ns = cpu_ns
@@ -87,15 +97,15 @@ class JobClock:
         self._preempted_ns, self._asleep_ns = lost_in_job(wall_ns, cpu_ns, delay_ns, self._cores, works_asleep)
 
     def done(self, job_id: int, sampled_ns: int, metrics: dict[str, float], skips: bool = False) -> Done:
-        """The answer to the job that has ended. `skips`: its frame takes the bypass."""
+        """Return the answer to the job that has ended. `skips`: whether its frame takes the bypass."""
         lost = (self._preempted_ns, self._asleep_ns, self._preempted_before_ns)
         times = (self._begin_ns, self._end_ns, sampled_ns, *lost, int(skips), self._cpu_ns, self._cpu_before_ns)
         return Done(job_id, *times, metrics)
 
     def answered(self) -> None:
-        """To be called when the job was answered, for what took place in it and since is read now.
+        """Read what took place in the job and since; called after the answer was sent.
 
-        This thread did not sleep since the job's end: of a delay that may be the job's, the time since is the most.
+        This thread did not sleep since the job's end, so a delay that may be the job's counts at most the time since.
         """
         delay_ns = self._meter.delay_ns()
         self._cpu_before_ns = self._meter.cpu_ns()

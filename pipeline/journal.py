@@ -1,11 +1,11 @@
-"""The journal of a run: what happened, in order, written while it happens, in one file that others may follow.
+"""The journal of a run: one file that records what happened, in order, while it happens; others may follow it.
 
-Rule: nothing of a run is kept in memory because somebody may want it later. Who wants it reads the journal: after the
-run, or while it goes on, from the same bytes.
+Rule: nothing of a run is kept in memory only because somebody may want it later. Whoever wants it reads the journal,
+after the run or during it, from the same bytes.
 
-The bytes are msgpack: arrays of a record's place in RECORDS and its fields, the first a `Begun`. A step comes before
-the accounts, jobs and counts that follow from it, and all of these before the next step. A journal that ends within a
-record, or without `Ended`, is of a run that was killed, or that still goes on.
+The file is MessagePack: each record is an array of the record's place in RECORDS and its fields, and the first is a
+`Begun`. A step comes before the accounts, jobs and counts that follow from it, and all of these before the next step. A
+journal that ends within a record, or without `Ended`, belongs to a run that was killed or still goes on.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from trilane.unexpected_value import UnexpectedValue
 
 NAME = "journal.msgpack"
 SCHEMA: Final = 1
-#: The longest that a run writes have a few kB, a map 25 entries. An empty map takes 72 times its byte in memory, and a
-#: list takes 8 bytes for each entry that it announces, in each of at most 1024 that may lie in one another.
+#: Bounds of a record: the longest that a run writes has a few kB, and a map has 25 entries. In memory, an empty map
+#: takes 72 times its byte. A list takes 8 bytes for each entry that it announces, in each of at most 1024 nested lists.
 MAX_RECORD_BYTES: Final = 1 << 20
 MAX_ENTRIES: Final = 1 << 14
 MAX_TEXT_BYTES: Final = 1 << 16
@@ -41,10 +41,10 @@ EXPECTED = "the journal of a run"
 
 
 class Begun(NamedTuple):
-    """The first record. `facts`: what else is known before the first frame, as JSON: `clock` ("host" or "virtual"),
+    """The first record.
 
-    `began_at` (UTC, ISO 8601), `config`, `machine`, `made`, `accuracy`, `units`, as in report.json, where they are
-    known.
+    `facts`: JSON values known before the first frame, with the keys of report.json where they are known: `clock`
+    ("host" or "virtual"), `began_at` (UTC, ISO 8601), `config`, `machine`, `made`, `accuracy`, `units`.
     """
 
     schema: int
@@ -54,7 +54,7 @@ class Begun(NamedTuple):
 
 
 class Stepped(NamedTuple):
-    """A step of the scheduler at `now_ns`: what it was told and what it answered."""
+    """A step of the scheduler at `now_ns`: the events it was told and the actions it answered with."""
 
     now_ns: int
     events: tuple[Event, ...]
@@ -62,7 +62,7 @@ class Stepped(NamedTuple):
 
 
 class Accounted(NamedTuple):
-    """From `now_ns` on the time of `unit` goes to `account` (`trilane.scheduler.ledger`)."""
+    """From `now_ns` on, the time of `unit` goes to `account` (`trilane.scheduler.ledger`)."""
 
     now_ns: int
     unit: str
@@ -70,14 +70,17 @@ class Accounted(NamedTuple):
 
 
 class Worked(NamedTuple):
-    """A job that has ended, and the numbers that its stage reported of it, by name."""
+    """A job that has ended. `figures`: numbers that its stage reported of it, by name."""
 
     job: JobRecord
     figures: Mapping[str, float]
 
 
 class Counted(NamedTuple):
-    """Frames `lost` and `dropped` until `now_ns`, by the cause's key in the report; written when they have changed."""
+    """Counts of the frames `lost` and `dropped` until `now_ns`, by the cause's key in the report.
+
+    The record is written when they have changed.
+    """
 
     now_ns: int
     lost: Mapping[str, int]
@@ -85,7 +88,7 @@ class Counted(NamedTuple):
 
 
 class Sampled(NamedTuple):
-    """What was looked at in passing, by dotted name, such as `temperature_c.device` or `duty.gpu`."""
+    """Readings taken in passing, by dotted name, such as `temperature_c.device` or `duty.gpu`."""
 
     now_ns: int
     values: Mapping[str, float]
@@ -99,7 +102,7 @@ class Said(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """The last record: the figures of the whole run, as `RunMetrics.as_json()` has them."""
+    """The last record. `report`: figures of the whole run, as `RunMetrics.as_json()` returns them."""
 
     now_ns: int
     report: Mapping[str, Any]
@@ -111,10 +114,10 @@ _PLACES = {kind: place for place, kind in enumerate(RECORDS)}
 
 
 class JournalWriter:
-    """Context manager: `add` writes a record. What is written reaches the file after `flush`, and at the end.
+    """Context manager that writes records: `add` writes one, and `flush` or the end brings all to the file.
 
-    `path`: a file that does not exist yet; OSError where it cannot be made. All else, the end included, raises
-    UnwrittenError where the file cannot be written on, such as on a full disk.
+    `path`: path of a file that does not exist yet; raises OSError where it cannot be made. Every other method raises
+    UnwrittenError where the file cannot be written, such as on a full disk.
     """
 
     def __init__(self, path: Path) -> None:
@@ -131,7 +134,7 @@ class JournalWriter:
             raise UnwrittenError(self._path, error) from None
 
     def flush(self) -> None:
-        """Whoever follows the journal sees all that was added."""
+        """Bring all added records to the file, where whoever follows the journal sees them."""
         try:
             self._file.flush()
         except OSError as error:
@@ -150,10 +153,9 @@ class JournalWriter:
 
 
 class JournalReader:
-    """The records of the journal at `path`, again and again as it grows; where it was moved, set `path` anew.
+    """Reads the journal at `path` again and again while it grows; after a move of the file, set `path` anew.
 
-    `new()`: those that came whole since the last call. Raises BadInputError for a file that is none, and for a record
-    that is none, by its number, from 1 on.
+    Raises BadInputError for a file that is no journal, and for a bad record, which it names by its number, from 1 on.
     """
 
     def __init__(self, path: Path) -> None:
@@ -171,7 +173,7 @@ class JournalReader:
         self._run: _Checks | None = None
 
     def new(self) -> Iterator[Record]:
-        """Each record once, in order."""
+        """Yield each record that became whole since the last call, once and in order."""
         try:
             with self.path.open("rb") as file:
                 file.seek(self._read_bytes)
@@ -182,7 +184,7 @@ class JournalReader:
             raise BadInputError.of_os_error(self.path, error, EXPECTED) from None
 
     def _parsed(self, chunk: bytes) -> Iterator[Record]:
-        """The records that end in `chunk`, which comes next."""
+        """Yield the records that end in `chunk`, the next bytes of the file."""
         count = self._count
         try:
             self._unpacker.feed(chunk)
@@ -198,7 +200,7 @@ class JournalReader:
             raise self._refused(f"more than {MAX_RECORD_BYTES} bytes")
 
     def _refused(self, found: str) -> BadInputError:
-        """Of the record that comes next, which cannot be read."""
+        """Return the error for the next record, which cannot be read."""
         return BadInputError(f"{self.path}, record {self._count + 1}", found, EXPECTED)
 
     def _record(self, row: Any) -> Record:
@@ -219,7 +221,7 @@ class JournalReader:
 
 
 def journal_in(folder: Path) -> Path | None:
-    """The journal of a run folder; None: it has none. Raises BadInputError for anything but a file."""
+    """Return the path of a run folder's journal, or None; raises BadInputError for anything that is not a file."""
     path = folder / NAME
     if path.exists() and not path.is_file():
         require_file(path, EXPECTED)
@@ -227,7 +229,10 @@ def journal_in(folder: Path) -> Path | None:
 
 
 def read_journal(path: Path) -> Iterator[Record]:
-    """Every whole record of the journal at `path`. Raises BadInputError; an empty file is none, nor is a pipe."""
+    """Yield every whole record of the journal at `path`.
+
+    Raises BadInputError, also for an empty file and for a pipe.
+    """
     require_file(path, EXPECTED)
     reader = JournalReader(path)
     is_empty = True
@@ -239,14 +244,14 @@ def read_journal(path: Path) -> Iterator[Record]:
 
 
 def records_of(recording: Recording, jobs: Iterable[JobRecord]) -> Iterator[Record]:
-    """The records of a run that is in memory, as far as what bounded it follows from them."""
+    """Yield the records of a run in memory that are needed to say what bounded it."""
     for stepped, others in _steps_of(recording, jobs):
         yield stepped
         yield from others
 
 
 def _steps_of(recording: Recording, jobs: Iterable[JobRecord]) -> Iterator[tuple[Stepped, list[Record]]]:
-    """Each step's record, with the records of what it changed and of the jobs that it ended."""
+    """Yield each step's record, with the records of what it changed and of the jobs that it ended."""
     accounts = deque(recording.accounts)
     left: dict[str, deque[JobRecord]] = {unit: deque() for unit in recording.graph.units}
     for job in sorted(jobs, key=lambda job: job.begin_ns):
@@ -264,9 +269,12 @@ def _steps_of(recording: Recording, jobs: Iterable[JobRecord]) -> Iterator[tuple
 def journal_of(
     recording: Recording, jobs: Iterable[JobRecord], facts: Mapping[str, Any], report: Mapping[str, Any]
 ) -> Iterator[Record]:
-    """The records of a run that is in memory, such as one in virtual time (`Simulation` with `keep`).
+    """Yield the records of a run in memory, such as one in virtual time (`Simulation` with `keep`).
 
-    Frames lost and dropped are counted by a core that hears the same events. `facts`: of `Begun`. `report`: of `Ended`.
+    A second `Core` that hears the same events counts the frames lost and dropped.
+
+    `facts`: facts of `Begun`.
+    `report`: report of `Ended`.
     """
     core, counted, now_ns = Core(recording.graph, recording.settings), 0, 0
     yield Begun(SCHEMA, recording.graph, recording.settings, facts)
@@ -282,7 +290,7 @@ def journal_of(
 
 
 def config_of(begun: Begun) -> Mapping[str, Any]:
-    """The configuration that a journal begins with; empty for one that does not know it."""
+    """Return the configuration that a journal begins with; empty for a journal without one."""
     config = begun.facts.get("config", {})
     if not isinstance(config, Mapping) or not all(
         isinstance(config.get(key, {}), Mapping) for key in ("units", "scene", "pace_ns")
@@ -291,14 +299,14 @@ def config_of(begun: Begun) -> Mapping[str, Any]:
     return config
 
 
-#: The fields of a record as they are written, where they are not its own.
+#: The fields of a record as written, for records whose fields are not written as they are.
 _FIELDS: dict[type[Any], Callable[[Any], list[Any]]] = {
     Begun: lambda record: [record.schema, asdict(record.graph), asdict(record.settings), record.facts],
     Stepped: lambda record: [record.now_ns, [*map(row_of, record.events)], [*map(row_of, record.actions)]],
 }
 
 
-#: What is wrong with bytes, by what the reader of MessagePack raises.
+#: What is wrong with the bytes, by the exception that the MessagePack reader raises.
 _UNREADABLE: tuple[tuple[type[Exception], str], ...] = (
     (msgpack.FormatError, "bytes that are no MessagePack"),
     (msgpack.StackError, "lists inside lists, too deep"),
@@ -311,7 +319,7 @@ _Checks = tuple[tuple[Callable[[Any], Any], ...], ...]
 
 
 def _checks(run: RunValues) -> _Checks:
-    """By the place of a record in RECORDS: what its fields are checked with."""
+    """Return the checks of each record's fields, by the record's place in RECORDS."""
     of: dict[type[Any], tuple[Callable[[Any], Any], ...]] = {
         Begun: (),
         Stepped: (run.step_ns, run.events, run.actions),

@@ -1,7 +1,7 @@
-"""What a value of a journal's record may be.
+"""Checks the values of a journal's records.
 
-Rule: a check takes a value as it was read, from whomever it is, and hands back what it stands for, or raises
-UnexpectedValue in plain words; what a check remembers of a run does not grow with the run.
+Rule: a check takes a value as it was read, from an untrusted file. It returns what the value stands for, or raises
+UnexpectedValue in plain words. What a check remembers of a run does not grow with the run.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from trilane.scheduler.recording import CARRIED, actions_of, events_of, graph_of
 from trilane.unexpected_value import UnexpectedValue
 
 LONGEST_FOUND: Final = 80
-MOST_NESTED: Final = 32  # of the facts: a configuration has five
+MOST_NESTED: Final = 32  # depth of the facts; a configuration has five
 ACCOUNTS: Final = {ASSIGNED: "assigned", STARVED: "starved", BLOCKED: "blocked", THROTTLED: "throttled"}
 A_TIME: Final = f"nanoseconds, a whole number from 0 to {NEVER}"
 NUMBERS: Final = {int, float}
 PLAIN: Final = {int, float, str, bool, type(None)}
-JOB_TYPES: Final = tuple(get_type_hints(JobRecord).values())  # journals of an older Trilane lack the last
+JOB_TYPES: Final = tuple(get_type_hints(JobRecord).values())  # journals of an older Trilane lack the last field
 SETTINGS_TYPES: Final = {
     name: tuple if "tuple" in str(kind) else kind for name, kind in get_type_hints(Settings).items()
 }
-#: Name of an event or action -> where its row has a unit and a stage; 0: nowhere.
+#: Where the row of each event or action has a unit and a stage; 0: nowhere.
 _NAMED: Final = {
     kind.__name__: tuple(fields.index(name) + 1 if name in fields else 0 for name in ("unit", "stage"))
     for kind in (*EVENTS, *ACTIONS)
@@ -36,27 +36,27 @@ _NAMED: Final = {
 
 
 def shown(value: Any) -> str:
-    """A value as part of a message."""
+    """Return a value as part of a message."""
     text = repr(value)
     return text if len(text) <= LONGEST_FOUND else f"{text[:LONGEST_FOUND]}…"
 
 
 def time_ns(value: Any) -> int:
-    """A time of the run's clock."""
+    """Return a time of the run's clock in ns."""
     if type(value) is not int or not 0 <= value <= NEVER:
         raise UnexpectedValue(f"time {shown(value)}", A_TIME)
     return value
 
 
 def text(value: Any) -> str:
-    """A text."""
+    """Return a text."""
     if type(value) is not str:
         raise UnexpectedValue(f"text {shown(value)}", "a text")
     return value
 
 
 def numbers(value: Any) -> Mapping[str, float]:
-    """Finite numbers by name."""
+    """Return finite numbers by name."""
     if type(value) is not dict:
         raise UnexpectedValue(shown(value), "numbers by name")
     if not (set(map(type, value)) <= {str} and set(map(type, value.values())) <= NUMBERS):
@@ -67,7 +67,7 @@ def numbers(value: Any) -> Mapping[str, float]:
 
 
 def counts(value: Any) -> Mapping[str, int]:
-    """Whole numbers from 0 on, by name."""
+    """Return whole numbers by name, each at least 0."""
     found: Any = numbers(value)
     if any(type(each) is not int or each < 0 for each in found.values()):
         raise UnexpectedValue(shown(value), "whole numbers from 0 on, by name")
@@ -75,7 +75,7 @@ def counts(value: Any) -> Mapping[str, int]:
 
 
 def facts(value: Any) -> Mapping[str, Any]:
-    """What JSON can hold, by name."""
+    """Return a map of what JSON can hold, by name."""
     if type(value) is not dict:
         raise UnexpectedValue(shown(value), "facts by name")
     waiting: list[tuple[Any, int]] = [(value, 1)]
@@ -93,7 +93,7 @@ def facts(value: Any) -> Mapping[str, Any]:
 
 
 def graph(value: Any) -> Graph:
-    """The graph of a run, with names that a terminal can show."""
+    """Return the graph of a run, with names that a terminal can show."""
     try:
         found = graph_of(value)
         names = [name for stage in found.stages for name in (stage.name, stage.unit)]
@@ -109,12 +109,12 @@ def graph(value: Any) -> Graph:
 
 
 def settings(value: Any, of_graph: Graph) -> Settings:
-    """The settings of a run with that graph, with which its scheduler can be made."""
+    """Return the settings of a run with `of_graph`, with which its scheduler can be made."""
     try:
         found = settings_of(value)
         for name, kind in SETTINGS_TYPES.items():
             _check_setting(name, kind, getattr(found, name))
-        Core(of_graph, found)  # says what is wrong with them
+        Core(of_graph, found)  # this raises an error that says what is wrong with them
     except UnexpectedValue:
         raise
     except (TypeError, AttributeError):
@@ -135,7 +135,7 @@ def _check_setting(name: str, kind: type[Any], value: Any) -> None:
 
 
 class RunValues:
-    """Checks of what must fit the graph of a run, or what was read before: times of steps, names, jobs."""
+    """Checks values against the graph of a run or against earlier records: times of steps, names, jobs."""
 
     def __init__(self, of_graph: Graph) -> None:
         self._unit_of = {stage.name: stage.unit for stage in of_graph.stages}
@@ -144,7 +144,7 @@ class RunValues:
         self._step_ns = 0
 
     def step_ns(self, value: Any) -> int:
-        """The time of a step: not before the last one's."""
+        """Return the time of a step, which is not before the last one's."""
         if type(value) is not int or not self._step_ns <= value <= NEVER:
             raise UnexpectedValue(
                 f"time {shown(value)} of a step", f"{A_TIME}, not before the last step's {self._step_ns}"
@@ -153,20 +153,20 @@ class RunValues:
         return value
 
     def unit(self, value: Any) -> str:
-        """The name of a unit."""
+        """Return the name of a unit of the graph."""
         if type(value) is not str or value not in self._units:
             raise _unknown("unit", value, self._units)
         return value
 
     def account(self, value: Any) -> int:
-        """An account of the ledger."""
+        """Return an account of the ledger."""
         if type(value) is not int or value not in ACCOUNTS:
             known = ", ".join(f"{number} ({name})" for number, name in ACCOUNTS.items())
             raise UnexpectedValue(f"account {shown(value)}", f"one of {known}")
         return value
 
     def events(self, rows: Any) -> tuple[Event, ...]:
-        """What a step was told."""
+        """Return the events of a step."""
         found = events_of(_rows(rows))
         for row in rows:
             self._check_row(row)
@@ -175,14 +175,17 @@ class RunValues:
         return found
 
     def actions(self, rows: Any) -> tuple[Action, ...]:
-        """What a step answered."""
+        """Return the actions of a step."""
         found = actions_of(_rows(rows))
         for row in rows:
             self._check_row(row)
         return found
 
     def _check_row(self, row: tuple[Any, ...]) -> None:
-        """Of an event or action, whose fields have their types: names that the graph has, numbers in their range."""
+        """Check that a row names units and stages of the graph, and that its numbers are in range.
+
+        Its types are checked already.
+        """
         unit, stage = _NAMED.get(row[0], (0, 0))
         if unit and row[unit] not in self._units:
             raise _unknown("unit", row[unit], self._units)
@@ -193,7 +196,7 @@ class RunValues:
                 raise UnexpectedValue(f"{value} in {row[0]}", f"a whole number from -1 to {NEVER}")
 
     def job(self, row: Any) -> JobRecord:
-        """A job that has ended; each stage does the frames in their order, and none twice."""
+        """Return a job that has ended; each stage does frames in order, and none twice."""
         if type(row) is not tuple or tuple(map(type, row)) not in (JOB_TYPES, JOB_TYPES[:-1]):
             raise UnexpectedValue(f"job {shown(row)}", f"texts and whole numbers: {', '.join(JobRecord._fields)}")
         job = JobRecord(*row)

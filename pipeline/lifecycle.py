@@ -1,4 +1,4 @@
-"""The units' lives outside the run itself: all up before it, all closed after it. Rule: the deadlines are here."""
+"""The units' lives outside the run: all are up before it, and closed after it. Rule: the time limits are here."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ POLL_MS = 200
 
 
 def start_units(processes: UnitProcesses, units: Iterable[str], interrupts: Interrupts) -> dict[str, float]:
-    """Every unit up and bound to its slots; how many milliseconds each took.
+    """Start every unit, wait until it is bound to its slots, and return how many ms each unit took.
 
-    Raises UnitError when one cannot start, KeyboardInterrupt when interrupted.
+    Raises UnitError when a unit cannot start, and KeyboardInterrupt when interrupted.
     """
     started_s = {}
     for unit in units:
@@ -39,7 +39,7 @@ def start_units(processes: UnitProcesses, units: Iterable[str], interrupts: Inte
 
 
 def listen_before_run(processes: UnitProcesses, interrupts: Interrupts) -> list[UnitMessage]:
-    """The next messages. Raises UnitError when a unit failed or ended, KeyboardInterrupt when interrupted."""
+    """Return the next messages; raises UnitError when a unit failed or ended, KeyboardInterrupt when interrupted."""
     messages = processes.listen(POLL_MS)
     if interrupts.count:
         raise KeyboardInterrupt
@@ -52,11 +52,15 @@ def listen_before_run(processes: UnitProcesses, interrupts: Interrupts) -> list[
 
 
 def close_units(processes: UnitProcesses, log: RunLog, interrupts: Interrupts) -> None:
-    """The stages complete their files, then the processes leave; `UnitProcesses.close` kills one that does not."""
+    """Let the stages complete their files and the processes end.
+
+    `UnitProcesses.close` kills a process that does not end.
+    """
     waiting = set(processes.pids)
     for unit in waiting:
         processes.send(unit, Close())
     end = time.monotonic() + CLOSE_S
+    # A second interrupt asks to end at once, so it ends the wait too.
     while waiting and time.monotonic() < end and interrupts.count < 2:
         for unit, message in processes.listen(POLL_MS):
             if isinstance(message, Failed):

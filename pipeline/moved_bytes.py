@@ -1,8 +1,8 @@
-"""Bytes that a stage moves for a frame, counted by the stage where it copies them, beside the least that would do.
+"""Counts the bytes that a stage moves for a frame, where the stage copies them, beside the least that would do.
 
-Rule: a byte counts at each memory that it is read from or written to. A copy from a slot to the GPU is read there and
-uploaded here; a copy back is read back here and written there. So the four figures add up to what passed through the
-memories, and a stage that copies nothing between its input and its output comes to its least.
+Rule: a byte counts at each memory that it is read from or written to. A copy from a slot to the GPU counts as read and
+as uploaded; a copy back counts as read back and as written. So the four figures add up to what passed through the
+memories. A stage that copies nothing between its input and its output moves its least.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-#: Key in report.json to the name under which a stage reports it with a job.
+#: Keys in report.json, with the name under which a stage reports each with a job.
 NAMES = {
     "read": "bytes_read",
     "written": "bytes_written",
@@ -25,13 +25,14 @@ LEAST = "least"
 
 @dataclass(slots=True)
 class ByteCounter:
-    """Of one frame.
+    """The bytes that a stage moves for one frame.
 
-    `read`: from slots, shared assets and what the stage samples.
-    `written`: into the output slot, or the file.
-    `uploaded`: from the CPU's memory into the GPU's.
-    `read_back`: from the GPU's memory into the CPU's.
-    `least`: what the frame needs: of the input what it depends on, read once, and the output, written once.
+    `read`: bytes read from slots, shared assets and what the stage samples.
+    `written`: bytes written into the output slot or the file.
+    `uploaded`: bytes moved from the CPU's memory into the GPU's.
+    `read_back`: bytes moved from the GPU's memory into the CPU's.
+    `least`: bytes that the frame needs: the part of the input that it depends on, read once, and the output, written
+    once.
     """
 
     read: int = 0
@@ -41,17 +42,17 @@ class ByteCounter:
     least: int = 0
 
     def start(self, passed_on: int = 0) -> None:
-        """A frame begins. `passed_on`: bytes of the header, copied from the input slot to the output slot."""
+        """Begin a frame. `passed_on`: bytes of the header, copied from the input slot to the output slot."""
         self.read = self.written = passed_on
         self.uploaded = self.read_back = self.least = 0
 
     def copied(self, count: int) -> None:
-        """`count` bytes were read in one slot and written to another."""
+        """Count `count` bytes that were read in one slot and written to another."""
         self.read += count
         self.written += count
 
     def figures(self) -> dict[str, float]:
-        """What the stage reports of its job."""
+        """Return what the stage reports of its job."""
         return {
             "bytes_read": self.read,
             "bytes_written": self.written,
@@ -62,9 +63,9 @@ class ByteCounter:
 
 
 def add_bytes(report: dict[str, Any], sums: Mapping[str, Mapping[str, float]]) -> None:
-    """Add to `report`, the keys of report.json, what each stage moved for a presented frame, and the total.
+    """Add what each stage moved for a presented frame, and the total, to `report`, the keys of report.json.
 
-    `sums`: of each stage, the sums of what its jobs reported. A stage that had no job moved nothing; one that does not
+    `sums`: sums of what the jobs of each stage reported. A stage without a job moved nothing; a stage that does not
     count has no row. Nothing is added where no frame was presented or no stage counts.
     """
     frames = report["frames"]["presented"]
@@ -81,7 +82,7 @@ def add_bytes(report: dict[str, Any], sums: Mapping[str, Mapping[str, float]]) -
 
 
 def _per_frame(sums: Mapping[str, float], frames: int) -> dict[str, float | None]:
-    """Means, and `ratio`: of all that was moved to the least; null where that is 0."""
+    """Return the means per frame, and `ratio`, all that was moved over the least; null where the least is 0."""
     least = sums[NAMES[LEAST]]
     means = {key: sums[name] / frames for key, name in NAMES.items()}
     return {**means, "ratio": _moved(sums) / least if least else None}

@@ -1,4 +1,7 @@
-"""What other programs have of the cores meanwhile. Rule: what is not ours is theirs, by the kernel's own counts."""
+"""Measures the share of other programs in the time of cores.
+
+Rule: what is not ours is theirs, by the kernel's counts.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,11 @@ from trilane import machine
 
 
 class OtherPrograms:
-    """Counts from its making on. `cores`: of which; `pids`: of processes that are ours beside this one."""
+    """Counts from its creation on.
+
+    `cores`: numbers of the cores that count.
+    `pids`: processes that are ours beside this one.
+    """
 
     def __init__(self, cores: Sequence[int], pids: Sequence[int] = ()) -> None:
         self._cores, self._processes = cores, [psutil.Process(pid) for pid in (os.getpid(), *pids)]
@@ -21,7 +28,10 @@ class OtherPrograms:
         self._begin_s, self._before_s = time.monotonic(), self._others_s()
 
     def share(self) -> float:
-        """Theirs of the time of the cores, at most 1; counted in steps of 10 ms, so under 0.1 s it says little."""
+        """Return the others' share of the time of the cores, at most 1.
+
+        The kernel counts in steps of 10 ms, so under 0.1 s the share says little.
+        """
         had_s = max(time.monotonic() - self._begin_s, 1e-9) * len(self._cores)
         return min(max(self._others_s() - self._before_s, 0.0) / had_s, 1.0)
 
@@ -32,10 +42,10 @@ class OtherPrograms:
 
 
 def beside_units(cores: Sequence[int], pids: Mapping[str, int]) -> Callable[[Mapping[str, int]], float | None]:
-    """Counts from now on, on `cores`, beside the processes `pids` of units.
+    """Count from now on what others have of `cores`, beside the processes `pids` of units.
 
-    What it hands back, called with the units' processes of then, says the others' share; None where a unit has died in
-    between, for then nobody knows what it had.
+    Return a function that takes the units' present processes and returns the others' share. It returns None if a unit
+    has died in between, because its CPU time is then unknown.
     """
     try:
         others = OtherPrograms(cores, [*pids.values()])
@@ -51,10 +61,10 @@ def beside_units(cores: Sequence[int], pids: Mapping[str, int]) -> Callable[[Map
 
 
 def busy_s(stat: str, cores: Sequence[int]) -> float:
-    """How long `cores` were not idle since the system began, what a hypervisor took of them included.
+    """Return how many seconds `cores` were not idle since the system began, including steal time.
 
-    `stat`: what /proc/stat said (proc_stat(5)): cpuN user nice system idle iowait irq softirq steal guest guest_nice,
-    the guests' time counted in user and nice too.
+    `stat`: text of /proc/stat (proc_stat(5)): cpuN user nice system idle iowait irq softirq steal guest guest_nice. The
+    guests' time is also counted in user and nice.
     """
     names = {f"cpu{core}" for core in cores}
     rows = [line.split() for line in stat.splitlines()]

@@ -1,6 +1,7 @@
 """The clock of this machine, for the scheduler's loop. Rule: it waits and does what the core says; it decides nothing.
 
-`wait` turns what the units, the signals and the governor say into events; `perform` turns actions into messages.
+`wait` turns messages of the units, signals and the governor's duties into events; `perform` turns actions into
+messages.
 """
 
 from __future__ import annotations
@@ -51,22 +52,24 @@ LONGEST_STEP_NS = PING_NS + 250_000_000  # between two steps, unless this proces
 
 
 class Governor(Protocol):
-    """Holds the units to shares of the time. `due_ns`: when it wants to be asked next."""
+    """Holds the units to shares of the time. `due_ns`: time at which `tick` is to be called next."""
 
     due_ns: int
 
     def begin(self, now_ns: int) -> list[SetDuty]:
-        """The duties at the start of the run."""
+        """Return the duties at the start of the run."""
 
     def tick(self, now_ns: int, busy_ns: dict[str, int]) -> list[SetDuty]:
-        """What changes now; `busy_ns`: how long each unit has worked since the run began."""
+        """Return the duties that change now. `busy_ns`: work of each unit in ns since the run began."""
 
 
 class RealtimeClock:
-    """`trilane.scheduler.loop.Clock` of one run over `processes`; it lets `core` run until that finishes.
+    """The `trilane.scheduler.loop.Clock` of one run over `processes`, which lets `core` run until it finishes.
 
-    Of the jobs that `ended` has told of: `metrics`, the sums of what those of each stage reported, and `reported`, how
-    many of them reported each; `cpu`, CPU time of units and stages. `first`: events that come before all others.
+    `metrics`: sums of what the jobs of each stage reported, over the jobs that `ended` has returned.
+    `reported`: number of those jobs that reported each figure.
+    `cpu`: CPU time of units and stages over the same jobs.
+    `first`: events that come before all others.
     """
 
     def __init__(
@@ -101,23 +104,24 @@ class RealtimeClock:
             processes.watch(requests.fd)
 
     def heed(self, controls: RunControls) -> None:
-        """Do what is asked of the run by `controls`."""
+        """Do from now on what `controls` asks of the run."""
         self._controls = controls
         self._processes.watch(controls.fd)
 
     def wait(self, deadline_ns: int) -> tuple[int, tuple[Event, ...]]:
-        """What happened until `deadline_ns` at the latest, and what time it is then."""
+        """Wait for something to happen, until `deadline_ns` at the latest, and return the time and the events."""
         self._show_progress()
         self._tell_unanswered()
         events = self._listen(deadline_ns) if self._begun else self._begin()
         now_ns = time.monotonic_ns()
+        # This process was stopped. Unless the core is told, it restarts healthy units.
         if now_ns - self._step_ns > LONGEST_STEP_NS:
             events.insert(0, SchedulerStalled(now_ns - self._step_ns))
         self._step_ns = now_ns
         return now_ns, tuple(events)
 
     def perform(self, now_ns: int, actions: tuple[Action, ...]) -> None:
-        """Tell the units."""
+        """Send the actions to the units."""
         for action in actions:
             if isinstance(action, Dispatch):
                 self._dispatch(now_ns, action.job)
@@ -129,11 +133,11 @@ class RealtimeClock:
 
     @property
     def waiting(self) -> int:
-        """How many jobs `ended` would tell of."""
+        """The number of jobs that `ended` would return now."""
         return len(self._unbooked)
 
     def ended(self) -> list[Worked | None]:
-        """Book the jobs that have ended since the last call; None for one whose frame was lost by then."""
+        """Book the jobs that have ended since the last call; None stands for a job whose frame was lost by then."""
         found: list[Worked | None] = []
         for job, dispatch_ns, ready_ns, done in self._unbooked:
             if ready_ns is None:
@@ -157,7 +161,7 @@ class RealtimeClock:
         self._show_progress(final=True)
 
     def _start(self, unit: str) -> None:
-        """Start the unit again; where no process can be made for it the run ends, with what was done until then."""
+        """Start the unit again; if no process can be made for it, the run ends with what was done until then."""
         try:
             self._processes.start(unit)
         except (TrilaneError, OSError) as error:
@@ -194,7 +198,7 @@ class RealtimeClock:
         return events
 
     def _interrupted(self) -> list[Event]:
-        """The first interrupt stops the run, a second one aborts it."""
+        """Return the events of interrupts: the first stops the run, the second aborts it."""
         if self._interrupts.count > 1:
             return [Abort()]
         if self._interrupts.count and not self._stopping:
@@ -213,9 +217,9 @@ class RealtimeClock:
         return events
 
     def _ping(self, now_ns: int) -> list[Event]:
-        """Ask idle units whether they live; a busy one is heard of when its job ends."""
+        """Ask idle units whether they live; a busy unit shows it when its job ends."""
         self._ping_ns = now_ns + PING_NS
-        with contextlib.suppress(OSError):  # it is tried once more when a unit is to be started
+        with contextlib.suppress(OSError):  # starting the next unit tries again
             if why := self._processes.renew_starter():
                 self._log.say(f"{why} and is replaced")
         self._tell_stopped(now_ns)
@@ -225,7 +229,7 @@ class RealtimeClock:
         return [Pinged(unit) for unit in units]
 
     def _tell_stopped(self, now_ns: int) -> None:
-        """Say of each unit that was stopped by a signal, and is not now, for how long; seen with each ping."""
+        """Say for how long each unit was stopped by a signal, once it runs again; looked at with each ping."""
         stopped = self._processes.stopped
         for unit in stopped - self._stopped_ns.keys():
             self._stopped_ns[unit] = now_ns
@@ -255,6 +259,7 @@ class RealtimeClock:
     def _done(self, unit: str, message: Done) -> Event:
         job, dispatch_ns = self._open.pop(message.id)
         frame = self._core.frames.get(job.frame)
+        # `ended` books the job later, so that the next one is sent first.
         self._unbooked.append((job, dispatch_ns, None if frame is None else frame.ready_ns, message))
         if frame is not None and self._requests is not None and job.stage == self._last_stage:
             self._requests.answered(job.frame)
@@ -263,7 +268,7 @@ class RealtimeClock:
     def _failed(self, unit: str, message: Failed) -> Event | None:
         self._log.fail_with(message)
         if message.id < 0:
-            return None  # the unit could not be built again; the end of its process follows
+            return None  # its stages could not be built again; the end of the process follows
         self._open.pop(message.id)
         return JobFailed(unit, message.id)
 
@@ -274,7 +279,7 @@ class RealtimeClock:
         self._processes.send(job.unit, RunJob(*fields))
 
     def _tell_unanswered(self) -> None:
-        """Whoever asked for frames learns at once of those that will not come."""
+        """Tell whoever asked for frames at once which of them will not come."""
         if self._requests is None:
             return
         ledger = self._core.ledger

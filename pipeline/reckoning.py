@@ -1,7 +1,7 @@
-"""What bounded a run, and how well it used its cores: one reading of what happened, for everyone who says it.
+"""Computes what bounded a run and how well it used its cores, once for everyone who shows it.
 
-Rule: report.json, the table, `trilane explain`, the dashboard and Python say what this says; nobody computes it again.
-What is held of a run while it is read is bounded, however long it lasts.
+Rule: report.json, the table, `trilane explain`, the dashboard and Python take these figures; nobody computes them
+again. The memory for reading a run is bounded, however long the run lasts.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ from trilane.scheduler.places import Place, Placement
 
 
 class Reckoned(NamedTuple):
-    """Of a whole run.
+    """What bounded a whole run.
 
-    `budget`: the ns of the path by what they are and of which stage. `taken`: of each stage, who had its core.
+    `budget`: ns of the critical path by kind and stage.
+    `taken`: who had the core of each stage's unit, by stage.
     `figures`: `bottleneck`, `bound`, `efficiency`, `core_efficiency` and `machine_efficiency` of a report.
     """
 
@@ -33,25 +34,28 @@ class Reckoned(NamedTuple):
 class Reckoning:
     """Takes the jobs of a run in order, with their waits explained.
 
-    `graph`, `settings`: of the run. `places`: of its units, as far as they are known. `downs`: of its units so far, as
-    `Timeline` notes them. `paths`, `sharing`: of the jobs so far.
+    `graph`, `settings`: graph and settings of the run.
+    `places`: places of its units, as far as they are known.
+    `downs`: times in which units were down so far, as `Timeline` notes them.
+    `paths`, `sharing`: paths and core sharing of the jobs so far.
     """
 
     def __init__(self, graph: Graph, settings: Settings, places: Placement, downs: Reversible[Down]) -> None:
         self.paths = Paths(graph, settings, downs)
         self.sharing = Sharing({unit: place.cores for unit, place in places.items()})
         self._budget = Budget(self.paths, self.sharing)
-        own = {unit: Place((-1 - number,), 1) for number, unit in enumerate(graph.units)}  # as if it had a core
+        # as if each unit had a core of its own
+        own = {unit: Place((-1 - number,), 1) for number, unit in enumerate(graph.units)}
         self._efficiencies = Efficiencies({**own, **places})
         self._unit_of = {stage.name: stage.unit for stage in graph.stages}
 
     @property
     def bound(self) -> Mapping[str, Any] | None:
-        """As in a report, by the path so far; None until 63 frames were presented."""
+        """The `bound` of a report, by the path so far; None until 63 frames were presented."""
         return self._budget.bound(self._unit_of).get("bound")
 
     def add(self, explained: ExplainedJob) -> None:
-        """The next job that has ended."""
+        """Take the next job that has ended."""
         self.paths.add(explained)
         self.sharing.add(explained.job)
         presents = explained.presented is not None
@@ -60,16 +64,16 @@ class Reckoning:
             self._budget.present(explained)
 
     def close(self) -> Reckoned:
-        """After the last job."""
+        """Return the result; called after the last job."""
         budget = self._budget.close()
         figures = {**self._efficiencies.close(), **self._budget.bound(self._unit_of)}
         return Reckoned(budget, self.sharing.close(), figures)
 
 
 def places_of(begun: Begun) -> dict[str, Place]:
-    """Cores and threads of each unit as `Pipeline.places` has them, as far as the journal's head knows them.
+    """Return the cores and threads of each unit, as far as the journal's first record has them.
 
-    Raises BadInputError for a configuration that is none of a run.
+    They are those of `Pipeline.places`. Raises BadInputError for a configuration that is none of a run.
     """
     config = config_of(begun)
     units, pace_ns = config.get("units", {}), config.get("pace_ns", {})
@@ -82,7 +86,7 @@ def places_of(begun: Begun) -> dict[str, Place]:
 
 
 def reckoned(graph: Graph, settings: Settings, places: Placement, records: Iterable[Record]) -> Reckoned:
-    """What bounded a run. `records`: those of the run after the first."""
+    """Return what bounded a run. `records`: records of the run after the first."""
     timeline = Timeline(graph, settings, waits=True)
     reckoning = Reckoning(graph, settings, places, timeline.downs)
     for record in records:

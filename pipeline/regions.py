@@ -1,4 +1,4 @@
-"""The shared memory of a run's edges. Rule: the parent makes a region per edge, and closes it whatever happens."""
+"""The shared memory of a run's edges. Rule: the parent makes a region for each edge, and closes it whatever happens."""
 
 from __future__ import annotations
 
@@ -12,7 +12,13 @@ from trilane.transport.slots import edge_rule
 
 
 class EdgeRegion(Model):
-    """A region that a unit maps. `fd` is inherited."""
+    """A region that a unit maps.
+
+    `fd`: descriptor, which the unit's process inherits.
+    `slots`: number of slots.
+    `header`: dtype of every packet's header.
+    `payload_bytes`: bytes of every packet's payload.
+    """
 
     fd: int
     slots: int
@@ -26,7 +32,7 @@ class EdgeRegion(Model):
 
 @contextlib.contextmanager
 def edge_regions(pipeline: Pipeline) -> Iterator[dict[str, EdgeRegion]]:
-    """A region for each edge, by the edge's name. Raises TrilaneError when there is too little memory."""
+    """Yield a region for each edge, by the edge's name; raises TrilaneError when there is too little memory."""
     regions: dict[str, EdgeRegion] = {}
     try:
         for name, edge in zip(pipeline.edge_names, pipeline.edges, strict=True):

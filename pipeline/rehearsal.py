@@ -1,8 +1,8 @@
-"""What is done before a run on the run's own stages: frames in the order of a run, one at a time. Rule: none twice.
+"""Measures, before a run, what units need for a frame. Rule: frames go through in the order of a run, one at a time.
 
-Every frame goes through all stages before the next one, and through the slots of an edge in turn: what a stage takes
-depends on what it did last, on what its slot holds, and on how long it rested. What counts is time in which the unit
-had its cores: others may use the machine meanwhile.
+Every frame goes through all stages before the next one, and through the slots of an edge in turn. That matters because
+the time of a stage depends on what it did last, on what its slot holds, and on how long it rested. Only time in which
+the unit had its cores counts, because others may use the machine meanwhile.
 """
 
 from __future__ import annotations
@@ -28,12 +28,15 @@ from trilane.scheduler.places import Times, Work
 from trilane.transport.messages import Done, RunJob
 from trilane.transport.slots import edge_rule
 
-WARM_UP = 2  # frames that do not count: as many as most edges have slots
-LIMIT_S = 0.5  # after those no further frame is begun after this
+WARM_UP = 2  # frames that do not count; most edges have as many slots
+LIMIT_S = 0.5  # seconds after the warm-up from which no further frame is begun
 
 
 class Chain:
-    """The stages of `graph`, but the last unless `whole`. `processes`: of each unit, ready and without a job."""
+    """The stages of `graph`, without the last unless `whole`.
+
+    `processes`: process of each unit, ready and without a job.
+    """
 
     def __init__(
         self, graph: Graph, processes: Mapping[str, UnitProcesses], interrupts: Interrupts, *, whole: bool
@@ -44,9 +47,9 @@ class Chain:
         self._frames = self._jobs = 0
 
     def frame(self, number: int, rung: int = 0) -> dict[str, Done]:
-        """Every stage does frame `number`, one after the other; their answers.
+        """Let every stage do frame `number`, one stage after the other, and return their answers by stage.
 
-        Raises UnitError when a stage fails or does not answer, KeyboardInterrupt when interrupted.
+        Raises UnitError when a stage fails or does not answer, and KeyboardInterrupt when interrupted.
         """
         slots = [-1, *(self._frames % count for count in self._slots), -1]
         self._frames += 1
@@ -71,11 +74,12 @@ class Chain:
 
 
 def on_rungs(chain: Chain, frames: Sequence[int], rungs: int, follow: Sequence[str]) -> list[StageAlone]:
-    """What each stage of `follow` takes, alone, on each of so many `rungs` of a ladder: the median over `frames`.
+    """Return the time that each stage of `follow` takes alone on each of `rungs` rungs of a ladder.
 
-    All of them go through one rung before the next, so no frame follows itself. Of several frames the first of each
-    rung warms up. Nothing is said of a stage that does not take less on every further rung, such as where nobody is on
-    the screen in any of the frames. Raises as `Chain.frame`.
+    Each time is the median over `frames`. All frames go through one rung before the next, so that no frame follows
+    itself. With several frames, the first of each rung warms up. A stage is left out unless it takes less on every
+    further rung. That happens, for example, where nobody is on the screen in any of the frames. Raises as `Chain.frame`
+    does.
     """
     medians: dict[str, list[float]] = {name: [] for name in follow}
     for rung in range(rungs):
@@ -91,7 +95,11 @@ def on_rungs(chain: Chain, frames: Sequence[int], rungs: int, follow: Sequence[s
 
 
 class Rehearsed(NamedTuple):
-    """What was measured. `times`: of each unit, by threads. `took_ns`: by stage of the first pipeline, each frame's."""
+    """Measured times.
+
+    `times`: work of each unit, by number of threads.
+    `took_ns`: times of each frame in ns, by stage of the first pipeline.
+    """
 
     times: Times
     took_ns: Mapping[str, Sequence[int]]
@@ -100,12 +108,14 @@ class Rehearsed(NamedTuple):
 def rehearse(
     pipeline: Pipeline, variants: Sequence[Pipeline], frames: Sequence[int], assets: Assets, starter: UnitStarter
 ) -> Rehearsed:
-    """What each unit needs for a frame; the files that the last stage writes are the caller's to remove.
+    """Measure what each unit needs for a frame; the caller removes the files that the last stage writes.
 
-    `pipeline`: of whose units all are measured, on `frames`.
-    `variants`: the same with other settings of some units, which alone are measured again, between the other stages.
-    `assets`, `starter`: as for a run.
-    Raises TrilaneError when a unit cannot start or a stage fails, KeyboardInterrupt when interrupted.
+    `pipeline`: pipeline of which all units are measured, on `frames`.
+    `variants`: the same pipeline with other settings of some units; only these are measured again, between the other
+    stages.
+    `assets`, `starter`: arrays and fork server, as for a run.
+
+    Raises TrilaneError when a unit cannot start or a stage fails, and KeyboardInterrupt when interrupted.
     """
     with contextlib.ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts())
@@ -135,9 +145,9 @@ def rehearse(
 
 
 def timed(chain: Chain, frames: Sequence[int]) -> list[dict[str, Done]]:
-    """The answers of all stages to each of `frames`, but to the first WARM_UP; LIMIT_S holds for the others.
+    """Return the answers of all stages to each of `frames` without the first WARM_UP.
 
-    Of fewer frames the last one counts.
+    LIMIT_S holds for the frames that count. Of WARM_UP frames or fewer, only the last one counts.
     """
     warm_up = min(WARM_UP, len(frames) - 1)
     for frame in frames[:warm_up]:
@@ -151,7 +161,7 @@ def timed(chain: Chain, frames: Sequence[int]) -> list[dict[str, Done]]:
 
 
 def works_of(pipeline: Pipeline, done: Sequence[Mapping[str, Done]]) -> dict[str, Work]:
-    """The work of each unit of `pipeline` for a frame: the sum over its stages of the medians of what was `done`."""
+    """Return the work of each unit for a frame: the sum over its stages of the median times in `done`."""
     works = {}
     for unit, settings in pipeline.units.items():
         names = [stage.name for stage in pipeline.stages_of(unit)]
@@ -163,5 +173,5 @@ def works_of(pipeline: Pipeline, done: Sequence[Mapping[str, Done]]) -> dict[str
 
 
 def _took_ns(done: Done) -> int:
-    """How long a job took without the time in which it had no core."""
+    """Return how long a job took without the time in which it had no core, in ns."""
     return done.t_end_ns - done.t_begin_ns - done.preempted_ns

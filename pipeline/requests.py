@@ -1,5 +1,7 @@
-"""Frames that somebody else asks for while a run goes on. Rule: `request` and `end` may be called by any
-thread; answers come on the thread of the run, in the order of the frames that were presented.
+"""Passes on frames that somebody asks for during a run.
+
+Rule: any thread may call `request` and `end`. Answers come on the thread of the run, in the order in which the frames
+were presented.
 """
 
 from __future__ import annotations
@@ -14,11 +16,12 @@ from trilane.scheduler.events import Event, FrameRequest, Stop
 
 
 class FrameRequestQueue:
-    """The way into one run. Frames are numbered from 0 as they are asked for.
+    """The way into one run; frames are numbered from 0 in the order in which they are asked for.
 
-    `answered(frame)`: it was presented. `ended()`: the run is over, and nothing more is answered.
-    `unanswered(causes)`: frames were dropped or lost, how many by each cause's key in the report; called once, with the
-    first of them.
+    `answered(frame)`: function that is called when the frame was presented.
+    `ended()`: function that is called when the run is over, after which nothing is answered.
+    `unanswered(causes)`: function that is called once, with the first frames that were dropped or lost: their number by
+    each cause's key in the report.
     """
 
     def __init__(
@@ -40,11 +43,11 @@ class FrameRequestQueue:
         self._put(FrameRequest(count))
 
     def end(self) -> None:
-        """No more is asked for; what was asked for is finished."""
+        """Ask for no more frames; those that were asked for are finished."""
         self._put(Stop())
 
     def events(self) -> list[Event]:
-        """What was requested since the last call."""
+        """Return what was requested since the last call."""
         events: list[Event] = []
         with contextlib.suppress(IndexError):
             while True:
@@ -52,13 +55,13 @@ class FrameRequestQueue:
         return events
 
     def tell_unanswered(self, causes: Mapping[str, int]) -> None:
-        """By the run: so many frames were dropped or lost so far, by cause."""
+        """Tell the caller how many frames were dropped or lost so far, by cause; called by the run."""
         if causes and not self._told:
             self._told = True
             self._unanswered(causes)
 
     def close(self) -> None:
-        """The run is over: `ended` is called, whoever waits for `is_open` goes on."""
+        """Note that the run is over: call `ended`, and let whoever waits for `is_open` go on."""
         with self._lock:
             if self._closed:
                 return

@@ -1,4 +1,4 @@
-"""What a run hands back. Rule: plain data; a recording is written only where the caller asks for it."""
+"""The result of a run. Rule: plain data; a recording is written only where the caller asks for it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,11 @@ from trilane.scheduler.recording import Recording
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a run ended early: one sentence and the exit code that it asks for."""
+    """Why a run ended early.
+
+    `message`: one sentence.
+    `exit_code`: exit code that the failure asks for.
+    """
 
     message: str
     exit_code: int = 1
@@ -23,15 +27,20 @@ class Failure:
 class RunResult:
     """A finished run.
 
-    `report`: what the run measured; who calls it adds the machine and the configuration.
-    `jobs`, `recording`: of a run without a journal; of one with it they are empty, and the journal has them
-    (`trilane.pipeline.journal.Worked`).
-    `lost`, `dropped`: frames by cause. `startup_ms`: of each unit. `metrics`: of each stage, the means
-    over the jobs that gave them.
-    `rungs`: of a run with a ladder of work, how many presented frames had each, and `rung_switches`, how often one had
-    another than the frame before.
-    `messages`: what went wrong on the way, such as a unit that died and was restarted.
-    `failure`: set when a stage failed or a unit could not be kept alive; what was done until then is still here.
+    `report`: what the run measured; the caller adds the machine and the configuration.
+    `requested`, `presented`: numbers of frames.
+    `lost`, `dropped`: numbers of frames by cause.
+    `pids`: process id of each unit.
+    `startup_ms`: start-up time of each unit in ms.
+    `jobs`, `recording`: jobs and steps of a run without a journal. With a journal both are empty, and the journal has
+    them (`trilane.pipeline.journal.Worked`).
+    `metrics`: means of what each stage reported, over the jobs that reported it.
+    `rungs`: number of presented frames on each rung, for a run with a ladder of work.
+    `rung_switches`: how often a frame had another rung than the frame before.
+    `messages`: texts of what went wrong on the way, such as a unit that died and was restarted.
+    `interrupted`: whether a signal ended the run.
+    `failure`: set when a stage failed or a unit could not be kept alive; the other fields hold what was done until
+    then.
     """
 
     report: RunMetrics

@@ -39,11 +39,11 @@ from trilane.transport.wakeup import awake
 from trilane.unexpected_value import UnexpectedValue
 
 HANG_NS = 10_000_000_000
-FRAMES_ON_RUNGS = 4  # on each rung; the first one warms up
+FRAMES_ON_RUNGS = 4  # on each rung; the first frame warms up
 
 
 class ReportingGovernor(Governor, Protocol):
-    """A governor of a whole run."""
+    """A governor of a whole run, which also reports what it did."""
 
     @property
     def is_prompt(self) -> bool:
@@ -51,14 +51,14 @@ class ReportingGovernor(Governor, Protocol):
 
     @property
     def power_w(self) -> float | None:
-        """Mean power of the run so far, None when it is not known."""
+        """The mean power of the run so far in watts; None when it is not known."""
 
     @property
     def temperatures_c(self) -> Mapping[str, float]:
-        """Those that it goes by, in degrees Celsius."""
+        """The temperatures that the governor goes by, in degrees Celsius, by name."""
 
     def report(self) -> dict[str, Any]:
-        """`caps` and `temperature_c` of the report."""
+        """Return `caps` and `temperature_c` of the report."""
 
 
 def run_pipeline(
@@ -81,33 +81,34 @@ def run_pipeline(
     on_progress: Callable[[int, int], None] | None = None,
     on_message: Callable[[str], None] | None = None,
 ) -> RunResult:
-    """Run `frames` frames through the units of `pipeline` and report.
+    """Run `frames` frames through the units of `pipeline`, and return the result.
 
     `policy`: sequential, pipelined, latest or deadline.
-    `fps`: the rate that the frames are meant for; a longer frame time counts as a missed deadline.
-    `pace_fps`: frames are released at this rate; None releases them as fast as they are taken, and under `latest` and
-    `deadline`, which need a rate, at `fps`.
+    `fps`: rate that the frames are meant for, in frames a second; a longer frame time counts as a missed deadline.
+    `pace_fps`: rate at which frames are released, in frames a second. None releases them as fast as they are taken, or
+    at the rate `fps` under `latest` and `deadline`, which need one.
     `assets`: arrays that every stage may read.
-    `hang_ns`: a unit whose job takes longer is restarted.
-    `latch_ms`: the first stage begins so late that it is expected to end this long before the second can take it; 0: at
+    `hang_ns`: longest time of a job in ns; a unit whose job takes longer is restarted.
+    `latch_ms`: margin in ms by which the first stage should end before the second can take its frame; 0: it begins at
     once.
-    `works`: of each rung of a ladder of work in thousandths, the most first: a frame that would be late is given less
-    (`trilane.scheduler.work_ladder`), of which the first stage is told (`SteppedStage`). Used where frames are released
-    at a rate. `follow`: the stages whose time follows the work.
-    `requests`: frames are released as somebody asks for them, `frames` at most; it is closed when this returns.
-    `controls`: what somebody asks of the run; the frames that it has released when it ends count as requested. It is
-    closed when this returns.
-    `governor`: holds the units to shares of the time, and says in the report what it did.
-    `journal`: everything that happens is written there while it happens, and nothing of it is kept in memory; None
-    keeps all of it, in `RunResult.recording` and `RunResult.jobs`.
-    `starter`: a fork server that was started earlier; None makes one for this run.
-    `on_progress(presented, requested)`, `on_message(text)`: called from this thread.
+    `works`: work of each rung of a ladder in thousandths, the most first; used where frames are released at a rate. A
+    frame that would be late is given less work (`trilane.scheduler.work_ladder`), and the first stage is told
+    (`SteppedStage`).
+    `follow`: names of the stages whose time follows the work.
+    `requests`: queue through which others ask for frames, at most `frames`; it is closed when this returns.
+    `controls`: queue of what others ask of the run, closed when this returns. At the run's end, the frames that it has
+    released count as requested.
+    `governor`: governor that holds the units to shares of the time, and adds what it did to the report.
+    `journal`: file for everything that happens, written while it happens, with nothing kept in memory. None keeps it
+    all, in `RunResult.recording` and `RunResult.jobs`.
+    `starter`: fork server that was started earlier; None makes one for this run.
+    `on_progress(presented, requested)`, `on_message(text)`: functions that are called from this thread.
 
-    SIGINT, SIGTERM, SIGHUP or SIGQUIT ends the run cleanly with its result marked `interrupted`; a second one ends the
-    units at once; before the first frame KeyboardInterrupt is raised instead.
+    SIGINT, SIGTERM, SIGHUP or SIGQUIT ends the run cleanly with its result marked `interrupted`; a second signal ends
+    the units at once. Before the first frame KeyboardInterrupt is raised instead.
 
-    Raises BadInputError for an unknown policy and in a unit's own process, TrilaneError (with the exit code of the
-    unit's error) when a unit cannot start; a failure after that is `RunResult.failure`.
+    Raises BadInputError for an unknown policy and in a unit's own process. Raises TrilaneError, with the exit code of
+    the unit's error, when a unit cannot start; a failure after that is `RunResult.failure`.
     """
     refuse_in_a_unit()
     check_open_files()
@@ -124,6 +125,7 @@ def run_pipeline(
             awake(governor is None or governor.is_prompt) as idle_cores,
             unit_processes(pipeline, assets or {}, starter, UnitProcesses) as processes,
         ):
+            # A run with a journal may last for days, so the ledger keeps sketches instead of all values.
             target_ns, sketch = 0 if settings.deadline_ns else round(1e9 / fps), None if journal is None else DdSketch
             core = Core(pipeline.graph(), settings, Books(target_ns, sketch))
             clock = RealtimeClock(core, processes, interrupts, log, requests, governor, on_progress, sketch)
@@ -148,7 +150,7 @@ def run_pipeline(
 
 
 def _add_caps(report: dict[str, Any], governor: ReportingGovernor | None) -> None:
-    """What the governor says of the run, and the score of the energy that it modelled."""
+    """Add what the governor says of the run, and the score of the energy that it modelled."""
     if governor is None:
         return
     report.update(governor.report())
@@ -157,7 +159,7 @@ def _add_caps(report: dict[str, Any], governor: ReportingGovernor | None) -> Non
 
 
 class _Run:
-    """The steps of one run: start, a frame that warms up, the scheduler's loop, close."""
+    """The steps of one run: start the units, warm up with a frame, run the scheduler's loop, close."""
 
     def __init__(
         self,
@@ -177,10 +179,11 @@ class _Run:
         self._outcome = Outcome(OutcomeKind.ABORTED)
 
     def execute(self) -> None:
-        """All of it. Raises as `run_pipeline`."""
+        """Do all steps; raises as `run_pipeline` does."""
         self._startup_ms = start_units(self._processes, self._core.graph.units, self._interrupts)
         self.pids = self._processes.pids
         graph, settings = self._core.graph, self._core.settings
+        # The last stage writes files, so the frames before the run leave it out.
         chain = Chain(graph, dict.fromkeys(graph.units, self._processes), self._interrupts, whole=False)
         if settings.works:
             few = _spread(settings.frames, FRAMES_ON_RUNGS)
@@ -220,7 +223,10 @@ class _Run:
         )
 
     def _mean_metrics(self) -> Mapping[str, Mapping[str, float]]:
-        """Of each stage that reported any, the mean over the jobs that reported it; of bytes see `add_bytes`."""
+        """Return the mean of each figure that a stage reported, over the jobs that reported it.
+
+        `add_bytes` handles the bytes, so they are left out.
+        """
         reported = self._clock.reported
         return {
             stage: {name: total / reported[stage][name] for name, total in sums.items() if name not in BYTES}
@@ -253,11 +259,11 @@ def _settings(
 
 
 def _stepped(settings: Settings, works: tuple[int, ...], follow: tuple[str, ...]) -> Settings:
-    """With the ladder, where frames are released at a rate, and so can be late."""
+    """Return the settings with the ladder if frames are released at a rate; otherwise none can be late."""
     return replace(settings, works=works, follow=follow) if works and settings.period_ns else settings
 
 
 def _spread(frames: int, count: int) -> list[int]:
-    """`count` frame numbers, evenly over the run."""
+    """Return `count` frame numbers, spread evenly over the run."""
     count = min(count, frames)
     return [index * frames // count for index in range(count)]

@@ -1,4 +1,4 @@
-"""What a person is told while a run goes on. Rule: the first failure stands; every message is in the report too."""
+"""What a person is told while a run goes on. Rule: the first failure stands; the report also has every message."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from trilane.errors import TrilaneError
 from trilane.pipeline.result import Failure
 from trilane.transport.messages import Failed
 
+# The memory of a run must not grow with its length; the journal has all messages.
 MOST_MESSAGES = 1000
 
 
 class UnitError(TrilaneError):
-    """A unit could not start or be measured; `exit_code` is the one of the error in the unit."""
+    """A unit could not start or be measured. `exit_code`: exit code of the error in the unit."""
 
     def __init__(self, message: str, exit_code: int = 1) -> None:
         super().__init__(message)
@@ -20,7 +21,11 @@ class UnitError(TrilaneError):
 
 
 class RunLog:
-    """`messages`: in order, the first MOST_MESSAGES; the run's first `failure`. Each of `hears` is called with all."""
+    """The messages and the failure of a run; each function of `hears` is called with every message.
+
+    `messages`: the first MOST_MESSAGES messages, in order.
+    `failure`: the run's first failure.
+    """
 
     def __init__(self, *hears: Callable[[str], None]) -> None:
         self.failure: Failure | None = None
@@ -46,13 +51,13 @@ class RunLog:
         self.failure = self.failure or Failure(text, exit_code)
 
     def fail_with(self, message: Failed) -> None:
-        """A stage's error: said, and noted as the failure."""
+        """Say a stage's error and note it as the failure, unless there was one before."""
         if self.failure is None:
             self.fail(message.message, message.exit_code)
             self.say(message.message)
 
 
 def after_stderr(tail: str) -> str:
-    """The last line of what a unit wrote to stderr, as part of a sentence; empty when it wrote nothing."""
+    """Return the last line that a unit wrote to stderr as part of a sentence; empty if it wrote nothing."""
     lines = tail.splitlines()
     return f"it wrote last: {lines[-1]}" if lines else ""

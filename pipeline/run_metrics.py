@@ -1,7 +1,7 @@
-"""What a run measured, as checked data: the keys of report.json that a run of any pipeline knows.
+"""Defines what a run measured as validated data: the keys of report.json for a run of any pipeline.
 
-Rule: the fields stand in the order of the file's keys; an unknown key is an error; an optional field that was not set
-is left out of the file. Times are in ms, shares between 0 and 1.
+Rule: the fields stand in the order of the file's keys, and an unknown key is an error. An optional field that was not
+set is left out of the file. Times are in ms, shares between 0 and 1.
 """
 
 from __future__ import annotations
@@ -13,36 +13,37 @@ from pydantic import Field, model_validator
 
 from trilane.pipeline.description import Model
 
-#: Stages measured by themselves, the shares of `units` computed a second time, and whether the core was compiled.
+#: Keys of older reports: the times of stages measured alone, a second computation of the shares in `units`, and whether
+#: the core was compiled.
 GONE: Final = frozenset({"isolated_ms", "accounts", "scheduler_core"})
 
 
 class Record(Model):
-    """Base of everything that is written to report.json."""
+    """Base class of everything that is written to report.json."""
 
     def as_json(self) -> dict[str, Any]:
-        """The keys that were set, as JSON takes them, in the order of the fields."""
+        """Return the keys that were set, as JSON values, in the order of the fields."""
         return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
 
     @model_validator(mode="before")
     @classmethod
     def _leave_out_what_is_gone(cls, document: Any) -> Any:
-        """Older Trilanes wrote keys that nobody makes now."""
+        """Leave out keys of older Trilanes that nothing writes now."""
         if not isinstance(document, dict):
             return document
         return {key: value for key, value in document.items() if key not in GONE}
 
 
 class FrameCounts(Record):
-    """Frames of a run, counted: all that were requested are presented, lost, dropped, or not begun.
+    """Counts of a run's frames: every requested frame is presented, lost, dropped, or not begun.
 
-    `requested`: asked for.
-    `presented`: that reached the last stage's end.
-    `lost`: begun and never presented, because a unit died or a stage failed.
-    `lost_by_cause`: the same by `cause:unit`.
-    `dropped`: left out by the policy, by `edge:cause`.
-    `not_begun`: never taken, because the run ended before; null in reports of before it was counted.
-    `skipped`: of those presented, how many took the pipeline's bypass; absent where it has none.
+    `requested`: number of frames that the run was asked for.
+    `presented`: number of frames that reached the end of the last stage.
+    `lost`: number of frames that were begun and not presented, because a unit died or a stage failed.
+    `lost_by_cause`: lost frames by `cause:unit`.
+    `dropped`: frames that the policy left out, by `edge:cause`.
+    `not_begun`: number of frames never taken because the run ended before; null in reports older than this count.
+    `skipped`: number of presented frames that took the pipeline's bypass; absent where it has none.
     """
 
     requested: int
@@ -55,7 +56,7 @@ class FrameCounts(Record):
 
     @model_validator(mode="after")
     def _add_up(self) -> Self:
-        """Every requested frame became one thing."""
+        """Check that every requested frame is counted once."""
         if self.not_begun is None:
             return self
         dropped = sum(self.dropped.values())
@@ -70,8 +71,8 @@ class FrameCounts(Record):
 class TimeSummary(Record):
     """Statistics of times in ms: `mean`, percentiles `p50` to `p99`, and `max`; all 0 when there were none.
 
-    `samples`: how many times they are of; null in reports of before it was counted. p90 needs 29 of them, p95 59, p99
-    299 (`trilane.scheduler.stats.samples_needed`).
+    `samples`: number of times; null in reports older than this count. p90 needs 29 of them, p95 59, p99 299
+    (`trilane.scheduler.stats.samples_needed`).
     """
 
     mean: float
@@ -84,12 +85,12 @@ class TimeSummary(Record):
 
 
 class FrameTimes(TimeSummary):
-    """Times between presented frames, ms.
+    """Times between presented frames, in ms.
 
     `ema20_min`, `ema20_max`: smallest and largest exponential average over 20 frames.
     `jitter`: mean absolute difference of successive frame times.
-    `mean_low`, `mean_high`: 95 % interval of the mean by the scatter of this run's frames (batch means), null when they
-    are too few to tell.
+    `mean_low`, `mean_high`: bounds of the 95 % interval of the mean, from the scatter of this run's frames (batch
+    means); null when there are too few frames.
     """
 
     ema20_min: float
@@ -102,9 +103,9 @@ class FrameTimes(TimeSummary):
 class XrBench(Record):
     """XRBench's scores (Kwon et al., MLSys 2023, section 3), 0 to 1.
 
-    `real_time`: how well frames kept their deadlines; null when none had one.
+    `real_time`: score of how well frames kept their deadlines; null when no frame had one.
     `qoe`: quality of experience, presented over requested frames.
-    `energy`: null where the power is not known.
+    `energy`: energy score; null where the power is not known.
     """
 
     real_time: float | None
@@ -113,13 +114,13 @@ class XrBench(Record):
 
 
 class MovedBytes(Record):
-    """Bytes that were moved for a presented frame, means (`trilane.pipeline.moved_bytes`).
+    """Mean bytes that were moved for a presented frame (`trilane.pipeline.moved_bytes`).
 
-    `read`: from slots, shared assets, samples.
-    `written`: into slots and files.
-    `uploaded`, `read_back`: into the GPU's memory, and out of it.
-    `least`: what the frames needed.
-    `ratio`: the first four in sum over the least; null where that is 0.
+    `read`: bytes read from slots, shared assets and samples.
+    `written`: bytes written into slots and files.
+    `uploaded`, `read_back`: bytes moved into the GPU's memory, and out of it.
+    `least`: bytes that the frames needed.
+    `ratio`: sum of the first four over `least`; null where `least` is 0.
     """
 
     read: float
@@ -131,25 +132,28 @@ class MovedBytes(Record):
 
     @property
     def all(self) -> float:
-        """That passed through the memories."""
+        """The sum of all bytes that passed through the memories."""
         return self.read + self.written + self.uploaded + self.read_back
 
 
 class MovedInAll(MovedBytes):
-    """The same of all stages. `gb_per_second`: of what was moved, over the time of the run, in 1e9 bytes a second."""
+    """Mean bytes that all stages together moved for a presented frame.
+
+    `gb_per_second`: moved bytes over the time of the run, in 1e9 bytes a second.
+    """
 
     gb_per_second: float | None
 
 
 class StageTimes(Record):
-    """One stage.
+    """Times of one stage.
 
-    `unit`: that ran it.
-    `jobs`: how many it ended.
-    `service_ms`: of its jobs, from begin to end, the time included in which another process had the core.
-    `wait_ms`: from a job's input to its begin.
-    `cpu_ms`: CPU time of its jobs, of all threads of the unit; on the host clock.
-    `bytes`: that it moved for a presented frame; absent where it does not count them.
+    `unit`: name of the unit that ran the stage.
+    `jobs`: number of jobs that it ended.
+    `service_ms`: times of its jobs from begin to end; these include time in which another process had the core.
+    `wait_ms`: times from the arrival of a job's input to the job's begin.
+    `cpu_ms`: CPU times of its jobs over all threads of the unit; on the host clock.
+    `bytes`: bytes that it moved for a presented frame; absent where it does not count them.
     """
 
     unit: str
@@ -163,11 +167,12 @@ class StageTimes(Record):
 class IdleShares(Record):
     """Why a unit did not work, as shares of the run's time.
 
-    `starved`: it had no input.
-    `blocked`: it had input, but no free output slot, or the limit of frames in flight was reached.
-    `throttled`: its cap held it.
-    `preempted`: it had a job, but not its core; null where the kernel does not say how long threads wait for one.
-    `overhead`: a job was on its way to it, it slept within a job, or its process was down.
+    `starved`: share in which the unit had no input.
+    `blocked`: share in which it had input, but no free output slot, or the limit of frames in flight was reached.
+    `throttled`: share in which its cap held it.
+    `preempted`: share in which it had a job, but no core; null where the kernel does not say how long threads wait for
+    one.
+    `overhead`: share in which a job was on its way to it, it slept within a job, or its process was down.
     """
 
     starved: float
@@ -178,18 +183,19 @@ class IdleShares(Record):
 
 
 class UnitShares(Record):
-    """One unit; `busy` and the five parts of `idle` sum to 1.
+    """Shares and figures of one unit; `busy` and the five parts of `idle` sum to 1.
+
+    On the virtual clock `cpu_s` and the fields after it are not set.
 
     `busy`: share of the time in which a job ran.
-    `idle`: the rest, by cause.
-    `jobs`: that it ended.
-    `restarts`: new processes after the first.
-    `cpu_s`: CPU time of all its threads in the run, those included that spin between jobs; on the host clock, as what
-    follows.
-    `cpu_in_jobs_s`: the part of it in jobs.
-    `pid`: of its last process.
-    `cores`: that it may use.
-    `threads`: that its stages may use.
+    `idle`: the rest of the time, by cause.
+    `jobs`: number of jobs that it ended.
+    `restarts`: number of new processes after the first.
+    `cpu_s`: CPU time in seconds of all its threads in the run, including those that spin between jobs.
+    `cpu_in_jobs_s`: part of `cpu_s` within jobs.
+    `pid`: process id of its last process.
+    `cores`: cores that it may use.
+    `threads`: number of threads that its stages may use.
     `spin`: whether those threads may spin between jobs.
     """
 
@@ -206,10 +212,10 @@ class UnitShares(Record):
 
 
 class CoreShare(Record):
-    """Units that may run on `cores` and nowhere else.
+    """Use of a set of cores by the units that may run on `cores` and nowhere else.
 
-    `cpu`: their CPU time as a share of the time that these cores had; at most 1.
-    `busy`: their busy shares as a share of the same; at most 1 where no unit has a device of its own.
+    `cpu`: CPU time of the units as a share of the time that these cores had; at most 1.
+    `busy`: busy time of the units as a share of the same time; at most 1 where no unit has a device of its own.
     """
 
     cores: tuple[int, ...]
@@ -219,7 +225,12 @@ class CoreShare(Record):
 
 
 class UnitCap(Record):
-    """The cap of one unit. `corner`: at the run's end; `duty`: share of the time then; `duty_mean`: over the run."""
+    """The cap of one unit.
+
+    `corner`: corner at the run's end.
+    `duty`: allowed share of the time at the run's end.
+    `duty_mean`: mean allowed share over the run.
+    """
 
     corner: str
     duty: float
@@ -227,16 +238,16 @@ class UnitCap(Record):
 
 
 class Caps(Record):
-    """What held the units; all but `how` is there when a performance profile was asked for.
+    """What held the units; all fields except `how` are present when a performance profile was asked for.
 
-    `how`: what a cap is on this clock, or that there was none.
+    `how`: meaning of a cap on this clock, or a note that there was none.
     `profile`: hardware profile whose corners and limits hold.
-    `performance_profile`: that was asked for.
+    `performance_profile`: performance profile that was asked for.
     `governor`: name of the rule that lowers and raises corners.
-    `units`: the cap of each.
-    `power_w`: mean modelled power, null when the run was too short for one.
+    `units`: cap of each unit, by name.
+    `power_w`: mean modelled power in watts; null when the run was too short for one.
     `throttled_share`: share of the time in which a unit was below the corner that was asked for.
-    `first_throttled_s`: when that began, null when it never did.
+    `first_throttled_s`: time in seconds at which that began first; null when it never did.
     """
 
     how: str
@@ -250,13 +261,13 @@ class Caps(Record):
 
 
 class Temperature(Record):
-    """Degrees Celsius; all but `sensor` is there when the temperature was modelled.
+    """Temperatures in degrees Celsius; all fields except `sensor` are present when the temperature was modelled.
 
-    `kind`: how it was modelled.
-    `device_end`: of the device's body at the end of the run.
-    `device_max`: the highest of the device's body.
-    `junction_max`: the highest of any unit.
-    `sensor`: this machine's hottest sensor at the end of the run, null where the system shows none.
+    `kind`: how the temperature was modelled.
+    `device_end`: temperature of the device's body at the end of the run.
+    `device_max`: highest temperature of the device's body.
+    `junction_max`: highest temperature of any unit.
+    `sensor`: temperature of this machine's hottest sensor at the end of the run; null where the system shows none.
     """
 
     kind: str = ""
@@ -267,10 +278,13 @@ class Temperature(Record):
 
 
 class PathShare(Record):
-    """What the critical path was for most of its time (`trilane.pipeline.critical_path`).
+    """The largest part of the critical path (`trilane.pipeline.critical_path`).
 
-    `name`: of the unit or the stage, or what it was instead. `share`: of the path. `share_low`, `share_high`: 95 %
-    interval by the scatter of this run's frames; null for fewer than 51. `rivals`: names whose share may be as large.
+    `name`: name of the unit or the stage, or of what the path was instead.
+    `share`: its share of the path.
+    `share_low`, `share_high`: bounds of the 95 % interval of `share`, from the scatter of this run's frames; null for
+    fewer than 51 frames.
+    `rivals`: names whose share may be as large.
     """
 
     name: str
@@ -281,12 +295,16 @@ class PathShare(Record):
 
     @property
     def names(self) -> str:
-        """What may be the largest part: the name and its rivals."""
+        """The names that may be the largest part: this one and its rivals."""
         return " or ".join([self.name, *(self.rivals or [])])
 
 
 class Bound(Record):
-    """What bounded the frame time. `unit`: its name is the report's `bottleneck`. `stage`: null where no stage did."""
+    """What bounded the frame time.
+
+    `unit`: share of the unit whose name is the report's `bottleneck`.
+    `stage`: share of the stage; null where no stage bounded it.
+    """
 
     unit: PathShare
     stage: PathShare | None = None
@@ -296,27 +314,31 @@ class RunMetrics(Record):
     """What a run measured.
 
     `clock`: `host`, measured on this machine, or `virtual`, computed from a hardware profile.
-    `frames`: counted by what became of them.
-    `duration_s`: from the first job to the end of the run.
-    `percentiles`: whether they are exact, or which are of a sketch and within what error; on the host clock.
-    `frame_time_ms`: between presented frames.
-    `latency_ms`: from the sampled pose to the end of the stage that the pipeline names (the composited frame).
+    `frames`: counts of frames by what became of them.
+    `duration_s`: time in seconds from the first job to the end of the run.
+    `percentiles`: whether percentiles are exact, or which come from a sketch and within what error; on the host clock.
+    `frame_time_ms`: times between presented frames.
+    `latency_ms`: times from the sampled pose to the end of the stage that the pipeline names (the composited frame).
     `fps`: presented frames a second; 0 for fewer than two.
-    `fps_low`, `fps_high`: its 95 % interval, from that of the mean frame time; null when there are too few frames.
-    `deadline_misses`: frames presented after their deadline, or frame times above the target.
+    `fps_low`, `fps_high`: bounds of the 95 % interval of `fps`, from that of the mean frame time; null when there are
+    too few frames.
+    `deadline_misses`: number of frames presented after their deadline, or of frame times above the target.
     `xrbench`: XRBench's scores.
-    `stages`: times of each, in the order of the pipeline.
-    `bytes`: moved for a presented frame by all stages that count them; absent where none does.
-    `units`: shares of each.
-    `efficiency`: work of the slowest unit's jobs, as a share of the time from the first presented frame to the last;
-    null for fewer than two. `core_efficiency`: of the fullest cores. `machine_efficiency`: of all cores of the run.
-    `bottleneck`: what most of the critical path is: a unit, `other programs`, `release`, `overhead`, or `held`; null
-    without a path.
-    `bound`: its share of the path, and the stage that has most of it.
-    `core_shares`: what was done on each set of cores that a unit has, and on all; on the host clock.
-    `policy`, `edge`: of the scheduler; `idle_cores`: whether cores without work stayed awake; on the host clock.
-    `other_programs`: their share of the time of the run's cores; null where a unit died.
-    `caps`, `temperature_c`: of a capped run.
+    `stages`: times of each stage, in the order of the pipeline.
+    `bytes`: bytes that the stages moved for a presented frame, over all stages that count them; absent where none does.
+    `units`: shares of each unit.
+    `efficiency`: work of the slowest unit's jobs, as a share of the time between the first and the last presented
+    frame; null for fewer than two.
+    `core_efficiency`: the same share for the fullest cores.
+    `machine_efficiency`: the same share for all cores of the run.
+    `bottleneck`: name of what most of the critical path is: a unit, `other programs`, `release`, `overhead`, or `held`;
+    null without a path.
+    `bound`: share of the bottleneck in the path, and the stage that has most of it.
+    `core_shares`: use of each set of cores that a unit has, and of all cores; on the host clock.
+    `policy`, `edge`: policy and edge rule of the scheduler.
+    `idle_cores`: whether cores without work stayed awake; on the host clock.
+    `other_programs`: share of other programs in the time of the run's cores; null where a unit died.
+    `caps`, `temperature_c`: caps and temperatures of a capped run.
     """
 
     clock: Literal["host", "virtual"]
@@ -348,5 +370,5 @@ class RunMetrics(Record):
 
 
 def metrics_of(ledger_report: Mapping[str, Any]) -> RunMetrics:
-    """`Ledger.report()`, and what the run added to it, checked. Raises ValueError naming a wrong or unknown key."""
+    """Validate `Ledger.report()` with what the run added to it; raises ValueError naming a wrong or unknown key."""
     return RunMetrics.model_validate(ledger_report)

@@ -1,8 +1,8 @@
-"""Where the steps and jobs of a run go: into memory, or into its journal. Rule: one of the two, never both.
+"""Stores the steps and jobs of a run, either in memory or in the run's journal. Rule: one of the two, never both.
 
-In memory they are for who runs a few frames and wants them all. Of a run with a journal nothing is kept that grows with
-its frames. Steps are written a few at a time, when the units have been told what follows from the last: one by one they
-take three times the time, for the code that writes them is never in the caches then.
+Memory is for a caller that runs a few frames and wants all of them. With a journal, nothing is kept that grows with the
+number of frames. Steps are written a few at a time, after the units have been told what follows from the last one.
+Written one by one they take three times as long, because the code that writes them is then never in the caches.
 """
 
 from __future__ import annotations
@@ -50,7 +50,9 @@ PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 class JournalFile:
     """Where a run writes its journal, and what else goes there.
 
-    `path`: does not exist yet. `facts`: of its `Begun`. `sensors`: what is looked at every `SAMPLE_NS`, by dotted name.
+    `path`: path of a file that does not exist yet.
+    `facts`: facts of the journal's `Begun`.
+    `sensors`: function that returns readings by dotted name; it is called every `SAMPLE_NS`.
     """
 
     path: Path
@@ -59,48 +61,51 @@ class JournalFile:
 
 
 class Source(Protocol):
-    """The clock of the run (`trilane.pipeline.realtime_clock.RealtimeClock`), once there is one."""
+    """The clock of the run (`trilane.pipeline.realtime_clock.RealtimeClock`)."""
 
     @property
     def waiting(self) -> int:
-        """How many jobs `ended` would tell of."""
+        """The number of jobs that `ended` would return now."""
 
     def ended(self) -> list[Worked | None]:
-        """Jobs that have ended since the last call; None for one of a frame that was lost."""
+        """Return the jobs that ended since the last call; None stands for a job of a lost frame."""
 
 
 class Caps(Protocol):
-    """The governor of a run."""
+    """The part of a run's governor that is recorded."""
 
     @property
     def temperatures_c(self) -> Mapping[str, float]:
-        """Those that it goes by, in degrees Celsius."""
+        """The temperatures that the governor goes by, in degrees Celsius, by name."""
 
 
 class RunRecord(Protocol):
-    """Fed by the scheduler's loop through `add`. `recording`, `jobs`: what of the run is in memory."""
+    """Takes steps from the scheduler's loop through `add`.
+
+    `recording`, `jobs`: part of the run that is in memory.
+    """
 
     recording: Recording
     jobs: list[JobRecord]
 
     def begin(self, source: Source, pids: Callable[[], Mapping[str, int]]) -> None:
-        """The loop begins. `pids`: gives the units' processes at any time."""
+        """Note that the loop begins. `pids`: function that returns the process id of each unit at any time."""
 
     def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
-        """Note a step of `core`, whose actions were carried out."""
+        """Note a step of `core` whose actions were carried out."""
 
     def say(self, text: str) -> None:
         """Note a message to a person."""
 
     def reckoned(self, places: Placement) -> Reckoned:
-        """What bounded the whole run; the loop is over. `places`: of its units."""
+        """Return what bounded the whole run; called after the loop. `places`: places of the run's units."""
 
     def end(self, report: Mapping[str, Any]) -> None:
-        """The run is over, with this report."""
+        """Note that the run is over, with this report."""
 
 
 class KeptRun:
-    """All in memory."""
+    """A record of the run in memory."""
 
     def __init__(self, graph: Graph, settings: Settings) -> None:
         self.recording = Recording(graph, settings)
@@ -108,14 +113,14 @@ class KeptRun:
         self._source: Source | None = None
 
     def begin(self, source: Source, pids: Callable[[], Mapping[str, int]]) -> None:  # noqa: ARG002 - a `RunRecord`
-        """Jobs are asked for when the run is over, for units share the scheduler's core."""
+        """Keep the source; jobs are read when the run is over, because units share the scheduler's core."""
         self._source = source
 
     def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
         self.recording.add(now_ns, events, actions, core)
 
     def say(self, text: str) -> None:
-        """Messages are kept by the log of the run."""
+        """Do nothing: the log of the run keeps messages."""
 
     def reckoned(self, places: Placement) -> Reckoned:
         if self._source is not None:
@@ -124,17 +129,18 @@ class KeptRun:
         return reckoned(recording.graph, recording.settings, places, records_of(recording, self.jobs))
 
     def end(self, report: Mapping[str, Any]) -> None:
-        """Nothing is left to do."""
+        """Do nothing: everything is in memory."""
 
 
-#: A step, what follows from it, and how many of the jobs since the last writing had ended with it.
+#: A step, the records that follow from it, and how many of the jobs since the last writing had ended by then.
 _Step = tuple[Stepped, list[Accounted | Counted], int]
 
 
 class JournaledRun:
-    """All in the journal of `file`; `recording` has no steps and `jobs` stays empty.
+    """A record of the run in the journal of `file`; `recording` has no steps and `jobs` stays empty.
 
-    `writer`: of that file. `caps`: what sets the units' duties; it and they are sampled.
+    `writer`: writer of that file.
+    `caps`: governor that sets the units' duties; duties and temperatures are sampled.
     """
 
     def __init__(
@@ -174,7 +180,7 @@ class JournaledRun:
             self._sample(now_ns, core)
 
     def _write(self) -> None:
-        """What was noted since the last call; raises UnwrittenError when it cannot be."""
+        """Write what was noted since the last call; raises UnwrittenError when it cannot be written."""
         add, told = self._writer.add, 0
         jobs = self._source.ended() if self._source is not None else []
         for step, follows, ended in self._steps:
@@ -199,12 +205,12 @@ class JournaledRun:
         self._writer.add(Ended(time.monotonic_ns(), report))
 
     def flush(self) -> None:
-        """Everything that was noted is in the file. Raises UnwrittenError when it cannot be written."""
+        """Write everything that was noted to the file; raises UnwrittenError when it cannot be written."""
         self._write()
         self._writer.flush()
 
     def _sample(self, now_ns: int, core: Core) -> None:
-        """Look at what is sampled, and let whoever follows the journal see it."""
+        """Write the readings that are due, and flush so that whoever follows the journal sees them."""
         self._flush_ns = now_ns + FLUSH_NS
         values: dict[str, float] = {}
         if self._caps is not None:
@@ -222,9 +228,10 @@ class JournaledRun:
 
 @contextmanager
 def recorded(file: JournalFile | None, graph: Graph, settings: Settings, caps: Caps | None) -> Iterator[RunRecord]:
-    """The record of one run, in memory or, with `file`, there. Raises BadInputError when that cannot be written.
+    """Yield the record of one run, which goes to `file`, or stays in memory without one.
 
-    Whatever becomes of the run, what was noted until then is in the file.
+    What was noted until the end of the run is in the file, whatever becomes of the run. Raises BadInputError when the
+    file cannot be made.
     """
     if file is None:
         yield KeptRun(graph, settings)
@@ -238,12 +245,12 @@ def recorded(file: JournalFile | None, graph: Graph, settings: Settings, caps: C
         try:
             yield run
         finally:
-            with suppress(UnwrittenError):  # what cannot be written was told when the run tried
+            with suppress(UnwrittenError):  # the run raised this error already when it tried to write
                 run.flush()
 
 
 def memory_bytes(pid: int) -> int:
-    """Memory of a process that is in use (RSS), the part included that it shares; 0 for one that has ended."""
+    """Return the memory in use (RSS) of a process in bytes, including shared memory; 0 for a process that has ended."""
     try:
         return int((machine.here.proc / f"{pid}/statm").read_text(encoding="ascii").split()[1]) * PAGE_BYTES
     except (OSError, IndexError):

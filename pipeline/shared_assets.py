@@ -1,7 +1,8 @@
-"""Arrays that the parent has loaded and every unit of a run may read. Rule: written once, sealed, mapped, never copied.
+"""Shares arrays of the parent with every unit of a run. Rule: written once, sealed, mapped, never copied.
 
-One region of anonymous memory holds them all: 8 bytes with the length of the index, the index as JSON, then the
-arrays, each on its own page. A unit maps it read-only; it goes with the last process that has it.
+One region of anonymous memory holds them all. It begins with 8 bytes for the length of the index, then the index as
+JSON, then the arrays, each on its own page. A unit maps it read-only. The kernel frees it when the last process that
+has it ends.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ Assets = Mapping[str, NDArray[Any]]
 
 F_SEAL_WRITE = 0x8  # <linux/fcntl.h>
 LENGTH_BYTES = 8
-KINDS = "?biufcmMSU"  # of NumPy types that are their bytes and no more
+KINDS = "?biufcmMSU"  # kinds of NumPy types that consist of their bytes alone
 
 
 def share_assets(assets: Assets) -> int:
-    """A descriptor of sealed memory that holds `assets`.
+    """Return a descriptor of sealed memory that holds `assets`.
 
-    Raises TrilaneError when there is too little memory, or for arrays of another kind than numbers, times and text.
+    Raises TrilaneError when there is too little memory, and for arrays of another kind than numbers, times and text.
     """
     index, end = _index(assets)
     free = machine.here.free_bytes()
@@ -44,6 +45,7 @@ def share_assets(assets: Assets) -> int:
         os.pwrite(fd, len(head).to_bytes(LENGTH_BYTES, "little") + head, 0)
         for name, array in assets.items():
             _write_all(fd, np.ascontiguousarray(array), start + index[name]["offset"])
+        # Sealed, so that no unit can change what another one reads.
         fcntl.fcntl(fd, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_WRITE)
     except OSError as error:
         os.close(fd)
@@ -52,7 +54,7 @@ def share_assets(assets: Assets) -> int:
 
 
 def map_assets(fd: int) -> dict[str, NDArray[Any]]:
-    """Read-only views of the arrays in `fd`, in the order in which they were given."""
+    """Return read-only views of the arrays in `fd`, in the order in which they were given."""
     view = memoryview(mmap.mmap(fd, os.fstat(fd).st_size, prot=mmap.PROT_READ))
     length = int.from_bytes(view[:LENGTH_BYTES], "little")
     index: dict[str, Any] = json.loads(bytes(view[LENGTH_BYTES : LENGTH_BYTES + length]))
@@ -66,7 +68,10 @@ def map_assets(fd: int) -> dict[str, NDArray[Any]]:
 
 
 def _index(assets: Assets) -> tuple[dict[str, dict[str, Any]], int]:
-    """Type, shape and place of every array, from the first page after the index; and where the last one ends."""
+    """Return type, shape and place of every array, and the end of the last one.
+
+    Places count from the first page after the index.
+    """
     index, offset = {}, 0
     for name, array in assets.items():
         if array.dtype.kind not in KINDS:

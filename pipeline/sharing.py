@@ -1,8 +1,7 @@
-"""Who had a unit's core while it had a job: stages that share cores, named.
+"""Finds which stages had a unit's core while the unit had a job.
 
-Rule: how long a job had no core the kernel counted; that another stage had it follows from which jobs ran then on the
-cores that both units may use, so it is computed. What no job of the run explains was another program, or a thread
-between jobs.
+Rule: the kernel counted how long a job had no core. Which stage had it is computed from the jobs that ran then on cores
+that both units may use. What no job of the run explains was another program, or a thread between jobs.
 """
 
 from __future__ import annotations
@@ -14,11 +13,15 @@ from typing import Final, NamedTuple
 
 from trilane.scheduler.ledger import JobRecord
 
-DELAY: Final = 256  # jobs; of those that ran beside a job all have ended by then
+DELAY: Final = 256  # in jobs; all that ran beside a job have ended after as many further jobs
 
 
 class Taken(NamedTuple):
-    """Of a stage's jobs together, ns. `of`: by stage, what was taken by its jobs. `other_ns`: by nobody of the run."""
+    """Times of all jobs of a stage together, in ns.
+
+    `of`: time that jobs of other stages took from them, by stage.
+    `other_ns`: time without a core that no job of the run explains.
+    """
 
     unit: str
     jobs: int
@@ -45,7 +48,7 @@ class Sharing:
         self._sums: dict[str, Taken] = {}
 
     def add(self, job: JobRecord) -> None:
-        """The next job that has ended."""
+        """Take the next job that has ended."""
         if self._beside.get(job.unit):
             of_unit = self._jobs[job.unit]
             of_unit.append(job)
@@ -56,15 +59,15 @@ class Sharing:
             self._count(self._waiting.popleft())
 
     def close(self) -> dict[str, Taken]:
-        """After the last job: of each stage, who took how much."""
+        """Return who took how much from each stage, by stage; called after the last job."""
         while self._waiting:
             self._count(self._waiting.popleft())
         return self._sums
 
     def taken(self, unit: str, begin_ns: int, end_ns: int, lacked_ns: int) -> dict[str, int]:
-        """By stage, how long its jobs had the core that `unit` lacked for `lacked_ns` of a piece of time.
+        """Return, by stage, how long its jobs had the core that `unit` lacked for `lacked_ns` of a piece of time.
 
-        In proportion to how long they ran then, and never longer than that.
+        The time is divided in proportion to how long the jobs ran then; no stage gets more than its jobs ran.
         """
         if not lacked_ns:
             return {}
@@ -96,7 +99,7 @@ def _end_ns(job: JobRecord) -> int:
 
 
 def _within_ns(job: JobRecord, begin_ns: int, end_ns: int) -> int:
-    """How long `job` ran then, without its share of time in which it had no core either."""
+    """Return how long `job` ran between two times, without its share of time in which it had no core or slept."""
     ns = min(job.end_ns, end_ns) - max(job.begin_ns, begin_ns)
     length_ns = job.end_ns - job.begin_ns
     return ns * max(length_ns - job.preempted_ns - job.asleep_ns, 0) // length_ns if ns > 0 else 0

@@ -1,4 +1,4 @@
-"""Signals that end a run, as something that is asked, not that breaks in. Rule: the handler only counts."""
+"""Turns signals that end a run into requests, so that they interrupt nothing. Rule: the handler only counts."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ UNLESS_IGNORED = (signal.SIGHUP, signal.SIGQUIT)
 
 
 class Interrupts:
-    """While entered from the main thread, counts the signals and makes `fd` readable; elsewhere does nothing.
+    """Counts the signals and makes `fd` readable while entered from the main thread; in other threads it does nothing.
 
-    SIGHUP and SIGQUIT stay ignored where the caller was started so (`nohup`, a shell's background job). SIGPIPE is
-    ignored meanwhile, as Python does: what is said to a unit that is gone must not end the program.
+    SIGHUP and SIGQUIT stay ignored if the caller was started so (`nohup`, a shell's background job). SIGPIPE is ignored
+    meanwhile, as Python does it: a message to a unit that is gone must not end the program.
     """
 
     def __init__(self) -> None:

@@ -1,8 +1,8 @@
 """Percentiles of more times than are kept, by the library ddsketch. Rule: within RELATIVE_ERROR of the exact ones.
 
 Masson, Rim, Lee, "DDSketch: A Fast and Fully-Mergeable Quantile Sketch with Relative-Error Guarantees", PVLDB 12
-(2019): bins that grow by a constant factor, so each value is known within that factor. BINS of them reach from a
-nanosecond to centuries; they are made where values are.
+(2019). The bins grow by a constant factor, so each value is known within that factor. BINS of them reach from a
+nanosecond to centuries; a bin is made when it gets a value.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ SKETCHED = f"of more than {MOST_EXACT} samples by ddsketch, within {RELATIVE_ERR
 
 
 class DdSketch:
-    """`trilane.scheduler.samples.Sketch` of values of at least 0."""
+    """A `trilane.scheduler.samples.Sketch` of values of at least 0."""
 
     def __init__(self) -> None:
         self._sketch = LogCollapsingLowestDenseDDSketch(RELATIVE_ERROR, BINS)

@@ -1,4 +1,7 @@
-"""What a stage is to the process that runs it. Rule: it sees its slots, its settings and its unit, nothing else."""
+"""The interface of a stage to the process that runs it.
+
+Rule: a stage sees its slots, its settings and its unit only.
+"""
 
 from __future__ import annotations
 
@@ -23,39 +26,40 @@ class Skip(dict[str, float]):
 class Stage(Protocol):
     """One stage inside a unit's process, made by a `StageFactory`.
 
-    At the end of `Pipeline.bypass` a stage has two edges from which frames come: `inputs` holds the slots of its own
-    edge, then those of the edge that frames skip from.
+    The stage at the end of `Pipeline.bypass` takes frames from two edges. Its `inputs` holds the slots of its own edge,
+    then those of the edge at which skipping frames leave.
     """
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
-        """Called once, with every slot of the stage's edges, before the first job: allocate here, never later."""
+        """Take every slot of the stage's edges; called once, before the first job. Allocate here, never later."""
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
-        """Do frame `frame` from `inputs[slot_in]` to `outputs[slot_out]`; metrics for the log, often empty.
+        """Do `frame` from `inputs[slot_in]` to `outputs[slot_out]`, and return metrics for the log, often none.
 
         The first stage of a pipeline has no input, the last no output. The header of the output slot already holds the
-        frame's number and sampling time; where both edges have the same header, all of the input's.
+        frame's number and sampling time. Where both edges have the same header, it already holds all of the input's
+        fields.
         """
 
     def close(self) -> None:
-        """Release what the stage holds (files are completed and renamed here)."""
+        """Release what the stage holds; files are completed and renamed here."""
 
 
 class SteppedStage(Stage, Protocol):
     """The first stage of a pipeline whose frames may be given less work (`run_pipeline`'s `works`)."""
 
     def step_to(self, rung: int) -> None:
-        """From now on frames are given the work of `rung`, 0 at first. Called before `run`, where it changes."""
+        """Give frames the work of `rung` from now on, at first 0; called before `run` whenever it changes."""
 
 
 class SkippingStage(Stage, Protocol):
     """The stage at which a pipeline's bypass begins. Its `run` may return a `Skip`."""
 
     def forget(self) -> None:
-        """The next frame must not skip because of what earlier frames brought to the bypass's end.
+        """Do not skip the next frame because of what earlier frames brought to the bypass's end.
 
-        Called before `run` for the first frame, and whenever a frame that did not skip has not come to the bypass's
-        end, or the unit there was started anew.
+        Called before `run` for the first frame. Called again whenever a frame that did not skip failed to reach the
+        bypass's end, or the unit there was started anew.
         """
 
 
@@ -63,7 +67,9 @@ class SkippingStage(Stage, Protocol):
 class UnitContext:
     """What the stages of one unit share in its process.
 
-    `name`: of the unit. `settings`: its cores and threads. `assets`: the arrays that the run was given, read-only.
+    `name`: name of the unit.
+    `settings`: cores and threads of the unit.
+    `assets`: arrays that the run was given, read-only.
     """
 
     name: str
@@ -73,27 +79,33 @@ class UnitContext:
     _devices: set[str] = field(default_factory=set)
 
     def shared(self, key: str, make: Callable[[], T]) -> T:
-        """What `make` returns, made once in this process: such as the context with which two stages draw."""
+        """Return what `make` returned, which is called once per `key` in this process.
+
+        An example is the context with which two stages draw.
+        """
         if key not in self._shared:
             self._shared[key] = make()
         made: T = self._shared[key]
         return made
 
     def use_device(self, name: str) -> None:
-        """The unit's work is done by hardware other than its cores, such as a graphics card.
+        """Note that hardware other than the unit's cores does its work, such as a graphics card.
 
-        Then a job whose threads sleep counts as busy: the device works. Else it would count as idle.
+        A job whose threads sleep then counts as busy, because the device works; otherwise it would count as idle.
         """
         self._devices.add(name)
 
     @property
     def has_device(self) -> bool:
-        """Whether a stage said `use_device`."""
+        """Whether a stage called `use_device`."""
         return bool(self._devices)
 
 
 class StageFactory(Protocol):
-    """What `PipelineStage.factory` names."""
+    """The kind of function that `PipelineStage.factory` names."""
 
     def __call__(self, settings: Mapping[str, Any], unit: UnitContext) -> Stage:
-        """The stage, built; everything slow or fallible happens here. Raises BadInputError, MissingPartError."""
+        """Return the built stage; everything slow or fallible happens here.
+
+        Raises BadInputError or MissingPartError.
+        """

@@ -1,4 +1,7 @@
-"""What a run needs around it, and undoes. Rule: whatever happens inside, cores, memory and processes are as before."""
+"""What a run needs around it and undoes afterwards.
+
+Rule: whatever happens, cores, memory and processes are as before.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +21,12 @@ from trilane.pipeline.unit_starter import UnitStarter
 from trilane.transport.wakeup import DEFAULT, SHORTEST_NS, use_slice
 
 Processes = TypeVar("Processes", bound=UnitProcesses)
-SWITCH_S = 0.0002  # the longest that another thread of this process keeps the interpreter
+SWITCH_S = 0.0002  # seconds for which another thread of this process keeps the interpreter at most
 
 
 @contextlib.contextmanager
 def on_cores(cores: tuple[int, ...]) -> Iterator[None]:
-    """The scheduler runs on `cores`, off those of the other units."""
+    """Run the scheduler on `cores` inside the `with` block, off the cores of the other units."""
     before = machine.here.cores()
     os.sched_setaffinity(0, cores)
     try:
@@ -34,10 +37,10 @@ def on_cores(cores: tuple[int, ...]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def prompt_answers() -> Iterator[None]:
-    """The scheduler answers at once.
+    """Make the scheduler answer at once inside the `with` block.
 
-    It does not wait for another unit's time slice on its core, for a thread that draws a progress bar, or for garbage
-    collection: a run makes no garbage in cycles.
+    It then waits neither for another unit's time slice on its core, nor for a thread that draws a progress bar. It does
+    not wait for garbage collection either, because a run makes no garbage in cycles.
     """
     switch_s, collects = sys.getswitchinterval(), gc.isenabled()
     sys.setswitchinterval(SWITCH_S)
@@ -56,7 +59,10 @@ def prompt_answers() -> Iterator[None]:
 def unit_processes(
     pipeline: Pipeline, assets: Assets, starter: UnitStarter | None, kind: type[Processes]
 ) -> Iterator[Processes]:
-    """The fork server, unless the caller has one; the memory; then processes of `kind` that map it, none started."""
+    """Yield processes of `kind`, none of them started, with the memory that they map.
+
+    A fork server is made unless the caller gives one as `starter`.
+    """
     with contextlib.ExitStack() as stack:
         used = starter or stack.enter_context(UnitStarter(pipeline.preload))
         assets_fd = share_assets(assets)

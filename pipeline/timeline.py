@@ -1,10 +1,13 @@
-"""A run as frames, jobs, waits and idle time, from its journal. Rule: nobody else interprets a journal's events.
+"""Turns the journal of a run into frames, jobs, waits and idle time.
 
-The scheduler's own parts tell what it knew: its source says which frames are released and wait (frame_source.py), and
-its record of a frame when that was sampled and how long it took (state.py). A frame waits before the first stage from
-its release on, before another stage from the step in which the scheduler heard that the stage before had ended, until
-it is handed to a unit, dropped or lost. Frames overtake nobody, so that those which are dropped where several wait are
-the oldest, but for one that is turned away before the first stage.
+Rule: no other module interprets a journal's events. The scheduler's own parts tell what it knew: its source says which
+frames are released and wait (frame_source.py). Its record of a frame says when the pose was sampled and how long the
+frame took (state.py).
+
+A frame waits before the first stage from its release on. It waits before another stage from the step in which the
+scheduler heard that the stage before had ended. The wait ends when the frame is handed to a unit, dropped or lost.
+Frames do not overtake each other: where several wait, the oldest are dropped. The exception is a frame that is turned
+away before the first stage.
 """
 
 from __future__ import annotations
@@ -39,15 +42,18 @@ from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.state import FrameState
 
 SOURCE: Final = "source"
-UNKNOWN: Final = -1  # of a frame that is gone, and nobody knows which it was
+UNKNOWN: Final = -1  # the number of a frame that is gone and cannot be told from others
 
 
 class Presented(NamedTuple):
-    """A frame that went through.
+    """A frame that was presented.
 
-    `release_ns`: when it was released. `end_ns`: of its last job. `interval_ns`: since that of the frame presented
-    before it, None of the first. `latency_ns`: from its sampled pose to the end of the stage that the pipeline names.
-    `skips`: whether it took the bypass. `rung`: of its work.
+    `release_ns`: time of its release.
+    `end_ns`: end of its last job.
+    `interval_ns`: time since the end of the frame presented before it; None for the first.
+    `latency_ns`: time from its sampled pose to the end of the stage that the pipeline names.
+    `skips`: whether it took the bypass.
+    `rung`: rung of its work.
     """
 
     frame: int
@@ -60,7 +66,11 @@ class Presented(NamedTuple):
 
 
 class Gone(NamedTuple):
-    """A frame that was not presented. `frame`: UNKNOWN where it cannot be told. `cause`: as in the report."""
+    """A frame that was not presented.
+
+    `frame`: its number; UNKNOWN where it cannot be told.
+    `cause`: key of the cause in the report.
+    """
 
     frame: int
     release_ns: int
@@ -70,21 +80,22 @@ class Gone(NamedTuple):
 
 
 class Done(NamedTuple):
-    """A job whose end the scheduler has heard of."""
+    """A job that has ended, as the scheduler has heard."""
 
     handed: Handed
     event: JobDone
 
 
 class ExplainedJob(NamedTuple):
-    """A job that is in the journal with its times, and why it waited.
+    """A job in the journal with its times, and why it waited.
 
-    `figures`: what its stage reported of it.
-    `waits_ns`: cause to ns, those that are not 0; they sum to `job.begin_ns - job.ready_ns`.
-    `behind`: the job that its unit did the longest in that time, None without one.
-    `after`: the jobs whose end the scheduler heard of in the step in which it handed this job over.
-    `presented`: the frame, of the job that presents it.
-    `rung`: of the frame's work. `skips`: the frame takes the bypass, said by the stage at which that begins.
+    `figures`: numbers that its stage reported of it, by name.
+    `waits_ns`: ns of each cause of its wait, without zeros; they sum to `job.begin_ns - job.ready_ns`.
+    `behind`: job that its unit did the longest during the wait; None without one.
+    `after`: jobs whose end the scheduler heard of in the step in which it handed this job over.
+    `presented`: the presented frame, for the job that presents it.
+    `rung`: rung of the frame's work.
+    `skips`: whether the frame takes the bypass; set for the stage at which the bypass begins.
     """
 
     job: JobRecord
@@ -102,40 +113,44 @@ class ExplainedJob(NamedTuple):
 
     @property
     def cause(self) -> str:
-        """Of most of its wait; "" where it did not wait."""
+        """The cause of most of its wait; "" where it did not wait."""
         return max(self.waits_ns, key=self.waits_ns.__getitem__, default="")
 
 
 class Span(NamedTuple):
-    """From the step in which the last unit got ready to the one that finished the run."""
+    """The time from the step in which the last unit got ready to the step that finished the run."""
 
     begin_ns: int
     end_ns: int
 
 
 class Down(NamedTuple):
-    """A unit's process was down; it was up again at `end_ns`."""
+    """A time in which a unit's process was down; it was up again at `end_ns`."""
 
     unit: str
     begin_ns: int
     end_ns: int
 
 
-#: What a record means. A `Done` comes with the step that heard of it, an `ExplainedJob` with the job's own record.
+#: What a record means. A `Done` comes from the step that heard of the end, an `ExplainedJob` from the job's own record.
 Fact = Done | Presented | Gone | ExplainedJob | IdleSlice
 
 
 class Timeline:
-    """Takes the records of a run in order; `add` hands back what each means, `end`, after the last, what is left.
+    """Takes the records of a run in order: `add` returns what each means, and `end` returns the rest.
 
-    `graph`, `settings`: of the run. `waits`: whether jobs are explained; it takes longer than all else.
-    `idle`: whether idle time is cut into slices, which come in the order of their ends.
-    `kept`: jobs and changes of each unit that are looked back on to explain a wait.
+    `graph`, `settings`: graph and settings of the run.
+    `waits`: whether to explain the waits of jobs; this takes longer than everything else.
+    `idle`: whether to cut idle time into slices, which come in the order of their ends.
+    `kept`: number of jobs and changes of each unit that are kept to explain a wait.
 
-    `frames`: those in flight. `start_ns`: when the last unit got ready; None before. `is_over`: whether the run is.
-    `span`: from the start to the end of the run; None until then, and of one that never started.
-    `presented`, `skipped`: frames that reached the end, and of these those that took the bypass to it.
-    `downs`: the last times in which a unit was down after its start, in the order of their ends.
+    `frames`: frames in flight, by number.
+    `start_ns`: time at which the last unit got ready; None before.
+    `is_over`: whether the run is over.
+    `span`: time from the start to the end of the run; None until the end, and for a run that never started.
+    `presented`: number of frames that reached the end.
+    `skipped`: number of presented frames that took the bypass.
+    `downs`: last times in which a unit was down after its start, in the order of their ends.
     """
 
     def __init__(
@@ -158,7 +173,7 @@ class Timeline:
         self._turned_away: dict[str, deque[tuple[int, int]]] = {cause: deque() for cause in DropCause}
         self._waiting: dict[str, list[int]] = {name: [] for name in names[1:]}
         self._heard_ns: dict[int, int] = {}
-        self._lost: deque[tuple[int, int]] = deque()  # and for which no cause was counted yet
+        self._lost: deque[tuple[int, int]] = deque()  # those whose cause was not counted yet
         self._counts: dict[tuple[str, str], int] = {}
         self._requested = settings.frames
         self._ended: dict[Key, tuple[Handed, JobDone, Presented | None]] = {}
@@ -175,7 +190,7 @@ class Timeline:
         }
 
     def add(self, record: Record) -> list[Fact]:
-        """What the next record after the first means."""
+        """Return what the next record after the first means."""
         if isinstance(record, Stepped):
             return self._step(record)
         if isinstance(record, Counted):
@@ -187,16 +202,16 @@ class Timeline:
         return []
 
     def end(self) -> list[IdleSlice]:
-        """After the last record: the idle slices until the last step."""
+        """Return the idle slices up to the last step; called after the last record."""
         return self._cutter.end() if self._cutter is not None else []
 
     def waiting(self, stage: str) -> list[int]:
-        """The frames that wait before `stage`, the oldest first; before the first stage those that are released."""
+        """Return the frames that wait before `stage`, the oldest first; before the first stage, the released frames."""
         return [frame for frame, _ in self._source.queue] if stage == self._first else [*self._waiting[stage]]
 
     @property
     def not_begun(self) -> int:
-        """Frames of the run that were never in flight, and not dropped before they could be."""
+        """The number of the run's frames that were never in flight and were not dropped before."""
         return self._requested - self._source.left
 
     # records
@@ -208,7 +223,7 @@ class Timeline:
         self._now_ns = step.now_ns
         after: list[Key] = []
         for event in step.events:
-            if type(event) is JobDone:  # most of them
+            if type(event) is JobDone:  # most events
                 facts += self._end(event, after)
             elif (handler := self._handlers.get(type(event))) is not None:
                 handler(event)
@@ -249,7 +264,7 @@ class Timeline:
         return [ExplainedJob(job, worked.figures, waits_ns, behind, after, presented, rung, skips)]
 
     def _count(self, counted: Counted) -> Iterator[Gone]:
-        """Frames that were lost or dropped since the last such record."""
+        """Yield the frames that were lost or dropped since the last such record."""
         for kind, counts, gone in (("lost", counted.lost, self._lost_for), ("dropped", counted.dropped, self._dropped)):
             for cause, count in counts.items():
                 for _ in range(count - self._counts.get((kind, cause), 0)):
@@ -257,11 +272,11 @@ class Timeline:
                 self._counts[kind, cause] = count
 
     def _lost_for(self, _cause: str, now_ns: int) -> tuple[int, int]:
-        """The frame that was lost first, and when it was released."""
+        """Return the frame that was lost first, and its release time."""
         return self._lost.popleft() if self._lost else (UNKNOWN, now_ns)
 
     def _dropped(self, cause: str, now_ns: int) -> tuple[int, int]:
-        """The frame that was dropped for `cause`, as `producer->consumer:kind`, and when it was released."""
+        """Return the frame that was dropped for `cause`, given as `producer->consumer:kind`, and its release time."""
         edge, _, kind = cause.rpartition(":")
         producer, _, consumer = edge.partition("->")
         if producer == SOURCE:
@@ -279,7 +294,7 @@ class Timeline:
     # jobs and frames
 
     def _begin(self, job: Job, after: tuple[Key, ...]) -> None:
-        """The job is handed to its unit."""
+        """Note that the job is handed to its unit."""
         heard_ns = self._heard_ns.get(job.frame, 0)
         self.units[job.unit].held.append(Handed(job, self._now_ns, heard_ns, after))
         if job.stage == self._first:
@@ -288,21 +303,21 @@ class Timeline:
             self._waiting[job.stage].remove(job.frame)
 
     def _frame(self, number: int) -> FrameState:
-        """A frame in flight; of one that a journal without its begin has, what is known from now on."""
+        """Return a frame in flight; where the journal lacks its begin, make one that is known from now on."""
         if (frame := self.frames.get(number)) is None:
             frame = self.frames[number] = FrameState(self._now_ns, NEVER)
         return frame
 
     def _take(self, frame: int) -> int:
-        """The frame is in flight from now on; when it was released."""
+        """Note that the frame is in flight from now on, and return its release time."""
         for released in self._source.queue:
-            if released[0] == frame:  # it is not always the oldest: that others are dropped is counted after the step
+            if released[0] == frame:  # others may come first: a frame dropped in this step is counted after it
                 self._source.queue.remove(released)
                 return released[1]
         return self._source.take(self._now_ns)[1]
 
     def _end(self, event: JobDone, after: list[Key]) -> Iterator[Fact]:
-        """A job has ended: its frame waits for the next stage, or is presented."""
+        """Note the end of a job: its frame waits for the next stage, or is presented."""
         handed = self.units[event.unit].take(event.job)
         if handed is None:
             return
@@ -310,6 +325,7 @@ class Timeline:
         after.append((job.stage, job.frame))
         self._heard_ns[job.frame] = self._now_ns
         frame = self._frame(job.frame)
+        # The scheduler's own record computes the latency, so that it is defined once.
         frame.end_stage(self._positions[job.stage], self._latency_position, event.t_sampled_ns, event.t_end_ns)
         frame.skips |= event.skips
         yield Done(handed, event)
@@ -321,7 +337,8 @@ class Timeline:
             self._waiting[skips_to or self._next[job.stage]].append(job.frame)
         if self._explains:
             self._ended[job.stage, job.frame] = handed, event, presented
-            if len(self._ended) > self._kept:  # of a job whose frame was lost meanwhile there is no record
+            # a job whose frame was lost meanwhile has no record and would stay for ever
+            if len(self._ended) > self._kept:
                 del self._ended[next(iter(self._ended))]
 
     def _present(self, number: int, frame: FrameState, end_ns: int) -> Presented:
@@ -347,7 +364,10 @@ class Timeline:
             self._source.start(self._now_ns)
 
     def _on_died(self, event: UnitDied) -> None:
-        """The frame that its unit worked on is lost; what it only held waits again, unless it was to begin."""
+        """Lose the frame that the dead unit worked on.
+
+        Its other frames wait for their stage again, but a frame at the first stage is lost too.
+        """
         unit = self.units[event.unit]
         unit.fall(self._now_ns, is_gone=True)
         for place, handed in enumerate(unit.held):
@@ -360,7 +380,10 @@ class Timeline:
         unit.held.clear()
 
     def _finish(self, kind: OutcomeKind) -> None:
-        """The run is over, and what was in flight is lost. What is dropped in this step is counted after it."""
+        """Note that the run is over. Frames in flight are lost if it was aborted or given up.
+
+        Frames that are dropped in this step are counted after it.
+        """
         self.is_over = True
         if self.start_ns is not None:
             self.span = Span(self.start_ns, self._now_ns)
@@ -371,11 +394,11 @@ class Timeline:
             unit.held.clear()
 
     def _lose(self, frame: int) -> None:
-        """The frame is no more; why, the next count says."""
+        """Note that the frame is lost; the next count says why."""
         self._lost.append((frame, self._leave(frame)))
 
     def _leave(self, number: int) -> int:
-        """The frame is nowhere any more; when it was released."""
+        """Remove the frame from all queues, and return its release time."""
         for waiting in self._waiting.values():
             if number in waiting:
                 waiting.remove(number)

@@ -1,9 +1,9 @@
-"""Frame times of placements, by real frames. Rule: what is compared runs in turns, a few frames each, the same ones.
+"""Measures frame times of placements by real frames. Rule: placements run in turns, a few frames each, the same frames.
 
-Units that run are moved from the cores of one placement to those of the next, while frames go through them. A slice of
-frames takes a fraction of a second, so what slows the machine for a second slows all that is compared; from run to run
-it may differ by more than two placements do. Placements with other numbers of threads need processes of their own:
-these stand still while others have their turn.
+Running units are moved from the cores of one placement to those of the next, while frames go through them. A slice of
+frames takes a fraction of a second, so what slows the machine for a second slows all placements that are compared. From
+run to run the machine may differ by more than two placements do. Placements with other numbers of threads need
+processes of their own, which stand still while others have their turn.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from trilane.scheduler.release import run_settings
 from trilane.transport.messages import Message, RunJob
 from trilane.transport.wakeup import awake
 
-SLICE: Final = 16  # frames that a placement has in its turn
-SKIPPED: Final = 6  # of them: they were under way when the units were moved
-DRAIN: Final = 6  # frames behind the last slice, so that its own are not the last in the pipeline
+SLICE: Final = 16  # frames of a placement in its turn
+SKIPPED: Final = 6  # first frames of a slice that do not count, as they were under way when the units were moved
+DRAIN: Final = 6  # frames behind the last slice, so that its own frames are not the last in the pipeline
 PERIOD_NS: Final = 33_333_333
 HANG_NS: Final = 10_000_000_000
 
-#: Unit to its cores.
+#: The cores of each unit.
 Cores = Mapping[str, tuple[int, ...]]
 
 
@@ -49,7 +49,11 @@ class Group(NamedTuple):
 
 
 class Round(NamedTuple):
-    """A turn of every placement. `frame_ns`: the mean of each, group by group. `others`: see `OtherPrograms.share`."""
+    """A turn of every placement.
+
+    `frame_ns`: mean frame time of each placement in ns, group by group.
+    `others`: share of other programs, see `OtherPrograms.share`.
+    """
 
     frame_ns: tuple[float, ...]
     others: float
@@ -62,12 +66,13 @@ def try_in_turns(
     starter: UnitStarter,
     is_enough: Callable[[Sequence[Round]], bool] = lambda _: False,
 ) -> list[Round]:
-    """A round for each of `windows`, or fewer when they are `is_enough`.
+    """Return a round for each of `windows`, or fewer when they are enough by `is_enough`.
 
-    `groups`: what is tried; each round begins with another placement.
-    `windows`: of each round, the first of the SLICE frames that every placement does in it.
-    `assets`, `starter`: as for a run.
-    Raises TrilaneError when a unit cannot start or a stage fails, KeyboardInterrupt when interrupted.
+    `groups`: placements to try; each round begins with another one.
+    `windows`: first of the SLICE frames that every placement does, for each round.
+    `assets`, `starter`: arrays and fork server, as for a run.
+
+    Raises TrilaneError when a unit cannot start or a stage fails, and KeyboardInterrupt when interrupted.
     """
     rounds: list[Round] = []
     cores = sorted({core for group in groups for place in group.places for own in place.values() for core in own})
@@ -87,7 +92,7 @@ def try_in_turns(
 
 
 class _Replaying(UnitProcesses):
-    """Every slice does the same frames of the scene: those from `first` on."""
+    """Units whose every slice does the same frames of the scene: those from `first` on."""
 
     first = 0
 
@@ -115,7 +120,10 @@ class _Live:
         return list(self._processes.pids.values())
 
     def one_round(self, turn: int, first: int) -> list[float]:
-        """The frame time of each place in ns, on the frames from `first` on; the `turn`-th begins with another one."""
+        """Return the frame time of each place in ns, on the frames from `first` on.
+
+        Each `turn` begins with another place.
+        """
         count = len(self._group.places)
         order = [(turn + number) % count for number in range(count)]
         self._processes.first = first
@@ -135,7 +143,7 @@ class _Live:
 
 
 class _Turns:
-    """`trilane.scheduler.loop.Clock`: `clock`, with the units moved to the next of `places` after each SLICE frames."""
+    """The `trilane.scheduler.loop.Clock` that moves the units to the next of `places` after each SLICE frames."""
 
     def __init__(self, core: Core, clock: RealtimeClock, processes: UnitProcesses, places: Sequence[Cores]) -> None:
         self._core, self._clock, self._processes, self._places = core, clock, processes, places
@@ -149,6 +157,7 @@ class _Turns:
             self._begun.append(presented)
             for unit, cores in place.items():
                 self._processes.move(unit, cores)
+            # The scheduler shares the cores of the first stage's unit, as it does in a run.
             os.sched_setaffinity(0, place[self._scheduler_unit])
         return self._clock.wait(deadline_ns)
 
@@ -156,7 +165,7 @@ class _Turns:
         self._clock.perform(now_ns, actions)
 
     def frame_ns(self) -> list[float]:
-        """Of each place, the mean time from a presented frame to the next, but the first SKIPPED."""
+        """Return the mean time between presented frames of each place in ns, without its first SKIPPED frames."""
         presented_ns = self._core.ledger.presented_ns
         ends = [*self._begun[1:], SLICE * len(self._places)]
         spans = [(begin + SKIPPED, end) for begin, end in zip(self._begun, ends, strict=True)]

@@ -1,13 +1,19 @@
-"""What a unit did, and why it did nothing: its idle time in slices, and each wait of a job cut into causes.
+"""Explains what a unit did: cuts its idle time into slices with causes, and each wait of a job into causes.
 
-Rule: a unit's time is a job or idle for one cause. Whether it had a job and whether its process was up, the timeline
-says (timeline.py); why it had none is what the core noted of it after each step.
+Rule: at any time a unit has a job or is idle for one cause. The timeline (timeline.py) says whether it had a job and
+whether its process was up. The core notes after each step why the unit had no job.
 
-Every ns from a job's `ready_ns` to its `begin_ns` has one cause, the first of these that holds: the unit did another
-job; it was at one that was lost with its process, or that was down; the scheduler had not heard yet that the input was
-there (overhead); the unit's cap held it; no output slot was free, or enough frames were in flight; the policy or the
-order of frames held it; and, from the moment in which the job was handed over, the unit had no core, or the job was on
-its way (overhead). What is kept is bounded: a wait that reaches further back than `kept` jobs or changes of its unit is
+Every nanosecond from a job's `ready_ns` to its `begin_ns` has one cause, the first of these that holds:
+- busy: the unit did another job;
+- lost or down: the unit was at a job that was lost with its process, or its process was down;
+- overhead: the scheduler had not heard yet that the input was there;
+- throttled: the unit's cap held it;
+- blocked: no output slot was free, or enough frames were in flight;
+- held: the policy or the order of frames held the job;
+- preempted: the job was handed over, but the unit had no core;
+- overhead: the job was handed over and on its way.
+
+The history is bounded: it keeps the last `kept` jobs and changes of each unit. A wait that reaches further back is
 `unknown` there.
 """
 
@@ -24,28 +30,29 @@ from trilane.scheduler.ledger import JobRecord
 
 BUSY, PREEMPTED, OVERHEAD = "busy", "preempted", "overhead"
 THROTTLED = "throttled"
-#: Why a unit without a job has none, by the ledger's account.
+#: What the ledger's account says about why a unit has no job.
 NAMES: Final = {ledger.STARVED: "starved", ledger.BLOCKED: "blocked", ledger.THROTTLED: THROTTLED}
 #: Why a unit is idle.
 IDLE_CAUSES: Final = (*NAMES.values(), PREEMPTED, OVERHEAD)
-#: A unit that has neither a job nor a noted cause: its time is missing in the sums, which shows.
+#: The cause of a unit that has neither a job nor a noted cause; the sums lack its time, which shows the gap.
 UNEXPLAINED = "unexplained"
 LOST, DOWN, HELD, UNKNOWN = "lost", "down", "held", "unknown"
 #: Why a job waits.
 WAIT_CAUSES: Final = (BUSY, LOST, DOWN, THROTTLED, NAMES[ledger.BLOCKED], HELD, PREEMPTED, OVERHEAD, UNKNOWN)
-#: What the account of a unit without this job means for the job, once the scheduler has heard of its input.
+#: What the account of a unit without this job means for the job, once the scheduler has heard of the job's input.
 MEANING: Final = {**NAMES, ledger.ASSIGNED: OVERHEAD, ledger.STARVED: HELD}
 KEPT: Final = 4096
 
-#: A job that is over: its stage and its frame.
+#: The stage and the frame of a job that has ended.
 Key = tuple[str, int]
 
 
 class Handed(NamedTuple):
-    """A job that its unit has.
+    """A job that was handed to its unit and has not ended.
 
-    `at_ns`: when it was handed over. `heard_ns`: when the scheduler heard of its input.
-    `after`: the jobs whose end the scheduler heard of in the step in which it handed this job over.
+    `at_ns`: time of the hand-over.
+    `heard_ns`: time at which the scheduler heard of the job's input.
+    `after`: jobs whose end the scheduler heard of in the step in which it handed this job over.
     """
 
     job: Job
@@ -55,7 +62,7 @@ class Handed(NamedTuple):
 
 
 class IdleSlice(NamedTuple):
-    """A piece of time in which no job ran on the unit. `preempted_ns`: how much of it the unit had no core."""
+    """A piece of time in which no job ran on the unit. `preempted_ns`: part of it in which the unit had no core."""
 
     unit: str
     cause: str
@@ -65,10 +72,12 @@ class IdleSlice(NamedTuple):
 
 
 class UnitHistory:
-    """One unit. `kept`: its last jobs and changes that are remembered to explain waits.
+    """The recent past of one unit.
 
-    `held`: the jobs that it has, the running one first. `account`: of its time without a job (the ledger's).
-    `is_up`: whether its process is there and ready, and is not to be ended.
+    `kept`: number of last jobs and of last changes that are remembered to explain waits.
+    `held`: jobs that the unit has, the running one first.
+    `account`: account of the ledger that gets the unit's time without a job.
+    `is_up`: whether the unit's process is up and ready, and no kill is under way.
     """
 
     def __init__(self, name: str, kept: int = KEPT) -> None:
@@ -76,7 +85,7 @@ class UnitHistory:
         self.held: deque[Handed] = deque()
         self.account = ledger.STARVED
         self.is_up = self._is_ending = False
-        self._down_ns: int | None = None  # since when, after it was up
+        self._down_ns: int | None = None  # start of the time in which its process is down, after it was up
         self._jobs: deque[JobRecord] = deque(maxlen=kept)
         self._changes: deque[tuple[int, str]] = deque(maxlen=kept)
         self._idle_cause = ""
@@ -85,7 +94,10 @@ class UnitHistory:
     # its process
 
     def rise(self, now_ns: int) -> int | None:
-        """Its process is up; since when it was down, None where it was not up before. One to be ended stays so."""
+        """Note that the process is up, and return since when it was down; None if it was not up before.
+
+        A process that is to be ended does not come up.
+        """
         if self._is_ending:
             return None
         down_ns, self._down_ns, self.is_up = self._down_ns, None, True
@@ -93,7 +105,10 @@ class UnitHistory:
         return down_ns
 
     def fall(self, now_ns: int, *, is_gone: bool) -> None:
-        """Its process is gone, or is to be ended; with it goes what it did between jobs since it had the first."""
+        """Note that the process is gone or is to be ended.
+
+        If it was up and had a job, the time since the hand-over of that job counts as lost.
+        """
         if self.is_up:
             if self.held:
                 self._lose(self.held[0].at_ns)
@@ -102,20 +117,20 @@ class UnitHistory:
         self._change(now_ns)
 
     def take(self, job: int) -> Handed | None:
-        """The job that has ended; None for one that was lost with the process that did it."""
+        """Return the job that has ended; None for a job that was lost with its process."""
         return self.held.popleft() if self.held and self.held[0].job.id == job else None
 
     # why its jobs waited
 
     def enter(self, now_ns: int, account: int) -> None:
-        """From now on its time without a job goes to `account`."""
+        """From now on, book the unit's time without a job on `account`."""
         self.account = account
         self._change(now_ns)
 
     def explain(self, job: JobRecord, heard_ns: int) -> tuple[dict[str, int], JobRecord | None]:
-        """The wait of its next job by cause, those that are not 0, and the job that it did the longest in that time.
+        """Return the wait of the unit's next job in ns by cause, and the job that the unit did the longest meanwhile.
 
-        `heard_ns`: when the scheduler heard of the job's input.
+        Causes with 0 ns are left out. `heard_ns`: time at which the scheduler heard of the job's input.
         """
         others = list(self._during(job.ready_ns, job.begin_ns))
         waits_ns = self._waits(job, heard_ns, others)
@@ -134,13 +149,13 @@ class UnitHistory:
 
     @property
     def _known_from_ns(self) -> int:
-        """Since when everything is kept; 0: since ever."""
+        """The time from which on everything is kept; 0: nothing was dropped yet."""
         firsts = [self._jobs[0].begin_ns] if len(self._jobs) == self._jobs.maxlen else []
         firsts += [self._changes[0][0]] if len(self._changes) == self._changes.maxlen else []
         return max(firsts, default=0)
 
     def _during(self, begin_ns: int, end_ns: int) -> Iterator[JobRecord]:
-        """Its jobs that ran in a piece of time, the last first."""
+        """Yield the unit's jobs that ran between two times, the last first."""
         for job in reversed(self._jobs):
             if job.end_ns <= begin_ns:
                 return
@@ -148,7 +163,7 @@ class UnitHistory:
                 yield job
 
     def _waits(self, job: JobRecord, heard_ns: int, others: list[JobRecord]) -> dict[str, int]:
-        """`others`: its jobs in the time of the wait, the last first."""
+        """Return the wait of `job` by cause. `others`: the unit's jobs during the wait, the last first."""
         found = dict.fromkeys(WAIT_CAUSES, 0)
         known_ns = min(max(self._known_from_ns, job.ready_ns), job.begin_ns)
         found[UNKNOWN] = known_ns - job.ready_ns
@@ -168,7 +183,7 @@ class UnitHistory:
         return {cause: ns for cause, ns in found.items() if ns}
 
     def _add_not_handed(self, found: dict[str, int], begin_ns: int, end_ns: int, heard_ns: int) -> None:
-        """Of a piece of time before a job was handed over, in which the unit did no other."""
+        """Add the causes of a piece of time before a job was handed over, in which the unit did no other job."""
         if end_ns <= begin_ns:
             return
         explained_ns = 0
@@ -180,7 +195,7 @@ class UnitHistory:
         found[OVERHEAD] += end_ns - begin_ns - explained_ns
 
     def _causes(self, begin_ns: int, end_ns: int) -> Iterator[tuple[str, int, int]]:
-        """(cause, begin, end) over a piece of time, the last first; what was before the first change has none."""
+        """Yield (cause, begin, end) over a piece of time, the last first; time before the first change is left out."""
         for since_ns, cause in reversed(self._changes):
             if since_ns < end_ns:
                 yield cause, max(since_ns, begin_ns), end_ns
@@ -192,23 +207,29 @@ class UnitHistory:
 
     @property
     def idle_cause(self) -> str:
-        """Of its time now: overhead while it has a job or its process is not up."""
+        """The cause of the unit's idle time now: overhead while it has a job or its process is not up."""
         return OVERHEAD if self.held or not self.is_up else NAMES.get(self.account, UNEXPLAINED)
 
     @property
     def cut_until_ns(self) -> int:
-        """No slice that may still come ends before this while the unit has a job."""
+        """The time before which no slice ends that may still come while the unit has a job."""
         return self._cut_ns
 
     def note_idle(self, now_ns: int, cause: str) -> Iterator[IdleSlice]:
-        """From now on its idle time has this cause; what is left of the slice before, if that had another."""
+        """Set the cause of the idle time from now on.
+
+        If the cause changes, yield the rest of the slice before.
+        """
         if cause != self._idle_cause:
             if self._idle_cause and now_ns > self._cut_ns:
                 yield IdleSlice(self.name, self._idle_cause, self._cut_ns, now_ns)
             self._idle_cause, self._cut_ns = cause, now_ns
 
     def cut(self, job: JobRecord) -> Iterator[IdleSlice]:
-        """The piece between the job before and this one; only of a slice of overhead, for in others it has no job."""
+        """Yield the piece between the job before and this one.
+
+        Only a slice of overhead is cut: during any other slice the unit has no job.
+        """
         if self._idle_cause == OVERHEAD:
             if job.begin_ns > self._cut_ns:
                 lost_ns = min(job.preempted_before_ns, job.begin_ns - self._cut_ns)
@@ -217,20 +238,21 @@ class UnitHistory:
 
 
 class IdleCutter:
-    """Cuts the idle time of `units` into slices, while a run goes on or afterwards, in the order of their ends.
+    """Cuts the idle time of `units` into slices, in the order of their ends, during a run or after it.
 
-    To be told each step before its events are, then each `account` that was noted after it and each `job` whose end it
-    heard; after the last one `end`. What `step` and `end` hand back are the slices that are known by then.
+    For each step the caller calls `settle` and then `step`. It then calls `account` for each account noted after the
+    step, and `job` for each job whose end the step heard. After the last step it calls `end`. `settle` and `end` return
+    the slices that are known by then.
     """
 
     def __init__(self, units: Iterable[UnitHistory]) -> None:
         self._units = tuple(units)
-        self._now_ns: int | None = None  # of the last step; None before the run's start
+        self._now_ns: int | None = None  # time of the last step; None before the run's start
         self._held: list[tuple[int, int, IdleSlice]] = []
         self._count = 0
 
     def settle(self) -> list[IdleSlice]:
-        """Before the next step: note what the last one left each unit with; slices that end before any to come."""
+        """Note how the last step left each unit, and return the slices that end before all later ones."""
         if self._now_ns is None:
             return []
         until_ns = NEVER
@@ -240,23 +262,23 @@ class IdleCutter:
         return self._take(until_ns)
 
     def step(self, now_ns: int) -> None:
-        """The time of the next step, once the run has started."""
+        """Note the time of the next step; called once the run has started."""
         self._now_ns = now_ns
 
     def account(self, since_ns: int, unit: UnitHistory, account: int) -> None:
-        """From `since_ns` on the time of `unit` without a job goes to `account`.
+        """Note that the time of `unit` without a job goes to `account` from `since_ns` on.
 
-        That is the time of the last step, or of a release before it which that step did late.
+        `since_ns` is the time of the last step, or of an earlier release that this step handled late.
         """
         if account == ledger.ASSIGNED and self._now_ns is not None and since_ns < self._now_ns:
             self._hold(unit.note_idle(since_ns, OVERHEAD))
 
     def job(self, unit: UnitHistory, job: JobRecord) -> None:
-        """A job whose end the last step heard; those of a unit come in the order in which it did them."""
+        """Note a job whose end the last step heard; a unit's jobs come in the order in which it did them."""
         self._hold(unit.cut(job))
 
     def end(self) -> list[IdleSlice]:
-        """The slices that are left, until the last step; nothing may be told after it."""
+        """Return the remaining slices up to the last step; nothing may be noted after it."""
         if self._now_ns is not None:
             for unit in self._units:
                 self._hold(unit.note_idle(self._now_ns, ""))
@@ -275,5 +297,5 @@ class IdleCutter:
 
 
 def _overlap(other: JobRecord, job: JobRecord) -> int:
-    """How long `other` ran while `job` waited."""
+    """Return how many ns of the wait of `job` the unit spent on `other`."""
     return min(other.end_ns, job.begin_ns) - max(other.begin_ns, job.ready_ns)

@@ -43,13 +43,14 @@ from trilane.transport.wakeup import UNIT_NS, use_slice
 
 
 def serve(raw_spec: dict[str, Any], number_of: Mapping[int, int]) -> int:
-    """Build the unit's stages, then answer messages until Close; the process's exit code.
+    """Build the unit's stages, answer messages until Close, and return the process's exit code.
 
-    `number_of`: what each descriptor that the spec names is called in this process.
+    `number_of`: number in this process of each descriptor that the spec names.
     """
     spec = UnitSpec.model_validate(raw_spec).renumbered(number_of)
     context = context_on_cores(spec.scheduler_cores)
     link = Link(context, JobPipe(spec.job_pipe, waits=True), LINGER_MS)
+    # `context_on_cores` leaves this thread with the I/O thread's slice; a unit's is longer.
     use_slice(UNIT_NS)
     link.connect(spec.endpoint)
     try:
@@ -60,7 +61,7 @@ def serve(raw_spec: dict[str, Any], number_of: Mapping[int, int]) -> int:
 
 
 def _serve(spec: UnitSpec, link: Link) -> int:
-    with contextlib.closing(counters_here()) as counters:  # of the threads that the stages begin, too
+    with contextlib.closing(counters_here()) as counters:  # these count the threads that the stages begin, too
         return _answer(spec, link, counters)
 
 
@@ -91,7 +92,7 @@ def _answer(spec: UnitSpec, link: Link, counters: HardwareCounters | NoCounters)
 
 @contextlib.contextmanager
 def building_cores(spec: UnitSpec) -> Iterator[None]:
-    """While the stages are built, this thread may use every core of the run: the unit is ready sooner.
+    """Let this thread use every core of the run while the stages are built, so that the unit is ready sooner.
 
     Afterwards it and every thread that was started meanwhile are back on the unit's own cores.
     """
@@ -107,12 +108,12 @@ def building_cores(spec: UnitSpec) -> Iterator[None]:
 
 
 def _threads() -> set[int]:
-    """Those of this process, by the kernel's numbers."""
+    """Return the threads of this process, by the kernel's numbers."""
     return {int(task.name) for task in Path(TASKS).iterdir()}
 
 
 def build_stages(spec: UnitSpec) -> list[BoundStage]:
-    """The unit's stages on their slots, in the order of `spec.stages`. Raises what their factories raise."""
+    """Return the unit's stages on their slots, in the order of `spec.stages`; raises what their factories raise."""
     sys.path[:0] = map(str, spec.module_folders)
     unit = UnitContext(spec.unit, spec.settings, map_assets(spec.assets_fd))
     stages = [factory_named(stage.factory)(stage.settings, unit) for stage in spec.stages]
@@ -132,7 +133,7 @@ def build_stages(spec: UnitSpec) -> list[BoundStage]:
 
 
 def factory_named(name: str) -> StageFactory:
-    """The factory that `module:name` names. Raises ImportError, AttributeError."""
+    """Return the factory that `module:name` names; raises ImportError or AttributeError."""
     module, _, attribute = name.partition(":")
     factory: StageFactory = getattr(import_module(module), attribute)
     return factory
@@ -169,7 +170,7 @@ def _close(unit: str, link: Link, stages: Iterable[BoundStage]) -> int:
 
 
 def _fail(link: Link, job_id: int, where: str, error: Exception) -> int:
-    """Answer with one sentence; the traceback goes to stderr, of which the parent keeps the tail."""
+    """Answer with one sentence, and return the exit code; the traceback goes to stderr, whose end the parent keeps."""
     traceback.print_exception(error)
     known = isinstance(error, TrilaneError)
     text = str(error) if known else f"{where}: {type(error).__name__}: {error}"

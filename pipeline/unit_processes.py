@@ -1,7 +1,8 @@
-"""The units' processes, seen from the parent. Rule: what was started here is ended here, and its end is always noticed.
+"""Starts, hears and ends the units' processes.
 
-A unit's messages come over its link, what it writes to stderr over a pipe, and its end over a pidfd; one poller waits
-for them all.
+Rule: what was started here is ended here, and its end is always noticed.
+
+A unit's messages come over its link, its stderr over a pipe, and its end over a pidfd; one poller waits for all.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ END_S = 2.0
 
 
 class UnitMessage(NamedTuple):
-    """A message of a unit, or None when its process has ended."""
+    """A message of a unit; `message` is None when the unit's process has ended."""
 
     unit: str
     message: Message | None
@@ -48,7 +49,7 @@ class _Process:
         os.set_blocking(stderr_fd, False)
 
     def read_stderr(self) -> bool:
-        """Keep the end of what was written; False when the pipe is closed."""
+        """Keep the last bytes that were written; return False when the pipe is closed."""
         with contextlib.suppress(BlockingIOError):
             while chunk := os.read(self.stderr_fd, TAIL_BYTES):
                 self.tail = (self.tail + chunk)[-TAIL_BYTES:]
@@ -57,10 +58,11 @@ class _Process:
 
     def kill(self) -> None:
         with contextlib.suppress(ProcessLookupError):
+            # Through a pidfd the signal can never reach another process that was given the same number.
             signal.pidfd_send_signal(self.pidfd, signal.SIGKILL)
 
     def wait(self) -> None:
-        """Until the process has ended; those that it started, which are in its process group, are ended here."""
+        """Wait until the process has ended, and kill the processes that it started, which are in its process group."""
         poller = select.poll()  # select(2) takes no descriptor above 1023
         poller.register(self.pidfd, select.POLLIN)
         poller.poll()
@@ -76,8 +78,9 @@ class _Process:
 class UnitProcesses:
     """Starts, hears and ends the processes of the units of `pipeline`, whose edges have `regions`.
 
-    `assets_fd`: of the arrays that every unit may read. `stderr_tails`: of units that have ended, the end of what they
-    wrote. `places`: stage to its place among those of its unit, as messages have it.
+    `assets_fd`: descriptor of the arrays that every unit may read.
+    `stderr_tails`: last text that each ended unit wrote, by unit.
+    `places`: place of each stage among those of its unit, as messages use it.
     """
 
     def __init__(
@@ -96,7 +99,7 @@ class UnitProcesses:
 
     @property
     def core_counts(self) -> dict[str, int]:
-        """How many cores each unit has."""
+        """The number of cores of each unit."""
         return {unit: len(settings.cores) for unit, settings in self._pipeline.units.items()}
 
     @property
@@ -104,12 +107,15 @@ class UnitProcesses:
         return {unit: process.pid for unit, process in self._live.items()}
 
     def watch(self, fd: int) -> None:
-        """Let `listen` return early when `fd` becomes readable, from the first call on."""
+        """Let `listen` return early when `fd` becomes readable; further calls for `fd` do nothing."""
         if fd not in self._reactions:
             self._register(fd, partial(_swallow, fd))
 
     def start(self, unit: str) -> None:
-        """A fresh process for the unit; `Ready` or `Failed` follows, or its end. Raises TrilaneError, OSError."""
+        """Start a fresh process for the unit; raises TrilaneError or OSError.
+
+        `Ready`, `Failed` or the end of the process follows.
+        """
         with contextlib.ExitStack() as undo:
             folder = SocketFolder()
             undo.callback(folder.remove)
@@ -133,12 +139,15 @@ class UnitProcesses:
         self._register(process.pidfd, partial(self._end, process))
 
     def connected(self, unit: str) -> None:
-        """The unit is connected: its socket needs no name any more."""
+        """Remove the name of the unit's socket, which a connected unit no longer needs."""
         if unit in self._live:
             self._live[unit].release_folder()
 
     def send(self, unit: str, message: Message) -> None:
-        """To a unit that is gone or does not read: nothing, its end or its deadline tells."""
+        """Send `message` to the unit; does nothing for a unit that is gone or does not read.
+
+        The end of such a unit, or its deadline, tells of it.
+        """
         process = self._live.get(unit)
         if process is not None:
             process.link.job_pipe.send(message)
@@ -148,14 +157,14 @@ class UnitProcesses:
             self._live[unit].kill()
 
     def move(self, unit: str, cores: tuple[int, ...]) -> None:
-        """Every thread of the unit may run on `cores` alone, from now until its process ends."""
-        with contextlib.suppress(ProcessLookupError, FileNotFoundError):  # its end is heard of by `listen`
+        """Bind every thread of the unit to `cores`, from now until its process ends."""
+        with contextlib.suppress(ProcessLookupError, FileNotFoundError):  # `listen` hears of its end
             for thread in (machine.here.proc / f"{self._live[unit].pid}/task").iterdir():
                 with contextlib.suppress(ProcessLookupError):  # the thread has ended meanwhile
                     os.sched_setaffinity(int(thread.name), cores)
 
     def listen(self, timeout_ms: int) -> list[UnitMessage]:
-        """What came within the time; at once when something waits. A unit's messages come before its end."""
+        """Return what came within the time, or at once when something waits. A unit's messages come before its end."""
         messages: list[UnitMessage] = []
         for fd, _ in self._poller.poll(timeout_ms / 1000):
             messages += self._reactions[fd]()
@@ -169,21 +178,21 @@ class UnitProcesses:
         return messages
 
     def why_ended(self, unit: str) -> str:
-        """What a unit that has ended wrote last; to be put behind a sentence."""
+        """Return the end of a sentence that says what an ended unit wrote last; empty if it wrote nothing."""
         end = after_stderr(self.stderr_tails.get(unit, ""))
         return f"; {end}" if end else ""
 
     @property
     def stopped(self) -> set[str]:
-        """Units whose processes are stopped by a signal now."""
+        """The units whose processes are stopped by a signal now."""
         return {unit for unit, process in self._live.items() if is_stopped(process.pid)}
 
     def renew_starter(self) -> str:
-        """Have a fork server that answers; why it had to be a fresh one, else "". Raises OSError."""
+        """Make sure that a fork server answers; return why it had to be replaced, else "". Raises OSError."""
         return self._starter.renew()
 
     def close(self) -> None:
-        """No process is left when this returns, however it was before."""
+        """End every process, whatever its state."""
         for process in list(self._live.values()):
             process.kill()
         for process in list(self._live.values()):
@@ -192,13 +201,13 @@ class UnitProcesses:
         self._poller.close()
 
     def wait_for_end(self, units: list[str], timeout_s: float = END_S) -> None:
-        """Give units that were told to close the time to leave by themselves."""
+        """Give units that were told to close up to `timeout_s` seconds to end by themselves."""
         end = time.monotonic() + timeout_s
         while any(unit in self._live for unit in units) and time.monotonic() < end:
             self.listen(50)
 
     def _job_messages(self, process: _Process) -> list[UnitMessage]:
-        """The next message of the job pipe, if there is one; while more wait, the pipe stays readable."""
+        """Return the next message of the job pipe, if there is one; while more wait, the pipe stays readable."""
         try:
             message = process.link.job_pipe.receive()
         except MessageError as error:
@@ -206,7 +215,8 @@ class UnitProcesses:
         if message is not None:
             return [UnitMessage(process.unit, message)]
         if process.link.job_pipe.ended:
-            self._unregister(process.link.job_pipe.fileno())  # else the poller would report it for ever
+            # otherwise the poller would report the closed pipe for ever
+            self._unregister(process.link.job_pipe.fileno())
         return []
 
     def _heartbeats(self, process: _Process) -> list[UnitMessage]:

@@ -1,4 +1,4 @@
-"""What a unit's process gets when it starts, as one JSON document. Rule: plain data, and descriptors by number."""
+"""What a unit's process gets at its start, as one JSON document. Rule: plain data, and descriptors by number."""
 
 from __future__ import annotations
 
@@ -13,13 +13,17 @@ from trilane.transport.messages import JobPipeEnd
 class UnitSpec(Model):
     """One unit of a run.
 
-    `endpoint`: of the heartbeat socket.
-    `job_pipe`, `assets_fd`: descriptors, as are those of the regions.
-    `settings`: the unit's own; `scheduler_cores`: where the scheduler runs; `run_cores`: those of all units.
-    `stages`: those of this unit; messages name a stage by its place in this list.
-    `module_folders`: put before the module search path.
-    `edges`: regions by the edge's name; `inputs`, `outputs`: stage to edges, for those that have any.
-    `may_skip`: the stage at which the pipeline's bypass begins.
+    `unit`: name of the unit.
+    `endpoint`: address of the heartbeat socket.
+    `job_pipe`, `assets_fd`: descriptors of the job pipe and the assets.
+    `settings`: settings of the unit.
+    `scheduler_cores`: cores of the scheduler.
+    `run_cores`: cores of all units.
+    `stages`: stages of this unit; messages name a stage by its place in this list.
+    `module_folders`: folders that are put before the module search path.
+    `edges`: regions with their descriptors, by the edge's name.
+    `inputs`, `outputs`: edges of each stage that has any.
+    `may_skip`: name of the stage at which the pipeline's bypass begins, or "".
     """
 
     unit: str
@@ -38,11 +42,11 @@ class UnitSpec(Model):
 
     @property
     def fds(self) -> list[int]:
-        """The descriptors that the process needs, as they are numbered here."""
+        """The descriptors that the process needs, with their numbers in this process."""
         return [*self.job_pipe, self.assets_fd, *(edge.fd for edge in self.edges.values())]
 
     def renumbered(self, number_of: Mapping[int, int]) -> UnitSpec:
-        """The same where descriptor n has the number `number_of[n]`."""
+        """Return the same spec with the number `number_of[n]` for each descriptor n."""
         edges = {name: edge.model_copy(update={"fd": number_of[edge.fd]}) for name, edge in self.edges.items()}
         return self.model_copy(
             update={

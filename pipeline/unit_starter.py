@@ -1,7 +1,7 @@
 """The parent's end of the fork server. Rule: it starts units, and leaves no process when it is closed.
 
-Units outlive the server. One that has ended or was stopped is replaced: `renew` is called from time to time, so that a
-fresh one has imported what units need before the next unit is asked for.
+Units outlive the server. A server that has ended or was stopped is replaced. The caller calls `renew` from time to
+time, so that a fresh server has imported what units need before the next unit is wanted.
 """
 
 from __future__ import annotations
@@ -27,16 +27,17 @@ if TYPE_CHECKING:
 ANSWER_S = 60.0  # the modules to preload may come from a slow disk
 LOOK_S = 0.1  # between two looks at a fork server that has not answered
 CLOSE_S = 5.0
-NOTICE_S = 0.2  # a fork server ends at most this long after its call or its socket
+NOTICE_S = 0.2  # a fork server ends at most this many seconds after its call fails or its socket closes
 TAIL_BYTES = 8192
 SERVER = "the fork server, which every unit comes from,"
-SERVERS = 3  # that are asked for one unit, before it cannot be started
+SERVERS = 3  # number of servers that are asked for one unit before it counts as not startable
 
 
 class StartedUnit(NamedTuple):
-    """A unit's process. Its owner closes both files.
+    """A unit's process; its owner closes both descriptors.
 
-    `pidfd`: readable when it has ended. `lifeline`: the process ends when it is closed, or when this process ends.
+    `pidfd`: descriptor that is readable when the process has ended.
+    `lifeline`: descriptor that keeps the process alive: it ends when this is closed, or when this process ends.
     """
 
     pid: int
@@ -49,16 +50,16 @@ class _ServerError(Exception):
 
 
 class ForkedCall:
-    """A call that goes on in a process of a fork server of `starter`, and answers to the pipe `reads`."""
+    """A call that runs in a process of a fork server of `starter`, and answers to the pipe `reads`."""
 
     def __init__(self, starter: UnitStarter, function: str, reads: int) -> None:
         self._starter, self._function, self._reads = starter, function, reads
         self._is_open = True
 
     def result(self) -> Any | None:
-        """What the function returned, once; None when it failed, its process died, or no answer came in time.
+        """Return the function's result, once; None when it failed, its process died, or no answer came in time.
 
-        A call whose fork server had to be replaced is made once more.
+        If the call's fork server had to be replaced, the call is made once more.
         """
         answer = self._answer()
         self.close()
@@ -69,7 +70,7 @@ class ForkedCall:
         return json.loads(answer) if answer else None
 
     def _answer(self) -> bytes:
-        """All that is written until the end, the time is over, or the fork server is no more."""
+        """Return all bytes until the pipe's end, the time limit, or the end of the fork server."""
         answer = b""
         poller = select.poll()  # select(2) takes no descriptor above 1023
         poller.register(self._reads, select.POLLIN)
@@ -84,14 +85,14 @@ class ForkedCall:
         return answer
 
     def close(self) -> None:
-        """Take no answer any more."""
+        """Stop waiting for an answer."""
         if self._is_open:
             self._is_open = False
             os.close(self._reads)
 
 
 class UnitStarter:
-    """A fork server with the modules `preload` imported; it imports them while the caller goes on.
+    """A fork server that imports the modules `preload` while the caller goes on.
 
     Close it when its units have ended. Raises OSError when no process can be made.
     """
@@ -106,7 +107,7 @@ class UnitStarter:
             raise
 
     def _launch(self) -> None:
-        """A fresh fork server, and the socket to it."""
+        """Start a fresh fork server, and make the socket to it."""
         self._has_units = False
         with contextlib.ExitStack() as undo, contextlib.ExitStack() as ended:
             self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -124,14 +125,16 @@ class UnitStarter:
             stdout=subprocess.DEVNULL,
             stderr=self._stderr,
             pass_fds=[theirs.fileno()],
+            # One thread for each library: a fork copies only the thread that forks.
             env={**os.environ, **dict.fromkeys(THREAD_LIMITS, "1")},
+            # Ctrl-C then reaches the parent alone, which decides what is finished first.
             process_group=0,
         )
 
     def renew(self, wait_s: float = 0.0) -> str:
-        """Put a fresh fork server in the place of one that has ended or was stopped, and say why; "": it is well.
+        """Replace a fork server that has ended or was stopped, and return why; "" for one that is well.
 
-        `wait_s`: for its end. Raises OSError when no process can be made.
+        `wait_s`: time to wait for its end, in seconds. Raises OSError when no process can be made.
         """
         why = self.trouble(wait_s)
         if why:
@@ -139,7 +142,7 @@ class UnitStarter:
         return why
 
     def trouble(self, wait_s: float = 0.0) -> str:
-        """Why the fork server answers no more; "" where it still may after the time."""
+        """Return why the fork server answers no more, after at most `wait_s` seconds; "" if it may still answer."""
         try:
             code = self._server.wait(wait_s)
         except subprocess.TimeoutExpired:
@@ -151,7 +154,10 @@ class UnitStarter:
         self._launch()
 
     def start(self, spec: UnitSpec, stderr_fd: int) -> StartedUnit:
-        """A process for the unit, which writes to `stderr_fd`. Raises TrilaneError when no fork server answers."""
+        """Return a process for the unit, which writes to `stderr_fd`.
+
+        Raises TrilaneError when no fork server answers at all.
+        """
         spec_fd = os.memfd_create(f"trilane:spec:{spec.unit}", os.MFD_CLOEXEC)
         try:
             os.write(spec_fd, spec.model_dump_json().encode())
@@ -170,7 +176,7 @@ class UnitStarter:
         raise TrilaneError(f"unit {spec.unit} could not be started: {why}")
 
     def _ask(self, spec: UnitSpec, fds: Sequence[int]) -> StartedUnit:
-        """The unit's process, whose spec and stderr are `fds`; whatever is raised, none is left."""
+        """Return the unit's process, with `fds` for its spec and stderr; after an error no process is left."""
         self._has_units = True
         settings = spec.settings
         request = {"unit": spec.unit, "cores": settings.cores, "threads": settings.threads, "fds": spec.fds}
@@ -192,7 +198,10 @@ class UnitStarter:
         return StartedUnit(int(answer), received[0], lifeline)
 
     def _received(self) -> tuple[bytes, list[int]]:
-        """The answer and its descriptors; nothing from a server that has ended, was stopped, or takes too long."""
+        """Return the answer and its descriptors.
+
+        Both are empty if the server has ended, was stopped, or takes too long.
+        """
         end = time.monotonic() + ANSWER_S
         while time.monotonic() < end:
             with contextlib.suppress(TimeoutError, ConnectionResetError):
@@ -203,11 +212,14 @@ class UnitStarter:
         return b"", []
 
     def call(self, function: str) -> ForkedCall:
-        """Call `module:name`, which takes nothing and returns what JSON takes, in a process of its own."""
+        """Call `module:name`, which takes no argument and returns JSON values, in a process of its own."""
         return ForkedCall(self, function, self.send_call(function))
 
     def send_call(self, function: str) -> int:
-        """Ask for the call; the end of the pipe to which it answers. One that no fork server hears answers nothing."""
+        """Ask for the call, and return the end of the pipe to which it answers.
+
+        Without a fork server the pipe ends empty.
+        """
         reads, writes = os.pipe2(os.O_CLOEXEC)
         try:
             with contextlib.suppress(BrokenPipeError, ConnectionResetError):
@@ -217,14 +229,14 @@ class UnitStarter:
         return reads
 
     def close(self) -> None:
-        """End the fork server. It waits for units that still live."""
+        """End the fork server, which waits for units that still live."""
         self._end()
         os.close(self._stderr)
 
     def _end(self) -> None:
         self._socket.close()
         if not self._has_units or self.trouble():
-            self._server.kill()  # it may still be importing, or a call go on
+            self._server.kill()  # it may still be importing, or a call may still run
         try:
             self._server.wait(CLOSE_S)
         except subprocess.TimeoutExpired:
@@ -232,7 +244,7 @@ class UnitStarter:
             self._server.wait()
 
     def _why(self) -> str:
-        """Why the server does not answer: how it was killed or stopped, else the end of what it wrote."""
+        """Return why the server does not answer: how it was killed or stopped, else the last line that it wrote."""
         trouble = self.trouble(NOTICE_S)
         if trouble and self._server.returncode not in range(1, 256):
             return trouble
@@ -250,7 +262,7 @@ class UnitStarter:
 
 
 def is_stopped(pid: int) -> bool:
-    """Whether the process was stopped by a signal; one that is gone was not."""
+    """Return whether a signal stopped the process; False for a process that is gone."""
     try:
         stat = (machine.here.proc / f"{pid}/stat").read_text(encoding="ascii", errors="replace")
     except OSError:

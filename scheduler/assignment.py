@@ -1,4 +1,4 @@
-"""Handing jobs to units. Rule: only dirty units are looked at, in the order in which they were marked."""
+"""Hands jobs to units. Rule: only dirty units are looked at, in the order in which they were marked."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from trilane.scheduler.state import StageState, UnitState
 
 
 class Assignment:
-    """Fills the queues of units."""
+    """Fills the queues of the units of a run."""
 
     def __init__(
         self, policy: Policy, hang_ns: int, flow: Flow, source: Source, choice: Choice, ledger: Ledger
     ) -> None:
-        """The one of a run.
+        """Take the parts of the run.
 
-        `policy`: which frames it gives up, and how far ahead it hands out jobs.
-        `hang_ns`: the longest that a job may take.
-        `flow`, `source`: what it moves.
-        `choice`: what it asks.
-        `ledger`: where it notes why units have no job.
+        `policy`: policy that says which frames are given up, and how far ahead jobs are handed out.
+        `hang_ns`: longest time of a job in ns.
+        `flow`, `source`: frames in flight and frames to come, which this class moves.
+        `choice`: what could run next.
+        `ledger`: ledger for the reasons why units have no job.
         """
         self._hang_ns = hang_ns
         self._flow, self._source, self._choice, self._ledger = flow, source, choice, ledger
@@ -37,11 +37,11 @@ class Assignment:
     def assign(self, now_ns: int, released_ns: int, actions: list[Action]) -> None:
         """Hand jobs to the dirty units, as `Dispatch` in `actions`, until each is full or has nothing to run.
 
-        `released_ns`: when the first frame was due that this step releases, else now. A unit that had no input until
-        then waited for the scheduler since.
+        `released_ns`: time at which the first frame of this step's release was due, else now. A unit without input
+        until then has waited for the scheduler since.
         """
         dirty = self._flow.dirty
-        for unit in dirty:  # a dispatch may append to the list, also a unit that was looked at before
+        for unit in dirty:  # a dispatch may append to it, even a unit looked at before
             while len(unit.queue) < unit.queue_capacity:
                 stage = self._next_stage(unit, now_ns)
                 if stage is None:

@@ -1,20 +1,20 @@
-"""Several pipelines in virtual time, each with a core of its own, on the same hardware.
+"""Runs several pipelines in virtual time on the same hardware, each with a scheduler (`Core`) of its own.
 
-Rule: nothing here decides which job a pipeline does next; that is its core's part. What is decided here is whose job a
-unit takes that several have handed one to (turns.py), and how fast the jobs go on that run at the same time.
+Rule: nothing here decides which job a pipeline does next; its `Core` decides that. This module decides whose job a unit
+takes when several pipelines have handed it one (turns.py). It also decides how fast jobs go that run at the same time.
 
-Theory of operation. Each pipeline has its own `Core` with its own policy, ledger and recording, as two applications on
-one phone have, and none knows of the others. A unit of a pipeline stands for a *seat*: the hardware that does its jobs.
-On a seat with turns one job runs at a time; the others wait, and their units are preempted. On a *divided* seat, such
-as a core of this machine between whose processes the kernel switches, all jobs run at once, each with an equal share.
-A unit does its own jobs in the order in which they were handed to it.
+Theory of operation. Each pipeline has its own `Core` with its own policy, ledger and recording, like two applications
+on one phone, and none knows of the others. Each unit of a pipeline has a *seat*: the hardware that does its jobs. On a
+seat with turns one job runs at a time; the others wait, and their units are preempted. On a *divided* seat all jobs run
+at once, each with an equal share. An example is a processor core of this machine, between whose processes the kernel
+switches. A unit does its own jobs in the order in which they were handed to it.
 
-One instant: first all events and all deadlines of the cores at that time, each of which is a step of one core; only
-then are jobs begun, so that of all jobs that are ready at one time none is passed over because it was named later. Jobs
-that run change their speed when others begin or end: what is left of a job is kept as a whole number of ns / `ONE`.
+At one instant, all events and all deadlines of the schedulers come first; each is a step of one `Core`. Only then do
+jobs begin, so that no ready job is passed over because it was named later. Running jobs change their speed when others
+begin or end. The rest of a job is kept as a whole number of ns / `ONE`.
 
-Accounts. A job that waits while another pipeline has its seat was preempted before (`JobDone.preempted_before_ns`); on
-a divided seat it is preempted within (`preempted_ns`). A job that the memory makes slower is busy all the while.
+Accounts. A job that waits while another pipeline has its seat was preempted before (`JobDone.preempted_before_ns`). On
+a divided seat it is preempted within (`preempted_ns`). A job that the memory slows down is busy all the while.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from trilane.scheduler.stats import summary_ms
 from trilane.scheduler.turns import ROUND_ROBIN, Waiting, turns_named
 from trilane.scheduler.virtual import Service, Simulation, Skips, none_skips
 
-#: The speed of a job that nothing slows. Divisible by 1 to 10, so that equal shares of a core are exact.
+#: The speed of a job that nothing slows; divisible by 1 to 10, so that equal shares of a core are exact.
 ONE: Final = 2520 * 1024
 
 
@@ -42,10 +42,12 @@ ONE: Final = 2520 * 1024
 class Member:
     """One of the pipelines.
 
-    `graph`, `settings`: of its core. `service`: gives the service time of each job, in ns, on hardware that no other
-    pipeline uses meanwhile. `seats`: unit -> the seat that does its jobs; a unit that is not in it has the seat of its
-    own name. `skips`: which frames take the bypass of the graph. `inputs`: (t_ns, event), events from outside, such as
-    `Stop`.
+    `graph`, `settings`: graph and settings of its core.
+    `service`: function that returns the service time of each job in ns on hardware that no other pipeline uses
+    meanwhile.
+    `seats`: seat of each unit, by unit; a unit that is missing has the seat of its own name.
+    `skips`: function that says which frames take the graph's bypass.
+    `inputs`: events from outside, such as `Stop`, as pairs (t_ns, event).
     """
 
     graph: Graph
@@ -58,7 +60,7 @@ class Member:
 
 @dataclass(frozen=True)
 class Runs:
-    """A job that runs: number of its pipeline, stage, unit, seat and frame."""
+    """A job that runs. `member`: number of its pipeline."""
 
     member: int
     stage: str
@@ -67,12 +69,13 @@ class Runs:
     frame: int
 
 
-#: (a job that runs, the others that run) -> its speed beside them, of `ONE`, above 0. It knows of no shares of a seat.
+#: (a job that runs, the others that run) -> its speed beside them, above 0, in units of 1 / ONE. It ignores seat
+#: shares.
 Speed = Callable[[Runs, Sequence[Runs]], int]
 
 
 class _Waits(NamedTuple):
-    """A job that was handed to its unit. `order`: of all jobs of the run."""
+    """A job that was handed to its unit. `order`: number that grows with each hand-over."""
 
     job: Job
     order: int
@@ -80,9 +83,14 @@ class _Waits(NamedTuple):
 
 
 class _Running:
-    """`left`: of its work, ns * ONE. `speed`: now, `held`: its seat's share in it. `had`: of its seat so far, ns * ONE.
+    """A job that runs.
 
-    `preempted_before_ns`: how long its unit waited for its seat, since the job was there and the one before was done.
+    `left`: rest of its work, in ns * ONE.
+    `speed`: its speed now, of `ONE`.
+    `held`: its share of its seat now, of `ONE`.
+    `had`: share of its seat that it had so far, in ns * ONE.
+    `preempted_before_ns`: time for which its unit waited for the seat, from the hand-over or the end of the unit's last
+    job.
     """
 
     __slots__ = ("begin_ns", "had", "held", "left", "preempted_before_ns", "runs", "speed", "waited")
@@ -94,12 +102,12 @@ class _Running:
         self.had = 0
 
     def end_ns(self, now_ns: int) -> int:
-        """When it ends if its speed stays; one that has nothing left ends now."""
+        """Return when the job ends if its speed stays; a job with nothing left ends now."""
         return now_ns - (-self.left // self.speed) if self.left > 0 else now_ns
 
 
 class _Unit:
-    """A unit of one pipeline. `queue`: its jobs that wait."""
+    """A unit of one pipeline. `queue`: its waiting jobs."""
 
     __slots__ = ("is_running", "last_end_ns", "name", "queue", "seat")
 
@@ -111,7 +119,7 @@ class _Unit:
 
 
 class _Line:
-    """A pipeline under way."""
+    """A pipeline while it runs."""
 
     def __init__(self, number: int, member: Member, keep: bool) -> None:
         self.number, self.member = number, member
@@ -124,7 +132,7 @@ class _Line:
 
 
 class BesideDriver:
-    """The clock of several cores. Equal inputs give equal runs."""
+    """The driver of several `Core`s in virtual time. Equal inputs give equal runs."""
 
     def __init__(
         self,
@@ -135,11 +143,13 @@ class BesideDriver:
         speed: Speed | None = None,
         keep: bool = False,
     ) -> None:
-        """`members`: the pipelines.
+        """Prepare a run of the pipelines `members`.
 
-        `turns`: of `TURNS`, on every seat that is not among the `divided` ones.
-        `speed`: how fast jobs are beside each other; None: a job is slowed by nothing but shares of its seat.
-        `keep`: record the steps of each core, and the jobs that end.
+        `turns`: name of a rule of `TURNS`, for every seat that is not among the `divided` ones.
+        `divided`: names of the divided seats.
+        `speed`: speed of jobs beside each other; None: only shares of its seat slow a job.
+        `keep`: whether to record the steps of each `Core`, and the jobs that end.
+
         Raises ValueError for an unknown policy, edge or rule of turns.
         """
         self._choose, self._divided, self._speed = turns_named(turns), frozenset(divided), speed
@@ -156,7 +166,7 @@ class BesideDriver:
                 self._push(at_ns, line.number, event)
 
     def run(self) -> list[Outcome]:
-        """Until every core finishes. Raises RuntimeError when nothing can ever happen again."""
+        """Run until every `Core` finishes; raises RuntimeError when nothing can ever happen again."""
         while not all(line.core.finished for line in self.lines):
             self._advance(self._next_ns())
             while self._step_one():
@@ -167,7 +177,7 @@ class BesideDriver:
         return [line.core.outcome for line in self.lines if line.core.outcome is not None]
 
     def _next_ns(self) -> int:
-        """When something happens next."""
+        """Return the time at which something happens next."""
         at_ns = min((line.deadline_ns for line in self.lines), default=NEVER)
         if self._heap:
             at_ns = min(at_ns, self._heap[0][0])
@@ -185,7 +195,10 @@ class BesideDriver:
                 running.had += passed_ns * running.held
 
     def _step_one(self) -> bool:
-        """Tell one core of one thing that happens now: an event from outside, a job's end, its deadline; else False."""
+        """Tell one `Core` of one thing that happens now: an event, a job's end or its deadline.
+
+        Return False if there is none.
+        """
         now_ns = self._now_ns
         if self._heap and self._heap[0][0] <= now_ns:
             _, _, number, event = heappop(self._heap)
@@ -216,12 +229,15 @@ class BesideDriver:
 
     @staticmethod
     def _check(line: _Line, action: Action) -> None:
-        """Raises RuntimeError for one that only a unit that hangs calls for: here a job ends, however long it takes."""
+        """Raise RuntimeError for an action that only a unit that hangs calls for.
+
+        Here every job ends, however long it takes.
+        """
         if not line.core.finished:
             raise RuntimeError(f"{action} of pipeline {line.number}: its hang_ns is shorter than a job takes")
 
     def _end(self, running: _Running) -> None:
-        """The job is done; its seat is free for the next one."""
+        """End the job, which frees its seat, and tell its core."""
         self._running.remove(running)
         self._is_changed = True
         line, job, now_ns = self.lines[running.runs.member], running.waited.job, self._now_ns
@@ -239,7 +255,7 @@ class BesideDriver:
         self._step(line, (done,))
 
     def _begin_jobs(self) -> None:
-        """Begin what can begin: on a divided seat the first job of each unit, on any other one job."""
+        """Begin what can begin: on a divided seat the first job of each unit, on any other seat one job."""
         waiting: dict[str, list[tuple[_Line, _Unit]]] = {}
         for line in self.lines:
             for unit in line.units.values():
@@ -274,7 +290,7 @@ class BesideDriver:
         self._running.append(_Running(waited, runs, now_ns, service_ns, before_ns))
 
     def _set_speeds(self) -> None:
-        """Of all jobs that run, now that others began or ended."""
+        """Set the speeds of all jobs that run, now that others began or ended."""
         self._is_changed = False
         if not self._divided and self._speed is None:
             return
@@ -294,11 +310,11 @@ class BesideDriver:
 
 
 def simulate_beside(members: Sequence[Member], *, keep: bool = False, **driver: Any) -> list[Simulation]:
-    """Run all `members` to their ends, and what each hands back, in their order.
+    """Run all `members` to their ends, and return what each gives, in their order.
 
-    Frames that still waited before the first stage at a `Stop` became nothing, and are not among the requested.
-    The reports have one more key: `response_ms`, from a frame's release to presented, of frames with a deadline.
-    `keep`, `driver`: see BesideDriver. Raises as it does.
+    Frames that still waited before the first stage at a `Stop` do not count as requested. The reports have one more
+    key, `response_ms`: times from a frame's release to its presentation, for frames with a deadline.
+    `keep`, `driver`: arguments of BesideDriver, which also lists the errors.
     """
     beside = BesideDriver(members, keep=keep, **driver)
     outcomes = beside.run()

@@ -1,11 +1,12 @@
 """The way past some stages. Rule: a frame on it overtakes none, and its slot goes back to the edge that it came from.
 
-The stage at which the bypass begins says of each frame whether it skips (`JobDone.skips`). The slot of a frame that
-does waits in `EdgeSlots.passing` of the edge behind that stage, for the stage at which the bypass ends. That stage has
-two sides from which frames come: it takes the oldest, and one that skips only when no older frame is still before it.
+The stage at which the bypass begins says of each frame whether it skips (`JobDone.skips`). The slot of such a frame
+waits in `EdgeSlots.passing` of the edge behind that stage, for the stage at which the bypass ends. That stage takes
+frames from two sides. It takes the oldest frame, and a frame that skips only when no older frame is still before it.
 
-What a frame that skips relies on was left at the bypass's end by one that did not. When such a frame is lost or dropped
-before it got there, or the unit at the end was started anew, the next job of the stage at the beginning is `fresh`.
+A frame that skips relies on what a frame that did not skip left at the bypass's end. Such a frame may be lost or
+dropped before it gets there, or the unit at the end may be started anew. Then the next job at the bypass's begin is
+`fresh`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from trilane.transport.slots import EdgeSlots
 class Bypass:
     """The way past the stages between `begin` and `end`; a frame that takes it has its slot on `edge`, behind `begin`.
 
-    `must_be_fresh`: of the next job of `begin`. `was_taken`: whether the last frame that `begin` did skipped.
+    `must_be_fresh`: whether the next job of `begin` must be fresh.
+    `was_taken`: whether the last frame that `begin` did skipped.
     """
 
     __slots__ = ("begin", "edge", "end", "must_be_fresh", "was_taken")
@@ -33,9 +35,9 @@ class Bypass:
 
 
 def next_slot(stage: StageState, frames: Mapping[int, FrameState]) -> int:
-    """What a stage that has an input takes next, as `Job.slot_in` counts; -1: nothing.
+    """Return the slot that a stage with an input takes next, as `Job.slot_in` counts; -1: none.
 
-    `frames`: those in flight, by number, oldest first.
+    `frames`: frames in flight by number, oldest first.
     """
     own, bypassed = stage.input, stage.bypassed
     assert own is not None
@@ -52,7 +54,7 @@ def next_slot(stage: StageState, frames: Mapping[int, FrameState]) -> int:
 
 
 def is_older_before(stage: StageState, frame: int, frames: Mapping[int, FrameState]) -> bool:
-    """Whether an older frame than `frame` has not come to `stage` yet."""
+    """Return whether an older frame than `frame` has not come to `stage` yet."""
     for number, state in frames.items():
         if number >= frame:
             return False
@@ -62,7 +64,7 @@ def is_older_before(stage: StageState, frame: int, frames: Mapping[int, FrameSta
 
 
 def side_of(stage: StageState, slot_in: int) -> tuple[EdgeSlots, int]:
-    """The edge and its slot that `Job.slot_in` of a job of `stage`, which has an input, means."""
+    """Return the edge and the slot that `slot_in` of a job of `stage` refers to; the stage must have an input."""
     own = stage.input
     assert own is not None
     if stage.bypassed is None or slot_in < len(own.state):
@@ -71,9 +73,10 @@ def side_of(stage: StageState, slot_in: int) -> tuple[EdgeSlots, int]:
 
 
 def stale_slot(stage: StageState, frames: Mapping[int, FrameState]) -> int:
-    """Of the frames that wait to skip to the stage, the oldest, where a newer one that waits could go as soon; else -1.
+    """Return the slot of the oldest frame that waits to skip to the stage if that frame is stale; else -1.
 
-    As `Job.slot_in` counts. A frame that did not skip is not stale for one that does, which may need it.
+    The frame is stale if a newer waiting frame could go as soon. A frame that did not skip is not stale for one that
+    does, which may need it. The slot counts as `Job.slot_in` does.
     """
     own, bypassed = stage.input, stage.bypassed
     if own is None or bypassed is None or not bypassed.passing:
@@ -87,6 +90,6 @@ def stale_slot(stage: StageState, frames: Mapping[int, FrameState]) -> int:
 
 
 def _parts(stage: StageState, frame: int, bypassed: EdgeSlots, frames: Mapping[int, FrameState]) -> bool:
-    """Whether a frame that does not skip is still on its way to the stage between the two oldest that wait to skip."""
+    """Return whether a frame between the two oldest that wait to skip is still on its way to the stage."""
     newer = bypassed.frame[bypassed.passing[1]]
     return any(frame < number < newer and state.position < stage.position for number, state in frames.items())

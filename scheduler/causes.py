@@ -1,6 +1,7 @@
-"""Why a run ended, a frame was lost or one was dropped. Rule: a kind and where it happened; nobody parses a string.
+"""The reasons why a run ended and why a frame was lost or dropped.
 
-`str()` of each is its key in the report and in messages.
+Rule: a reason is a kind and where it happened, so nobody parses a string. `str()` of each is its key in the report and
+in messages.
 """
 
 from __future__ import annotations
@@ -10,7 +11,13 @@ from typing import NamedTuple
 
 
 class OutcomeKind(StrEnum):
-    """How a run ended: every frame went through; `Stop`; `Abort`; a unit failed too often."""
+    """How a run ended.
+
+    - DONE: every frame went through.
+    - STOPPED: `Stop` was asked for.
+    - ABORTED: `Abort` was asked for.
+    - GAVE_UP: a unit failed too often.
+    """
 
     DONE = "done"
     STOPPED = "stopped"
@@ -19,7 +26,7 @@ class OutcomeKind(StrEnum):
 
 
 class Outcome(NamedTuple):
-    """How a run ended. `unit`: the one that could not be kept alive, for GAVE_UP alone."""
+    """How a run ended. `unit`: unit that could not be kept alive, for GAVE_UP alone."""
 
     kind: OutcomeKind
     unit: str = ""
@@ -29,7 +36,12 @@ class Outcome(NamedTuple):
 
 
 class LossKind(StrEnum):
-    """What ended a frame in flight: its unit died, hung or was given up; its stage failed; the run was aborted."""
+    """What ended a frame in flight.
+
+    - DIED, HUNG, GAVE_UP: its unit died, hung, or was given up.
+    - FAILED: its stage raised an error.
+    - ABORTED: the run was aborted.
+    """
 
     DIED = "died"
     HUNG = "hung"
@@ -39,7 +51,7 @@ class LossKind(StrEnum):
 
 
 class Loss(NamedTuple):
-    """Why a frame in flight was lost. `where`: the unit, for FAILED the stage, for ABORTED nothing."""
+    """Why a frame in flight was lost. `where`: name of the unit; of the stage for FAILED; empty for ABORTED."""
 
     kind: LossKind
     where: str = ""
@@ -51,8 +63,11 @@ class Loss(NamedTuple):
 class DropCause(StrEnum):
     """Why a waiting frame was taken out.
 
-    STALE: a newer one took its place. LATE: it could not be in time. POOL: an edge had no other slot. QUEUE_FULL and
-    TIMEOUT: it was turned away, or waited too long, before the first stage.
+    - STALE: a newer frame took its place.
+    - LATE: it could not be in time.
+    - POOL: an edge had no other slot.
+    - QUEUE_FULL: it was turned away before the first stage.
+    - TIMEOUT: it waited too long before the first stage.
     """
 
     STALE = "stale"
@@ -63,7 +78,7 @@ class DropCause(StrEnum):
 
 
 class Drop(NamedTuple):
-    """Where a frame was dropped, as `producer->consumer`, and why."""
+    """A reason to drop a frame. `edge`: place of the drop, as `producer->consumer`."""
 
     edge: str
     cause: DropCause

@@ -1,4 +1,4 @@
-"""What could run next, and what waits in vain. Rule: questions about the present state; nothing here changes it."""
+"""Finds what could run next and what waits in vain. Rule: it only asks about the present state, and changes nothing."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from trilane.transport.slots import READING
 
 
 class Choice:
-    """Looks at the core's own stages, source and frames."""
+    """A view of the core's own stages, source and frames."""
 
     def __init__(
         self,
@@ -27,13 +27,13 @@ class Choice:
         frames: dict[int, FrameState],
         bypass: Bypass | None,
     ) -> None:
-        """The view of one run.
+        """Take what the choice depends on.
 
-        `settings`, `policy`: of the run.
-        `stages`: the chain.
-        `source`: where its frames come from.
-        `frames`: those in flight, by number.
-        `bypass`: the chain's, if it has one.
+        `settings`, `policy`: settings and policy of the run.
+        `stages`: stages of the chain.
+        `source`: source of its frames.
+        `frames`: frames in flight, by number.
+        `bypass`: bypass of the chain, or None.
         """
         self._bypass = bypass
         self._policy, self._stages, self._source, self._frames = policy, stages, source, frames
@@ -53,18 +53,18 @@ class Choice:
         return sink is None or bool(sink.free) or sink.can_claim()
 
     def preferred(self, runnable: Sequence[StageState], now_ns: int) -> StageState:
-        """Which of its runnable stages a unit takes, by the policy."""
+        """Return the stage of `runnable` whose job the policy chooses for the unit."""
         return self._stages[self._policy.choose([self._candidate(stage, now_ns) for stage in runnable]).position]
 
     def is_full(self) -> bool:
-        """Whether as many frames are in flight as may be."""
+        """Whether the number of frames in flight has reached its limit."""
         return 0 < self._in_flight <= len(self._frames)
 
     def latch_from_ns(self, now_ns: int) -> int:
-        """From when on the first stage may begin its next frame; only of a run that latches.
+        """Return when the first stage may begin its next frame; only for a run that latches.
 
-        NEVER while one of its frames waits for the second stage. Else so late that it is expected to end `latch_ns`
-        before the second stage's unit is free.
+        The time is NEVER while one of its frames waits for the second stage. Otherwise it is so late that the first
+        stage is expected to end `latch_ns` before the second stage's unit is free.
         """
         first, second = self._stages[0], self._stages[1]
         edge = first.output
@@ -87,11 +87,11 @@ class Choice:
         return end_ns > waiting.deadline_ns
 
     def deadline_from_ns(self, release_ns: int) -> int:
-        """Deadline of a frame that was released then, or NEVER."""
+        """Return the deadline of a frame that was released at `release_ns`, or NEVER."""
         return release_ns + self._deadline_ns if self._deadline_ns else NEVER
 
     def account_without_job(self, unit: UnitState, now_ns: int) -> int:
-        """Where the ledger books the time of a unit whose queue is empty: why it has no job."""
+        """Return the account of the time of a unit whose queue is empty: why it has no job."""
         if unit.life != READY:
             return ASSIGNED
         account = STARVED
@@ -109,7 +109,7 @@ class Choice:
         return account
 
     def _candidate(self, stage: StageState, now_ns: int) -> Candidate:
-        """The frame that the stage would do next."""
+        """Return the frame that the stage would do next."""
         edge = stage.input
         if edge is None:
             frame, release_ns = self._source.head(now_ns)

@@ -1,9 +1,11 @@
-"""The earliest time at which a frame can be presented: the bound on its completion. Rule: never later than it can be,
-so that no frame is given up that could be in time.
+"""Computes the earliest time at which a frame can be presented.
 
-It is a lower bound as far as service times are what they were lately. At every stage older frames go first: a frame
-begins there after their work at that stage, or after its own work at the stages before, whichever ends later. Where
-there is a bypass, a frame that has not come to its beginning is taken to do what the last frame there did.
+Rule: the bound is never later than the truth, so that no frame is given up that could be in time. It is a lower bound
+if service times stay what they were lately.
+
+At every stage older frames go first. So a frame begins at a stage after the older frames' work there, or after its own
+work at the stages before, whichever ends later. With a bypass, a frame that has not come to its beginning is taken to
+do what the last frame there did.
 """
 
 from __future__ import annotations
@@ -21,16 +23,16 @@ def earliest_completion_ns(
     frames: Mapping[int, FrameState],
     bypass: tuple[int, int] = (0, 0),
 ) -> int:
-    """The bound for the end of the last stage of `frame`.
-
-    `now_ns`: the time.
-    `frame`: its number; frames with smaller numbers are older.
-    `position`: of its next stage in the chain.
-    `stages`: the chain, with the estimates of service times.
-    `frames`: those in flight, by number.
-    `bypass`: positions of two stages; a frame that has yet to do the first skips those between them.
+    """Return the earliest end of the last stage of `frame`, in ns.
 
     It is now + max over s >= position of [ max(own work before s, work of older frames at s) + own work from s on ].
+
+    `now_ns`: present time in ns.
+    `frame`: number of the frame; frames with smaller numbers are older.
+    `position`: position of its next stage in the chain.
+    `stages`: stages of the chain, with the estimates of service times.
+    `frames`: frames in flight, by number.
+    `bypass`: positions of two stages; a frame that has yet to do the first skips the stages between them.
     """
     older = [0] * len(stages)
     for number, state in frames.items():
@@ -53,7 +55,7 @@ def earliest_completion_ns(
 
 
 def _done_of_running(now_ns: int, stage: StageState) -> int:
-    """How much of the stage's running job is over, by the estimate of its length."""
+    """Return how much of the stage's running job is over in ns, by the estimate of its length."""
     queue = stage.unit.queue
     if not queue or queue[0].stage != stage.name:
         return 0

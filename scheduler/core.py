@@ -1,29 +1,32 @@
 """The scheduler: which job runs where, and when. Rule: pure; it knows the time only from `step`, and does no I/O.
 
-Theory of operation. A driver calls `step` with the time and what has happened since (events); it answers with what to
-do now (actions) and with the time at which it wants to be asked again. The same steps give the same answers, so a run
-is replayed from its events alone. One step: (1) each event moves slots, frames and units; (2) when the alarm has gone
-off, units whose deadline or hold is over are killed, started again or let work; (3) the source releases what is due;
-(4) every dirty unit is handed jobs until its queue is full or nothing can run; (5) with no frame in flight and none to
-come, the run is finished.
+Theory of operation. A driver calls `step` with the time and the events since the last step. The core answers with
+actions to do now and with the time at which it wants to be asked again. The same steps give the same answers, so a run
+can be replayed from its events alone. One step does five things, in this order:
+- Each event moves slots, frames and units.
+- When the alarm has gone off, units whose deadline or hold is over are killed, started again or let work.
+- The source releases the frames that are due.
+- Every dirty unit is handed jobs until its queue is full or nothing can run.
+- With no frame in flight and none to come, the run is finished.
 
-Slots. Between two stages lies an edge with a fixed number of slots (transport/slots.py). A job holds its input slot
-and its output slot from dispatch until it is done, so a stage can begin only when a frame waits before it and a slot is
-free behind it. That is all that holds back the stages before a slow one.
+Slots. Between two stages lies an edge with a fixed number of slots (transport/slots.py). A job holds its input slot and
+its output slot from dispatch until it is done. So a stage can begin only when a frame waits before it and a slot is
+free behind it. Nothing else holds back the stages before a slow one.
 
 Bypass. A frame may skip the stages between two others, when the first of these says so. It then waits for the second in
 the slot that it has, and overtakes no frame (bypass.py).
 
-Dirty units. A step looks only at units for which something has changed: the unit's own job ended, a frame came to one
-of its stages, a slot got free behind one, its life or duty changed. Whoever changes such a thing calls `mark_dirty`;
-a dispatch may make a unit dirty that this step has already looked at, and it is looked at again.
+Dirty units. A step looks only at units for which something has changed. The unit's own job ended, a frame came to one
+of its stages, a slot got free behind one, or its life or duty changed. Whoever changes such a thing calls `mark_dirty`.
+A dispatch may make a unit dirty that this step has already looked at; the step then looks at it again.
 
-The alarm is a time before which no unit's deadline or hold can be over (watchdog.py). It is found by asking all units
-only when it has gone off or was reset: events that put a deadline off leave it as it is, to be found too early.
+The alarm is a time before which no unit's deadline or hold can be over (watchdog.py). It is found by asking all units,
+and only when it has gone off or was reset. Events that put a deadline off leave the alarm as it is, so it may go off
+too early.
 
 Dispatch ahead and leading. A unit holds its next job while one runs, so that no message delay lies between them. A
-policy that wants the newest frame hands the next job over only `lead_ns` before the running one should end. Latching
-is the same for the first stage: it begins so late that its pose is new when the second stage can take it.
+policy that wants the newest frame hands the next job over only `lead_ns` before the running one should end. Latching is
+the same for the first stage: it begins so late that its pose is new when the second stage can take it.
 """
 
 from __future__ import annotations
@@ -113,17 +116,19 @@ class Core:
         }
 
     def step(self, now_ns: int, events: tuple[Event, ...] = ()) -> Decision:
-        """Tell the core what happened and what time it is; times never go back. Nothing is heard after the finish.
+        """Take the events and the time, and return what to do; times never go back.
 
-        Raises KeyError for a unit or stage that there is not, UnitLifeError for an event that cannot happen to a unit
-        now, ValueError for a frame that skips where no bypass begins.
+        Events after the finish are ignored.
+
+        Raises KeyError for an unknown unit or stage, and UnitLifeError for an event that cannot happen to a unit now.
+        Raises ValueError for a frame that skips where no bypass begins.
         """
         self.now_ns = now_ns
         self.actions = []
         for event in events:
             if self.finished:
                 break
-            if type(event) is JobDone:  # most of them: the table takes longer
+            if type(event) is JobDone:  # most events: the table takes longer
                 self._on_done(event)
             else:
                 self._handlers[type(event)](event)  # type: ignore[operator]
@@ -136,19 +141,19 @@ class Core:
             before = len(self.actions)
             self.assignment.assign(now_ns, released_ns, self.actions)
             if len(self.actions) > before:
-                self._set_alarm(now_ns + self._hang_ns)  # a job that was handed out now may be late then
+                self._set_alarm(now_ns + self._hang_ns)  # the deadline of a job that was handed out now
             if not self.frames and self.source.exhausted:
                 self._finish(Outcome(OutcomeKind.STOPPED if self.stopping else OutcomeKind.DONE))
         next_ns = NEVER if self.finished else self._next_deadline()
         return Decision(tuple(self.actions), next_ns)
 
     def report(self, *, clock: str, requested: int | None = None) -> dict[str, Any]:
-        """What the ledger reports, see there. `requested`: frames that were asked for; None: those of the settings."""
+        """Return the ledger's report. `requested`: number of frames that were asked for; None: that of the settings."""
         asked = self.settings.frames if requested is None else requested
         return self.ledger.report(clock=clock, requested=asked, not_begun=asked - self.source.left)
 
     def _release(self, now_ns: int) -> int:
-        """Release what is due; since when the first of it was, now where there was nothing."""
+        """Release the frames that are due, and return since when the first was due; now if none was."""
         due_ns = self.source.due_ns
         if not self.source.advance(now_ns):
             return now_ns
@@ -158,7 +163,8 @@ class Core:
     def _next_deadline(self) -> int:
         if self._lead_ns or self.alarm_ns <= self.now_ns:
             self.alarm_ns = watchdog.next_alarm_ns(self.units.values(), self.now_ns, self._lead_ns)
-        next_ns = self.source.due_ns if self.started else NEVER  # until then nothing is released, however due it is
+        # before the start nothing is released, even if it is due
+        next_ns = self.source.due_ns if self.started else NEVER
         if self.alarm_ns < next_ns:
             next_ns = self.alarm_ns
         if self._latches and not self.source.is_empty:
@@ -168,7 +174,7 @@ class Core:
         return next_ns
 
     def _reset_alarm(self) -> None:
-        """A deadline or a hold was set: this step asks all units again."""
+        """Let this step ask all units again, because a deadline or a hold was set."""
         self.alarm_ns = 0
 
     def _set_alarm(self, at_ns: int) -> None:
@@ -194,7 +200,7 @@ class Core:
         name, job_id, begin_ns, end_ns, pose_ns, preempted_ns, asleep_ns, preempted_before_ns, skips = event
         unit = self.units[name]
         if not unit.queue or unit.queue[0].id != job_id:
-            return  # it was lost with the process that did it
+            return  # the job was lost with its process
         job = unit.queue.popleft()
         self._begin_next(unit)
         unit.failures = 0
@@ -218,13 +224,13 @@ class Core:
         self.flow.pass_on(stage, job, end_ns)
 
     def _on_skip(self, stage: StageState, frame: FrameState) -> None:
-        """The stage at which the bypass begins says that the frame takes it."""
+        """Note that the frame takes the bypass; raises ValueError if none begins at `stage`."""
         if self.bypass is None or stage is not self.bypass.begin:
             raise ValueError(f"stage {stage.name} skips, but no bypass begins there")
         frame.skips = True
 
     def _step_work(self, ladder: WorkLadder, stage: StageState, frame: FrameState, service_ns: int) -> None:
-        """Learn what the frame's work takes; on another rung the estimates are of that rung at once."""
+        """Learn the service time of the frame's work, and reset all estimates when the rung changes."""
         ladder.learn(stage.position, frame.rung, service_ns)
         if stage.position == ladder.last and ladder.consider():
             self.flow.rung = ladder.rung
@@ -232,14 +238,14 @@ class Core:
                 each.estimate_ns = ladder.service_ns(each.position, ladder.rung)
 
     def _begin_next(self, unit: UnitState) -> None:
-        """The unit's job is over, and the one that it holds, if any, begins."""
+        """Begin the unit's next job, if it holds one, as its last job is over."""
         unit.head_since_ns = self.now_ns
         unit.deadline_ns = self.now_ns + self._hang_ns if unit.queue and unit.life == READY else NEVER
 
     def _on_failed(self, event: JobFailed) -> None:
         unit = self.units[event.unit]
         if not unit.queue or unit.queue[0].id != event.job:
-            return  # it was lost with the process that did it
+            return  # the job was lost with its process
         job = unit.queue.popleft()
         self._begin_next(unit)
         self.flow.free_slots(job)
@@ -314,6 +320,7 @@ class Core:
     # events of the run
 
     def _on_stalled(self, event: SchedulerStalled) -> None:
+        # The units could not be heard in that time, so their deadlines and expected ends do not count it.
         for unit in self.units.values():
             unit.deadline_ns = watchdog.extended_deadline_ns(unit, event.ns)
             unit.head_since_ns += event.ns

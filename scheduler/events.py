@@ -1,7 +1,8 @@
-"""Events, which the core takes in, and actions, which it answers with. Rule: plain tuples of numbers and short strings.
+"""Defines the events that the core takes in and the actions that it answers with.
 
-All times are integer nanoseconds of the driver's clock, from 0 on. There is one notation for a time that will not come
-or is not set, here and in every file of the scheduler: NEVER. Slots are -1 where a stage has no such edge.
+Rule: events and actions are plain tuples of numbers and short strings. All times are integer nanoseconds of the
+driver's clock, counted from 0. NEVER stands for a time that does not come or is not set, in every file of the
+scheduler. A slot is -1 where a stage has no such edge.
 """
 
 from __future__ import annotations
@@ -17,11 +18,13 @@ NEVER: Final = (1 << 62) - 1  # ns, later than any time
 
 
 class Job(NamedTuple):
-    """One stage of one frame on one unit, from a slot to a slot.
+    """One stage of one frame on one unit, from an input slot to an output slot.
 
-    `slot_in` counts through the slots of the stage's input edge and, where a bypass ends at it, on through those of the
-    bypassed edge. `fresh`: the stage at which the bypass begins must not count on what earlier frames left behind.
-    `rung`: of the frame's work (work_ladder.py).
+    `slot_in`: index of the input slot; where a bypass ends at the stage, the slots of the bypassed edge follow those of
+    the input edge.
+    `fresh`: whether the stage must ignore what earlier frames left behind; set for the stage at which the bypass
+    begins.
+    `rung`: rung of the frame's work (work_ladder.py).
     """
 
     id: int
@@ -42,11 +45,13 @@ class UnitReady(NamedTuple):
 
 
 class JobDone(NamedTuple):
-    """`t_sampled_ns`: when the frame's pose was sampled, as its header says; 0 but from the first stage.
+    """A unit has finished a job.
 
-    `preempted_ns`, `asleep_ns`: parts of the job in which its unit had no core, and in which nothing of it worked.
-    `preempted_before_ns`: how long the unit had no core between its job before and this one.
-    `skips`: the frame takes the bypass; False but from the stage at which that begins.
+    `t_sampled_ns`: time at which the frame's pose was sampled, from the frame's header; 0 except from the first stage.
+    `preempted_ns`: part of the job in which the unit had no core.
+    `asleep_ns`: part of the job in which nothing of the unit worked.
+    `preempted_before_ns`: time in which the unit had no core between the job before and this one.
+    `skips`: whether the frame takes the bypass; False except from the stage at which the bypass begins.
     """
 
     unit: str
@@ -61,7 +66,7 @@ class JobDone(NamedTuple):
 
 
 class JobFailed(NamedTuple):
-    """A stage raised an error; the unit lives."""
+    """A stage raised an error; the unit's process goes on."""
 
     unit: str
     job: int
@@ -74,32 +79,32 @@ class UnitDied(NamedTuple):
 
 
 class Pinged(NamedTuple):
-    """A unit without a job was sent a ping, and must answer with `Pong`."""
+    """The driver sent a ping to a unit without a job; the unit must answer with `Pong`."""
 
     unit: str
 
 
 class Pong(NamedTuple):
-    """The unit answered the ping: it lives."""
+    """The unit answered the ping, so its process is alive."""
 
     unit: str
 
 
 class SchedulerStalled(NamedTuple):
-    """The driver did nothing for `ns` since the last step: units have as much longer to answer."""
+    """The driver did nothing for `ns` since the last step, so units get that much longer to answer."""
 
     ns: int
 
 
 class SetDuty(NamedTuple):
-    """From now on the unit may work `permille` thousandths of the time."""
+    """From now on the unit may work for `permille` thousandths of the time."""
 
     unit: str
     permille: int
 
 
 class StageAlone(NamedTuple):
-    """The stage takes `ns` for a frame on `rung` while other units are quiet; said of all rungs, before the start."""
+    """The stage takes `ns` for a frame on `rung` while other units are quiet; sent for all rungs, before the start."""
 
     stage: str
     rung: int
@@ -107,26 +112,26 @@ class StageAlone(NamedTuple):
 
 
 class Stop(NamedTuple):
-    """Admit no more frames; end when those in flight are done."""
+    """Admit no more frames, and end when the frames in flight are done."""
 
 
 class FrameRequest(NamedTuple):
-    """So many more frames are wanted from outside, now."""
+    """Someone outside wants `frames` more frames now."""
 
     frames: int
 
 
 class Hold(NamedTuple):
-    """From now on only `frames` more frames are released, and none by its time; -1: all are again.
+    """Release `frames` more frames now, and no others until the next `Hold`; -1 ends the hold.
 
-    Frames that were released before go on. A rate goes on from the moment in which the hold ends.
+    Frames that were released before go on. A rate goes on from the moment at which the hold ends.
     """
 
     frames: int
 
 
 class Abort(NamedTuple):
-    """End at once: every frame in flight is lost."""
+    """End at once and lose every frame in flight."""
 
 
 class Dispatch(NamedTuple):
@@ -136,7 +141,7 @@ class Dispatch(NamedTuple):
 
 
 class Kill(NamedTuple):
-    """The unit missed its deadline: end its process; `UnitDied` is expected."""
+    """End the process of a unit that missed its deadline; `UnitDied` is expected."""
 
     unit: str
 
@@ -177,7 +182,11 @@ ACTIONS = (Dispatch, Kill, Start, Finish)
 
 
 class Decision(NamedTuple):
-    """The core's answer: what to do now, and when to ask again at the latest (NEVER: at the next event)."""
+    """The core's answer.
+
+    `actions`: actions to carry out now.
+    `next_deadline_ns`: latest time of the next step; NEVER: the next step comes with the next event.
+    """
 
     actions: tuple[Action, ...]
     next_deadline_ns: int
@@ -193,9 +202,11 @@ class StageSpec:
 
 @dataclass(frozen=True)
 class Graph:
-    """A chain of stages. `edges[i]`: the rule between stages i and i + 1. Latency ends with stage `latency_to`.
+    """A chain of stages.
 
-    `bypass`: names of two stages; a frame for which the first says so skips those between them (bypass.py).
+    `edges`: rule of each edge; `edges[i]` lies between stages i and i + 1.
+    `latency_to`: stage at whose end the latency ends.
+    `bypass`: names of two stages; a frame for which the first says so skips the stages between them (bypass.py).
     """
 
     stages: tuple[StageSpec, ...]
@@ -214,7 +225,7 @@ class Graph:
             self._check_bypass(names, self.bypass)
 
     def _check_bypass(self, names: list[str], bypass: tuple[str, str]) -> None:
-        """Raises UnexpectedValue for one that skips nothing, or skips the end of the latency."""
+        """Raise UnexpectedValue for a bypass that skips no stage, or the stage at which the latency ends."""
         if not set(bypass) <= set(names) or names.index(bypass[0]) + 1 >= names.index(bypass[1]):
             raise UnexpectedValue(f"bypass {bypass} of stages {names}", "a stage, and one at least two places after it")
         if self.latency_to in self.bypassed:
@@ -238,9 +249,9 @@ class Graph:
 
 
 def chain(stages: Iterable[tuple[str, str]], edge: str, latency_to: str) -> Graph:
-    """A graph of `stages`, each a name and its unit, all of whose edges have the same rule.
+    """Return the graph of `stages`, pairs of a name and its unit, with `edge` as the rule of every edge.
 
-    Raises ValueError for stages of one name, and when `latency_to` is none of them.
+    Raises ValueError when two stages have the same name, and when `latency_to` is none of them.
     """
     specs = tuple(StageSpec(name, unit) for name, unit in stages)
     return Graph(specs, (edge,) * (len(specs) - 1), latency_to)
@@ -248,22 +259,24 @@ def chain(stages: Iterable[tuple[str, str]], edge: str, latency_to: str) -> Grap
 
 @dataclass(frozen=True)
 class Settings:
-    """What a run asks of the core. All `_ns` are lengths of time; a length or a limit of 0 means that there is none.
+    """What a run asks of the core. Names in `_ns` are durations; a duration or limit of 0 means that there is none.
 
-    `period_ns`: a frame is released every so often; 0: as soon as it can be taken.
+    `frames`: number of frames of the run.
+    `policy`: name of the scheduling policy.
+    `period_ns`: time between releases of frames; 0: a frame is released as soon as it can be taken.
     `arrivals_ns`: release times from the start, instead of a period.
-    `asked`: frames are released by `FrameRequest` alone.
-    `latch_ns`: the first stage of a frame begins so late that it is expected to end this long before the second can
-    take it: the pose is newer, and waits less.
-    `deadline_ns`: a frame's time from release to presented.
-    `works`: of each rung of the ladder on which a frame's work is stepped down when it would be late (work_ladder.py),
-    in thousandths, 1000 first, falling; empty: there is none. `follow`: the stages whose time follows the work.
-    `in_flight`: frames between pose and presented.
-    `in_queue`: released frames that may wait; more are turned away.
-    `queue_timeout_ns`: the longest wait there.
-    `hang_ns`: the longest that a job may take, or that an idle unit may leave a ping unanswered.
-    `start_ns`: the longest that a unit may take to start.
-    `max_failures`: in a row, without a finished job between them, after which a unit is given up.
+    `asked`: whether `FrameRequest` alone releases frames.
+    `latch_ns`: margin by which a frame's first stage is expected to end before the second can take it. The first stage
+    begins that late so that the pose is newer and waits less.
+    `deadline_ns`: longest time from a frame's release to its presentation.
+    `works`: work of each rung of the ladder (work_ladder.py) in thousandths, 1000 first, falling; empty: no ladder.
+    `follow`: names of the stages whose time follows the work.
+    `in_flight`: limit of frames between pose and presentation.
+    `in_queue`: limit of released frames that wait; more are turned away.
+    `queue_timeout_ns`: longest wait of a released frame.
+    `hang_ns`: longest time of a job, and longest time for which an idle unit may leave a ping unanswered.
+    `start_ns`: longest time of a unit's start.
+    `max_failures`: number of failures in a row, with no finished job between them, after which a unit is given up.
     """
 
     frames: int

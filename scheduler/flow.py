@@ -1,6 +1,6 @@
-"""Frames on their way through the slots. Rule: a frame leaves here once: presented, dropped or lost, and counted so.
+"""Moves frames through the slots. Rule: each frame leaves here once, counted as presented, dropped or lost.
 
-It moves frames and slots as it is told, and notes for which units that changed something (`mark_dirty`).
+It moves frames and slots as it is told, and notes which units the change concerns (`mark_dirty`).
 """
 
 from __future__ import annotations
@@ -16,12 +16,16 @@ from trilane.transport.slots import EdgeSlots
 class Flow:
     """Stages, units, edges and the frames in flight. Raises ValueError for an unknown edge.
 
-    `dirty`: the units that a step must look at, in the order in which they were marked; a unit may be there twice.
-    `bypass`: of the chain, if it has one. `rung`: of the work of frames that are admitted from now on.
+    `dirty`: units that a step must look at, in the order in which they were marked; a unit may appear twice.
+    `bypass`: bypass of the chain, or None.
+    `rung`: rung of the work of frames that are admitted from now on.
     """
 
     def __init__(self, graph: Graph, ledger: Ledger, drops: bool) -> None:
-        """`drops`: whether the policy drops waiting frames, so that each further one that waits matters."""
+        """Begin with no frame in flight.
+
+        `drops`: whether the policy drops waiting frames, so that each further waiting frame matters.
+        """
         self.stages, self.units, self.edges = build(graph)
         self.stage_named = {stage.name: stage for stage in self.stages}
         self.frames: dict[int, FrameState] = {}
@@ -35,15 +39,15 @@ class Flow:
             self.bypass = Bypass(self.stage_named[begin], self.stage_named[end])
 
     def mark_dirty(self, unit: UnitState) -> None:
-        """Something has changed for the unit: this step looks at it."""
+        """Note that something has changed for the unit, so that this step looks at it."""
         self.dirty.append(unit)
 
     def admit(self, frame: int, release_ns: int, deadline_ns: int) -> None:
-        """The frame is in flight from now on."""
+        """Put the frame in flight."""
         self.frames[frame] = FrameState(release_ns, deadline_ns, self.rung)
 
     def begin(self, stage: StageState, frame: int, slot_in: int) -> Job:
-        """The stage's job for `frame`: one just admitted, or the one that waits for the stage in `slot_in`."""
+        """Return the stage's job for `frame`, which was just admitted or waits for the stage in `slot_in`."""
         source, sink = stage.input, stage.output
         slot_out = -1
         if source is not None:
@@ -67,7 +71,7 @@ class Flow:
         return job
 
     def pass_on(self, stage: StageState, job: Job, end_ns: int) -> None:
-        """The job is done: its frame waits for the next stage, or is presented."""
+        """Note that the job is done: its frame waits for the next stage, or is presented."""
         source, sink, bypass = stage.input, stage.output, self.bypass
         if source is not None:
             if stage.bypassed is None:
@@ -90,7 +94,7 @@ class Flow:
             self.mark_dirty(self.stages[0].unit)
 
     def _take(self, bypass: Bypass, job: Job) -> bool:
-        """Whether the frame takes the bypass; it then waits for the stage at its end."""
+        """Return whether the frame takes the bypass; if so, it waits for the stage at the bypass's end."""
         bypass.was_taken = self.frames[job.frame].skips
         if bypass.was_taken:
             self.drop(bypass.edge.commit(job.slot_out, skips=True), bypass.begin.position, DropCause.STALE)
@@ -98,32 +102,32 @@ class Flow:
         return bypass.was_taken
 
     def _release(self, stage: StageState, slot_in: int) -> None:
-        """The slot from which the stage at a bypass's end took its frame is free again."""
+        """Free the slot from which the stage at a bypass's end took its frame."""
         edge, slot = side_of(stage, slot_in)
         if not edge.free:
             self.mark_dirty(self._producer(stage, edge).unit)
         edge.release(slot)
 
     def _producer(self, stage: StageState, edge: EdgeSlots) -> StageState:
-        """The stage that fills `edge`, from which `stage` takes frames."""
+        """Return the stage that fills `edge`, from which `stage` takes frames."""
         if edge is not stage.input and self.bypass is not None:
             return self.bypass.begin
         return self.stages[stage.position - 1]
 
     def drop(self, frames: list[int], edge: int, cause: DropCause) -> None:
-        """Count frames whose slots on the edge behind stage `edge` were given to others."""
+        """Drop frames whose slots on the edge behind stage `edge` were given to others, and count them."""
         for frame in frames:
             self._count_drop(frame, edge, cause)
             self.mark_dirty(self.stages[edge].unit)
             self.mark_dirty(self.stages[0].unit)
 
     def drop_waiting(self, stage: StageState, slot_in: int, cause: DropCause) -> None:
-        """Take the frame that waits for the stage in `slot_in` out of its slot."""
+        """Drop the frame that waits for the stage in `slot_in`, and free its slot."""
         edge, slot = side_of(stage, slot_in)
         self.drop([edge.drop(slot)], self._producer(stage, edge).position, cause)
 
     def mark_lost(self, frame: int, loss: Loss) -> None:
-        """Count a frame that was in flight as lost; its slots, if it had any, are another's business."""
+        """Count a frame in flight as lost; its slots, if it has any, are not freed here."""
         state = self.frames.pop(frame)
         self._ledger.lost[loss] += 1
         self.mark_dirty(self.stages[0].unit)
@@ -132,7 +136,8 @@ class Flow:
     def reclaim(self, unit: UnitState, loss: Loss) -> None:
         """Give the slots of a unit whose process is gone back to their edges, under a new epoch.
 
-        The frame that it worked on is lost; what it only held is done again, or lost when it held its first stage.
+        The frame that the unit worked on is lost. Its other frames wait again, but those for the chain's first stage
+        are lost.
         """
         jobs = list(unit.queue)
         unit.queue.clear()
@@ -149,7 +154,7 @@ class Flow:
                 self.bypass.must_be_fresh = True
 
     def free_slots(self, job: Job) -> None:
-        """Both slots of a job that will not end are free again."""
+        """Free both slots of a job that will not end."""
         stage = self.stage_named[job.stage]
         if stage.input:
             edge, slot = side_of(stage, job.slot_in)
@@ -160,7 +165,7 @@ class Flow:
             self.mark_dirty(stage.unit)
 
     def _put_back(self, job: Job, loss: Loss) -> None:
-        """The job's frame waits for its stage again."""
+        """Let the job's frame wait for its stage again."""
         stage = self.stage_named[job.stage]
         if stage.output:
             stage.output.abandon(job.slot_out)
@@ -184,11 +189,11 @@ class Flow:
         self._tell_bypass(state)
 
     def _tell_bypass(self, gone: FrameState) -> None:
-        """A frame that was in flight is no more."""
+        """Update the bypass after a frame in flight was dropped or lost."""
         bypass = self.bypass
         if bypass is None:
             return
         if not gone.skips and gone.position <= bypass.end.position:
             bypass.must_be_fresh = True
         if gone.skips or bypass.edge.passing:
-            self.mark_dirty(bypass.end.unit)  # it waited there, or what waits there may have waited for it alone
+            self.mark_dirty(bypass.end.unit)  # the frame waited there, or what waits there may have waited for it alone

@@ -1,4 +1,4 @@
-"""Where frames come from: release, the waiting queue, its limits. Rule: a frame leaves here once, or is counted."""
+"""Releases frames and queues them within limits. Rule: each frame leaves here once, or is counted."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from trilane.scheduler.events import NEVER, Settings
 
 
 class Source:
-    """Frames 0..n-1. A released frame waits in `queue` until it is taken, turned away, or out of time.
+    """The source of frames 0..n-1. A released frame waits in `queue` until it is taken, turned away, or out of time.
 
-    Without a rate (no period, no arrivals, no requests) a frame counts as released in the moment in which it can be
-    taken. `drop` is called with each frame that is dropped here, its release time and the cause. `due_ns`: when the
-    next frame is released or the oldest waiting one runs out of time. `is_empty`: whether no frame can be taken now.
+    Without a rate (no period, no arrivals, no requests) a frame counts as released at the moment when it can be taken.
+    While frames are held, `hold` alone releases them, a few at a time. After the hold the next frame is due at once,
+    and the frames after it follow at their usual distances.
 
-    While frames are held, `hold` alone releases them, a few at a time. Afterwards the next one is due at once, and
-    those that follow it as long after it as they would have been.
+    `drop`: function that is called with each frame that is dropped here, its release time and the cause.
+    `due_ns`: time at which the next frame is released or the oldest waiting frame runs out of time.
+    `is_empty`: whether no frame can be taken now.
     """
 
     def __init__(self, settings: Settings, drop: Callable[[int, int, DropCause], None]) -> None:
@@ -35,16 +36,16 @@ class Source:
 
     @property
     def _waits(self) -> bool:
-        """Whether a frame has to be released before it is taken."""
+        """Whether a frame must be released before it can be taken."""
         return self._paced or self._held
 
     def start(self, now_ns: int) -> None:
-        """The run begins: periods and arrivals count from here."""
+        """Begin the run: periods and arrivals count from `now_ns`."""
         self._start_ns = now_ns
         self._set_due()
 
     def stop(self) -> None:
-        """Nothing more is released, and what waits is forgotten."""
+        """Release nothing more, and forget the waiting frames."""
         self._end = self._next
         self._forgotten += len(self.queue)
         self.queue.clear()
@@ -52,12 +53,12 @@ class Source:
 
     @property
     def released(self) -> int:
-        """How many frames have left, wait, or were forgotten."""
+        """The number of frames that have left, wait, or were forgotten."""
         return self._next
 
     @property
     def left(self) -> int:
-        """How many frames were taken or dropped here."""
+        """The number of frames that were taken or dropped here."""
         return self._next - self._forgotten - len(self.queue)
 
     @property
@@ -65,7 +66,7 @@ class Source:
         return self._next >= self._end and not self.queue
 
     def advance(self, now_ns: int) -> bool:
-        """Release what is due, drop what waited too long; True when something changed."""
+        """Release the frames that are due, drop those that waited too long, and return whether something changed."""
         changed = False
         while self._paced and not self._held and self._next < self._end and self._release_ns(self._next) <= now_ns:
             self._admit(self._next, self._release_ns(self._next))
@@ -79,40 +80,42 @@ class Source:
         return changed
 
     def request(self, count: int, now_ns: int) -> None:
-        """Release `count` frames, or those that are left."""
+        """Release `count` frames, or all that are left if they are fewer."""
         for frame in range(self._next, min(self._next + count, self._end)):
             self._admit(frame, now_ns)
             self._next += 1
         self._set_due()
 
     def hold(self, frames: int, now_ns: int) -> None:
-        """Release `frames` frames and no more until the next call; -1: the hold is over."""
+        """Release `frames` frames and no more until the next call; -1 ends the hold."""
         if frames >= 0:
             self._held = True
             self.request(frames, now_ns)
         elif self._held:
             self._held = False
             if self._paced and not self._settings.asked and self._next < self._end:
+                # The schedule is moved on, so that the frames that came due in the hold are not all released at its
+                # end.
                 self._start_ns += now_ns - self._release_ns(self._next)
             self._set_due()
 
     def head(self, now_ns: int) -> tuple[int, int]:
-        """The frame that is next and its release time; `is_empty` says whether there is one."""
+        """Return the next frame and its release time; only valid if `is_empty` is False."""
         return self.queue[0] if self.queue else (self._next, now_ns)
 
     def keep_newest(self) -> None:
-        """The others that wait are stale."""
+        """Drop all waiting frames but the newest, as stale."""
         while len(self.queue) > 1:
             self._drop(*self.queue.popleft(), DropCause.STALE)
         self._set_due()
 
     def drop_late_head(self) -> None:
-        """The frame that has waited longest cannot be in time."""
+        """Drop the frame that has waited longest, as it cannot be in time."""
         self._drop(*self.queue.popleft(), DropCause.LATE)
         self._set_due()
 
     def take(self, now_ns: int) -> tuple[int, int]:
-        """The head and its release time."""
+        """Remove the head, and return it with its release time."""
         head = self.head(now_ns)
         if self.queue:
             self.queue.popleft()

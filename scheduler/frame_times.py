@@ -1,7 +1,9 @@
-"""The times between presented frames, as they come. Rule: what is held of them does not grow with their number.
+"""Summarises the times between presented frames as they come.
 
-Where all of them are still there (`trilane.scheduler.samples`), the interval of their mean is computed from them; of
-more, from the means of blocks of equally many, each some thousandth of the run.
+Rule: the memory for them does not grow with their number.
+
+While all times are still kept (`trilane.scheduler.samples`), the interval of their mean is computed from them. After
+that it is computed from the means of blocks of equally many times, each about a thousandth of the run.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ MOST_BLOCKS: Final = 2048
 
 
 class FrameTimes:
-    """`samples`: the times in ns."""
+    """The times between presented frames. `samples`: the times in ns."""
 
     def __init__(self, sketch: Callable[[], Sketch] | None = None) -> None:
         self.samples = Samples(sketch)
@@ -31,7 +33,7 @@ class FrameTimes:
         self._open_ns = self._open_frames = 0
 
     def add(self, interval_ns: int) -> None:
-        """The time from one presented frame to the next."""
+        """Add the time from one presented frame to the next."""
         number = self.samples.count
         if number:
             self._steps_ns += abs(interval_ns - self._last_ns)
@@ -47,9 +49,9 @@ class FrameTimes:
         self._add_to_block(interval_ns)
 
     def row(self) -> dict[str, float | None]:
-        """`frame_time_ms` of a report: summary, exponential average, jitter, interval of the mean.
+        """Return `frame_time_ms` of a report: summary, exponential average, jitter, interval of the mean.
 
-        The average over SPAN frames (weight 2 / (SPAN + 1)) counts from frame SPAN on, when there are as many. Jitter
+        The average over SPAN frames (weight 2 / (SPAN + 1)) counts from frame SPAN on, if there are that many. Jitter
         is the mean absolute difference of successive times.
         """
         return {
@@ -61,7 +63,7 @@ class FrameTimes:
         }
 
     def fps_interval(self) -> dict[str, float | None]:
-        """`fps_low` and `fps_high` of a report."""
+        """Return `fps_low` and `fps_high` of a report."""
         return fps_interval(self._interval())
 
     def _interval(self) -> tuple[float, float] | None:
@@ -76,27 +78,32 @@ class FrameTimes:
             self._blocks.append(self._open_ns / self._open_frames)
             self._open_ns = self._open_frames = 0
         if len(self._blocks) == MOST_BLOCKS:
+            # Two neighbours become one block, so that the memory stays bounded.
             pairs = zip(self._blocks[::2], self._blocks[1::2], strict=True)
             self._blocks = [(before + after) / 2 for before, after in pairs]
             self._block_frames *= 2
 
 
 class Lateness:
-    """How late frames were. `count`: of those that had a deadline; `missed`: of those that came after it."""
+    """How late frames were.
+
+    `count`: number of frames that had a deadline.
+    `missed`: number of frames that came after it.
+    """
 
     def __init__(self) -> None:
         self.count = self.missed = 0
         self._score = 0.0
 
     def add(self, late_ns: int) -> None:
-        """A frame that came so long after its deadline, or before it where this is negative."""
+        """Add a frame that came `late_ns` after its deadline, or before it if that is negative."""
         self.count += 1
         self.missed += late_ns > 0
         self._score += 1 / (1 + exp(min(SCORE_PER_MS * late_ns / NS_PER_MS, LARGEST_EXPONENT)))
 
     @property
     def real_time_score(self) -> float | None:
-        """Mean of 1 / (1 + e^(15 l)), l the lateness of a frame in ms: 1 in time, 0 late, None for no frame.
+        """The mean of 1 / (1 + e^(15 l)), l the lateness of a frame in ms: 1 in time, 0 late, None for no frame.
 
         Kwon et al., XRBench, MLSys 2023, section 3.
         """

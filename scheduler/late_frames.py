@@ -1,7 +1,7 @@
-"""Dropping frames that wait in vain: those that must be late, and those that a newer one has made stale.
+"""Drops frames that wait in vain: those that must be late, and those that a newer frame has made stale.
 
-Rule: a frame is dropped in the moment in which the stage that it waits for is considered, and not before; by which
-rule, the policy says.
+Rule: a frame is dropped when the stage that it waits for is considered, and not before. The policy says which of the
+two kinds are dropped.
 """
 
 from __future__ import annotations
@@ -16,13 +16,18 @@ from trilane.scheduler.state import StageState
 
 
 class LateFrames:
-    """`policy`: which frames are dropped. `flow`, `source`: where they wait. `choice`: whether one must be late."""
+    """Drops waiting frames of a run.
+
+    `policy`: policy that says which frames are dropped.
+    `flow`, `source`: where frames wait.
+    `choice`: knows whether a frame must be late.
+    """
 
     def __init__(self, policy: Policy, flow: Flow, source: Source, choice: Choice) -> None:
         self._policy, self._flow, self._source, self._choice = policy, flow, source, choice
 
     def drop(self, stage: StageState, now_ns: int) -> None:
-        """Drop what waits for the stage and is stale or must be late."""
+        """Drop the frames that wait for the stage and are stale or must be late."""
         edge = stage.input
         if edge is None:
             if not self._choice.is_full():
@@ -42,7 +47,7 @@ class LateFrames:
             self._source.keep_newest()
         if self._policy.drop_late:
             while self._source.queue and self._choice.is_late(first, now_ns):
-                if not self._flow.frames:  # nothing is in its way: the estimates alone say that it is late
+                if not self._flow.frames:  # nothing is in its way, so only the estimates make it late
                     for stage in self._flow.stages:
                         stage.lower_estimate()
                 self._source.drop_late_head()

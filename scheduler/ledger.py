@@ -1,9 +1,14 @@
-"""Where the time went. Rule: every nanosecond of a unit is busy or idle for one stated cause; the six sum to the run.
+"""Accounts for the time of the units: each nanosecond is busy or idle for one stated cause, and the six sum to the run.
 
-busy: a job runs. starved: no input. blocked: input, but no free output slot, or the limit of frames in flight.
-throttled: held by the cap. preempted: the unit has a job, but not its core. overhead: a job is assigned but does not
-run (messages, scheduling, it sleeps), or the unit is down. On the virtual clock no unit is preempted here: those on one
-core are one unit to the scheduler, whose share trilane.hw_profiles.application divides.
+- busy: a job runs.
+- starved: the unit has no input.
+- blocked: the unit has input, but no free output slot, or the limit of frames in flight is reached.
+- throttled: the cap holds the unit.
+- preempted: the unit has a job, but no core.
+- overhead: a job is assigned but does not run (messages, scheduling, sleep), or the unit is down.
+
+On the virtual clock no unit is preempted here: units on one core are one unit to the scheduler, and
+trilane.hw_profiles.application divides its share.
 """
 
 from __future__ import annotations
@@ -26,10 +31,12 @@ THROTTLED: Final = 3
 
 
 class JobRecord(NamedTuple):
-    """One finished job. Times in ns of the run's clock; `ready` is when its input was there.
+    """One finished job; times in ns of the run's clock.
 
-    `preempted_ns`, `asleep_ns`, `preempted_before_ns`: as in `JobDone`. `cpu_ns`: CPU time of all its unit's threads in
-    the job; 0 in journals of before it was kept; on the virtual clock its service time.
+    `ready_ns`: time at which its input was there.
+    `preempted_ns`, `asleep_ns`, `preempted_before_ns`: as in `JobDone`.
+    `cpu_ns`: CPU time of all its unit's threads in the job; 0 in journals older than this field; on the virtual clock
+    its service time.
     """
 
     stage: str
@@ -56,7 +63,7 @@ class _UnitBook:
         self.restarts = 0
 
     def add_job(self, begin_ns: int, end_ns: int, preempted_ns: int, asleep_ns: int, preempted_before_ns: int) -> None:
-        """Book a job, and what was lost of the time before it in which the unit had it and did no other."""
+        """Book a job, and the time before it in which the unit had it, did no other job and had no core."""
         self.jobs += 1
         held_from_ns = max(self.last_end_ns, self.since_ns)
         if begin_ns > held_from_ns:
@@ -89,8 +96,9 @@ class _UnitBook:
 class Books:
     """How a run is accounted for.
 
-    `target_period_ns`: frame times above it count as missed deadlines, and those of frames do not; 0: those of frames.
-    `sketch`: as of `trilane.scheduler.samples.Samples`.
+    `target_period_ns`: longest frame time that is not a missed deadline; the frames' own deadlines then do not count.
+    0: only the frames' own deadlines count.
+    `sketch`: function that makes a sketch, as for `trilane.scheduler.samples.Samples`.
     """
 
     target_period_ns: int = 0
@@ -104,10 +112,13 @@ class _StageBook:
 
 
 class Ledger:
-    """Fed by the core alone. Times in ns of the run's clock.
+    """The accounts of a run, written by the core alone; times in ns of the run's clock.
 
-    `presented_count`, `skipped`: frames; `rungs`: those of each rung of work; `rung_switches`: how often one had
-    another than the frame before. Of a run that keeps all values, `presented_frames` and `lateness_ns`, in order.
+    `presented_count`, `skipped`: number of presented frames, and of those that took the bypass.
+    `rungs`: number of presented frames on each rung of work.
+    `rung_switches`: how often a frame had another rung than the frame before.
+    `presented_frames`, `lateness_ns`: numbers and lateness of the presented frames in order; filled only for a run that
+    keeps all values.
     """
 
     def __init__(self, graph: Graph, books: Books | None = None) -> None:
@@ -152,7 +163,7 @@ class Ledger:
         asleep_ns: int = 0,
         preempted_before_ns: int = 0,
     ) -> None:
-        """Book a job that has ended: `ready_ns` is when its input was there, the rest is as in `JobDone`."""
+        """Book a job that has ended. `ready_ns`: time at which its input was there; the rest is as in `JobDone`."""
         stage = self._stages[job.stage]
         stage.service.add(end_ns - begin_ns)
         stage.wait.add(begin_ns - ready_ns)
@@ -160,7 +171,7 @@ class Ledger:
 
     @property
     def busy_ns(self) -> dict[str, int]:
-        """How long each unit has worked so far: jobs that have ended."""
+        """How many ns each unit has worked so far, in jobs that have ended."""
         return {unit: book.busy_ns for unit, book in self._units.items()}
 
     def restart(self, unit: str) -> None:
@@ -169,7 +180,12 @@ class Ledger:
     def presented(
         self, frame: int, end_ns: int, latency_ns: int, deadline_ns: int, skipped: bool = False, rung: int = 0
     ) -> None:
-        """`deadline_ns`: NEVER when the frame has none. `skipped`: it took the bypass. `rung`: of its work."""
+        """Book a presented frame.
+
+        `deadline_ns`: time of its deadline; NEVER without one.
+        `skipped`: whether it took the bypass.
+        `rung`: rung of its work.
+        """
         self.skipped += skipped
         self.rungs[rung] += 1
         self.rung_switches += rung != self._rung and self.presented_count > 0
@@ -196,38 +212,38 @@ class Ledger:
 
     @property
     def left_out(self) -> int:
-        """How many frames were lost or dropped so far."""
+        """The number of frames that were lost or dropped so far."""
         return sum(self.lost.values()) + sum(self.dropped.values())
 
     @property
     def lost_by_cause(self) -> dict[str, int]:
-        """Frames lost, by the cause's key in the report."""
+        """The number of lost frames by the cause's key in the report."""
         return dict(sorted((str(loss), count) for loss, count in self.lost.items()))
 
     @property
     def dropped_by_cause(self) -> dict[str, int]:
-        """Frames dropped, by the cause's key in the report."""
+        """The number of dropped frames by the cause's key in the report."""
         return dict(sorted((str(drop), count) for drop, count in self.dropped.items()))
 
     @property
     def presented_ns(self) -> list[int]:
-        """When each frame was presented, in order; of a run that keeps all values."""
+        """The time at which each frame was presented, in order; only for a run that keeps all values."""
         return [*accumulate(self._frame_times.samples.kept, initial=self._first_ns)] if self.presented_count else []
 
     @property
     def latency_ns(self) -> list[int]:
-        """The latency of each presented frame, in order; of a run that keeps all values."""
+        """The latency of each presented frame, in order; only for a run that keeps all values."""
         return [*self._latency.kept]
 
     @property
     def is_exact(self) -> bool:
-        """Whether all percentiles are."""
+        """Whether all percentiles are exact."""
         books = self._stages.values()
         samples = [*[book.service for book in books], *[book.wait for book in books], self._latency]
         return self._frame_times.samples.is_exact and all([each.is_exact for each in samples])
 
     def report(self, *, clock: str, requested: int, not_begun: int) -> dict[str, Any]:
-        """The keys of report.json. `not_begun`: of the requested frames, those that never left the source."""
+        """Return the keys of report.json. `not_begun`: number of requested frames that never left the source."""
         intervals, span_ns = max(self.presented_count - 1, 0), self._last_ns - self._first_ns
         return {
             "clock": clock,
@@ -249,7 +265,7 @@ class Ledger:
             "xrbench": {
                 "real_time": self._lateness.real_time_score,
                 "qoe": self.presented_count / requested if requested else 0.0,
-                "energy": None,  # filled in by a caller that knows the power
+                "energy": None,  # a caller that knows the power fills it in
             },
             "stages": {stage.name: self._stage_row(stage.name, stage.unit) for stage in self._graph.stages},
             "units": {unit: book.shares() for unit, book in self._units.items()},

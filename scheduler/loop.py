@@ -13,11 +13,12 @@ class Clock(Protocol):
     """The world around the core: it knows the time, hears what happens and does what the core says."""
 
     def wait(self, deadline_ns: int) -> tuple[int, tuple[Event, ...]]:
-        """Until something happens or the deadline comes; what time it is and what has happened.
+        """Wait until something happens or the deadline comes; return the time and what has happened.
 
-        `deadline_ns`: NEVER when only an event can bring the core on. So it is in the first call of a run, which must
-        return the first events: a `UnitReady` for each unit that is up.
         Times never go back. It may return without an event at any time.
+
+        `deadline_ns`: latest time of return; NEVER when only an event can bring the core on. The first call of a run
+        has NEVER. It must return the first events: a `UnitReady` for each unit that is up.
         """
         ...
 
@@ -27,15 +28,15 @@ class Clock(Protocol):
 
 
 class Recorder(Protocol):
-    """What the steps of a run are added to, such as `trilane.scheduler.recording.Recording`."""
+    """Takes the steps of a run, such as `trilane.scheduler.recording.Recording`."""
 
     def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
-        """A step of `core` that has just been taken, and whose actions were performed."""
+        """Add a step of `core` that has just been taken, and whose actions were performed."""
         ...
 
 
 def run_loop(core: Core, clock: Clock, recording: Recorder | None = None) -> Outcome:
-    """Run `core` until it finishes; every step is added to `recording`.
+    """Run `core` until it finishes, and add every step to `recording`.
 
     Raises what `clock` raises, KeyError and UnitLifeError (see Core.step).
     """

@@ -1,7 +1,8 @@
-"""Which cores and how many threads each unit gets. Rule: it follows from measured times alone, by one formula.
+"""Chooses cores and the number of threads of each unit. Rule: measured times alone decide, by one formula.
 
-`places.py` has the words, `placement_list.py` the placements that there are, `placement_model.py` the formula. The
-formula is not exact; where real frames can be had, the few placements that it cannot tell apart are told by them.
+`places.py` defines the words, `placement_list.py` lists the possible placements, and `placement_model.py` has the
+formula. The formula is not exact. Where real frames can be had, they decide between the few placements that it cannot
+tell apart.
 """
 
 from __future__ import annotations
@@ -14,12 +15,13 @@ from trilane.scheduler.placement_list import placements
 from trilane.scheduler.placement_model import Rules, frame_ns
 from trilane.scheduler.places import Core, Placement, Times, shared_cores
 
-#: Predictions this near to the shortest are as good: the model's own error is not less.
+#: Relative difference from the shortest within which predictions are as good; the model's own error is not smaller.
 WORTH: Final = 0.03
-#: Placements that are predicted so much longer than the shortest may be the best all the same; and so many are tried.
+#: Relative difference from the shortest prediction up to which a placement may still be the best, and how many are
+#: tried.
 UNCERTAIN: Final = 0.25
 MOST_TRIED: Final = 5
-#: Measured frame times this near to each other are the same.
+#: Relative difference within which measured frame times are the same.
 SAME: Final = 0.01
 
 
@@ -31,11 +33,13 @@ class Ranked(NamedTuple):
 
 
 def ranked(cores: Sequence[Core], times: Times, rules: Rules, fixed: Placement | None = None) -> list[Ranked]:
-    """All placements, the smallest frame time first.
+    """Return all placements, the smallest frame time first.
 
-    Ties go to fewer shared cores, then less work that floats, less time in all stages (latency), lower numbers.
+    Ties go to fewer shared cores, then less floating work, less time in all stages (latency), lower core numbers.
 
-    `fixed`: places that are given. Raises ValueError for no cores, or a unit of which no number of threads fits.
+    `fixed`: places that are given.
+
+    Raises ValueError for no cores, or for a unit of which no number of threads fits.
     """
     found = [Ranked(each, frame_ns(each, cores, times, rules)) for each in placements(cores, times, fixed or {})]
     if not found:
@@ -44,10 +48,10 @@ def ranked(cores: Sequence[Core], times: Times, rules: Rules, fixed: Placement |
 
 
 def chosen(found: Sequence[Ranked], rule: Ranked) -> Ranked:
-    """What to take of `found`, which is `ranked`: never one that is predicted longer than the `rule`'s.
+    """Return the placement of `found` to take; `found` is in the order of `ranked`.
 
-    `rule`: the placement for any run; it stays unless another is shorter by more than WORTH. Then, of those within
-    WORTH of the shortest, the one that shares least.
+    It is never predicted longer than `rule`, the placement for any run. The rule stays unless another placement is
+    shorter by more than WORTH. Otherwise the choice is the placement within WORTH of the shortest that shares least.
     """
     near = [each for each in found if each.frame_ns * (1 - WORTH) <= found[0].frame_ns]
     if rule.frame_ns * (1 - WORTH) <= found[0].frame_ns:
@@ -56,7 +60,10 @@ def chosen(found: Sequence[Ranked], rule: Ranked) -> Ranked:
 
 
 def worth_trying(found: Sequence[Ranked], rule: Ranked) -> list[Ranked]:
-    """Which of `found`, which is `ranked`, may be the best; the `chosen` one first, that of the `rule` always."""
+    """Return the placements of `found` that may be the best; `found` is in the order of `ranked`.
+
+    The `chosen` one comes first, and the `rule` is always among them.
+    """
     best, longest = chosen(found, rule), found[0].frame_ns * (1 + UNCERTAIN)
     first = [best] if best.placement == rule.placement else [best, rule]
     known = [each.placement for each in first]
@@ -64,10 +71,10 @@ def worth_trying(found: Sequence[Ranked], rule: Ranked) -> list[Ranked]:
 
 
 def typical(rounds: Sequence[Sequence[float]]) -> list[float]:
-    """The frame time of each placement, in the unit of `rounds`.
+    """Return the typical frame time of each placement, in the unit of `rounds`.
 
-    `rounds`: of each the frame times of all placements. They count relative to the median of their round, so that a
-    slow second of the machine slows all alike; what they are relative to is the median of these medians.
+    `rounds`: frame times of all placements, for each round. They count relative to the median of their round, so that a
+    slow second of the machine slows all alike. The relative times are scaled by the median of these medians.
     """
     medians = [median(times) for times in rounds]
     relative = [[frame / middle for frame in times] for times, middle in zip(rounds, medians, strict=True)]
@@ -75,7 +82,7 @@ def typical(rounds: Sequence[Sequence[float]]) -> list[float]:
 
 
 def fastest(frame_ns: Sequence[float]) -> int:
-    """Place of the placement with the shortest measured frames; the first of those that are the `SAME`."""
+    """Return the index of the placement with the shortest measured frames; the first of those that are the `SAME`."""
     return next(place for place, value in enumerate(frame_ns) if value <= min(frame_ns) * (1 + SAME))
 
 
@@ -87,6 +94,6 @@ def _tie(placement: Placement, times: Times) -> tuple[tuple[int, ...], tuple[tup
 
 
 def _sharing(placement: Placement) -> int:
-    """How often a unit has a core that is shared: more with each shared core, and with each unit that floats there."""
+    """Count how often a unit has a shared core: each shared core counts for each unit that has it."""
     shared = shared_cores(placement)
     return sum(len(shared.intersection(place.cores)) for place in placement.values())

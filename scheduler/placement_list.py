@@ -1,4 +1,4 @@
-"""Every way to place units on cores. Rule: of those that differ only by which of equal cores is which, one is here."""
+"""Lists every way to place units on cores. Rule: one stands for all that differ only by an exchange of equal cores."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from typing import Final
 
 from trilane.scheduler.places import Core, Place, Placement, Times, Work
 
-#: With more cores than this, no unit floats: there is a core for each.
+#: Most cores with which a unit may float; with more, there is a core for each unit.
 MOST_FLOATING: Final = 4
 
 
 def placements(cores: Sequence[Core], times: Times, fixed: Placement) -> Iterator[Placement]:
-    """Every way to place the units of `times`, but one of those that differ only by which of equal cores is which.
+    """Yield every way to place the units of `times`, one for all that differ only by an exchange of equal cores.
 
-    Two cores are equal when they have the same speed, the same users, and siblings that are equal too. Of equal ones
-    the lowest number is taken. A unit with one thread has one core, or floats between two of the same speed.
+    Two cores are equal when they have the same speed and the same users, and equal siblings. Of equal cores the lowest
+    number is taken. A unit with one thread has one core, or floats between two of the same speed.
     """
     users: dict[int, frozenset[str]] = {core.number: frozenset() for core in cores}
     for unit, place in fixed.items():
@@ -35,7 +35,7 @@ def placements(cores: Sequence[Core], times: Times, fixed: Placement) -> Iterato
 
 
 def _forms(works: Mapping[int, Work], most: int) -> Iterator[tuple[int, int]]:
-    """Threads and cores that a unit may have."""
+    """Yield the threads and cores that a unit may have."""
     for threads in works:
         if threads <= most:
             yield threads, threads
@@ -47,9 +47,9 @@ def _equally_fast(cores: Sequence[Core], chosen: Sequence[int]) -> bool:
     return len({core.permille for core in cores if core.number in chosen}) == 1
 
 
-#: Core to the units that have it.
+#: The units that have each core.
 Users = Mapping[int, frozenset[str]]
-#: Of a core: its speed and its users; of all: those of each physical core's.
+#: A core's speed and users, and the same for all cores, grouped by physical core.
 CoreSignature = tuple[int, tuple[str, ...]]
 Signature = tuple[tuple[CoreSignature, ...], ...]
 
@@ -57,7 +57,7 @@ Signature = tuple[tuple[CoreSignature, ...], ...]
 def _choices(
     cores: Sequence[Core], users: Users, unit: str, count: int
 ) -> Iterator[tuple[dict[int, frozenset[str]], tuple[int, ...]]]:
-    """The users after `unit` was given `count` cores, and those cores, once for each that differs."""
+    """Yield the users after `unit` was given `count` cores, and those cores, once for each choice that differs."""
     states = [dict(users)]
     for _ in range(count):
         different: dict[Signature, dict[int, frozenset[str]]] = {}
@@ -89,7 +89,7 @@ def _siblings(cores: Sequence[Core], core: Core, users: Users) -> tuple[CoreSign
 
 
 def _signature(cores: Sequence[Core], users: Users) -> Signature:
-    """What stays the same when equal cores are exchanged: the multiset of physical cores."""
+    """Return what stays the same when equal cores are exchanged: the multiset of physical cores."""
     groups: dict[int, list[CoreSignature]] = {}
     for core in cores:
         groups.setdefault(core.physical, []).append(_own_signature(core, users))

@@ -1,23 +1,23 @@
-"""The frame time of a placement, predicted from what its units need. Rule: one formula; nothing is tried.
+"""Predicts the frame time of a placement from what its units need. Rule: one formula; nothing is tried.
 
-A placement gives each unit cores and threads. Its frame time is predicted from `Work`: how long the unit needs for a
-frame, and how long each of its cores is taken meanwhile. With T the frame time, of a pipelined run these must hold:
+A placement gives each unit cores and threads. Its frame time is predicted from `Work`: the time that the unit needs for
+a frame, and the time for which it takes each of its cores. Let T be the frame time. In a pipelined run these hold:
 
 - *A unit does one job at a time.* Its jobs of a frame take at most T.
 - *A core does one thing at a time.* What the units need of it is at most T. A unit with one thread and several cores
-  *floats*: the kernel runs it where there is room. So for every set of cores, what cannot go elsewhere is at most what
-  they can do in T (Hall's condition: then, and only then, is there a way to divide it), less what the kernel misses.
-- *Each of a job's parallel regions waits for its slowest thread.* Where others have core c for the share o(c) of the
-  time, a job of several threads goes on only while all its cores are free: a share of the product of 1 - o(c) over its
-  cores, as if the others came independently. So much longer it takes, and that is at most T too.
-- *Siblings* of one physical core do together `SIBLINGS` times what one does alone.
+  *floats*: the kernel runs it where there is room. So for every set of cores, work that cannot go elsewhere is at most
+  what they can do in T, less what the kernel misses. By Hall's condition the work can then be divided, and only then.
+- *Each of a job's parallel regions waits for its slowest thread.* Let others have core c for the share o(c) of the
+  time. A job of several threads goes on only while all its cores are free. If the others come independently, that is
+  the product of 1 - o(c) over its cores, as a share of the time. The job takes that much longer, and at most T too.
+- *Siblings* of one physical core together do `SIBLINGS` times the work that one does alone.
 
 The least such T is the answer. A sequential run has one stage at work at any time: T is the sum, and nothing waits.
 
-A floating unit of which one core is nobody else's *stays* there: the kernel moves a thread only when it has to wait.
+A floating unit that has one core to itself *stays* there, because the kernel moves a thread only when it has to wait.
 
-Every job of a unit on a shared core costs a change of threads more; a floating unit that does not stay is moved once a
-frame. What the scheduler takes of its cores counts like work that nothing waits for.
+Every job of a unit on a shared core costs a change of threads more. A floating unit that does not stay is moved once a
+frame. The time that the scheduler takes on its cores counts like work that nothing waits for.
 """
 
 from __future__ import annotations
@@ -29,37 +29,44 @@ from typing import Final, NamedTuple
 
 from trilane.scheduler.places import FULL, Core, Place, Placement, Times, Work, has_own_cores, share_ns, shared_cores
 
-#: Assumed: what two threads on the siblings of a physical core do together, over what one alone does.
+#: Assumed: work of two threads on the siblings of a physical core, over the work of one thread alone.
 SIBLINGS: Final = 1.25
-#: Assumed: a change of threads, with the first-level cache; a move, with a second-level one of 2 MiB at 8 GB/s. A
-#: simulated fair scheduler moved units that float 0.5 to 1.2 times a frame (docs/decisions/placement.md).
+#: Assumed: the cost of a change of threads, with the first-level cache, and of a move, with a second-level cache of 2
+#: MiB at 8 GB/s. A simulated fair scheduler moved floating units 0.5 to 1.2 times a frame
+#: (docs/decisions/placement.md).
 CHANGE_NS: Final = 30_000
 MOVE_NS: Final = 250_000
-#: Assumed, of what several cores can do for units that float: the kernel moves a waiting thread to a core that has just
-#: become idle, a running one hardly ever; so a core may idle while a unit that has no other one waits.
+#: Assumed share of what several cores can do for floating units. The kernel moves a waiting thread to a core that has
+#: just become idle, but hardly ever a running one. So a core may idle while a unit that has no other core waits.
 ROOM_USED: Final = 0.9
-#: What the scheduler takes for a job: measured as CPU time of its process (docs/decisions/placement.md).
+#: Time that the scheduler takes for a job, measured as CPU time of its process (docs/decisions/placement.md).
 SCHEDULER_NS: Final = 100_000
-LEAST_FREE: Final = 1e-9  # of a core's time: none
+LEAST_FREE: Final = 1e-9  # free share of a core below which it counts as none
 
 
 class Rules(NamedTuple):
-    """What else decides. `sequential`: one stage at a time. `first`: the unit on whose cores the scheduler runs."""
+    """The rules of the run that the frame time depends on.
+
+    `first`: unit on whose cores the scheduler runs.
+    `sequential`: whether one stage works at a time.
+    """
 
     first: str
     sequential: bool = False
 
 
 def frame_ns(placement: Placement, cores: Sequence[Core], times: Times, rules: Rules) -> int:
-    """The predicted time from a frame to the next, in ns."""
+    """Return the predicted time from a frame to the next, in ns."""
     model = _Model(placement, cores, times, rules)
     return model.sum_ns() if rules.sequential else model.pipelined_ns()
 
 
 class _Load(NamedTuple):
-    """What a unit, or the scheduler, needs of its cores: `core_ns` of each, or in all where it `floats`.
+    """What a unit, or the scheduler, needs of its cores for a frame.
 
-    `work_ns`: the same if siblings did not slow each other.
+    `serial_ns`: time that the unit needs for its jobs.
+    `core_ns`: time that it takes of each core, or of all together where it `floats`.
+    `work_ns`: the same time if siblings did not slow each other.
     """
 
     cores: tuple[int, ...]
@@ -69,14 +76,17 @@ class _Load(NamedTuple):
     floats: bool
 
     def on(self, core: int) -> float:
-        """What it needs of one core; of one that floats, an even part."""
+        """Return what the unit needs of one core in ns; for a floating unit, an even part."""
         if core not in self.cores:
             return 0.0
         return self.core_ns / len(self.cores) if self.floats else self.core_ns
 
 
 def _settled(placement: Placement) -> Placement:
-    """`placement` with each floating unit that has one core to itself on that one alone; it leaves the others free."""
+    """Return `placement` with each floating unit that has one core to itself on that core alone.
+
+    Such a unit leaves its other cores free.
+    """
     shared = shared_cores(placement)
     settled = dict(placement)
     for unit, place in placement.items():
@@ -87,7 +97,7 @@ def _settled(placement: Placement) -> Placement:
 
 
 class _Model:
-    """One placement."""
+    """The model of one placement."""
 
     def __init__(self, placement: Placement, cores: Sequence[Core], times: Times, rules: Rules) -> None:
         self._speed = {core.number: core.permille / FULL for core in cores}
@@ -106,9 +116,9 @@ class _Model:
         self._loads = [*self._units, _Load(where, 0.0, taken_ns, taken_ns, len(where) > 1)]
 
     def _load(self, place: Place, work: Work, cost_ns: int) -> _Load:
-        """The unit's needs on these very cores: the slowest decides, and siblings of which both are used are slower.
+        """Return the unit's needs on its cores: the slowest core decides, and siblings that are both used are slower.
 
-        `cost_ns`: what others on its cores cost it.
+        `cost_ns`: cost in ns of sharing the cores with others.
         """
         floats = place.threads < len(place.cores)
         speed = min(self._speed[core] for core in place.cores)
@@ -120,11 +130,11 @@ class _Model:
         return _Load(place.cores, serial_ns * slower, core_ns * slower, core_ns, floats)
 
     def sum_ns(self) -> int:
-        """Of a sequential run."""
+        """Return the frame time of a sequential run in ns."""
         return round(sum(unit.serial_ns for unit in self._units) + self._scheduler_ns)
 
     def pipelined_ns(self) -> int:
-        """The least whole number of ns that is long enough, from what every frame needs upwards."""
+        """Return the least whole number of ns that is long enough, searched upwards from what every frame needs."""
         high = low = int(max([*self._crowded(), *(unit.serial_ns for unit in self._units)]))
         gangs = [self._gang(unit) for unit in self._units if len(unit.cores) > 1 and not unit.floats]
         while not all(gang.fits(high) for gang in gangs):
@@ -135,7 +145,7 @@ class _Model:
         return high
 
     def _crowded(self) -> Iterator[float]:
-        """For each set of cores that can be too full, what it needs over what it can do."""
+        """Yield, for each set of cores that can be too full, what it needs over what it can do."""
         floating = [load for load in self._loads if load.floats]
         sets = {frozenset([core]): 1.0 for core in self._speed}
         for one in self._physical_cores:
@@ -152,11 +162,14 @@ class _Model:
 
     @staticmethod
     def _within(load: _Load, these: frozenset[int]) -> float:
-        """What of a load must be done on `these` cores."""
+        """Return the part of a load that must be done on `these` cores."""
         return share_ns(load.cores, load.core_ns if len(these) == 1 else load.work_ns, load.floats, these)
 
     def _capacity(self, these: frozenset[int]) -> float:
-        """How many cores' worth of work the set does: loads are in the time of the very cores, so each counts 1."""
+        """Return how many cores' worth of work the set does.
+
+        Loads are in the time of these very cores, so each core counts 1.
+        """
         counts = [sum(self._physical[core] == one for core in these) for one in self._physical_cores]
         return sum(SIBLINGS if count > 1 else count for count in counts)
 
@@ -171,14 +184,18 @@ class _Model:
 
 
 class _Gang(NamedTuple):
-    """A unit of several threads, each on a core: the times of its jobs, and what others do on each core and beside."""
+    """A unit of several threads, each on a core.
+
+    `serial_ns`, `core_ns`: times of its jobs, as in `_Load`.
+    `others_ns`: time of others on each of its cores, and on the core's siblings.
+    """
 
     serial_ns: float
     core_ns: float
     others_ns: Sequence[tuple[float, float]]
 
     def fits(self, frame: int) -> bool:
-        """Whether its jobs, stretched by their waits, end within a frame of so many ns."""
+        """Return whether its jobs, stretched by their waits, end within `frame` ns."""
         free = prod(
             max(1 - on / frame, 0.0) * (1 - (1 - SIBLINGS / 2) * min(beside / frame, 1.0))
             for on, beside in self.others_ns

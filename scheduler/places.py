@@ -1,4 +1,4 @@
-"""Cores, places and what units need of them: the words of placement. Rule: plain data, and what follows from it."""
+"""The words of placement: cores, places and what units need of them. Rule: plain data, and what follows from it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,12 @@ FULL: Final = 1000
 
 
 class Core(NamedTuple):
-    """A core as the system counts them. `physical`: the same for siblings. `permille`: its speed, 1000 the fastest."""
+    """A core.
+
+    `number`: number by which the system counts it.
+    `physical`: number of the physical core, the same for siblings.
+    `permille`: speed in thousandths, 1000 for the fastest core.
+    """
 
     number: int
     physical: int
@@ -18,10 +23,11 @@ class Core(NamedTuple):
 
 
 class Work(NamedTuple):
-    """A frame's, on cores of full speed that the unit has to itself.
+    """The work of a unit for a frame, on cores of full speed that the unit has to itself.
 
-    `serial_ns`: how long the unit's jobs take. `core_ns`: how long they take each of its cores; less where a device
-    works. `jobs`: how many there are.
+    `serial_ns`: time of the unit's jobs.
+    `core_ns`: time that they take of each of its cores; less where a device works.
+    `jobs`: number of jobs.
     """
 
     serial_ns: int
@@ -30,33 +36,39 @@ class Work(NamedTuple):
 
 
 class Place(NamedTuple):
-    """`cores`, ascending, of a unit, and its `threads`: as many, or one that floats between them."""
+    """The place of a unit.
+
+    `cores`: numbers of its cores, ascending.
+    `threads`: number of its threads: one for each core, or one that floats between the cores.
+    """
 
     cores: tuple[int, ...]
     threads: int
 
 
-#: Unit to its place.
+#: The place of each unit.
 Placement = Mapping[str, Place]
-#: Unit, then threads, to what is known of it. A unit can have no other number of threads.
+#: The work of each unit by number of threads; a unit can have no other number of threads.
 Times = Mapping[str, Mapping[int, Work]]
 
 
 def shared_cores(placement: Placement) -> set[int]:
-    """Cores that more than one unit has."""
+    """Return the cores that more than one unit has."""
     used = [core for place in placement.values() for core in place.cores]
     return {core for core in used if used.count(core) > 1}
 
 
 def has_own_cores(unit: str, placement: Placement) -> bool:
-    """Whether no other unit has one of its cores: only then may its threads spin between jobs."""
+    """Return whether no other unit has one of its cores; only then may its threads spin between jobs."""
     return not shared_cores(placement) & set(placement[unit].cores)
 
 
 def busiest_core_ns(placement: Placement, core_ns: Mapping[str, float]) -> float:
-    """The work of the busiest core for a frame: what no way to divide the units' work among their cores avoids.
+    """Return the work of the busiest core for a frame in ns.
 
-    `core_ns`: of each unit, how long it takes each of its cores, or in all where it floats.
+    No division of the work among the units' cores avoids it.
+
+    `core_ns`: time that each unit takes of each of its cores, or of all together where it floats.
     """
     floating = [place.cores for place in placement.values() if place.threads < len(place.cores)]
     sets = {frozenset([core]) for place in placement.values() for core in place.cores}
@@ -70,7 +82,10 @@ def busiest_core_ns(placement: Placement, core_ns: Mapping[str, float]) -> float
 
 
 def share_ns(cores: tuple[int, ...], core_ns: float, floats: bool, these: frozenset[int]) -> float:
-    """What must be done on `these` cores of a load that takes `core_ns` of each of `cores`, or in all if it floats."""
+    """Return the part of a load that must be done on `these` cores, in ns.
+
+    The load takes `core_ns` of each of `cores`, or of all together if it floats.
+    """
     if floats:
         return core_ns if these.issuperset(cores) else 0.0
     return core_ns * len(these.intersection(cores))

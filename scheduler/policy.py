@@ -1,4 +1,4 @@
-"""The scheduling policies. Rule: a policy is a row of the table; what differs between policies differs here alone."""
+"""The scheduling policies. Rule: a policy is a row of the table; policies differ in their rows alone."""
 
 from __future__ import annotations
 
@@ -10,7 +10,11 @@ from trilane.unexpected_value import UnexpectedValue
 
 
 class Candidate(NamedTuple):
-    """A job that could start now. `position`: of its stage in the chain. `deadline_ns`: of its frame, or NEVER."""
+    """A job that could start now.
+
+    `position`: position of its stage in the chain.
+    `deadline_ns`: deadline of its frame, or NEVER.
+    """
 
     frame: int
     position: int
@@ -18,28 +22,30 @@ class Candidate(NamedTuple):
 
 
 def oldest_frame(candidates: Sequence[Candidate]) -> Candidate:
-    """Finish what was begun first: along a chain this keeps the buffers drained and the latency low."""
+    """Choose the frame that was begun first: along a chain this keeps the buffers drained and the latency low."""
     return min(candidates)
 
 
 def furthest_stage(candidates: Sequence[Candidate]) -> Candidate:
-    """What is nearest to the screen: newest-first would starve the later stages of a shared unit."""
+    """Choose the stage nearest to the screen: newest-first would starve the later stages of a shared unit."""
     return max(candidates, key=lambda c: c.position)
 
 
 def earliest_deadline(candidates: Sequence[Candidate]) -> Candidate:
-    """Earliest deadline first; ties go to the older frame."""
+    """Choose the earliest deadline; ties go to the older frame."""
     return min(candidates, key=lambda c: (c.deadline_ns, c.frame))
 
 
 @dataclass(frozen=True)
 class Policy:
-    """One row.
+    """One row of the table.
 
-    `choose`: which of its runnable jobs a shared unit takes. `in_flight`: frames between admission and presented, 0
-    for no limit of its own. `newest`: of the frames that wait for a stage the newest is taken, the others are stale.
-    `drop_late`: a frame that cannot make its deadline is dropped before its next stage. `lead_ns`: how long before
-    the expected end of its job a unit is handed the next; 0: as soon as there is one. `paced`: frames need a rate.
+    `choose`: function that says which of its runnable jobs a shared unit takes.
+    `in_flight`: limit of frames between admission and presentation; 0: no limit of its own.
+    `newest`: whether a stage takes the newest waiting frame, and the others are stale.
+    `drop_late`: whether a frame that cannot make its deadline is dropped before its next stage.
+    `lead_ns`: time before the expected end of its job at which a unit is handed the next; 0: as soon as there is one.
+    `paced`: whether frames need a rate.
     """
 
     choose: Callable[[Sequence[Candidate]], Candidate]
@@ -59,7 +65,7 @@ POLICIES = {
 
 
 def policy_named(name: str) -> Policy:
-    """The row of `POLICIES`. Raises UnexpectedValue."""
+    """Return the row of `POLICIES`; raises UnexpectedValue for an unknown name."""
     if name not in POLICIES:
         raise UnexpectedValue(f"policy {name!r}", f"one of {', '.join(POLICIES)}")
     return POLICIES[name]

@@ -1,4 +1,7 @@
-"""The steps of a run: events in, actions out. Rule: a replay gives the same actions, or says where it does not."""
+"""Records the steps of a run: events in, actions out.
+
+Rule: a replay gives the same actions, or says where it does not.
+"""
 
 from __future__ import annotations
 
@@ -28,12 +31,12 @@ from trilane.scheduler.unit_life import UnitLifeError
 from trilane.unexpected_value import UnexpectedValue
 
 SCHEMA = 7
-#: Actions that carry one tuple, which is written in their place.
+#: Actions that carry one tuple, whose fields are written in place of the action's own.
 CARRIED: dict[Any, Any] = {Dispatch: Job, Finish: Outcome}
 
 
 def _forms(kinds: tuple[Any, ...]) -> dict[str, tuple[Any, dict[str, Any]]]:
-    """Name -> the event or action, and its fields with their types, in the order of its row."""
+    """Return each event or action by name, with its fields and their types in the order of its row."""
     return {kind.__name__: (kind, get_type_hints(CARRIED.get(kind, kind))) for kind in kinds}
 
 
@@ -42,10 +45,10 @@ _EVENTS, _ACTIONS = _forms(EVENTS), _forms(ACTIONS)
 
 @dataclass
 class Recording:
-    """The steps of one run: (now_ns, events, actions).
+    """The steps of one run, as tuples (now_ns, events, actions).
 
-    `accounts`: (now_ns, unit, account) each time that a step left a unit with another account (ledger.py) than the step
-    before; not written, for a replay gives them again.
+    `accounts`: (now_ns, unit, account) for each step that left a unit with another account (ledger.py) than the step
+    before. They are not written, because a replay gives them again.
     """
 
     graph: Graph
@@ -63,7 +66,7 @@ class Recording:
                 self.accounts.append((unit.account_ns, unit.name, unit.account))
 
     def write(self, path: Path) -> None:
-        """As JSON lines (`header_line`, `step_line`)."""
+        """Write the recording as JSON lines (`header_line`, `step_line`)."""
         with path.open("w", encoding="utf-8") as file:
             file.write(header_line(self.graph, self.settings))
             for now_ns, events, actions in self.steps:
@@ -71,12 +74,15 @@ class Recording:
 
 
 def header_line(graph: Graph, settings: Settings) -> str:
-    """The first line of a recording: `schema`, `graph`, `settings`."""
+    """Return the first line of a recording: `schema`, `graph`, `settings`."""
     return json.dumps({"schema": SCHEMA, "graph": asdict(graph), "settings": asdict(settings)}) + "\n"
 
 
 def step_line(now_ns: int, events: Iterable[Event], actions: Iterable[Action]) -> str:
-    """The line of a step: `t`, `events`, `actions`; each of these an object of its name and its fields."""
+    """Return the line of a step, an object of `t`, `events` and `actions`.
+
+    Each event or action is an object of its name and its fields.
+    """
     told = [{"event": type(event).__name__, **_fields_of(event)} for event in events]
     answered = [{"action": type(action).__name__, **_fields_of(action)} for action in actions]
     return json.dumps({"t": now_ns, "events": told, "actions": answered}, separators=(",", ":")) + "\n"
@@ -88,7 +94,7 @@ def _fields_of(item: Any) -> dict[str, Any]:
 
 
 def read(path: Path) -> Recording:
-    """Raises BadInputError naming the line that is not part of a recording."""
+    """Return the recording at `path`; raises BadInputError naming the line that is not part of a recording."""
     number = 0
     try:
         with path.open(encoding="utf-8") as file:
@@ -96,7 +102,7 @@ def read(path: Path) -> Recording:
             if header["schema"] != SCHEMA:
                 raise ValueError(f"schema {header['schema']!r}; this Trilane reads {SCHEMA}")
             recording = Recording(graph_of(header["graph"]), settings_of(header["settings"]))
-            Core(recording.graph, recording.settings)  # says what is wrong with them
+            Core(recording.graph, recording.settings)  # raises an error that says what is wrong
             for number, line in enumerate(file, start=1):  # noqa: B007 - named in the message below
                 row = json.loads(line)
                 now_ns = row["t"]
@@ -117,9 +123,9 @@ def read(path: Path) -> Recording:
 
 
 def replay(recording: Recording) -> Iterator[str]:
-    """Feed the events to a fresh core; one sentence for every step that is answered differently.
+    """Feed the events to a fresh core, and yield one sentence for every step that is answered differently.
 
-    Raises BadInputError for events of units or frames that there are not, or that cannot happen to a unit then.
+    Raises BadInputError for events of unknown units or frames, and for events that cannot happen to a unit then.
     """
     core = Core(recording.graph, recording.settings)
     for now_ns, events, actions in recording.steps:
@@ -134,23 +140,26 @@ def replay(recording: Recording) -> Iterator[str]:
 
 
 def row_of(item: Event | Action) -> list[Any]:
-    """An event or action as it is written: its name and its fields."""
+    """Return an event or action as it is written: its name and its fields."""
     row: Any = item
     return [type(item).__name__, *(row[0] if type(item) in CARRIED else row)]
 
 
 def events_of(rows: Iterable[Sequence[Any]]) -> tuple[Event, ...]:
-    """The events that were written as `rows`. Raises UnexpectedValue for a row that is none."""
+    """Return the events that were written as `rows`; raises UnexpectedValue for a row that is none."""
     return tuple(_parse(row, _EVENTS) for row in rows)
 
 
 def actions_of(rows: Iterable[Sequence[Any]]) -> tuple[Action, ...]:
-    """The actions that were written as `rows`. Raises UnexpectedValue for a row that is none."""
+    """Return the actions that were written as `rows`; raises UnexpectedValue for a row that is none."""
     return tuple(_parse(row, _ACTIONS) for row in rows)
 
 
 def _listed(row: Mapping[str, Any], key: str, forms: dict[str, tuple[Any, dict[str, Any]]]) -> list[Any]:
-    """An object of a recording's line as a row. Raises UnexpectedValue for other fields than those of its name."""
+    """Return an object of a recording's line as a row.
+
+    Raises UnexpectedValue for other fields than those of its name.
+    """
     name = row[key]
     _, types = _form(name, forms)
     if row.keys() != {key, *types}:
@@ -159,14 +168,17 @@ def _listed(row: Mapping[str, Any], key: str, forms: dict[str, tuple[Any, dict[s
 
 
 def _form(name: Any, forms: dict[str, tuple[Any, dict[str, Any]]]) -> tuple[Any, dict[str, Any]]:
-    """Raises UnexpectedValue for a name that none of `forms` has."""
+    """Return the form of `name`; raises UnexpectedValue for a name that none of `forms` has."""
     if not isinstance(name, str) or name not in forms:
         raise UnexpectedValue(repr(str(name)[:80]), f"one of {', '.join(forms)}")
     return forms[name]
 
 
 def _parse(row: Sequence[Any], forms: dict[str, tuple[Any, dict[str, Any]]]) -> Any:
-    """Raises UnexpectedValue for a name, for types of fields or for a kind of outcome that none of `forms` has."""
+    """Return the event or action of a row.
+
+    Raises UnexpectedValue for a wrong name, type of a field or kind of outcome.
+    """
     name, *fields = row
     kind, hints = _form(name, forms)
     types = list(hints.values())
@@ -178,13 +190,13 @@ def _parse(row: Sequence[Any], forms: dict[str, tuple[Any, dict[str, Any]]]) -> 
 
 
 def graph_of(data: Mapping[str, Any]) -> Graph:
-    """The graph that was written as `data`. Raises KeyError and TypeError for one that is none."""
+    """Return the graph that was written as `data`; raises KeyError or TypeError for data that are none."""
     bypass = data["bypass"]
     ends = None if bypass is None else (bypass[0], bypass[1])
     return Graph(tuple(StageSpec(**stage) for stage in data["stages"]), tuple(data["edges"]), data["latency_to"], ends)
 
 
 def settings_of(data: Mapping[str, Any]) -> Settings:
-    """The settings that were written as `data`. Raises TypeError for data that are none."""
+    """Return the settings that were written as `data`; raises TypeError for data that are none."""
     fields: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in data.items()}
     return Settings(**fields)

@@ -1,4 +1,4 @@
-"""At what rate a run's frames are released, and by when each must be presented.
+"""Sets the rate at which a run's frames are released, and by when each must be presented.
 
 Rule: runs on this machine and runs in virtual time take their settings from here, so that a policy means the same on
 both clocks.
@@ -15,12 +15,13 @@ DEADLINE_PERIODS = 3  # from a frame's release until it must be presented
 
 
 def run_settings(policy: str, frames: int, scene_period_ns: int, forced_period_ns: int = 0, **others: Any) -> Settings:
-    """The settings of a run of `frames` frames.
+    """Return the settings of a run of `frames` frames.
 
-    `scene_period_ns`: of the scene's rate. Under `latest` and `deadline`, which need a rate, a frame is released so
-    often; under the others as soon as it can be taken.
-    `forced_period_ns`: releases frames so often under every policy; 0: as above.
+    `scene_period_ns`: period of the scene's rate in ns. Under `latest` and `deadline`, which need a rate, it is the
+    period of releases. Under other policies a frame is released as soon as it can be taken.
+    `forced_period_ns`: period of releases under every policy; 0: as above.
     `others`: further fields of Settings.
+
     Raises UnexpectedValue for an unknown policy.
     """
     period_ns = forced_period_ns or (scene_period_ns if policy_named(policy).paced else 0)

@@ -1,7 +1,9 @@
-"""Times of a run, of which there may be any number. Rule: exact while they are few, then a sketch, and it is said.
+"""Collects times of a run in any number.
 
-A sketch is a structure of bounded size that gives percentiles within a stated error. This folder knows none: who makes
-`Samples` of a run that may last for days gives one, of the others all values are kept.
+Rule: they are exact while they are few, then a sketch, and `is_exact` says so.
+
+A sketch is a structure of bounded size that gives percentiles within a stated error. This folder knows none: the maker
+of `Samples` provides one for a run that may last for days. Without one, all values are kept.
 """
 
 from __future__ import annotations
@@ -12,8 +14,9 @@ from typing import Final, Protocol
 
 from trilane.scheduler.stats import percentile, summary_row
 
+# At 8 bytes a value, runs of some minutes stay exact, and runs of days stay small (docs/decisions/journal.md).
 MOST_EXACT: Final = 20_000
-#: Of the kept values, so many go to the sketch with each further one, so that no step of the scheduler takes long.
+#: Number of kept values that go to the sketch with each further value, so that no step of the scheduler takes long.
 MOVED_AT_ONCE: Final = 4
 
 
@@ -21,22 +24,26 @@ class Sketch(Protocol):
     """Percentiles of any number of values."""
 
     def add(self, value: int) -> None:
-        """One more."""
+        """Add one value."""
         ...
 
     def percentile(self, share: float) -> float:
-        """The value that `share` of the values do not exceed, within the error of the sketch."""
+        """Return the value that `share` of the values do not exceed, within the error of the sketch."""
         ...
 
 
 class Samples:
     """Values in ns. `count`, `total` and `largest` are exact.
 
-    `is_exact`: whether all are in `kept`, in the order in which they came; else `kept` is on its way into the sketch.
+    `is_exact`: whether all values are in `kept`, in the order in which they came. Otherwise `kept` is on its way into
+    the sketch.
     """
 
     def __init__(self, sketch: Callable[[], Sketch] | None = None) -> None:
-        """`sketch`: makes the one that takes them once there are more than MOST_EXACT; None: all are kept."""
+        """Begin without values.
+
+        `sketch`: function that makes the sketch for more than MOST_EXACT values; None: all values are kept.
+        """
         self.count = self.total = self.largest = 0
         self.kept = array("q")
         self._make_sketch = sketch
@@ -48,11 +55,11 @@ class Samples:
 
     @property
     def mean(self) -> float:
-        """0 when there are none."""
+        """The mean in ns; 0 without values."""
         return self.total / self.count if self.count else 0.0
 
     def add(self, value: int) -> None:
-        """One more."""
+        """Add one value."""
         if value > self.largest or not self.count:
             self.largest = value
         self.count += 1
@@ -66,7 +73,7 @@ class Samples:
             self._sketch = self._make_sketch()
 
     def summary_ms(self) -> dict[str, float]:
-        """As `trilane.scheduler.stats.summary_ms` of all values."""
+        """Return `trilane.scheduler.stats.summary_ms` of all values."""
         sketch = self._sketch
         if sketch is None:
             ordered = sorted(self.kept)

@@ -1,4 +1,4 @@
-"""What the core remembers of stages, units and frames. Rule: fields and what follows from them; core.py decides.
+"""The core's memory of stages, units and frames. Rule: it holds fields and what follows from them; core.py decides.
 
 A time that is not set is NEVER.
 """
@@ -18,12 +18,18 @@ FULL_DUTY: Final = 1000
 
 
 class UnitState:
-    """`life`: its state by unit_life.py. `deadline_ns`: when what that state waits for is late.
+    """The state of one unit.
 
-    `queue`: the running job, then the one dispatched ahead. `queue_capacity`: how many jobs it may hold now, see
-    `update_queue_capacity`. `head_since_ns`: since when the running job could run. `hold_until_ns`: the end of the
-    pause that its duty asks for. `failures`: how often it died since it last ended a job. `account`: where the ledger
-    books its time now, and `account_ns`: since when.
+    `life`: state in the table of unit_life.py.
+    `deadline_ns`: time from which on the event that this state waits for is late.
+    `queue`: the running job, then the one dispatched ahead.
+    `queue_capacity`: number of jobs that it may hold now (`update_queue_capacity`).
+    `head_since_ns`: time since which the running job could run.
+    `hold_until_ns`: end of the pause that its duty asks for.
+    `duty`: share of the time for which it may work, in thousandths.
+    `failures`: number of its deaths since it last ended a job.
+    `account`: account of the ledger that gets its time now.
+    `account_ns`: time since which that account gets it.
     """
 
     __slots__ = (
@@ -62,11 +68,11 @@ class UnitState:
 
     @property
     def awaits_nothing(self) -> bool:
-        """Whether it is ready, has no job, and was not pinged: only a ping can tell whether it lives."""
+        """Whether it is ready, has no job and was not pinged, so that only a ping can tell whether it lives."""
         return self.life == READY and not self.queue and self.deadline_ns == NEVER
 
     def move(self, event: type, deadline_ns: int) -> bool:
-        """Take the table's row for `event`, from then on with `deadline_ns`; False: the event is ignored.
+        """Take the table's row for `event` and set `deadline_ns`; return False if the event is ignored.
 
         Raises UnitLifeError for an event that cannot happen now.
         """
@@ -77,14 +83,15 @@ class UnitState:
         return True
 
     def update_queue_capacity(self) -> None:
-        """To be called when `life`, `hold_until_ns` or `duty` was set, on which it depends."""
+        """Set `queue_capacity` from `life`, `hold_until_ns` and `duty`; call this after a change of any of them."""
         if self.life != READY or self.hold_until_ns != NEVER:
             self.queue_capacity = 0
         else:
+            # A capped unit pauses after each job, so it holds none ahead.
             self.queue_capacity = HELD_JOBS if self.duty == FULL_DUTY else 1
 
     def expected_end_ns(self) -> int:
-        """When the running job should end, by its stage's estimate. Raises IndexError when no job runs."""
+        """Return when the running job should end by its stage's estimate; raises IndexError when no job runs."""
         name = self.queue[0].stage
         for stage in self.stages:
             if stage.name == name:
@@ -93,9 +100,10 @@ class UnitState:
 
 
 class StageState:
-    """`estimate_ns`: running mean of its service time (weight 1/8), 0 before the first.
+    """The state of one stage.
 
-    `bypassed`: of the stage at which a bypass ends, the edge whose frames may skip to it.
+    `estimate_ns`: running mean of its service time in ns (weight 1/8); 0 before the first job.
+    `bypassed`: for the stage at which a bypass ends, the edge whose frames may skip to it.
     """
 
     __slots__ = ("bypassed", "estimate_ns", "input", "name", "output", "position", "unit")
@@ -112,15 +120,22 @@ class StageState:
         self.estimate_ns += (service_ns - self.estimate_ns) >> 3 if self.estimate_ns else service_ns
 
     def lower_estimate(self) -> None:
-        """By a sixteenth: it may rest on one slow job, and no job corrects it while every frame is given up."""
+        """Lower the estimate by a sixteenth.
+
+        It may rest on one slow job, and no job corrects it while every frame is given up.
+        """
         self.estimate_ns -= self.estimate_ns >> 4
 
 
 class FrameState:
-    """`position`: of its next stage. `release_ns`: when it was released. `ready_ns`: when its last stage ended.
+    """The state of one frame in flight.
 
-    `latency_ns`: from the pose to the composited frame, once known. `skips`: whether it takes the bypass. `rung`:
-    of its work.
+    `position`: position of its next stage.
+    `release_ns`: time of its release.
+    `ready_ns`: time at which its last stage ended.
+    `latency_ns`: time from the pose to the composited frame, once known.
+    `skips`: whether it takes the bypass.
+    `rung`: rung of its work.
     """
 
     __slots__ = ("deadline_ns", "latency_ns", "pose_ns", "position", "ready_ns", "release_ns", "rung", "skips")
@@ -132,9 +147,9 @@ class FrameState:
         self.skips = False
 
     def end_stage(self, position: int, latency_position: int, pose_ns: int, end_ns: int) -> None:
-        """The stage at `position` has ended; latency ends with the one at `latency_position`.
+        """Note that the stage at `position` has ended; latency ends with the stage at `latency_position`.
 
-        `pose_ns`: when the pose was sampled, which the first stage says.
+        `pose_ns`: time at which the first stage sampled the pose.
         """
         self.position, self.ready_ns = position + 1, end_ns
         if position == 0:
@@ -144,7 +159,7 @@ class FrameState:
 
 
 def build(graph: Graph) -> tuple[list[StageState], dict[str, UnitState], list[EdgeSlots]]:
-    """States of a graph, joined up. Raises ValueError for an unknown edge."""
+    """Return the joined states of a graph's stages, units and edges; raises ValueError for an unknown edge."""
     units = {name: UnitState(name) for name in graph.units}
     edges = [EdgeSlots(edge_rule(text)) for text in graph.edges]
     stages = []

@@ -1,4 +1,4 @@
-"""Summaries of times. Rule: exact percentiles of what was measured (linear between ranks), no bins."""
+"""Summaries of times. Rule: percentiles are exact for what was measured (linear between ranks), without bins."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ NS_PER_MS = 1e6
 CONFIDENCE = 0.95
 SCORE_PER_MS = 15.0
 LARGEST_ENERGY_MJ = 1500.0
-LARGEST_EXPONENT = 700.0  # e to it is still a number
+LARGEST_EXPONENT = 700.0  # e to this power is still a number
 
 
 def percentile(ordered: Sequence[int], share: float) -> float:
-    """Linear interpolation between the two nearest ranks of the sorted `ordered`; 0 when it is empty."""
+    """Interpolate linearly between the two nearest ranks of the sorted `ordered`; return 0 if it is empty."""
     if not ordered:
         return 0.0
     place = share * (len(ordered) - 1)
@@ -23,7 +23,7 @@ def percentile(ordered: Sequence[int], share: float) -> float:
 
 
 def summary_ms(values_ns: Iterable[int]) -> dict[str, float]:
-    """mean, p50, p90, p95, p99, max in milliseconds, all 0 when there are no values; `samples`: how many there are."""
+    """Return mean, p50, p90, p95, p99 and max in ms, all 0 without values, and the number of values as `samples`."""
     ordered = sorted(values_ns)
     return summary_row(
         len(ordered), sum(ordered), ordered[-1] if ordered else 0, lambda share: percentile(ordered, share)
@@ -31,7 +31,7 @@ def summary_ms(values_ns: Iterable[int]) -> dict[str, float]:
 
 
 def summary_row(count: int, total: int, largest: int, percentile_of: Callable[[float], float]) -> dict[str, float]:
-    """`summary_ms` of `count` values in ns, whose percentiles `percentile_of` gives in ns."""
+    """Return `summary_ms` of `count` values in ns. `percentile_of`: function that returns their percentiles in ns."""
     if not count:
         return dict.fromkeys(("mean", "p50", "p90", "p95", "p99", "max", "samples"), 0)
     ranks = {f"p{rank}": percentile_of(rank / 100) for rank in (50, 90, 95, 99)}
@@ -40,19 +40,19 @@ def summary_row(count: int, total: int, largest: int, percentile_of: Callable[[f
 
 
 def samples_needed(share: float) -> int:
-    """How many samples a percentile needs: so many that the largest of them exceeds it with 95 % confidence.
+    """Return how many samples a percentile needs, so that the largest of them exceeds it with 95 % confidence.
 
-    The least n with 1 - share^n >= 0.95: 29 for p90, 59 for p95, 299 for p99. With fewer, the samples themselves do not
-    show that they reach up to it. Wilks, Annals of Mathematical Statistics 12 (1941), 91-96.
+    This is the least n with 1 - share^n >= 0.95: 29 for p90, 59 for p95, 299 for p99. With fewer, the samples
+    themselves do not show that they reach up to it. Wilks, Annals of Mathematical Statistics 12 (1941), 91-96.
     """
     return ceil(log(1 - CONFIDENCE) / log(share))
 
 
 def median_interval(values: Sequence[float], confidence: float = 0.95) -> tuple[float, float]:
-    """Between which of the values the median of what they were drawn from lies, with at least that confidence.
+    """Return the two values between which the median of their distribution lies with at least `confidence`.
 
     By the sign test: the k-th least and the k-th largest, k the largest with P(B(n, 1/2) < k) <= (1 - confidence) / 2.
-    With too few values for that (below six for 0.95) the least and the largest. Raises ValueError for no values.
+    With too few values for that (below six for 0.95), the least and the largest. Raises ValueError for no values.
     """
     if not values:
         raise ValueError("no values")
@@ -64,7 +64,7 @@ def median_interval(values: Sequence[float], confidence: float = 0.95) -> tuple[
 
 
 def energy_score(frame_mj: float) -> float:
-    """(E - e) / E, e the millijoules of a frame, E = `LARGEST_ENERGY_MJ`: 1 for nothing, 0 for E and more.
+    """Return (E - e) / E, e the millijoules of a frame, E = `LARGEST_ENERGY_MJ`: 1 for nothing, 0 for E and more.
 
     Kwon et al., XRBench, MLSys 2023, section 3, with their E.
     """

@@ -1,6 +1,6 @@
 """The driver of simulated time. Rule: a heap keyed (t_ns, priority, seq) decides ties, so equal inputs give equal runs.
 
-The units are queues of jobs whose service times a callable gives; everything else is the real core.
+The units are queues of jobs whose service times come from a function; everything else is the real core.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ Service = Callable[[str, str, int, int], int]
 #: (frame, `Job.fresh`) -> whether the frame takes the bypass.
 Skips = Callable[[int, bool], bool]
 
-#: Priority at equal times; the core's deadline comes after both.
+#: Priorities at equal times; the core's deadline comes after both.
 FAULT: Final = 0
 EVENT: Final = 1
 
 
 def none_skips(_frame: int, _fresh: bool) -> bool:
-    """No frame does."""
+    """Return False: no frame takes the bypass."""
     return False
 
 
 @dataclass(frozen=True)
 class Simulation:
-    """What a simulated run hands back. `report` has the keys of report.json."""
+    """The result of a simulated run. `report` has the keys of report.json."""
 
     report: dict[str, Any]
     recording: Recording | None
@@ -58,7 +58,12 @@ class Simulation:
 
 @dataclass
 class _VirtualUnit:
-    """`up`: a process exists, starting or ready. `epoch` grows when it dies: events of an older epoch are void."""
+    """A simulated unit.
+
+    `up`: whether its process exists, starting or ready.
+    `free_ns`: time from which it can begin another job.
+    `epoch`: number of its deaths; events of an older epoch are void.
+    """
 
     up: bool = True
     free_ns: int = 0
@@ -82,17 +87,18 @@ class VirtualDriver:
         keep: bool = False,
         books: Books | None = None,
     ) -> None:
-        """All times are `int`, those of `service` too (no NumPy integers).
+        """Prepare a simulated run; all times are `int`, also those of `service` (no NumPy integers).
 
-        `graph`, `settings`: of the core.
-        `service`: gives the service time of each job.
-        `message_delay_ns`: of a message, each way.
-        `restart_ns`: a unit's start-up time.
-        `faults`: (t_ns, unit), deaths of units.
-        `inputs`: (t_ns, event), events from outside, such as SetDuty or Stop.
-        `skips`: which frames take the bypass of `graph`, if it has one.
-        `keep`: record steps, and the jobs that end.
-        `books`: of the core.
+        `graph`, `settings`: graph and settings of the core.
+        `service`: function that returns the service time of each job in ns.
+        `message_delay_ns`: delay of a message, each way.
+        `restart_ns`: start-up time of a unit.
+        `faults`: deaths of units, as pairs (t_ns, unit).
+        `inputs`: events from outside, such as SetDuty or Stop, as pairs (t_ns, event).
+        `skips`: function that says which frames take the bypass of `graph`, if it has one.
+        `keep`: whether to record steps and the jobs that end.
+        `books`: how the core accounts for the run.
+
         Raises ValueError for an unknown policy or edge.
         """
         self.core = Core(graph, settings, books)
@@ -113,7 +119,7 @@ class VirtualDriver:
             self._push(at_ns, FAULT, event)
 
     def run(self) -> Outcome:
-        """Until the core finishes. Raises RuntimeError when nothing can ever happen again."""
+        """Run until the core finishes; raises RuntimeError when nothing can ever happen again."""
         collects = gc.isenabled()
         gc.disable()  # a run makes no cycles, and looking for them takes a tenth of its time
         try:
@@ -123,7 +129,7 @@ class VirtualDriver:
                 gc.enable()
 
     def wait(self, deadline_ns: int) -> tuple[int, tuple[Event, ...]]:
-        """The next valid event, or none at the core's deadline when that comes first."""
+        """Return the next valid event, or none at the core's deadline if that comes first."""
         heap = self._heap
         while heap and heap[0][0] <= deadline_ns:
             at_ns, _, _, event, epoch = heappop(heap)
@@ -196,11 +202,12 @@ def simulate(
     keep: bool = False,
     **driver: Any,
 ) -> Simulation:
-    """Run to the end.
+    """Simulate a run to its end.
 
-    `graph`, `settings`, `service`, `keep`, `driver`: see VirtualDriver.
-    `target_period_ns`: see `trilane.scheduler.ledger.Books`.
-    Raises ValueError for an unknown policy or edge, RuntimeError when nothing can ever happen again.
+    `graph`, `settings`, `service`, `keep`, `driver`: arguments of VirtualDriver.
+    `target_period_ns`: as in `trilane.scheduler.ledger.Books`.
+
+    Raises ValueError for an unknown policy or edge, and RuntimeError when nothing can ever happen again.
     """
     virtual = VirtualDriver(graph, settings, service, keep=keep, books=Books(target_period_ns), **driver)
     outcome = virtual.run()

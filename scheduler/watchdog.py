@@ -1,4 +1,4 @@
-"""Which units' time is up, and when the next one's will be. Rule: it looks and answers; the core carries it out."""
+"""Finds the units whose time is up, and when the next one's will be. Rule: it only answers; the core acts."""
 
 from __future__ import annotations
 
@@ -16,12 +16,15 @@ START: Final = 2
 RESUME: Final = 3
 LOOK: Final = 4
 
-#: Wait before a restart, by failures in a row without a finished job between; the last repeats.
+#: Waits before a restart, by the number of failures in a row without a finished job; the last repeats.
 BACK_OFF_NS = (0, 100_000_000, 400_000_000, 1_600_000_000)
 
 
 def verdict(unit: UnitState, now_ns: int, lead_ns: int) -> int:
-    """What is to be done with the unit now. `lead_ns`: of the policy; with one, the unit's next job may be due."""
+    """Return what is to be done with the unit now.
+
+    `lead_ns`: lead of the policy; with a lead, the unit's next job may be due.
+    """
     if unit.deadline_ns <= now_ns:
         return START if unit.life == DOWN else KILL
     if unit.hold_until_ns <= now_ns:
@@ -30,9 +33,9 @@ def verdict(unit: UnitState, now_ns: int, lead_ns: int) -> int:
 
 
 def next_alarm_ns(units: Iterable[UnitState], now_ns: int, lead_ns: int) -> int:
-    """When the first verdict that is not NOTHING is due, or NEVER.
+    """Return when the first verdict other than NOTHING is due, or NEVER.
 
-    No verdict can be due earlier until a deadline or a hold is set: a job's end and a Pong only put deadlines off.
+    Until a deadline or a hold is set, no verdict can be due earlier: a job's end and a Pong only put deadlines off.
     """
     alarm_ns = NEVER
     for unit in units:
@@ -45,12 +48,12 @@ def next_alarm_ns(units: Iterable[UnitState], now_ns: int, lead_ns: int) -> int:
 
 
 def back_off_ns(failures: int) -> int:
-    """How long a unit stays down after so many failures in a row, 1 or more."""
+    """Return how long a unit stays down after `failures` failures in a row, 1 or more."""
     return BACK_OFF_NS[min(failures, len(BACK_OFF_NS)) - 1]
 
 
 def extended_deadline_ns(unit: UnitState, ns: int) -> int:
-    """The unit's deadline after the scheduler did nothing for `ns`: it has as much longer. A restart is not put off."""
+    """Return the unit's deadline, put off by the `ns` for which the scheduler did nothing; a restart is not put off."""
     if unit.deadline_ns == NEVER or unit.life not in (STARTING, READY):
         return unit.deadline_ns
     return unit.deadline_ns + ns

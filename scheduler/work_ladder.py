@@ -1,15 +1,22 @@
-"""How much work a frame is given, so that it is in time. Rule: measured times decide; less work at once, more late.
+"""Chooses how much work a frame gets, so that it is in time.
 
-A ladder has rungs: 0 is all the work, each further one is less of it, at the price of a worse picture. Some stages take
-less time for less work (the network), the others are taken to need the same. What a stage takes on a rung is what it
-took there alone (`set_alone`; where that is not known, in proportion to the work), times its load: how many times as
-long its last jobs took as alone, in the median of three, so that one slow job decides nothing.
+Rule: measured times decide; less work is chosen at once, more work only later. A ladder has rungs: rung 0 is all the
+work, and each further rung is less work at the price of a worse picture. Some stages take less time for less work (the
+network); the others are taken to need the same time.
 
-The use of a rung is the largest of: each unit's time for a frame as a share of the period, and the time of all stages
-as a share of the deadline. The rung is the first whose use is at most `FULL`; where there is none, the first that no
-other betters by more than a twentieth, so that no work is left out that saves nothing. It is stepped down to at once.
-One rung up is taken after as many frames as `patience` in which the use of that rung was at most `ROOM`; a step up that
-did not last as long doubles the patience, up to `MOST_PATIENCE`.
+The time of a stage on a rung is the time that it took there alone, times its load. The time alone comes from
+`set_alone`, or else is proportional to the work. The load is the ratio of the stage's time to its time alone. The
+median over its last three jobs counts, so that one slow job decides nothing.
+
+The use of a rung is the larger of two shares:
+- the busiest unit's time for a frame, as a share of the period;
+- the time of all stages, as a share of the deadline.
+
+The wanted rung is the first whose use is at most `FULL`. Without such a rung it is the first that no other betters by
+more than a twentieth, because less work would then save nothing.
+
+The ladder steps down at once. It takes one step up after `patience` frames in which the use of the rung above was at
+most `ROOM`. A step up that did not last as long doubles the patience, up to `MOST_PATIENCE`.
 """
 
 from __future__ import annotations
@@ -31,7 +38,11 @@ TWENTIETH: Final = 20
 
 
 class WorkLadder:
-    """`rung`: of the frames that begin from now on. `patience`: frames until the next step up."""
+    """The ladder of a run.
+
+    `rung`: rung of the frames that begin from now on.
+    `patience`: number of frames until the next step up.
+    """
 
     def __init__(
         self,
@@ -41,12 +52,13 @@ class WorkLadder:
         period_ns: int,
         deadline_ns: int,
     ) -> None:
-        """The one of a run, at rung 0.
+        """Begin at rung 0.
 
-        `stages`: the chain.
-        `works`: of each rung in thousandths, ALL first, falling.
+        `stages`: stages of the chain.
+        `works`: work of each rung in thousandths, ALL first, falling.
         `follow`: names of the stages whose time follows the work.
-        `period_ns`: of frames, more than 0. `deadline_ns`: from a frame's release until it is presented; 0: none.
+        `period_ns`: period of frames, more than 0.
+        `deadline_ns`: longest time from a frame's release to its presentation; 0: none.
         """
         self.rung = 0
         self.patience = PATIENCE
@@ -60,20 +72,20 @@ class WorkLadder:
         self._since_up = MOST_PATIENCE
 
     def set_alone(self, position: int, rung: int, service_ns: int) -> None:
-        """What the stage at `position` takes on `rung`, alone. To be said of all rungs, or of none."""
+        """Set the time that the stage at `position` takes on `rung` alone; to be called for all rungs or for none."""
         self._alone[position][rung] = max(service_ns, 1)
 
     def learn(self, position: int, rung: int, service_ns: int) -> None:
-        """The stage at `position` took so long for a frame that began on `rung`."""
+        """Note that the stage at `position` took `service_ns` for a frame that began on `rung`."""
         self._loads[position].append(service_ns * LOAD_ONE // self._alone[position][rung])
 
     def service_ns(self, position: int, rung: int) -> int:
-        """What the stage at `position` would take now on `rung`; 0 before its first job."""
+        """Return the time that the stage at `position` would take now on `rung`; 0 before its first job."""
         loads = sorted(self._loads[position])
         return self._alone[position][rung] * loads[len(loads) // 2] // LOAD_ONE if loads else 0
 
     def use(self, rung: int) -> int:
-        """The use of `rung`, in thousandths."""
+        """Return the use of `rung` in thousandths."""
         of_units: dict[str, int] = {}
         for stage in self._stages:
             name = stage.unit.name
@@ -84,7 +96,7 @@ class WorkLadder:
         return max(busiest, sum(of_units.values()) * ALL // self._deadline_ns)
 
     def consider(self) -> bool:
-        """Choose the rung, once for each frame that was measured; whether it is another now."""
+        """Choose the rung, once for each frame that was measured, and return whether it changed."""
         uses = [self.use(rung) for rung in range(self._rungs)]
         wanted = _first_that_does(uses)
         self._since_up += 1
@@ -102,7 +114,7 @@ class WorkLadder:
 
 
 def _first_that_does(uses: Sequence[int]) -> int:
-    """The rung with the most work whose use is at most `FULL`; without one, the first about as good as the best."""
+    """Return the first rung whose use is at most `FULL`; without one, the first that is about as good as the best."""
     for rung, use in enumerate(uses):
         if use <= FULL:
             return rung

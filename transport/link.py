@@ -1,11 +1,11 @@
 """One end of the connection between the scheduler and a unit: the job pipe and the heartbeat socket together.
 
-What must keep its order (jobs and their answers) goes over the job pipe; heartbeats have a way of their own, so that
+Jobs and their answers must keep their order, so they go over the job pipe. Heartbeats have a way of their own, so that
 neither delays the other. Neither end ever waits for the other: a heartbeat that the other end does not read is dropped.
 
-The folder of a unit's ZeroMQ socket is private, and there only until the unit has connected: a connection lives on
-without the name of its socket. A parent that is killed before that leaves its folder behind; the next run finds that
-nobody holds the folder's lock, and removes it.
+The folder of a unit's ZeroMQ socket is private. It exists only until the unit has connected, because a connection does
+not need the name of its socket. A parent that is killed before that leaves its folder behind. The next run finds that
+nobody holds the folder's lock, and removes the folder.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from trilane.transport.wakeup import SHORTEST_NS, use_slice
 
 PREFIX = "trilane-"
 LOCK = "lock"
-MAX_PATH = 80  # bytes of the folder's path; the path of a Unix socket inside it may have 108
+MAX_PATH = 80  # of the folder's path; the path of a Unix socket inside it may have 108
 
 
 class SocketFolder:
@@ -57,7 +57,7 @@ class SocketFolder:
 
 
 def remove_abandoned(base: Path) -> None:
-    """Remove this user's socket folders in `base` whose owner has ended, which are those whose lock is free."""
+    """Remove this user's socket folders in `base` whose owner has ended; their lock is free."""
     for folder in base.glob(f"{PREFIX}*"):
         with contextlib.suppress(OSError):
             if folder.is_symlink() or folder.stat().st_uid != os.getuid():
@@ -81,7 +81,7 @@ class HeartbeatSocket:
     """
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], linger_ms: int = 0) -> None:
-        """A socket of `context`. On closing it tries for `linger_ms` to deliver what was sent."""
+        """Make a socket of `context`, which tries for `linger_ms` ms after its closing to deliver what was sent."""
         self.socket: zmq.Socket[bytes] = context.socket(zmq.PAIR)
         self.socket.setsockopt(zmq.LINGER, linger_ms)
         self.socket.setsockopt(zmq.MAXMSGSIZE, MAX_BYTES)
@@ -89,18 +89,18 @@ class HeartbeatSocket:
         self.socket.setsockopt(zmq.RCVHWM, HIGH_WATER)
 
     def fileno(self) -> int:
-        """Readable when the socket may have messages: then `receive` is to be called."""
+        """Return a descriptor that is readable when the socket may have messages; then call `receive`."""
         return self.socket.fileno()
 
     def send(self, message: Heartbeat) -> None:
-        """Send without waiting. Does nothing when the other end has stopped reading."""
+        """Send without waiting; does nothing when the other end has stopped reading."""
         with contextlib.suppress(zmq.Again):
             self.socket.send(pack(message), zmq.DONTWAIT)
 
     def receive(self) -> list[Message]:
-        """All messages that have come since the last call. Raises MessageError for bytes that are no message."""
+        """Return all messages since the last call; raises MessageError for bytes that are no message."""
         messages = []
-        while self.socket.poll(0):  # until it is empty: ZeroMQ's descriptor does not become readable again before
+        while self.socket.poll(0):  # until it is empty: before that, ZeroMQ's descriptor does not become readable again
             messages.append(unpack(self.socket.recv(zmq.DONTWAIT)))
         return messages
 
@@ -109,10 +109,10 @@ class HeartbeatSocket:
 
 
 def context_on_cores(cores: Sequence[int]) -> zmq.Context[zmq.Socket[bytes]]:
-    """A ZeroMQ context for a unit, whose I/O thread runs on `cores` and preempts other work there when it is woken.
+    """Return a ZeroMQ context for a unit, whose I/O thread runs on `cores` and preempts other work there when it wakes.
 
-    On the unit's own cores that thread would wait behind the unit's next job. Call it from the thread that makes the
-    first socket: the I/O thread inherits the short time slice that this function sets, and the caller keeps it too.
+    On the unit's own cores that thread would wait behind the unit's next job. Call this from the thread that makes the
+    first socket. The I/O thread inherits the short time slice set here, and the caller keeps it too.
     """
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     for core in cores:
@@ -122,15 +122,15 @@ def context_on_cores(cores: Sequence[int]) -> zmq.Context[zmq.Socket[bytes]]:
 
 
 class Link:
-    """`job_pipe` and `heartbeat_socket` of one end. Messages of each arrive in order or not at all."""
+    """The `job_pipe` and the `heartbeat_socket` of one end; messages of each arrive in order or not at all."""
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], job_pipe: JobPipe, linger_ms: int = 0) -> None:
-        """Takes over `job_pipe`; `context` and `linger_ms` are those of `HeartbeatSocket`."""
+        """Take over `job_pipe`; `context` and `linger_ms` are those of `HeartbeatSocket`."""
         self.job_pipe = job_pipe
         self.heartbeat_socket = HeartbeatSocket(context, linger_ms)
 
     def bind(self, endpoint: str) -> None:
-        """Wait for the unit's heartbeats at `endpoint` (the scheduler's end)."""
+        """Receive the unit's heartbeats at `endpoint` (the scheduler's end)."""
         self.heartbeat_socket.socket.bind(endpoint)
 
     def connect(self, endpoint: str) -> None:
@@ -139,15 +139,15 @@ class Link:
 
     @property
     def heartbeat_fd(self) -> int:
-        """A descriptor that is readable when `heartbeats` is to be called."""
+        """A descriptor that is readable when `heartbeats` should be called."""
         return self.heartbeat_socket.fileno()
 
     def send_heartbeat(self, message: Heartbeat) -> None:
-        """Send without waiting. Does nothing when the other end has stopped reading."""
+        """Send without waiting; does nothing when the other end has stopped reading."""
         self.heartbeat_socket.send(message)
 
     def heartbeats(self) -> list[Message]:
-        """All heartbeats since the last call. Raises MessageError for bytes that are no message."""
+        """Return all heartbeats since the last call; raises MessageError for bytes that are no message."""
         return self.heartbeat_socket.receive()
 
     def close(self) -> None:

@@ -1,9 +1,11 @@
 """A window into a run that goes on: the newest picture out, the camera's steering in. Rule: nobody waits for anybody.
 
-One region of memory without a name (memfd), which every process maps. Who looks notes when; the presenting stage
-copies a picture in only while somebody has looked lately. Two buffers take turns: a reader that finds its buffer's
-number changed under it reads the other. Numbers are 8 bytes on an address that is a multiple of 8, so each is read and
-written in one piece; processors that reorder writes may show a torn picture, never a wrong run.
+The window is one region of memory without a name (memfd), which every process maps. A viewer notes when it looks; the
+presenting stage copies a picture in only while somebody has looked lately. Two buffers take turns: a reader that finds
+its buffer's number changed under it reads the other.
+
+Each number has 8 bytes at an address that is a multiple of 8, so it is read and written in one piece. A processor that
+reorders writes may show a torn picture, but cannot disturb the run.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from numpy.typing import NDArray
 
 from trilane.transport.packets import PAGE
 
-LOOKED_NS: Final = 500_000_000  # after the last look nobody looks any more
+LOOKED_NS: Final = 500_000_000  # time after the last look from which nobody counts as looking
 TRIES: Final = 3
 CLOSED: Final = -1
 
@@ -39,7 +41,11 @@ _HEAD: Final = np.dtype(
 
 
 class Steering(NamedTuple):
-    """How far the camera is turned about what it looks at, in degrees, and how many times nearer it is."""
+    """How the camera is turned about its target, and how much nearer it is.
+
+    `azimuth_deg`, `elevation_deg`: turns about the target in degrees.
+    `zoom`: factor by which the camera is nearer.
+    """
 
     azimuth_deg: float = 0.0
     elevation_deg: float = 0.0
@@ -47,7 +53,12 @@ class Steering(NamedTuple):
 
 
 class ShownPicture(NamedTuple):
-    """A picture (height, width, 3), RGB, of `frame`: the scene at `media_s`, whose pose was sampled at `sampled_ns`."""
+    """A picture of `frame`.
+
+    `media_s`: time of the scene in seconds.
+    `sampled_ns`: time at which its pose was sampled.
+    `pixels`: RGB picture (height, width, 3).
+    """
 
     frame: int
     media_s: float
@@ -56,7 +67,7 @@ class ShownPicture(NamedTuple):
 
 
 def create_window(height: int, width: int) -> int:
-    """A descriptor of a new window for pictures of that size. Raises OSError."""
+    """Return a descriptor of a new window for pictures of that size; raises OSError."""
     fd = os.memfd_create("trilane:window", os.MFD_CLOEXEC)
     try:
         os.posix_fallocate(fd, 0, PAGE + 2 * height * width * 3)
@@ -68,7 +79,7 @@ def create_window(height: int, width: int) -> int:
 
 
 def path_of(fd: int) -> Path:
-    """The path by which another process of this user opens the window, while this one has it open."""
+    """Return the path by which another process of this user opens the window, while this process has it open."""
     return Path(f"/proc/{os.getpid()}/fd/{fd}")
 
 
@@ -88,26 +99,26 @@ class LiveWindow:
 
     @classmethod
     def opened(cls, path: Path, height: int, width: int) -> LiveWindow:
-        """The window at `path`. Raises OSError."""
+        """Return the window at `path`; raises OSError."""
         fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         try:
             return cls(fd, height, width)
         finally:
             os.close(fd)
 
-    # by who looks
+    # for whoever looks
 
     def look(self) -> None:
-        """Pictures are wanted for a while from now on."""
+        """Ask for pictures for a while from now on."""
         self._head["looked_ns"] = time.monotonic_ns()
 
     def steer(self, steering: Steering) -> None:
-        """The camera stands so from the next frame on."""
+        """Steer the camera from the next frame on."""
         for name, value in zip(Steering._fields, steering, strict=True):
             self._head[name] = value
 
     def newest(self, had: int) -> ShownPicture | None:
-        """The newest picture; None when there is none, or it is of frame `had`."""
+        """Return the newest picture; None when there is none, or it is of frame `had`."""
         for _ in range(TRIES):
             side = int(self._head["newest"][0]) & 1
             number = int(self._head["number"][0, side])
@@ -120,7 +131,7 @@ class LiveWindow:
                 return ShownPicture(frame, *times, pixels)
         return None
 
-    # by the run
+    # for the run
 
     @property
     def is_looked_at(self) -> bool:
@@ -131,9 +142,10 @@ class LiveWindow:
         return Steering(*(float(self._head[name][0]) for name in Steering._fields))
 
     def show(self, frame: int, media_s: float, sampled_ns: int, pixels: NDArray[np.uint8]) -> None:
-        """`pixels` (height, width, 3) is the newest picture."""
+        """Make `pixels` (height, width, 3) the newest picture."""
         side = 1 - (int(self._head["newest"][0]) & 1)
         number = int(self._head["number"][0, 1 - side])
+        # Marked first: a reader that still copies this buffer then finds its number changed.
         self._head["number"][0, side] = CLOSED
         self._pixels[side] = pixels
         self._head["frame"][0, side], self._head["media_s"][0, side] = frame, media_s

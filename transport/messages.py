@@ -1,9 +1,9 @@
 """The messages between the scheduler and its units, and the job pipe over which jobs and their answers go.
 
-There is a fixed list of messages with typed fields; anything else is refused. The bytes of a message: one byte that
-says which message it is, its integer fields with 64 bits each, and at the end, packed with msgpack, the field of
-another type. That last part is left out when the field is empty. Integers are not packed with msgpack because reading
-them would then take twice the time in a process that has just been woken. Nothing is ever pickled.
+There is a fixed list of messages with typed fields; anything else is refused. The first byte of a message says which
+message it is. Its integer fields follow with 64 bits each. At the end comes the field of another type, packed with
+msgpack, or nothing when that field is empty. Integers are not packed with msgpack, because reading them would then take
+twice the time in a process that has just been woken. Nothing is ever pickled.
 
 A job pipe is two pipes, one each way, in packet mode (O_DIRECT of pipe(2)), in which every read returns one whole
 message. One message wakes one process, with no thread between. Heartbeats do not go over it (see
@@ -22,22 +22,26 @@ import msgpack
 
 from trilane.errors import TrilaneError, reason
 
-MAX_BYTES = 4096  # of a message: a pipe takes no more in one piece (PIPE_BUF of pipe(7))
+MAX_BYTES = 4096  # of a message; a pipe takes no more in one piece (PIPE_BUF of pipe(7))
 MAX_TEXT = 2000  # bytes of UTF-8 in `Failed.message`
 
 
 class MessageError(ValueError):
-    """Bytes that are none of the messages."""
+    """The bytes are no known message."""
 
 
 class RunJob(NamedTuple):
     """To a unit: run one of its stages for one frame.
 
-    `id`: of the job; its answer, `Done` or `Failed`, carries the same. `stage`: place in the unit's list of stages,
-    from 0. `slot_in`, `slot_out`: slots of the stage's edges, -1 where it has no such edge; where a bypass ends, those
-    of the bypassed edge are counted after the stage's own. `epoch`: of `slot_out`. `t_dispatch_ns`: since when the unit
-    has the job, in ns of CLOCK_MONOTONIC. `fresh`: 1 when the stage must not count on earlier frames, else 0. `rung`:
-    of the frame's work, 0 for all of it.
+    `id`: number of the job; its answer, `Done` or `Failed`, carries the same number.
+    `stage`: place in the unit's list of stages, from 0.
+    `frame`: number of the frame.
+    `slot_in`, `slot_out`: slots of the stage's edges, -1 where it has no such edge. Where a bypass ends, the slots of
+    the bypassed edge follow the stage's own.
+    `epoch`: epoch of `slot_out`.
+    `t_dispatch_ns`: time since which the unit has the job, in ns of CLOCK_MONOTONIC.
+    `fresh`: 1 when the stage must ignore what earlier frames left behind, else 0.
+    `rung`: rung of the frame's work, 0 for all of it.
     """
 
     id: int
@@ -60,19 +64,21 @@ class Close(NamedTuple):
 
 
 class Ready(NamedTuple):
-    """From a unit, as a heartbeat: its stages are built and their slots are bound. `pid`: of its process."""
+    """From a unit, as a heartbeat: its stages are built and their slots are bound. `pid`: its process id."""
 
     pid: int
 
 
 class Done(NamedTuple):
-    """From a unit: the job `id` has ended. Times in ns of CLOCK_MONOTONIC.
+    """From a unit: the job `id` has ended; times in ns of CLOCK_MONOTONIC.
 
-    `t_sampled_ns`: of the chain's first stage, when it sampled the frame's input; of the others 0. `preempted_ns`,
-    `asleep_ns`: parts of the job in which the unit had no core, and in which nothing of it worked.
-    `preempted_before_ns`: how long it had no core between the job before and this one. `skips`: 1 when the frame takes
-    the pipeline's bypass, else 0. `cpu_ns`, `cpu_before_ns`: CPU time of all its threads in the job, and between the
-    job before and this one. `metrics`: numbers that the stage itself reports of the job, by name.
+    `t_sampled_ns`: time at which the chain's first stage sampled the frame's input; 0 for other stages.
+    `preempted_ns`: part of the job in which the unit had no core.
+    `asleep_ns`: part of the job in which nothing of the unit worked.
+    `preempted_before_ns`: time in which it had no core between the job before and this one.
+    `skips`: 1 when the frame takes the pipeline's bypass, else 0.
+    `cpu_ns`, `cpu_before_ns`: CPU time of all its threads in the job, and between the job before and this one.
+    `metrics`: numbers that the stage itself reports of the job, by name.
     """
 
     id: int
@@ -91,8 +97,9 @@ class Done(NamedTuple):
 class Failed(NamedTuple):
     """From a unit: something raised an error.
 
-    `id`: of the job, or BUILDING or CLOSING when it was none. `exit_code`: that the error asks the program
-    to end with. `message`: for people, at most MAX_TEXT bytes.
+    `id`: number of the job; BUILDING or CLOSING outside a job.
+    `exit_code`: exit code that the error asks the program to end with.
+    `message`: text for people, at most MAX_TEXT bytes.
     """
 
     id: int
@@ -110,7 +117,7 @@ class Closed(NamedTuple):
 
 Heartbeat = Ready | Pong
 Message = RunJob | Ping | Close | Ready | Done | Failed | Pong | Closed
-#: `Failed.id` of an error outside a job: while stages were built, while they were closed.
+#: `Failed.id` of an error outside a job: while stages are built, and while they are closed.
 BUILDING, CLOSING = -1, -2
 
 #: A message's place here is its first byte.
@@ -121,7 +128,9 @@ _PACKER = msgpack.Packer()  # one for the process: making one costs more than pa
 class _Form(NamedTuple):
     """How a kind of message is written as bytes.
 
-    `code`: its first byte. `integers`: its integer fields. `rest`: the type of its last field if that is no integer.
+    `code`: first byte of the message.
+    `integers`: format of its integer fields.
+    `rest`: type of its last field if that is no integer.
     """
 
     kind: Any
@@ -142,9 +151,9 @@ _FORM_OF = {form.kind: form for form in _FORMS}
 
 
 def pack(message: Message) -> bytes:
-    """The bytes of `message`.
+    """Return the bytes of `message`.
 
-    Raises struct.error for an integer of more than 64 bits, MessageError when it has more than MAX_BYTES.
+    Raises struct.error for an integer of more than 64 bits, and MessageError for more than MAX_BYTES bytes.
     """
     _, code, integers, rest = _FORM_OF[type(message)]
     fields: tuple[Any, ...] = message
@@ -159,7 +168,10 @@ def pack(message: Message) -> bytes:
 
 
 def unpack(data: bytes | memoryview) -> Message:
-    """The message whose bytes are `data`. Raises MessageError when they are no message or a field has a wrong type."""
+    """Return the message whose bytes are `data`.
+
+    Raises MessageError for bytes that are no message or a field of a wrong type.
+    """
     if not data or data[0] >= len(_FORMS):
         raise MessageError(f"unknown message {bytes(data[:80])!r}")
     kind, _, integers, rest = _FORMS[data[0]]
@@ -187,7 +199,7 @@ def _are_metrics(rest: Any) -> bool:
     return type(rest) is dict and all(type(key) is str and type(value) in (int, float) for key, value in rest.items())
 
 
-PACKETS = 16  # messages that a pipe holds: a page each, of the 64 KiB that Linux gives a pipe
+PACKETS = 16  # messages that a pipe holds; each takes a page of the 64 KiB that Linux gives a pipe
 
 
 class JobPipeEnd(NamedTuple):
@@ -202,7 +214,7 @@ class JobPipeEnd(NamedTuple):
 
 
 def job_pipe_pair() -> tuple[JobPipeEnd, JobPipeEnd]:
-    """The two ends of a new job pipe. Raises TrilaneError when this user or this process may open no more pipes."""
+    """Return the two ends of a new job pipe; raises TrilaneError when this user or process may open no more pipes."""
     fds: list[int] = []
     try:
         for _ in range(2):
@@ -220,8 +232,8 @@ def job_pipe_pair() -> tuple[JobPipeEnd, JobPipeEnd]:
 class JobPipe:
     """One end of a job pipe. Messages arrive in order or not at all.
 
-    `waits`: `receive` waits until there is a message. `ended`: the other end is closed, and every message that it sent
-    has been received.
+    `waits`: whether `receive` waits until there is a message.
+    `ended`: whether the other end is closed and every message that it sent has been received.
     """
 
     def __init__(self, end: JobPipeEnd, *, waits: bool = False) -> None:
@@ -232,13 +244,13 @@ class JobPipe:
         os.set_blocking(end.writes, False)
 
     def fileno(self) -> int:
-        """Readable when `receive` has something to return, or when the other end is closed."""
+        """Return a descriptor that is readable when `receive` has something to return or the other end is closed."""
         return self._reads
 
     def send(self, message: Message) -> None:
-        """Send without waiting. Does nothing when the other end is closed or its pipe is full.
+        """Send without waiting; does nothing when the other end is closed or its pipe is full.
 
-        The scheduler learns of such a unit by the end of its process or by a missed deadline.
+        The scheduler learns of such a unit from the end of its process or from a missed deadline.
         """
         try:
             os.write(self._writes, pack(message))
@@ -246,7 +258,7 @@ class JobPipe:
             return
 
     def receive(self) -> Message | None:
-        """The next message; None when none has come (if this end does not wait) or the other end is closed.
+        """Return the next message; None when the other end is closed, or when none has come and this end does not wait.
 
         Raises MessageError for bytes that are no message.
         """

@@ -1,12 +1,12 @@
-"""The packets that pass between stages, and the shared memory that they live in.
+"""Lays out the packets that pass between stages, and the shared memory that they live in.
 
-One slot is one header, then the payload; stages get views of a slot, never copies. Every header begins with
+One slot holds one header, then the payload; stages get views of a slot, never copies. Every header begins with
 `FRAME_FIELDS`, which the unit's loop fills in; the other fields are the pipeline's own. Everything that a later stage
 needs to know about a frame travels in its packet; no stage asks another.
 
-There is one region of memory per edge, without a name (memfd) and of a fixed size. The parent makes the regions and
-keeps their descriptors; its children inherit and map them. The kernel frees a region when the last process that has it
-ends, however it ends.
+Each edge has one region of memory without a name (memfd), of a fixed size. The parent makes the regions and keeps their
+descriptors; its children inherit and map them. The kernel frees a region when the last process that has it ends,
+however it ends.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from trilane.arrays import U8
 from trilane.errors import TrilaneError, reason
 
 PAGE = 4096
-#: `frame`: number from 0. `t_sampled_ns`: CLOCK_MONOTONIC, when the frame's input was sampled: latency begins there.
-#: `epoch`: of the slot, see `trilane.transport.slots`.
+#: `frame`: number from 0. `t_sampled_ns`: time on CLOCK_MONOTONIC at which the frame's input was sampled, where latency
+#: begins. `epoch`: epoch of the slot (`trilane.transport.slots`).
 FRAME_FIELDS = (("frame", "<u8"), ("t_sampled_ns", "<i8"), ("epoch", "<u4"))
 
 
 def header_dtype(fields: Sequence[tuple[Any, ...]] = ()) -> np.dtype[Any]:
-    """The layout of a header: `FRAME_FIELDS`, then `fields` as `numpy.dtype` takes them."""
+    """Return the layout of a header: `FRAME_FIELDS`, then `fields` as `numpy.dtype` takes them."""
     return np.dtype([*FRAME_FIELDS, *fields], align=True)
 
 
 @dataclass(frozen=True)
 class SlotLayout:
-    """Bytes of one slot: the header rounded up to a page, then `payload_bytes`, rounded up likewise."""
+    """The bytes of one slot: the header rounded up to a page, then `payload_bytes`, rounded up likewise."""
 
     header: np.dtype[Any]
     payload_bytes: int
@@ -61,7 +61,7 @@ class Packet:
 
 
 def view_packet(buffer: memoryview, layout: SlotLayout) -> Packet:
-    """Views of a slot's memory, without a copy. Raises ValueError when `buffer` is shorter than the layout."""
+    """Return views of a slot's memory, without a copy; raises ValueError when `buffer` is shorter than the layout."""
     if len(buffer) < layout.slot_bytes:
         raise ValueError(f"slot of {len(buffer)} bytes, the layout needs {layout.slot_bytes}")
     header = np.frombuffer(buffer, dtype=layout.header, count=1).reshape(())
@@ -70,7 +70,7 @@ def view_packet(buffer: memoryview, layout: SlotLayout) -> Packet:
 
 
 MIB = 1 << 20
-#: Of <linux/fcntl.h>; the fcntl module of Python 3.11 does not have all of them.
+#: From <linux/fcntl.h>; the fcntl module of Python 3.11 does not have all of them.
 F_ADD_SEALS, F_SEAL_SHRINK, F_SEAL_GROW = 1033, 0x2, 0x4
 
 
@@ -87,10 +87,10 @@ class RegionLayout:
 
 
 def create_region(name: str, layout: RegionLayout) -> int:
-    """A descriptor of new, zeroed shared memory for `layout`. `name` is shown in /proc/PID/maps and nowhere else.
+    """Return a descriptor of new, zeroed shared memory for `layout`. `name` appears in /proc/PID/maps and nowhere else.
 
-    Every page is reserved here: on a machine with too little memory this function fails, and not a later write, which
-    would end the process by a signal. Raises TrilaneError when there is too little memory.
+    Every page is reserved here. So with too little memory this function fails, not a later write, which would end the
+    process by a signal. Raises TrilaneError when there is too little memory.
     """
     free = machine.here.free_bytes()
     if layout.total_bytes > free:
@@ -106,7 +106,7 @@ def create_region(name: str, layout: RegionLayout) -> int:
 
 
 def map_region(fd: int, layout: RegionLayout) -> list[Packet]:
-    """Views of every slot of the region; the mapping lives as long as they do.
+    """Return views of every slot of the region; the mapping lives as long as they do.
 
     Raises ValueError when the region is smaller than the layout.
     """

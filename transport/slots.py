@@ -1,8 +1,9 @@
-"""Which unit a slot belongs to, and when. Rule: a slot changes hands by a transition of the table, and by nothing else.
+"""Says which unit each slot of an edge belongs to. Rule: a slot changes hands only by a transition of the table.
 
     FREE --claim--> WRITING --commit--> READY --take--> READING --release--> FREE
 
-WRITING belongs to the producer's unit, READING to the consumer's, FREE and READY to nobody. Pure: no memory, no clock.
+WRITING belongs to the producer's unit, READING to the consumer's, FREE and READY to nobody. The module is pure: it
+knows neither memory nor a clock.
 """
 
 from __future__ import annotations
@@ -38,7 +39,12 @@ class SlotError(Exception):
 
 @dataclass(frozen=True)
 class EdgeRule:
-    """An edge's policy. `mailbox`: a commit replaces what waits. `yields`: a claim may replace the oldest waiting."""
+    """An edge's policy.
+
+    `slots`: number of slots.
+    `mailbox`: whether a commit replaces the waiting frames.
+    `yields`: whether a claim may replace the oldest waiting frame.
+    """
 
     name: str
     slots: int
@@ -46,7 +52,7 @@ class EdgeRule:
     yields: bool = False
 
 
-#: Name -> rule; the count of those in COUNTED may be given as NAME:N.
+#: The rules by name; those in COUNTED may be given with a count, as NAME:N.
 RULES = {
     "single": EdgeRule("single", 1),
     "double": EdgeRule("double", 2),
@@ -54,11 +60,14 @@ RULES = {
     "fifo": EdgeRule("fifo", 4),
     "orphan": EdgeRule("orphan", 6, yields=True),
 }
-COUNTED = {"fifo": 1, "orphan": 4}  # least count: an orphan edge has two slots read, one written and one waiting
+COUNTED = {"fifo": 1, "orphan": 4}  # least counts; an orphan edge has two slots read, one written and one waiting
 
 
 def edge_rule(text: str) -> EdgeRule:
-    """`single`, `double`, `triple`, `fifo[:N]`, `orphan[:N]`. Raises UnexpectedValue."""
+    """Return the rule of `single`, `double`, `triple`, `fifo[:N]` or `orphan[:N]`.
+
+    Raises UnexpectedValue for other texts.
+    """
     name, colon, count = text.partition(":")
     if name not in RULES or (colon and name not in COUNTED):
         raise UnexpectedValue(f"edge {text!r}", "single, double, triple, fifo:N or orphan:N")
@@ -73,8 +82,10 @@ def edge_rule(text: str) -> EdgeRule:
 class EdgeSlots:
     """The slots of one edge.
 
-    `frame[i]` is -1 when none. `ready`: slots that wait for the edge's consumer, oldest first. `passing`: those that
-    wait for the stage at which a bypass of this edge ends. `epoch` grows at each fault.
+    `frame`: frame in each slot; -1 without one.
+    `ready`: slots that wait for the edge's consumer, oldest first.
+    `passing`: slots that wait for the stage at which a bypass of this edge ends.
+    `epoch`: number that grows at each fault.
     """
 
     def __init__(self, rule: EdgeRule) -> None:
@@ -91,23 +102,27 @@ class EdgeSlots:
         return bool(self.free) or (self.rule.yields and bool(self.ready or self.passing))
 
     def claim(self, frame: int) -> tuple[int, int | None]:
-        """A slot to write `frame` into, and the waiting frame that was evicted from it, if one was.
+        """Claim a slot for `frame`; return the slot and the waiting frame that was evicted from it, or None.
 
-        A frame on the bypass is evicted before any other, for no frame can need it.
-        Raises SlotError when none is free and none may be evicted.
+        A frame on the bypass is evicted before any other, because no frame can need it. Raises SlotError when no slot
+        is free and none may be evicted.
         """
         dropped = None
         if not self.free and self.rule.yields and (self.ready or self.passing):
             dropped = self.drop((self.passing or self.ready)[0])
         if not self.free:
             raise SlotError("no slot to claim")
+        # The slot that was given back last: its memory may still be in the caches.
         slot = self.free.pop()
         self._move("claim", slot)
         self.frame[slot] = frame
         return slot, dropped
 
     def commit(self, slot: int, skips: bool = False) -> list[int]:
-        """The slot's frame is complete; returns the frames that it replaces. `skips`: it takes the bypass."""
+        """Mark the slot's frame as complete, and return the frames that it replaces.
+
+        `skips`: whether it takes the bypass.
+        """
         self._move("commit", slot)
         line = self.passing if skips else self.ready
         replaced = [self.drop(old) for old in list(line)] if self.rule.mailbox else []
@@ -115,22 +130,22 @@ class EdgeSlots:
         return replaced
 
     def take(self, slot: int) -> None:
-        """The unit of the stage that the slot waits for reads it from now on."""
+        """Let the unit of the stage that the slot waits for read it from now on."""
         self._move("take", slot)
         self._line_of(slot).remove(slot)
 
     def release(self, slot: int) -> None:
-        """The unit that took the slot has read it."""
+        """Free the slot, which the unit that took it has read."""
         self._move("release", slot)
         self._empty(slot)
 
     def abandon(self, slot: int) -> None:
-        """The producer's unit will not complete the slot."""
+        """Free the slot, which the producer's unit will not complete."""
         self._move("abandon", slot)
         self._empty(slot)
 
     def drop(self, slot: int) -> int:
-        """Take a waiting frame out; returns its number."""
+        """Take a waiting frame out of its slot, and return its number."""
         self._move("drop", slot)
         self._line_of(slot).remove(slot)
         frame = self.frame[slot]
@@ -138,7 +153,7 @@ class EdgeSlots:
         return frame
 
     def give_back(self, slot: int, skips: bool = False) -> list[int]:
-        """A taken frame waits again, in its old place; returns it when a newer one waits in a mailbox."""
+        """Let a taken frame wait again in its old place; return it if a newer frame waits in a mailbox."""
         self._move("give_back", slot)
         line = deque(sorted([*(self.passing if skips else self.ready), slot], key=self.frame.__getitem__))
         if skips:

@@ -1,11 +1,11 @@
-"""How soon a process runs after a message has woken it. Rule: the kernel is asked; a refusal changes only the speed.
+"""Makes a process run soon after a message has woken it. Rule: the kernel is asked; a refusal changes only the speed.
 
-Linux makes a woken thread wait until the time slice of the running one ends, about 3 ms, unless the woken one asks for
-a shorter slice (EEVDF since Linux 6.12; older kernels ignore the request). Measured with another process busy on the
-same core, the 99th percentile of the wake-up went from 3.4 ms to 0.2 ms.
+Linux makes a woken thread wait until the time slice of the running one ends, about 3 ms. The woken thread need not wait
+if it asks for a shorter slice (EEVDF since Linux 6.12; older kernels ignore the request). With another process busy on
+the same core, the measured 99th percentile of the wake-up went from 3.4 ms to 0.2 ms.
 
-This matters most for ZeroMQ's I/O threads. A unit that has sent a message begins its next job at once; the thread that
-is to carry the message then waited on the same core for the end of that job's slice: 1.6 ms from raster to infer.
+This matters most for ZeroMQ's I/O threads. A unit that has sent a message begins its next job at once. The thread that
+carries the message then waits on the same core for the end of that job's slice: 1.6 ms from raster to infer.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from trilane import machine
 from trilane.errors import reason
 
 SHORTEST_NS = 100_000
-UNIT_NS = 1_000_000  # of a unit: shorter than that of other programs, longer than the scheduler's
+UNIT_NS = 1_000_000  # shorter than the slice of other programs, longer than the scheduler's
 DEFAULT = 0
 #: <asm/unistd.h>
 SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
-#: struct sched_attr of <linux/sched/types.h>: size, policy, flags, nice, priority, runtime, deadline, period.
+#: The struct sched_attr of <linux/sched/types.h>: size, policy, flags, nice, priority, runtime, deadline, period.
 SCHED_ATTR = "=IIQiIQQQ"
 SCHED_OTHER = 0
-#: Linux's "PM QoS" file: while it is open, no core sleeps so deeply that waking it takes longer than the integer
-#: written to it, in microseconds.
+#: Linux's "PM QoS" file. The integer written to it is a time in us; while the file is open, no core sleeps so deeply
+#: that waking it takes longer.
 LATENCY_FILE = Path("/dev/cpu_dma_latency")
 AWAKE = "wait awake"
 
@@ -37,7 +37,7 @@ AWAKE = "wait awake"
 def use_slice(slice_ns: int) -> bool:
     """Ask for a time slice of `slice_ns` for this thread and the processes it starts.
 
-    Returns whether the kernel accepted it.
+    Return whether the kernel accepted it.
     """
     number = SCHED_SETATTR.get(machine.here.architecture())
     if number is None or os.sched_getscheduler(0) != os.SCHED_OTHER:
@@ -49,9 +49,9 @@ def use_slice(slice_ns: int) -> bool:
 
 @contextlib.contextmanager
 def awake(wanted: bool = True) -> Iterator[str]:
-    """Keep idle cores of the whole machine awake inside the `with` block. Yields AWAKE, or `sleep: ` and the reason.
+    """Keep idle cores of the whole machine awake inside the `with` block. Yield AWAKE, or `sleep: ` and the reason.
 
-    A sleeping core takes 50 us and more to react to a message; one that is kept awake takes power. Usually only root
+    A sleeping core takes 50 us and more to react to a message; a core that is kept awake takes power. Usually only root
     may do this. The kernel undoes it when the process ends.
     """
     if not wanted:
