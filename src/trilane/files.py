@@ -277,7 +277,7 @@ def _holds_objects(file: IO[bytes]) -> bool:
     Raises one of DAMAGED on a broken header.
     """
     version = np.lib.format.read_magic(file)
-    return version in _HEADERS and _HEADERS[version](file)[2].hasobject
+    return version in _HEADERS and _header(file, version)[2].hasobject
 
 
 def read_bytes(path: Path, most: int, expected: str) -> bytes:
@@ -310,12 +310,22 @@ def read_header(where: Path | str, file: IO[bytes]) -> tuple[tuple[int, ...], bo
     version = np.lib.format.read_magic(file)
     if version not in _HEADERS:
         raise BadInputError(where, f".npy version {version}", "1.0 or 2.0")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of headers written by Python 2
-        shape, fortran, dtype = _HEADERS[version](file)
+    shape, fortran, dtype = _header(file, version)
     if dtype.hasobject:
         raise BadInputError(where, "pickled objects", "numbers", "save it as a plain number array")
     return shape, fortran, dtype
+
+
+def _header(file: IO[bytes], version: tuple[int, int]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, Fortran order and type by the header that comes next in `file`. Raises one of DAMAGED on a broken one."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of headers written by Python 2
+            return _HEADERS[version](file)
+    except DAMAGED:
+        raise
+    except Exception as error:  # NumPy sorts and unpacks the literal before it knows what that holds
+        raise ValueError(f"a damaged header: {error}") from error
 
 
 def _read_array(file: IO[bytes]) -> NDArray[Any]:

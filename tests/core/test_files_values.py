@@ -156,7 +156,17 @@ def test_damaged_arrays(case: str, tmp_path: Path) -> None:
     assert said(lambda: read_npy(file, WANTED)) == f"{file}: found {found}"
 
 
-@pytest.mark.parametrize("content", [b"no magic at all", header("(3,")[:-1], header("3")])
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"no magic at all",
+        header("(3,")[:-1],
+        header("3"),
+        header("(3,), b'x': 1"),  # NumPy sorts the keys
+        header("(3,)", "()"),  # and takes the first of a tuple
+        header("(3,), []: 1"),
+    ],
+)
 def test_broken_headers(content: bytes, tmp_path: Path) -> None:
     file = tmp_path / "a.npy"
     file.write_bytes(content)
