@@ -75,7 +75,7 @@ def test_version(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[
 WRONG_USAGE = {
     ("fly",): "Error: No such command 'fly'.",
     ("run", "--fly"): "Error: No such option: --fly",
-    ("run", "--policy", "fly"): "error: --policy: found 'fly', expected one of pipelined, sequential, latest, deadline",
+    ("run", "--policy", "fly"): "error: --policy: found 'fly', expected one of sequential, pipelined, latest, deadline",
     ("run", "--frames", "x"): "error: --frames: found 'x', expected a valid integer",
 }
 

@@ -13,18 +13,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 PRODUCT = (
-    "src/trilane",
-    "apps",
-    "avatars",
-    "bench",
-    "body",
-    "hw_profiles",
-    "pipeline",
-    "scene",
-    "scheduler",
-    "shaders",
-)
-PRODUCT += ("stages", "training", "transport")
+    "src/trilane", "apps", "avatars", "bench", "body", "hw_profiles", "pipeline", "scene", "scheduler", "shaders",
+    "stages", "training", "transport",
+)  # fmt: skip
 SMALL_LINES = 100
 Functions = ast.FunctionDef | ast.AsyncFunctionDef
 
