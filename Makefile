@@ -2,7 +2,7 @@
 # Arguments of `trilane run` go in ARGS: make run ARGS="--frames 60 --size 192"
 SHELL := /bin/bash
 .DELETE_ON_ERROR:
-.PHONY: run test test-all test-rest test-machines test-device results setup format clean
+.PHONY: run test test-all test-rest explore test-machines test-device results setup format clean
 
 BIN := .venv/bin
 
@@ -27,6 +27,10 @@ test-rest: .venv/ready-all
 # ARGS=--environments: those with packages or a Python of their own, which are installed once.
 test-machines: .venv/ready-test
 	@$(BIN)/python tests/support/machines.py $(ARGS)
+
+# The property tests with examples that no run before has drawn; what fails prints how to repeat it.
+explore: .venv/ready-test
+	TRILANE_EXPLORE=1 $(BIN)/pytest --numprocesses auto -m hypothesis tests $(ARGS)
 
 # What needs a GPU: hardware OpenGL, training on CUDA, the runtime cuda. Exit code 3 where there is none.
 test-device: .venv/ready-device

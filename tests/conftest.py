@@ -34,9 +34,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items[:] = [item for item in items if item not in slow]
 
 
-# How long an example takes is the machine's matter.
-settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("any machine")
+# How long an example takes is the machine's matter. What a property test draws follows from its code, so a failure of
+# `make test` is one of the change that was made; `make explore` draws something else each time.
+for profile, is_fixed in (("repeatable", True), ("explore", False)):
+    settings.register_profile(
+        profile, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=is_fixed, print_blob=True
+    )
+settings.load_profile("explore" if "TRILANE_EXPLORE" in os.environ else "repeatable")
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
