@@ -1,8 +1,8 @@
-"""Which modules are compiled, and whether they are here. Rule: what runs is what the sources say, or nothing runs.
+"""Which modules are compiled, and whether the compiled ones are current. Rule: only what the sources say runs.
 
-mypyc turns the core, the job pipe over which units get jobs and answer, and the clock around a job into C while the
-package is installed (setup.py); without a C compiler the same files run as Python, less than half as fast. The name of
-the compiled library holds a digest of the sources it was made from.
+mypyc turns three parts into C while the package is installed (setup.py): the core, the job pipe over which units get
+jobs and answer, and the clock around a job. Without a C compiler the same files run as Python, less than half as fast.
+The name of the compiled library holds a digest of the sources it was made from.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ PACKAGE = Path(__file__).resolve().parent
 
 
 def library(package: Path) -> str:
-    """Name of the library that is made from the sources in the package's folder, without mypyc's ending."""
+    """Return the name of the library made from the sources in the package's folder, without mypyc's ending."""
     sources = hashlib.sha256(b"\0".join((package / name).read_bytes() for name in MODULES))
     return PREFIX + sources.hexdigest()[:16]
 
 
 def form(package: Path = PACKAGE) -> str:
-    """`compiled`, `interpreted`, or `stale`: compiled, but from other sources than these."""
+    """Return `compiled`, `interpreted`, or `stale`: compiled, but from other sources than these."""
     stem = package / MODULES[0].removesuffix(".py")
     if not any(stem.with_name(stem.name + suffix).exists() for suffix in EXTENSION_SUFFIXES):
         return "interpreted"
@@ -65,7 +65,7 @@ def form(package: Path = PACKAGE) -> str:
 
 
 def check(package: Path = PACKAGE) -> None:
-    """Raises MissingPartError when what is compiled was made from other sources."""
+    """Raise MissingPartError when the compiled library was made from other sources."""
     if form(package) == "stale":
         from trilane.errors import MissingPartError  # setup.py reads this file before there is a package
 
