@@ -2,8 +2,8 @@
 
 Rule: only bytes cross a cut, so the parts, run one after the other, give the same bytes as the whole network.
 
-Every tensor that a later part reads crosses the cut, such as a U-Net's skips or its input, not only the tensor that the
-cut is named after. A Dequantize whose bytes cross, and a Transpose behind it, are repeated in the part that reads them.
+Every tensor that a later part reads crosses the cut, not only the one that the cut is named after. Others are a U-Net's
+skips or its input. A Dequantize whose bytes cross, and a Transpose behind it, are repeated in the part that reads them.
 """
 
 from __future__ import annotations

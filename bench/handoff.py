@@ -85,6 +85,7 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 300, rounds
         for number in range(rounds):
             for size in kib:
                 variants = [variant for variant, of in pairs if of == size]
+                # Each round begins with another variant, so that none is always the first.
                 first = number % len(variants)
                 for variant in variants[first:] + variants[:first]:
                     times.setdefault((variant, size), []).append(pairs[variant, size].run(frames))
@@ -178,6 +179,7 @@ def consume(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[in
 def _child(pipe: Connection, cores: tuple[int, ...]) -> Iterator[None]:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends it
     os.sched_setaffinity(0, cores)
+    # The kernel schedules the processes of units with the same slice.
     use_slice(UNIT_NS)
     try:
         yield

@@ -119,7 +119,7 @@ def _best_ms(variants: dict[str, Variant]) -> dict[str, float]:
 
 
 def _memory_gb_s() -> float:
-    """Return the 1e9 bytes read and written a second by a copy far larger than the caches, on one thread."""
+    """Return the memory rate of one thread in 1e9 bytes a second, read and written by a copy larger than the caches."""
     source, target = np.ones(COPY_BYTES // 8), np.empty(COPY_BYTES // 8)
     best = float("inf")
     for _ in range(ROUNDS):

@@ -112,6 +112,7 @@ def _cpu_seconds(ways: dict[str, Run], rounds: int) -> dict[str, list[float]]:
     seconds: dict[str, list[float]] = {way: [] for way in ways}
     for number in range(rounds):
         names = list(ways)
+        # Each round begins with another way, so that none is always the first.
         first = number % len(names)
         ends: dict[str, list[int]] = {}
         for way in names[first:] + names[:first]:

@@ -221,6 +221,7 @@ class ShapedBody:
         """Return the person with `offsets` (V,3), metres from the skin at rest, in place of earlier ones."""
         bare = self.bare()
         moved = (bare.vertices.astype(np.float64) + offsets).astype(np.float32)
+        # Copied, because freezing would make the caller's array read-only.
         return ShapedBody(_frozen(moved), self.joints, replace(self.body, offsets=_frozen(offsets.copy())))
 
 

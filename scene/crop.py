@@ -3,8 +3,8 @@
 Rectangles are x0, y0, x1, y1 in normalised device coordinates, y up; a tensor's pixels are square on the screen.
 
 `error_px` leads from metres to pixels, with a proved bound. For a vertex whose clip coordinates are X, Y, W, an error
-of e metres changes X by at most e |r_x|, where r_x are the first three numbers of the clip matrix's row of X; likewise
-for Y and W. With x = X / W between -1 and 1,
+of e metres changes X by at most e |r_x|. Here r_x are the first three numbers of the clip matrix's row of X; Y and W
+are alike. With x = X / W between -1 and 1,
 
     |x' - x| = |dX - x dW| / |W + dW| <= e (|r_x| + |r_w|) / (W - e |r_w|),
 

@@ -6,7 +6,7 @@ is at (0.5, 0.5), as in COLMAP (https://colmap.github.io/cameras.html). `of_open
 centre.
 
 Pictures are drawn without distortion. `distortion_note` says how far distortion would move points of the picture's
-border, by the models of OpenCV and COLMAP, so that a person can judge whether it matters.
+border, by the models of OpenCV and COLMAP. A person can then judge whether it matters.
 """
 
 from __future__ import annotations

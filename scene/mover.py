@@ -134,6 +134,7 @@ def floor_lift(
     times_s = np.linspace(0.0, motion.duration_s, _sample_count(motion, rule))
     poses, pelvises = motion.sample_all(times_s)
     rows = [
+        # Copied, because the skeleton writes its next pose to the same buffer.
         skeleton.pose(pose, pelvis * scale + shift).matrices[:, 1].copy()
         for pose, pelvis in zip(poses, pelvises, strict=True)
     ]

@@ -1,7 +1,7 @@
 """Lays out the crops of a frame's avatars in the tensor that they share.
 
 Rule: one visible avatar has the whole tensor. Several are drawn at one scale in rows, so each has a share of the tensor
-in proportion to its area on the screen, with at least `MARGIN_PX` of background between them. Tensor pixels are square
+in proportion to its area on the screen. At least `MARGIN_PX` of background lie between them. Tensor pixels are square
 on the screen.
 
 `lay_out` fills the tensor: the scale is the largest that the tensor has room for. `lay_out_at` stops at a density. At

@@ -140,6 +140,7 @@ def tried(
     begins. `least`: number of rounds that are done in any case.
     `checked`, `starter`, and the errors raised: as in `measured_times`.
     """
+    # Placements with equal threads differ in cores alone, so one pipeline serves all of them.
     groups: dict[tuple[tuple[int, bool], ...], list[int]] = {}
     for number, placement in enumerate(placements):
         settings = settings_of(placement).values()

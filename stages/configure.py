@@ -1,7 +1,7 @@
 """Turns the options of a run into a RunConfig, every part of which is checked.
 
-Rule: motion, camera, background, avatar and runtime are opened and checked here, in the parent, so that a bad input
-ends the command before a process is started or a file is made.
+Rule: motion, camera, background, avatar and runtime are opened and checked here, in the parent. A bad input then ends
+the command before a process is started or a file is made.
 """
 
 from __future__ import annotations

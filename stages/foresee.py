@@ -170,6 +170,7 @@ def foresee(
             found = joined(found, ShapeSet(larger, math.ceil(per_pixel * sum(map(area, larger))), 0))
             changes.append(tuple((frame / scene.fps, shape) for frame, shape in foreseen))
         elif are_close:
+            # Without shapes of its own, this budget's tensors change as those of the larger one do.
             changes.append(changes[-1])
         chosen = joined(chosen, found)
     return Foreseen(chosen, frames, len(seen), left_out, tuple(changes))

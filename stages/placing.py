@@ -99,6 +99,7 @@ def considered(cores: Sequence[Core], asked: Placement) -> list[Core]:
     if len(cores) <= MOST_LOGICAL:
         return list(cores)
     fixed = {core for place in asked.values() for core in place.cores}
+    # Reversed, so that the first core of each physical one is kept.
     first = {core.physical: core.number for core in reversed(cores)}
     chosen_numbers = {*sorted(first.values())[:MOST_CORES], *fixed}
     return [core for core in cores if core.number in chosen_numbers]
@@ -247,6 +248,7 @@ def choice(
 
     def measured() -> Arrays:
         others = OtherPrograms(cores)
+        # The share is counted in steps of 10 ms, so a shorter look would say little.
         time.sleep(LOOK_S)
         _refuse_when_busy(others.share())
         say(TRYING.format(len(candidates)))

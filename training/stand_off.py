@@ -3,8 +3,8 @@
 Rule: an offset is measured only where the surface turns away from the camera, because the outline shows it only there.
 Other vertices get theirs from neighbours on the surface.
 
-The offsets are those of "SMPL+D" (Alldieck et al., Video Based Reconstruction of 3D People Models, CVPR 2018), but
-lines across the outline are read instead of following gradients.
+The offsets are those of "SMPL+D" (Alldieck et al., Video Based Reconstruction of 3D People Models, CVPR 2018), but they
+are found by reading along lines, not by gradients.
 """
 
 from __future__ import annotations
@@ -138,6 +138,7 @@ def smoothed(values: F64, certainty: F64, faces: Ints) -> F64:
     edges = sparse.coo_matrix((ones, (pairs[:, 0], pairs[:, 1])), (count, count))
     edges = edges + edges.T
     degree = np.asarray(edges.sum(axis=1)).ravel()
+    # The small term keeps the system regular where a part of the mesh has no measurement; it draws that part to 0.
     system = sparse.diags(certainty + STIFFNESS * degree + 1e-6) - STIFFNESS * edges
     return np.asarray(spsolve(system.tocsc(), certainty * values))
 

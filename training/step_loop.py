@@ -1,7 +1,7 @@
 """Training by a number of steps, in one process: the same settings give the same weights.
 
-Rule: what a step does depends on its number, the settings and the state alone, so a training that was ended anywhere
-goes on as if it had not been ended.
+Rule: what a step does depends only on its number, the settings and the state. A training that was ended anywhere
+therefore goes on as if it had not been ended.
 """
 
 from __future__ import annotations
@@ -258,7 +258,7 @@ class MaskedAdam(_Masked, torch.optim.Adam):
 
 
 class MaskedAdamW(_Masked, torch.optim.AdamW):
-    """AdamW."""
+    """AdamW, whose weight decay does not touch masked numbers."""
 
 
 # The optimiser of an avatar: Adam or AdamW, of three groups of parameters.

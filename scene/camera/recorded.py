@@ -240,7 +240,10 @@ def _price(turns: F64, up: F64, quarter: int) -> float | None:
 
 
 def _between(turns: F64, dearer: float) -> list[_Guess]:
-    """Return the direction for which the horizons are most nearly level: at right angles to the pictures' rights."""
+    """Return the direction to which the right axes of all pictures are most nearly at right angles.
+
+    The horizons are level about it.
+    """
     ups, rights = _ups_and_rights(turns, 0)
     spread, directions = np.linalg.eigh(rights.T @ rights / len(rights))
     direction = directions[:, 0] if (ups @ directions[:, 0]).mean() >= 0 else -directions[:, 0]

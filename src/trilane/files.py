@@ -161,6 +161,7 @@ def read_text(path: Path, expected: str) -> str:
         raise BadInputError(path, f"{size} bytes", f"at most {MAX_TEXT_BYTES}")
     try:
         refuse_other(path, expected)
+        # utf-8-sig drops a byte order mark, which is no part of the text.
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         found = f"a file that cannot be read as text ({reason(error)})"

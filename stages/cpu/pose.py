@@ -237,6 +237,7 @@ class PoseStage:
         else:
             packet["picture"] = frame if work is FrameWork.FULL else -1
             self.plan = replace(self.plan, work=work)
+            # Copied, because a later frame is written to the same slot.
             self._made[work] = _Made(shown, packet.copy(), self.plan)
         return _metrics(self.plan, self._moved)
 

@@ -57,6 +57,7 @@ class Segment:
         self._digest = ""
         self._picture: Any = None
         self.moved = ByteCounter()
+        # Line buffering keeps the digests of finished frames when the process is killed.
         self._digests = path.with_suffix(".sha256").open("w", encoding="ascii", buffering=1)
 
     def digest(self, frame: int, pixels: NDArray[np.uint8], repeats: bool = False) -> None:

@@ -96,7 +96,7 @@ def _measured(
 
 
 def _integers(path: Path) -> NetworkFile | None:
-    """Return the network in `path` where an avatar may have it, else None."""
+    """Return the network in `path` if it is an integer network that an avatar may have; else None."""
     try:
         return read_network(path)
     except BadInputError:

@@ -173,6 +173,7 @@ class InferStage:
         bindings = {
             (i, o): _bound(session, part, source.payload, target.payload, weights) for (i, source), (o, target) in pairs
         }
+        # A session allocates memory in its first run; later runs, those of frames, do not.
         bindings[0, 0].run(ByteCounter())
         return bindings
 

@@ -242,6 +242,7 @@ class CompositeStage:
         with checked(self._ctx):
             self._take(pose, packet.payload)
             drawing = self._drawing(pose)
+            # A full frame brings a new picture of the avatars, so no slot can hold it already.
             repeated = None if int(pose["work"]) == FrameWork.FULL else self._drawn.slot_of(drawing, slot_out)
             frame_bytes = math.prod(self._shape) * 3
             if repeated is None:
@@ -276,6 +277,7 @@ class CompositeStage:
                 self._picture.upload(picture)
                 counter_of(self._ctx).least += picture.nbytes
         if int(pose["work"]) == FrameWork.FULL:
+            # Copied, because a later frame is written to the same slot.
             self._held = pose.copy()
             if _visible(pose):
                 shape = _tensor_shape(pose)

@@ -1,7 +1,7 @@
 """Calibration: the range of each tensor of a network on real frames.
 
-Rule: ranges are measured. After that they are only narrowed where bytes cannot show the difference, widened where a
-norm over the picture reads them, or made one range where an operator only moves bytes.
+Rule: ranges are measured. They change afterwards in three cases alone. They are narrowed where bytes cannot show the
+difference, widened where a norm over the picture reads them, and made equal where an operator only moves bytes.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def saturated(frames: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float32]
 
 
 def norm_inputs(model: onnx.ModelProto) -> set[str]:
-    """Return the tensors that norms over the picture read, and the tensors from which moves made those."""
+    """Return the tensors that norms over the picture read, and those that were moved to become them."""
     makers = {out: node for node in model.graph.node for out in node.output}
     norms = (node for node in model.graph.node if node.op_type == "InstanceNormalization")
     return {source for node in norms for source in _sources(node.input[0], makers)}
