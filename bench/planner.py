@@ -254,9 +254,10 @@ def _frame_ms(checked: Checked, what: str, starter: UnitStarter) -> float:
 
 
 def sheet(moment: _Moment) -> U8:
-    """Put full, fixed and planned above, and below the truth (grey without) and the differences from full.
+    """Return the pictures of a moment in two rows.
 
-    Differences are around grey.
+    Above stand full, fixed and planned. Below stand the truth (grey without) and the differences from full, around
+    grey.
     """
     above = [moment.full, *moment.plans.values()]
     below = [np.full_like(moment.full, 128) if moment.true is None else moment.true]

@@ -127,7 +127,7 @@ def write_dataset(
 ) -> None:
     """Render samples to disk, grouped by tensor shape; samples of the same frame follow each other.
 
-    `source`: opens the renderer in each process; it is pickled and sent there.
+    `source`: opens the renderer in each process; it is sent there.
     `samples`: samples to render.
     `folder`: folder of the arrays, see `sample_files`.
     `processes`: number of rendering processes.

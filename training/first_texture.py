@@ -47,8 +47,8 @@ def first_texture(body: BodyArrays, groups: list[ShapeGroup], side: int, channel
 def mean_colours(groups: list[ShapeGroup], side: int, body: BodyArrays) -> NDArray[np.float64]:
     """Return the mean colour (side, side, 3) in 0..1 of the pixels that show each texel.
 
-    Texels beside seen ones lie between the pixels of a view and take the mean of those. All others are filled along the
-    surface of `body`.
+    Texels beside seen ones, which lie between the pixels of a view, take the mean of the seen ones. All others are
+    filled along the surface of `body`.
 
     Clothes stand off the body, so a texel shows another point of them in every view. The mean is still sharp: near
     views and views along the surface's normal have the largest weights.

@@ -45,9 +45,9 @@ ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {"relu": nn.ReLU, "relu6": nn.
 
 
 class Encoder(Protocol):
-    """An encoder.
+    """Turns a picture into five features.
 
-    `channels`: channels of the five features, from stride 2 to stride 32.
+    `channels`: channels of the features, from stride 2 to stride 32.
     """
 
     channels: tuple[int, ...]

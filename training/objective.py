@@ -71,7 +71,7 @@ SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 WINDOW, SIGMA = 11, 1.5
 #: Constants of luminance and of contrast, for values in 0..1.
 C1, C2 = 0.01**2, 0.03**2
-#: Stands for a negative structure, of which no power exists.
+#: Replaces a negative structure, because a negative number has no real power.
 LEAST = 1e-6
 
 
@@ -414,5 +414,8 @@ class Adversary:
 
 
 def bits(score: Tensor, true: bool) -> Tensor:
-    """Binary cross entropy, in bits (thesis, formula 3.1), of log odds `score` (N,) of pictures that are all `true`."""
+    """Return the mean binary cross entropy of log odds `score` (N,), in bits (thesis, formula 3.1).
+
+    `true`: whether all the pictures are true ones; else all are painted.
+    """
     return functional.softplus(-score if true else score).mean() / math.log(2)

@@ -195,7 +195,10 @@ def chosen_device(asked: str) -> torch.device:
 
 
 def device_words(device: torch.device, threads: int) -> str:
-    """Name `device` in words. `threads`: threads of PyTorch on the CPU."""
+    """Return a name for `device` in words.
+
+    `threads`: threads of PyTorch on the CPU.
+    """
     if device.type == "cuda":
         return f"the GPU {torch.cuda.get_device_name(device)}"
     return f"{threads} {'thread' if threads == 1 else 'threads'} of the CPU"

@@ -171,7 +171,10 @@ def _cross(points: F64, first: int, second: int) -> F64:
 
 
 def _determinant(points: F64) -> F64:
-    """Return (F,): positive for triangles that wind clockwise in the picture (rows run downward)."""
+    """Return a determinant (F,) that is positive for triangles that wind clockwise in the picture.
+
+    Rows run downwards.
+    """
     return np.asarray((_cross(points, 1, 2) * points[:, 0][:, [0, 1, 3]]).sum(axis=-1))
 
 

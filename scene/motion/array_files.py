@@ -1,7 +1,7 @@
 """Reads motions from `.npy`, `.npz` and `.pkl` files: poses, dicts of arrays, or only places of joints.
 
 The content of a file, not its ending, decides how it is read. Places of joints, as in HumanML3D, are (T, 22, 3) in the
-order of SMPL's joints. Turns have the same shapes, so the content tells an array apart. It has places if its bones,
+order of SMPL's joints. Turns have the same shapes, so the content tells them apart. An array has places if its bones,
 apart from the legs, are as long as a person's, alike on both sides, and rigid. The hips must also lie on either side of
 the pelvis, and the trunk must not be folded. `retarget.py` makes turns from places. What places cannot tell is chosen:
 a limb twists as its bend and the toes say, the head turns as the neck.
