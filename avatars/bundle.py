@@ -33,7 +33,8 @@ CAPTURE = "capture.toml"
 HOW_TO_TRAIN = "docs/own-avatar.md says how `trilane avatar train` makes one from frames of a person"
 HOW_TO_CREATE = "`trilane avatar create --body` puts a body of the same UV layout into an avatar"
 TEXTURE_KEYS = ("texture", "scale", "levels")
-#: Clothes and hair of an avatar reach this far from its body, metres. The pose stage and the training crop by it.
+#: Distance in metres that clothes and hair of an avatar reach from its body. The pose stage and the training crop by
+#: it.
 CLOTHES_STANDOFF_M = 0.045
 
 
@@ -76,7 +77,10 @@ class Bundle:
         return read_texture(self.texture_path, self.manifest.network.channels)
 
     def read_levels(self) -> NDArray[np.float32] | None:
-        """Smaller levels of the neural texture, see `texture_levels`; None where it has none. Raises BadInputError."""
+        """Return smaller levels of the neural texture, see `pack_levels`; None where it has none.
+
+        Raises BadInputError.
+        """
         arrays = read_npz(self.texture_path, TEXTURE_KEYS, "a neural texture")
         if "levels" not in arrays:
             return None
@@ -84,7 +88,7 @@ class Bundle:
         return _decoded(arrays["levels"], arrays.get("scale"), self.texture_path)
 
     def read_network(self) -> NetworkFile:
-        """The checked network. Raises BadInputError, also when it contradicts the manifest."""
+        """Read the checked network. Raises BadInputError, also when it contradicts the manifest."""
         network = read_network(self.network_path)
         entry = self.manifest.network
         if network.channels != entry.channels:
@@ -95,7 +99,7 @@ class Bundle:
 
 
 def read_texture(path: Path, channels: int) -> NDArray[np.float32]:
-    """The neural texture (H, W, `channels`) of a file of a bundle, row 0 at v = 0. Raises BadInputError."""
+    """Read a bundle's neural texture (H, W, `channels`), row 0 at v = 0, from a file. Raises BadInputError."""
     arrays = read_npz(path, TEXTURE_KEYS, "a neural texture")
     if "texture" not in arrays:
         raise BadInputError(path, "no array 'texture'", "a neural texture")
@@ -103,7 +107,7 @@ def read_texture(path: Path, channels: int) -> NDArray[np.float32]:
 
 
 def bundle_folder(name: str | Path) -> Path:
-    """The folder of a bundle: names of `BUILT_IN` are embedded, anything else is a path."""
+    """Return the folder of a bundle: a name of `BUILT_IN` is part of the package, anything else is a path."""
     return Path(__file__).parent / name if str(name) in BUILT_IN else Path(name)
 
 
@@ -126,7 +130,7 @@ def load_bundle(name: str | Path) -> Bundle:
 
 
 def _what_it_is(file: Path) -> tuple[str, str, str]:
-    """Of a file that stands where an avatar's folder should: what it is, what is expected, and what to do."""
+    """Say what a file is that stands where an avatar's folder should, what is expected, and what to do."""
     try:
         is_body = bool(read_npz(file, ("v_template",), "a body"))
     except BadInputError:
@@ -150,14 +154,14 @@ def write_bundle(
 
     A validation of other parts than these is left out of the manifest.
 
-    `folder`: of the bundle; made when it does not exist.
-    `manifest`: its content, but for the name of the file of `offsets`.
-    `body`: an .npz file to copy.
+    `folder`: folder of the bundle; made when it does not exist.
+    `manifest`: manifest to write; this function adds the name of the file of `offsets`.
+    `body`: .npz file to copy.
     `texture`: (H, W, C) float16, or int8 with `scale`.
-    `network`: the network to write.
-    `scale`: (C,) float32, of an int8 texture.
-    `offsets`: (V,3) metres, of the body's vertices at rest; None for a body that is drawn bare.
-    `levels`: smaller ones of the texture, of its type, see `texture_levels`.
+    `network`: network to write.
+    `scale`: scale of each channel of an int8 texture, (C,) float32.
+    `offsets`: offsets of the body's vertices at rest, (V,3) metres; None for a body that is drawn bare.
+    `levels`: smaller levels of the texture, of its type, see `pack_levels`.
     Raises BadInputError when the parts do not fit together; then nothing is written.
     """
     with write_folder(folder) as draft:
@@ -180,7 +184,7 @@ def write_bundle(
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Put `manifest` in place of that of the bundle in `folder`, whole or not at all. Raises BadInputError.
+    """Replace the manifest of the bundle in `folder` by `manifest`, whole or not at all. Raises BadInputError.
 
     Where the manifest is a symbolic link, the file that it leads to is replaced and the link stays.
     """
@@ -188,7 +192,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 
 
 def require_writable_manifest(folder: Path) -> None:
-    """Whether `write_manifest` can write, found out before the work. Raises BadInputError when it cannot."""
+    """Find out before the work whether `write_manifest` can write. Raises BadInputError when it cannot."""
     require_writable(_manifest_file(folder))
 
 
@@ -201,7 +205,7 @@ def _content(manifest: Manifest) -> bytes:
 
 
 def _with_own_validation(manifest: Manifest, folder: Path) -> Manifest:
-    """`manifest`, without its validation where that is not of the files in `folder`."""
+    """Return `manifest` without its validation where that is of other files than those in `folder`."""
     validation = manifest.validation
     own = validation is not None and validation.digests == digests_of(folder, manifest)
     return manifest if own else manifest.model_copy(update={"validation": None})
@@ -253,24 +257,24 @@ def _check_scale(scale: Any, path: Path, channels: int) -> NDArray[np.float32]:
     return factor
 
 
-# Smaller levels of a neural texture, which were learnt with it: read where a texel is smaller than a pixel.
+# Smaller levels of a neural texture, which were learnt with it. They are read where a texel is smaller than a pixel.
 #
-# Rule: they are stored side by side in one array (H/2, W/2 + W/4 + ..., C), each at the top, so that an avatar has one
-# array more and its width says how many levels there are.
+# Rule: they are stored side by side in one array (H/2, W/2 + W/4 + ..., C), each at the top. An avatar then has a
+# single array more, whose width says how many levels there are.
 
-#: More would end below 16 texels of the usual 512, which hold no part of a body.
+#: A further level would have fewer than 16 of the usual 512 texels along a side, too few for any part of a body.
 MOST_LEVELS = 5
 
 
 def pack_levels(levels: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """The array of `levels` (H/2,W/2,C), (H/4,W/4,C), ...; at least one."""
+    """Pack `levels` (H/2,W/2,C), (H/4,W/4,C), ..., at least one, into an array."""
     height = levels[0].shape[0]
     rows = [np.pad(level, ((0, height - level.shape[0]), (0, 0), (0, 0))) for level in levels]
     return np.concatenate(rows, axis=1)
 
 
 def split_levels(packed: NDArray[Any] | None, width: int) -> list[NDArray[Any]]:
-    """The levels of `packed`, for a texture of `width`; none without an array."""
+    """Return the levels in `packed`, for a texture of `width`; none without an array."""
     levels: list[NDArray[Any]] = []
     left = 0
     while packed is not None and left < packed.shape[1]:
@@ -282,7 +286,7 @@ def split_levels(packed: NDArray[Any] | None, width: int) -> list[NDArray[Any]]:
 
 
 def check_levels(packed: NDArray[Any], texture: NDArray[Any], where: object) -> None:
-    """Raises BadInputError unless `packed` has levels of `texture` (H,W,C), in numbers of its kind."""
+    """Raise BadInputError unless `packed` has levels of `texture` (H,W,C), in numbers of its kind."""
     height, width, channels = texture.shape
     widths = [sum(width >> (k + 1) for k in range(count)) for count in range(1, MOST_LEVELS + 1)]
     fits = packed.ndim == 3 and packed.shape[::2] == (height // 2, channels) and packed.shape[1] in widths
@@ -296,17 +300,17 @@ def check_levels(packed: NDArray[Any], texture: NDArray[Any], where: object) -> 
 
 # Offsets of a body's vertices, from the skin to what is drawn, as a file of a bundle.
 #
-# Rule: as many as the body has vertices, finite, and none longer than clothes and hair are; kept in float16, which is
-# exact to 16 micrometres at 5 cm.
+# Rule: there are as many as the body has vertices; they are finite and no longer than clothes and hair reach. They are
+# stored in float16, which is exact to 16 micrometres at 5 cm.
 
 OFFSETS_KEY = "offsets"
 OFFSETS_EXPECTED = "offsets of a body's vertices at rest (.npz)"
-#: Metres; what stands farther off is no part of a body's surface.
+#: Greatest length in metres; what stands farther off is no part of a body's surface.
 LONGEST_M = 0.5
 
 
 def as_kept(offsets: F32) -> F32:
-    """`offsets` (V,3) as a file keeps them."""
+    """Return `offsets` (V,3) as a file stores them."""
     return offsets.astype(np.float16).astype(np.float32)
 
 
@@ -316,7 +320,7 @@ def save_offsets(file: Path | BinaryIO, offsets: F32) -> None:
 
 
 def read_offsets(path: Path, vertices: int) -> F32:
-    """(V,3) metres, of a body of so many `vertices`. Raises BadInputError."""
+    """Read offsets (V,3), metres, of a body of so many `vertices`. Raises BadInputError."""
     array = read_npz(path, (OFFSETS_KEY,), OFFSETS_EXPECTED).get(OFFSETS_KEY)
     if array is None:
         raise BadInputError(path, f"no array {OFFSETS_KEY!r}", OFFSETS_EXPECTED)
@@ -328,7 +332,7 @@ def read_offsets(path: Path, vertices: int) -> F32:
     with np.errstate(over="ignore"):
         offsets: F32 = array.astype(np.float32)
         lengths = np.linalg.norm(offsets, axis=1)
-    if not (lengths <= LONGEST_M).all():  # NaN and infinity are not
+    if not (lengths <= LONGEST_M).all():  # `not` includes NaN, which no comparison holds for
         raise BadInputError(where, "offsets that are not finite or too long", f"at most {LONGEST_M} m")
     offsets.flags.writeable = False
     return offsets

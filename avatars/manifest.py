@@ -25,17 +25,17 @@ from pydantic import (
 from trilane.avatars.network_file import MAX_CHANNELS, NetworkFile, network_files
 from trilane.errors import BadInputError
 
-#: Of `provenance`: what `weights` says of a network that nobody trained.
+#: Value of `weights` in `provenance` for a network that nobody trained.
 UNTRAINED = "untrained: for speed alone"
-#: Entry `body` of the provenance where the person is known by frames alone: nobody can draw another pose or view.
+#: Value of `body` in `provenance` where the person is known by frames alone: nobody can draw another pose or view.
 CAPTURED = "that of a capture"
 BANDS = ("far", "full_body", "upper_body", "face")
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-#: A shape or expression coefficient in standard deviations; values outside describe no human body.
+#: A shape or expression coefficient in standard deviations; values outside this range describe no human body.
 Coefficient = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]
 FileName = Annotated[str, Field(min_length=1, max_length=200)]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-#: In JSON as YYYY-MM-DD, a day that there is.
+#: An existing day, in JSON as YYYY-MM-DD.
 Day = Annotated[datetime.date, Field(strict=True)]
 Band = Literal["far", "full_body", "upper_body", "face"]
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -53,8 +53,9 @@ class ByteRange(_Model):
 
 
 class NetworkEntry(_Model):
-    """The network file and the network in it. `width`: 64 is the full network. `channels`: of the neural texture.
+    """The network file and the network in it.
 
+    `width`: 64 is the full network. `channels`: channels of the neural texture.
     `input`, `output`: scale and zero point of the file's bytes, which the GPU unit encodes with.
     """
 
@@ -68,11 +69,11 @@ class NetworkEntry(_Model):
 
 
 class Digests(_Model):
-    """SHA-256, hexadecimal, of all that an avatar's pictures depend on.
+    """SHA-256, hexadecimal, of everything that an avatar's pictures depend on.
 
-    `body`, `texture`, `network`: of the bytes of those files; offsets count as the body's. `constants`: of the
-    manifest's numbers, which are shape,
-    expression, and the scales and zero points of the network's bytes.
+    `body`, `texture`, `network`: digests of those files' bytes; offsets count as part of the body.
+    `constants`: digest of the manifest's numbers: shape, expression, and the scales and zero points of the network's
+    bytes.
     """
 
     body: Sha256
@@ -82,7 +83,10 @@ class Digests(_Model):
 
 
 class WorstView(_Model):
-    """The view of the least PSNR, by which it is found again. `number`: among the views of `seed`."""
+    """The view of the least PSNR, with the numbers that identify it.
+
+    `number`: number of the view among those of `seed`.
+    """
 
     seed: int
     number: int
@@ -92,7 +96,7 @@ class WorstView(_Model):
 
 
 class SeedFigures(_Model):
-    """Of the views of one seed, in dB: two means and the least."""
+    """Figures of the views of one seed, in dB: two means and the least."""
 
     psnr_db: Finite
     body_psnr_db: Finite
@@ -102,10 +106,11 @@ class SeedFigures(_Model):
 class Figures(_Model):
     """Image error of one network on one runtime, on poses and views that were not trained on.
 
-    `psnr_db_by_band`: in dB, before random backgrounds, inside the box of the true mask. `see_through`: share of the
-    inside of the person whose alpha is less than 0.9. `iou`, `ssim`: means. The other keys, see `summary` of
-    `training/image_error.py`, are None where nobody measured them, and then not written; without
-    `psnr_db_by_background` the figures are before one grey, as an older Trilane measured them.
+    `psnr_db_by_band`: PSNR in dB, before random backgrounds, inside the box of the true mask. `see_through`: share of
+    the inside of the person whose alpha is less than 0.9. `iou`, `ssim`: means.
+    The other keys are those of `summary` in `training/image_error.py`; they are None, and not written, where nobody
+    measured them. Without `psnr_db_by_background` the figures are before a single grey, as an older Trilane measured
+    them.
     """
 
     model_config = ConfigDict(extra="allow", frozen=True)
@@ -142,10 +147,10 @@ class Figures(_Model):
 
 
 class MadeWith(_Model):
-    """What measured the figures, beside the avatar's files. No digest covers it.
+    """The software that measured the figures, beside the avatar's files. No digest covers it.
 
-    `trilane`: its version; `revision`, `modified`: of its checkout in git; all three None where not known.
-    `renderer`: of OpenGL. `runtimes`: name to name and version of the library.
+    `trilane`: its version. `revision`, `modified`: state of its checkout in git. All three are None where not known.
+    `renderer`: OpenGL's renderer. `runtimes`: name and version of the library, by the runtime's name.
     """
 
     trilane: str | None
@@ -156,10 +161,11 @@ class MadeWith(_Model):
 
 
 class BySize(_Model):
-    """What smaller tensors cost: the same views painted at several sizes, and enlarged to the first one's.
+    """The cost of smaller tensors: the same views painted at several sizes, and enlarged to the first one's.
 
-    `date`: UTC. `runtime`: that painted. `seed`, `per_band`, `held_out`: of the views. `psnr_db`: mean over them inside
-    the box of the true mask, by HEIGHTxWIDTH of the tensor; the network's own size first.
+    `date`: date in UTC. `runtime`: runtime that painted. `seed`, `per_band`, `held_out`: choice of the views.
+    `psnr_db`: mean PSNR in dB inside the box of the true mask, by HEIGHTxWIDTH of the tensor; the network's own size
+    first.
     """
 
     date: Day
@@ -170,24 +176,25 @@ class BySize(_Model):
     psnr_db: dict[Annotated[str, Field(pattern=r"^[0-9]{1,4}x[0-9]{1,4}$")], Finite] = Field(min_length=1)
 
 
-#: Figures of the runtime that a validation is by, which stand at its top too.
+#: Figures that stand at the top of a validation too, taken from its own runtime.
 AT_THE_TOP = ("psnr_db_by_band", "psnr_db_by_background", "see_through", "iou", "ssim")
 
 
 class Validation(Figures):
-    """The figures of an avatar, and what they are of.
+    """The figures of an avatar, and what they were measured on.
 
-    `date`: of the validation, UTC; None in a manifest that an older Trilane wrote, as the next two and `made_with`.
-    `digests`: of what was validated.
-    `figures_digest`: of all other keys here, by `figures_digest` of `avatars/manifest.py`.
-    `made_with`: by which code.
-    `runtime`: on which the pictures of `integer` were painted, whose errors stand at the top too.
-    `other_runtimes`: the figures of more runtimes, by name.
+    `date`: day of the validation, UTC. `date`, `digests`, `figures_digest` and `made_with` are None in a manifest that
+    an older Trilane wrote.
+    `digests`: digests of the validated files.
+    `figures_digest`: digest of all other keys here, by `figures_digest` of `avatars/manifest.py`.
+    `made_with`: software that measured.
+    `runtime`: runtime that painted the pictures of `integer`, whose errors stand at the top too.
+    `other_runtimes`: figures of more runtimes, by name.
     `size`: tensor size, as `trilane run --size` takes it.
-    `texture_filter`: of the neural texture.
-    `by_size`: what smaller tensors cost; None where nobody measured it.
-    More keys: `per_band`, views of each band and seed; `held_out`, motion to digest; `float`, figures of the network
-    before it was quantised, and `psnr_loss_db`, what quantising cost.
+    `texture_filter`: filter of the neural texture.
+    `by_size`: cost of smaller tensors; None where nobody measured it.
+    More keys: `per_band`, views of each band and seed; `held_out`, digest of each motion; `float`, figures of the
+    network before it was quantised; `psnr_loss_db`, loss by quantising.
     """
 
     date: Day | None = None
@@ -202,7 +209,7 @@ class Validation(Figures):
     by_size: BySize | None = None
 
     def on(self, runtime: str) -> Figures | None:
-        """The figures of `runtime`; None when nothing was painted on it."""
+        """Return the figures of `runtime`; None when nothing was painted on it."""
         if runtime != self.runtime:
             return self.other_runtimes.get(runtime)
         return self.integer or Figures(**{key: getattr(self, key) for key in AT_THE_TOP})
@@ -226,9 +233,9 @@ class Manifest(_Model):
 
 
 def network_entry(network: NetworkFile, encoder: str, norm: str, width: int) -> NetworkEntry:
-    """The manifest's entry for a quantised network, stored as `network.onnx`.
+    """Return the manifest's entry for a quantised network, stored as `network.onnx`.
 
-    `network`: the network, whose scales and zero points are written into the entry.
+    `network`: network whose scales and zero points are written into the entry.
     `encoder`, `norm`: names, as `trilane avatar network` takes them.
     `width`: 64 is the full network.
     """
@@ -245,7 +252,7 @@ def network_entry(network: NetworkFile, encoder: str, norm: str, width: int) -> 
 
 
 def parse_manifest(text: str, path: Path) -> Manifest:
-    """The manifest in JSON `text`, which was read from `path`. Raises BadInputError naming file and key."""
+    """Return the manifest in JSON `text`, which was read from `path`. Raises BadInputError naming file and key."""
     try:
         return Manifest.model_validate_json(text)
     except ValidationError as error:
@@ -261,7 +268,7 @@ def _short(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-# What an avatar's pictures depend on, as digests: the bytes of its files and the numbers of its manifest.
+# Digests of everything that an avatar's pictures depend on: the bytes of its files and the numbers of its manifest.
 #
 # Rule: a byte that changes the picture changes a digest; names, provenance and other words change none.
 
@@ -269,7 +276,7 @@ BLOCK = 1 << 20
 
 
 def digests_of(folder: Path, manifest: Manifest) -> Digests:
-    """The digests of the files in `folder` that `manifest` names. Raises BadInputError for one that cannot be read."""
+    """Return the digests of the files in `folder` that `manifest` names. Raises BadInputError for an unreadable one."""
     return Digests(
         body=sha256_of([folder / file for file in (manifest.body, manifest.offsets) if file is not None]),
         texture=sha256_of([folder / manifest.texture]),
@@ -279,7 +286,7 @@ def digests_of(folder: Path, manifest: Manifest) -> Digests:
 
 
 def figures_digest(validation: Validation) -> str:
-    """SHA-256, hexadecimal, of all that `validation` says but this digest, written in one way.
+    """Return the SHA-256, hexadecimal, of all of `validation` except this digest, in a canonical form.
 
     A key that is None counts as not there, so an optional key that a later Trilane adds changes no older digest.
     """
@@ -288,12 +295,12 @@ def figures_digest(validation: Validation) -> str:
 
 
 def with_figures_digest(validation: Validation) -> Validation:
-    """`validation`, which has just been measured, with the digest of its figures."""
+    """Return `validation`, which has just been measured, with the digest of its figures."""
     return validation.model_copy(update={"figures_digest": figures_digest(validation)})
 
 
 def sha256_of(files: Sequence[Path]) -> str:
-    """SHA-256, hexadecimal, of the bytes of `files`, one after the other. Raises BadInputError."""
+    """Return the SHA-256, hexadecimal, of the bytes of `files`, one after the other. Raises BadInputError."""
     digest = hashlib.sha256()
     for file in files:
         try:
@@ -306,7 +313,7 @@ def sha256_of(files: Sequence[Path]) -> str:
 
 
 def _constants(manifest: Manifest) -> str:
-    """The manifest's numbers that the picture depends on, written in one way."""
+    """Return the manifest's numbers that the picture depends on, in a canonical form."""
     network = manifest.network
     numbers = {
         "betas": list(manifest.betas),

@@ -1,6 +1,6 @@
-"""The network file of an avatar: its integers and constants, whether it can be run as it is, and its other shapes.
+"""The network file of an avatar: reads and checks it, and rewrites the network for other tensor shapes.
 
-Rule: a network is checked once, when it is read or made; who has a `NetworkFile` need not check it again.
+Rule: a network is checked once, when it is read or made; code that holds a `NetworkFile` need not check it again.
 """
 
 from __future__ import annotations
@@ -43,14 +43,17 @@ class Affine:
 
 @dataclass(frozen=True)
 class IntegerNetwork:
-    """What a runtime loads: `model`, a static integer graph with bytes at its ends, and `where` it was read from."""
+    """The network that a runtime loads.
+
+    `model`: static integer graph with bytes at its ends. `where`: place that it was read from.
+    """
 
     where: str
     model: onnx.ModelProto = field(repr=False)
 
     @property
     def float_layers(self) -> frozenset[str]:
-        """Names of the layers that may run in float: those the network's metadata lists.
+        """Names of the layers that may run in float: those that the network's metadata lists.
 
         Raises BadInputError when the metadata is not a JSON list.
         """
@@ -68,9 +71,10 @@ class IntegerNetwork:
 
 @dataclass(frozen=True)
 class NetworkFile(IntegerNetwork):
-    """A checked network. `shape` (N, H, W, C): of its uint8 input; its output is (N, H, W, 4) uint8.
+    """A checked network.
 
-    `input`, `output`: scale and zero point of the bytes.
+    `shape`: (N, H, W, C) of its uint8 input; its output is (N, H, W, 4) uint8. `input`, `output`: scale and zero point
+    of the bytes.
     """
 
     shape: tuple[int, int, int, int]
@@ -83,12 +87,12 @@ class NetworkFile(IntegerNetwork):
 
 
 def node_name(node: onnx.NodeProto) -> str:
-    """The node's name; without one, its operator and the tensor it outputs."""
+    """Return the node's name; without one, its operator and the tensor that it outputs."""
     return node.name or f"{node.op_type} that makes {next(iter(node.output), 'nothing')}"
 
 
 def constants_of(model: onnx.ModelProto) -> Mapping[str, TensorProto]:
-    """Constant tensors of the graph by name: initializers and the outputs of Constant nodes."""
+    """Return constant tensors of the graph by name: initializers and the outputs of Constant nodes."""
     constants = {tensor.name: tensor for tensor in model.graph.initializer}
     for node in model.graph.node:
         if node.op_type == "Constant":
@@ -97,7 +101,7 @@ def constants_of(model: onnx.ModelProto) -> Mapping[str, TensorProto]:
 
 
 def check_integer_layers(network: IntegerNetwork) -> None:
-    """Raises BadInputError naming the layers whose inputs are not dequantised integers; `float_layers` are allowed."""
+    """Raise BadInputError naming layers whose inputs are not dequantised integers; `float_layers` are allowed."""
     makers = {out: node for node in network.model.graph.node for out in node.output}
     float_layers = []
     for node in network.model.graph.node:
@@ -121,14 +125,14 @@ def _beyond_transposes(makers: Mapping[str, onnx.NodeProto], name: str) -> onnx.
 # Checks a network: operators, shapes of its ends, scales and zero points.
 #
 # Rule: a network that passes is a static integer network from NHWC bytes to RGBA bytes, so a runtime need not check it
-# again; a network that does not pass is refused by the name of the node that is wrong.
+# again. The refusal of another one names the node that is wrong.
 
 RGBA = 4
-#: What to do with a network of floats.
+#: Remedy for a network of floats.
 TO_INTEGERS = "make it one of integers: trilane avatar quantise FLOAT.onnx --frames FRAMES.npy --out NETWORK.onnx"
 #: Smallest and largest plausible scale; others come from an empty calibration or a damaged file.
 SCALE_RANGE = (1e-30, 1e30)
-#: The operators a network may have: layers that quantise, activations, norms, and operators that move data.
+#: Operators that a network may have: layers that quantise, activations, norms, and operators that move data.
 OPERATORS = {
     *("Conv", "ConvTranspose", "Gemm", "Add", "Sub", "Mul", "Div", "Sqrt", "ReduceMean", "Constant", "Identity"),
     *("Relu", "LeakyRelu", "Clip", "Sigmoid", "HardSigmoid", "HardSwish", "Tanh"),
@@ -146,7 +150,7 @@ ZERO_POINT_TYPES = {
 
 
 def check_network(model: onnx.ModelProto, where: str) -> NetworkFile:
-    """The checked network of `model`, which came from `where`. Raises BadInputError that names the node at fault."""
+    """Check `model`, which came from `where`, and return the network. Raises BadInputError that names the node."""
     _check_operators(model, where)
     shape = _check_input(model, where)
     _check_output(model, where, shape)
@@ -248,7 +252,7 @@ def _array(tensor: TensorProto, where: str) -> NDArray[np.generic]:
 
 
 def _reader_of(graph: onnx.GraphProto, name: str, op_type: str, where: str) -> onnx.NodeProto:
-    """The node of `op_type` that reads tensor `name`, with only Transposes between them."""
+    """Return the node of `op_type` that reads tensor `name`, with only Transposes between them."""
     for _ in graph.node:
         users = [node for node in graph.node if name in node.input]
         if users and all(node.op_type == op_type for node in users):
@@ -260,7 +264,7 @@ def _reader_of(graph: onnx.GraphProto, name: str, op_type: str, where: str) -> o
 
 
 def _maker_of(graph: onnx.GraphProto, name: str, op_type: str, where: str) -> onnx.NodeProto:
-    """The node of `op_type` that makes tensor `name`, with only Transposes between them."""
+    """Return the node of `op_type` that makes tensor `name`, with only Transposes between them."""
     makers = {out: node for node in graph.node for out in node.output}
     for _ in graph.node:
         node = makers.get(name)
@@ -284,19 +288,19 @@ def _affine(node: onnx.NodeProto, constants: Mapping[str, TensorProto], where: s
     return Affine(float(scale.astype(np.float64).item()), int(zero.item()))
 
 
-# Makes the same network for another tensor shape: rewrites batch, height and width and infers all other shapes again.
+# Makes the same network for another tensor shape: rewrites batch, height and width, and infers all other shapes again.
 #
-# Rule: the result is static and passes the checks of every network; weights are not changed.
+# Rule: the result is static and passes the checks of every network; weights do not change.
 
 STRIDE = 32
 
 
 def reshaped(network: NetworkFile, height: int, width: int, batch: int = 1) -> NetworkFile:
-    """`network` for inputs of another shape; the same object when it has that shape already.
+    """Return `network` for inputs of another shape; the same object when it has that shape already.
 
-    `network`: the checked network.
-    `height`, `width`: of the input in pixels, multiples of 32.
-    `batch`: frames that are inferred together.
+    `network`: checked network.
+    `height`, `width`: size of the input in pixels, multiples of 32.
+    `batch`: number of frames that are inferred together.
     Raises BadInputError when the graph cannot run at that shape.
     """
     if height % STRIDE or width % STRIDE or min(height, width, batch) < 1:
@@ -329,14 +333,14 @@ def read_network(path: Path) -> NetworkFile:
 
 
 def parse_network(path: Path) -> onnx.ModelProto:
-    """The ONNX model in the file, of any kind, with external data read in. Raises BadInputError when unreadable."""
+    """Read the ONNX model in the file, of any kind, with external data. Raises BadInputError when unreadable."""
     model = _parse(path)
     _load_external(model, path)
     return model
 
 
 def network_files(path: Path) -> list[Path]:
-    """The ONNX file itself, then every file beside it that holds tensors of it. Raises BadInputError."""
+    """Return the ONNX file itself, then every file beside it that holds tensors of it. Raises BadInputError."""
     kept = {_external_file(tensor, path) for tensor in _external_tensors(_parse(path))}
     return [path, *sorted(kept)]
 
@@ -374,7 +378,7 @@ def _load_external(model: onnx.ModelProto, path: Path) -> None:
 
 
 def _external_file(tensor: TensorProto, path: Path) -> Path:
-    """The file that holds the data of `tensor`, of the network in `path`. Raises BadInputError when it may not be."""
+    """Return the file that holds the data of `tensor` in network `path`. Raises BadInputError for a forbidden place."""
     folder = path.parent.resolve()
     entry = {pair.key: pair.value for pair in tensor.external_data}
     file: Path = (folder / entry.get("location", "")).resolve()

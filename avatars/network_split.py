@@ -2,8 +2,8 @@
 
 Rule: only bytes cross a cut, so the parts, run one after the other, give the same bytes as the whole network.
 
-Every tensor that a later part reads crosses the cut, not only the tensor it is named after: a U-Net's skips, or its
-input. A Dequantize whose bytes cross, and a Transpose behind it, are repeated in the part that reads them.
+Every tensor that a later part reads crosses the cut, not only the one that the cut is named after. Others are a U-Net's
+skips or its input. A Dequantize whose bytes cross, and a Transpose behind it, are repeated in the part that reads them.
 """
 
 from __future__ import annotations
@@ -21,15 +21,16 @@ from trilane.avatars.network_file import IntegerNetwork, NetworkFile
 from trilane.errors import BadInputError
 
 QUANTIZE = "QuantizeLinear"
-#: Operators of one input that a later part can repeat from the bytes that cross.
+#: Operators with one input that a later part can repeat from the bytes that cross.
 MOVABLE = ("DequantizeLinear", "Transpose")
 Shapes = dict[str, tuple[int, ...]]
 
 
 @dataclass(frozen=True)
 class Cut:
-    """A place to cut. `at`: the tensor it is named after. `nodes`: how many nodes of the graph come before it.
+    """A place to cut.
 
+    `at`: tensor that it is named after. `nodes`: number of the graph's nodes before it.
     `crossing`: name and shape of every tensor that crosses, all uint8; `at` is one of them.
     """
 
@@ -39,16 +40,16 @@ class Cut:
 
     @property
     def bytes(self) -> int:
-        """Bytes that cross the cut for one frame."""
+        """Number of bytes that cross the cut for one frame."""
         return sum(math.prod(shape) for shape in self.crossing.values())
 
 
 @dataclass(frozen=True)
 class NetworkPart(IntegerNetwork):
-    """A part of the network that runs by itself. All four tables take a uint8 tensor's name to its shape.
+    """A part of the network that runs by itself. Its four tables map a uint8 tensor's name to its shape.
 
-    `inputs`, `outputs`: the tensors of `model`, in its order.
-    `crossing_in`: tensors that cross the cut before this part; `crossing_out`: those that cross the cut behind it. A
+    `inputs`, `outputs`: tensors of `model`, in its order.
+    `crossing_in`: tensors that cross the cut before this part. `crossing_out`: tensors that cross the cut behind it. A
     tensor of `crossing_out` that is not in `outputs` is in `crossing_in`, and has to be copied unchanged.
     """
 
@@ -59,7 +60,7 @@ class NetworkPart(IntegerNetwork):
 
 
 def cuts(network: NetworkFile) -> Iterator[Cut]:
-    """Every place where `network` can be cut, in the order of its nodes."""
+    """Yield every place where `network` can be cut, in the order of its nodes."""
     graph = onnx.shape_inference.infer_shapes(network.model).graph
     for number, node in enumerate(graph.node, 1):
         if node.op_type == QUANTIZE and node.output[0] != graph.output[0].name:
@@ -69,7 +70,7 @@ def cuts(network: NetworkFile) -> Iterator[Cut]:
 
 
 def split(network: NetworkFile, at: Sequence[str]) -> list[NetworkPart]:
-    """The parts of `network`, cut at the quantised tensors `at`, which are in the order of the network's nodes.
+    """Return the parts of `network`, cut at the quantised tensors `at`, given in the order of the network's nodes.
 
     Raises BadInputError when it cannot be cut there.
     """
@@ -88,7 +89,7 @@ def split(network: NetworkFile, at: Sequence[str]) -> list[NetworkPart]:
 
 
 def _crossing(graph: onnx.GraphProto, nodes: int) -> Shapes | None:
-    """Tensors that the nodes from number `nodes` on read from the nodes before; None unless all of them are bytes."""
+    """Return the tensors that nodes from number `nodes` on read from earlier ones; None unless all are bytes."""
     makers = {name: node for node in graph.node[:nodes] for name in node.output}
     names = []
     for node in graph.node[nodes:]:
@@ -129,7 +130,7 @@ def _part(network: NetworkFile, before: Cut, after: Cut) -> NetworkPart:
 
 
 def _needed(nodes: Sequence[onnx.NodeProto], outputs: Sequence[str]) -> list[onnx.NodeProto]:
-    """The nodes that `outputs` depend on, in their order."""
+    """Return the nodes that `outputs` depend on, in their order."""
     wanted, needed = set(outputs), []
     for node in reversed(nodes):
         if wanted.intersection(node.output):

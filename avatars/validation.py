@@ -1,7 +1,7 @@
-"""Which figures of accuracy are an avatar's own, and what is said in place of those that are not.
+"""Decides which figures of accuracy are an avatar's own, and what is said in place of the others.
 
-Rule: a figure is shown only where the bytes, the constants and the way of drawing are those that it was measured with;
-everything else is a sentence that names what differs and the command that measures it.
+Rule: a figure is shown only where bytes, constants and the way of drawing are those of its measurement. Everything else
+is a sentence that names what differs and the command that measures it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from trilane.avatars.manifest import CAPTURED, UNTRAINED, Validation, digests_of
 from trilane.figure_sources import NO_FIGURES, from_validation
 from trilane.shapes import parse_shape
 
-#: Part of an avatar to its name in a sentence.
+#: Name of each part of an avatar in a sentence.
 PARTS = {
     "body": "the body",
     "texture": "the neural texture",
@@ -31,7 +31,7 @@ HELD_OUT = "held_out_error"
 ON_HELD_OUT = "its error on those held out is in the provenance of its manifest"
 
 
-#: What a validation at another size or on another runtime costs.
+#: Warning about a validation at another size or on another runtime.
 REPLACES = ", in place of what the manifest says now"
 NEIGHBOURS = "`trilane bench several` measures what an avatar loses to its neighbours"
 PLANNED, BY_FRAME = "auto", "`trilane bench planner` measures scenes whose tensor is planned"
@@ -41,8 +41,8 @@ PLANNED, BY_FRAME = "auto", "`trilane bench planner` measures scenes whose tenso
 class DrawnAs:
     """How a run draws an avatar.
 
-    `runtime`: of the network. `size`: tensor size of the scene. `texture_filter`: of the neural texture. `avatars`: how
-    many share the tensor.
+    `runtime`: runtime of the network. `size`: tensor size of the scene. `texture_filter`: filter of the neural texture.
+    `avatars`: number of avatars that share the tensor.
     """
 
     runtime: str
@@ -52,10 +52,10 @@ class DrawnAs:
 
 
 def accuracy_of(bundle: Bundle, drawn: DrawnAs) -> dict[str, Any]:
-    """What may be said of the error of the avatar's pictures in a run that draws it as `drawn`.
+    """Return what may be said about the error of the avatar's pictures in a run that draws it as `drawn`.
 
     With figures: `source`, which names the validation and its date; `runtime`, `size`; the keys of `Figures`.
-    Without: what `refused` says, also where the avatar is drawn otherwise than it was when it was validated.
+    Without: what `refused` returns, also where the avatar is drawn otherwise than in its validation.
     Raises BadInputError for a file that cannot be read.
     """
     validation = bundle.manifest.validation
@@ -78,7 +78,7 @@ def accuracy_of(bundle: Bundle, drawn: DrawnAs) -> dict[str, Any]:
 
 
 def validation_facts(bundle: Bundle) -> dict[str, Any] | None:
-    """The whole validation with its `source`, or what `refused` says; None for an avatar that was never validated."""
+    """Return the whole validation with its `source`, or what `refused` returns; None for an unvalidated avatar."""
     validation = bundle.manifest.validation
     if validation is None:
         return None
@@ -86,7 +86,7 @@ def validation_facts(bundle: Bundle) -> dict[str, Any] | None:
 
 
 def refused(bundle: Bundle) -> dict[str, Any]:
-    """Why no figure of the manifest may be shown; empty when the files are those that were validated.
+    """Say why no figure of the manifest may be shown; empty when the files are those that were validated.
 
     Keys: `source`, which is `NO_FIGURES`; `changed`: keys of `PARTS` that were changed since; `why`: a sentence.
     Raises BadInputError for a file that cannot be read.
@@ -119,12 +119,12 @@ def refused(bundle: Bundle) -> dict[str, Any]:
 
 
 def no_truth(bundle: Bundle) -> str:
-    """Why an avatar of a capture cannot be validated, and where its error on frames is if somebody measured it."""
+    """Say why an avatar of a capture cannot be validated, and where its error on frames is if somebody measured it."""
     return f"{NO_TRUTH}; {ON_HELD_OUT}" if HELD_OUT in bundle.manifest.provenance else NO_TRUTH
 
 
 def _drawn_otherwise(validation: Validation, drawn: DrawnAs) -> str:
-    """What of `drawn` differs from how the avatar was drawn when it was validated; empty when nothing does."""
+    """Say how `drawn` differs from the way in which the avatar was validated; empty when it does not."""
     runtimes = [validation.runtime, *validation.other_runtimes]
     if drawn.avatars > 1:
         return f"it was validated alone in its tensor, and here {drawn.avatars} avatars share one"
@@ -139,35 +139,37 @@ def _drawn_otherwise(validation: Validation, drawn: DrawnAs) -> str:
 
 
 def _no_figures(bundle: Bundle, changed: Sequence[str], why: str, how: str = "", remark: str = "") -> dict[str, Any]:
-    """`why`, and the command that measures what there is now, with the options `how` and a `remark` on it."""
+    """Return `why`, and the command that measures the present files, with the options `how` and a `remark` on it."""
     command = f"{VALIDATE} {shlex.quote(name_of(bundle.folder))}{how}"
     return {"source": NO_FIGURES, "changed": list(changed), "why": f"{why}; `{command}` measures it{remark}"}
 
 
 def name_of(folder: Path) -> str:
-    """What a person types for `folder`: the name of an avatar of the package, or the folder."""
+    """Return what a person types for `folder`: the name of an avatar of the package, or the folder."""
     known = (name for name in BUILT_IN if folder.absolute() == bundle_folder(name).absolute())
     return next(known, str(folder))
 
 
-# What an avatar loses in smaller tensors than its network was trained for. Rule: its validation's figures or none.
+# The loss of an avatar in smaller tensors than its network was trained for. Rule: it is its validation's figures or
+# none.
 
-WHOLE = 1000  # thousandths
+WHOLE = 1000  # the work of a whole tensor, in thousandths
 DIGITS = 2
 
 
 @dataclass(frozen=True)
 class SizeLoss:
-    """`by_work`: PSNR in dB that is lost, by thousandths of the pixels; empty without figures.
+    """The loss of an avatar in smaller tensors.
 
-    `source`: where they come from, or why there are none and what measures them.
+    `by_work`: loss of PSNR in dB, by thousandths of the pixels; empty without figures.
+    `source`: source of the figures, or why there are none and what measures them.
     """
 
     source: str
     by_work: Mapping[int, float]
 
     def at(self, work: int) -> float | None:
-        """The loss with so many thousandths of the pixels: of the next smaller size that was measured, if any was."""
+        """Return the loss with `work` thousandths of the pixels: that of the next smaller measured size, if any."""
         if work >= WHOLE and self.by_work:
             return 0.0
         measured = [size for size in self.by_work if size <= work]
@@ -175,7 +177,7 @@ class SizeLoss:
 
 
 def size_loss(bundle: Bundle) -> SizeLoss:
-    """Of `bundle`. Raises BadInputError for a file that cannot be read."""
+    """Return the loss of `bundle`. Raises BadInputError for a file that cannot be read."""
     validation, name = bundle.manifest.validation, bundle.manifest.name
     measures = f"`{VALIDATE} {name_of(bundle.folder)} --sizes` measures them"
     if validation is None or refused(bundle):

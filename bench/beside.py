@@ -1,12 +1,12 @@
-"""Two avatars at once on this machine, beside what the virtual clock says of them: are the frame times the same?
+"""Two avatars at once on this machine, beside what the virtual clock predicts for them: are the frame times the same?
 
-Rule: measured are the runs, and before and after them what each stage takes while no other unit works; computed is,
-from these times alone, what two such pipelines do on cores that they divide in equal shares.
+Rule: the runs are measured, and before and after them the time of each stage while no other unit works. From these
+times alone, the frame times of two such pipelines are computed, on cores that they divide in equal shares.
 
-What the scheduler takes of its core, `SCHEDULER_NS` a job as in the model of placement, counts with the first stage,
-which runs there. `strangers` says how quiet the machine was: the waits of the sequential stages for their cores, over
-their work. The virtual clock knows nothing of others: with more than a few hundredths of a stranger the ratio says
-nothing.
+The scheduler's own time on its core, `SCHEDULER_NS` a job as in the model of placement, counts with the first stage,
+which runs there. `strangers` says how quiet the machine was: the time that sequential stages wait for their cores, over
+the time that they work. The virtual clock does not know other programs: the ratio says nothing when `strangers` is more
+than a few hundredths.
 """
 
 from __future__ import annotations
@@ -29,12 +29,16 @@ from trilane.units import AFTER_INFER, BEFORE_INFER
 
 SEQUENTIAL, PIPELINED = "sequential", "pipelined"
 FIRST, LAST = BEFORE_INFER[0][0], AFTER_INFER[-1][0]
-SECONDS = 20.0  # of the simulated runs, virtual
+SECONDS = 20.0  # virtual seconds of the simulated runs
 ENDLESS = 1 << 40
 
 
 class Isolated(NamedTuple):
-    """Of one pipeline: mean ns of each stage; how long all of them worked, and waited for a core."""
+    """The times of one pipeline alone.
+
+    `stage_ns`: mean time of each stage, ns. `worked_ns`, `waited_ns`: time that all stages worked, and waited for a
+    core, ns.
+    """
 
     stage_ns: Mapping[str, float]
     worked_ns: int
@@ -46,12 +50,12 @@ def measure_beside(
     rounds: int,
     processes: Any = avatar_processes,
 ) -> list[dict[str, Any]]:
-    """A row for each of the two pipelines `asked`, medians over the `rounds`.
+    """Return a row for each of the two pipelines `asked`, medians over the `rounds`.
 
     `frame_ms`: mean time between presented frames while both ran. `virtual_ms`: the same, computed. `ratio`: measured
-    over computed; `ratio_low`, `ratio_high`: the 95 % interval of its median. `isolated_ms`: a frame's stages.
-    `strangers`: how many threads of others were ready where its stages worked, in the mean.
-    `processes`: makes the processes that run. Raises TrilaneError when a run fails.
+    over computed. `ratio_low`, `ratio_high`: 95 % interval of its median. `isolated_ms`: time of a frame's stages.
+    `strangers`: mean number of other programs' threads that were ready where its stages worked. `processes`: makes the
+    processes that run. Raises TrilaneError when a run fails.
     """
     found: list[list[dict[str, float]]] = []
     context: AbstractContextManager[list[AvatarProcess]] = processes(asked)
@@ -74,7 +78,7 @@ def _ran(process: AvatarProcess, policy: str) -> Ran:
 
 
 def isolated_of(jobs: Sequence[JobRecord]) -> Isolated:
-    """What the stages took in `jobs` of sequential runs, net of what they waited for their cores."""
+    """Return the times of the stages in `jobs` of sequential runs, without their waits for cores."""
     times: dict[str, list[int]] = {}
     for job in jobs:
         times.setdefault(job.stage, []).append(job.end_ns - job.begin_ns - job.preempted_ns)
@@ -99,7 +103,10 @@ def _round(both: Sequence[Ran], isolated: Sequence[Isolated], asked: Sequence[As
 
 
 def overlapping_ms(runs: Sequence[Sequence[JobRecord]]) -> list[float]:
-    """Mean time between presented frames of each run, while all ran. Raises TrilaneError when they hardly met."""
+    """Return the mean time between presented frames of each run, while all ran, in ms.
+
+    Raises TrilaneError when they hardly overlapped.
+    """
     ends = [sorted(job.end_ns for job in jobs if job.stage == LAST) for jobs in runs]
     first, last = max(each[0] for each in ends), min(each[-1] for each in ends)
     kept = [[end for end in each if first <= end <= last] for each in ends]
@@ -111,7 +118,7 @@ def overlapping_ms(runs: Sequence[Sequence[JobRecord]]) -> list[float]:
 def computed_ms(
     isolated: Sequence[Isolated], seats: Sequence[Mapping[str, str]], asked: Sequence[Asked]
 ) -> list[float]:
-    """Mean time between frames of each pipeline in virtual time, all beside each other on cores that they divide."""
+    """Return the mean virtual time between frames of each pipeline, ms, all at once on cores that they divide."""
     stop = (round(SECONDS * 1e9), Stop())
     members = [
         Member(

@@ -1,6 +1,7 @@
 """What do MIP maps and anisotropic filtering of the neural texture cost, and what do they change?
 
-Rule: one avatar, one view, the filters interleaved; every filter's picture is compared with the same ground truth.
+Rule: there is one avatar and one view, and the filters are interleaved; every filter's picture is compared with the
+same ground truth.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ class _FilterFixture:
             self._drawn[name] = packed, PackedAvatar(packed, SkinnedMesh(self.ctx, assets.arrays), assets.texture)
 
     def rows(self, shape: tuple[int, int], repeats: int) -> list[dict[str, Any]]:
-        """One row per filter."""
+        """Return one row per filter."""
         tensors = {name: np.empty((1, *shape, drawn[0].channels), np.uint8) for name, drawn in self._drawn.items()}
         variants = {name: partial(self._draw, name, shape, tensor) for name, tensor in tensors.items()}
         times = interleaved_ms(variants, repeats)

@@ -1,8 +1,8 @@
 """How long from the producer's last byte written until the consumer, another process, can read them all, and has?
 
-Rule: one definition for every variant, and all run interleaved; the producer writes every byte anew, then reads the
-clock. What a run does, through the scheduler, is what is judged and set against the peers: a chain of units, the second
-of which fills its slot and the third reads every byte of it, and the others do nothing.
+Rule: one definition holds for every variant, and all run interleaved; the producer writes every byte anew, then reads
+the clock. The variant that is judged and compared with the peers is a real run through the scheduler. Its units form a
+chain: the second one fills its slot, the third one reads every byte of it, and the others do nothing.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from trilane.scheduler.stats import median_interval, samples_needed
 from trilane.transport.packets import Packet
 from trilane.transport.wakeup import UNIT_NS, awake, use_slice
 
-#: KiB of a tensor of 16 channels at 128, 256, 512 and 1024 squared; other sizes are not asked for.
+#: KiB of a tensor of 16 channels at 128, 256, 512 and 1024 squared; no other sizes are accepted.
 SIZES_KIB = (256, 1024, 4096, 16384)
 PIPELINE = "slot through the scheduler"
 OURS = (SLOT, BARE, PIPELINE)
@@ -39,7 +39,7 @@ MIN_FRAMES = 10
 ANSWER_S = 120
 LIMITS_US = {"p50": 150, "p99": 500}
 ENDS = ("producer", "consumer")
-#: Microseconds of each frame of a round until every byte could be read, and until it was.
+#: Microseconds of each frame of a round until every byte could be read, and until every byte was read.
 Times = tuple[list[float], list[float]]
 FACTORY = "trilane.bench.handoff:build"
 PAUSE_S = 0.001
@@ -85,6 +85,7 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 300, rounds
         for number in range(rounds):
             for size in kib:
                 variants = [variant for variant, of in pairs if of == size]
+                # Each round begins with another variant, so that none is always the first.
                 first = number % len(variants)
                 for variant in variants[first:] + variants[:first]:
                     times.setdefault((variant, size), []).append(pairs[variant, size].run(frames))
@@ -123,7 +124,7 @@ class Pair:
             raise
 
     def run(self, frames: int) -> Times:
-        """Microseconds from written to readable, and to all read, of `frames` hand-overs."""
+        """Return microseconds from written to readable, and to all read, of `frames` hand-overs."""
         for pipe in reversed(self._pipes):
             pipe.send(frames)
         written, (readable, read) = (_answer(pipe) for pipe in self._pipes)
@@ -141,7 +142,7 @@ class Pair:
 
 
 def produce(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[int, ...], written: int) -> None:
-    """The process that writes; answers each number of frames with the instants, in ns, at which they were written."""
+    """Run the process that writes; it answers each number of frames with the instants of writing, ns."""
     with _child(pipe, cores):
         end = channel.producer()
         pipe.send("ready")
@@ -157,7 +158,7 @@ def produce(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[in
 
 
 def consume(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[int, ...], written: int) -> None:
-    """The process that reads; answers with the instants at which the bytes could be and had been read."""
+    """Run the process that reads; it answers with the instants, ns, at which bytes could be and had been read."""
     with _child(pipe, cores):
         end = channel.consumer()
         pipe.send("ready")
@@ -178,6 +179,7 @@ def consume(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[in
 def _child(pipe: Connection, cores: tuple[int, ...]) -> Iterator[None]:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends it
     os.sched_setaffinity(0, cores)
+    # The kernel schedules the processes of units with the same slice.
     use_slice(UNIT_NS)
     try:
         yield
@@ -197,7 +199,7 @@ def _answer(pipe: Connection) -> Any:
 
 
 def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, int], Pair], dict[str, str]]:
-    """Waiting processes for each variant and size, and why a variant is absent."""
+    """Return waiting processes for each variant and size, and why a variant is absent."""
     context = multiprocessing.get_context("spawn")
     pairs, absent = {}, {}
     for variant, make in CHANNELS.items():
@@ -213,7 +215,10 @@ def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, in
 
 
 def _through_pipeline(size: int, frames: int) -> Times:
-    """A sequential run of units that only write and read: from raster's end to infer's begin, and to its end."""
+    """Run units sequentially that only write and read; return the times to infer's begin, and to its end.
+
+    Times count from raster's end.
+    """
     result = run_pipeline(handoff_pipeline(size * 1024), frames, policy="sequential")
     if result.interrupted:
         raise KeyboardInterrupt
@@ -243,7 +248,7 @@ def _row(variant: str, size: int, rounds: list[Times]) -> dict[str, Any]:
 
 
 def over_rounds(key: str, rounds: Sequence[list[float]], percent: float) -> dict[str, float | None]:
-    """The median of the rounds' percentiles and its interval; None where a round has too few values for it."""
+    """Return the median of the rounds' percentiles and its interval; None where a round has too few values for it."""
     names = (f"{key}_us", f"{key}_low_us", f"{key}_high_us")
     if min(map(len, rounds)) < samples_needed(percent / 100):
         return dict.fromkeys(names)
@@ -269,7 +274,7 @@ def _met(row: dict[str, Any]) -> bool | None:
 
 
 def against_peers(times: dict[tuple[str, int], list[Times]]) -> dict[str, Any]:
-    """How much longer each peer takes than ours, in the same round; see `measure`."""
+    """Return how much longer each peer takes than ours, in the same round; see `measure`."""
     slower, read_slower = _slower(times, PIPELINE, 0), _slower(times, PIPELINE, 1)
     return {
         "ahead": _ahead(slower),
@@ -284,7 +289,10 @@ def against_peers(times: dict[tuple[str, int], list[Times]]) -> dict[str, Any]:
 def _slower(
     times: dict[tuple[str, int], list[Times]], ours: str, until: int
 ) -> dict[str, dict[int, tuple[float, float]]]:
-    """The ends of an interval, by peer and size. `until`: 0 for readable, 1 for read."""
+    """Return the ends of an interval, by peer and size.
+
+    `until`: 0 for readable, 1 for read.
+    """
     p50 = {key: np.array([np.percentile(of_round[until], 50) for of_round in of]) for key, of in times.items()}
     sizes = sorted({size for _, size in times})
     peers = sorted({variant for variant, _ in times} - {*OURS})
@@ -298,7 +306,7 @@ def _ahead(slower: dict[str, dict[int, tuple[float, float]]]) -> dict[str, bool]
 
 
 class HandoffStage:
-    """`trilane.pipeline.stage.Stage`; what it does follows from its name."""
+    """A `trilane.pipeline.stage.Stage` whose work follows from its name."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -318,23 +326,23 @@ class HandoffStage:
         return {}
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing: there is nothing to release."""
 
 
 def check_bytes(payload: U8, value: int) -> None:
-    """Read every byte. Raises TrilaneError when one is not `value`; the size is a multiple of 8."""
+    """Read every byte of `payload`, whose size is a multiple of 8. Raises TrilaneError when one is not `value`."""
     words = payload.view(np.uint64)
     if int(words.sum(dtype=np.uint64)) != len(words) * value * 0x0101010101010101 % 2**64:
         raise TrilaneError(f"a slot of {payload.size} bytes holds others than were written")
 
 
 def build(settings: Mapping[str, Any], unit: UnitContext) -> HandoffStage:  # noqa: ARG001 - a factory's signature
-    """The stage that `settings["name"]` says."""
+    """Build the stage that `settings["name"]` names."""
     return HandoffStage(settings["name"])
 
 
 def handoff_pipeline(payload_bytes: int) -> Pipeline:
-    """A chain whose edge from the GPU unit to the DSP carries `payload_bytes`, and the others nothing."""
+    """Return a chain whose edge from the GPU unit to the DSP unit carries `payload_bytes`; the others carry nothing."""
     sizes = [payload_bytes if before == WRITER else 0 for before, _ in STAGES[:-1]]
     return Pipeline(
         stages=tuple(

@@ -80,7 +80,7 @@ def _fixtures(
     size: tuple[str, ...],
     batch: tuple[int, ...],
 ) -> Iterator[tuple[NetworkFixture, onnx.ModelProto | None]]:
-    """Integer networks, and each in float where there is one."""
+    """Yield integer networks, each with its float network where there is one."""
     if network:
         file = read_network(Path(network)) if network.endswith(".onnx") else load_bundle(network).read_network()
         for frames in batch:
@@ -109,7 +109,7 @@ def _variants(
 
 @contextmanager
 def _cache(folder: Path) -> Iterator[None]:
-    """Compiled networks are kept in `folder` by the processes started inside the block."""
+    """Make processes started inside the block keep compiled networks in `folder`."""
     before = os.environ.get(CACHE)
     os.environ[CACHE] = str(folder)
     try:
@@ -122,7 +122,7 @@ def _cache(folder: Path) -> Iterator[None]:
 
 
 def _measure_periods(variants: dict[str, Variant], seconds: float, period: float) -> dict[str, dict[str, Any]]:
-    """Start-up times of each variant, and the times of its runs in each period, ms."""
+    """Return start-up times of each variant, and the times of its runs in each period, ms."""
     with runners(variants) as by_name:
         cold = {name: runner.startup_ms for name, runner in by_name.items()}
     with runners(variants) as by_name:

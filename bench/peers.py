@@ -1,6 +1,6 @@
 """Are Trilane's runtimes as fast as the libraries themselves, and how far from what the machine can do?
 
-Rule: the libraries run as their first examples run them, ours on as many threads; all run interleaved.
+Rule: the libraries run as in their first examples, Trilane's runtimes on as many threads; all run interleaved.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ ORT, OPENVINO, FP32 = "trilane ort", "trilane openvino", "onnxruntime fp32"
 APP = "benchmark_app"
 APP_STATS = "benchmark_report.json"
 APP_TIMEOUT_S = 600
-#: Ratio: the peak that it is a share of.
+#: For each ratio, the peak that it is a share of.
 PEAKS = {
     "openvino_of_roofline": "the best INT8 layer of the same runtimes, measured here (roofline.int8_gmac_s)",
     "openvino_of_instruction_peak": "the instruction set: documented multiply-accumulates a cycle x clock measured "
@@ -84,10 +84,10 @@ def measure(
 def compared(
     times: Mapping[str, Sequence[Sequence[float]]], gmac: float, layer_gmac_s: float, instruction_gmac_s: float | None
 ) -> dict[str, dict[str, Any]]:
-    """The ratios and their intervals.
+    """Return the ratios and their intervals.
 
     `times`: milliseconds of each variant's runs, by round. `gmac`: 1e9 multiply-accumulates of a run. `layer_gmac_s`,
-    `instruction_gmac_s`: the peaks.
+    `instruction_gmac_s`: the two peaks, 1e9 multiply-accumulates a second.
     """
     medians = {name: np.array([np.median(of_round) for of_round in of_rounds]) for name, of_rounds in times.items()}
     rate = gmac / (medians[OPENVINO] / 1e3)
@@ -120,7 +120,7 @@ def _variants(integer: Path, plain: Path, threads: int) -> dict[str, Variant]:
 def _measure_rounds(
     variants: dict[str, Variant], integer: Path, threads: int, rounds: int, seconds: int
 ) -> dict[str, list[list[float]]]:
-    """Milliseconds of each variant's runs, by round; of `benchmark_app`, the median that it printed."""
+    """Return milliseconds of each variant's runs, by round; for `benchmark_app`, the median that it printed."""
     times: dict[str, list[list[float]]] = {name: [] for name in (*variants, APP)}
     with runners(variants) as by_name:
         for _ in range(rounds):
@@ -131,7 +131,7 @@ def _measure_rounds(
 
 
 def _benchmark_app(network: Path, threads: int, seconds: int) -> float:
-    """Median latency in milliseconds by OpenVINO's tool: one request at a time."""
+    """Return the median latency in milliseconds by OpenVINO's tool, with one request at a time."""
     tool = machine.here.program(APP, first=Path(sys.executable).parent)
     if tool is None:
         raise MissingPartError(f"{APP} is not there", extra="openvino")

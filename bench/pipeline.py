@@ -1,6 +1,6 @@
 """Does the pipeline keep its slowest unit busy, and what does that gain over one frame at a time?
 
-Rule: every run is compared with the `sequential` runs before and after it on the same cores, in which every stage does
+Rule: every run is compared with the `sequential` runs before and after it on the same cores. In those, every stage does
 the same frames in the same order while the other units are quiet. Settings run interleaved in many short rounds,
 because a shared machine grows slower and faster within seconds; a row is the median over the rounds.
 """
@@ -36,14 +36,14 @@ from trilane.unexpected_value import UnexpectedValue
 
 SEQUENTIAL = "sequential"
 MIN_FRAMES = 20
-LATENCIES = "latencies_ns"  # of a run; a row has their percentiles over all rounds
-UNITS_MS = "units_ms"  # of a run: what each unit takes for a frame
-PACE = 1.25  # of the slowest unit's rate: paced policies always get more frames than they can present
+LATENCIES = "latencies_ns"  # key of a run's latencies; a row has their percentiles over all rounds
+UNITS_MS = "units_ms"  # key of what each unit takes for a frame in a run
+PACE = 1.25  # factor on the slowest unit's rate: paced policies always get more frames than they can present
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What one row measures."""
+    """The settings that one row measures."""
 
     avatar: str
     size: str
@@ -111,7 +111,7 @@ def measure(
 def _measure_two(
     which: Sequence[tuple[str, str]], edge: str, cores: int, frames: int, rounds: int, runtime: str, *, video: bool
 ) -> dict[str, Any]:
-    """Two avatars at once, each a name and a size."""
+    """Measure two avatars at once, each given as a name and a size."""
     asked = [
         Asked(_folder(name), size, frames, runtime, usable_cores()[:cores], video=video, edge=edge)
         for name, size in which
@@ -126,7 +126,7 @@ def _folder(avatar: str) -> str:
 
 
 def _measure_rounds(checked: Checked, settings: list[Setting], rounds: int) -> list[dict[str, Any]]:
-    """A row for each setting. One more `sequential` run ends the last round."""
+    """Return a row for each setting. One more `sequential` run ends the last round."""
     measured = [_run_round(checked, settings) for _ in range(rounds)]
     closing = _run(checked, settings[0])
     for runs, after in zip(measured, [*(runs[0] for runs in measured[1:]), closing], strict=True):
@@ -148,7 +148,7 @@ def _check(policies: Sequence[str], edges: Sequence[str], cores: Sequence[int]) 
 
 
 def _pairs(policies: Sequence[str], edges: Sequence[str]) -> list[tuple[str, str]]:
-    """Policies and edges; `sequential` first, because the others are compared with it."""
+    """Return policies and edges, `sequential` first, because the others are compared with it."""
     return [(SEQUENTIAL, "double"), *(pair for pair in product(policies, edges) if pair != (SEQUENTIAL, "double"))]
 
 
@@ -159,7 +159,7 @@ def _config(avatar: str, size: str, cores: int, frames: int, runtime: str, video
 
 
 def _run_round(checked: Checked, settings: list[Setting]) -> list[dict[str, Any]]:
-    """One run of each; the `sequential` one sets the pace of the paced ones."""
+    """Run each setting once; the `sequential` run sets the pace of the paced ones."""
     base = _run(checked, settings[0])
     slowest_ms = max(base[UNITS_MS].values())
     return [base, *(_run(checked, setting, slowest_ms) for setting in settings[1:])]
@@ -194,7 +194,7 @@ def _run(checked: Checked, plan: Setting, slowest_ms: float = 0.0) -> dict[str, 
 
 
 def _figures(result: RunResult) -> dict[str, Any]:
-    """The row of one run, before it is compared with others."""
+    """Return the row of one run, before it is compared with others."""
     metrics = result.report
     stages_ms = sum(stage.service_ms.mean for stage in metrics.stages.values())
     busiest = max(metrics.units, key=lambda unit: metrics.units[unit].busy)
@@ -213,7 +213,7 @@ def _figures(result: RunResult) -> dict[str, Any]:
 
 
 def _units_ms(result: RunResult) -> dict[str, float]:
-    """Milliseconds of each unit's jobs for a frame, without the time in which it had no core."""
+    """Return milliseconds of each unit's jobs for a frame, without the time in which it had no core."""
     times = dict.fromkeys(result.report.units, 0.0)
     for name, stage in result.report.stages.items():
         preempted = [job.preempted_ns for job in result.jobs if job.stage == name]
@@ -222,7 +222,7 @@ def _units_ms(result: RunResult) -> dict[str, float]:
 
 
 def idle_between_jobs(jobs: Sequence[JobRecord]) -> dict[str, float]:
-    """Shares of the time between the first job's begin and the last one's end; `idle` is the sum of its causes."""
+    """Return shares of the time between the first job's begin and the last one's end; `idle` sums up its causes."""
     ordered = sorted(jobs, key=lambda job: job.begin_ns)
     span = ordered[-1].end_ns - ordered[0].begin_ns
     parts = {"starved": 0, "undispatched": 0, "overhead": 0}
@@ -237,14 +237,14 @@ def idle_between_jobs(jobs: Sequence[JobRecord]) -> dict[str, float]:
 
 
 def latencies_ns(recording: Recording, jobs: Sequence[JobRecord]) -> list[int]:
-    """The latency of each presented frame of a run that is in memory."""
+    """Return the latency of each presented frame of a run that is in memory."""
     timeline = Timeline(recording.graph, recording.settings)
     facts = (fact for record in records_of(recording, jobs) for fact in timeline.add(record))
     return [fact.latency_ns for fact in facts if isinstance(fact, Presented)]
 
 
 def _latency_ms(runs: list[dict[str, Any]]) -> dict[str, float | None]:
-    """Percentiles over the frames of all `runs`; None where there are too few."""
+    """Return percentiles over the frames of all `runs`; None where there are too few."""
     ordered = sorted(ns for run in runs for ns in run[LATENCIES])
     enough = {percent: len(ordered) >= samples_needed(percent / 100) for percent in (50, 99)}
     return {
@@ -254,7 +254,7 @@ def _latency_ms(runs: list[dict[str, Any]]) -> dict[str, float | None]:
 
 
 def _summary(setting: Setting, runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Of the runs of one setting: medians of numbers, the commonest of names, sums of frames."""
+    """Summarise the runs of one setting: medians of numbers, the commonest of names, sums of frames."""
     names = ("slowest", "busiest")
     sums = ("dropped", "lost")
     row: dict[str, Any] = {**vars(setting)}

@@ -1,8 +1,8 @@
 """Is the placement that a run chooses the best one, what does it gain over the rule, and does the model predict it?
 
-Rule: a run's own choice is made first, then everything is tried anew: all placements in turns, a few frames each, then
-those that could be the best, in further rounds which alone decide. Whole runs of the chosen one and the rule's stand
-beside them. Other numbers of cores are in virtual time, which is said.
+Rule: a run's own choice is made first, then everything is tried anew. All placements run in turns, a few frames each.
+Those that could be the best run in further rounds, which alone decide. Whole runs of the chosen placement and of the
+rule's stand beside them. Other numbers of cores are computed in virtual time, and the results say so.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def _check(counts: Sequence[int], frames: int, rounds: int, finalists: int, furt
 
 
 class _Trial:
-    """All placements of one scene on some cores."""
+    """Tries all placements of one scene on some cores."""
 
     def __init__(self, checked: Checked, cores: Sequence[Core], starter: UnitStarter) -> None:
         self._checked, self._starter = checked, starter
@@ -132,7 +132,7 @@ class _Trial:
         self._runs: dict[str, list[RunMetrics]] = {of: [] for of in self._places}
 
     def run(self, rounds: int, finalists: int, further: int, runs: int) -> None:
-        """`rounds` of all, `further` of those that could be the best, and whole runs."""
+        """Do `rounds` of all placements, `further` rounds of those that could be the best, and whole runs."""
         self._rounds = self._try(range(len(self._found)), rounds)
         tried_ms = self._tried_ms()
         always = list(dict.fromkeys(self._places.values()))
@@ -146,7 +146,7 @@ class _Trial:
                 self._runs[of].append(self._run(self._found[place].placement))
 
     def rows(self) -> list[dict[str, Any]]:
-        """One of each placement, in the order of the predictions."""
+        """Return a row for each placement, in the order of the predictions."""
         return [
             {
                 "placement": described(each.placement),
@@ -160,7 +160,7 @@ class _Trial:
         ]
 
     def summary(self) -> dict[str, Any]:
-        """The chosen placement beside the best of the others and beside the rule's, and the model beside the trial."""
+        """Compare the chosen placement with the best other one and the rule's, and the model with the trial."""
         place = self._places["chosen"]
         mine = self._further[place]
         best = min(self._further, key=lambda other: (median(self._further[other]), other != place))
@@ -193,15 +193,15 @@ class _Trial:
         }
 
     def times(self) -> list[dict[str, Any]]:
-        """What the units were measured to need."""
+        """Return what the units were measured to need."""
         return times_rows(self._times)
 
     def _tried_ms(self) -> list[float]:
-        """Of each placement, in the rounds of all."""
+        """Return the time of each placement in the rounds of all, ms."""
         return [median(each.frame_ns[place] for each in self._rounds) / NS_PER_MS for place in range(len(self._found))]
 
     def _place(self, one: Ranked) -> int:
-        """Where a placement stands among those that were found."""
+        """Return the index of a placement among those that were found."""
         return [each.placement for each in self._found].index(one.placement)
 
     def _try(self, places: Sequence[int], rounds: int) -> Sequence[Round]:
@@ -225,7 +225,7 @@ def _interval(prefix: str, values: Sequence[float]) -> dict[str, float]:
 
 
 def _virtual(checked: Checked, avatar: str, count: int) -> Mapping[str, Any]:
-    """What virtual time says of the placements on `count` equal cores without siblings."""
+    """Return what virtual time says about the placements on `count` equal cores without siblings."""
     height, width = min(checked.config.buckets, key=lambda shape: (abs(shape[0] - shape[1]), shape))
     network = reshaped(network_of(checked.assets), height, width)
     _, _, _, channels = network.shape
@@ -255,7 +255,7 @@ def _virtual(checked: Checked, avatar: str, count: int) -> Mapping[str, Any]:
 
 
 def rank_correlation(first: Sequence[float], second: Sequence[float]) -> float | None:
-    """Pearson's correlation of the ranks, from -1 to 1; None where one list has no order, for all of it is equal.
+    """Return Pearson's correlation of the ranks, from -1 to 1; None where all values of a list are equal.
 
     Spearman, American Journal of Psychology 15 (1904), 72-101. Raises ValueError for lists of different lengths.
     """

@@ -1,10 +1,9 @@
 """What does planning save against a fixed square of 512 x 512, and what does it cost in image error?
 
-Rule: both plans run interleaved, on the same moments of the same scenes, each on the cores that are best for it, as
-`trilane run` places it; the pictures that are compared are made by the
-runs' own stages from the very configurations that were timed. What they are compared with, the plan `full`, is written
-a second time (`bench/lib/full_picture.py`). Single bad frames are seen and means hide them, so every frame of both runs
-is compared too, with the truth, which takes less long to draw.
+Rule: both plans run interleaved, on the same moments of the same scenes. Each has the cores that are best for it, as
+`trilane run` places it. The compared pictures are made by the runs' own stages from the very configurations that were
+timed. Their reference, the plan `full`, is a second implementation (`bench/lib/full_picture.py`). Single bad frames are
+seen but hidden by means, so every frame of both runs is also compared with the truth, which is quicker to draw.
 """
 
 from __future__ import annotations
@@ -38,20 +37,20 @@ from trilane.writing import write_folder
 SCENES = ("portrait", "full-body", "crowd", "walk-past", "top-to-floor", "leave-and-return")
 POLICY = "pipelined"
 LEAST_FRAMES = 20
-#: By what differences from `full` are multiplied in the sheets.
+#: Factor on differences from `full` in the sheets.
 SHOWN = 8
 #: Tensor of the reference application, which fills it in every frame.
 FIXED = "512x512"
 
 
 def fixed(checked: Checked) -> Checked:
-    """The reference application's plan: one square tensor for everything, and every skin weight (12 at most)."""
+    """Return the reference application's plan: one square tensor for everything, and every skin weight (12 at most)."""
     scene = checked.config.scene.model_copy(update={"size": FIXED, "plan": "fixed"})
     return checked.changed(scene=scene, shapes=())
 
 
 def planned(checked: Checked) -> Checked:
-    """What the scene says itself; the shapes of a planned tensor are in the configuration."""
+    """Return the scene's own plan; the shapes of a planned tensor are in the configuration."""
     return checked
 
 
@@ -59,7 +58,7 @@ PLANS = {"fixed": fixed, "planned": planned}
 
 
 def in_frames(checked: Checked, frames: int) -> Checked:
-    """The whole of the scene in `frames` frames: fewer, at longer steps. Unchanged when it has no more than those."""
+    """Spread the whole scene over `frames` frames: fewer, at longer steps; unchanged when it has no more than those."""
     scene = checked.config.scene
     if frames >= scene.frames:
         return checked
@@ -94,7 +93,7 @@ def measure(
     require_metrics()
     if out:
         with write_folder(Path(out)):
-            pass  # that it can be written is found out before the work
+            pass  # finds out before the work whether it can be written
     found = [_Scene(name, frames, runtime, video=video) for name in scene]
     rows = []
     with UnitStarter(PRELOAD) as starter:
@@ -124,7 +123,10 @@ def _check(frames: int, pictures: int) -> None:
 
 @dataclass(frozen=True)
 class _Moment:
-    """One frame by every plan, (h,w,3) uint8 each. `true`: None where there is no truth."""
+    """One frame by every plan, (h,w,3) uint8 each.
+
+    `true`: true picture; None where there is no truth.
+    """
 
     number: int
     full: U8
@@ -133,10 +135,13 @@ class _Moment:
 
 
 class _Scene:
-    """One scene by both plans. `name`: the scene's. `driver`: of OpenGL, once it was compared."""
+    """One scene by both plans.
+
+    `name`: name of the scene. `driver`: OpenGL driver, once the scene was compared.
+    """
 
     def __init__(self, name: str, frames: int, runtime: str, *, video: bool) -> None:
-        """Raises BadInputError, MissingPartError."""
+        """Prepare both plans. Raises BadInputError, MissingPartError."""
         asked = RunOptions(scene=name, runtime=runtime, hud=False)
         checked = in_frames(configure(asked, Path.cwd()).changed(record=video), frames)
         self.name = checked.config.scene.name
@@ -145,9 +150,9 @@ class _Scene:
         self._plans = {plan: make(checked) for plan, make in PLANS.items()}
 
     def time(self, rounds: int, starter: UnitStarter) -> dict[str, Any]:
-        """Frame times of both plans in turns, and their ratio. Raises TrilaneError when a run fails.
+        """Measure frame times of both plans in turns, and their ratio. Raises TrilaneError when a run fails.
 
-        `starter`: of all units. Scenes too short to be rehearsed are placed by the rule for any run.
+        `starter`: starter of all units. Scenes too short to be rehearsed are placed by the rule for any run.
         """
         on_cores = {plan: placed(one, POLICY, starter, str(self.driver)) for plan, one in self._plans.items()}
         times: dict[str, list[float]] = {plan: [] for plan in self._plans}
@@ -161,7 +166,7 @@ class _Scene:
         return {"speedup": median(ratios), "speedup_low": low, "speedup_high": high, **middle, "placements": said}
 
     def compare(self, pictures: int) -> tuple[dict[str, Any], list[tuple[int, U8]]]:
-        """Image errors over `pictures` frames, evenly spread, and a sheet of each with its number."""
+        """Return image errors over `pictures` frames, evenly spread, and a sheet of each with its number."""
         cast, total = Cast(self._checked), self._checked.config.scene.frames
         full = FullPictures(cast)
         first = AvatarFrames(self._checked)
@@ -200,12 +205,12 @@ def by_frame(
     true: Callable[[int, U8], U8],
     cast: Cast,
 ) -> dict[str, Any] | None:
-    """Of `frames`, one after the other, each plan's error in the avatars' boxes against the truth.
+    """Return each plan's error in the avatars' boxes against the truth, over `frames`, one after the other.
 
     `true`: makes the true picture of a frame over the background that `behind` makes.
-    By plan what `psnr_of_frames` says of the frames in which somebody is seen, and `worst_frame`, its number; and of
-    `planned` `changes`: how often the tensor's shape is not that of the frame before, and `worst_change_db`, the least
-    PSNR of these frames, None without any. None with nobody in view.
+    The result has, by plan, the values of `psnr_of_frames` for the frames in which somebody is seen, and `worst_frame`,
+    its number. For `planned` it also has `changes`, how often the tensor's shape differs from the frame before, and
+    `worst_change_db`, the least PSNR of these frames, None without any. It is None with nobody in view.
     """
     errors: dict[str, dict[int, float]] = {plan: {} for plan in chains}
     tensors: dict[int, str] = {}
@@ -249,7 +254,11 @@ def _frame_ms(checked: Checked, what: str, starter: UnitStarter) -> float:
 
 
 def sheet(moment: _Moment) -> U8:
-    """Above: full, fixed, planned. Below: the truth (grey without), then what differs from full, around grey."""
+    """Return the pictures of a moment in two rows.
+
+    Above stand full, fixed and planned. Below stand the truth (grey without) and the differences from full, around
+    grey.
+    """
     above = [moment.full, *moment.plans.values()]
     below = [np.full_like(moment.full, 128) if moment.true is None else moment.true]
     for picture in moment.plans.values():
@@ -259,7 +268,7 @@ def sheet(moment: _Moment) -> U8:
 
 
 def _write(folder: Path, name: str, sheets: Sequence[tuple[int, U8]]) -> None:
-    """`NAME-FRAME.png` of each sheet. Raises BadInputError."""
+    """Write each sheet as `NAME-FRAME.png`. Raises BadInputError."""
     from PIL import Image
 
     with write_folder(folder) as draft:

@@ -32,9 +32,9 @@ from trilane.stages.gpu.skinned_mesh import MeshDraw, PosedMesh, SkinnedMesh
 from trilane.training.sample_renderer import UvBytes
 
 MAX_SIDE = 4096
-#: The variants whose bytes are compared.
+#: Variants whose bytes are compared.
 COMPARED = ("packed", "packed, other way", "split")
-UNEQUAL = 1e-3  # share of bytes that may differ by one step: other targets interpolate UVs at other places
+UNEQUAL = 1e-3  # largest share of bytes that may differ by one step: other targets interpolate UVs at other places
 
 
 def measure(size: int = 512, channels: int = 16, repeats: int = 40, threads: int = 1) -> dict[str, Any]:
@@ -74,7 +74,7 @@ def measure(size: int = 512, channels: int = 16, repeats: int = 40, threads: int
 def _variants(
     ctx: Any, fixture: Fixture, tensors: dict[str, Any], shape: tuple[int, int], deferred: bool
 ) -> dict[str, Callable[[], object]]:
-    """Every variant; those of `COMPARED` write to their own of `tensors`."""
+    """Return every variant; those of `COMPARED` write to their own of `tensors`."""
     draws = (
         packed_variant(ctx, fixture, shape, deferred),
         packed_variant(ctx, fixture, shape, not deferred),
@@ -92,10 +92,10 @@ def _variants(
 
 
 def packed_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int], deferred: bool) -> Callable[[Any], None]:
-    """A function that draws the body by the packed pass and reads it into a tensor.
+    """Return a function that draws the body by the packed pass and reads it into a tensor.
 
-    `ctx`: the OpenGL context.
-    `fixture`: the body.
+    `ctx`: OpenGL context.
+    `fixture`: body to draw.
     `shape`: (height, width) of the tensor.
     `deferred`: whether UVs are drawn first and the texture is read in a second pass.
     """
@@ -113,9 +113,9 @@ def packed_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int], deferred:
 def skinned_variant(
     ctx: Any, fixture: Fixture, shape: tuple[int, int], deferred: bool
 ) -> tuple[Callable[[], None], Callable[[Any], None]]:
-    """A function that skins the body as the CPU unit does, and one that draws the skinned body by the packed pass.
+    """Return a function that skins the body as the CPU unit does, and one that draws it by the packed pass.
 
-    Parameters as in `packed_variant`.
+    The parameters are those of `packed_variant`.
     """
     packed = PackedPass(ctx, fixture.texture.shape[2], ENCODING, deferred)
     avatar = PackedAvatar(packed, PosedMesh(ctx, fixture.arrays), fixture.texture)
@@ -135,7 +135,7 @@ def skinned_variant(
 
 
 def split_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int]) -> Callable[[Any], None]:
-    """A function that draws the body by the split passes, reads them and permutes."""
+    """Return a function that draws the body by the split passes, reads them and permutes."""
     split = SplitPass(ctx, SkinnedMesh(ctx, fixture.arrays), fixture.texture, ENCODING, shape)
     placement = Placement(fixture.joints, fixture.projection, (0, 0, *shape))
 
@@ -147,7 +147,7 @@ def split_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int]) -> Callabl
 
 
 def uv_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int]) -> Callable[[Any], None]:
-    """A function that draws the UV coordinates of the body as two bytes a pixel."""
+    """Return a function that draws the UV coordinates of the body as two bytes a pixel."""
     image = UvBytes(ctx, SkinnedMesh(ctx, fixture.arrays))
 
     def draw_and_read(tensor: Any) -> None:
@@ -166,10 +166,10 @@ def _check_equal(tensors: dict[str, Any]) -> None:
 class SplitPass:
     """Draws one avatar into tensors, RGBA8 by RGBA8.
 
-    `ctx`: the OpenGL context.
-    `mesh`: of the avatar.
+    `ctx`: OpenGL context.
+    `mesh`: mesh of the avatar.
     `texture`: (H,W,C) floats, C a multiple of 4.
-    `quantisation`: of the tensor.
+    `quantisation`: scale and zero point of the tensor.
     `shape`: (height, width) of the tensor in pixels.
     """
 

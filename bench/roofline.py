@@ -1,8 +1,8 @@
 """What is the most this machine's cores can do, in INT8, in FP32, and from memory?
 
-Rule: there are two peaks for INT8, and each figure says which it is of. One is the best rate that any layer of the
-installed runtimes reached here, on layers that suit them. The other is what the instruction set allows: the documented
-multiply-accumulates of a cycle, by the clock measured under that load, by the cores.
+Rule: there are two peaks for INT8, and each figure names its own. The first is the best rate that any layer of the
+installed runtimes reached here, on layers that suit them. The second is what the instruction set allows: the documented
+multiply-accumulates of a cycle, times the clock measured under that load, times the number of cores.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from trilane.errors import reason
 from trilane.stages.dsp.runtime import installed
 from trilane.stages.machine_facts import cpu_facts
 
-#: (side, channels, kernel): layers whose weights stay in cache and whose channels fill the registers.
+#: Layers (side, channels, kernel) whose weights stay in cache and whose channels fill the registers.
 INT8_LAYERS = ((32, 256, 3), (64, 128, 3), (64, 512, 1))
 LAYERS = 4
 RUNS, ROUNDS = 4, 6
@@ -58,11 +58,12 @@ def measure(threads: int = 0) -> dict[str, Any]:
 
 
 def instruction_peak(flags: Sequence[str], threads: int) -> dict[str, Any]:
-    """The INT8 peak of the widest instruction set that `flags` name, on as many cores as `threads` can use.
+    """Return the INT8 peak of the widest instruction set that `flags` name, on as many cores as `threads` can use.
 
-    `set`, `sequence`, `source`: of the table in lib/instruction_sets.py. `macs_a_cycle`: documented, for one core;
-    `issued_macs_a_cycle`: what a loop of registers alone reached. `clock_ghz` with its 95 % interval: under that load.
-    `cores`, `gmac_s`: macs_a_cycle x clock x cores. `absent` alone: why there is none.
+    `set`, `sequence`, `source`: entries of the table in lib/instruction_sets.py. `macs_a_cycle`: documented value for
+    one core. `issued_macs_a_cycle`: value that a loop of registers alone reached. `clock_ghz`: clock under that load,
+    with its 95 % interval. `cores`: number of cores. `gmac_s`: macs_a_cycle x clock x cores. `absent`: why there is
+    none; it stands alone.
     """
     widest = instruction_set_of(flags)
     if widest is None:
@@ -118,7 +119,7 @@ def _best_ms(variants: dict[str, Variant]) -> dict[str, float]:
 
 
 def _memory_gb_s() -> float:
-    """Bytes read and written a second by a copy far larger than the caches, one thread."""
+    """Return the memory rate of one thread in 1e9 bytes a second, read and written by a copy larger than the caches."""
     source, target = np.ones(COPY_BYTES // 8), np.empty(COPY_BYTES // 8)
     best = float("inf")
     for _ in range(ROUNDS):
@@ -136,7 +137,7 @@ def _product() -> onnx.ModelProto:
 
 
 def _layers(side: int, channels: int, kernel: int) -> onnx.ModelProto:
-    """`LAYERS` quantised convolutions in a row, NHWC bytes in and out."""
+    """Return `LAYERS` quantised convolutions in a row, NHWC bytes in and out."""
     rng = np.random.default_rng(0)
     shape = (channels, channels, kernel, kernel)
     constants = {

@@ -1,7 +1,7 @@
 """Does the pipeline answer as a service should: one query at a time, several, at random moments, all at once?
 
-Rule: the whole pipeline is asked, from pose to presented frame. A result is valid or says why not, and MLCommons
-LoadGen can ask for and evaluate the same load.
+Rule: the whole pipeline answers, from pose to presented frame. A result is valid or says why not, and MLCommons LoadGen
+can ask for the same load and evaluate it.
 """
 
 from __future__ import annotations
@@ -76,12 +76,12 @@ def measure(
 def run_scenario(
     pipeline: Pipeline, assets: Assets, load: Load, evaluated_by: str, policy: str
 ) -> tuple[dict[str, Any], str]:
-    """One run under `load`: its row, and LoadGen's summary where LoadGen evaluates it.
+    """Do one run under `load`; return its row, and LoadGen's summary where LoadGen evaluates it.
 
-    `pipeline`, `assets`: what is run, and the arrays that its stages may read.
-    `load`: the pattern and its limits.
+    `pipeline`, `assets`: pipeline to run, and the arrays that its stages may read.
+    `load`: pattern and its limits.
     `evaluated_by`: one of `JUDGES`.
-    `policy`: of the scheduler.
+    `policy`: policy of the scheduler.
     Raises TrilaneError when the run fails.
     """
     queries = Queries(size=load.samples if load.scenario == "multi-stream" and evaluated_by == "trilane" else 1)
@@ -109,9 +109,9 @@ def run_scenario(
 class _Player(threading.Thread):
     """Asks for frames on a thread of its own.
 
-    `requests`: of the run; asking begins when it is open.
-    `work`: asks, and waits for the answers.
-    `errors`: what `work` raised.
+    `requests`: queue of the run; asking begins when it is open.
+    `work`: function that asks, and waits for the answers.
+    `errors`: errors that `work` raised.
     """
 
     requests: FrameRequestQueue

@@ -1,7 +1,7 @@
 """How fast is the scheduler in virtual time, beside SimPy on the same model, and is it the same every time?
 
-Rule: all present every frame at the same nanosecond or the bench fails; their runs are interleaved, with the same
-service times, and Python's garbage collector is off in every one of them.
+Rule: all models present every frame at the same nanosecond or the bench fails. Their runs are interleaved, with the
+same service times, and with Python's garbage collector off.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ REPEATS, SEED_FRAMES = 10, 300
 TRILANE, NO_REPORT, RECORDED = "trilane", "trilane, no report", "trilane, recorded"
 SIMPY, LEAN = "simpy", "simpy lean"
 
-#: A run of the model; answers when it presented each frame, in ns.
+#: A run of the model; it returns when each frame was presented, in ns.
 Run = Callable[[], list[int]]
 
 
@@ -84,7 +84,7 @@ def measure(minutes: float = 15.0, rounds: int = 7, seeds: int = 10, events: str
 
 
 def compared(seconds: dict[str, list[float]]) -> dict[str, Any]:
-    """Ratios within each round, of the `seconds` of each way's rounds."""
+    """Return ratios within each round, from the `seconds` of each way's rounds."""
     ours = seconds[TRILANE]
     ratios = {
         way: [other / own for other, own in zip(runs, ours, strict=True)]
@@ -104,10 +104,14 @@ def _with_interval(values: list[float]) -> dict[str, float]:
 
 
 def _cpu_seconds(ways: dict[str, Run], rounds: int) -> dict[str, list[float]]:
-    """CPU time of every round of each way. Raises TrilaneError when they present frames at different times."""
+    """Return the CPU time of every round of each way.
+
+    Raises TrilaneError when they present frames at different times.
+    """
     seconds: dict[str, list[float]] = {way: [] for way in ways}
     for number in range(rounds):
         names = list(ways)
+        # Each round begins with another way, so that none is always the first.
         first = number % len(names)
         ends: dict[str, list[int]] = {}
         for way in names[first:] + names[:first]:
@@ -120,7 +124,7 @@ def _cpu_seconds(ways: dict[str, Run], rounds: int) -> dict[str, list[float]]:
 
 
 def _timed(run: Run) -> tuple[float, list[int]]:
-    """CPU seconds of a run without garbage collection, and its answer."""
+    """Return the CPU seconds of a run without garbage collection, and its answer."""
     collects = gc.isenabled()
     gc.collect()
     gc.disable()
@@ -142,7 +146,7 @@ def _determinism(seeds: int) -> dict[str, int]:
 
 
 def _service(seed: int, frames: int) -> Service:
-    """Service times from a table made beforehand, so that both runs pay for a look-up and no more."""
+    """Return service times from a table made beforehand, so that all runs pay only for a look-up."""
     rng = np.random.default_rng(seed)
     table = {name: (ms * MS * rng.uniform(0.5, 1.5, frames)).astype(int).tolist() for name, ms in SERVICE_MS.items()}
     return lambda stage, _unit, frame, _begin_ns: table[stage][frame]
@@ -160,7 +164,7 @@ def _trilane_ways(graph: Graph, service: Service, frames: int) -> dict[str, Run]
 
 
 def _simpy_ways(graph: Graph, service: Service, frames: int) -> tuple[dict[str, Run], dict[str, dict[str, str]]]:
-    """SimPy's runs, or why they are absent."""
+    """Return SimPy's runs, or why they are absent."""
     try:
         models = _models()
     except ModuleNotFoundError:
@@ -174,14 +178,14 @@ def _run_model(model: Any, graph: Graph, service: Service, frames: int) -> list[
 
 
 def _models() -> dict[str, Any]:
-    """Way: its model. Raises ModuleNotFoundError without SimPy."""
+    """Return the model of each way. Raises ModuleNotFoundError without SimPy."""
     from trilane.bench.lib.simpy_models import LeanPipeline, SimpyPipeline
 
     return {SIMPY: SimpyPipeline, LEAN: LeanPipeline}
 
 
 def _processed(graph: Graph, service: Service, frames: int, ways: list[str]) -> dict[str, int]:
-    """How many events SimPy processes in each of `ways`."""
+    """Return how many events SimPy processes in each of `ways`."""
     return {way: _count_events(_models()[way](graph, service, frames, PERIOD_NS).env) for way in ways}
 
 
@@ -201,7 +205,7 @@ def _row(way: str, frames: int, events: int, seconds: list[float], processed: in
 
 
 def _traces(seed: int) -> list[str]:
-    """Digests of every step of equal runs under the `deadline` policy, in which the DSP dies once."""
+    """Return digests of every step of equal runs under the `deadline` policy, in which the DSP dies once."""
     settings = Settings(SEED_FRAMES, "deadline", period_ns=PERIOD_NS, deadline_ns=3 * PERIOD_NS)
     digests = []
     for _ in range(REPEATS):

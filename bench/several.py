@@ -1,6 +1,6 @@
 """How much does an avatar change when others share its tensor, by the width of the background between them?
 
-Rule: the same avatars in the same cells, together and each on its own; only the neighbours differ.
+Rule: the same avatars are drawn in the same cells, together and each on its own; only the neighbours differ.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ BOUND_DB = 0.5
 OUTPUT = (480, 640)
 MOST_AVATARS = 8
 MOST_MARGIN = 128
-#: Metres between neighbours, and how far every second one stands back.
+#: Metres between neighbours, and metres that every second one stands back.
 STEP_M, BACK_M = 0.8, 0.7
 SECONDS = 10.0
 
@@ -44,9 +44,9 @@ SECONDS = 10.0
 class _View:
     """A moment of the scene.
 
-    `joints`: (55,3,4) of each avatar.
-    `view`, `projection`: (4,4) of the camera.
-    `layout`: of the tensor.
+    `joints`: skinning matrices (55,3,4) of each avatar.
+    `view`, `projection`: matrices (4,4) of the camera.
+    `layout`: layout of the tensor.
     """
 
     joints: tuple[NDArray[np.float32], ...]
@@ -105,7 +105,7 @@ class _CrowdFixture:
         self._bound: dict[Shape, tuple[U8, U8, Binding]] = {}
 
     def compare(self, view: _View) -> list[tuple[float, float, float, float, float]]:
-        """For each avatar: PSNR together, PSNR on its own, mean and greatest difference in bytes, its cell's height."""
+        """Return for each avatar: PSNR together, PSNR alone, mean and greatest byte difference, its cell's height."""
         everyone = self._picture(view, range(len(view.joints)))
         rows = []
         for k, (crop, (top, left, height, width)) in enumerate(view.layout.crops):
@@ -121,7 +121,7 @@ class _CrowdFixture:
         return rows
 
     def _picture(self, view: _View, shown: Sequence[int]) -> U8:
-        """The network's picture (h,w,4) with only the avatars `shown`."""
+        """Return the network's picture (h,w,4) with only the avatars `shown`."""
         shape = view.layout.shape
         tensor, image, binding = self._binding(shape)
         target = self.packed.begin(shape)
@@ -144,7 +144,7 @@ class _CrowdFixture:
 
 
 def _views(fixture: _CrowdFixture, avatars: int, views: int, size: str, margin: int) -> Iterator[_View]:
-    """Moments in which every avatar is seen, spread over the default motion."""
+    """Yield moments in which every avatar is seen, spread over the default motion."""
     specs = tuple(
         AvatarSpec(position=((k - (avatars - 1) / 2) * STEP_M, 0.0, -BACK_M * (k % 2))) for k in range(avatars)
     )

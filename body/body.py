@@ -2,7 +2,7 @@
 
 A `Body` is finite, consistent and ready for use; anything wrong with a file raises one BadInputError. A body whose rest
 pose is lower or higher than people are is refused, since everything else is in metres. Pose blend shapes are read as a
-stream: an array of zeros (80 MB in many files) takes no memory, as it is allocated at the first other number.
+stream. An array of zeros (80 MB in many files) takes no memory: memory is allocated at the first number that is not 0.
 
 The layout is that of https://smpl-x.is.tue.mpg.de, read as the `smplx` package reads it: the rest shape is `v_template
 + shapedirs @ [betas, expression]`, the joints are `J_regressor @ rest shape`.
@@ -26,14 +26,14 @@ from trilane.errors import BadInputError
 from trilane.files import DAMAGED, npz_names, read_header, read_npz
 from trilane.unexpected_value import UnexpectedValue
 
-#: From sole to crown, metres: from less than a newborn child to more than anybody was.
+#: Range of heights from sole to crown, metres: from less than a newborn child's to more than anybody's.
 LEAST_HEIGHT_M, MOST_HEIGHT_M = 0.3, 3.0
 USUAL_HEIGHT_M = 1.7
 UNITS_M = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "feet": 0.3048, "decimetres": 0.1}
 
 
 def check_height(height: float) -> None:
-    """Raises UnexpectedValue for a `height` that no body in metres has, with the unit that would make it one."""
+    """Raise UnexpectedValue for a `height` that no body in metres has, with the unit that would make it one."""
     if LEAST_HEIGHT_M <= height <= MOST_HEIGHT_M:
         return
     found = f"a body {height:.4g} m high, along Y at rest"
@@ -55,7 +55,7 @@ _CHUNK_ITEMS = 1 << 18
 
 
 def read_pose_blend(path: Path, shape: tuple[int, int, int]) -> NDArray[np.float32] | None:
-    """The array `posedirs` of the npz at `path`, float32 of `shape`, read-only; None when it is all zero.
+    """Return the array `posedirs` of the npz at `path`, float32 of `shape`, read-only; None when it is all zero.
 
     Raises BadInputError when it is missing, misshapen, pickled, too large, truncated or not finite.
     """
@@ -109,15 +109,16 @@ EXPECTED = "a body file in the SMPL-X layout (.npz)"
 MAX_VERTICES = 1 << 18
 MAX_FACES = 1 << 19
 SUM_TOLERANCE = 1e-3
-#: Names of arrays that are a motion's, in AMASS files and those like them.
+#: Names of arrays that belong to a motion, in AMASS files and similar ones.
 MOTION_KEYS = frozenset(
     {"poses", "smpl_poses", "smpl_pose", "smpl_thetas", "body_pose", "pose_body", "mocap_framerate", "mocap_frame_rate"}
 )
 MOST_NAMED = 16
-#: Unit roundoff of the weights' float32: one that a file has rounded is off by so much of itself.
+#: Unit roundoff of float32: a weight that a file has rounded is off by at most this share of itself.
 ROUNDING = 2.0**-24
 
-#: Array of the file to its shape ("V" vertices, "F" faces, "T" texture coordinates, "*" any) and whether it is indices.
+#: For each array of the file, its shape ("V" vertices, "F" faces, "T" texture coordinates, "*" any) and whether it
+#: holds indices.
 _LAYOUT: dict[str, tuple[tuple[int | str, ...], bool]] = {
     "v_template": (("V", 3), False),
     "shapedirs": (("V", 3, "*"), False),
@@ -146,7 +147,7 @@ class Body:
     `posedirs` (V,3,486), or None when the file's are all zero; `j_regressor` (55,V); `weights` (V,55);
     `parents` (55,), -1 at the root; `faces` (F,3); `uv` (T,2), u right, v up; `uv_faces` (F,3), per corner;
     `hand_components` (left (C,45), right (C,45)); `hand_mean` (90,), axis-angle, left then right.
-    `offsets` (V,3): from the rest shape to what is drawn, such as clothes and hair; None for none.
+    `offsets` (V,3): vectors from the rest shape to the drawn surface, such as clothes and hair; None for none.
     """
 
     source: str
@@ -169,7 +170,7 @@ class Body:
         return self.posedirs is not None
 
     def shape(self, betas: ArrayLike = (), expression: ArrayLike = ()) -> ShapedBody:
-        """The body with up to S `betas` and up to E `expression` coefficients; missing ones are 0.
+        """Return the body with up to S `betas` and up to E `expression` coefficients; missing ones are 0.
 
         Raises BadInputError for too many coefficients or ones that are not finite.
         """
@@ -190,7 +191,10 @@ class Body:
         return ShapedBody(_frozen(rest.astype(np.float32)), _frozen(joints), self)
 
     def full_pose(self, poses: ArrayLike, flat_hand_mean: bool) -> F64:
-        """Axis-angle `poses` (..., 165) with the mean hand pose added unless `flat_hand_mean`. Raises BadInputError."""
+        """Return axis-angle `poses` (..., 165) with the mean hand pose added unless `flat_hand_mean`.
+
+        Raises BadInputError.
+        """
         full = np.array(poses, np.float64)
         if full.ndim == 0 or full.shape[-1] != POSE_SIZE:
             raise BadInputError("poses", f"shape {full.shape}", f"(..., {POSE_SIZE})")
@@ -208,21 +212,24 @@ class ShapedBody:
     body: Body
 
     def bare(self) -> ShapedBody:
-        """The person without offsets: the skin that clothes are put on."""
+        """Return the person without offsets: the skin that clothes are put on."""
         if self.body.offsets is None:
             return self
         return ShapedBody(_frozen(self.vertices - self.body.offsets), self.joints, replace(self.body, offsets=None))
 
     def with_offsets(self, offsets: F32) -> ShapedBody:
-        """The person drawn `offsets` (V,3) metres from the skin at rest, in place of those there were."""
+        """Return the person with `offsets` (V,3), metres from the skin at rest, in place of earlier ones."""
         bare = self.bare()
         moved = (bare.vertices.astype(np.float64) + offsets).astype(np.float32)
+        # Copied, because freezing would make the caller's array read-only.
         return ShapedBody(_frozen(moved), self.joints, replace(self.body, offsets=_frozen(offsets.copy())))
 
 
 def load_body(path: Path) -> Body:
-    """Read a body file. Raises BadInputError when it is missing, truncated, pickled, too large, of another layout, not
-    finite or inconsistent.
+    """Read a body file.
+
+    Raises BadInputError when it is missing, truncated, pickled, too large, of another layout, not finite or
+    inconsistent.
     """
     arrays = read_npz(path, _LAYOUT, EXPECTED)
     _check_layout(path, arrays)
@@ -282,7 +289,7 @@ def _check_layout(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
 
 
 def _instead_of_body(names: Collection[str]) -> str:
-    """What a file with the arrays `names` has instead of those of a body."""
+    """Say what a file with the arrays `names` holds instead of a body."""
     listed = f"arrays that were found: {', '.join(sorted(names)[:MOST_NAMED]) or 'none'}"
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
     motion = ": a motion, which `trilane run --motion` takes" if MOTION_KEYS & set(names) else ""
@@ -318,9 +325,9 @@ def _check_weights(path: Path, weights: F32) -> None:
 
 
 def weights_of_one(weights: F32) -> F32:
-    """Skin weights (V,J) with no number below 0 and rows that sum to 1; a row whose sum is 1 within rounding is kept.
+    """Return skin weights (V,J) without negative numbers; rows are scaled to sum to 1 unless they do within rounding.
 
-    A body that stands p metres from the origin would be off by p times what is missing of 1.
+    A body that stands p metres from the origin would be off by p times the difference of the sum from 1.
     """
     bounded = np.maximum(weights, 0)
     sums = bounded.sum(axis=1, dtype=np.float64, keepdims=True)
@@ -338,7 +345,7 @@ def _split_shape(path: Path, dirs: F32) -> tuple[F32, F32]:
 
 
 def _parents(path: Path, table: NDArray[Any]) -> I32:
-    """(55,) parents from the table's first row; the root's is -1 whatever the file has there. Raises BadInputError."""
+    """Return the parents (55,) from the table's first row; the root's is always -1. Raises BadInputError."""
     stored = [int(parent) for parent in table[0]]
     where = f"{path}[kintree_table]"
     for joint, parent in enumerate(stored[1:], start=1):

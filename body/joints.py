@@ -51,13 +51,13 @@ JOINT_PARENTS: tuple[int, ...] = (
     *_hand_parents(wrist=21, first=40),
 )
 
-#: Index of each joint by name.
-#: Those without face and hands.
+#: Joints without face and hands.
 BODY_JOINTS: tuple[str, ...] = JOINT_NAMES[:22]
 
+#: Index of each joint by name.
 JOINT_INDEX: dict[str, int] = {name: i for i, name in enumerate(JOINT_NAMES)}
 
-#: Poses are axis-angle, three numbers a joint.
+#: Length of a pose: axis-angle, three numbers a joint.
 POSE_SIZE = 3 * len(JOINT_NAMES)
 LEFT_HAND = slice(3 * 25, 3 * 40)
 RIGHT_HAND = slice(3 * 40, 3 * 55)

@@ -1,7 +1,7 @@
 """Forward kinematics: from an axis-angle pose to skinning matrices, in float64, in memory that is allocated once.
 
-Rule: exact at every angle. A rotation by t = |v| about v has the quaternion w = cos(t/2), u = v sin(t/2) / t, and
-R - I = 2 (u u^T - (u.u) I + w [u]x) (O. Rodrigues, 1840), in which no digits cancel near 0 or pi.
+Rule: the result is exact at every angle. A rotation by t = |v| about v has the quaternion w = cos(t/2), u = v sin(t/2)
+/ t. Then R - I = 2 (u u^T - (u.u) I + w [u]x) (O. Rodrigues, 1840), in which no digits cancel near 0 or pi.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from trilane.arrays import F32, F64
 from trilane.errors import BadInputError
 
-#: sin(x) / x is exactly 1 in float64 at this x and below; smaller halves of angles are replaced by it, so 0 needs no
+#: At this x and below, sin(x) / x is exactly 1 in float64. Smaller half angles are replaced by it, so 0 needs no
 #: special case.
 _TINY = 1e-150
 #: Largest joint angle (radians) and coordinate (metres): float64 and float32 lose too many digits beyond it.
@@ -22,7 +22,10 @@ MAX_VALUE = 1e6
 
 
 def _products_to_turn() -> F64:
-    """(16, 9) matrix that turns the outer product of (w, ux, uy, uz) with itself, row-major, into R - I, row-major."""
+    """Return the matrix (16, 9) that turns the outer product of (w, ux, uy, uz) with itself into R - I.
+
+    Both are row-major.
+    """
     table = np.zeros((4, 4, 3, 3))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         table[1 + i, 1 + i, [j, k], [j, k]] = -2.0
@@ -36,7 +39,7 @@ _IDENTITY = np.eye(3)
 
 
 def turn(rotvec: ArrayLike) -> F64:
-    """R - I (..., 3, 3) of axis-angle vectors (..., 3), radians, any magnitude."""
+    """Return R - I (..., 3, 3) of axis-angle vectors (..., 3), radians, any magnitude."""
     v = np.asarray(rotvec, np.float64)
     half = 0.5 * np.sqrt(np.einsum("...i,...i->...", v, v))
     floor = np.maximum(half, _TINY)
@@ -48,7 +51,7 @@ def turn(rotvec: ArrayLike) -> F64:
 
 
 def rodrigues(rotvec: ArrayLike) -> F64:
-    """Rotation matrices (..., 3, 3) of axis-angle vectors (..., 3), radians, any magnitude."""
+    """Return rotation matrices (..., 3, 3) of axis-angle vectors (..., 3), radians, any magnitude."""
     return turn(rotvec) + _IDENTITY
 
 
@@ -68,12 +71,15 @@ class Posed:
 class Skeleton:
     """The joint chain of one shaped body.
 
-    World transforms come by pointer jumping: after round k each joint holds the product of the 2^k transforms that
-    end at it, so a tree of depth 11 takes four batched products instead of 55 steps.
+    World transforms come by pointer jumping: after round k each joint holds the product of the 2^k transforms that end
+    at it. A tree of depth 11 then takes four batched products instead of 55 steps.
     """
 
     def __init__(self, joints: F64, parents: NDArray[np.int32]) -> None:
-        """`joints` (J,3) rest positions, metres; `parents` (J,), -1 at the root, which is joint 0."""
+        """Prepare the chain.
+
+        `joints`: rest positions (J,3), metres. `parents`: (J,), -1 at the root, which is joint 0.
+        """
         count = len(parents)
         self._rest = np.asarray(joints, np.float64)
         self._jumps = _ancestors(parents)
@@ -90,9 +96,9 @@ class Skeleton:
     def pose(self, pose: ArrayLike, translation: ArrayLike | None = None, world: F64 | None = None) -> Posed:
         """Pose the chain.
 
-        `pose`: (J * 3,) axis-angle, radians.
-        `translation`: (3,) metres, of the root in body space; None for none.
-        `world`: (4,4) from body space to the world; None for the identity.
+        `pose`: axis-angle (J * 3,), radians.
+        `translation`: translation of the root in body space, (3,) metres; None for none.
+        `world`: matrix (4,4) from body space to the world; None for the identity.
         Raises BadInputError when a number is not finite or an angle or coordinate is beyond a million.
         """
         self._angles.reshape(-1)[:] = np.asarray(pose, np.float64).reshape(-1)
@@ -126,12 +132,12 @@ def _require_finite(values: F64, where: str, expected: str) -> None:
     flat = values.ravel()
     with np.errstate(over="ignore", invalid="ignore"):
         square = flat @ flat
-    if not square <= MAX_VALUE**2:  # also when it is NaN
+    if not square <= MAX_VALUE**2:  # `not` includes NaN, which no comparison holds for
         raise BadInputError(where, "NaN, infinity or a huge number", expected)
 
 
 def _ancestors(parents: NDArray[np.int32]) -> list[NDArray[np.intp]]:
-    """Per round, each joint's 2^k-th ancestor; index J is an identity that stands above the root."""
+    """Return, per round, each joint's 2^k-th ancestor; index J is an identity that stands above the root."""
     count = len(parents)
     jump = np.append(np.where(parents < 0, count, parents), count).astype(np.intp)
     rounds = []

@@ -1,16 +1,16 @@
-"""Linear blend skinning on the CPU: skin weights, how much of a body is modelled, and the vertices of a pose.
+"""Linear blend skinning on the CPU: skin weights, levels of detail of a body, and the vertices of a pose.
 
-x_world = sum_j w_j (matrix_j @ [x_rest, 1]); the products are small enough that the BLAS starts no threads. Of the
-weights of a vertex the K largest remain, scaled to sum to 1. What a level of detail leaves out has a proved bound; the
-last level leaves nothing out.
+x_world = sum_j w_j (matrix_j @ [x_rest, 1]); the products are small enough that the BLAS starts no threads. The K
+largest weights of a vertex remain, scaled to sum to 1. The error of what a level of detail leaves out has a proved
+bound; the last level leaves nothing out.
 
 Proof. Let w be a vertex's skin weights, w' those of the level, p its rest position, c_b the centre of joint b and t_b
-the angle by which b is turned. As in `weight_error_bound`, other weights move the vertex by at most sum_b |E_b| |y_b -
-y_parent|, with E_b the sum of w' - w over b and the joints below it, and b's own turn moves p by |y_b - y_parent| = 2
-sin(t_b / 2) dist(p, axis of b) <= 2 sin(t_b / 2) |p - c_b|. Pose blend shapes move p by at most r = sum_b r_b |R_b -
-I|, r_b the norm of the vertex's block of them. Left out, they move the skinned vertex by at most r, because its weights
-are shares of rigid motions; kept, they make |p - c_b| larger by at most r. |R_b - I|, Frobenius, is 2 sqrt(2) sin(t_b /
-2). Vertices are taken in groups, with the largest of each term in the group.
+the angle by which b is turned. As in `weight_error_bound`, the change of weights moves the vertex by at most sum_b
+|E_b| |y_b - y_parent|, with E_b the sum of w' - w over b and the joints below it. The turn of b moves p by |y_b -
+y_parent| = 2 sin(t_b / 2) dist(p, axis of b) <= 2 sin(t_b / 2) |p - c_b|. Pose blend shapes move p by at most r = sum_b
+r_b |R_b - I|, with r_b the norm of the vertex's block of them. Left out, they move the skinned vertex by at most r,
+because its weights are shares of rigid motions; kept, they make |p - c_b| larger by at most r. The Frobenius norm |R_b
+- I| is 2 sqrt(2) sin(t_b / 2). Vertices are taken in groups, with the largest of each term in the group.
 """
 
 from __future__ import annotations
@@ -34,20 +34,23 @@ WEIGHT_COUNTS = (4, 8, 12)
 
 @dataclass(frozen=True)
 class TopWeights:
-    """`joints` (V,K) int32 and `weights` (V,K) float32, largest first, rows sum to 1; unused columns have weight 0."""
+    """The largest skin weights of each vertex.
+
+    `joints` (V,K) int32 and `weights` (V,K) float32, largest first, rows sum to 1; unused columns have weight 0.
+    """
 
     joints: NDArray[np.int32]
     weights: F32
 
     def dense(self) -> F32:
-        """The weights as (V,55) float32, one column per joint."""
+        """Return the weights as (V,55) float32, one column per joint."""
         full = np.zeros((len(self.weights), JOINTS), np.float32)
         np.put_along_axis(full, self.joints, self.weights, axis=1)
         return full
 
 
 def largest_weights(weights: F32, k: int) -> TopWeights:
-    """The `k` largest of each row of `weights` (V,55), scaled to sum to 1.
+    """Return the `k` largest of each row of `weights` (V,55), scaled to sum to 1.
 
     Raises BadInputError unless `k` is 4, 8 or 12.
     """
@@ -59,10 +62,10 @@ def largest_weights(weights: F32, k: int) -> TopWeights:
 
 
 def weight_error_bound(shaped: ShapedBody, weight_count: int) -> F64:
-    """(V,) metres: the furthest that any pose moves a vertex when only its `weight_count` largest weights are used.
+    """Return the furthest (V,), metres, that any pose moves a vertex drawn with its `weight_count` largest weights.
 
     Proof. Let joint j alone move the rest vertex p to y_j, and let e_j be the change of its weight; the e_j sum to 0.
-    Joint b and its parent both move p rigidly, and both move the centre c_b of b to the same point, so y_b and y_parent
+    Joint b and its parent both move p rigidly, and both move the centre c_b of b to the same point. So y_b and y_parent
     lie on one sphere about that point: |y_b - y_parent| <= 2 |p - c_b|. With each y_j written as the root's y plus the
     steps down the chain to j,
 
@@ -76,12 +79,12 @@ def weight_error_bound(shaped: ShapedBody, weight_count: int) -> F64:
 
 
 def joint_distance(shaped: ShapedBody) -> F64:
-    """(V,55) metres from each rest vertex to each joint."""
+    """Return the distance (V,55), metres, from each rest vertex to each joint."""
     return np.asarray(np.linalg.norm(shaped.vertices[:, None, :] - shaped.joints[None], axis=2))
 
 
 def branch_sums(parents: NDArray[np.int32], values: F64) -> F64:
-    """`values` (..., 55) summed over each joint and all joints below it."""
+    """Return `values` (..., 55) summed over each joint and all joints below it."""
     above = np.eye(len(parents))
     for joint in range(len(parents)):
         at = int(parents[joint])
@@ -91,20 +94,22 @@ def branch_sums(parents: NDArray[np.int32], values: F64) -> F64:
     return np.asarray(values @ above)
 
 
-#: Joints of the hands and the face, to the joint that carries them.
+#: For each joint of the hands and the face, the joint that carries it.
 CARRIED_BY = {
     name: JOINT_INDEX["head" if name in ("jaw", "left_eye", "right_eye") else f"{name.partition('_')[0]}_wrist"]
     for name in JOINT_NAMES[JOINT_INDEX["jaw"] :]
 }
-VERSION = "detail bounds 1"  # to be raised when the same body gives other bounds
-#: What float32 may add: the weights' and the skinned vertices' rounding, metres.
+VERSION = "detail bounds 1"  # raise it when the same body gives other bounds
+#: Error that float32 may add, metres: the rounding of weights and of skinned vertices.
 ROUNDING_M = 5e-6
 
 
 @dataclass(frozen=True)
 class Detail:
-    """A level. `weight_count`: skin weights of a vertex, None for all. `hands_and_face`: whether their joints count,
-    else they are carried by wrist and head. `pose_blend`: whether pose blend shapes are applied, where there are any.
+    """A level of detail.
+
+    `weight_count`: number of skin weights of a vertex, None for all. `hands_and_face`: whether their joints count; else
+    wrist and head carry them. `pose_blend`: whether pose blend shapes are applied, where there are any.
     """
 
     name: str
@@ -113,7 +118,7 @@ class Detail:
     pose_blend: bool
 
     def weights(self, shaped: ShapedBody) -> F32:
-        """(V,55) skin weights of this level; rows sum to 1."""
+        """Return the skin weights (V,55) of this level; rows sum to 1."""
         weights = shaped.body.weights
         if not self.hands_and_face:
             weights = carried(weights)
@@ -124,7 +129,7 @@ class Detail:
 
 
 def left_out(detail: Detail, body: Body) -> list[str]:
-    """The parts of `body` that `detail` leaves out, in words; empty when it leaves out nothing."""
+    """Name the parts of `body` that `detail` leaves out, in words; empty when it leaves out nothing."""
     found = []
     weights = body.weights
     if not detail.hands_and_face:
@@ -139,7 +144,7 @@ def left_out(detail: Detail, body: Body) -> list[str]:
     return found
 
 
-#: From the least work to all of it.
+#: Levels of detail, from the least work to all of it.
 DETAILS = (
     Detail("4 weights, hands and face at rest, no pose blend shapes", 4, hands_and_face=False, pose_blend=False),
     Detail("4 weights, no pose blend shapes", 4, hands_and_face=True, pose_blend=False),
@@ -152,7 +157,7 @@ EVERYTHING = DETAILS[-1]
 
 
 def carried(weights: F32) -> F32:
-    """`weights` (V,55) with those of the hands' and the face's joints given to wrist and head."""
+    """Return `weights` (V,55) with those of the hands' and the face's joints given to wrist and head."""
     given = weights.astype(np.float64)
     for name, carrier in CARRIED_BY.items():
         given[:, carrier] += given[:, JOINT_INDEX[name]]
@@ -163,7 +168,8 @@ def carried(weights: F32) -> F32:
 class DetailBounds:
     """The bounds of every level of `DETAILS`, for one shaped body.
 
-    `reach` (55,): metres, the furthest from each joint's centre at rest of the vertices that any level moves with it.
+    `reach` (55,): greatest distance in metres from each joint's centre at rest to a vertex that any level moves with
+    it.
     """
 
     def __init__(self, shaped: ShapedBody) -> None:
@@ -175,7 +181,10 @@ class DetailBounds:
         self.reach: F64 = arrays["reach"]
 
     def metres(self, posed: Posed) -> list[float]:
-        """The furthest, in metres, that each level of `DETAILS` moves a vertex in this frame of `Skeleton.pose`."""
+        """Return the furthest, in metres, that each level of `DETAILS` moves a vertex in this frame.
+
+        `posed`: a frame of `Skeleton.pose`.
+        """
         turned = _turned(posed)
         swing = turned / np.sqrt(2.0)
         blend = self._blend @ turned
@@ -186,12 +195,12 @@ class DetailBounds:
         ]
 
     def blend_m(self, posed: Posed) -> float:
-        """The furthest that pose blend shapes move a vertex in this frame, metres."""
+        """Return the furthest, in metres, that pose blend shapes move a vertex in this frame."""
         return float((self._blend @ _turned(posed)).max())
 
 
 def _turned(posed: Posed) -> F64:
-    """(54,) |R - I|, Frobenius, of joints 1 to 54."""
+    """Return the Frobenius norm |R - I| (54,) of joints 1 to 54."""
     return np.asarray(np.linalg.norm(posed.feature.reshape(-1, 9).astype(np.float64), axis=1))
 
 
@@ -201,7 +210,7 @@ def _bound(detail: Detail, lever: F64, change: F64, blend: F64) -> float:
 
 
 def _terms(shaped: ShapedBody) -> Arrays:
-    """The largest terms of each of the G groups of vertices.
+    """Return the largest terms of each of the G groups of vertices.
 
     `lever`, `change` (levels,G,54): |E_b| |p - c_b| and |E_b|. `blend` (G,54): r_b of the blend shapes. `reach` (55,).
     """
@@ -224,7 +233,7 @@ def _terms(shaped: ShapedBody) -> Arrays:
 
 
 def _blend_reach(shaped: ShapedBody) -> F64:
-    """(V,54) metres: how far each joint's pose blend shapes can move each vertex at |R - I| = 1."""
+    """Return how far (V,54), metres, each joint's pose blend shapes can move each vertex at |R - I| = 1."""
     posedirs = shaped.body.posedirs
     if posedirs is None:
         return np.zeros((len(shaped.vertices), JOINTS - 1))
@@ -233,7 +242,7 @@ def _blend_reach(shaped: ShapedBody) -> F64:
 
 
 def _groups(weights: F32) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Vertices grouped by their two largest joints: where each group begins in the order (V,) that is also returned."""
+    """Group vertices by their two largest joints; return where each group begins in the order (V,), and that order."""
     two = np.sort(np.argsort(-weights, axis=1, kind="stable")[:, :2], axis=1)
     key = two[:, 0] * JOINTS + two[:, 1]
     order = np.argsort(key, kind="stable")
@@ -241,13 +250,13 @@ def _groups(weights: F32) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return starts, order
 
 
-#: Vertices of one product. OpenBLAS wakes its other threads for more than 2**18 multiplications, which stalls on shared
-#: cores.
+#: Number of vertices in one product. OpenBLAS wakes its other threads above 2**18 multiplications, which stalls on
+#: shared cores.
 _BLOCK_ROWS = 256
 
 
 def blend_matrices(weights: F64, per_joint: F64) -> F64:
-    """(N,M): `weights` (N,55) @ `per_joint` (55,M), in blocks that the BLAS computes on the calling thread."""
+    """Return `weights` (N,55) @ `per_joint` (55,M), (N,M), in blocks that the BLAS computes on the calling thread."""
     blended = np.empty((len(weights), per_joint.shape[1]))
     whole = len(weights) // _BLOCK_ROWS * _BLOCK_ROWS
     blocks = weights[:whole].reshape(-1, _BLOCK_ROWS, weights.shape[1])
@@ -257,9 +266,10 @@ def blend_matrices(weights: F64, per_joint: F64) -> F64:
 
 
 class CpuSkinner:
-    """Vertices of one shaped body, frame by frame, in float64 inside.
+    """Computes vertices of one shaped body, frame by frame, in float64.
 
-    `weight_count`: None for all weights, else 4, 8 or 12. `pose_blend`: apply the body's pose blend shapes, if any.
+    `weight_count`: number of weights, 4, 8 or 12; None for all. `pose_blend`: whether to apply the body's pose blend
+    shapes, if any.
     """
 
     def __init__(self, shaped: ShapedBody, weight_count: int | None = None, pose_blend: bool = True) -> None:
@@ -270,7 +280,7 @@ class CpuSkinner:
         self._blend = body.posedirs.reshape(-1, POSE_FEATURES) if pose_blend and body.posedirs is not None else None
 
     def vertices(self, posed: Posed) -> F64:
-        """(V,3) world metres of a frame of `Skeleton.pose`."""
+        """Return the vertices (V,3), world metres, of a frame of `Skeleton.pose`."""
         rest = self._rest
         if self._blend is not None:
             rest = rest + (self._blend @ posed.feature).reshape(-1, 3)
@@ -279,15 +289,15 @@ class CpuSkinner:
 
 
 class FrameSkinner:
-    """Vertices of one shaped body in float32, written into the caller's memory: the CPU unit does this each frame.
+    """Writes vertices of one shaped body, float32, into the caller's memory; the CPU unit does this each frame.
 
     Vertices are computed in blocks. Neighbouring vertices depend on few joints, so a block is multiplied only by the
-    joints it has weights for; every block uses as many joints as the block with the most. x of all vertices is stored
-    in one row, then y, then z.
+    joints that it has weights for. Every block uses as many joints as the block with the most. x of all vertices is
+    stored in one row, then y, then z.
     """
 
     def __init__(self, shaped: ShapedBody, detail: Detail = EVERYTHING) -> None:
-        """`detail`: how much of the body is modelled."""
+        """Prepare the blocks. `detail`: level of detail of the body."""
         body = shaped.body
         count = len(body.weights)
         blocks = -(-count // _BLOCK_ROWS)
@@ -308,7 +318,7 @@ class FrameSkinner:
 
     @property
     def constant_bytes(self) -> int:
-        """What every frame reads besides its pose: rest positions, weights, pose blend shapes."""
+        """Bytes that every frame reads besides its pose: rest positions, weights, pose blend shapes."""
         kept = (self._rest, self._weights, self._joints, *(() if self._blend is None else (self._blend,)))
         return sum(array.nbytes for array in kept)
 
@@ -331,7 +341,7 @@ class FrameSkinner:
 
 
 def posed_vertices(shaped: ShapedBody, poses: ArrayLike, translation: ArrayLike | None = None) -> Iterator[F64]:
-    """Vertices (V,3), metres, for each pose of `poses` (T,165), as `Body.full_pose` returns them.
+    """Yield vertices (V,3), metres, for each pose of `poses` (T,165), as `Body.full_pose` returns them.
 
     `translation`: (3,) metres, the same for all poses. Raises BadInputError when a number is not finite.
     """

@@ -1,8 +1,8 @@
-"""The camera in the scene: where a recorded one is placed so that it films the avatars, and how a person steers it.
+"""The camera in the scene: places a recorded one so that it films the avatars, and lets a person steer it.
 
 The recording is moved as one rigid, upright piece: it is turned about the vertical and shifted; its movement from frame
-to frame never changes. A fixed grid of places is searched, coarse and then finer. The best place shows the whole bodies
-at the most moments; among equals the one where they are larger wins. At first the camera is in front of the avatars, in
+to frame never changes. A fixed grid of places is searched, coarse and then finer. The best place shows whole bodies at
+the most moments; among equals the one where they are larger wins. At first the camera is in front of the avatars, in
 the direction that a heading of 0 faces. Over a drawn background the camera is also tilted by one constant angle, so
 that it does not look down on people. The moments are those of the scene's first seconds, however many frames a run
 shows and at whatever rate: a frame of a scene is the same picture in every run.
@@ -33,8 +33,8 @@ from trilane.shapes import Shape
 class PlacedCamera:
     """A camera in the scene.
 
-    `turn` (3, 3) and `shift` (3,): from the path's world to the scene's. `mount` (3, 3): from the camera's axes to
-    those of the path. `notes`: what was decided, for people.
+    `turn` (3, 3), `shift` (3,): transform from the path's world to the scene's. `mount` (3, 3): turn from the camera's
+    axes to those of the path. `notes`: what was decided, for people.
     """
 
     path: CameraPath
@@ -44,29 +44,29 @@ class PlacedCamera:
     notes: tuple[str, ...]
 
     def sample(self, t_s: float) -> F64:
-        """World to camera (4, 4) at `t_s`; the world is the scene's."""
+        """Return the matrix (4, 4) from world to camera at `t_s`; the world is the scene's."""
         turn, place = self.path.pose(t_s)
         return view_from_pose(self.turn @ turn @ self.mount, self.turn @ place + self.shift)
 
     def reach(self) -> tuple[F64, F64]:
-        """Lowest and highest coordinates (3,) of all places of the camera in the scene."""
+        """Return the lowest and highest coordinates (3,) of all places of the camera in the scene."""
         places = self.path.places @ self.turn.T + self.shift
         return places.min(axis=0), places.max(axis=0)
 
     def projection(self, t_s: float, output: Shape) -> F64:
-        """OpenGL clip matrix (4, 4) at `t_s` for a picture of `output` (height, width)."""
+        """Return the OpenGL clip matrix (4, 4) at `t_s` for a picture of `output` (height, width)."""
         return self.path.projection(t_s, output)
 
 
 LOWEST_DEG, HIGHEST_DEG = -8.0, 85.0
-LEAST_LEVEL_M = 1e-6  # of the camera's distance from the pivot, level; below it stands over the pivot
+LEAST_LEVEL_M = 1e-6  # least level distance of the camera from the pivot; below it, the camera stands over the pivot
 
 
 def steered(view: F64, pivot: F64, azimuth_deg: float, elevation_deg: float, zoom: float) -> F64:
-    """World to camera (4, 4) of the camera of `view` (4, 4), turned about `pivot` (3,) and moved towards it.
+    """Return the matrix (4, 4) from world to the camera of `view`, turned about `pivot` (3,) and moved towards it.
 
-    `azimuth_deg`: turn to the right about the vertical. `elevation_deg`: upwards. `zoom`: how many times nearer, above
-    0.
+    `view`: matrix (4, 4) from world to camera. `azimuth_deg`: turn to the right about the vertical. `elevation_deg`:
+    turn upwards. `zoom`: factor by which the camera is nearer, above 0.
     """
     if azimuth_deg == 0.0 and elevation_deg == 0.0 and zoom == 1.0:
         return view
@@ -82,7 +82,7 @@ def steered(view: F64, pivot: F64, azimuth_deg: float, elevation_deg: float, zoo
 
 
 def _turn(arm: F64, azimuth_deg: float, elevation_deg: float) -> F64:
-    """The turn (3, 3) of a camera at `arm` (3,) from the pivot."""
+    """Return the turn (3, 3) of a camera at `arm` (3,) from the pivot."""
     level = float(np.hypot(arm[0], arm[2]))
     if level < LEAST_LEVEL_M:
         return about(1, np.radians(azimuth_deg))
@@ -93,28 +93,28 @@ def _turn(arm: F64, azimuth_deg: float, elevation_deg: float) -> F64:
     return about(1, heading + np.radians(azimuth_deg)) @ about(0, -raised) @ about(1, -heading)
 
 
-#: A place is scored at so many moments, evenly spread over the first SCORED_S seconds of the scene, in which a shorter
-#: motion or recording is repeated as in a run. What a longer one shows later does not count.
+#: Number of moments at which a place is scored, evenly spread over the first SCORED_S seconds of the scene. A shorter
+#: motion or recording is repeated as in a run; what a longer one shows later does not count.
 SCORED_MOMENTS, SCORED_S = 48, 10.0
-#: Metres: the grid of places, level up to REACH_M each way from the camera and EYE_HEIGHTS_M below it; first in steps
-#: of COARSE_M, then in those of FINER_M round the best place so far.
+#: The grid of places, metres: level up to REACH_M each way from the camera and EYE_HEIGHTS_M below it, first in steps
+#: of COARSE_M, then in those of FINER_M around the best place so far.
 REACH_M, COARSE_M = 7.0, 0.5
 EYE_HEIGHTS_M: F64 = np.arange(0.8, 3.61, 0.2)
 FINER_M = (0.25, 0.12, 0.06)
-#: The camera is never nearer to the floor than this.
+#: Least height of the camera above the floor.
 LOWEST_EYE_M = 0.3
-#: A body counts as whole in the picture when it is within this part of the picture's half width and half height.
+#: Share of the picture's half width and half height within which a body counts as whole in the picture.
 MARGIN = 0.97
-#: With whole bodies at a smaller part of the moments the run warns.
+#: Share of the moments with whole bodies below which the run warns.
 ENOUGH_WHOLE = 0.5
-#: Range of the camera's median line of sight, degrees above the horizon; outside of it the camera is tilted to its end.
+#: Range of the camera's median line of sight, degrees above the horizon; beyond it the camera is tilted to its end.
 SIGHT_DEG = (-24.0, 0.0)
 LARGEST_TILT_DEG = 40.0
 SYNTHETIC_BACKGROUNDS = ("room",)
 #: Score of the bodies' share of the picture's height, up to ENOUGH_SIZE; whole bodies at all moments score 1.
 SIZE_WEIGHT, ENOUGH_SIZE = 0.12, 0.75
 NEAREST_M = 0.3
-#: Places that are scored together: so few that the arrays stay in the processor's cache.
+#: Number of places that are scored together: so few that the arrays stay in the processor's cache.
 PLACES_AT_ONCE = 256
 
 
@@ -122,9 +122,9 @@ PLACES_AT_ONCE = 256
 class _Footage:
     """The recording and the bodies at the F moments at which places are scored.
 
-    `views` (F, 3, 4): path world to camera. `eyes` (F, 3): the camera's places, path world. `boxes` (F, 8, 3):
-    corners of a box round the bodies, scene world. `lenses` (F, 2, 2): of x and of y, factor and addend to NDC, where
-    ndc = factor * x / depth + addend.
+    `views` (F, 3, 4): matrices from the path's world to the camera. `eyes` (F, 3): places of the camera in the path's
+    world. `boxes` (F, 8, 3): corners of a box around the bodies in the scene's world. `lenses` (F, 2, 2): factor and
+    addend of x and of y, where ndc = factor * x / depth + addend.
     """
 
     views: F32
@@ -134,11 +134,11 @@ class _Footage:
 
 
 def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> PlacedCamera:
-    """The camera of a scene. A built-in one, and one whose spec has `place = "none"`, stays where it is.
+    """Place the camera of a scene; a built-in one, and one whose spec has `place = "none"`, stays where it is.
 
     `path`: path of the camera.
-    `scene`: says what lies behind, how large the picture is, and whether the camera is placed.
-    `movers`: its avatars.
+    `scene`: scene, which states the background, the picture's size, and whether the camera is placed.
+    `movers`: avatars of the scene.
     `bodies`: bodies of these avatars, in the same order.
     """
     times = np.linspace(0.0, SCORED_S, SCORED_MOMENTS)
@@ -169,7 +169,7 @@ def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies
 
 
 def _seen_notes(whole: float, size: float) -> tuple[str, ...]:
-    """How much of the bodies is filmed, and a warning where it is little."""
+    """Say how much of the bodies is filmed, with a warning where it is little."""
     seen = f"whole body in the picture in {whole:.0%} of the first {SCORED_S:g} s, {size:.0%} of its height on average"
     if whole >= ENOUGH_WHOLE:
         return (seen,)
@@ -180,7 +180,7 @@ def _seen_notes(whole: float, size: float) -> tuple[str, ...]:
 
 
 def _from_the_middle(path: CameraPath) -> tuple[CameraPath, F64, F64]:
-    """`path` about its middle, first looking along -Z; and the turn (3, 3) and middle (3,) that were taken off.
+    """Return `path` about its middle, first looking along -Z, and the turn (3, 3) and middle (3,) taken off it.
 
     So the grid of places is the same however the file's world is turned, and wherever it has its origin.
     """
@@ -192,7 +192,7 @@ def _from_the_middle(path: CameraPath) -> tuple[CameraPath, F64, F64]:
 
 
 def _tilt_deg(path: CameraPath, times: F64) -> float:
-    """Degrees by which the camera is turned up on its mount so that its median line of sight is within SIGHT_DEG."""
+    """Return the degrees by which the camera is tilted up so that its median line of sight is within SIGHT_DEG."""
     sight = float(np.median([np.degrees(np.arcsin(np.clip(-path.pose(float(t))[0][1, 2], -1, 1))) for t in times]))
     return float(np.clip(np.clip(sight, *SIGHT_DEG) - sight, -LARGEST_TILT_DEG, LARGEST_TILT_DEG))
 
@@ -211,7 +211,7 @@ def _footage(
 
 
 def _bounds(times: F64, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> tuple[F64, F64]:
-    """Lowest and highest coordinates (F, 3) of all bodies at `times`."""
+    """Return the lowest and highest coordinates (F, 3) of all bodies at `times`."""
     lows, highs = np.full((len(times), 3), np.inf), np.full((len(times), 3), -np.inf)
     for mover, body in zip(movers, bodies, strict=True):
         skeleton, shape = Skeleton(body.joints, body.body.parents), outline(body)
@@ -223,7 +223,7 @@ def _bounds(times: F64, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -
 
 
 def _coarse_grid(footage: _Footage) -> F64:
-    """Places (S, 3) to try for the scene's origin, in the path's world."""
+    """Return places (S, 3) to try for the scene's origin, in the path's world."""
     middle = footage.eyes.mean(axis=0)
     level = np.arange(-REACH_M, REACH_M + COARSE_M / 2, COARSE_M)
     x, height, z = np.meshgrid(level, EYE_HEIGHTS_M, level, indexing="ij")
@@ -244,10 +244,10 @@ def _best(footage: _Footage, places: F64) -> F64:
 
 
 def _visibility(footage: _Footage, places: F64) -> tuple[F64, F64]:
-    """The share of moments with whole bodies, and the mean share of the picture's height that these take; both (S,)."""
+    """Return the share of moments with whole bodies, and their mean share of the picture's height; both (S,)."""
     angle = _facing(footage, places)
     cos, sin = (f(angle).astype(np.float32)[:, None] for f in (np.cos, np.sin))
-    by_axis = footage.boxes.astype(np.float32).transpose(2, 1, 0)  # the 8 corners before the frames: faster to reduce
+    by_axis = footage.boxes.astype(np.float32).transpose(2, 1, 0)  # the corners' axis comes first: faster to reduce
     corners = np.ascontiguousarray(by_axis)[:, :, None]
     places32 = places.astype(np.float32)[:, :, None]
     x = cos * corners[0] + sin * corners[2] + places32[:, 0]
@@ -257,7 +257,7 @@ def _visibility(footage: _Footage, places: F64) -> tuple[F64, F64]:
 
 
 def _filmed(footage: _Footage, corners: Sequence[F32] | F32) -> tuple[F64, F64]:
-    """The result of `_visibility` for boxes with `corners` x, y, z, each (8, S, F), in the path's world."""
+    """Return the result of `_visibility` for boxes with `corners` x, y, z, each (8, S, F), in the path's world."""
     x, y, z = corners
     right, up, back = (_row(footage.views[:, k], x, y, z) for k in range(3))
     depth = np.maximum(-back, NEAREST_M)
@@ -270,13 +270,16 @@ def _filmed(footage: _Footage, corners: Sequence[F32] | F32) -> tuple[F64, F64]:
 
 
 def _row(row: F32, x: F32, y: F32, z: F32) -> F32:
-    """One coordinate (8, S, F) of the points x, y, z, each (8, S, F), by a row (F, 4) of the views."""
+    """Return one coordinate (8, S, F) of the points x, y, z, each (8, S, F), by a row (F, 4) of the views."""
     a, b, c, d = row.T
     return np.asarray(a * x + b * y + c * z + d)
 
 
 def _facing(footage: _Footage, places: F64) -> F64:
-    """Angles (S,) about +Y from the scene to the path's world with which +Z at each place points to the first eye."""
+    """Return angles (S,) about +Y from the scene to the path's world, with which +Z points to the first eye.
+
+    There is one for each of `places`.
+    """
     towards = footage.eyes[0] - places
     return np.asarray(np.arctan2(towards[:, 0], towards[:, 2]))
 

@@ -3,8 +3,8 @@
 Rectangles are x0, y0, x1, y1 in normalised device coordinates, y up; a tensor's pixels are square on the screen.
 
 `error_px` leads from metres to pixels, with a proved bound. For a vertex whose clip coordinates are X, Y, W, an error
-of e metres changes X by at most e |r_x|, with r_x the first three numbers of the clip matrix's row of X, and so on.
-With x = X / W between -1 and 1,
+of e metres changes X by at most e |r_x|. Here r_x are the first three numbers of the clip matrix's row of X; Y and W
+are alike. With x = X / W between -1 and 1,
 
     |x' - x| = |dX - x dW| / |W + dW| <= e (|r_x| + |r_w|) / (W - e |r_w|),
 
@@ -28,11 +28,11 @@ from trilane.shapes import Shape
 
 #: Least height and width of a crop, in output pixels, however small the body is on the screen.
 LEAST_PIXELS = 1.0
-ROUNDING_PX = 1e-4  # so far over the edge of a pixel is still that edge
+ROUNDING_PX = 1e-4  # a side this little beyond the edge of a pixel is still on that edge
 
 
 class Rect(NamedTuple):
-    """x0 < x1, y0 < y1 in normalised device coordinates, y up."""
+    """A rectangle with x0 < x1, y0 < y1 in normalised device coordinates, y up."""
 
     x0: float
     y0: float
@@ -52,12 +52,12 @@ SCREEN = Rect(-1.0, -1.0, 1.0, 1.0)
 
 
 def choose_bucket(rect: Rect, output: Shape, buckets: Sequence[Shape]) -> tuple[Shape, Rect]:
-    """The tensor shape that wastes the least area on `rect`, and `rect` grown to the shape's aspect.
+    """Return the tensor shape that wastes the least area on `rect`, and `rect` grown to the shape's aspect.
 
     The grown rectangle holds `rect`. It is moved onto the screen where it fits; a side longer than the screen reaches
     over both of its edges by the same length. Of two shapes that waste the same area the larger is chosen.
 
-    `rect`: the mesh's rectangle.
+    `rect`: rectangle of the mesh.
     `output`: (height, width) of the picture in pixels.
     `buckets`: tensor shapes (height, width) to choose from.
     Raises BadInputError without buckets.
@@ -79,7 +79,7 @@ def choose_bucket(rect: Rect, output: Shape, buckets: Sequence[Shape]) -> tuple[
 
 
 def grow(low: float, high: float, length: float) -> tuple[float, float]:
-    """An interval of `length` about the middle of [low, high], moved onto [-1, 1] when it fits, else centred on it."""
+    """Return an interval of `length` about the middle of [low, high], moved onto [-1, 1] if it fits, else centred."""
     if length >= 2.0:
         return -length / 2.0, length / 2.0
     start = min(max((low + high - length) / 2.0, -1.0), 1.0 - length)
@@ -87,7 +87,7 @@ def grow(low: float, high: float, length: float) -> tuple[float, float]:
 
 
 def on_grid(rect: Rect, output: Shape) -> Rect:
-    """`rect` widened to whole pixels of a picture of `output` (height, width); at least one each way."""
+    """Widen `rect` to whole pixels of a picture of `output` (height, width), at least one each way."""
     x0, x1 = _whole_pixels(rect.x0, rect.x1, output[1])
     y0, y1 = _whole_pixels(rect.y0, rect.y1, output[0])
     return Rect(x0, y0, x1, y1)
@@ -100,10 +100,10 @@ def _whole_pixels(low: float, high: float, side: int) -> tuple[float, float]:
 
 
 def grow_on_grid(rect: Rect, output: Shape, size: tuple[float, float]) -> Rect:
-    """`rect`, which lies on the grid of a picture of `output` pixels, grown to `size` (height, width) in its pixels.
+    """Grow `rect`, which lies on the pixel grid of a picture of `output`, to `size` (height, width) in its pixels.
 
-    It begins on the grid, so where `size` is whole each of its pixels is a pixel of the picture. It has `rect` in its
-    middle, unless it has to be moved onto the screen, where it fits.
+    The result begins on the grid, so where `size` is whole each of its pixels is a pixel of the picture. It has `rect`
+    in its middle, unless it has to be moved onto the screen, where it fits.
     """
     x0, x1 = _grow_from_pixel(rect.x0, rect.x1, size[1], output[1])
     y0, y1 = _grow_from_pixel(rect.y0, rect.y1, size[0], output[0])
@@ -120,10 +120,10 @@ def _grow_from_pixel(low: float, high: float, length: float, side: int) -> tuple
 
 
 def crop_projection(projection: ArrayLike, rect: Rect) -> F64:
-    """(4,4): `projection` (4,4) followed by the map of `rect` onto the whole screen; depth does not change.
+    """Return `projection` (4,4) followed by the map of `rect` onto the whole screen; depth does not change.
 
-    With x' = (2 x - (x0 + x1)) / (x1 - x0) in normalised device coordinates the clip coordinate is
-    X' = (2 X - (x0 + x1) W) / (x1 - x0), which is linear, so the crop is exact for any projection.
+    With x' = (2 x - (x0 + x1)) / (x1 - x0) in normalised device coordinates the clip coordinate is X' = (2 X - (x0 +
+    x1) W) / (x1 - x0), which is linear, so the crop is exact for any projection.
     """
     after = np.eye(4)
     after[0, 0], after[0, 3] = 2.0 / rect.width, -(rect.x0 + rect.x1) / rect.width
@@ -132,19 +132,20 @@ def crop_projection(projection: ArrayLike, rect: Rect) -> F64:
 
 
 def least_w(posed: Posed, clip: F64, reach: F64, blend_m: float = 0.0) -> float:
-    """The least W of clip space that a vertex can have, 0 or less when it may lie behind the camera.
+    """Return the least W of clip space that a vertex can have, 0 or less when it may lie behind the camera.
 
-    `clip` (4,4): projection @ view. `reach` (55,): of `DetailBounds`. `blend_m`: how far pose blend shapes
-    move a vertex.
+    `clip`: projection @ view, (4,4). `reach`: `DetailBounds.reach`, (55,). `blend_m`: furthest that pose blend shapes
+    move a vertex, metres.
     """
     centres = posed.joints @ clip[3, :3] + clip[3, 3]
     return float((centres - (reach + blend_m) * np.linalg.norm(clip[3, :3]))[reach > 0].min())
 
 
 def error_px(metres: float, clip: ArrayLike, w: float, output: Shape) -> float:
-    """Pixels of a picture of `output` (height, width) by which a vertex can be wrong that is wrong by `metres`.
+    """Return the largest error in pixels of a vertex that is wrong by `metres`, in a picture of `output`.
 
-    `clip` (4,4): projection @ view. `w`: the least of its clip space. Infinite when a vertex may be behind the camera.
+    `clip`: projection @ view, (4,4). `w`: least W of the body in clip space. `output`: (height, width). The result is
+    infinite when a vertex may be behind the camera.
     """
     if metres == 0.0:
         return 0.0
@@ -157,5 +158,5 @@ def error_px(metres: float, clip: ArrayLike, w: float, output: Shape) -> float:
 
 
 def cheapest_within(errors_px: Sequence[float], budget_px: float) -> int:
-    """Index of the first level, from the least work to all of it, whose error is within the budget; else the last."""
+    """Return the index of the first level, from the least work on, whose error is within the budget; else the last."""
     return next((level for level, error in enumerate(errors_px) if error <= budget_px), len(errors_px) - 1)

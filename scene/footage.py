@@ -1,11 +1,11 @@
 """A background that the user brings: its order and times, and the camera that filmed it.
 
-A recorded camera is taken for the one that filmed the background: they begin together, they start again together, and
-the camera's picture is cut as the background is. Photos that the camera's file names belong to their views.
+A recorded camera counts as the one that filmed the background: both begin together and start again together, and the
+camera's picture is cut as the background is. Photos that the camera's file names belong to their views.
 
-Pictures of a folder follow each other by name, in which numbers are compared as numbers. Names that are alike but for
-one number are the frames of a film, and the number is their time: while one is missing, the picture before it is shown.
-Names that are times, as data sets of robots have them, are kept as they are.
+Pictures of a folder follow each other by name, with numbers compared as numbers. Names that differ in a single number
+are the frames of a film, and the number is their time. While a frame is missing, the picture before it is shown. Names
+that are times, as in robots' data sets, are used as they are.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from trilane.scene.lens import Known, Lens, cover
 from trilane.scene.rotations import quat_from_matrix
 from trilane.shapes import Shape
 
-#: Of neighbours in a film, at least so many are one step apart, and it has at most so many times as many frames as
-#: pictures; else the numbers say nothing of time.
+#: Least share of a film's neighbours that are one step apart, and most frames for each picture; else the numbers are
+#: not times.
 LEAST_IN_STEP, MOST_MISSING = 0.5, 4
 NAMED_GAPS = 3
 #: A step between times above so many usual ones is a gap.
 GAP = 1.5
-#: Names that are times since 1970, in seconds, milli-, micro- or nanoseconds; and their range, of 2001 to 2100.
+#: Patterns of names that are times since 1970, and their unit in seconds; and their range, the years 2001 to 2100.
 CLOCKS = {r"\d{10}\.\d{1,9}": 1.0, r"\d{13}": 1e-3, r"\d{16}": 1e-6, r"\d{19}": 1e-9}
 EARLIEST_S, LATEST_S = 1e9, 4.1e9
 ROUNDING_S = 1e-6
@@ -43,10 +43,11 @@ LAST_NUMBER = re.compile(r"(.*?)(\d{1,15})(\D*)\Z", re.DOTALL)
 
 @dataclass(frozen=True)
 class Film:
-    """`times_s`: when each picture is first shown, from 0. `period_s`: after which time the film starts again.
+    """The times of a folder's pictures.
 
-    `rate`: rate of the pictures, and the missing ones, for people. `began_s`: of the first one, seconds since 1970;
-    None where names do not say it.
+    `times_s`: time at which each picture is first shown, from 0. `period_s`: time after which the film starts again.
+    `rate`: rate of the pictures, and the missing ones, for people. `began_s`: time of the first one, seconds since
+    1970; None where names do not say it.
     """
 
     times_s: tuple[float, ...]
@@ -55,12 +56,12 @@ class Film:
     began_s: float | None = None
 
     def number_at(self, time_s: float) -> int:
-        """The number of the picture that is shown at `time_s`."""
+        """Return the number of the picture that is shown at `time_s`."""
         return bisect_right(self.times_s, (time_s + ROUNDING_S) % self.period_s) - 1
 
 
 def in_order(names: Sequence[str]) -> list[str]:
-    """`names` of files, sorted."""
+    """Return the file names `names` in order."""
     return sorted(names, key=lambda name: ([_part(part) for part in re.split(r"(\d+)", name)], name))
 
 
@@ -69,7 +70,7 @@ def _part(text: str) -> tuple[int, str]:
 
 
 def film_of(names: Sequence[str], fps: float) -> Film:
-    """The film of the pictures `names`, at least one, which are in order; numbered ones follow each other at `fps`."""
+    """Return the film of the pictures `names`, at least one, in order; numbered ones follow each other at `fps`."""
     clock = _clock(names)
     if clock:
         return _film_by_clock(clock)
@@ -82,7 +83,7 @@ def film_of(names: Sequence[str], fps: float) -> Film:
 
 
 def _clock(names: Sequence[str]) -> list[float]:
-    """Seconds since 1970 that each name is, increasing; none when there is one picture, or they are something else."""
+    """Return the increasing times of the names, seconds since 1970; none for a single picture, or other names."""
     stems = [name.rpartition(".")[0] for name in names]
     for pattern, unit in CLOCKS.items():
         times = [float(stem) * unit for stem in stems if re.fullmatch(pattern, stem)]
@@ -103,7 +104,7 @@ def _film_by_clock(clock: Sequence[float]) -> Film:
 
 
 def _numbers(names: Sequence[str]) -> list[int]:
-    """The number in each of `names`, when they differ in nothing else but their endings; else no numbers."""
+    """Return the number in each of `names`, when they differ in nothing else but their endings; else no numbers."""
     parts = [LAST_NUMBER.match(name.rpartition(".")[0]) for name in names]
     found = [part for part in parts if part]
     if len(found) < len(names) or len({(part[1], part[3]) for part in found}) > 1:
@@ -112,7 +113,7 @@ def _numbers(names: Sequence[str]) -> list[int]:
 
 
 def _step(numbers: Sequence[int]) -> int:
-    """The step from one frame to the next; 0 when `numbers` are no film's."""
+    """Return the step from one frame to the next; 0 when `numbers` are no film's."""
     steps = Counter(later - earlier for earlier, later in pairwise(numbers))
     if not steps:
         return 0
@@ -132,7 +133,7 @@ def _missing(numbers: Sequence[int], step: int) -> str:
     return f"{count} numbers missing ({', '.join(named)}{more}): the picture before is held"
 
 
-#: Lengths of camera and background that differ by more than this share are said.
+#: A note says it when the lengths of camera and background differ by more than this share.
 LIKE_LENGTH = 0.05
 #: Shapes whose aspects differ by more than this are different.
 LIKE_ASPECT = 0.01
@@ -145,26 +146,28 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Stored:
-    """A picture, or the frames of a video. `shape`: (height, width) of its pixels as stored, when they are square.
+    """A picture, or the frames of a video.
 
-    `turned`: by how many quarters they are to be turned clockwise, as the file says.
+    `shape`: (height, width) of its pixels as stored, with square pixels. `turned`: number of quarters by which they are
+    to be turned clockwise, as the file says.
     """
 
     shape: Shape
     turned: int = 0
 
     def shown(self, turned: int | None = None) -> Shape:
-        """(height, width), turned by `turned` quarters, or as the file says."""
+        """Return (height, width) after a turn by `turned` quarters, or as the file says."""
         return self.shape[::-1] if (self.turned if turned is None else turned) % 2 else self.shape
 
 
 @dataclass(frozen=True)
 class Footage:
-    """A background. `what` it is, and the `rate` at which its frames follow each other, for people.
+    """A background.
 
-    `stored`: the video or the picture; of a folder, each of its pictures. `files`: names of pictures, in the order of
-    `stored`; none of a video. `folder`: where they are. `period_s`: after which time it starts again; 0 for a single
-    picture. `clock_s`: of each picture, seconds since 1970, increasing; none where names do not say it.
+    `what`: description for people. `rate`: rate at which its frames follow each other, for people. `stored`: the video
+    or the picture; for a folder, each of its pictures. `files`: names of pictures, in the order of `stored`; none for a
+    video. `folder`: folder of the files. `period_s`: time after which it starts again; 0 for a single picture.
+    `clock_s`: time of each picture, seconds since 1970, increasing; none where names do not say it.
     """
 
     what: tuple[str, ...]
@@ -177,7 +180,7 @@ class Footage:
 
 
 def filmed(path: CameraPath, footage: Footage | None, output: Shape) -> tuple[CameraPath, tuple[str, ...]]:
-    """`path` as the camera that filmed `footage`, and notes on the background; None is one that is drawn.
+    """Return `path` as the camera that filmed `footage`, and notes on the background; None is a drawn one.
 
     `output`: (height, width) of the picture that is shown.
     """
@@ -202,7 +205,7 @@ def filmed(path: CameraPath, footage: Footage | None, output: Shape) -> tuple[Ca
 def _over_all(
     path: CameraPath, footage: Footage, output: Shape, notes: tuple[str, ...]
 ) -> tuple[CameraPath, tuple[str, ...]]:
-    """A video, a picture, or pictures that have nothing to do with single poses; their first one stands for all."""
+    """Handle a video, a picture, or pictures unrelated to single poses, whose first one stands for all."""
     camera, turn_notes = _turned(path, footage.stored[:1])
     camera = replace(camera, repeat_s=footage.period_s)
     return camera, (
@@ -218,14 +221,14 @@ def _over_all(
 
 
 def _turned(path: CameraPath, stored: tuple[Stored, ...]) -> tuple[CameraPath, tuple[str, ...]]:
-    """`path` over `stored`, one for all of its samples or one for each, turned so that camera and picture agree."""
+    """Turn `path` so that camera and picture agree over `stored`, one for all samples or one for each."""
     lenses = path.optics.lenses
     turns = tuple(
         _turn(lenses[k % len(lenses)], path.quarter, one, is_own=path.is_held) for k, one in enumerate(stored)
     )
     shapes = tuple(one.shown(turned) for one, turned in zip(stored, turns, strict=True))
     differ = sum((one.turned - turned) % 4 != 0 for one, turned in zip(stored, turns, strict=True))
-    as_files_say = not differ and not path.is_held  # mirrored, too, and each picture of a folder by its own tag
+    as_files_say = not differ and not path.is_held  # its turn may mirror, and differs by picture
     optics = replace(path.optics, filmed=_once(shapes), turned=() if as_files_say else _once(turns))
     said = f" ({differ} of {len(stored)})" if len(stored) > 1 else ""
     note = (f"turned with the camera's picture, and not as the file says{said}",) if differ else ()
@@ -233,11 +236,11 @@ def _turned(path: CameraPath, stored: tuple[Stored, ...]) -> tuple[CameraPath, t
 
 
 def _turn(lens: Lens, quarter: int, stored: Stored, is_own: bool) -> int:
-    """Quarters by which `stored` is turned clockwise to be seen through `lens`, which was turned by `quarter`.
+    """Return the quarters by which `stored` is turned clockwise to be seen through `lens`.
 
-    A photo that the camera's file measured (`is_own`) was measured as it is stored, or as its file says, whichever has
-    the shape of the lens. Else the file is believed, unless its pixels have the shape of a measured lens, and as it is
-    shown it lies across it.
+    `quarter`: turn of the lens. A photo that the camera's file measured (`is_own`) was measured as stored, or as its
+    file says, whichever has the shape of the lens. Any other file is believed, with one exception: its pixels have the
+    shape of a measured lens, but as shown it lies across that lens.
     """
     measured = lens.turned(-quarter)
     if is_own and lens.known is Known.ALL:
@@ -254,7 +257,7 @@ def _once(values: tuple[T, ...]) -> tuple[T, ...]:
 def _with_photos(
     path: CameraPath, footage: Footage
 ) -> tuple[tuple[CameraPath, tuple[Stored, ...]] | None, tuple[str, ...]]:
-    """`path` without the poses whose photo is missing, and the photos of the others; None when all are missing."""
+    """Return `path` without the poses whose photo is missing, and the other photos; None when all are missing."""
     if not path.pictures or not footage.files:
         return None, ()
     places = _matches(path.pictures, footage)
@@ -284,7 +287,7 @@ def _with_photos(
 def _by_clock(
     path: CameraPath, footage: Footage
 ) -> tuple[tuple[CameraPath, tuple[Stored, ...]], tuple[str, ...]] | None:
-    """`path` at the times of those pictures that were taken during it, and these; None where the clocks do not meet."""
+    """Return `path` at the times of the pictures taken during it, and these; None where the clocks do not meet."""
     if path.began_s is None:
         return None
     times = np.array(footage.clock_s) - path.began_s
@@ -314,10 +317,10 @@ def _of_samples(optics: Optics, kept: NDArray[np.intp]) -> Optics:
 
 
 def _matches(names: tuple[str, ...], footage: Footage) -> Mapping[int, int]:
-    """The number of the folder's file for each of the `names` that has one.
+    """Return the number of the folder's file for each of the `names` that has one.
 
-    Names are compared without their folders, and without their endings where one has none or another one. Where files
-    of several folders have the same name, only those are meant whose folder is called like this one.
+    Names are compared without their folders. Endings are ignored where one has none or another one. Where files of
+    several folders have the same name, only those whose folder is called like this one count.
     """
     paths = [PurePosixPath(name.replace("\\", "/")) for name in names]
     if len({one.name for one in paths}) < len(paths):
@@ -336,7 +339,7 @@ def _loop(footage: Footage) -> str:
 
 
 def cut_note(shapes: tuple[Shape, ...] | list[Shape], output: Shape) -> str:
-    """What of pictures of `shapes` is not shown when they cover `output`."""
+    """Say what part of pictures of `shapes` is not shown when they cover `output`."""
     height, width = output
     cuts = {_cut(shape, output) for shape in shapes}
     how = cuts.pop() if len(cuts) == 1 else "cut according to their shapes"
@@ -353,7 +356,7 @@ def _cut(shape: Shape, output: Shape) -> str:
 
 
 def _shape_notes(path: CameraPath) -> tuple[str, ...]:
-    """What does not fit between the camera's lens and what it is said to have filmed."""
+    """Say what does not fit between the camera's lens and the background that it is said to have filmed."""
     lens, shape = path.optics.lenses[0], path.optics.filmed[0]
     if lens.lies_across(shape):
         held, lies = ("upright", "lies") if lens.height_px > lens.width_px else ("level", "stands")
@@ -367,7 +370,7 @@ def _shape_notes(path: CameraPath) -> tuple[str, ...]:
 
 
 def _is_like(lens: Lens, shape: Shape) -> bool:
-    """Whether a picture of `shape` (height, width) has the aspect of the lens's."""
+    """Return whether a picture of `shape` (height, width) has the aspect of the lens's."""
     return abs(lens.width_px * shape[0] / (lens.height_px * shape[1]) - 1) < LIKE_ASPECT
 
 

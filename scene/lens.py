@@ -1,12 +1,12 @@
-"""A pinhole lens as pixels of the picture that it makes, and what scaling, cutting and turning that picture does to it.
+"""A pinhole lens as pixels of the picture that it makes, and the effect of scaling, cutting and turning that picture.
 
-Whatever is done to a picture is done to its lens by the method of the same name, so that a point of the world stays on
-its pixel. Pixels are counted from the picture's top left corner, x to the right and y down: the centre of the first
-pixel is at (0.5, 0.5), as COLMAP has it (https://colmap.github.io/cameras.html). `of_opencv` is for formats that count
-from that centre.
+Whatever is done to a picture is done to its lens by the method of the same name, so a point of the world stays on its
+pixel. Pixels are counted from the picture's top left corner, x to the right and y down: the centre of the first pixel
+is at (0.5, 0.5), as in COLMAP (https://colmap.github.io/cameras.html). `of_opencv` is for formats that count from that
+centre.
 
-Pictures are drawn without distortion. `distortion_note` says how far it would move points of the picture's border, by
-the models of OpenCV and COLMAP, so that a person can judge whether that matters.
+Pictures are drawn without distortion. `distortion_note` says how far distortion would move points of the picture's
+border, by the models of OpenCV and COLMAP. A person can then judge whether it matters.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.shapes import Shape
 
-#: Picture of a lens of which nothing but an angle is known.
+#: Size of the picture of a lens for which only an angle is known.
 ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX = 640.0, 480.0
 
 
 class Known(Enum):
     """What is known of a lens: all of it, or the angle over one side of a picture whose shape is not known.
 
-    LONG: the angle over the longer side, and whether that lies or stands.
+    LONG: the angle over the longer side, whether that side lies or stands.
     """
 
     ALL = "all"
@@ -40,7 +40,7 @@ class Known(Enum):
     LONG = "long"
 
 
-#: What is known of a lens whose picture was turned by a quarter.
+#: What is known of a lens after its picture is turned by a quarter.
 TURNED = {**{known: known for known in Known}, Known.WIDTH: Known.HEIGHT, Known.HEIGHT: Known.WIDTH}
 
 
@@ -54,7 +54,10 @@ class PictureCut(NamedTuple):
 
 
 def cover(picture: Shape, output: Shape) -> PictureCut:
-    """How `picture` covers `output`, both (height, width): scaled until no border is left, the overhang cut equally."""
+    """Return how `picture` covers `output`, both (height, width).
+
+    It is scaled until no border is left; the overhang is cut equally.
+    """
     scale = max(output[0] / picture[0], output[1] / picture[1])
     height, width = (max(side, round(full * scale)) for side, full in zip(output, picture, strict=True))
     return PictureCut(height, width, (height - output[0]) // 2, (width - output[1]) // 2)
@@ -64,7 +67,7 @@ def cover(picture: Shape, output: Shape) -> PictureCut:
 class Lens:
     """A lens without distortion: x = `cx` + `fx` X / Z, y = `cy` + `fy` Y / Z, with Y down and Z ahead.
 
-    All numbers in pixels of a picture of `width_px` x `height_px`. `known`: whether the shape of the picture is.
+    All numbers are in pixels of a picture of `width_px` x `height_px`. `known`: what is known of the lens.
     """
 
     width_px: float
@@ -76,22 +79,22 @@ class Lens:
     known: Known = Known.ALL
 
     def lies_across(self, picture: Shape) -> bool:
-        """Whether the lens's picture stands upright and `picture` (height, width) lies, or the other way round."""
+        """Return whether one of the lens's picture and `picture` (height, width) is upright and the other one wide."""
         is_known = self.known in (Known.ALL, Known.LONG)
         return is_known and (self.height_px - self.width_px) * (picture[0] - picture[1]) < 0
 
     @property
     def fov_y_deg(self) -> float:
-        """Field of view from the top to the bottom of the picture."""
+        """Field of view from the top to the bottom of the picture, degrees."""
         return math.degrees(math.atan(self.cy / self.fy) + math.atan((self.height_px - self.cy) / self.fy))
 
     @property
     def fov_x_deg(self) -> float:
-        """Field of view from the left to the right of the picture."""
+        """Field of view from the left to the right of the picture, degrees."""
         return math.degrees(math.atan(self.cx / self.fx) + math.atan((self.width_px - self.cx) / self.fx))
 
     def scaled(self, width_px: float, height_px: float) -> Lens:
-        """The lens of the picture scaled to `width_px` x `height_px`."""
+        """Return the lens of the picture scaled to `width_px` x `height_px`."""
         x, y = width_px / self.width_px, height_px / self.height_px
         return replace(
             self,
@@ -104,11 +107,11 @@ class Lens:
         )
 
     def cropped(self, x: float, y: float, width_px: float, height_px: float) -> Lens:
-        """The lens of a part of `width_px` x `height_px`; its top left corner (`x`, `y`) may be outside the picture."""
+        """Return the lens of a part of `width_px` x `height_px`; its corner (`x`, `y`) may be outside the picture."""
         return replace(self, width_px=width_px, height_px=height_px, cx=self.cx - x, cy=self.cy - y)
 
     def turned(self, quarters: int) -> Lens:
-        """The lens of the picture turned clockwise by `quarters` of 90 degrees."""
+        """Return the lens of the picture turned clockwise by `quarters` of 90 degrees."""
         lens = self
         for _ in range(quarters % 4):
             lens = Lens(
@@ -117,9 +120,9 @@ class Lens:
         return lens
 
     def onto(self, picture: Shape) -> Lens:
-        """The lens of `picture` (height, width), which it made.
+        """Return the lens of `picture` (height, width), which it made.
 
-        A picture of another shape than the lens's is taken as cut equally at both sides, by its sensor or later. A lens
+        A picture of another shape than the lens's counts as cut equally at both sides, by its sensor or later. A lens
         whose shape is not known takes the picture's, with square pixels and the angle that is known.
         """
         height, width = float(picture[0]), float(picture[1])
@@ -135,19 +138,19 @@ class Lens:
         return whole.cropped((whole.width_px - width) / 2, (whole.height_px - height) / 2, width, height)
 
     def covering(self, output: Shape) -> Lens:
-        """The lens of the picture cut by `cover` to `output` (height, width); the picture has whole pixels."""
+        """Return the lens of the picture cut by `cover` to `output` (height, width); the picture has whole pixels."""
         cut = cover((round(self.height_px), round(self.width_px)), output)
         return self.scaled(cut.width, cut.height).cropped(cut.left, cut.top, output[1], output[0])
 
     def filling_height(self, output: Shape) -> Lens:
-        """The lens of a drawing of `output` (height, width) as high as the picture; its sides show more, or less."""
+        """Return the lens of a drawing of `output` (height, width) as high as the picture; its width may differ."""
         height, width = output
         scale = height / self.height_px
         whole = self.scaled(self.width_px * scale, height)
         return whole.cropped((whole.width_px - width) / 2, 0.0, width, height)
 
     def between(self, other: Lens, fraction: float) -> Lens:
-        """The lens between this one, at a `fraction` of 0, and `other`, at 1, which has a picture of the same size."""
+        """Return the lens at `fraction` between this one, at 0, and `other`, at 1, whose picture has the same size."""
 
         def mix(a: float, b: float) -> float:
             return a + (b - a) * fraction
@@ -156,9 +159,10 @@ class Lens:
         return replace(self, fx=fx, fy=fy, cx=mix(self.cx, other.cx), cy=mix(self.cy, other.cy))
 
     def projection(self, near_m: float, far_m: float) -> F64:
-        """OpenGL clip matrix (4, 4), its camera with y up, looking along -Z. `near_m`, `far_m`: of the clip planes.
+        """Return the OpenGL clip matrix (4, 4) of a camera with y up, looking along -Z.
 
-        x / w = 2 (cx + fx X / -Z) / width - 1, and y / w = 1 - 2 (cy - fy Y / -Z) / height.
+        `near_m`, `far_m`: distances of the clip planes. x / w = 2 (cx + fx X / -Z) / width - 1, and y / w = 1 - 2 (cy -
+        fy Y / -Z) / height.
         """
         depth = near_m - far_m
         return np.array(
@@ -172,23 +176,23 @@ class Lens:
 
 
 def centred(width_px: float, height_px: float, focal_px: float, known: Known = Known.ALL) -> Lens:
-    """A lens with square pixels whose principal point is the middle of its picture."""
+    """Return a lens with square pixels whose principal point is the middle of its picture."""
     return Lens(width_px, height_px, focal_px, focal_px, width_px / 2, height_px / 2, known)
 
 
 def of_opencv(width_px: float, height_px: float, fx: float, fy: float, cx: float, cy: float) -> Lens:
-    """A lens whose principal point is counted from the centre of the first pixel, as OpenCV and Kalibr do."""
+    """Return a lens whose principal point is counted from the centre of the first pixel, as OpenCV and Kalibr do."""
     return Lens(width_px, height_px, fx, fy, cx + 0.5, cy + 0.5)
 
 
 def of_fov_y(fov_y_deg: float) -> Lens:
-    """A lens by its field of view over the picture's height, degrees."""
+    """Return a lens by its field of view over the picture's height, degrees."""
     focal = ASSUMED_HEIGHT_PX / 2 / math.tan(math.radians(fov_y_deg) / 2)
     return centred(ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX, focal, Known.HEIGHT)
 
 
 def of_fov_x(fov_x_deg: float) -> Lens:
-    """A lens by its field of view over the picture's width, degrees."""
+    """Return a lens by its field of view over the picture's width, degrees."""
     focal = ASSUMED_WIDTH_PX / 2 / math.tan(math.radians(fov_x_deg) / 2)
     return centred(ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX, focal, Known.WIDTH)
 
@@ -198,9 +202,9 @@ LEAST_SIDE_PX, MOST_SIDE_PX = 1.0, 1e6  # of a side of the picture
 
 
 def checked_lens(where: str | Path, lens: Lens) -> Lens:
-    """`lens`, if its picture has LEAST_PX to MOST_PX a side, and it sees LEAST_DEG to MOST_DEG over each.
+    """Return `lens` if its picture and its angles are plausible; else raise BadInputError about `where`.
 
-    Raises BadInputError about `where`.
+    Each side has LEAST_SIDE_PX to MOST_SIDE_PX pixels and spans LEAST_DEG to MOST_DEG degrees.
     """
     if not LEAST_SIDE_PX <= min(lens.width_px, lens.height_px) <= max(lens.width_px, lens.height_px) <= MOST_SIDE_PX:
         found = f"a picture of {lens.width_px:.4g}x{lens.height_px:.4g} pixels"
@@ -212,14 +216,14 @@ def checked_lens(where: str | Path, lens: Lens) -> Lens:
     return lens
 
 
-#: Points along each side of the border.
+#: Number of points along each side of the border.
 BORDER_STEPS = 9
 #: Displacements below this are not worth a note.
 LEAST_BEND_PX = 0.5
 
 
 def measured_lens(where: str | Path, width_px: float, height_px: float, numbers: F64) -> Lens:
-    """The lens of a file's fx, fy, cx and cy, in pixels. Raises BadInputError about `where` for what is no lens."""
+    """Return the lens of a file's fx, fy, cx and cy, in pixels. Raises BadInputError about `where` for no lens."""
     if not (np.isfinite(numbers).all() and (numbers > 0).all()):
         raise BadInputError(where, "a lens whose numbers are not all positive", "fx, fy, cx and cy in pixels")
     fx, fy, cx, cy = (float(value) for value in numbers)
@@ -227,7 +231,7 @@ def measured_lens(where: str | Path, width_px: float, height_px: float, numbers:
 
 
 class Bent(NamedTuple):
-    """A lens with the `parameters` k1 to k6, p1 and p2 of its distortion."""
+    """A lens and the `parameters` k1 to k6, p1 and p2 of its distortion."""
 
     lens: Lens
     parameters: Mapping[str, float]
@@ -235,7 +239,7 @@ class Bent(NamedTuple):
 
 
 def distortion_note(lenses: Iterable[Bent]) -> tuple[str, ...]:
-    """What is left out of the lens that is distorted the most; nothing where it is nothing."""
+    """Say what is left out of the most distorted lens; nothing where nothing is."""
     bent = [each for each in lenses if each.is_fisheye or any(each.parameters.values())]
     most, worst = max(((largest_px(*each), k) for k, each in enumerate(bent)), default=(0.0, 0))
     if most < LEAST_BEND_PX:
@@ -246,7 +250,7 @@ def distortion_note(lenses: Iterable[Bent]) -> tuple[str, ...]:
 
 
 def largest_px(lens: Lens, parameters: Mapping[str, float], is_fisheye: bool = False) -> float:
-    """The farthest that a point of the pinhole picture's border is from where the lens draws it, pixels."""
+    """Return the farthest, in pixels, that the lens moves a point of the pinhole picture's border."""
     part = np.linspace(0.0, 1.0, BORDER_STEPS)
     zero, one = np.zeros(BORDER_STEPS), np.ones(BORDER_STEPS)
     border = np.column_stack([np.concatenate([part, part, zero, one]), np.concatenate([zero, one, part, part])])
@@ -258,7 +262,7 @@ def largest_px(lens: Lens, parameters: Mapping[str, float], is_fisheye: bool = F
 
 
 def _polynomial(points: F64, parameters: Mapping[str, float]) -> F64:
-    """OpenCV's radial and tangential model of `points` (N, 2), X / Z and Y / Z."""
+    """Apply OpenCV's radial and tangential model to `points` (N, 2), X / Z and Y / Z."""
     k1, k2, k3, k4, k5, k6, p1, p2 = (
         parameters.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
     )
@@ -272,7 +276,7 @@ def _polynomial(points: F64, parameters: Mapping[str, float]) -> F64:
 
 
 def _fisheye(points: F64, parameters: Mapping[str, float]) -> F64:
-    """OpenCV's fisheye model: the distance from the middle goes with the angle, not with its tangent."""
+    """Apply OpenCV's fisheye model: the distance from the middle follows the angle, not its tangent."""
     k1, k2, k3, k4 = (parameters.get(key, 0.0) for key in ("k1", "k2", "k3", "k4"))
     radius = np.linalg.norm(points, axis=1)
     angle = np.arctan(radius)

@@ -2,8 +2,8 @@
 
 A body touches the floor with its outermost vertices, not with its joints; pose blend shapes are left out. The rule
 `sequence` lifts the whole motion by one amount, so that jumps leave the floor. `frame` lifts each frame by its own
-amount, so that some point always touches it. `stance` is for a recording that tells when its feet stand: standing feet
-are on the floor, and other frames are lifted as much as those are on average.
+amount, so that some point always touches it. `stance` is for a recording that says when its feet stand: standing feet
+are on the floor, and other frames are lifted by the average of those.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from trilane.scene.motion.motion import Motion, bracket, rest_leg_m, wrapped_tim
 from trilane.scene.rotations import about
 from trilane.scene.schema import AvatarSpec
 
-#: How many of a vertex's skin weights are used: the largest ones.
+#: Number of a vertex's skin weights that are used: the largest ones.
 WEIGHTS = 4
-#: Frames whose heights are computed together: so few that the arrays stay in the processor's cache.
+#: Number of frames whose heights are computed together: so few that the arrays stay in the processor's cache.
 FRAMES_AT_ONCE = 16
 FEET = ("left_ankle", "right_ankle", "left_foot", "right_foot")
 #: Directions in which the outermost vertices of each joint are taken: the axes and the diagonals of a cube.
@@ -36,8 +36,8 @@ DIRECTIONS: F64 = np.array(_SIGNS, dtype=np.float64) / np.linalg.norm(_SIGNS, ax
 class BodyOutline:
     """The K outermost vertices of a body.
 
-    `points` (K, 4): places at rest, metres, with a 1 appended. `joints` and `weights` (K, W): the joints that move each
-    of them, and how much.
+    `points` (K, 4): places at rest, metres, with a 1 appended. `joints`, `weights` (K, W): joints that move each of
+    them, and by how much.
     """
 
     points: F64
@@ -45,12 +45,12 @@ class BodyOutline:
     weights: F64
 
     def posed(self, matrices: F32) -> F64:
-        """World positions (K, 3) under skinning matrices (55, 3, 4)."""
+        """Return world positions (K, 3) under skinning matrices (55, 3, 4)."""
         blend = np.einsum("kw,kwc->kc", self.weights, matrices.reshape(-1, 12)[self.joints])
         return np.asarray(np.einsum("kab,kb->ka", blend.reshape(-1, 3, 4), self.points))
 
     def lowest(self, height_rows: F32) -> F64:
-        """The least height (T,) that `posed` gives, of `height_rows` (T, 55, 4): row 1 of the skinning matrices."""
+        """Return the least height (T,) that `posed` would give, from row 1 of the skinning matrices, (T, 55, 4)."""
         parts = np.split(height_rows, range(FRAMES_AT_ONCE, len(height_rows), FRAMES_AT_ONCE))
         return np.concatenate([self._heights(rows).min(axis=1) for rows in parts])
 
@@ -61,7 +61,7 @@ class BodyOutline:
 
 
 def outline(body: ShapedBody) -> BodyOutline:
-    """The outline of the vertices furthest along each of DIRECTIONS, among those that each joint moves most."""
+    """Return the outline of the vertices furthest along each of DIRECTIONS, among those that each joint moves most."""
     weights, rest = body.body.weights, body.vertices.astype(np.float64)
     owner = weights.argmax(axis=1)
     picked: set[int] = set()
@@ -73,12 +73,12 @@ def outline(body: ShapedBody) -> BodyOutline:
 
 
 def feet(body: ShapedBody) -> BodyOutline:
-    """All vertices that ankles and toes move most: those that stand on the floor to the millimetre."""
+    """Return all vertices that ankles and toes move most: those that stand on the floor to the millimetre."""
     return _of(body, np.flatnonzero(np.isin(body.body.weights.argmax(axis=1), [JOINT_INDEX[name] for name in FEET])))
 
 
 def _of(body: ShapedBody, index: NDArray[np.intp]) -> BodyOutline:
-    """The Outline of the vertices `index`."""
+    """Return the outline of the vertices `index`."""
     weights, rest = body.body.weights[index], body.vertices[index].astype(np.float64)
     points = np.concatenate([rest, np.ones((len(index), 1))], axis=1)
     top = np.argsort(-weights, axis=1)[:, :WEIGHTS]
@@ -89,21 +89,21 @@ def _of(body: ShapedBody, index: NDArray[np.intp]) -> BodyOutline:
 Ground = Literal["auto", "sequence", "frame", "none"]
 Rule = Literal["sequence", "frame", "stance", "none"]
 
-#: Times per second of a motion at which the lowest point is computed.
+#: Number of times per second of a motion at which the lowest point is computed.
 SAMPLES_PER_S = 30
-#: How many there are at most: with `stance` those of 200 s, beyond which feet are less exactly on the floor.
+#: Most of these times: with `stance` those of 200 s, beyond which feet are less exactly on the floor.
 MAX_SAMPLES: dict[Rule, int] = {"sequence": 600, "frame": 600, "stance": 6000}
-#: With `sequence` 5 % of the frames may dip below the floor, so that one bad frame does not lift all others.
+#: With `sequence`, 5 % of the frames may dip below the floor, so that one bad frame does not lift all others.
 LOWEST_PERCENTILE = 5.0
-#: With `stance` no point of the body is further below the floor, metres: hands and knees may be of another length.
+#: With `stance`, greatest depth of any point of the body below the floor, metres: hands and knees may differ in length.
 DEEPEST_M = 0.03
 
 
 def ground_rule(motion: Motion, ground: Ground) -> Rule:
-    """`ground`, or for `auto`: what `motion` allows.
+    """Return `ground`, or the rule that `motion` allows where it is `auto`.
 
-    That is `stance` when it tells when its feet stand, `sequence` when it has a recorded place of the pelvis, else
-    `frame`.
+    That rule is `stance` when the motion says when its feet stand, `sequence` when it has a recorded place of the
+    pelvis, else `frame`.
     """
     if ground != "auto":
         return ground
@@ -120,14 +120,13 @@ def _sample_count(motion: Motion, rule: Rule) -> int:
 def floor_lift(
     motion: Motion, skeleton: Skeleton, shape: BodyOutline, shift: F64, scale: float, rule: Rule, soles: BodyOutline
 ) -> tuple[F64, F64]:
-    """Times (L,) in seconds, and metres (L,) by which the body is lifted at them; linear between.
+    """Return times (L,) in seconds, and metres (L,) by which the body is lifted at them; linear between.
 
     `motion`: motion to put on the floor.
     `skeleton`: joints of the body that does it.
     `shape`: outline of that body.
-    `shift`: as in `Mover`.
-    `scale`: as in `Mover`.
-    `rule`: of `ground_rule`.
+    `shift`, `scale`: as in `Mover`.
+    `rule`: rule from `ground_rule`.
     `soles`: outline of the body's feet.
     """
     if rule == "none":
@@ -135,6 +134,7 @@ def floor_lift(
     times_s = np.linspace(0.0, motion.duration_s, _sample_count(motion, rule))
     poses, pelvises = motion.sample_all(times_s)
     rows = [
+        # Copied, because the skeleton writes its next pose to the same buffer.
         skeleton.pose(pose, pelvis * scale + shift).matrices[:, 1].copy()
         for pose, pelvis in zip(poses, pelvises, strict=True)
     ]
@@ -149,7 +149,10 @@ def floor_lift(
 
 
 def _lift_of_feet(feet: F64, lowest: F64, stance: F64) -> F64:
-    """Metres (L,) of lift, by heights (L,) of the feet and of the `lowest` point of the body, and by `stance` (L,)."""
+    """Return the lift (L,) in metres from heights (L,) of the feet and of the body's `lowest` point.
+
+    `stance` (L,): how much the feet stand.
+    """
     usual = -float(np.average(feet, weights=stance)) if stance.any() else -np.percentile(lowest, LOWEST_PERCENTILE)
     lift = usual + stance * (-feet - usual)
     return np.maximum(lift, -lowest - DEEPEST_M)
@@ -160,9 +163,9 @@ class Mover:
     """A motion in its place.
 
     `world` (4, 4): map from the motion's space to the scene's. `scale`: factor on the pelvis's places, the ratio of the
-    leg lengths. `shift` (3,): added to these places, minus the pelvis of the rest pose. `lift_times_s` (L,), `lift_m`
-    (L,): metres by which the body is lifted onto the floor, linear between these times. `notes`: what was decided, for
-    people.
+    leg lengths. `shift` (3,): vector added to these places, minus the pelvis of the rest pose. `lift_times_s` (L,),
+    `lift_m` (L,): metres by which the body is lifted onto the floor, linear between these times. `notes`: what was
+    decided, for people.
     """
 
     motion: Motion
@@ -174,7 +177,7 @@ class Mover:
     notes: tuple[str, ...]
 
     def sample(self, t_s: float) -> tuple[F64, F64]:
-        """Pose (55, 3), axis-angle, and translation (3,), metres, at `t_s`; both before `world`."""
+        """Return pose (55, 3), axis-angle, and translation (3,), metres, at `t_s`; both before `world`."""
         pose, pelvis = self.motion.sample(t_s)
         translation = pelvis * self.scale + self.shift
         i, j, fraction = bracket(self.lift_times_s, wrapped_time(t_s, self.motion.duration_s, self.motion.wrap))
@@ -183,7 +186,7 @@ class Mover:
 
 
 def make_mover(spec: AvatarSpec, motion: Motion, body: ShapedBody) -> Mover:
-    """`motion` on the floor for `body`, at the position and heading of `spec`."""
+    """Put `motion` on the floor for `body`, at the position and heading of `spec`."""
     leg = rest_leg_m(body.joints)
     scale = leg / motion.leg_m if motion.leg_m else 1.0
     shift = -body.joints[0]

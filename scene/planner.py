@@ -1,6 +1,6 @@
-"""The planner: how much of a frame is made, which tensor it gets, and which shapes of tensors a run gets ready.
+"""The planner: how much of a frame is made, which tensor it gets, and which shapes of tensors a run prepares.
 
-**Work.** A picture is used again only when all that it depends on is the same, bit for bit.
+**Work.** A picture is used again only when everything that it depends on is the same, bit for bit.
 
 **Tensor.** A network paints a body best at about the size that it has learnt, whatever the distance: much smaller it
 loses the face, much larger it paints ragged edges. So each avatar in view gets the pixels that its network was trained
@@ -9,7 +9,7 @@ times the pixels (docs/decisions/planner.md has the figures).
 
 **Changes.** A change of shape is seen, so it costs as much as the pixels of `PATIENCE` frames. The scene is known
 ahead: before the run `foreseen_changes` finds the changes that cost least. Each is made while both shapes are good, and
-where nobody is in view or what is seen moves fast. A frame whose shape is not good enough gets a good one at once,
+where nobody is in view or the scene moves fast. A frame whose shape is not good enough gets a good one at once,
 whatever was foreseen. Where nothing is foreseen, a smaller shape is taken after `PATIENCE` frames in which it would
 have done.
 
@@ -39,7 +39,7 @@ from trilane.shapes import Shape, shapes_within
 
 
 class FrameWork(IntEnum):
-    """What a frame asks for. FULL: a new picture of the avatars. REUSE: the one that is there. NONE: nobody is seen."""
+    """The work for a frame. FULL: a new picture of the avatars. REUSE: the present picture. NONE: nobody is seen."""
 
     FULL = 0
     REUSE = 1
@@ -47,18 +47,21 @@ class FrameWork(IntEnum):
 
 
 def shown_by(arrays: Iterable[Floats]) -> bytes:
-    """What the picture of the avatars depends on, to be compared: `arrays` of always the same shapes."""
+    """Return everything that the picture of the avatars depends on as bytes to compare.
+
+    `arrays`: numbers of always the same shapes.
+    """
     return b"".join(array.tobytes() for array in arrays)
 
 
 def work_of(
     shown: bytes, of_picture: bytes | None, of_nobody: bytes | None, is_anybody_seen: Callable[[], bool]
 ) -> FrameWork:
-    """What a frame that shows `shown` asks for.
+    """Return the work for a frame that shows `shown`.
 
-    `of_picture`: what the frame showed whose picture is there, None when there is none.
+    `of_picture`: what the frame of the present picture showed, None when there is none.
     `of_nobody`: what a frame showed on which nobody was seen, None when there was none.
-    `is_anybody_seen`: looks whether an avatar is on the screen; asked only when neither frame tells.
+    `is_anybody_seen`: finds out whether an avatar is on the screen; called only when neither frame tells.
     """
     if shown == of_picture:
         return FrameWork.REUSE
@@ -67,35 +70,36 @@ def work_of(
     return FrameWork.FULL
 
 
-#: Tensor pixels for one pixel of the picture, along a side: more could not be seen.
+#: Most tensor pixels for one pixel of the picture, along a side: more could not be seen.
 MOST_DENSITY = 4.0
-#: A density is as good as the best one when it is at least this share of it.
+#: Least share of the best density at which a density is as good.
 AS_GOOD = 0.95
-#: A change in view costs as much as the pixels of so many frames; so long a smaller shape has to do before it is taken.
+#: Cost of a change in view, in pixels of so many frames; also the number of frames for which a smaller shape must do
+#: before it is taken.
 PATIENCE = 10
-#: What is seen moves by this share of the picture's side in a frame: a change shows half as much as at rest.
+#: Movement in a frame, as a share of the picture's side, at which a change shows half as much as at rest.
 FAST = 0.01
-#: A change of the density by this factor shows twice as much as one of the shape alone.
+#: Factor by which a change of the density shows twice as much as a change of the shape alone.
 DENSITY_STEP = 1.25
-#: How many times its own pixels an avatar gets at most, where the picture shows as many: 5/4 of the sides.
+#: Most pixels of an avatar, as a multiple of its own, where the picture shows as many: 5/4 of the sides.
 MOST_GROWTH = 25 / 16
-#: Sides of a tensor, in parts of those that its network was trained to paint: the sizes that it may be stepped down to
-#: when frames would be late, or that an error budget allows.
+#: Sides of a tensor, as shares of those that its network was trained to paint: sizes for stepping down when frames
+#: would be late, or for an error budget.
 SIDES = (1.0, 0.75, 0.5)
 ALL_WORK = 1000
 
 
 def work_of_side(side: float) -> int:
-    """Thousandths of all the pixels that a tensor has whose sides are `side` times as long."""
+    """Return the thousandths of all pixels in a tensor whose sides are `side` times as long."""
     return math.ceil(ALL_WORK * side * side)
 
 
 @dataclass(frozen=True)
 class TensorBudget:
-    """Pixels of a tensor.
+    """The pixels that a tensor may have.
 
-    `own`: pixels of the network's own shape, for each avatar. `most`: most pixels of all together. `work`: thousandths
-    of what these two allow.
+    `own`: pixels of the network's own shape, for each avatar. `most`: most pixels of all avatars together. `work`:
+    thousandths of these two that are allowed.
     """
 
     own: int
@@ -103,15 +107,15 @@ class TensorBudget:
     work: int = ALL_WORK
 
     def scaled(self, work: int) -> TensorBudget:
-        """The budget with `work` thousandths of the pixels."""
+        """Return the budget with `work` thousandths of the pixels."""
         return replace(self, work=work)
 
     def most_of(self, avatars: int) -> int:
-        """Pixels for so many avatars in view, however large they are."""
+        """Return the pixels for so many `avatars` in view, however large they are."""
         return self._allowed(avatars * self.own * MOST_GROWTH)
 
     def of(self, rects: Sequence[Rect], output: Shape) -> int:
-        """Pixels for the avatars at `rects` on a picture of `output`: their own, or as many as the picture shows."""
+        """Return the pixels for the avatars at `rects` on a picture of `output`: their own, or as many as it shows."""
         own = len(rects) * self.own
         return min(self._allowed(max(own, area(tight_shape(rects, output)))), self.most_of(len(rects)))
 
@@ -123,8 +127,8 @@ class TensorBudget:
 class HeldShape:
     """The shape in use.
 
-    `foreseen`: the foreseen shape that was taken last. `smaller_for`: frames in a row for which a smaller shape would
-    have done.
+    `foreseen`: foreseen shape that was taken last. `smaller_for`: number of successive frames for which a smaller shape
+    would have done.
     """
 
     shape: Shape
@@ -148,12 +152,12 @@ def plan_tensor(
     before: HeldShape | None,
     foreseen: Shape | None = None,
 ) -> TensorPlan:
-    """The tensor for the avatars at `rects`, at least one.
+    """Plan the tensor for the avatars at `rects`, at least one.
 
     `output`: (height, width) of the picture in pixels.
     `shapes`: shapes that are ready. Where all of them are larger than the budget allows, any may be taken.
     `before`: shape of the frame before, None for the first.
-    `foreseen`: the shape of this frame by `foreseen_changes`; None where nothing was foreseen.
+    `foreseen`: shape of this frame by `foreseen_changes`; None where nothing was foreseen.
     Raises BadInputError when no shape has room for all avatars.
     """
     fits, good = _fits(rects, output, shapes, budget)
@@ -166,9 +170,9 @@ def plan_tensor(
 def _fits(
     rects: Sequence[Rect], output: Shape, shapes: Sequence[Shape], budget: TensorBudget
 ) -> tuple[dict[Shape, DenseLayout], list[Shape]]:
-    """The avatars' layout in each shape that may be taken and has room for them, and which of the shapes are good.
+    """Return the layout in each shape that may be taken and has room for the avatars, and which of the shapes are good.
 
-    Good is what is nearly as dense as the densest within the frame's budget. A shape may be larger than that, but not
+    A good shape is nearly as dense as the densest within the frame's budget. It may be larger than that one, but not
     than the budget of any frame with as many avatars.
     """
     most, pixels = budget.most_of(len(rects)), budget.of(rects, output)
@@ -180,7 +184,7 @@ def _fits(
 
 
 def _held(good: Sequence[Shape], before: HeldShape | None, foreseen: Shape | None) -> HeldShape:
-    """What was foreseen, once and as soon as it is good; then what is held while it is good, else the smallest."""
+    """Return the foreseen shape once, as soon as it is good; then the held one while it is good, else the smallest."""
     last = before.foreseen if before is not None else None
     is_kept = before is not None and before.shape in good
     if foreseen is not None and foreseen in good and (foreseen != last or not is_kept):
@@ -196,7 +200,10 @@ def _held(good: Sequence[Shape], before: HeldShape | None, foreseen: Shape | Non
 
 @dataclass(frozen=True)
 class LookAhead:
-    """A frame that was looked at before the run. `rects`: rectangles of the visible avatars, by their numbers."""
+    """A frame that was looked at before the run.
+
+    `rects`: rectangles of the visible avatars, by their numbers.
+    """
 
     frame: int
     rects: Mapping[int, Rect]
@@ -205,10 +212,10 @@ class LookAhead:
 def foreseen_changes(
     looks: Sequence[LookAhead], output: Shape, shapes: Sequence[Shape], budget: TensorBudget
 ) -> tuple[tuple[int, Shape], ...]:
-    """The shape from the first of `looks` on, at least one, and every change of shape with its frame.
+    """Return the shape from the first of `looks` on, at least one, and every change of shape with its frame.
 
-    The way through the good shapes is the cheapest one in pixels: those of all frames, and the cost of the changes. A
-    shape that is not good at a look is left in the first frame behind the look before.
+    The way through the good shapes is the cheapest in pixels: those of all frames, and the cost of the changes. A shape
+    that is not good at a look is left in the first frame after the look before.
     """
     order = sorted(shapes, key=lambda shape: (area(shape), shape))
     costs, origins, needed = dict.fromkeys(order, 0.0), [], []
@@ -234,7 +241,10 @@ def foreseen_changes(
 def _cheapest_way(
     shape: Shape, costs: Mapping[Shape, float], fits: Mapping[Shape, DenseLayout], price: float
 ) -> tuple[float, Shape]:
-    """Cost of the cheapest way to `shape`, and the shape of `costs` where it begins. `price`: cost of a change."""
+    """Return the cost of the cheapest way to `shape`, and the shape of `costs` where it begins.
+
+    `price`: cost of a change.
+    """
 
     def change(origin: Shape) -> float:
         if origin == shape:
@@ -247,7 +257,7 @@ def _cheapest_way(
 
 
 def _speed(before: LookAhead, now: LookAhead) -> float:
-    """How far the sides of the avatars' rectangles move in a frame, at most, as a share of the picture's sides."""
+    """Return the largest move of a side of the avatars' rectangles in a frame, as a share of the picture's sides."""
     frames = max(now.frame - before.frame, 1)
     both = now.rects.keys() & before.rects.keys()
     moved = [abs(a - b) / 2.0 for one in both for a, b in zip(now.rects[one], before.rects[one], strict=True)]
@@ -255,7 +265,7 @@ def _speed(before: LookAhead, now: LookAhead) -> float:
 
 
 def ideal_shape(rects: Sequence[Rect], output: Shape, budget: TensorBudget) -> Shape:
-    """The shape in which the avatars at `rects` are densest within the budget; of equal ones the smallest."""
+    """Return the shape in which the avatars at `rects` are densest within the budget; the smallest of equal ones."""
     pixels = budget.of(rects, output)
     tight = tight_shape(rects, output, MOST_DENSITY)
     shapes = [*shapes_within(pixels), *([tight] if area(tight) <= pixels else [])]
@@ -266,17 +276,17 @@ def ideal_shape(rects: Sequence[Rect], output: Shape, budget: TensorBudget) -> S
 
 
 def area(shape: Shape) -> int:
-    """Pixels of a tensor."""
+    """Return the number of pixels of a tensor."""
     return shape[0] * shape[1]
 
 
 MOST_SHAPES = 10
-#: Share of the pixels of all frames that a further shape has to save.
+#: Least share of the pixels of all frames that a further shape has to save.
 LEAST_SAVING = 0.02
 
 
 class Demand(NamedTuple):
-    """What a frame asks for: its ideal shape (height, width), and the pixels that its tensor may have."""
+    """The needs of a frame: its ideal shape (height, width), and the pixels that its tensor may have."""
 
     ideal: Shape
     pixels: int
@@ -284,9 +294,10 @@ class Demand(NamedTuple):
 
 @dataclass(frozen=True)
 class ShapeSet:
-    """`shapes` (height, width), the smallest first. `memory_bytes`: what their networks take.
+    """The shapes that a run prepares.
 
-    `unserved`: frames that none of them serves, because there may be no more; they are drawn less densely.
+    `shapes`: (height, width), the smallest first. `memory_bytes`: memory of their networks. `unserved`: number of
+    frames that none of them serves, because there may be no more; they are drawn less densely.
     """
 
     shapes: tuple[Shape, ...]
@@ -302,12 +313,12 @@ def choose_shapes(
     *,
     optional: bool = False,
 ) -> ShapeSet:
-    """The shapes to prepare: at least one, whatever its memory, unless they are `optional`.
+    """Choose the shapes to prepare: at least one, whatever its memory, unless they are `optional`.
 
     `demands`: demands of the foreseen frames, at least one.
     `bytes_per_pixel`: memory of a network that is ready to run, for each pixel of its tensor.
-    `memory_bytes`: what all of them may take.
-    `most_shapes`: how many there may be.
+    `memory_bytes`: most memory of all of them.
+    `most_shapes`: largest number of shapes.
     """
     frames = Counter(demands)
     chosen: list[Shape] = []
@@ -324,27 +335,30 @@ def choose_shapes(
 
 
 def joined(first: ShapeSet, second: ShapeSet) -> ShapeSet:
-    """Both sets. `unserved` is the first one's, unless it has no shapes. A shape of both counts twice as memory."""
+    """Join both sets; a shape in both counts twice as memory.
+
+    `unserved` is the first one's, unless it has no shapes.
+    """
     shapes = sorted({*first.shapes, *second.shapes}, key=lambda shape: (area(shape), shape))
     unserved = first.unserved if first.shapes else second.unserved
     return ShapeSet(tuple(shapes), first.memory_bytes + second.memory_bytes, unserved)
 
 
 def larger_shapes(shapes: Sequence[Shape], most_pixels: int) -> list[Shape]:
-    """New shapes that hold two of `shapes` each, with at most `most_pixels`."""
+    """Return new shapes that hold two of `shapes` each, with at most `most_pixels`."""
     both = {(max(a[0], b[0]), max(a[1], b[1])) for a, b in combinations(shapes, 2)}
     return sorted((shape for shape in both - set(shapes) if area(shape) <= most_pixels), key=area)
 
 
 def serves(shape: Shape, demand: Demand) -> bool:
-    """Whether the frame of `demand` can be drawn well in a tensor of `shape`."""
+    """Return whether the frame of `demand` can be drawn well in a tensor of `shape`."""
     (height, width), (ideal_height, ideal_width) = shape, demand.ideal
     large_enough = height >= AS_GOOD * ideal_height and width >= AS_GOOD * ideal_width
     return large_enough and area(shape) <= demand.pixels
 
 
 def _next(frames: Mapping[Demand, int], chosen: Sequence[Shape]) -> Shape | None:
-    """The shape to add, None when a further one is not worth it."""
+    """Return the shape to add, None when a further one is not worth it."""
     candidates = sorted({demand.ideal for demand in frames} - set(chosen))
     if not candidates:
         return None
@@ -357,7 +371,7 @@ def _next(frames: Mapping[Demand, int], chosen: Sequence[Shape]) -> Shape | None
 
 
 def _work(frames: Mapping[Demand, int], chosen: Sequence[Shape]) -> int:
-    """Pixels of all frames, each in the smallest shape that serves it."""
+    """Return the pixels of all frames, each in the smallest shape that serves it."""
     return sum(
         count * min(area(shape) for shape in chosen if serves(shape, demand)) for demand, count in frames.items()
     )

@@ -1,7 +1,8 @@
 """What a reader finds in the file of a motion or a camera, and which of its samples are usable.
 
-A sample is left out when its reader finds it unreadable, or when its time is not after that of the last usable one;
-sampling interpolates across the hole, and a note says how many. A file with more bad samples than good ones is refused.
+A sample is left out when its reader finds it unreadable, or when its time is not after that of the last usable one.
+Sampling interpolates across the hole, and a note says how many are left out. A file with more bad samples than good
+ones is refused.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from trilane.errors import BadInputError
 class Detected:
     """What a file is.
 
-    `format`: its name for people. `reason`: what told the format apart. `axes`: which is up, and why. `unit`: of
-    its lengths, and why. `rate`: where the rate comes from. `lens`: the same of a camera's. `joints`: SMPL-X joint ->
-    the file's name of it. `unmapped`: names of the file's joints that have no partner, in its order.
+    `format`: its name for people. `reason`: what told the format apart. `axes`: axis that is up, and why. `unit`: unit
+    of its lengths, and why. `rate`: source of the rate. `lens`: source of a camera's lens. `joints`: the file's name of
+    each SMPL-X joint. `unmapped`: names of the file's joints that have no partner, in its order.
     """
 
     format: str = ""
@@ -35,19 +36,19 @@ class Detected:
     unmapped: tuple[str, ...] = ()
 
 
-#: Of what comes from no file.
+#: For a source that is no file.
 NOTHING = Detected()
 
 
 #: An interval longer than this many median intervals is reported as a gap.
 GAP = 1.5
 
-#: The index of a sample -> where it stands in its file, for messages.
+#: A function that says, for messages, where the sample of an index stands in its file.
 PlaceOf = Callable[[int], str]
 
 
 def by_number(index: int) -> str:
-    """The place of sample `index` in a file without lines or names."""
+    """Name the place of sample `index` in a file without lines or names."""
     return f"number {index}"
 
 
@@ -58,10 +59,10 @@ def usable_samples(
     place_of: PlaceOf = by_number,
     broken_as: str = "not finite or no rotation",
 ) -> tuple[NDArray[np.intp], tuple[str, ...]]:
-    """Indices of the usable samples, and notes on the others and on gaps in time.
+    """Return indices of the usable samples, and notes on the others and on gaps in time.
 
-    `where`: the file, for messages. `times_s` (T,): times of the samples. `readable` (T,): whether their values are
-    readable. `place_of`: where each stands in the file. `broken_as`: what those that are not readable are. Raises
+    `where`: file, for messages. `times_s` (T,): times of the samples. `readable` (T,): whether their values are
+    readable. `place_of`: place of each in the file. `broken_as`: words for those that are not readable. Raises
     BadInputError when less than half of the samples are usable.
     """
     timed = readable & np.isfinite(times_s)
@@ -85,7 +86,7 @@ def usable_samples(
 
 
 def _strictly_increasing(times_s: F64) -> NDArray[np.bool_]:
-    """Whether each time (T,) is later than all before it."""
+    """Return whether each time (T,) is later than all before it."""
     highest = np.maximum.accumulate(times_s)
     later = np.ones(len(times_s), dtype=bool)
     later[1:] = times_s[1:] > highest[:-1]

@@ -1,7 +1,7 @@
 """Scene files (TOML): their schema, how they are loaded, and one sentence for people about the first defect.
 
 The schema checks types and ranges; the loaders check whether a named file exists and what is in it. The values of a
-file are never changed, but for paths, which are made absolute.
+file never change, except paths, which are made absolute.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from trilane.files import read_text
 from trilane.shapes import BUCKET_STEP, MAX_SIDE, checked_size
 from trilane.unexpected_value import UnexpectedValue, unexpected_in
 
-MAX_DEPTH_RATIO = 1e6  # of far to near clip plane; beyond it a depth buffer of 24 bits is too coarse
-AUTO = "auto"  # size of a tensor that is planned
-LEAST_FPS = 1e-3  # far below that a period in nanoseconds is no number any more
-LONGEST_S = 1e6  # of a motion
-FARTHEST_M = 1e4  # of an avatar from the scene's origin; there float32 still resolves millimetres
+MAX_DEPTH_RATIO = 1e6  # largest ratio of far to near clip plane; beyond it a depth buffer of 24 bits is too coarse
+AUTO = "auto"  # size of a planned tensor
+LEAST_FPS = 1e-3  # far below that, a period in nanoseconds overflows
+LONGEST_S = 1e6  # longest motion
+FARTHEST_M = 1e4  # farthest avatar from the scene's origin; there float32 still resolves millimetres
 
 NAME = r"^[\w .-]+$"
 
-LISTED = Strict(strict=False)  # of a tuple, which is a list in a file
+LISTED = Strict(strict=False)  # for a tuple, which is a list in a file
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Metres = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False)]
 
@@ -51,9 +51,9 @@ class StrictModel(BaseModel):
 
 
 class Table(StrictModel):
-    """A table of a scene file: a value has the type of its key, and nothing else is read as one.
+    """A table of a scene file. Each value has the type of its key; other types are not converted.
 
-    A number that need not be whole may be written as a whole one, though; and tuples are lists there.
+    Two exceptions: a number that need not be whole may be written as a whole one, and tuples are written as lists.
     """
 
     model_config = ConfigDict(strict=True)
@@ -69,11 +69,12 @@ class OutputSpec(Table):
 class AvatarSpec(Table):
     """One avatar.
 
-    `name`: no other avatar of the scene has it; `avatar1`, `avatar2`, ... by its place when it is not given.
-    `bundle`: `default`, `hiker` or a folder. `motion`: `builtin:NAME` or a file. `position`: metres. `up_axis`,
-    `units`: of the motion file. `joint_map`: joint of the body -> name of the file's, or an empty text for none.
-    `start_s`, `end_s`: of the motion's own time, what is played of it; `speed`: how many times as fast; `loop`: what
-    follows, by default what is usual for the motion. `ground`: how the motion is put on the floor (`mover.py`).
+    `name`: name that no other avatar of the scene has; by default `avatar1`, `avatar2`, ... by its place. `bundle`:
+    `default`, `hiker` or a folder. `motion`: `builtin:NAME` or a file. `position`: place, metres. `up_axis`, `units`:
+    axis that is up and unit of lengths in the motion file. `joint_map`: the file's name of each joint of the body, or
+    an empty text for none. `start_s`, `end_s`: part of the motion's own time that is played. `speed`: factor on the
+    speed. `loop`: what follows the end, by default what is usual for the motion. `ground`: how the motion is put on the
+    floor (`mover.py`).
     """
 
     name: str | None = Field(default=None, min_length=1, max_length=80, pattern=NAME)
@@ -109,10 +110,11 @@ class AvatarSpec(Table):
 class CameraSpec(Table):
     """The camera.
 
-    `source`: `builtin:NAME`, a file or a folder. `fov_y_deg`: of the picture's height; None for that of the file, or
-    the usual one of its format. `up_axis`: axis that is up in the file's world. `metres_per_unit`: of its lengths; None
-    for what it says or is likely. `rate_hz`: frames a second of a file without times. `near_m`, `far_m`: clip planes.
-    `place`: whether a recorded camera is placed in the scene (`auto`) or stays where it was recorded (`none`).
+    `source`: `builtin:NAME`, a file or a folder. `fov_y_deg`: field of view over the picture's height; None for that of
+    the file, or the usual one of its format. `up_axis`: axis that is up in the file's world. `metres_per_unit`: unit of
+    its lengths in metres; None for what the file says or what is likely. `rate_hz`: frames a second of a file without
+    times. `near_m`, `far_m`: distances of the clip planes. `place`: whether a recorded camera is placed in the scene
+    (`auto`) or stays where it was recorded (`none`).
     """
 
     source: str = "builtin:orbit"
@@ -136,9 +138,10 @@ class CameraSpec(Table):
 
 
 class PlaneSpec(Table):
-    """A detected plane to show: a rectangle round `centre` (world, metres) with `normal` (of any length but 0).
+    """A detected plane to show: a rectangle around `centre` (world, metres) with `normal` (of any length but 0).
 
-    `turn_deg`: about the normal. At 0 the first side lies along the world's x if the plane is level, else it points up.
+    `turn_deg`: turn about the normal. At 0 the first side lies along the world's x if the plane is level, else it
+    points up.
     """
 
     centre: Annotated[tuple[Finite, Finite, Finite], LISTED] = (0.0, 0.0, 0.0)
@@ -168,13 +171,15 @@ class Scene(Table):
     """A scene.
 
     `background`: `room`, or a video, a folder of images or a picture. `hud`: whether frame, rate and age are written on
-    the picture. `planes`: detected ones, shown over the background. `texture_filter`: filter of the neural texture.
+    the picture. `planes`: detected planes, shown over the background. `texture_filter`: filter of the neural texture.
 
-    What may be left out: `plan` is `planned` (what the picture does not show is not modelled), `fixed` (everything is,
-    in every frame) or `full` (to compare with: float64 body, supersampled raster, FP32 network; nothing runs it in real
-    time). `size`: `auto` plans the tensor, up to `most_side`² pixels; else it is fixed to that size. `error_budget_px`:
-    how far a vertex may be off on the picture. `error_budget_db`: how much worse avatars may be painted, in dB of PSNR,
-    than in tensors of the size that their network was trained for; None: no worse, unless frames would be late.
+    Keys about what may be left out:
+    `plan`: `planned` (what the picture does not show is not modelled), `fixed` (everything is modelled in every frame)
+    or `full` (a reference: float64 body, supersampled raster, FP32 network; nothing runs it in real time).
+    `size`: `auto` plans the tensor, up to `most_side`² pixels; any other size is fixed.
+    `error_budget_px`: largest error of a vertex on the picture, pixels.
+    `error_budget_db`: largest loss of an avatar's PSNR in dB against tensors of the size that its network was trained
+    for; None: no loss, unless frames would be late.
     `memory_mb`: most memory of the networks that are made ready for the planned shapes.
     """
 
@@ -200,7 +205,7 @@ class Scene(Table):
     @field_validator("avatars")
     @classmethod
     def _avatars_named(cls, avatars: tuple[AvatarSpec, ...]) -> tuple[AvatarSpec, ...]:
-        """The avatars, each with a name of its own."""
+        """Give each avatar a name of its own."""
         places: dict[str, int] = {}
         for place, avatar in enumerate(avatars):
             name = avatar.name or f"avatar{place + 1}"
@@ -227,7 +232,7 @@ class Scene(Table):
 INPUT_SHOULD = "Input should be "
 ENDING = ".toml"
 LONGEST_FOUND = 80
-#: Type of a pydantic error -> what was expected, where pydantic's own text is not fit for people.
+#: What was expected, by the type of a pydantic error, where pydantic's own text is not fit for people.
 EXPECTED = {
     "too_short": "at least {min_length} of them",
     "too_long": "at most {max_length} of them",
@@ -240,16 +245,16 @@ EXPECTED = {
     "string_too_short": "at least one character",
     "string_pattern_mismatch": "letters, digits, spaces, dots, hyphens and underscores",
 }
-#: Types of pydantic errors of numbers out of range, or between two steps.
+#: Types of pydantic errors for numbers out of range, or between two steps.
 IN_STEPS = ("multiple_of", "greater_than_equal", "less_than_equal")
-#: Key of the scene -> why it cannot be what it was, where the range alone does not tell.
+#: Reason why a key cannot have its value, where the range alone does not tell.
 REASONS = {"error_budget_px": "numbers are rounded, so nothing is drawn without an error"}
 BUILT_IN_PREFIX = "builtin:"
-BUILT_IN = ("room", "default", "hiker")  # a background, avatars
+BUILT_IN = ("room", "default", "hiker")  # a background, and avatars
 
 
 def bad_input(where: str | Path, error: ValidationError) -> BadInputError:
-    """The first defect that `error` lists, as a BadInputError about `where` with the key."""
+    """Return the first defect that `error` lists, as a BadInputError about `where` with the key."""
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"])
     place = f"{where}: {key}" if key else str(where)
@@ -268,7 +273,7 @@ def bad_input(where: str | Path, error: ValidationError) -> BadInputError:
 
 
 def _steps(first: Mapping[str, Any]) -> str:
-    """All that a number must be that has to be a multiple of another; empty for other errors."""
+    """Say all conditions of a number that must be a multiple of another; empty for other errors."""
     if first["type"] not in IN_STEPS or not isinstance(first["loc"][-1], str):
         return ""
     limits = ("multiple_of", "ge", "le")
@@ -277,29 +282,29 @@ def _steps(first: Mapping[str, Any]) -> str:
 
 
 def _remedy(first: Mapping[str, Any]) -> str:
-    """How to mend a value, by one of the `errors()` of a scene; empty when the expectation says all."""
+    """Say how to mend a value, by one of the `errors()` of a scene; empty when the expectation says all."""
     if first["type"] == "literal_error":
         return did_you_mean(str(first["input"]), _choices(first["loc"]))
     return REASONS.get(".".join(map(str, first["loc"])), "") if first["type"] == "greater_than" else ""
 
 
 def _keys_beside(loc: tuple[int | str, ...]) -> list[str]:
-    """The keys of the table in which the key at `loc` stands."""
+    """Return the keys of the table in which the key at `loc` stands."""
     return list(_table_of(loc).model_fields)
 
 
 def _choices(loc: tuple[int | str, ...]) -> list[str]:
-    """The words that the key at `loc` may be; of a key that may be nothing else."""
+    """Return the words that the key at `loc` may be, if it may be nothing else."""
     return [str(word) for word in get_args(_field(loc).annotation)]
 
 
 def _field(loc: tuple[int | str, ...]) -> FieldInfo:
-    """The schema's field of the key at `loc`."""
+    """Return the schema's field of the key at `loc`."""
     return _table_of(loc).model_fields[str(loc[-1])]
 
 
 def _table_of(loc: tuple[int | str, ...]) -> type[BaseModel]:
-    """The schema of the table in which the key at `loc` stands."""
+    """Return the schema of the table in which the key at `loc` stands."""
     table: type[BaseModel] = Scene
     for key in loc[:-1]:
         if isinstance(key, str):
@@ -310,7 +315,7 @@ def _table_of(loc: tuple[int | str, ...]) -> type[BaseModel]:
 
 
 def scene_from(where: str | Path, values: Mapping[str, Any]) -> Scene:
-    """`values` as a Scene. Raises BadInputError that names `where` and the key."""
+    """Return `values` as a Scene. Raises BadInputError that names `where` and the key."""
     try:
         return Scene.model_validate(values)
     except ValidationError as error:
@@ -318,13 +323,13 @@ def scene_from(where: str | Path, values: Mapping[str, Any]) -> Scene:
 
 
 def scene_names() -> list[str]:
-    """Names of the scenes that come with the package."""
+    """Return the names of the scenes that come with the package."""
     folder = files("trilane.scene.scenes")
     return sorted(item.name.removesuffix(ENDING) for item in folder.iterdir() if item.name.endswith(ENDING))
 
 
 def find_scene(name: str) -> Path:
-    """The file of a scene: a path, or the name of one that comes with the package. Raises BadInputError."""
+    """Return the file of a scene: a path, or the name of one that comes with the package. Raises BadInputError."""
     if name in scene_names():
         return Path(str(files("trilane.scene.scenes") / f"{name}{ENDING}"))
     path = Path(name)
@@ -335,13 +340,13 @@ def find_scene(name: str) -> Path:
 
 
 def load_scene(path: Path) -> dict[str, Any]:
-    """The values of a scene file, checked against the schema; paths in it are made absolute from its folder.
+    """Return the values of a scene file, checked against the schema, with paths made absolute from its folder.
 
     Raises BadInputError naming the line or the key.
     """
     try:
         values = tomllib.loads(read_text(path, "a scene file (TOML)"))
-    except (ValueError, RecursionError) as error:  # also of numbers and lists that are too long
+    except (ValueError, RecursionError) as error:  # raised also for numbers and lists that are too long
         raise BadInputError(path, f"no valid TOML ({error})", "a scene file (TOML)") from None
     values.setdefault("name", path.stem)
     scene = scene_from(path, values)
@@ -357,7 +362,7 @@ def load_scene(path: Path) -> dict[str, Any]:
 
 
 def located(source: str, base: Path) -> str:
-    """`source` unchanged if it names something built in, else as a path that starts at `base`.
+    """Return `source` unchanged if it names something built in, else as a path that starts at `base`.
 
     Raises BadInputError for an empty text.
     """

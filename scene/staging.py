@@ -30,7 +30,10 @@ from trilane.scene.schema import Scene
 
 @dataclass(frozen=True)
 class Staged:
-    """`movers`: one per avatar of the scene. `notes`: what was decided about motions, floor and camera, for people."""
+    """A staged scene.
+
+    `movers`: one per avatar of the scene. `notes`: what was decided about motions, floor and camera, for people.
+    """
 
     movers: tuple[Mover, ...]
     camera: PlacedCamera
@@ -40,7 +43,7 @@ class Staged:
 def stage_scene(scene: Scene, bodies: Sequence[ShapedBody], base: Path, footage: Footage | None = None) -> Staged:
     """Load the motions and the camera of `scene`, whose avatars have `bodies`; relative paths start at `base`.
 
-    `footage`: what its background is; None for a drawn one. Raises BadInputError when a file is unusable.
+    `footage`: facts of its background; None for a drawn one. Raises BadInputError when a file is unusable.
     """
     motions = [load_motion(spec, base, body.joints) for spec, body in zip(scene.avatars, bodies, strict=True)]
     movers = tuple(
@@ -62,7 +65,7 @@ LENS = ("width_px", "height_px", "fx", "fy", "cx", "cy")
 
 
 def staged_to_arrays(staged: Staged) -> Arrays:
-    """The arrays of `staged`, without copies where it has arrays already. They hold no Python objects."""
+    """Return the arrays of `staged`, copied only where it has none yet. They hold no Python objects."""
     arrays: Arrays = {"movers": np.array(len(staged.movers))}
     for index, mover in enumerate(staged.movers):
         arrays |= {f"mover.{index}.{key}": value for key, value in _mover_arrays(mover).items()}
@@ -71,7 +74,7 @@ def staged_to_arrays(staged: Staged) -> Arrays:
 
 
 def staged_from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Staged:
-    """The scene that `staged_to_arrays` was called with, without its notes; keeps `arrays`, which may be read-only.
+    """Return the scene that `staged_to_arrays` stored, without its notes; it keeps `arrays`, which may be read-only.
 
     Raises KeyError when one is missing.
     """
@@ -114,7 +117,7 @@ def _mover(arrays: Arrays) -> Mover:
         None if leg_m is None else float(leg_m),
         bool(arrays["travels"]),
     )
-    vars(motion)["quats"] = arrays["quats"]  # the cached property, which otherwise is computed at the first sample
+    vars(motion)["quats"] = arrays["quats"]  # sets the cached property, which otherwise is computed at the first sample
     return Mover(
         motion, arrays["world"], float(arrays["scale"]), arrays["shift"], arrays["lift_times_s"], arrays["lift_m"], ()
     )

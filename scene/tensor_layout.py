@@ -1,11 +1,11 @@
-"""Where each avatar's crop lies in the tensor that all avatars of a frame share.
+"""Lays out the crops of a frame's avatars in the tensor that they share.
 
 Rule: one visible avatar has the whole tensor. Several are drawn at one scale in rows, so each has a share of the tensor
-in proportion to its area on the screen, with at least `MARGIN_PX` of background between them. Tensor pixels are square
+in proportion to its area on the screen. At least `MARGIN_PX` of background lie between them. Tensor pixels are square
 on the screen.
 
-`lay_out` fills the tensor: the scale is what the tensor has room for. `lay_out_at` stops at a density: at 1 a tensor
-pixel is a pixel of the picture, on its grid, and what the avatars leave of the tensor is background.
+`lay_out` fills the tensor: the scale is the largest that the tensor has room for. `lay_out_at` stops at a density. At
+density 1 a tensor pixel is a pixel of the picture, on its grid; the rest of the tensor is background.
 """
 
 from __future__ import annotations
@@ -28,7 +28,10 @@ MARGIN_PX = 16
 
 @dataclass(frozen=True)
 class TensorLayout:
-    """`shape` (height, width) of the tensor; for each avatar its crop rectangle and its cell."""
+    """A layout.
+
+    `shape`: (height, width) of the tensor. `crops`: crop rectangle and cell of each avatar.
+    """
 
     shape: Shape
     crops: tuple[tuple[Rect, Cell], ...]
@@ -44,7 +47,10 @@ class DenseLayout:
 
 @dataclass(frozen=True)
 class _Arrangement:
-    """`rows`: the avatars' numbers, row by row, in a tensor of `shape`. `scale`: tensor pixels for one output pixel."""
+    """An arrangement of the avatars in rows.
+
+    `rows`: numbers of the avatars, row by row, in a tensor of `shape`. `scale`: tensor pixels for one output pixel.
+    """
 
     shape: Shape
     rows: tuple[tuple[int, ...], ...]
@@ -52,7 +58,7 @@ class _Arrangement:
 
 
 def lay_out(rects: Sequence[Rect], output: Shape, buckets: Sequence[Shape], margin_px: int = MARGIN_PX) -> TensorLayout:
-    """Place the visible avatars in one tensor. Where the tensor is too small for them, their margins shrink.
+    """Place the visible avatars in one tensor; margins shrink where it is too small for them.
 
     `rects`: the avatars' mesh rectangles on the screen, at least one.
     `output`: (height, width) of the picture in pixels.
@@ -77,12 +83,11 @@ def lay_out(rects: Sequence[Rect], output: Shape, buckets: Sequence[Shape], marg
 def lay_out_at(
     rects: Sequence[Rect], output: Shape, shape: Shape, most_density: float = 1.0, margin_px: int = MARGIN_PX
 ) -> DenseLayout | None:
-    """Place the visible avatars in a tensor of `shape`, no denser than `most_density`.
+    """Place the visible avatars in a tensor of `shape`, no denser than `most_density`; None without room for all.
 
     `rects`: the avatars' mesh rectangles on the screen, at least one; each is widened to whole pixels of the picture.
     `output`: (height, width) of the picture in pixels.
     `margin_px`: background between two avatars, tensor pixels.
-    None when the tensor has no room for them all.
     """
     whole = [on_grid(rect, output) for rect in rects]
     sizes = [_pixels(rect, output) for rect in whole]
@@ -99,11 +104,10 @@ def lay_out_at(
 
 
 def tight_shape(rects: Sequence[Rect], output: Shape, density: float = 1.0, margin_px: int = MARGIN_PX) -> Shape:
-    """The shape of least area, sides in multiples of `BUCKET_STEP`, with room for the avatars at `density`.
+    """Return the shape of least area, sides in multiples of `BUCKET_STEP`, with room for the avatars at `density`.
 
-    Of several avatars' arrangements none is longer than `MOST_ASPECT` times its width, unless all are.
-
-    Arguments as of `lay_out_at`.
+    For several avatars, no arrangement is longer than `MOST_ASPECT` times its width, unless all are. The parameters are
+    those of `lay_out_at`.
     """
     whole = [_pixels(on_grid(rect, output), output) for rect in rects]
     sizes = [(math.ceil(height * density), math.ceil(width * density)) for height, width in whole]
@@ -114,33 +118,33 @@ def tight_shape(rects: Sequence[Rect], output: Shape, density: float = 1.0, marg
 
 
 def _pixels(rect: Rect, output: Shape) -> tuple[int, int]:
-    """Height and width of a rectangle on the grid."""
+    """Return height and width of a rectangle on the grid."""
     return round(rect.height * output[0] / 2), round(rect.width * output[1] / 2)
 
 
 def _extent(sizes: Sequence[tuple[int, int]], rows: Sequence[Sequence[int]], margin: int) -> Shape:
-    """What `rows` need; a pixel of each side is reserved for rounding up, as in `_scale`."""
+    """Return the extent of `rows`; a pixel of each side is reserved for rounding up, as in `_scale`."""
     height = sum(max(sizes[k][0] for k in row) for row in rows) + margin * (len(rows) - 1) + len(rows)
     width = max(sum(sizes[k][1] for k in row) + margin * (len(row) - 1) + len(row) for row in rows)
     return _whole_steps(height), _whole_steps(width)
 
 
 def _whole_steps(side: int) -> int:
-    """`side` rounded up to a multiple of `BUCKET_STEP`."""
+    """Round `side` up to a multiple of `BUCKET_STEP`."""
     return -(-side // BUCKET_STEP) * BUCKET_STEP
 
 
 def _arrangements(
     sizes: Sequence[tuple[float, float]], buckets: Sequence[Shape], margin: int
 ) -> Iterator[_Arrangement]:
-    """Every arrangement of the avatars, tallest first, in each bucket: one row, two rows, up to a row for each."""
+    """Yield the avatars' arrangements, tallest first, in each bucket: one row, two rows, up to a row for each."""
     for rows in _rows(sizes):
         for shape in buckets:
             yield _Arrangement(shape, rows, _scale(sizes, shape, rows, margin))
 
 
 def _rows(sizes: Sequence[tuple[float, float]]) -> Iterator[tuple[tuple[int, ...], ...]]:
-    """The avatars' numbers, tallest first, in one row, in two, and so on."""
+    """Yield the avatars' numbers, tallest first, in one row, in two, and so on."""
     order = sorted(range(len(sizes)), key=lambda k: -sizes[k][0])
     for count in range(1, len(order) + 1):
         each = math.ceil(len(order) / count)
@@ -148,7 +152,7 @@ def _rows(sizes: Sequence[tuple[float, float]]) -> Iterator[tuple[tuple[int, ...
 
 
 def _scale(sizes: Sequence[tuple[float, float]], shape: Shape, rows: Sequence[Sequence[int]], margin: int) -> float:
-    """The largest scale at which all rows fit; one pixel of each side is reserved for rounding up."""
+    """Return the largest scale at which all rows fit; one pixel of each side is reserved for rounding up."""
     high = (shape[0] - margin * (len(rows) - 1) - len(rows)) / sum(max(sizes[k][0] for k in row) for row in rows)
     wide = ((shape[1] - margin * (len(row) - 1) - len(row)) / sum(sizes[k][1] for k in row) for row in rows)
     return min(high, *wide)
@@ -157,7 +161,7 @@ def _scale(sizes: Sequence[tuple[float, float]], shape: Shape, rows: Sequence[Se
 def _crops(
     rects: Sequence[Rect], sizes: Sequence[tuple[float, float]], output: Shape, arrangement: _Arrangement, margin: int
 ) -> tuple[tuple[Rect, Cell], ...]:
-    """Crop rectangle and cell of each avatar, in the order of `rects`."""
+    """Return crop rectangle and cell of each avatar, in the order of `rects`."""
     placed: dict[int, tuple[Rect, Cell]] = {}
     top = 0
     for row in arrangement.rows:

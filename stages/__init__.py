@@ -4,7 +4,7 @@ It may use `scene/`, `avatars/`, `hw_profiles/`, `pipeline/` and the folders bel
 that the fork server can start with the names below before anything slow is imported.
 """
 
-#: Stage to its factory; the parts of the network share one.
+#: Factory of each stage; the parts of the network share one.
 FACTORIES = {
     "pose": "trilane.stages.cpu.pose:build",
     "raster": "trilane.stages.gpu.raster:build",
@@ -12,5 +12,5 @@ FACTORIES = {
     "composite": "trilane.stages.gpu.composite:build",
     "present": "trilane.stages.cpu.present:build",
 }
-#: What the fork server imports: units then start in milliseconds.
+#: Modules that the fork server imports: units then start in milliseconds.
 PRELOAD = tuple(factory.partition(":")[0] for factory in FACTORIES.values())

@@ -1,6 +1,7 @@
-"""What the parent has loaded of a scene and its avatars, as arrays that every unit maps. Rule: files are opened once.
+"""The arrays that the parent has loaded for a scene and its avatars, and that every unit maps.
 
-Names begin with what they belong to: `body0/` and `avatar0/` of the first distinct bundle, `network`, `scene/`.
+Rule: files are opened once. Names begin with what they belong to: `body0/` and `avatar0/` of the first distinct bundle,
+`network`, `scene/`.
 """
 
 from __future__ import annotations
@@ -31,7 +32,10 @@ BODY_ARRAYS = tuple(field.name for field in fields(Body) if field.name not in ("
 
 @dataclass(frozen=True)
 class AvatarData:
-    """One distinct bundle, loaded. `texture` (H,W,C) float32. `levels`: smaller ones of it, see `texture_levels`."""
+    """One distinct bundle, loaded.
+
+    `texture`: (H,W,C) float32. `levels`: smaller levels of the texture, see `pack_levels`.
+    """
 
     bundle: Bundle
     shaped: ShapedBody
@@ -41,13 +45,13 @@ class AvatarData:
 
 
 def load_avatar(bundle: Bundle) -> AvatarData:
-    """Everything that a run needs of `bundle`. Raises BadInputError."""
+    """Load everything that a run needs from `bundle`. Raises BadInputError."""
     shaped = bundle.shaped_body()
     return AvatarData(bundle, shaped, bundle.read_texture(), bundle.read_network(), bundle.read_levels())
 
 
 def require_one_tensor(avatars: Sequence[AvatarData]) -> None:
-    """Raises BadInputError unless `avatars` can share a tensor: one network, and one encoding of its input."""
+    """Raise BadInputError unless `avatars` can share a tensor: one network, and one encoding of its input."""
     first, *others = avatars
     for other in others:
         if other.network.digest != first.network.digest:
@@ -64,7 +68,7 @@ def _encoding(avatar: AvatarData) -> tuple[Any, ...]:
 
 
 def pack_assets(avatars: Sequence[AvatarData], staged: Staged) -> dict[str, NDArray[Any]]:
-    """The arrays of a run: those of each distinct avatar in order, the network's and the scene's."""
+    """Return the arrays of a run: those of each distinct avatar in order, the network's and the scene's."""
     arrays: dict[str, NDArray[Any]] = {}
     for number, avatar in enumerate(avatars):
         body, scale = avatar.shaped.body, avatar.bundle.manifest.network.input
@@ -82,19 +86,19 @@ def pack_assets(avatars: Sequence[AvatarData], staged: Staged) -> dict[str, NDAr
 
 
 def with_network(assets: Assets, network: NetworkFile) -> dict[str, NDArray[Any]]:
-    """`assets` with another `network` of all avatars, and with the scale and zero point of its input."""
+    """Return `assets` with another `network` for all avatars, and with the scale and zero point of its input."""
     encoding = np.array([network.input.scale, network.input.zero_point])
     inputs = {name: encoding for name in assets if name.startswith("avatar") and name.endswith("/input")}
     return {**assets, **inputs, NETWORK: np.frombuffer(network.model.SerializeToString(), np.uint8)}
 
 
 def distinct(config: RunConfig) -> list[Path]:
-    """The folders of the distinct bundles of `config`, in the order in which assets number them."""
+    """Return the folders of the distinct bundles of `config`, in the order in which assets number them."""
     return list(dict.fromkeys(config.avatar_dirs))
 
 
 def shaped_body(assets: Assets, number: int) -> ShapedBody:
-    """The body of distinct avatar `number`."""
+    """Return the body of distinct avatar `number`."""
     own = _with_prefix(assets, f"body{number}/")
     arrays: dict[str, Any] = {name: own.get(name) for name in BODY_ARRAYS}  # `posedirs` and `offsets` may be None
     hands = (own[HANDS[0]], own[HANDS[1]])
@@ -103,29 +107,29 @@ def shaped_body(assets: Assets, number: int) -> ShapedBody:
 
 
 def texture_of(assets: Assets, number: int) -> F32:
-    """The neural texture (H,W,C) of distinct avatar `number`."""
+    """Return the neural texture (H,W,C) of distinct avatar `number`."""
     return assets[f"avatar{number}/texture"]
 
 
 def levels_of(assets: Assets, number: int) -> F32 | None:
-    """Smaller levels of the neural texture of distinct avatar `number`, if it has any."""
+    """Return smaller levels of the neural texture of distinct avatar `number`, if it has any."""
     return assets.get(f"avatar{number}/levels")
 
 
 def quantisation_of(assets: Assets, number: int) -> Quantisation:
-    """How distinct avatar `number` is packed for the network."""
+    """Return how distinct avatar `number` is packed for the network."""
     scale, zero_point = assets[f"avatar{number}/input"].tolist()
     return Quantisation(scale, int(zero_point))
 
 
 def network_of(assets: Assets) -> NetworkFile:
-    """The network that all avatars share."""
+    """Return the network that all avatars share."""
     model = onnx.load_from_string(assets[NETWORK].tobytes())
     return check_network(model, assets[NETWORK_PATH].tobytes().decode())
 
 
 def staged_of(assets: Assets) -> Staged:
-    """The scene's movers and camera."""
+    """Return the scene's movers and camera."""
     return staged_from_arrays(_with_prefix(assets, SCENE))
 
 

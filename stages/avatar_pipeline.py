@@ -1,7 +1,7 @@
 """The avatar's pipeline as `trilane.pipeline` runs it: its stages, what passes between them, and its rehearsal.
 
-Everything that the run must know of the avatar is said here, as data; no other module of the run knows an avatar. A
-rehearsal runs the stages one after the other, and tells what each needs of its unit before they share the cores.
+Everything that the run must know about the avatar is stated here, as data; no other module of the run knows an avatar.
+A rehearsal runs the stages one after the other and measures what each needs from its unit, before they share the cores.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from trilane.stages.configure import Checked
 from trilane.stages.dsp.infer import crossing_bytes
 from trilane.units import AFTER_INFER, BEFORE_INFER, BYPASS, LATENCY_TO, UNITS
 
-MAX_CHANNELS = 16  # of a tensor: what the GPU packs in one pass
+MAX_CHANNELS = 16  # channels of a tensor: the most that the GPU packs in one pass
 
 
 def avatar_pipeline(config: RunConfig, assets: Assets, edge: str = "double") -> Pipeline:
-    """The stages of `config`, every edge with the rule `edge`. Raises BadInputError for an unknown rule."""
+    """Return the pipeline of `config`, every edge with the rule `edge`. Raises BadInputError for an unknown rule."""
     header = pose_dtype(len(config.avatar_dirs))
     return Pipeline(
         stages=tuple(_stages(config)),
@@ -49,7 +49,7 @@ def avatar_pipeline(config: RunConfig, assets: Assets, edge: str = "double") -> 
 
 
 def edge_bytes(config: RunConfig, assets: Assets) -> dict[str, int]:
-    """Bytes of payload of each edge, for the largest tensor that the scene's size allows."""
+    """Return the payload bytes of each edge, for the largest tensor that the scene's size allows."""
     output, names = config.scene.output, config.infer_names
     crossings = crossing_bytes(config, network_of(assets)) if config.cuts else []
     return {
@@ -77,10 +77,10 @@ def run_avatar(
 ) -> RunResult:
     """Run the avatar of `config`.
 
-    `assets`: of the same avatars and scene, see `trilane.stages.avatar_assets.pack_assets`.
-    `edge`: the rule of every edge.
-    `frames`: how many; the scene's when None.
-    `options`: what `run_pipeline` takes. Raises as `run_pipeline`.
+    `assets`: arrays of the same avatars and scene, see `trilane.stages.avatar_assets.pack_assets`.
+    `edge`: rule of every edge.
+    `frames`: number of frames; None for the scene's.
+    `options`: further arguments of `run_pipeline`. Raises as `run_pipeline`.
     """
     pipeline = avatar_pipeline(config, assets, edge)
     if len(config.works) > 1 and not config.pace_ns:
@@ -88,14 +88,14 @@ def run_avatar(
     return run_pipeline(pipeline, frames or config.scene.frames, fps=config.scene.fps, assets=assets, **options)
 
 
-FRAMES = 12  # of the scene, evenly spread, the first two of which warm up
+FRAMES = 12  # frames of a rehearsal, evenly over the scene; the first two warm up
 
 
 def thread_counts(cores: int, rule: Placement) -> dict[str, list[int]]:
-    """The numbers of threads, beside 1, that each unit is measured with: those that a placement may give it.
+    """Return the numbers of threads, beside 1, that each unit is measured with: those that a placement may give it.
 
-    Each, what the `rule` for any run and the options give it. The network also up to four, half of the cores, all, and
-    all but those of the others.
+    Every unit is measured with the number that the `rule` for any run, or the options, give it. The network is also
+    measured with 2 to 4 threads, half of the cores, all cores, and all but those of the other units.
     """
     counts = {unit: {place.threads} for unit, place in rule.items()}
     counts["dsp"] |= {*range(2, min(cores, 4) + 1), cores // 2, cores - 2, cores - 1, cores}
@@ -103,10 +103,11 @@ def thread_counts(cores: int, rule: Placement) -> dict[str, list[int]]:
 
 
 def measured_times(checked: Checked, cores: Sequence[Core], rule: Placement, starter: UnitStarter) -> Rehearsed:
-    """What each unit needs for a frame, measured now.
+    """Measure what each unit needs for a frame.
 
-    `checked`: what is to be run. `cores`: there are. `rule`: whose numbers of threads are measured too. `starter`: a
-    fork server. Raises TrilaneError when a unit cannot start or a stage fails, KeyboardInterrupt when interrupted.
+    `checked`: run to measure. `cores`: available cores. `rule`: placement whose numbers of threads are measured too.
+    `starter`: fork server. Raises TrilaneError when a unit cannot start or a stage fails, KeyboardInterrupt when
+    interrupted.
     """
     fastest = [core.number for core in sorted(cores, key=lambda core: (-core.permille, core.number))]
     one = {unit: Place((fastest[0],), 1) for unit in UNITS}
@@ -133,11 +134,13 @@ def tried(
     limit_s: float = math.inf,
     least: int = 1,
 ) -> list[Round]:
-    """Frame times of `placements`, in turns.
+    """Measure frame times of `placements`, in turns.
 
-    `rounds`: how many, on frames from all over the scene; after `limit_s` seconds no further one than the `least`.
-    `checked`, `starter`, and what is raised: as `measured_times`.
+    `rounds`: number of rounds, on frames from all over the scene. `limit_s`: seconds after which no further round
+    begins. `least`: number of rounds that are done in any case.
+    `checked`, `starter`, and the errors raised: as in `measured_times`.
     """
+    # Placements with equal threads differ in cores alone, so one pipeline serves all of them.
     groups: dict[tuple[tuple[int, bool], ...], list[int]] = {}
     for number, placement in enumerate(placements):
         settings = settings_of(placement).values()
@@ -163,7 +166,7 @@ def tried(
 
 @contextmanager
 def _thrown_away(checked: Checked) -> Iterator[RunConfig]:
-    """The configuration with one of its tensor shapes, prepared soonest, and a folder that is then removed.
+    """Yield the configuration with only one tensor shape, which is prepared soonest, and a folder that is then removed.
 
     No shape of the same size has more than 25/16 of its area.
     """
@@ -174,7 +177,7 @@ def _thrown_away(checked: Checked) -> Iterator[RunConfig]:
 
 
 def _spinning(placement: Placement, cores: int) -> dict[str, Any]:
-    """Settings in which a unit's threads spin if there are cores for it alone, as they then will in the run."""
+    """Return settings in which a unit's threads spin if there are cores for it alone, as they then do in the run."""
     return {
         unit: settings.model_copy(update={"spin": 1 < settings.threads <= cores - len(UNITS) + 1})
         for unit, settings in settings_of(placement).items()
@@ -182,6 +185,6 @@ def _spinning(placement: Placement, cores: int) -> dict[str, Any]:
 
 
 def one_shape(config: RunConfig) -> Shape:
-    """The tensor shape nearest to a square, of those that are not stepped down to when frames would be late."""
+    """Return the tensor shape nearest to a square, among those that are not for stepping down when frames are late."""
     large = [shape for shape in config.buckets if 2 * shape[0] * shape[1] > config.max_tensor_pixels]
     return min(large, key=lambda shape: (abs(shape[0] - shape[1]), shape))

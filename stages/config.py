@@ -1,6 +1,6 @@
-"""The configuration of a run of the avatar, checked by the parent, and what the avatar's packets hold.
+"""The configuration of a run of the avatar, checked by the parent, and the contents of the avatar's packets.
 
-A `RunConfig` is plain data; the parent has looked at every path in it. Axis orders and signs of packets are those of
+A `RunConfig` is plain data; the parent has checked every path in it. Axis orders and signs in packets follow
 docs/conventions.md.
 """
 
@@ -29,7 +29,7 @@ from trilane.units import UnitName
 #: `joints`: skinning matrices, metres, world space, row-major 3x4: x_world = sum_k w_k (joints_k @ [x_rest, 1]).
 #: `pose_feature`: (R - I) row-major of joints 1..54; multiplies the body's `posedirs`.
 #: `rect`: crop rectangle x0, y0, x1, y1 in normalised device coordinates, y up: the mesh's rectangle clipped to
-#: [-1, 1], grown to the tensor's aspect so that tensor pixels are square; what is grown may hang over the screen.
+#: [-1, 1], grown to the tensor's aspect so that tensor pixels are square; the grown part may exceed the screen.
 #: `tensor_rect`: top, left, height, width in tensor pixels that the crop rectangle fills.
 #: `visible`: 0 when nothing of the avatar is on screen; the other fields are then unspecified.
 AVATAR_DTYPE = np.dtype(
@@ -46,13 +46,13 @@ AVATAR_DTYPE = np.dtype(
 
 
 def pose_dtype(avatars: int) -> np.dtype[Any]:
-    """Layout of the header of a packet with `avatars` avatars.
+    """Return the layout of the header of a packet with `avatars` avatars.
 
-    `work`: a number of `FrameWork`. `picture`: number of the frame whose picture of the avatars is shown,
-    -1 when none is. `repeats`: of a composited frame, 0 when it was drawn, else 1 + the number of the frame that was
-    drawn with the same bytes. `media_time_s`: time in motion and camera. `view`: world to camera. `projection`: OpenGL
-    clip matrix; both row-major for column vectors. `tensor_shape`: height, width of the tensor (the shape bucket) of
-    this frame.
+    `work`: a number of `FrameWork`. `picture`: number of the frame whose picture of the avatars is shown, -1 when none
+    is. `repeats`: for a composited frame, 0 when it was drawn, else 1 + the number of the drawn frame with the same
+    bytes. `media_time_s`: time in motion and camera. `view`: matrix from world to camera. `projection`: OpenGL clip
+    matrix; both are row-major for column vectors. `tensor_shape`: height, width of this frame's tensor (the shape
+    bucket).
     """
     return header_dtype(
         [
@@ -70,9 +70,10 @@ def pose_dtype(avatars: int) -> np.dtype[Any]:
 
 
 def posed_vertices(payload: U8, counts: Sequence[int]) -> list[F32]:
-    """Views (V,3) float32 into the payload of the pose edge, one for each avatar of `counts` vertices; none if empty.
+    """Return views (V,3) float32 into the payload of the pose edge, one for each avatar of `counts` vertices.
 
-    They hold skinned vertices in the body's order, metres, world space, when the CPU unit skins.
+    They hold skinned vertices in the body's order, metres, world space, when the CPU unit skins; an empty payload has
+    none.
     """
     views, start = [], 0
     for count in counts:
@@ -88,7 +89,7 @@ def posed_vertices_bytes(counts: Sequence[int]) -> int:
 
 
 class NetworkCut(StrictModel):
-    """The network is cut at quantised tensor `at`; what follows runs on `unit`."""
+    """A cut of the network at the quantised tensor `at`; the part behind it runs on `unit`."""
 
     at: str
     unit: UnitName
@@ -97,23 +98,23 @@ class NetworkCut(StrictModel):
 class RunConfig(StrictModel):
     """One run of the avatar, as plain data. Paths are absolute and were checked by the parent.
 
-    `scene`: what is shown, and with what avatars.
-    `out_dir`: the temporary run folder.
-    `avatar_dirs`: the bundle's folder of each avatar of the scene.
+    `scene`: scene to show, with its avatars.
+    `out_dir`: temporary run folder.
+    `avatar_dirs`: bundle folder of each avatar of the scene.
     `units`: cores and threads of each unit.
-    `runtime`: inference runtime of the DSP unit, by name.
-    `shapes`: of the tensor, where the scene plans it; else those of its size are used.
-    `changes`: for each of `works` from which second of the scene on a planned tensor has which shape; empty where that
-    was not foreseen.
-    `own_pixels`: pixels of the tensor at which the network was trained.
-    `works`: of a planned tensor in thousandths of those pixels, the most first; a further one is stepped down to when
-    frames would be late.
+    `runtime`: name of the DSP unit's inference runtime.
+    `shapes`: tensor shapes where the scene plans the tensor; else those of its size are used.
+    `changes`: for each of `works`, the times in seconds at which a planned tensor changes, with its shape from then on;
+    empty where that was not foreseen.
+    `own_pixels`: number of pixels of the tensor with which the network was trained.
+    `works`: sizes of a planned tensor in thousandths of those pixels, the largest first; the run steps down to a
+    further one when frames would be late.
     `record`: whether the frames are encoded to a video.
-    `posed_vertices`: how many of each avatar, when the CPU unit skins; empty when the GPU unit does.
-    `pace_ns`: how long a job of a stage is held, at least.
-    `cuts`: cuts of the network; its first part is the DSP's.
-    `kept`: numbers of frames whose presented pictures are kept, to be compared when the run is over.
-    `window`: where somebody looks at the pictures and steers the camera while the run goes on; None: nowhere.
+    `posed_vertices`: number of vertices of each avatar when the CPU unit skins; empty when the GPU unit does.
+    `pace_ns`: least duration of a stage's job, ns.
+    `cuts`: cuts of the network; its first part runs on the DSP unit.
+    `kept`: numbers of frames whose presented pictures are kept, to compare them after the run.
+    `window`: shared memory in which somebody watches the pictures and steers the camera during the run; None for none.
     """
 
     scene: Scene
@@ -141,7 +142,7 @@ class RunConfig(StrictModel):
         return units
 
     def opened_window(self) -> LiveWindow | None:
-        """The window, mapped. Raises OSError when whoever made it is gone."""
+        """Map the window and return it, if any. Raises OSError when its maker is gone."""
         output = self.scene.output
         return None if self.window is None else LiveWindow.opened(self.window, output.height, output.width)
 
@@ -151,23 +152,23 @@ class RunConfig(StrictModel):
 
     @property
     def tensor_budgets(self) -> tuple[TensorBudget, ...]:
-        """The budgets of a planned tensor, one for each of `works`."""
+        """Budgets of a planned tensor, one for each of `works`."""
         whole = TensorBudget(self.own_pixels, self.scene.most_side**2)
         return tuple(whole.scaled(work) for work in self.works)
 
     @property
     def budget_px(self) -> float:
-        """How far a vertex may be off on the picture; 0 when everything is modelled."""
+        """Largest error of a vertex on the picture in pixels; 0 when everything is modelled."""
         return self.scene.error_budget_px if self.scene.plan == "planned" else 0.0
 
     @property
     def infer_units(self) -> tuple[str, ...]:
-        """The unit of each part of the network, in the order of the work."""
+        """Unit of each part of the network, in the order of the parts."""
         return ("dsp", *(cut.unit for cut in self.cuts))
 
     @property
     def infer_names(self) -> tuple[str, ...]:
-        """The stages that run the parts: `infer`, `infer-2`, ..."""
+        """Names of the stages that run the parts: `infer`, `infer-2`, ..."""
         return ("infer", *(f"infer-{number}" for number in range(2, len(self.cuts) + 2)))
 
     @property

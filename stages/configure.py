@@ -1,7 +1,7 @@
-"""The options of a run as a RunConfig whose every part was looked at.
+"""Turns the options of a run into a RunConfig, every part of which is checked.
 
-Rule: motion, camera, background, avatar and runtime are opened and checked here, in the parent, so that a bad
-input ends the command before a process is started or a file is made.
+Rule: motion, camera, background, avatar and runtime are opened and checked here, in the parent. A bad input then ends
+the command before a process is started or a file is made.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ GlFacts = Callable[[], dict[str, Any] | None]
 class Checked:
     """A configuration that can be run.
 
-    `assets`: what was loaded to check it, as the units take it. `notes`: what the loads said of their sources.
-    `accuracy`: of each avatar, by its name, what `accuracy_of` says of it. `asked_cores`: cores of units by the
-    options. `placement`: what `trilane.stages.placing` says of the units' cores. `losses`: of each distinct avatar,
-    what smaller tensors cost.
+    `assets`: arrays that were loaded to check it, as the units take them. `notes`: notes of the loads on their sources.
+    `accuracy`: result of `accuracy_of` for each avatar, by its name. `asked_cores`: cores of units that the options ask
+    for. `placement`: facts from `trilane.stages.placing` about the units' cores. `losses`: loss of each distinct avatar
+    in smaller tensors.
     """
 
     config: RunConfig
@@ -60,15 +60,15 @@ class Checked:
     losses: tuple[SizeLoss, ...] = ()
 
     def changed(self, **values: Any) -> Checked:
-        """This run with other `values` of the configuration, such as `out_dir`, `record` or `units`."""
+        """Return this run with other `values` of the configuration, such as `out_dir`, `record` or `units`."""
         return replace(self, config=self.config.model_copy(update=values))
 
 
 def requested_scene(options: RunOptions) -> Scene:
-    """The scene file with the options laid over it. Raises BadInputError.
+    """Return the scene file with the options laid over it. Raises BadInputError.
 
-    An option that is a key of the scene replaces its value. A motion or camera from the options drops what the scene
-    says of its own file's format.
+    An option that is a key of the scene replaces its value. A motion or camera from the options drops the format that
+    the scene states for its own file.
     """
     values = load_scene(find_scene(options.scene))
     here = Path.cwd()
@@ -90,7 +90,7 @@ def requested_scene(options: RunOptions) -> Scene:
 
 
 def _output(text: str) -> dict[str, int]:
-    """WIDTHxHEIGHT as the scene's `output`. Raises BadInputError."""
+    """Parse WIDTHxHEIGHT as the scene's `output`. Raises BadInputError."""
     match = re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", text)
     if match is None:
         raise BadInputError("--output", repr(text), "WIDTHxHEIGHT in pixels, such as 640x480")
@@ -98,7 +98,7 @@ def _output(text: str) -> dict[str, int]:
 
 
 def configure(options: RunOptions, out_dir: Path, gl: GlFacts = gl_facts) -> Checked:
-    """Look at every part of what was asked for. Raises BadInputError or MissingPartError."""
+    """Check every part of what the options ask for. Raises BadInputError or MissingPartError."""
     scene = requested_scene(options)
     if scene.plan == "full":
         raise BadInputError(
@@ -148,7 +148,7 @@ def configure(options: RunOptions, out_dir: Path, gl: GlFacts = gl_facts) -> Che
 
 
 def requested_runtime(asked: str) -> tuple[str, str]:
-    """The runtime and why: as asked, else the fastest installed one. Raises BadInputError, MissingPartError."""
+    """Return the runtime and why: as asked, else the fastest installed one. Raises BadInputError, MissingPartError."""
     if asked == "auto":
         return fastest_runtime(load_profile(HOST), installed())
     if asked not in RUNTIMES:
@@ -158,7 +158,7 @@ def requested_runtime(asked: str) -> tuple[str, str]:
 
 
 def requested_cuts(texts: Sequence[str], network: NetworkFile) -> tuple[NetworkCut, ...]:
-    """`TENSOR=UNIT` texts as cuts of `network`. Raises BadInputError."""
+    """Parse `TENSOR=UNIT` texts as cuts of `network`. Raises BadInputError."""
     cuts = []
     for text in texts:
         at, _, unit = text.rpartition("=")
@@ -171,16 +171,16 @@ def requested_cuts(texts: Sequence[str], network: NetworkFile) -> tuple[NetworkC
 
 
 def _footage(scene: Scene) -> Footage | None:
-    """What the background of `scene` is; None for the room. Raises BadInputError."""
+    """Return the facts of the background of `scene`; None for the room. Raises BadInputError."""
     if scene.background == ROOM:
         return None
-    from trilane.stages.gpu.survey import survey  # slow to import, and seldom needed here
+    from trilane.stages.gpu.survey import survey  # it is slow to import, and seldom needed here
 
     return survey(Path(scene.background), scene.fps)
 
 
 def _check_pictures(scene: Scene, staged: Staged) -> None:
-    """Raises BadInputError when a picture that the run shows cannot be decoded."""
+    """Raise BadInputError when a picture that the run shows cannot be decoded."""
     if scene.background != ROOM:
         from trilane.stages.gpu.survey import check_pictures
 
@@ -188,7 +188,7 @@ def _check_pictures(scene: Scene, staged: Staged) -> None:
 
 
 def _accuracy(avatars: Sequence[AvatarData], drawn: DrawnAs) -> dict[str, Any]:
-    """The error of each avatar's pictures by its name; avatars of one name are told apart by their folders."""
+    """Return the error of each avatar's pictures by its name; avatars with the same name are told apart by folders."""
     bundles = [avatar.bundle for avatar in avatars]
     names = Counter(bundle.manifest.name for bundle in bundles)
     return {
@@ -200,7 +200,7 @@ def _accuracy(avatars: Sequence[AvatarData], drawn: DrawnAs) -> dict[str, Any]:
 
 
 def skinning_unit(asked: str, gl: GlFacts = gl_facts) -> tuple[str, str]:
-    """`cpu` or `gpu`, and why: what was asked for, else the GPU where the driver is hardware. Raises BadInputError."""
+    """Return `cpu` or `gpu`, and why: as asked, else the GPU where the driver is hardware. Raises BadInputError."""
     if asked in ("cpu", "gpu"):
         return asked, "as asked"
     if asked != "auto":
@@ -211,7 +211,7 @@ def skinning_unit(asked: str, gl: GlFacts = gl_facts) -> tuple[str, str]:
 
 
 def required_machine(gl: GlFacts = gl_facts) -> dict[str, Any]:
-    """Facts of this machine. Raises MissingPartError when no OpenGL context can be made."""
+    """Return facts about this machine. Raises MissingPartError when no OpenGL context can be made."""
     driver = gl()
     if driver is None:
         raise MissingPartError("no OpenGL 3.3 context through EGL", EGL_LINE)

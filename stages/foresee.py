@@ -1,7 +1,7 @@
-"""The tensors of a scene, looked at before the run: how many pixels they may have, and in which shapes they come.
+"""Looks at the tensors of a scene before the run: how many pixels they may have, and which shapes they take.
 
-The bounds and layouts are those of the run, on a fixed number of frames spread over the scene. Where these lie close
-enough to each other, it is foreseen when the tensor changes its shape.
+The bounds and layouts are those of the run, on a fixed number of frames spread over the scene. Where these frames lie
+close enough to each other, the changes of the tensor's shape are foreseen too.
 
 A tensor has all the pixels that its network was trained for, or fewer where a scene allows it. A policy that releases
 frames at a rate may step down, so that frames are in time. An error budget in dB limits how far, by the avatars'
@@ -49,9 +49,9 @@ KEY = "error_budget_db"
 
 
 def tensor_works(scene: Scene, policy: str, losses: Sequence[SizeLoss]) -> tuple[tuple[int, ...], str]:
-    """`RunConfig.works` of a scene under `policy`, and what is to be said of it; empty when nothing is.
+    """Return `RunConfig.works` of a scene under `policy`, and a note for a person, which may be empty.
 
-    `losses`: measured losses of the scene's avatars. Raises BadInputError for a budget that they have no figures for.
+    `losses`: measured losses of the scene's avatars. Raises BadInputError for a budget when an avatar has no figures.
     """
     if not scene.plans_tensor:
         return (ALL_WORK,), ""
@@ -73,16 +73,16 @@ def tensor_works(scene: Scene, policy: str, losses: Sequence[SizeLoss]) -> tuple
     return (within if paced else within[-1:]), said
 
 
-#: Of the scene, over all avatars; but at least so many of each.
+#: Number of frames to look at, over all avatars, and the least for each avatar.
 FORESEEN_FRAMES, LEAST_FRAMES = 96, 24
-#: Frames from a look to the next, at most, for changes to be foreseen.
+#: Most frames between two looks for changes to be foreseen.
 MOST_APART = 15
-#: Shapes of each size that is stepped down to.
+#: Most shapes of each size that is stepped down to.
 MOST_SMALLER = 3
 #: A network that is ready to run holds its tensors once, and a runtime may lay each of them out anew.
 COPIES = 2
 MB = 1_000_000
-BYTE_TYPES = (2, 3)  # of ONNX: uint8 and int8
+BYTE_TYPES = (2, 3)  # ONNX's uint8 and int8
 
 
 Changes = tuple[tuple[tuple[float, Shape], ...], ...]
@@ -90,11 +90,13 @@ Changes = tuple[tuple[tuple[float, Shape], ...], ...]
 
 @dataclass(frozen=True)
 class Foreseen:
-    """`shapes`: shapes to make ready. `frames`: numbers of those that were looked at. `seen`: on how many somebody is.
+    """The result of a look ahead.
 
-    `changes`: for each of the budgets from which second of the scene on the tensor has which shape; empty where that is
-    not foreseen.
-    `left_out`: how many of the sizes that are stepped down to have no shape, because `memory_mb` has no room for one.
+    `shapes`: shapes to make ready. `frames`: numbers of the frames that were looked at. `seen`: number of them that
+    show somebody.
+    `changes`: for each budget, the times in seconds at which the tensor changes, with its shape from then on; empty
+    where that is not foreseen.
+    `left_out`: number of the smaller sizes without a shape, because `memory_mb` has no room for one.
     """
 
     shapes: ShapeSet
@@ -105,7 +107,7 @@ class Foreseen:
 
     @property
     def note(self) -> str:
-        """What a person should know of it."""
+        """Note about the shapes for a person."""
         names = ", ".join(f"{height}x{width}" for height, width in self.shapes.shapes)
         looked_at = f"somebody is seen in {self.seen} of {len(self.frames)} frames looked at"
         if self.changes:
@@ -116,7 +118,10 @@ class Foreseen:
         return text
 
     def notes(self, memory_mb: int) -> tuple[str, ...]:
-        """`note`, and what `memory_mb` has no room for: smaller sizes, or even one network, by computed memory."""
+        """Return `note`, and notes on what does not fit into `memory_mb`: smaller sizes, or even a single network.
+
+        Memory is computed, not measured.
+        """
         notes = [self.note]
         if self.left_out:
             notes.append(
@@ -133,11 +138,12 @@ class Foreseen:
 def foresee(
     scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], network: NetworkFile, budgets: Sequence[TensorBudget]
 ) -> Foreseen:
-    """The tensor shapes that `scene` needs.
+    """Return the tensor shapes that `scene` needs.
 
     `bodies`: bodies of its avatars, in order.
     `network`: network that all of them share.
-    `budgets`: of its tensors, the largest first; the further ones are stepped down to, where memory has room for them.
+    `budgets`: budgets of its tensors, the largest first; the run steps down to the others, where memory has room for
+    them.
     """
     count = min(scene.frames, max(FORESEEN_FRAMES // len(bodies), LEAST_FRAMES))
     frames = tuple(index * scene.frames // count for index in range(count))
@@ -164,6 +170,7 @@ def foresee(
             found = joined(found, ShapeSet(larger, math.ceil(per_pixel * sum(map(area, larger))), 0))
             changes.append(tuple((frame / scene.fps, shape) for frame, shape in foreseen))
         elif are_close:
+            # Without shapes of its own, this budget's tensors change as those of the larger one do.
             changes.append(changes[-1])
         chosen = joined(chosen, found)
     return Foreseen(chosen, frames, len(seen), left_out, tuple(changes))
@@ -172,9 +179,9 @@ def foresee(
 def _foreseen(
     looks: Sequence[LookAhead], output: Shape, shapes: Sequence[Shape], budget: TensorBudget, room: tuple[int, int]
 ) -> tuple[tuple[Shape, ...], tuple[tuple[int, Shape], ...]]:
-    """Shapes to make ready beside `shapes`, which spare changes by being good for more frames, and all changes then.
+    """Return further shapes to make ready, which spare changes because they suit more frames, and all changes then.
 
-    `room`: how many there may be, and how many pixels they may have together.
+    `shapes`: shapes that are ready anyway. `room`: most further shapes, and most pixels that they may have together.
     """
     most = budget.most_of(max(len(look.rects) for look in looks))
     larger = larger_shapes(shapes, most)
@@ -190,7 +197,7 @@ def _foreseen(
 def foreseen_rects(
     scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], frames: Sequence[int]
 ) -> Iterator[Mapping[int, Rect]]:
-    """The rectangles of the visible avatars, by their numbers, for each of `frames`."""
+    """Yield the rectangles of the visible avatars, by their numbers, for each of `frames`."""
     distinct = {id(body): MeshBounds(body, standoff_m=CLOTHES_STANDOFF_M) for body in bodies}
     skeletons = [Skeleton(body.joints, body.body.parents) for body in bodies]
     for frame in frames:
@@ -207,7 +214,7 @@ def foreseen_rects(
 
 
 def bytes_per_pixel(network: NetworkFile) -> float:
-    """Memory of `network`, ready to run, for each pixel of its tensor: COPIES of all its tensors of bytes."""
+    """Return the memory of `network`, ready to run, for each pixel of its tensor: COPIES of all its byte tensors."""
     _, height, width, _ = network.shape
     if not network.model.graph.value_info:
         network = reshaped(network, height + STRIDE, width)

@@ -1,4 +1,4 @@
-"""Facts of the machine that a measurement was made on: they stand beside every number that is reported.
+"""Facts about the machine that made a measurement; they stand beside every number that is reported.
 
 Rule: only what was read or tried on this machine is stated; what could not be read is absent, never guessed.
 """
@@ -15,7 +15,7 @@ from typing import Any
 from trilane import machine
 from trilane.pipeline.hardware_counters import availability
 
-#: Instructions that decide how fast INT8 and FP32 networks run; a network's speed means nothing without them.
+#: Instruction sets that decide how fast INT8 and FP32 networks run; a network's speed means nothing without them.
 CPU_FLAGS = (
     "avx2", "fma", "f16c", "avx512f", "avx512bw", "avx512_vnni", "avx_vnni", "avx512_bf16", "amx_tile", "amx_int8",
     "sha_ni",
@@ -43,7 +43,7 @@ GL_LIMITS = (
 
 
 def package_version(name: str) -> str | None:
-    """Version of an installed distribution, or None."""
+    """Return the version of an installed distribution, or None."""
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
@@ -51,12 +51,12 @@ def package_version(name: str) -> str | None:
 
 
 def versions_with(package: str) -> list[str]:
-    """The versions of all packages that times depend on, a runtime's `package` among them."""
+    """Return the versions of all packages that times depend on, including a runtime's `package`."""
     return [f"{name} {package_version(name)}" for name in dict.fromkeys(("trilane", *PACKAGES, package))]
 
 
 def cpu_facts() -> dict[str, Any]:
-    """Model, instruction flags and cores; `cores_allowed` are those that this process may run on."""
+    """Return model, instruction flags and cores; `cores_allowed` are those that this process may run on."""
     flags = machine.here.cpu_flags()
     return {
         "model": machine.here.cpu_model(),
@@ -85,7 +85,10 @@ def open_gl() -> dict[str, Any]:
 
 @cache
 def gl_facts() -> dict[str, Any] | None:
-    """The OpenGL driver that EGL gives, tried in a process of its own: a driver may crash. None when none works."""
+    """Return facts about the OpenGL driver that EGL gives; None when none works.
+
+    It is tried in a process of its own, because a driver may crash.
+    """
     command = [sys.executable, "-P", "-c", GL_PROGRAM]
     try:
         done = subprocess.run(command, capture_output=True, timeout=GL_TIMEOUT_S, check=True)
@@ -96,7 +99,7 @@ def gl_facts() -> dict[str, Any] | None:
 
 
 def runtime_facts() -> dict[str, Any]:
-    """Inference runtimes and what they can run on."""
+    """Return the inference runtimes and what they can run on."""
     import onnxruntime
 
     facts: dict[str, Any] = {"onnxruntime": list(onnxruntime.get_available_providers())}
@@ -108,7 +111,10 @@ def runtime_facts() -> dict[str, Any]:
 
 
 def machine_facts(gl: dict[str, Any] | None = None) -> dict[str, Any]:
-    """All facts that stand beside a measurement; `gl` is what `gl_facts` said, when it was asked."""
+    """Return all facts that stand beside a measurement.
+
+    `gl`: result of `gl_facts`, where it was called.
+    """
     packages = {name: package_version(name) for name in (*PACKAGES, *OPTIONAL_PACKAGES)}
     return {
         "system": machine.here.system(),

@@ -1,14 +1,13 @@
-"""Which cores the units of a run get: as asked; else those with the shortest frames, tried or predicted; else by a
-rule.
+"""Chooses the cores of a run's units: as asked; else by the shortest frames, tried or predicted; else by a rule.
 
-A run that is long enough is rehearsed for a moment: what each unit needs for a frame is measured, with the numbers of
+A run that is long enough is rehearsed for a moment: what each unit needs for a frame is measured, with every number of
 threads that it may have. The few placements with the least predicted frame times are then tried with real frames. Both
-results are kept for the next run of the same network, shapes, runtime, output and machine. A run that is too short to
-gain by it, or is held to a chip's pace, is placed by the rule of `trilane.hw_profiles.host`.
+results are kept for the next run of the same network, shapes, runtime, output and machine. The rule of
+`trilane.hw_profiles.host` places a run that is too short to gain by this, or is held to a chip's pace.
 
-Nothing is tried while other programs use the cores. A unit that floats dodges them and one that does not waits, so
-frame times then say more of those programs than of the placements. The prediction decides, a note says so, and the next
-run looks again.
+Nothing is tried while other programs use the cores. A floating unit dodges such programs and a pinned one waits, so
+frame times would say more about those programs than about the placements. The prediction decides then, a note says so,
+and the next run looks again.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from trilane.stages.dsp.runtime import RUNTIMES
 from trilane.stages.machine_facts import cpu_facts, versions_with
 from trilane.units import BEFORE_INFER, UNITS
 
-#: Shorter runs do not gain what a rehearsal takes.
+#: Least number of frames; shorter runs gain less than a rehearsal costs.
 LEAST_FRAMES = 100
 CACHE, TRIAL_CACHE = "placement-3", "placement-trial-2"
 MOST_LOGICAL, MOST_CORES = 8, 16
@@ -52,11 +51,11 @@ MEASURING = "measuring the stages for their placement on cores (once for this av
 def placed(
     checked: Checked, policy: str, starter: UnitStarter, driver: str = "", say: Callable[[str], None] = lambda _: None
 ) -> Checked:
-    """`checked` with its units on the cores that are best for it, and what is to be said of that.
+    """Return `checked` with its units on the cores that are best for it, and with a note on them.
 
-    `policy`: policy of the run. `starter`: a fork server. `driver`: OpenGL's, which the times depend on. `say`: is told
-    before something takes seconds. Raises TrilaneError when a unit cannot start or a stage fails, KeyboardInterrupt
-    when interrupted.
+    `policy`: policy of the run. `starter`: fork server. `driver`: OpenGL driver, which the times depend on. `say`: is
+    called with a message before something takes seconds. Raises TrilaneError when a unit cannot start or a stage fails,
+    KeyboardInterrupt when interrupted.
     """
     asked = {unit: Place(own, len(own)) for unit, own in checked.asked_cores.items()}
     cores = host_cores(sorted({*usable_cores(), *(core for place in asked.values() for core in place.cores)}))
@@ -92,20 +91,22 @@ def placed(
 
 
 def considered(cores: Sequence[Core], asked: Placement) -> list[Core]:
-    """Those to place units on: all, or of more than MOST_LOGICAL one of each physical core, and the first MOST_CORES.
+    """Return the cores to place units on: all of them, or fewer where there are more than MOST_LOGICAL.
 
-    Placements on more are too many to list. Cores that were `asked` for stay.
+    Fewer means one of each physical core, and the first MOST_CORES of these: placements on more are too many to list.
+    Cores that were `asked` for stay.
     """
     if len(cores) <= MOST_LOGICAL:
         return list(cores)
     fixed = {core for place in asked.values() for core in place.cores}
+    # Reversed, so that the first core of each physical one is kept.
     first = {core.physical: core.number for core in reversed(cores)}
     chosen_numbers = {*sorted(first.values())[:MOST_CORES], *fixed}
     return [core for core in cores if core.number in chosen_numbers]
 
 
 def times_rows(times: Times) -> list[dict[str, Any]]:
-    """What was measured: a row for each unit and number of threads, times in ms."""
+    """Return the measured times: a row for each unit and number of threads, times in ms."""
     return [
         {"unit": unit, "threads": threads, "ms": work.serial_ns / NS_PER_MS, "core_ms": work.core_ns / NS_PER_MS}
         for unit, works in times.items()
@@ -114,7 +115,7 @@ def times_rows(times: Times) -> list[dict[str, Any]]:
 
 
 def _why_not(checked: Checked, cores: Sequence[Core]) -> str:
-    """Why nothing is measured; empty when it is."""
+    """Say why nothing is measured; empty when it is."""
     if len(checked.asked_cores) == len(UNITS):
         return "as asked"
     if len(cores) == 1:
@@ -151,9 +152,9 @@ def _reason(facts: Mapping[str, Any]) -> str:
 def rehearsed(
     checked: Checked, starter: UnitStarter, driver: str = "", say: Callable[[str], None] = lambda _: None
 ) -> tuple[Rehearsed, str]:
-    """What a run of `checked` is placed by, and when that was measured, UTC: now, or for an earlier one.
+    """Return the times that place a run of `checked`, and when they were measured, UTC: now, or for an earlier run.
 
-    The words, and what is raised: as of `placed`.
+    Parameters and errors are those of `placed`.
     """
     cores, rule = host_cores(usable_cores()), rule_placement(usable_cores(), {})
     return _kept(checked, cores, rule, starter, [*_made_from(checked, cores, rule), driver], say)
@@ -167,7 +168,7 @@ def _kept(
     made_from: Sequence[str],
     say: Callable[[str], None],
 ) -> tuple[Rehearsed, str]:
-    """What each unit needs for a frame, and when that was measured, UTC."""
+    """Return what each unit needs for a frame, and when that was measured, UTC."""
 
     def measured() -> dict[str, NDArray[Any]]:
         say(MEASURING)
@@ -190,7 +191,7 @@ def _kept(
 
 
 def _made_from(checked: Checked, cores: Sequence[Core], rule: Placement) -> list[str]:
-    """All that the times depend on."""
+    """Return everything that the times depend on."""
     config = checked.config
     said = config.model_dump_json(exclude={"out_dir", "units", "scene", "pace_ns"})
     scene = config.scene.model_dump_json(exclude={"name", "frames", "fps"})
@@ -199,9 +200,9 @@ def _made_from(checked: Checked, cores: Sequence[Core], rule: Placement) -> list
     return [said, scene, *machine, network, *versions_with(RUNTIMES[config.runtime].package)]
 
 
-#: Rounds of trying placements; after TRY_S seconds no further one than LEAST_ROUNDS.
+#: Number of rounds in which placements are tried; after TRY_S seconds, only LEAST_ROUNDS are completed.
 ROUNDS, LEAST_ROUNDS, TRY_S = 6, 3, 5.0
-#: Share of the cores that other programs may have while placements are compared, and for how long that is looked at.
+#: Largest share of the cores that other programs may have while placements are compared, and seconds of looking at it.
 MOST_OTHERS, LOOK_S = 0.1, 0.25
 PREDICTED = "the least predicted frame time"
 TRYING = "trying {} placements with frames of the scene (once for this avatar, scene and machine) ..."
@@ -210,7 +211,10 @@ Arrays = Mapping[str, NDArray[Any]]
 
 
 class TriedPlacement(NamedTuple):
-    """`best`: place of the one to take. `why`: reason in words. `frame_ms`: frame times of those that were tried."""
+    """The result of trying placements.
+
+    `best`: index of the one to take. `why`: reason in words. `frame_ms`: frame times of those that were tried.
+    """
 
     best: int
     why: str
@@ -233,17 +237,18 @@ def choice(
     say: Callable[[str], None] = lambda _: None,
     kept: Callable[[Callable[[], Arrays]], Arrays] = lambda make: make(),
 ) -> TriedPlacement:
-    """Which of `candidates` has the shortest frames; where nothing is tried, the first.
+    """Choose the one of `candidates` with the shortest frames; the first one where nothing is tried.
 
-    `checked`: what is to be run. `cores`: there are. `starter`: a fork server. `say`: is told before it takes seconds.
-    `kept`: what its argument makes, or has made before. Raises TrilaneError when a unit cannot start or a stage fails,
-    KeyboardInterrupt when interrupted.
+    `checked`: run to place. `cores`: available cores. `starter`: fork server. `say`: is called with a message before
+    this takes seconds. `kept`: returns what its argument makes, now or in an earlier run. Raises TrilaneError when a
+    unit cannot start or a stage fails, KeyboardInterrupt when interrupted.
     """
     if len(candidates) == 1:
         return TriedPlacement(0, PREDICTED)
 
     def measured() -> Arrays:
         others = OtherPrograms(cores)
+        # The share is counted in steps of 10 ms, so a shorter look would say little.
         time.sleep(LOOK_S)
         _refuse_when_busy(others.share())
         say(TRYING.format(len(candidates)))

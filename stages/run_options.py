@@ -1,7 +1,7 @@
 """The options of a run, each as one field: its help text, default, range, unit and words.
 
 The command line, `trilane.run`, sweeps, the dashboard's controls and the report read their options from the fields.
-Rule: no other list of the options exists. A field is plain data; whether a file exists is found out in `configure`.
+Rule: no other list of the options exists. A field is plain data; `configure` finds out whether a file exists.
 """
 
 from __future__ import annotations
@@ -27,28 +27,29 @@ RUNTIME_HELP: Final = "auto, ort, openvino, qnn or cuda; auto is the fastest tha
 SIZE_HELP: Final = "Tensor size in pixels: HEIGHTxWIDTH, or a side S for areas up to SxS."
 WIDTH_HELP: Final = "Width of the network: 64 is full, every channel count scales with it."
 
-#: The dashboard's word for None.
+#: Word for None on the dashboard.
 NOTHING: Final = "none"
-#: The calibration of the network in the avatar's own file.
+#: Word for the calibration of the network in the avatar's own file.
 AS_IT_IS: Final = "as-it-is"
-#: The methods of `trilane.training.quantising.calibration`, which takes long to import.
+#: Methods of `trilane.training.quantising.calibration`, repeated here because that module takes long to import.
 METHODS: Final = ("minmax", "percentile", "entropy")
-#: The method of an untrained network where no calibration is asked for, and the views where no number is given.
+#: Calibration method of an untrained network that none was asked for, and number of views where none is given.
 METHOD, VIEWS = "minmax", 5
 MOST_VIEWS: Final = 1000
-#: The numbers of channels that the packed pass draws (`stages/gpu/packed_pass.py`).
+#: Numbers of channels that the packed pass draws (`stages/gpu/packed_pass.py`).
 CHANNELS: Final = (4, 8, 12, 16)
 
 
 @dataclass(frozen=True)
 class Option:
-    """What a field's type does not say of its option.
+    """Facts about an option that its field's type does not state.
 
     `spelling`: option on the command line where it is not the field's name, such as `--latch`.
     `is_argument`: whether the command line takes it without a name.
-    `unit`: plural noun of a number.
+    `unit`: unit of a number, as a plural noun.
     `words`: all words that it may be; any text where empty.
-    `offered`: words that the dashboard's control offers beside what it finds here; None: the dashboard has no control.
+    `offered`: words that the dashboard's control offers beside what it finds here; None where the dashboard has no
+    control.
     """
 
     spelling: str = ""
@@ -59,12 +60,12 @@ class Option:
 
 
 def option_of(field: FieldInfo) -> Option:
-    """The field's `Option`; an empty one where it has none."""
+    """Return the field's `Option`; an empty one where it has none."""
     return next((each for each in field.metadata if isinstance(each, Option)), Option())
 
 
 def kind_of(field: FieldInfo) -> Any:
-    """The field's type without None, limits and elements: str, int, float, bool, Path or tuple."""
+    """Return the field's type without None, limits and elements: str, int, float, bool, Path or tuple."""
     kind: Any = field.annotation
     while get_origin(kind) in (Annotated, Union, UnionType):
         kind = next(each for each in get_args(kind) if each is not NoneType)
@@ -72,7 +73,7 @@ def kind_of(field: FieldInfo) -> Any:
 
 
 def limits_of(field: FieldInfo) -> tuple[float | None, float | None]:
-    """The least and the largest number that the field may be; None where there is no limit."""
+    """Return the least and the largest number that the field may be; None where there is no limit."""
     least, most = (
         next((getattr(one, key) for one in field.metadata if hasattr(one, key)), None) for key in ("ge", "le")
     )
@@ -80,7 +81,10 @@ def limits_of(field: FieldInfo) -> tuple[float | None, float | None]:
 
 
 def calibration_of(text: str) -> tuple[str, int] | None:
-    """Method and number of views of `text`, METHOD or METHOD:VIEWS; None of `AS_IT_IS`. Raises UnexpectedValue."""
+    """Parse `text`, METHOD or METHOD:VIEWS, into method and number of views; None for `AS_IT_IS`.
+
+    Raises UnexpectedValue.
+    """
     method, colon, views = text.partition(":")
     if text == AS_IT_IS:
         return None
@@ -93,7 +97,7 @@ def calibration_of(text: str) -> tuple[str, int] | None:
 
 
 def _text(value: object) -> object:
-    """Programs give paths, and whole numbers as sizes."""
+    """Turn paths and whole numbers (sizes), which programs may give, into text."""
     return str(value) if isinstance(value, PurePath) or type(value) is int else value
 
 
@@ -102,14 +106,14 @@ def _texts(value: object) -> object:
 
 
 def _cores(value: object) -> object:
-    """Programs give {"dsp": [0, 1]}."""
+    """Accept {"dsp": [0, 1]}, which programs give."""
     if not isinstance(value, Mapping):
         return _texts(value)
     return tuple(f"{unit}={','.join(map(str, own))}" for unit, own in value.items())
 
 
 def _folder(value: object) -> object:
-    """Of an empty name Path would make the working directory."""
+    """Refuse an empty name, which Path would turn into the working directory."""
     if isinstance(value, str) and not value.strip():
         raise UnexpectedValue(repr(value), "the name of a folder")
     return Path(value) if isinstance(value, str) else value
@@ -242,7 +246,7 @@ class RunOptions(BaseModel):
 
     @classmethod
     def checked(cls, values: Mapping[str, Any], *, as_typed: bool = False) -> Self:
-        """`values` by the fields' names. Raises BadInputError for the first that is not what its field says.
+        """Check `values`, by the fields' names. Raises BadInputError for the first that its field does not allow.
 
         `as_typed`: whether the error names the option of the command line in place of the field.
         """
@@ -257,24 +261,24 @@ class RunOptions(BaseModel):
 
     @classmethod
     def spelling(cls, name: str) -> str:
-        """The option of field `name` on the command line."""
+        """Return the option of field `name` on the command line."""
         return option_of(cls.model_fields[name]).spelling or f"--{name.replace('_', '-')}"
 
     def changed(self, **values: Any) -> Self:
-        """The same with other `values`. Raises BadInputError as `checked`."""
+        """Return the same options with other `values`. Raises BadInputError as `checked`."""
         return self.checked({**dict(self), **values})
 
     def as_json(self) -> dict[str, Any]:
-        """Every option by its field's name, as the report has it."""
+        """Return every option by its field's name, as the report has it."""
         return {name: _as_json(value) for name, value in self}
 
     @property
     def remakes_avatar(self) -> bool:
-        """Whether the run's avatar is another than that of the scene's files: its network or its texture."""
+        """Return whether the run's avatar differs from that of the scene's files in its network or its texture."""
         return any(value not in (None, AS_IT_IS) for value in (self.width, self.channels, self.calibration))
 
     def check_together(self) -> None:
-        """Raises BadInputError for options of a chip's pace that lack another, or that it leaves no room for."""
+        """Raise BadInputError for options of a chip's pace that lack another, or exclude another."""
         if (self.profile is not None) != self.pace:
             found = "--profile without --pace" if self.profile is not None else "--pace without --profile"
             remedy = "give both; `trilane predict --profile` answers without running"
@@ -298,7 +302,7 @@ def _as_json(value: object) -> object:
 
 
 def _expected(field: FieldInfo) -> str:
-    """What a field's value must be, from its type, range and unit."""
+    """Say what a field's value must be, from its type, range and unit."""
     kind, unit = kind_of(field), option_of(field).unit
     if kind not in (int, float):
         return {str: "text", bool: "true or false", tuple: "a list of texts", Path: "a path"}[kind]

@@ -20,13 +20,13 @@ from trilane.writing import write_atomically
 #: Steps of vertices and joints (7.6 um) and of skin weights.
 LENGTH_STEP = 2.0**-17
 WEIGHT_STEP = 2.0**-12
-#: Number of vertices that a joint's centre is computed from, and the ridge of the regression, square metres.
+#: Number of vertices that a joint's centre is computed from; ridge of the regression, square metres.
 REGRESSOR_VERTICES = 400
 REGRESSOR_RIDGE = 1e-8
 
 
 def build_body() -> dict[str, NDArray[Any]]:
-    """The arrays of a body file as `trilane.body.body` reads it, float32 and uint32.
+    """Return the arrays of a body file as `trilane.body.body` reads it, float32 and uint32.
 
     Raises MissingPartError without `anny`.
     """
@@ -71,14 +71,20 @@ def _nose_score(vertices: F64, weights: F64) -> F64:
 
 
 def relaxed_hand(bend: int) -> F64:
-    """(45,) mean hand pose, axis-angle: fingers bent about Z by `bend` times 0.15, 0.3 and 0.2 rad; thumb straight."""
+    """Return the mean hand pose (45,), axis-angle: fingers bent about Z, thumb straight.
+
+    A finger's three joints bend by `bend` times 0.15, 0.3 and 0.2 rad.
+    """
     pose = np.zeros((5, 3, 3))
     pose[:4, :, 2] = bend * np.array([0.15, 0.3, 0.2])
     return pose.reshape(45)
 
 
 def round_weights(weights: F64) -> F64:
-    """`weights` (V, 55) in steps of 2**-12 with rows that sum to exactly 1: the largest weight takes the difference."""
+    """Round `weights` (V, 55) to steps of 2**-12 so that rows sum to exactly 1.
+
+    The largest weight of each row takes the difference.
+    """
     rounded = np.round(weights / WEIGHT_STEP) * WEIGHT_STEP
     rows = np.arange(len(rounded))
     rounded[rows, rounded.argmax(axis=1)] += 1.0 - rounded.sum(axis=1)
@@ -86,10 +92,11 @@ def round_weights(weights: F64) -> F64:
 
 
 def regressor(vertices: F64, joints: F64) -> F64:
-    """Sparse `J_regressor` (55, V) whose rows sum to 1: takes `vertices` (1 + K, V, 3) to `joints` (1 + K, 55, 3).
+    """Return the sparse `J_regressor` (55, V), whose rows sum to 1.
 
-    Each row starts as the mean of the 400 vertices nearest to the joint. Ridge regression then finds the smallest
-    change, with sum zero, that gives the joint of the template and of every shape component.
+    It takes `vertices` (1 + K, V, 3) to `joints` (1 + K, 55, 3). Each row starts as the mean of the 400 vertices
+    nearest to the joint. Ridge regression then finds the smallest change, with sum zero, that gives the joint of the
+    template and of every shape component.
     """
     shapes, count = vertices.shape[:2]
     rows = np.zeros((joints.shape[1], count))
@@ -153,7 +160,7 @@ EXPRESSIONS: tuple[tuple[str, ...], ...] = (
     ("noseSneerLeft", "noseSneerRight"),
 )
 HIDDEN_PARTS = ("tongue", "eye_cavity.L", "eye_cavity.R", "eye_back.L", "eye_back.R")
-#: Joint to the bone at whose head it sits: of joints in the middle, and of joints that each side has.
+#: Joints, and the bone of anny at whose head each one sits: first those in the middle, then those of each side.
 _CENTRE_BONES = {
     "pelvis": "spine05",
     "spine1": "spine04",
@@ -194,7 +201,7 @@ class AnnyMesh:
 
 
 def joint_bones() -> dict[str, tuple[str, ...]]:
-    """For each of the 55 joints, the bones of anny whose heads' mean position is the joint's centre."""
+    """Map each of the 55 joints to bones of anny; the joint's centre is the mean position of their heads."""
     bones: dict[str, tuple[str, ...]] = {joint: (bone,) for joint, bone in _CENTRE_BONES.items()}
     for side, letter in (("left", "L"), ("right", "R")):
         bones |= {f"{side}_{joint}": (f"{bone}.{letter}",) for joint, bone in _SIDE_BONES.items()}
@@ -205,9 +212,9 @@ def joint_bones() -> dict[str, tuple[str, ...]]:
 
 
 def joint_of_bone(labels: list[str], parents: list[int]) -> NDArray[np.int64]:
-    """(bones,) the joint that moves each bone: the bone's own joint, else its nearest ancestor's, else the pelvis.
+    """Return the joint that moves each bone (bones,): its own joint, else its nearest ancestor's, else the pelvis.
 
-    `labels`: names of the bones. `parents`: of each bone, -1 for none; parents come first.
+    `labels`: names of the bones. `parents`: index of each bone's parent, -1 for none; parents come first.
     """
     own = {bone: JOINT_INDEX[joint] for joint, bones in joint_bones().items() for bone in bones}
     joints: list[int] = []
@@ -217,7 +224,7 @@ def joint_of_bone(labels: list[str], parents: list[int]) -> NDArray[np.int64]:
 
 
 def read_anny() -> AnnyMesh:
-    """The mesh of `PHENOTYPE` with `BETAS` shape components and the expressions. Raises MissingPartError."""
+    """Return the mesh of `PHENOTYPE` with `BETAS` shape components and the expressions. Raises MissingPartError."""
     try:
         import anny
         import torch
@@ -233,7 +240,7 @@ def read_anny() -> AnnyMesh:
 
 
 def _mesh_of(model: Any, shown: NDArray[np.bool_]) -> AnnyMesh:
-    """The mesh of the faces that are `shown` (F,)."""
+    """Return the mesh of the `shown` faces; `shown` is a mask (F,)."""
     faces = model.faces.numpy()[shown]
     uv_faces = model.face_texture_coordinate_indices.numpy()[shown]
     used, faces = np.unique(faces, return_inverse=True)
@@ -260,7 +267,7 @@ def _mesh_of(model: Any, shown: NDArray[np.bool_]) -> AnnyMesh:
 def _rest(
     model: Any, used: NDArray[np.int64], phenotypes: dict[str, F64], actions: dict[str, float]
 ) -> tuple[F64, F64]:
-    """Vertices and joints (B, V + 55, 3) in anny's rest pose, and finger ends (B, 10, 3); metres, Y up."""
+    """Return vertices and joints (B, V + 55, 3) in anny's rest pose, and finger ends (B, 10, 3); metres, Y up."""
     import torch
 
     tensors = {name: torch.as_tensor(value) for name, value in phenotypes.items()}
@@ -279,7 +286,7 @@ def _y_up(points: F64) -> F64:
 
 
 def _principal_components(model: Any, used: NDArray[np.int64]) -> F64:
-    """(10, V + 55, 3) principal components of a population of adults, each one standard deviation long."""
+    """Return 10 principal components (10, V + 55, 3) of a population of adults, each one standard deviation long."""
     random = np.random.default_rng(0)
     drawn = {name: random.uniform(low, high, SAMPLES) for name, (low, high) in ADULTS.items()}
     population = _rest(model, used, drawn, {})[0].reshape(SAMPLES, -1)
@@ -309,16 +316,16 @@ def _expression_offsets(model: Any, used: NDArray[np.int64], template: F64) -> l
 _UP = np.array([0.0, 1.0, 0.0])
 _FRONT = np.array([0.0, 0.0, 1.0])
 _FINGER_TIPS = ("thumb", "index", "middle", "ring", "pinky")
-#: Share of the hand's turn about the forearm that the forearm makes, and of the upper arm's lift that the collar makes.
+#: Part of the hand's turn about the forearm that the forearm makes, and of the upper arm's lift that the collar makes.
 _FOREARM_TWIST = 0.5
 _COLLAR_LIFT = 0.15
 _THIGH_SPREAD = np.radians(2.0)
 
 
 def bake(points: F64, weights: F64, tips: F64) -> F64:
-    """`points` (1 + K, V + 55, 3) in the T pose: row 0 is the template, the others are offsets. Metres.
+    """Turn `points` (1 + K, V + 55, 3) into the T pose: row 0 is the template, the others are offsets. Metres.
 
-    `weights` (V, 55). `tips` (10, 3): finger ends of the template, thumb to pinky, left then right.
+    `weights` (V, 55): skin weights. `tips` (10, 3): finger ends of the template, thumb to pinky, left then right.
     """
     vertex_count = len(weights)
     rotations = rest_rotations(points[0, vertex_count:], tips)
@@ -335,7 +342,7 @@ def bake(points: F64, weights: F64, tips: F64) -> F64:
 
 
 def rest_rotations(joints: F64, tips: F64) -> F64:
-    """(55, 3, 3) world rotation of each joint that takes the rest pose of `joints` (55, 3) to the T pose."""
+    """Return the world rotations (55, 3, 3) that take each joint of the rest pose `joints` (55, 3) to the T pose."""
     rotations = np.tile(np.eye(3), (len(JOINT_PARENTS), 1, 1))
     for side, out, side_tips in (("left", 1.0, tips[:5]), ("right", -1.0, tips[5:])):
         ends = dict(zip(_FINGER_TIPS, side_tips, strict=True))
@@ -374,13 +381,13 @@ def _hand_rotation(at: object, out: F64) -> F64:
 
 
 def _flat(hand: F64, segment: F64, finger: str) -> F64:
-    """The hand's rotation, then the smallest rotation that turns a finger's segment into the horizontal plane."""
+    """Return the hand's rotation, then the smallest one that turns a finger's segment into the horizontal plane."""
     turned = hand @ segment
     return hand if finger == "thumb" else align(turned, turned - _UP * (turned @ _UP)) @ hand
 
 
 def frame(first: F64, second: F64) -> F64:
-    """Rotation with unit columns: `first`, the part of `second` at right angles to it, and their cross product."""
+    """Return a rotation of three columns: `first`, the part of `second` at right angles to it, their cross product."""
     x = first / np.linalg.norm(first)
     y = second - x * (second @ x)
     y /= np.linalg.norm(y)
@@ -388,13 +395,13 @@ def frame(first: F64, second: F64) -> F64:
 
 
 def align(a: F64, b: F64) -> F64:
-    """Smallest rotation (3, 3) that turns direction `a` to direction `b`."""
+    """Return the smallest rotation (3, 3) that turns direction `a` to direction `b`."""
     axis = np.cross(a, b)
     return about(axis, float(np.arctan2(np.linalg.norm(axis), a @ b)))
 
 
 def about(axis: F64, angle: float) -> F64:
-    """Rotation (3, 3) by `angle` radians about `axis`; the identity when the axis is zero."""
+    """Return the rotation (3, 3) by `angle` radians about `axis`; the identity when the axis is zero."""
     length = np.linalg.norm(axis)
     if length == 0.0:
         return np.eye(3)
@@ -404,13 +411,13 @@ def about(axis: F64, angle: float) -> F64:
 
 
 def power(rotation: F64, share: float) -> F64:
-    """The rotation about the axis of `rotation` by `share` of its angle, which is less than half a turn."""
+    """Return the rotation about the axis of `rotation` by `share` of its angle, which must be below half a turn."""
     axis = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
     return about(axis, share * float(np.arctan2(np.linalg.norm(axis), np.trace(rotation) - 1.0)))
 
 
 def _twist(rotation: F64, axis: F64) -> float:
-    """Angle, radians, by which `rotation` turns about the unit `axis`: the twist of its swing-twist decomposition."""
+    """Return the angle, radians, by which `rotation` turns about the unit `axis`: the twist in swing-twist form."""
     vector = np.array(
         [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
     )

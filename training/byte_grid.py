@@ -1,11 +1,11 @@
-"""Training with the roundings of the bundle: weights and activations of a network on the grid of its bytes.
+"""Training with the bundle's rounding: weights and activations of a network lie on the grid of its bytes.
 
-Rule: the grid is the quantiser's own, measured once, when the rounding begins; gradients go through a rounding as if it
-were none, and end where a value is cut off (Bengio et al., Estimating or propagating gradients, 2013). What is exported
-at last is measured anew.
+Rule: the grid is the quantiser's own, measured once, when the rounding begins. Gradients pass a rounding unchanged and
+stop where a value is clipped (Bengio et al., Estimating or propagating gradients, 2013). The final export measures the
+ranges anew.
 
-Batch norms are folded into the convolutions before them when an avatar is written, so a weight is rounded as it will be
-then, times the scale of its norm, whose statistics must stay. Biases are left as they are: their steps are far finer.
+The export folds each batch norm into the convolution before it. A weight is therefore rounded in its folded form, times
+the scale of its norm, whose statistics must not change. Biases are not rounded: their steps are far finer.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from trilane.training.quantising.power_of_two_scales import WEIGHT_TOP
 from trilane.training.quantising.quantise import ByteRanges
 from trilane.unet_tables import DECODER
 
-#: Largest integer weight, and the greatest integer of an activation.
+#: Largest integer weight, and the largest integer of an activation.
 TOP, BYTE = WEIGHT_TOP[True], 255
-#: Modules of the two heads, which are exported as one, by the tensor that stands for both.
+#: Modules of the two heads, by the tensor that stands for both: the export joins the heads.
 HEADS = {"/Relu_output_0": ("colour.2", "mask.2"), "/second/Conv_output_0": ("colour.3", "mask.3")}
-#: Levels of the decoder, by the tensor that each reads: what is joined is cut off once more.
+#: Levels of the decoder, by the joined tensor that each reads, which is clipped once more.
 JOINED = {f"/Concat{f'_{level}' if level else ''}_output_0": f"levels.{level}" for level in range(len(DECODER))}
 NAMED = {INPUT: (INPUT,), **HEADS, **{tensor: (level,) for tensor, level in JOINED.items()}}
 
 
 class ByteGrid:
-    """The grid of `network`, and the roundings on it, which begin when `active` is set.
+    """The byte grid of `network`; rounding begins when `active` is set.
 
-    `ends` (K,2): of each place where bytes are stored, the real values of bytes 0 and 255; all 0 until measured.
+    `ends` (K,2): the real values of bytes 0 and 255 at each place that stores bytes; all 0 until measured.
     `alike` (1,): whether weights are even multiples of powers of two.
     """
 
@@ -54,18 +54,18 @@ class ByteGrid:
         return bool(self.ends.any())
 
     def measure(self, ranges: ByteRanges) -> None:
-        """Take the grid from the `ranges` that the network's export was given."""
+        """Take the grid from `ranges`, which the network's export used."""
         by_place = {place: ends for name, ends in ranges.ends.items() for place in _modules_of(name)}
         self.ends.copy_(torch.tensor([by_place[place] for place in self.places]))
         self.alike.fill_(ranges.alike)
 
     def painted(self, network: UNet, x: Tensor) -> Tensor:
-        """`network` of `x`, with rounded weights; activations are rounded by the hooks."""
+        """Return the output of `network` for `x`, with rounded weights; hooks round the activations."""
         output: Tensor = functional_call(network, self.weights(network), (x,))
         return output
 
     def weights(self, network: UNet) -> dict[str, Tensor]:
-        """The rounded weights of all convolutions, by name."""
+        """Return the rounded weights of all convolutions, by name."""
         return {
             f"{name}.weight": _rounded_weight(conv.weight, _folded_scale(conv, norm), bool(self.alike))
             for name, conv, norm in convolutions(network)
@@ -82,8 +82,9 @@ class ByteGrid:
 
 
 def rounded_weights(folded: Tensor, alike: bool) -> Tensor:
-    """`folded` (O,I,h,w) as the bundle has it: whole multiples of a scale for each O, which is a power of two and the
-    multiples even where runtimes round `alike`.
+    """Round `folded` (O,I,h,w) as the bundle does: to whole multiples of one scale for each output channel.
+
+    Where runtimes round `alike`, the scale is a power of two and the multiples are even.
     """
     largest = folded.abs().amax(dim=(1, 2, 3), keepdim=True).clamp(min=1e-30)
     unit = 2 * torch.exp2(torch.ceil(torch.log2(largest / (TOP + 0.99)))) if alike else largest / TOP
@@ -91,7 +92,7 @@ def rounded_weights(folded: Tensor, alike: bool) -> Tensor:
 
 
 def _rounded_weight(weight: Tensor, scale: Tensor, alike: bool) -> Tensor:
-    """`weight` (O,I,h,w), which is folded with `scale` (O,) of a norm, so that the folded one is on the grid."""
+    """Round `weight` (O,I,h,w) so that its product with the norm's `scale` (O,), its folded form, is on the grid."""
     with torch.no_grad():
         by_channel = scale[:, None, None, None]
         change = rounded_weights(weight * by_channel, alike) / by_channel - weight
@@ -106,7 +107,7 @@ def _folded_scale(conv: nn.Conv2d, norm: nn.BatchNorm2d | None) -> Tensor:
 
 
 def convolutions(network: UNet) -> Iterator[tuple[str, nn.Conv2d, nn.BatchNorm2d | None]]:
-    """Each convolution with its name and the norm behind it, which always is the next module."""
+    """Yield each convolution with its name and the norm behind it, which always is the next module."""
     named = list(network.named_modules())
     for (name, module), (_, after) in zip(named, [*named[1:], ("", None)], strict=True):
         if isinstance(module, nn.Conv2d):
@@ -114,7 +115,10 @@ def convolutions(network: UNet) -> Iterator[tuple[str, nn.Conv2d, nn.BatchNorm2d
 
 
 def _places(network: UNet) -> Iterator[str]:
-    """Where bytes are stored: the input, joined tensors, rectified outputs, other norms' outputs, the heads' ends."""
+    """Yield the places that store bytes.
+
+    These are the input, joined tensors, rectified outputs, other norms' outputs and the heads' ends.
+    """
     yield INPUT
     yield from list(JOINED.values())[: len(DECODER) - (not network.input_skip)]
     ends = HEADS["/second/Conv_output_0"]
@@ -127,7 +131,7 @@ def _places(network: UNet) -> Iterator[str]:
 
 
 def _modules_of(tensor: str) -> tuple[str, ...]:
-    """The places that the exported `tensor` is stored at, by the exporter's names: `/a/b.0/b.0.1/Conv_output_0`."""
+    """Return the places that store the exported `tensor`, by the exporter's names: `/a/b.0/b.0.1/Conv_output_0`."""
     if tensor in NAMED:
         return NAMED[tensor]
     name, operator = module_of(tensor), tensor.rpartition("/")[2]
@@ -138,7 +142,7 @@ def _modules_of(tensor: str) -> tuple[str, ...]:
 
 
 def module_of(exported: str) -> str:
-    """The module of the `exported` operator or tensor: `a.b.0.1` of `/a/b.0/b.0.1/Conv`."""
+    """Return the module of an `exported` operator or tensor: `a.b.0.1` for `/a/b.0/b.0.1/Conv`."""
     path: list[str] = []
     for scope in exported.strip("/").split("/")[:-1]:
         if path and scope.startswith(f"{path[-1]}."):

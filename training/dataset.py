@@ -1,6 +1,6 @@
-"""The data set: which samples an avatar is trained and evaluated on, rendered to disk by several processes.
+"""The data set: the samples that an avatar is trained and evaluated on, rendered to disk by several processes.
 
-Samples come from the synthetic person or from a capture; what follows is the same for both.
+Samples come from the synthetic person or from a capture; everything after that is the same for both.
 
 Rule: validation poses come from motions that no training sample uses; a sample depends only on its seed.
 """
@@ -31,12 +31,12 @@ TRAINING_SHARE = {"far": 0.16, "full_body": 0.34, "upper_body": 0.22, "face": 0.
 SIZES = {"256": 0.85, "128": 0.15}
 #: Tensor size of validation samples.
 VALIDATION_SIZE = "256"
-#: Samples that a process renders at a time.
+#: Number of samples that a process renders as one part.
 PART = 50
 
 
 def motion_poses(motions: Sequence[Motion]) -> PoseSource:
-    """A source of poses: each is taken at a random time of one of `motions`, drawn at random."""
+    """Return a source of poses that takes each one at a random time of a random one of `motions`."""
 
     def draw(rng: np.random.Generator) -> F64:
         motion = motions[int(rng.integers(len(motions)))]
@@ -46,9 +46,10 @@ def motion_poses(motions: Sequence[Motion]) -> PoseSource:
 
 
 class Planned(Protocol):
-    """A sample that was planned: of the synthetic person, or of a capture.
+    """A sample that was planned, of the synthetic person or of a capture.
 
-    `crop`: whose shape is the tensor's. `band`: its index. `picture`: the number of the frame that it is cut from.
+    `crop`: crop whose shape is the tensor's. `band`: index of the band. `picture`: number of the frame that it is cut
+    from.
     """
 
     @property
@@ -62,19 +63,19 @@ class Planned(Protocol):
 
 
 class SampleSource(Protocol[One]):
-    """What samples come from; each process that renders opens one."""
+    """Something that plans and renders samples; each rendering process opens one."""
 
     def training_sample(self, seed: Sequence[int], band: str, size: str) -> One:
-        """The sample of `seed`, in `band` and of tensor size `size`."""
+        """Plan the sample of `seed`, in `band` and of tensor size `size`."""
 
     def render(self, sample: One) -> tuple[F32, U8]:
-        """The UV image (h,w,3) and the ground truth (h,w,4) of `sample`."""
+        """Return the UV image (h,w,3) and the ground truth (h,w,4) of `sample`."""
 
 
 def clothed_source(body: Path, name: str, offsets: F32 | None) -> SampleRenderer:
-    """The default source: the body in the file `body`, in the look `name`, drawn with `offsets` (V,3), on one thread.
+    """Open the default source: the body in the file `body`, in the look `name`, on one thread.
 
-    Raises BadInputError.
+    The body is drawn with `offsets` (V,3). Raises BadInputError.
     """
     look = look_named(name)
     shaped = load_body(body).shape(look.betas)
@@ -82,11 +83,11 @@ def clothed_source(body: Path, name: str, offsets: F32 | None) -> SampleRenderer
 
 
 def plan_training(source: SampleSource[One], count: int, seed: int, track: Callable[[Any], Any] = iter) -> list[One]:
-    """Samples in random bands and sizes.
+    """Plan samples in random bands and sizes.
 
     `source`: plans each sample.
-    `count`: how many.
-    `seed`: of all random numbers.
+    `count`: number of samples.
+    `seed`: seed of all random numbers.
     `track`: wraps the list of samples to show progress.
     """
     rng = np.random.default_rng((seed, 0))
@@ -101,13 +102,13 @@ def plan_training(source: SampleSource[One], count: int, seed: int, track: Calla
 def plan_validation(
     renderer: SampleRenderer, per_band: int, seed: int, motions: Sequence[Motion], size: str = VALIDATION_SIZE
 ) -> list[Sample]:
-    """Samples for validation, all of one tensor size.
+    """Plan samples for validation, all of one tensor size.
 
     `renderer`: plans each sample.
-    `per_band`: samples of each band.
-    `seed`: of all random numbers.
-    `motions`: where the poses come from; no training sample uses them.
-    `size`: the tensor size, as `shape_buckets` takes it.
+    `per_band`: number of samples in each band.
+    `seed`: seed of all random numbers.
+    `motions`: source of the poses; no training sample uses them.
+    `size`: tensor size, as `shape_buckets` takes it.
     """
     source = motion_poses(motions)
     return [
@@ -124,12 +125,12 @@ def write_dataset(
     processes: int,
     track: Callable[[Any], Any] = iter,
 ) -> None:
-    """Render samples to disk, grouped by tensor shape, those of a frame after each other.
+    """Render samples to disk, grouped by tensor shape; samples of the same frame follow each other.
 
-    `source`: opens what renders them in each process; it is sent there.
-    `samples`: what to render.
-    `folder`: where the arrays are written, see `sample_files`.
-    `processes`: how many processes render.
+    `source`: opens the renderer in each process; it is sent there.
+    `samples`: samples to render.
+    `folder`: folder of the arrays, see `sample_files`.
+    `processes`: number of rendering processes.
     `track`: wraps the list of parts to show progress.
     """
     by_shape: dict[Shape, list[Planned]] = {}

@@ -19,21 +19,23 @@ from trilane.training.surface import BodyArrays
 
 COLOURS = 3
 OPAQUE = 250
-#: At most this many samples of one shape are read, and none with fewer pixels: those span too many texels.
+#: Most samples of one shape that are read, and fewest pixels of a sample: smaller ones span too many texels.
 MOST_SAMPLES = 250
 LEAST_PIXELS = 200 * 200
-#: A pixel that spans more than this share of the texture crosses a UV seam.
+#: A pixel that spans a larger share of the texture than this crosses a UV seam.
 LARGEST_SPAN = 0.03
 LEAST_WEIGHT = 1e-4
 
 
 def first_texture(body: BodyArrays, groups: list[ShapeGroup], side: int, channels: int) -> F32:
-    """(side, side, channels) in -1..1: three channels of colour, then eigenfunctions of the body's Laplacian.
+    """Return the first texture (side, side, channels) in -1..1: three colour channels, then smooth fields.
 
-    `body`: the body at rest.
-    `groups`: the training samples.
-    `side`: of the texture, texels.
-    `channels`: of the texture, more than three.
+    The fields are eigenfunctions of the body's Laplacian.
+
+    `body`: body at rest.
+    `groups`: training samples.
+    `side`: side of the texture in texels.
+    `channels`: channels of the texture, more than three.
     """
     fields = eigenfunctions(body.vertices, body.faces, channels - COLOURS)
     image, known = lay_out(fields, body.faces, body.uv, body.uv_faces, side)
@@ -43,13 +45,13 @@ def first_texture(body: BodyArrays, groups: list[ShapeGroup], side: int, channel
 
 
 def mean_colours(groups: list[ShapeGroup], side: int, body: BodyArrays) -> NDArray[np.float64]:
-    """(side, side, 3) in 0..1: the mean colour of the pixels at which each texel is drawn.
+    """Return the mean colour (side, side, 3) in 0..1 of the pixels that show each texel.
 
-    Texels beside seen ones, which lie between the pixels of a view, have their mean; all others are filled along the
-    surface of `body`.
+    Texels beside seen ones, which lie between the pixels of a view, take the mean of the seen ones. All others are
+    filled along the surface of `body`.
 
-    Clothes stand off the body, so in every view a texel shows another point of them. The mean is still sharp, because
-    near views and views along the surface's normal have the largest weights.
+    Clothes stand off the body, so a texel shows another point of them in every view. The mean is still sharp: near
+    views and views along the surface's normal have the largest weights.
     """
     total, count = np.zeros((side * side, COLOURS)), np.zeros(side * side)
     for group in groups:
@@ -72,10 +74,10 @@ def mean_colours(groups: list[ShapeGroup], side: int, body: BodyArrays) -> NDArr
 
 
 def head_on(uv: NDArray[np.float64], covered: NDArray[np.bool_], side: int) -> NDArray[np.float64]:
-    """Weight (h,w) of each pixel of a UV image (h,w,2): 1 where the surface is seen along its normal and large.
+    """Return the weight (h,w) of each pixel of a UV image (h,w,2): 1 where the surface is large and seen head-on.
 
-    With s >= t the singular values of the derivative of UV by pixel: (t / s)^3, times (1 / (side s))^2 where a pixel
-    spans more than a texel. 0 at the outline, where there is no derivative, and across seams.
+    Let s >= t be the singular values of the derivative of UV by pixel. The weight is (t / s)^3, times (1 / (side s))^2
+    where a pixel spans more than a texel. It is 0 across seams and at the outline, where there is no derivative.
     """
     across, down = np.zeros_like(uv), np.zeros_like(uv)
     across[:, 1:-1] = (uv[:, 2:] - uv[:, :-2]) / 2
@@ -92,7 +94,7 @@ def head_on(uv: NDArray[np.float64], covered: NDArray[np.bool_], side: int) -> N
 
 
 def used_texels(body: BodyArrays, side: int, margin: int) -> NDArray[np.bool_]:
-    """(side, side): texels that a bilinear read of the body's texture can use, and `margin` more round them."""
+    """Return the texels (side, side) that a bilinear read of the body's texture can use, grown by `margin` texels."""
     _, known = lay_out(np.zeros((len(body.vertices), 1)), body.faces, body.uv, body.uv_faces, side)
     for _ in range(margin):
         grown = known.copy()
@@ -111,11 +113,10 @@ def used_texels(body: BodyArrays, side: int, margin: int) -> NDArray[np.bool_]:
 
 
 def eigenfunctions(vertices: F64, faces: Ints, count: int) -> F64:
-    """The `count` smoothest non-constant eigenfunctions (V,count) of the cotangent Laplacian, each scaled to -1..1.
+    """Return the `count` smoothest non-constant eigenfunctions (V,count) of the cotangent Laplacian, in -1..1 each.
 
     `vertices` (V,3), `faces` (F,3). Pinkall and Polthier, Computing discrete minimal surfaces and their conjugates,
-    1993. Vertices that are not connected to the largest part of the mesh (eyeballs) take the values of its nearest
-    vertex.
+    1993. Vertices outside the mesh's largest connected part (eyeballs) take the values of that part's nearest vertex.
     """
     laplacian, mass = cotangent_laplacian(vertices, faces)
     part = _largest_part(laplacian)
@@ -133,7 +134,7 @@ def eigenfunctions(vertices: F64, faces: Ints, count: int) -> F64:
 
 
 def cotangent_laplacian(vertices: F64, faces: Ints) -> tuple[Any, F64]:
-    """The cotangent Laplacian (V,V), sparse, and each vertex's share of the area (V,)."""
+    """Return the sparse cotangent Laplacian (V,V), and each vertex's share of the area (V,)."""
     count = len(vertices)
     rows, columns, values = [], [], []
     mass = np.zeros(count)
@@ -158,17 +159,17 @@ def _largest_part(laplacian: Any) -> NDArray[np.int64]:
 
 # Lays values of a mesh's vertices out as an image in texture space.
 #
-# Rule: a texel that a face covers is interpolated from the face's corners; gaps between faces are filled on request.
+# Rule: a texel under a face is interpolated from the face's corners; gaps between faces are filled on request.
 
 
 def lay_out(values: F64, faces: Ints, uv: F64, uv_faces: Ints, side: int) -> tuple[F64, NDArray[np.bool_]]:
-    """An image (side,side,C) of the vertices' values, and which texels (side,side) a face covers; others are 0.
+    """Return an image (side,side,C) of the vertices' values, 0 off all faces, and the texels (side,side) on a face.
 
-    `values`: (V,C).
-    `faces`: (F,3) indices of `values`.
-    `uv`: (T,2).
-    `uv_faces`: (F,3) indices of `uv`, per corner.
-    `side`: of the image, texels.
+    `values`: values of the vertices, (V,C).
+    `faces`: indices of `values`, (F,3).
+    `uv`: texture coordinates, (T,2).
+    `uv_faces`: indices of `uv`, (F,3), per corner.
+    `side`: side of the image in texels.
     """
     image = np.zeros((side, side, values.shape[1]))
     covered = np.zeros((side, side), bool)
@@ -189,13 +190,13 @@ def lay_out(values: F64, faces: Ints, uv: F64, uv_faces: Ints, side: int) -> tup
 
 
 def fill_gaps(image: NDArray[Any], known: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """`image` (S,S,C) with the texels that are not `known` (S,S) filled from those round them (push and pull)."""
+    """Fill every texel of `image` (S,S,C) that is not `known` (S,S) from its surroundings (push and pull)."""
     weight = known.astype(np.float64)[..., None]
     return _pulled(image * weight, weight)
 
 
 def fill_beside(image: NDArray[Any], known: NDArray[np.bool_]) -> tuple[F64, NDArray[np.bool_]]:
-    """`image` (S,S,C) where texels beside those that are `known` (S,S) have their mean; and which are known now."""
+    """Fill texels of `image` (S,S,C) beside `known` ones (S,S) with their mean, and return what is known then too."""
     total = np.sum(_round_each(image * known[..., None]), axis=0)
     count = np.sum(_round_each(known.astype(np.float64)[..., None]), axis=0)
     near = np.asarray(count[..., 0] > 0)
@@ -203,12 +204,12 @@ def fill_beside(image: NDArray[Any], known: NDArray[np.bool_]) -> tuple[F64, NDA
 
 
 def grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """`mask` (S,S) and the eight texels round each of its own."""
+    """Return `mask` (S,S) with the eight neighbours of each of its texels added."""
     return np.asarray(np.any(_round_each(mask[..., None]), axis=0)[..., 0])
 
 
 def _round_each(image: NDArray[Any]) -> list[NDArray[Any]]:
-    """Of `image` (S,S,C): nine images, in which each texel has its own value or that of one beside it; 0 beyond."""
+    """Return nine images: `image` (S,S,C) and its shifts by one texel in the eight directions, 0 beyond the edge."""
     side = image.shape[0]
     padded = np.pad(image, ((1, 1), (1, 1), (0, 0)))
     return [padded[y : y + side, x : x + side] for y in range(3) for x in range(3)]
@@ -233,18 +234,18 @@ def _barycentric(corner: F64, x: NDArray[Any], y: NDArray[Any]) -> F64 | None:
     return np.stack([1 - b - c, b, c], axis=-1)
 
 
-# Fills what is not known on a surface from what is known round it, along the surface and so across its UV seams.
+# Fills unknown places of a surface from known ones around them, along the surface and so across its UV seams.
 #
 # Rule: filled values are harmonic: each is the weighted mean of its neighbours on the mesh, so none lies beyond the
-# known ones. What is known stays as it is.
+# known values. Known values stay as they are.
 
 
 def harmonic_fill(values: F64, known: Mask, vertices: F64, faces: Ints) -> F64:
-    """`values` (V,C) of a mesh with those of vertices that are not `known` (V,) solved for.
+    """Return `values` (V,C) of a mesh with the vertices that are not `known` (V,) filled by Laplace's equation.
 
-    The solution of Laplace's equation with the known values as boundary, for the cotangent Laplacian (Pinkall and
-    Polthier 1993) of `vertices` (V,3), `faces` (F,3). Parts of the mesh without any known vertex take the values of the
-    known vertex that is nearest in space. Unchanged when no vertex is known.
+    The known values are the boundary; the operator is the cotangent Laplacian (Pinkall and Polthier 1993) of `vertices`
+    (V,3), `faces` (F,3). A part of the mesh without a known vertex takes the values of the known vertex nearest in
+    space. Nothing changes when no vertex is known.
     """
     filled = np.array(values, np.float64)
     if not known.any():
@@ -264,10 +265,10 @@ def harmonic_fill(values: F64, known: Mask, vertices: F64, faces: Ints) -> F64:
 
 
 def fill_along_surface(image: NDArray[np.floating], unseen: Mask, body: BodyArrays) -> F64:
-    """`image` (S,S,C) with the texels `unseen` (S,S) filled from the others that the body uses.
+    """Return `image` (S,S,C) with the texels `unseen` (S,S) filled from the other texels that the body uses.
 
-    Those that a face covers are filled along the body's surface; those beside the faces, which only bilinear reads at
-    seams use, from the texels round them.
+    Texels under a face are filled along the body's surface. Texels beside the faces, which only bilinear reads at seams
+    use, are filled from the texels around them.
     """
     side = len(image)
     values, known = _at_vertices(np.asarray(image, np.float64), ~unseen, body)
@@ -279,10 +280,10 @@ def fill_along_surface(image: NDArray[np.floating], unseen: Mask, body: BodyArra
 
 
 def _at_vertices(image: F64, seen: Mask, body: BodyArrays) -> tuple[F64, Mask]:
-    """The values (V,C) of the `seen` texels of `image` at the body's vertices, and which vertices (V,) have one.
+    """Return the values (V,C) of `image` at the body's vertices, and which vertices (V,) have one.
 
-    Each of a vertex's places in the texture is read bilinearly, from seen texels alone; a vertex on a seam has the mean
-    of its places.
+    Only `seen` texels are read, bilinearly, at each of a vertex's places in the texture. A vertex on a seam takes the
+    mean of its places.
     """
     side, count = len(image), len(body.vertices)
     pairs = np.unique(np.column_stack([body.faces.reshape(-1), body.uv_faces.reshape(-1)]), axis=0)

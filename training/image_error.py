@@ -1,11 +1,11 @@
-"""Error of an avatar's picture against the ground truth: PSNR, SSIM and IoU of it, and the error of its alpha.
+"""Error of an avatar's picture against the ground truth: PSNR, SSIM and IoU of the picture, and the error of its alpha.
 
-Rule: pictures are compared before each kind of background in turn, inside the box of the true mask, because before one
-colour a person who lets that colour through has no error; beside that PSNR, which counts the background in the box too,
-stands that of the true mask's pixels alone. Decibels and SSIM are means over the backgrounds.
+Rule: pictures are compared before each kind of background in turn, inside the box of the true mask. Before a single
+colour, a person who lets that colour through would have no error. That PSNR also counts the background inside the box,
+so a second one counts the true mask's pixels alone. Decibels and SSIM are means over the backgrounds.
 
-Alpha is counted in three regions. The edge is whatever lies within `EDGE_PX` of a change of the true alpha: there an
-outline that is wrong by a pixel decides, which IoU says too. Inside and outside are the rest, where alpha should be 1
+Alpha is counted in three regions. The edge is everything within `EDGE_PX` of a change of the true alpha: an outline
+that is wrong by a pixel decides there, and IoU shows that too. Inside and outside are the rest, where alpha should be 1
 and 0.
 """
 
@@ -27,9 +27,9 @@ from trilane.training.backgrounds import KINDS, background
 HALF, OPAQUE = 128, 255
 SSIM_WINDOW = 7
 EDGE_PX = 2
-#: A pixel inside whose alpha is less lets more than a tenth of the background through.
+#: A pixel inside whose alpha is below this lets more than a tenth of the background through.
 SOLID = 0.9
-#: The least mean square that a PSNR is computed of, which makes 100 dB the most.
+#: Lower bound of the mean square, which makes 100 dB the highest PSNR.
 LEAST_SQUARE = 1e-10
 
 
@@ -37,10 +37,11 @@ LEAST_SQUARE = 1e-10
 class ImageError:
     """How far a picture is from the truth.
 
-    `psnr_db`, `ssim`: inside the box of the true mask. `body_psnr_db`: in dB, over the true mask's pixels alone.
-    `by_background`: `psnr_db` before each kind. `background`: share of the box that the mask does not cover. `iou`: of
-    the masks, over the whole tensor. `alpha_inside`, `alpha_edge`, `alpha_outside`: mean size of alpha's error there.
-    `see_through`: share of the inside whose alpha is less than `SOLID`. Both of the inside are 0 where there is none.
+    `psnr_db`, `ssim`: figures inside the box of the true mask. `body_psnr_db`: PSNR in dB over the true mask's pixels
+    alone. `by_background`: `psnr_db` before each kind of background. `background`: share of the box that the mask does
+    not cover. `iou`: intersection over union of the masks, over the whole tensor. `alpha_inside`, `alpha_edge`,
+    `alpha_outside`: mean absolute error of alpha in that region. `see_through`: share of the inside whose alpha is less
+    than `SOLID`. `alpha_inside` and `see_through` are 0 where there is no inside.
     """
 
     psnr_db: float
@@ -56,7 +57,7 @@ class ImageError:
 
 
 def image_error(picture: U8, truth: U8) -> ImageError | None:
-    """Error of `picture` against `truth`, both (h,w,4) with straight alpha; None when the truth shows no person."""
+    """Return the error of `picture` against `truth`, both (h,w,4), straight alpha; None when `truth` shows nobody."""
     mask, true_mask = picture[..., 3] >= HALF, truth[..., 3] >= HALF
     if not true_mask.any():
         return None
@@ -82,13 +83,13 @@ def image_error(picture: U8, truth: U8) -> ImageError | None:
 
 
 def over(image: U8, behind: NDArray[np.floating]) -> F64:
-    """`image` (h,w,4) uint8 over `behind` (h,w,3) in 0..1: (h,w,3) in 0..1."""
+    """Composite `image` (h,w,4) uint8 over `behind` (h,w,3) in 0..1 and return (h,w,3) in 0..1."""
     alpha = image[..., 3:] / OPAQUE
     return np.asarray(image[..., :3] / OPAQUE * alpha + behind * (1 - alpha))
 
 
 def regions(alpha: U8) -> tuple[Mask, Mask, Mask]:
-    """Inside, edge and outside (h,w) of a true `alpha` (h,w); what lies beyond the picture is as its last pixels."""
+    """Return inside, edge and outside (h,w) of a true `alpha` (h,w); border pixels are repeated beyond the picture."""
     near = [np.pad(alpha, EDGE_PX, mode="edge")]
     for axis in (0, 1):
         size = alpha.shape[axis]
@@ -100,7 +101,7 @@ def regions(alpha: U8) -> tuple[Mask, Mask, Mask]:
 
 
 def _behind(truth: U8) -> Iterator[tuple[str, NDArray[np.floating]]]:
-    """A background of each kind, which `truth` alone decides: all painters stand before the same ones."""
+    """Yield a background of each kind. `truth` alone decides them, so all painters stand before the same ones."""
     rng = np.random.default_rng(zlib.crc32(truth.tobytes()))
     for kind in KINDS:
         yield kind, background(kind, (truth.shape[0], truth.shape[1]), rng)
@@ -118,13 +119,13 @@ def _mean(values: NDArray[np.generic]) -> float:
 
 
 def _psnr_db(square: F64) -> float:
-    """PSNR in dB of values in 0..1 whose differences have the squares `square`."""
+    """Return the PSNR in dB of values in 0..1 from the squares of their differences, `square`."""
     return -10 * float(np.log10(max(float(square.mean()), LEAST_SQUARE)))
 
 
-# What the errors of many samples come to, as the manifest has it.
+# Summary of the errors of many samples, as the manifest holds it.
 #
-# Rule: beside every mean stands the worst sample, by seed and number, so that it can be drawn and looked at again.
+# Rule: the worst sample stands beside every mean, by seed and number, so that it can be drawn and inspected again.
 
 DB_DIGITS, SHARE_DIGITS = 2, 4
 #: Fields of `ImageError` whose mean says how good an avatar is.
@@ -136,9 +137,9 @@ MEANS = (
 
 @dataclass(frozen=True)
 class SampleError:
-    """The error of one sample, and how it is found again.
+    """The error of one sample, and what identifies the sample.
 
-    `seed`: of all samples of its kind. `number`: among them. `band`: its name.
+    `seed`: seed of the sample's set. `number`: number of the sample in its set. `band`: name of its band.
     """
 
     seed: int
@@ -148,12 +149,12 @@ class SampleError:
 
 
 def summary(errors: Sequence[SampleError]) -> dict[str, Any]:
-    """What `errors`, at least one, come to; decibels are means over pictures.
+    """Return the summary of `errors`, at least one; decibels are means over pictures.
 
-    Keys: `psnr_db_by_band`, `body_psnr_db_by_band`, `see_through_by_band`, `iou_by_band`; `psnr_db_by_background`;
-    those of `MEANS`: means of the fields of `ImageError`; `least_psnr_db`, `least_body_psnr_db`; `worst`, the sample of
-    the least PSNR: `seed`, `number`, `band`, `psnr_db`, `body_psnr_db`; `by_seed`: `psnr_db`, `body_psnr_db`,
-    `least_psnr_db` of each seed's samples; `samples`, how many.
+    Keys: `psnr_db_by_band`, `body_psnr_db_by_band`, `see_through_by_band`, `iou_by_band`; `psnr_db_by_background`; the
+    names in `MEANS`, which are means of the fields of `ImageError`; `least_psnr_db`, `least_body_psnr_db`; `worst`, the
+    sample of the least PSNR: `seed`, `number`, `band`, `psnr_db`, `body_psnr_db`; `by_seed`: `psnr_db`, `body_psnr_db`,
+    `least_psnr_db` of each seed's samples; `samples`: number of samples.
     """
     bands = [band for band in BANDS if any(sample.band == band for sample in errors)]
     worst = min(errors, key=lambda sample: sample.error.psnr_db)

@@ -1,6 +1,6 @@
 """From trained weights to an avatar's bundle: quantise network and texture, write the files.
 
-Rule: what is written was never validated; `validate` measures the files themselves.
+Rule: this module validates nothing that it writes; `validate` measures the files themselves.
 """
 
 from __future__ import annotations
@@ -42,16 +42,18 @@ CALIBRATION_SHAPE = (320, 192)
 STORED_SHAPE = (256, 256)
 CALIBRATION_FRAMES = 96
 METHOD = "minmax"
-#: What a person can quantise anew; 20 inputs of the calibration's shape are 40 MB.
+#: Files from which a person can quantise the avatar anew; 20 inputs of the calibration's shape take 40 MB.
 FLOAT_NETWORK, FRAMES, WRITTEN_FRAMES = "network.onnx", "frames.npy", 20
 TEXEL_MARGIN = 3
 
 
 @dataclass(frozen=True)
 class QuantisedAvatar:
-    """`network`: in integers, with its `norm`. `texture` (S,S,C) int8 with `scale` (C,) float32.
+    """An avatar in integers.
 
-    `levels`: smaller ones of the texture, as `texture_levels` packs them, or None.
+    `network`: quantised network, with its `norm`. `texture`: (S,S,C) int8. `scale`: (C,) float32, scale of each
+    channel.
+    `levels`: smaller levels of the texture, as `pack_levels` packs them, or None.
     """
 
     network: Quantised
@@ -64,10 +66,10 @@ class QuantisedAvatar:
 def byte_texture(
     avatar: TrainableAvatar, shaped: ShapedBody, unseen: Mask | None = None
 ) -> tuple[NDArray[np.int8], NDArray[np.float32], NDArray[np.int8] | None]:
-    """The texture as int8 (S,S,C), the scale (C,) of each channel, and the packed smaller levels, if any.
+    """Return the texture (S,S,C) int8, the scale (C,) of each channel, and the packed smaller levels, if any.
 
-    Texels that the body does not use are 0. Those of the body that are `unseen`, an image of any side, were never
-    trained: they are filled from those that were.
+    Texels that the body does not use are 0. `unseen`, an image of any side, marks texels of the body that were never
+    trained; they are filled from trained ones.
     """
     body = body_arrays(shaped)
     images = [_finished(level.detach()[0].permute(1, 2, 0).numpy(), unseen, body) for level in avatar.texture.levels()]
@@ -78,7 +80,7 @@ def byte_texture(
 
 
 def _finished(image: NDArray[Any], unseen: Mask | None, body: BodyArrays) -> NDArray[Any]:
-    """`image` (S,S,C) without holes where texels are `unseen`, and 0 where the body uses none."""
+    """Return `image` (S,S,C) with `unseen` texels filled, and 0 where the body uses none."""
     if unseen is not None and unseen.any():
         image = _without_holes(image, unseen, body)
     finished: NDArray[Any] = image * used_texels(body, image.shape[0], TEXEL_MARGIN)[..., None]
@@ -86,7 +88,7 @@ def _finished(image: NDArray[Any], unseen: Mask | None, body: BodyArrays) -> NDA
 
 
 def _without_holes(image: NDArray[Any], unseen: Mask, body: BodyArrays) -> F64:
-    """`image` (S,S,C) with its `unseen` texels filled, and those beside the body's faces that lie next to them."""
+    """Fill the `unseen` texels of `image` (S,S,C), and those beside the body's faces that lie next to them."""
     side = image.shape[0]
     nearest = np.arange(side) * len(unseen) // side
     hole = margin = unseen[np.ix_(nearest, nearest)]
@@ -96,20 +98,21 @@ def _without_holes(image: NDArray[Any], unseen: Mask, body: BodyArrays) -> F64:
 
 
 def integer_network(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> Quantised:
-    """The network in integers, calibrated on training samples of one shape: that with most, where none is usual."""
+    """Return the network in integers, calibrated on samples of `CALIBRATION_SHAPE`, else of the commonest shape."""
     quantised = quantise(*_calibration(avatar, groups, seed, CALIBRATION_FRAMES), METHOD)
     return replace(quantised, network=reshaped(quantised.network, *STORED_SHAPE))
 
 
 def ranges_of(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> ByteRanges:
-    """The ranges that the tensors of `integer_network` would have."""
+    """Return the ranges that the tensors of `integer_network` would have."""
     return byte_ranges(*_calibration(avatar, groups, seed, CALIBRATION_FRAMES), METHOD)
 
 
 def write_float_network(folder: Path, avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> dict[str, str]:
-    """Write what `trilane avatar quantise` takes to `folder`: the float network, and inputs from training samples.
+    """Write the input of `trilane avatar quantise` to `folder`: the float network, and inputs from training samples.
 
-    The names of both files, by `float_network` and `frames`. Inputs are as those of `integer_network`, but fewer.
+    Returns the names of both files, by `float_network` and `frames`. The inputs are those of `integer_network`, but
+    fewer.
     """
     model, frames = _calibration(avatar, groups, seed, WRITTEN_FRAMES)
     files = {"float_network": folder / FLOAT_NETWORK, "frames": folder / FRAMES}
@@ -122,7 +125,7 @@ def write_float_network(folder: Path, avatar: TrainableAvatar, groups: list[Shap
 def _calibration(
     avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int, count: int
 ) -> tuple[onnx.ModelProto, list[NDArray[np.float32]]]:
-    """The float network of `avatar`, and at most `count` inputs of its shape."""
+    """Return the float network of `avatar`, and at most `count` inputs of its shape."""
     group = max(groups, key=lambda group: (group.shape == CALIBRATION_SHAPE, len(group)))
     chosen = np.random.default_rng(seed).permutation(len(group))[:count]
     return export_onnx(avatar.network, *group.shape), _inputs(avatar, group, np.sort(chosen))
@@ -131,12 +134,12 @@ def _calibration(
 def quantise_avatar(
     avatar: TrainableAvatar, shaped: ShapedBody, groups: list[ShapeGroup], seed: int, unseen: Mask | None = None
 ) -> QuantisedAvatar:
-    """Network and texture in integers.
+    """Quantise network and texture.
 
-    `avatar`: the trained weights.
-    `shaped`: the body, whose texels are stored.
+    `avatar`: trained weights.
+    `shaped`: body whose texels are stored.
     `groups`: training samples, from which calibration frames are chosen.
-    `seed`: of that choice.
+    `seed`: seed of that choice.
     `unseen`: texels of the body that no sample can show, see `byte_texture`.
     """
     texture, scale, levels = byte_texture(avatar, shaped, unseen)
@@ -154,11 +157,11 @@ def write_avatar(
 ) -> None:
     """Write the bundle.
 
-    `folder`: of the bundle.
-    `person`: whose it is.
-    `quantised`: network and texture.
-    `width`: of the network; 64 is full.
-    `provenance`: how the avatar was trained.
+    `folder`: folder of the bundle.
+    `person`: person whose avatar it is.
+    `quantised`: network and texture in integers.
+    `width`: width of the network; 64 is full.
+    `provenance`: facts about the training.
     `names`: `name` and `training_command` of the manifest.
     """
     manifest = Manifest(
@@ -175,7 +178,7 @@ def write_avatar(
 
 
 def _inputs(avatar: TrainableAvatar, group: ShapeGroup, index: NDArray[np.int64]) -> list[NDArray[np.float32]]:
-    """The network's inputs (H, W, C) for samples `index` of `group`."""
+    """Return the network's inputs (H, W, C) for samples `index` of `group`."""
     levels = [level.detach() for level in avatar.texture.levels()]
     frames = []
     for number in index:
@@ -185,44 +188,50 @@ def _inputs(avatar: TrainableAvatar, group: ShapeGroup, index: NDArray[np.int64]
     return frames
 
 
-# The rounding of an avatar to the bytes of its bundle while it is trained, and what is left of it at the end.
+# Rounds an avatar to the bytes of its bundle while it is trained, and keeps the rounded weights at the end.
 #
-# Rule: the grid is measured once, on a copy in the form in which the avatar is exported; at the end the float network
-# has the rounded weights, because those that they were rounded from paint a worse picture.
+# Rule: the grid is measured once, on a copy in the form in which the avatar is exported. At the end the float network
+# keeps the rounded weights: the weights before rounding paint a worse picture.
 
 
 def round_to_bytes(avatar: TrainableAvatar, grid: ByteGrid, groups: list[ShapeGroup], seed: int) -> None:
-    """Round `avatar` on `grid` from now on. `groups`, `seed`: as of `ranges_of`."""
+    """Round `avatar` on `grid` from now on.
+
+    `groups`, `seed`: as in `ranges_of`.
+    """
     if not grid.measured:
         grid.measure(ranges_of(copy.deepcopy(avatar).cpu(), groups, seed))
     grid.active = True
 
 
 def keep_rounded_weights(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> None:
-    """Put the weights of `avatar`, which was trained rounded, on the grid. `groups`, `seed`: as of `ranges_of`."""
+    """Replace the weights of `avatar`, which was trained with rounding, by those on the grid.
+
+    `groups`, `seed`: as in `ranges_of`.
+    """
     grid = ByteGrid(copy.deepcopy(avatar.network))
     grid.measure(ranges_of(copy.deepcopy(avatar).cpu(), groups, seed))
     avatar.network.load_state_dict(grid.weights(avatar.network), strict=False)
 
 
-# Inputs of a network to calibrate it on, drawn as the training draws its views, and others to look at the result.
+# Inputs of a network for its calibration, drawn as the training draws its views, and others to inspect the result.
 #
-# Rule: every kind of view that the training has, in its shares; what the result is looked at on comes from motions that
-# no training has. All are of the one tensor shape that networks are calibrated at.
+# Rule: calibration inputs have every kind of training view, in the training's shares. Inputs to inspect come from
+# motions that no training uses. All have the one tensor shape at which networks are calibrated.
 
 #: Seed of the views; the training of the default avatar had another one.
 SEED = 17
 
 
 def float_model(bundle: Bundle, weights: Any) -> onnx.ModelProto:
-    """The float network of file `weights`, of `bundle`, at the calibration's shape. Raises BadInputError."""
+    """Return the float network in file `weights`, for `bundle`, at the calibration's shape. Raises BadInputError."""
     entry = bundle.manifest.network
     untrained = UNet(entry.encoder, entry.norm, entry.width, entry.channels, input_skip=True)
     return export_onnx(load_network(untrained, weights), *CALIBRATION_SHAPE)
 
 
 def training_views(renderer: SampleRenderer, bundle: Bundle, views: int) -> list[F32]:
-    """`views` inputs (H,W,C), of random poses and views in the training's shares."""
+    """Return `views` inputs (H,W,C) in random poses, with views in the training's shares."""
     rng = np.random.default_rng((SEED, 0))
     bands, sizes = list(TRAINING_SHARE), list(SIZES)
 
@@ -235,7 +244,7 @@ def training_views(renderer: SampleRenderer, bundle: Bundle, views: int) -> list
 
 
 def held_out_views(renderer: SampleRenderer, bundle: Bundle, views: int) -> list[F32]:
-    """`views` inputs (H,W,C) of all bands in turn, in poses of a motion that no training has."""
+    """Return `views` inputs (H,W,C) of all bands in turn, in poses of a motion that no training uses."""
     poses = motion_poses(held_out_motions([BUILTIN_HELD_OUT]))
 
     def sample(number: int) -> Sample:
@@ -246,7 +255,7 @@ def held_out_views(renderer: SampleRenderer, bundle: Bundle, views: int) -> list
 
 
 def _tensors(renderer: SampleRenderer, bundle: Bundle, sample: Callable[[int], Sample], wanted: int) -> Iterator[F32]:
-    """Of samples 0, 1, 2, ... the first `wanted` that have the calibration's shape, as the network is given them."""
+    """Yield the network's inputs for the first `wanted` of samples 0, 1, 2, ... that have the calibration's shape."""
     levels = levels_of(bundle)
     found = (one for one in map(sample, count()) if one.crop.shape == CALIBRATION_SHAPE)
     for _, one in zip(range(wanted), found, strict=False):

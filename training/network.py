@@ -1,6 +1,6 @@
 """The avatar's network: an encoder, a decoder of five levels with skips, a colour head and a mask head.
 
-Rule: this is the only definition of the network that computes; every runtime runs a file exported from it.
+Rule: no other module defines a network that computes; every runtime runs a file exported from this one.
 """
 
 from __future__ import annotations
@@ -39,29 +39,33 @@ from trilane.unet_tables import (
 Norm = Callable[[int], nn.Module]
 Scale = Callable[[int], int]
 
-#: A strided 1x1 convolution of as many channels is trained as it is: a whole vector of floats.
+#: A strided 1x1 convolution of at least this many channels is trained unchanged: it fills a whole vector of floats.
 SAFE_CHANNELS = 16
 ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {"relu": nn.ReLU, "relu6": nn.ReLU6, "hardswish": nn.Hardswish}
 
 
 class Encoder(Protocol):
-    """`channels`: of the five features, from stride 2 to stride 32."""
+    """Turns a picture into five features.
+
+    `channels`: channels of the features, from stride 2 to stride 32.
+    """
 
     channels: tuple[int, ...]
 
     def __call__(self, x: Tensor) -> list[Tensor]:
-        """(N, C, H, W), sides multiples of 32 -> five features, finest first."""
+        """Turn (N, C, H, W), sides multiples of 32, into five features, finest first."""
 
 
 class Shortcut(nn.Conv2d):
     """A strided 1x1 convolution without bias.
 
-    In float32, oneDNN's backward pass of one with 8 channels or fewer, channels last, writes beyond its memory (seen
-    with PyTorch 2.13 under AVX-512, from 4 and 8 channels). While training, pixels are therefore left out before it.
+    While training with few channels, it picks the strided pixels before the convolution. oneDNN's float32 backward pass
+    of a strided one with 8 channels or fewer, channels last, writes beyond its memory. This was seen with PyTorch 2.13
+    under AVX-512, from 4 and 8 channels.
     """
 
     def __init__(self, c_in: int, c_out: int, stride: int) -> None:
-        """From `c_in` to `c_out` channels, at every `stride`-th pixel of each axis."""
+        """Build a shortcut from `c_in` to `c_out` channels that reads every `stride`-th pixel of each axis."""
         super().__init__(c_in, c_out, 1, stride, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -75,10 +79,10 @@ class ResidualBlock(nn.Module):
     """Two 3x3 convolutions, added to a shortcut, which is a strided 1x1 convolution where the shape changes."""
 
     def __init__(self, c_in: int, c_out: int, stride: int, norm: Norm) -> None:
-        """A block from `c_in` to `c_out` channels.
+        """Build a block.
 
         `c_in`, `c_out`: channels of its input and output.
-        `stride`: of its first convolution.
+        `stride`: stride of its first convolution.
         `norm`: makes a normalisation for a number of channels.
         """
         super().__init__()
@@ -146,10 +150,10 @@ class InvertedResidual(nn.Module):
     """1x1 expansion, depthwise convolution, optional squeeze, linear 1x1 projection, added where shapes agree."""
 
     def __init__(self, c_in: int, row: MobileBlock, scale: Scale, norm: Norm) -> None:
-        """The block of one row of the table.
+        """Build the block of one row of the table.
 
         `c_in`: channels of its input.
-        `row`: its kernel, channels, stride and activation.
+        `row`: kernel, channels, stride and activation of the block.
         `scale`: scales a channel count by the network's width.
         `norm`: makes a normalisation for a number of channels.
         """
@@ -178,13 +182,13 @@ class InvertedResidual(nn.Module):
 class MobileFeatures(nn.Module):
     """A 3x3 stride-2 stem, inverted residual blocks, a last 1x1 layer.
 
-    Features: the tensors that enter the strided blocks, and the last layer's output.
+    Its features are the tensors that enter the strided blocks, and the last layer's output.
     """
 
     def __init__(self, spec: MobileEncoder, c_in: int, scale: Scale, norm: Norm) -> None:
-        """The encoder of one table.
+        """Build the encoder of one table.
 
-        `spec`: the table.
+        `spec`: table of the encoder.
         `c_in`: channels of its input.
         `scale`: scales a channel count by the network's width.
         `norm`: makes a normalisation for a number of channels.
@@ -244,7 +248,7 @@ class NoNorm(nn.BatchNorm2d):
     """
 
     def train(self, mode: bool = True) -> Self:
-        """Stays in evaluation mode, in which the mean is 0 and the variance 1; `mode` changes nothing."""
+        """Stay in evaluation mode, in which the mean is 0 and the variance 1; `mode` changes nothing."""
         del mode
         super().train(False)
         return self
@@ -259,7 +263,10 @@ NORMS: dict[str, Callable[[int], nn.Module]] = {
 
 
 class UNet(nn.Module):
-    """(N, channels, H, W) float32 to (N, 4, H, W): straight colour and mask, each in 0..1. H, W: multiples of 32."""
+    """The whole network: (N, channels, H, W) float32 to (N, 4, H, W), straight colour and mask, each in 0..1.
+
+    H and W are multiples of 32.
+    """
 
     def __init__(
         self,
@@ -274,8 +281,9 @@ class UNet(nn.Module):
         `encoder`: a name of `ENCODERS`.
         `norm`: a name of `NORMS`.
         `width`: 64 is the full network; every channel count is scaled by `width` / 64 and rounded to a multiple of 4.
-        `channels`: of the input.
-        `input_skip`: the last level also reads the input, the only tensor of full resolution; the paper's does not.
+        `channels`: channels of the input.
+        `input_skip`: whether the last level also reads the input, the only tensor of full resolution; the paper's does
+        not.
         Raises BadInputError for an unknown encoder or norm, or a width or channel count out of range.
         """
         super().__init__()
@@ -304,7 +312,7 @@ class UNet(nn.Module):
         return torch.sigmoid(torch.cat((self.colour(x), self.mask(x)), dim=1))
 
     def features(self, x: Tensor) -> Tensor:
-        """The features (N, width, H, W) that both heads read."""
+        """Return the features (N, width, H, W) that both heads read."""
         whole = x if self.input_skip else None
         *skips, x = self.encoder(x)
         for level, skip in zip(self.levels, (*reversed(skips), whole), strict=True):
@@ -326,13 +334,13 @@ def _check(encoder: str, norm: str, width: int, channels: int) -> None:
             raise BadInputError("network", f"{name} {number}", f"a number from 1 to {top}")
 
 
-# Noise on activations while training, so that the picture hardly changes when another runtime rounds differently.
+# Noise on activations while training, so that the picture hardly changes on a runtime that rounds differently.
 #
-# Rule: noise is added only to positive outputs of ReLUs, is about as large as one step of a byte, and only in training.
+# Rule: noise is added only in training, to positive outputs of ReLUs, and is about as large as one step of a byte.
 
 BYTE_STEPS = 255
-#: Values that are drawn once, beyond those of the largest output: noise begins at any of them, which costs a fifth of
-#: drawing all of it anew.
+#: Number of random values beyond those of the largest output. Noise starts at a random one of them, which costs a fifth
+#: of drawing all of it anew.
 STARTS = 1 << 16
 
 
@@ -341,7 +349,7 @@ def add_activation_noise(network: nn.Module, steps: float) -> None:
     bank = torch.empty(0)
 
     def noise_for(output: Tensor) -> Tensor:
-        """Like `output`, uniform in -1..1."""
+        """Return noise in the shape of `output`, uniform in -1..1."""
         nonlocal bank
         if len(bank) < output.numel() + STARTS or bank.dtype != output.dtype or bank.device != output.device:
             drawn = torch.rand(output.numel() + STARTS, generator=torch.Generator().manual_seed(0))
@@ -363,7 +371,7 @@ def add_activation_noise(network: nn.Module, steps: float) -> None:
 
 # Dropout of whole channels after each level of encoder and decoder.
 #
-# Rule: it acts in training mode only and adds no weights, so that what is exported and resumed is as without it.
+# Rule: it acts in training mode only and adds no weights, so export and resume do not notice it.
 
 
 def add_dropout(network: UNet, probability: float) -> None:
@@ -415,9 +423,9 @@ def _fused(head: nn.Sequential) -> tuple[nn.Conv2d, nn.Conv2d]:
 
 
 def export_onnx(network: UNet, height: int, width: int) -> onnx.ModelProto:
-    """A float model for (1, C, height, width): input `tensor`, output `rgba` (1, 4, height, width) in 0..1.
+    """Export a float model for (1, C, height, width): input `tensor`, output `rgba` (1, 4, height, width) in 0..1.
 
-    `network` is put into evaluation mode. `height` and `width`: multiples of 32.
+    `network`: network, which is put into evaluation mode. `height`, `width`: multiples of 32.
     """
     network.eval()
     batch_norm = isinstance(network.colour[1], nn.BatchNorm2d)

@@ -1,4 +1,4 @@
-"""What a training by steps minimises as a whole: the terms of `losses.py`, and those that need networks of their own.
+"""The objective that training minimises: the loss terms, and those that need networks of their own.
 
 Rule: a term is computed only where it has a weight, and the same step on the same pictures gives the same numbers.
 """
@@ -23,20 +23,24 @@ from trilane.errors import BadInputError, MissingPartError, package_line, reason
 from trilane.training.backgrounds import backgrounds
 
 PERCEPTUAL = "perceptual"
-#: What discriminators err by, bits; told with the terms, but not one of them.
+#: Key of the discriminators' own error, in bits; it is reported with the terms but is not one of them.
 JUDGES = "discriminators"
 
 
 @dataclass(frozen=True)
 class Objective:
-    """`weights` of the terms, by name. `vgg`: for the perceptual loss, in place of MS-SSIM. `adversary`: if any."""
+    """What a training minimises.
+
+    `weights`: weights of the terms, by name. `vgg`: network of the perceptual loss; None for MS-SSIM. `adversary`:
+    discriminators, or None.
+    """
 
     weights: Mapping[str, float] = field(default_factory=lambda: WEIGHTS)
     vgg: Vgg16 | None = None
     adversary: Adversary | None = None
 
     def terms(self, output: Tensor, target: Tensor) -> dict[str, Tensor]:
-        """The terms by name, before weighting, over backgrounds that are drawn here.
+        """Return the terms by name, before weighting; the backgrounds behind both pictures are drawn here.
 
         `output`, `target` (N, 4, H, W): straight colour and mask, 0..1.
         """
@@ -49,30 +53,30 @@ class Objective:
         return terms if self.adversary is None else terms | self.adversary.terms(output, target, behind)
 
     def total(self, terms: Mapping[str, Tensor]) -> Tensor:
-        """The weighted sum of `terms`, which is minimised."""
+        """Return the weighted sum of `terms`, which is minimised."""
         return total_loss(terms, self.weights)
 
     def learn(self, output: Tensor, target: Tensor) -> dict[str, float]:
-        """What of this objective is trained itself takes a step on these pictures; what that tells, by name."""
+        """Train the discriminators, if any, by one step on these pictures, and return their error by name."""
         return {} if self.adversary is None else {JUDGES: self.adversary.learn(output, target, drawn_behind(target))}
 
 
-# MS-SSIM of pictures, which can be minimised: structure at five scales, without the weights of any other network.
+# MS-SSIM of pictures, in a form that can be minimised: structure at five scales, without any network's weights.
 #
-# Rule: windows lie wholly inside the picture; a picture that is too small for a scale is compared at the coarser ones
-# that it has, with their weights scaled to a sum of 1.
+# Rule: windows lie wholly inside the picture. A picture that is too small for some scales is compared at those that it
+# has, with their weights scaled to a sum of 1.
 
 #: Weights of the scales, finest first: Wang, Simoncelli, Bovik, Multiscale structural similarity, 2003, section 3.2.
 SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 WINDOW, SIGMA = 11, 1.5
 #: Constants of luminance and of contrast, for values in 0..1.
 C1, C2 = 0.01**2, 0.03**2
-#: A negative structure has no power; it counts as this.
+#: Replaces a negative structure, because a negative number has no real power.
 LEAST = 1e-6
 
 
 def ms_ssim(one: Tensor, other: Tensor) -> Tensor:
-    """(N,): the product of the mean contrast and structure of each scale, and at the last of luminance too.
+    """Return (N,): the product of the mean contrast and structure of each scale, with luminance at the last one.
 
     `one`, `other` (N, C, H, W) in 0..1, H and W at least 11. Formula 7 of the paper above, with equal exponents.
     """
@@ -88,7 +92,7 @@ def ms_ssim(one: Tensor, other: Tensor) -> Tensor:
 
 
 def _similarity(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
-    """(N,) twice: the mean SSIM, and the mean of its factor of contrast and structure."""
+    """Return two tensors (N,): the mean SSIM, and the mean of its factor of contrast and structure."""
     mean_one, mean_other = _blurred(one), _blurred(other)
     variances = _blurred(one**2) - mean_one**2 + _blurred(other**2) - mean_other**2
     covariance = _blurred(one * other) - mean_one * mean_other
@@ -98,7 +102,7 @@ def _similarity(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _blurred(picture: Tensor) -> Tensor:
-    """`picture` (N, C, H, W) under a Gaussian window, where the window lies inside it."""
+    """Return `picture` (N, C, H, W) blurred by a Gaussian window, where the window lies inside it."""
     places = torch.arange(WINDOW, dtype=picture.dtype, device=picture.device) - WINDOW // 2
     bell = torch.exp(-(places**2) / (2 * SIGMA**2))
     bell = (bell / bell.sum()).expand(picture.shape[1], 1, WINDOW)
@@ -106,13 +110,13 @@ def _blurred(picture: Tensor) -> Tensor:
     return functional.conv2d(down, bell[:, :, None], groups=picture.shape[1])
 
 
-# What training minimises: errors of the picture, of its decibels, colours, edges, structure and its mask.
+# The loss terms of training: errors of the picture, of its PSNR, colours, edges, structure and mask.
 #
-# Rule: every term is a mean over the pixels it is about, so that the weights in the table mean the same for every view.
-# Each picture of a batch stands before a background of its own: before one colour for all, a person who lets that
-# colour through has no error.
+# Rule: every term is a mean over the pixels it is about, so that a weight means the same for every view. Each picture
+# of a batch stands before a background of its own: before one colour for all, a person who lets that colour through has
+# no error.
 #
-# The colour where there is no person is not visible and is trained to be black: left alone it would be noise that
+# The colour where there is no person is not visible and is trained to be black: otherwise it would be noise that
 # differs from runtime to runtime.
 
 #: Pixels round the person that count as its outline.
@@ -127,7 +131,7 @@ WEIGHTS: Mapping[str, float] = {
     "background": 0.05,
     "overlap": 0.1,
 }
-#: One minus MS-SSIM, a term that is computed only where it has a weight: it takes several blurs.
+#: One minus MS-SSIM. It is computed only where it has a weight, because it takes several blurs.
 STRUCTURE = "structure"
 LEAST_SQUARE = 1e-5
 
@@ -135,11 +139,12 @@ LEAST_SQUARE = 1e-5
 def loss_terms(
     output: Tensor, target: Tensor, behind: Tensor, weights: Mapping[str, float] = WEIGHTS
 ) -> dict[str, Tensor]:
-    """The terms by name, before weighting. `output` and `target` (N, 4, H, W): straight colour and mask, 0..1.
+    """Return the terms by name, before weighting.
 
-    `behind` (N, 3, H, W): what stands behind both, as `drawn_behind` draws it.
-    `weights`: by name; of `STRUCTURE` it decides whether that is among the terms. `overlap` is the Dice loss, with one
-    pixel more in numerator and denominator, so that it is 0 without a person.
+    `output`, `target` (N, 4, H, W): straight colour and mask, 0..1.
+    `behind` (N, 3, H, W): background of both, as `drawn_behind` draws it.
+    `weights`: weights by name; the one of `STRUCTURE` decides whether that term is computed.
+    The term `overlap` is the Dice loss, with one pixel more in numerator and denominator, so it is 0 without a person.
     """
     mask, true_mask = output[:, 3:], target[:, 3:]
     near = _grown(true_mask)
@@ -167,9 +172,10 @@ def loss_terms(
 
 
 def missing_db(difference: Tensor, near: Tensor) -> Tensor:
-    """(N,): dB of PSNR that each picture's `difference` (N, 3, H, W) costs where `near` (N, 1, H, W) is 1.
+    """Return the loss of PSNR (N,) in dB that each picture's `difference` causes where `near` is 1.
 
-    Counted from a mean square of `LEAST_SQUARE`, which is 50 dB and as good as none.
+    `difference` (N, 3, H, W), `near` (N, 1, H, W). The loss counts from a mean square of `LEAST_SQUARE`, a PSNR of 50
+    dB, which is as good as no difference.
     """
     pixels = 3 * near.sum(dim=(1, 2, 3)) + 1
     square = (difference.square() * near).sum(dim=(1, 2, 3)) / pixels
@@ -177,7 +183,7 @@ def missing_db(difference: Tensor, near: Tensor) -> Tensor:
 
 
 def _grown(mask: Tensor) -> Tensor:
-    """(N, 1, H, W): 1 on the person of `mask` and up to `MARGIN_PX` round it, else 0."""
+    """Return (N, 1, H, W): 1 on the person of `mask` and up to `MARGIN_PX` around it, else 0."""
     grown = mask.detach().contiguous()
     for along in ((1, 0), (0, 1)):
         kernel, padding = tuple(2 * MARGIN_PX * side + 1 for side in along), tuple(MARGIN_PX * side for side in along)
@@ -186,31 +192,31 @@ def _grown(mask: Tensor) -> Tensor:
 
 
 def total_loss(terms: Mapping[str, Tensor], weights: Mapping[str, float] = WEIGHTS) -> Tensor:
-    """The sum of the terms, weighted by `weights`; a term without a weight counts nothing."""
+    """Return the sum of the terms, weighted by `weights`; a term without a weight counts nothing."""
     return torch.stack([weights.get(name, 0.0) * term for name, term in terms.items()]).sum()
 
 
 def composite(image: Tensor, behind: Tensor) -> Tensor:
-    """`image` (N, 4, H, W) over `behind` (N, 3, H, W): (N, 3, H, W)."""
+    """Composite `image` (N, 4, H, W) over `behind` (N, 3, H, W) and return (N, 3, H, W)."""
     mask = image[:, 3:]
     return image[:, :3] * mask + behind * (1 - mask)
 
 
 def drawn_behind(target: Tensor) -> Tensor:
-    """(N, 3, H, W): a background for each of `target` (N, 4, H, W), drawn by PyTorch's random numbers."""
+    """Return a background (N, 3, H, W) for each picture of `target` (N, 4, H, W), drawn by PyTorch's random numbers."""
     rng = np.random.default_rng(int(torch.randint(2**62, ())))
     drawn = backgrounds(len(target), (target.shape[2], target.shape[3]), rng)
     return torch.from_numpy(drawn).permute(0, 3, 1, 2).to(target.device)
 
 
-# The perceptual loss by features of VGG-16, whose weights the user brings as a file.
+# The perceptual loss by features of VGG-16, whose weights the user supplies as a file.
 #
-# Rule: the file is data: only tensors are read from it, and each must have the size that VGG-16 has there.
+# Rule: the file is data: only tensors are read from it, and each must have the size that VGG-16 requires.
 
-#: Convolutions and channels of the five blocks, between which the picture is halved: Simonyan and Zisserman, Very deep
-#: convolutional networks for large-scale image recognition, 2014, table 1, column D.
+#: Number of convolutions and channels of the five blocks, between which the picture is halved: Simonyan and Zisserman,
+#: Very deep convolutional networks for large-scale image recognition, 2014, table 1, column D.
 BLOCKS = ((2, 64), (2, 128), (3, 256), (3, 512), (3, 512))
-#: Of ImageNet, which the weights were trained for.
+#: Mean and deviation of ImageNet's colours, for which the weights were trained.
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 EXPECTED = "weights of VGG-16 by torchvision's names (features.0.weight ...)"
 SAFETENSORS = ".safetensors"
@@ -234,7 +240,7 @@ class Vgg16(nn.Module):
         self.requires_grad_(False)
 
     def forward(self, picture: Tensor) -> list[Tensor]:
-        """The last features of each block, for `picture` (N, 3, H, W) in 0..1, sides at least 16."""
+        """Return the last features of each block for `picture` (N, 3, H, W) in 0..1, sides at least 16."""
         x, found = (picture - self.mean) / self.deviation, list[Tensor]()
         for layer, after in pairwise([*self.features, nn.MaxPool2d(2)]):
             x = layer(x)
@@ -243,10 +249,11 @@ class Vgg16(nn.Module):
         return found
 
     def distance(self, one: Tensor, other: Tensor) -> Tensor:
-        """(N,): of pictures (N, 3, H, W) in 0..1, the squared differences of features of length 1, summed over blocks.
+        """Return the perceptual distance (N,) of pictures (N, 3, H, W) in 0..1.
 
-        Zhang et al., The unreasonable effectiveness of deep features as a perceptual metric, 2018, formula 1, where all
-        its learned weights of channels are 1.
+        It is the squared difference of features that are scaled to length 1, summed over blocks. Zhang et al., The
+        unreasonable effectiveness of deep features as a perceptual metric, 2018, formula 1, with all learned channel
+        weights set to 1.
         """
         parts = [
             (functional.normalize(mine, eps=LEAST_LENGTH) - functional.normalize(theirs, eps=LEAST_LENGTH))
@@ -259,7 +266,7 @@ class Vgg16(nn.Module):
 
 
 def read_vgg16(path: Path) -> Vgg16:
-    """The network of the state dict in the file `path` (.pth, .pt or .safetensors).
+    """Read the network from a state dict in the file `path` (.pth, .pt or .safetensors).
 
     Raises BadInputError; MissingPartError for a .safetensors file where that package is not installed.
     """
@@ -284,7 +291,7 @@ def _tensors(path: Path) -> dict[str, object]:
 
 
 def _saved_tensors(path: Path) -> dict[str, object]:
-    """What `torch.save` wrote; with `weights_only` it can hold tensors and plain values, and no code."""
+    """Read what `torch.save` wrote; with `weights_only` the file can hold tensors and plain values, and no code."""
     found = torch.load(path, map_location="cpu", weights_only=True)
     if not isinstance(found, dict):
         raise ValueError(f"a {type(found).__name__}, not a state dict")
@@ -303,33 +310,37 @@ def _safe_tensors(path: Path) -> dict[str, object]:
         raise ValueError(str(error)) from error
 
 
-# Three discriminators, which tell pictures of the person from painted ones, and what they add to the avatar's loss.
+# Three discriminators, which tell pictures of the person from painted ones, and the terms that they add to the avatar's
+# loss.
 #
-# Rule: the avatar's loss does not change them, and their own does not change the avatar. No normalisation is in them,
-# so that a picture's score does not depend on the others of its batch.
+# Rule: the avatar's loss does not change the discriminators, and their loss does not change the avatar. They have no
+# normalisation, so that a picture's score does not depend on the others of its batch.
 #
 # The thesis has three networks of falling resolution and rising channels, each with one probability for a picture, and
-# does not say what the three see. Here each sees colours before a background and the mask, at the whole, half and
-# quarter size (Wang et al., High-resolution image synthesis with conditional GANs, 2018, section 3.2).
+# does not say what each of the three sees. Here each sees the mask and the colours before a background, at the whole,
+# half and quarter size (Wang et al., High-resolution image synthesis with conditional GANs, 2018, section 3.2).
 
-#: How much smaller the picture is that each discriminator sees.
+#: Factor by which the picture is shrunk for each discriminator.
 SHRUNK = (1, 2, 4)
 SEEN_CHANNELS = 4
-#: Channels of the levels of one, as multiples of its width; each level halves the picture.
+#: Channels of a discriminator's levels, as multiples of its width; each level halves the picture.
 LEVELS = (1, 2, 4, 8)
 SLOPE = 0.2
 BETAS = (0.9, 0.999)
 
 
 class Judged(NamedTuple):
-    """What a discriminator finds. `features`: of each level, (N, C, H, W). `score` (N,): log odds of a true picture."""
+    """What a discriminator finds.
+
+    `features`: features of each level, (N, C, H, W). `score` (N,): log odds that the picture is a true one.
+    """
 
     features: list[Tensor]
     score: Tensor
 
 
 class Discriminator(nn.Module):
-    """Strided 3x3 convolutions, the mean over the picture's places of a last 1x1 convolution."""
+    """Strided 3x3 convolutions, then a last 1x1 convolution whose output is averaged over the picture."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -352,17 +363,21 @@ class Adversary:
     """The discriminators and Adam, which trains them."""
 
     def __init__(self, width: int, rate: float, seed: int, device: torch.device | str = "cpu") -> None:
-        """`width`: channels of the first level. `rate`: of learning. `seed`: of the first weights."""
+        """Build the discriminators.
+
+        `width`: channels of the first level. `rate`: learning rate. `seed`: seed of the first weights.
+        """
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.discriminators = nn.ModuleList(Discriminator(width) for _ in SHRUNK).to(device)
         self.optimiser = torch.optim.Adam(self.discriminators.parameters(), lr=rate, betas=BETAS)
 
     def terms(self, output: Tensor, target: Tensor, behind: Tensor) -> dict[str, Tensor]:
-        """What the avatar minimises: `adversarial`, that its pictures are told from true ones, and `features`.
+        """Return the terms that the avatar minimises against the discriminators.
 
         `output`, `target` (N, 4, H, W): straight colour and mask in 0..1; both are judged over `behind` (N, 3, H, W).
-        `features`: the mean difference of the discriminators' features (feature matching).
+        `adversarial` falls as the discriminators take painted pictures for true ones. `features` is the mean difference
+        of their features (feature matching).
         """
         self.discriminators.requires_grad_(False)
         painted, true = self._judged(output, behind), self._judged(target, behind)
@@ -376,7 +391,10 @@ class Adversary:
         return {"adversarial": fooled.mean(), "features": torch.stack(differences).mean()}
 
     def learn(self, output: Tensor, target: Tensor, behind: Tensor) -> float:
-        """One step of the discriminators on these pictures; their mean error before it: 1 bit where they guess."""
+        """Train the discriminators by one step on these pictures and return their mean error before it, in bits.
+
+        The error is 1 bit where they guess.
+        """
         wrong = [
             (bits(mine.score, true=False) + bits(theirs.score, true=True)) / 2
             for mine, theirs in zip(self._judged(output.detach(), behind), self._judged(target, behind), strict=True)
@@ -396,5 +414,8 @@ class Adversary:
 
 
 def bits(score: Tensor, true: bool) -> Tensor:
-    """Binary cross entropy, in bits (thesis, formula 3.1), of log odds `score` (N,) of pictures that are all `true`."""
+    """Return the mean binary cross entropy of log odds `score` (N,), in bits (thesis, formula 3.1).
+
+    `true`: whether all the pictures are true ones; else all are painted.
+    """
     return functional.softplus(-score if true else score).mean() / math.log(2)

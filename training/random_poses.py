@@ -1,6 +1,6 @@
 """Random natural poses, drawn from a table of attitudes (stand, walk, reach, ...) with ranges of joint angles.
 
-Rule: a pose depends only on the random generator; no recorded or built-in motion is used, so those can be held out.
+Rule: a pose depends only on the random generator. No recorded or built-in motion is used, so those can be held out.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from trilane.scene.rotations import about, rotvec_from_matrix
 
 JOINTS = len(JOINT_NAMES)
 
-#: Standard deviation, degrees about x, y, z, of the angles added to the joints of every pose. Fingers: `_curl_hand`.
+#: Standard deviation, in degrees about x, y, z, of the angles added to the joints of every pose. Fingers: `_curl_hand`.
 JITTER_DEG = {
     "spine1": (5, 5, 3),
     "spine2": (4, 5, 3),
@@ -45,7 +45,10 @@ SIDES = {"left": 1.0, "right": -1.0}
 
 
 def random_pose(rng: np.random.Generator) -> F64:
-    """Axis-angle rotations (55,3), radians, in SMPL-X joint order. The root only leans: the cameras go round it."""
+    """Return axis-angle rotations (55,3), radians, in SMPL-X joint order.
+
+    The root only leans, because the cameras go around it.
+    """
     pose = np.zeros((JOINTS, 3))
     ATTITUDES[_pick(rng, WEIGHTS)](pose, rng)
     for name, deviation in JITTER_DEG.items():

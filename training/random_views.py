@@ -1,4 +1,4 @@
-"""Random cameras round a posed body, by band: how much of the body fills the screen, from far away to the face.
+"""Random cameras around a posed body, by band: how much of the body fills the screen, from far away to the face.
 
 Rule: a close-up is taken by a camera that is near or has a long lens; pixels are never enlarged.
 """
@@ -24,8 +24,8 @@ from trilane.training.clothing.layers import Layer
 
 NEAR_M, FAR_M = 0.05, 100.0
 NEAREST_M = 0.45
-#: Band to the joints that a camera may aim at, and the least and greatest height, metres at the aim, that fills the
-#: screen.
+#: For each band, the joints that a camera may aim at, and the least and greatest height that fills the screen, metres
+#: at the aim.
 BANDS: dict[str, tuple[tuple[str, ...], float, float]] = {
     "far": (("pelvis", "spine1"), 4.5, 10.0),
     "full_body": (("pelvis", "spine1"), 1.9, 3.4),
@@ -51,7 +51,10 @@ FOV_DEG = (24.0, 60.0)
 
 @dataclass(frozen=True)
 class View:
-    """`view` and `projection` (4,4), OpenGL; `aspect` of the screen, width over height."""
+    """A random camera.
+
+    `view`, `projection`: OpenGL matrices (4,4). `aspect`: width of the screen over its height.
+    """
 
     view: F64
     projection: F64
@@ -59,13 +62,16 @@ class View:
 
     @property
     def near_reach_m(self) -> float:
-        """Metres from the camera to a corner of its near plane: what stands farther off is not cut by that plane."""
+        """Distance in metres from the camera to a corner of its near plane, which cuts nothing that is farther away."""
         half_height = 1 / self.projection[1, 1]
         return NEAR_M * float(np.sqrt(1 + half_height**2 * (1 + self.aspect**2)))
 
 
 def random_view(rng: np.random.Generator, band: str, joints: F64) -> View:
-    """A random camera of `band` (a name of `BANDS`, or `anywhere`) for a body with `joints` (55,3) in world metres."""
+    """Return a random camera of `band` for a body with `joints` (55,3) in world metres.
+
+    `band`: a name of `BANDS`, or `anywhere`.
+    """
     names, least, most = BANDS.get(band, (ANYWHERE, 0.4, 2.5))
     aim = joints[JOINT_INDEX[names[rng.integers(len(names))]]]
     if band == "face":
@@ -83,7 +89,10 @@ def random_view(rng: np.random.Generator, band: str, joints: F64) -> View:
 
 
 def look_at(eye: F64, at: F64, roll: float = 0.0) -> F64:
-    """The matrix (4,4) from world to camera of a camera at `eye` that looks at `at`, rolled by `roll` radians."""
+    """Return the matrix (4,4) from world to camera for a camera at `eye` that looks at `at`.
+
+    `roll`: angle about the direction of sight, radians.
+    """
     z = (eye - at) / np.linalg.norm(eye - at)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)
@@ -96,7 +105,7 @@ def look_at(eye: F64, at: F64, roll: float = 0.0) -> F64:
 
 
 def perspective(fov_y: float, aspect: float, near: float = NEAR_M, far: float = FAR_M) -> F64:
-    """OpenGL projection (4,4).
+    """Return an OpenGL projection (4,4).
 
     `fov_y`: vertical field of view, radians.
     `aspect`: width over height.
@@ -124,7 +133,11 @@ OUTPUT_ROWS = 480
 
 @dataclass(frozen=True)
 class Crop:
-    """`shape`: of the tensor. `projection` (4,4): of the crop. `pixels`: of the screen, in the body's rectangle."""
+    """The crop of a sample.
+
+    `shape`: shape of the tensor. `projection` (4,4): projection of the crop. `pixels`: number of screen pixels in the
+    body's rectangle.
+    """
 
     shape: Shape
     projection: NDArray[np.float64]
@@ -135,11 +148,17 @@ class Cropper:
     """Crops of one shaped body."""
 
     def __init__(self, shaped: ShapedBody, pose_blend: bool = False) -> None:
-        """Of `shaped`; `pose_blend`: whether its pose blend shapes, if any, are drawn."""
+        """Make crops of `shaped`.
+
+        `pose_blend`: whether its pose blend shapes, if any, are drawn.
+        """
         self._bounds = MeshBounds(shaped, standoff_m=CLOTHES_STANDOFF_M, pose_blend=pose_blend)
 
     def crop(self, posed: Posed, view: View, buckets: Sequence[Shape]) -> Crop | None:
-        """The crop of the body as seen from `view`, in one of the tensor shapes `buckets`; None when it is not seen."""
+        """Return the crop of the body as seen from `view`; None when the body is not seen.
+
+        `buckets`: tensor shapes to choose from.
+        """
         rect = self._bounds.rect(posed, view.projection @ view.view)
         if rect is None:
             return None
@@ -149,14 +168,14 @@ class Cropper:
         return Crop(shape, crop_projection(view.projection, grown), pixels)
 
 
-# Which cameras stand clear of a clothed body: those whose near plane cannot cut it.
+# Finds cameras that stand clear of a clothed body: their near plane cannot cut it.
 #
-# Rule: a cut body has no ground truth, because the picture of it shows the inside of clothes and limbs; the bound comes
-# from the triangles themselves, so that every other near view stays.
+# Rule: a cut body has no ground truth, because its picture shows the inside of clothes and limbs. The bound comes from
+# the triangles themselves, so that every other near view stays.
 
 
 class ClothedSurface:
-    """The surface of all `layers` of a clothed body, as points that reach over the triangles round them."""
+    """The surface of all `layers` of a clothed body, as points that each stand for the triangles around them."""
 
     def __init__(self, layers: Sequence[Layer]) -> None:
         self._rest = np.concatenate([layer.vertices for layer in layers])
@@ -164,23 +183,23 @@ class ClothedSurface:
         self._reach = np.concatenate([vertex_reach(layer.vertices, layer.faces) for layer in layers])
 
     def posed(self, posed: Posed) -> F64:
-        """The points (N,3), world metres, in the pose `posed`."""
+        """Return the points (N,3), world metres, in the pose `posed`."""
         matrices = posed.matrices.reshape(JOINTS, 12).astype(np.float64)
         moved = blend_matrices(self._weights, matrices).reshape(-1, 3, 4)
         return np.asarray(np.einsum("vab,vb->va", moved[:, :, :3], self._rest) + moved[:, :, 3])
 
     def is_clear_of(self, view: View, points: F64) -> bool:
-        """Whether the near plane of `view` cannot cut the surface, whose points of `posed` are `points`."""
+        """Return whether the near plane of `view` cannot cut the surface whose `points` the method `posed` returned."""
         eye = np.linalg.inv(view.view)[:3, 3]
         distance = np.linalg.norm(points - eye, axis=1)
         return bool((distance - self._reach).min() > view.near_reach_m)
 
 
 def vertex_reach(vertices: F64, faces: NDArray[np.int64]) -> F64:
-    """(N,) metres: every point of a triangle is within this distance of that corner of it which is nearest.
+    """Return a radius (N,) in metres around each vertex: the balls at a triangle's corners cover the triangle.
 
-    A point of a triangle is at most its longest edge over the root of 3 from the nearest corner, as the middle of an
-    equilateral one is. `vertices` (N,3), `faces` (F,3).
+    A triangle's point is at most its longest edge over the root of 3 from the nearest corner; the middle of an
+    equilateral triangle reaches that. `vertices` (N,3), `faces` (F,3).
     """
     corners = vertices[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)

@@ -1,6 +1,6 @@
-"""Rendered samples on disk, and which of them a training reads in which of its steps.
+"""Rendered samples on disk, and which of them a training reads in each of its steps.
 
-Rule: arrays hold the pixels that were rendered, none resampled; there is one folder of memory-mapped arrays per shape.
+Rule: arrays hold the rendered pixels without resampling; each shape has one folder of memory-mapped arrays.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from trilane.training.sample_renderer import BAND_NAMES
 from trilane.training.training_settings import TrainingSettings
 
 U16 = 65535
-#: Array to its trailing shape and type. `uv`: u and v in 1/65535. `covered`: 1 on the body. `rgba`: the ground truth.
+#: Trailing shape and type of each array. `uv`: u and v in 1/65535. `covered`: 1 on the body. `rgba`: ground truth.
 FIELDS: dict[str, tuple[tuple[int, ...], type]] = {
     "uv": ((2,), np.uint16),
     "covered": ((), np.uint8),
@@ -32,7 +32,10 @@ FIELDS: dict[str, tuple[tuple[int, ...], type]] = {
 
 @dataclass(frozen=True)
 class ShapeGroup:
-    """Samples of one tensor shape. Arrays (N, H, W, ...) as in `FIELDS`; `band` (N,): the index of each one's band."""
+    """Samples of one tensor shape, in arrays (N, H, W, ...) as in `FIELDS`.
+
+    `band` (N,): index of each sample's band.
+    """
 
     shape: Shape
     uv: NDArray[np.uint16]
@@ -45,7 +48,7 @@ class ShapeGroup:
 
 
 def create_group(folder: Path, shape: Shape, bands: NDArray[np.int8]) -> ShapeGroup:
-    """New arrays on disk under `folder`, for the caller to fill, one sample for each of `bands`."""
+    """Create arrays on disk under `folder` for the caller to fill, one sample for each of `bands`."""
     place = folder / f"{shape[0]}x{shape[1]}"
     place.mkdir(parents=True, exist_ok=True)
     np.save(place / "band.npy", bands)
@@ -57,7 +60,7 @@ def create_group(folder: Path, shape: Shape, bands: NDArray[np.int8]) -> ShapeGr
 
 
 def open_groups(folder: Path, writable: bool = False) -> list[ShapeGroup]:
-    """All groups of the data set in `folder`, in order of their shapes."""
+    """Open all groups of the data set in `folder`, in order of their shapes."""
     mode: Any = "r+" if writable else "r"
     groups = []
     for place in sorted(folder.iterdir(), key=lambda path: parse_shape(path.name)):
@@ -73,13 +76,14 @@ def batches(
     repeats: Sequence[int] = (1,) * 5,
     labels: Sequence[NDArray[np.int64]] | None = None,
 ) -> Iterator[tuple[ShapeGroup, NDArray[np.int64]]]:
-    """Batches without end, each of one tensor shape: a group and the indices of the samples in it.
+    """Yield batches without end, each of one tensor shape: a group and the indices of its samples in the batch.
 
-    `groups`: the samples.
-    `size`: samples of a batch, roughly.
+    `groups`: samples.
+    `size`: approximate number of samples in a batch.
     `rng`: shuffles the samples of each epoch.
-    `repeats`: how often an epoch has a sample, by its band.
-    `labels`: of each group (N,); the samples of a batch have one label, and those below 0 are left out.
+    `repeats`: number of times that an epoch has a sample, by the sample's band.
+    `labels`: label of each sample, (N,) for each group. A batch has one label; samples with a label below 0 are left
+    out.
     """
     kinds = labels if labels is not None else [np.zeros(len(group), np.int64) for group in groups]
     while True:
@@ -94,18 +98,18 @@ def batches(
             yield epoch[index]
 
 
-# Which samples a training by steps reads in which of its steps.
+# Which samples a training reads in each of its steps.
 #
-# Rule: it follows from the settings, the samples and the number of the step alone, so that an ended training goes on
-# with the batches that it would have read.
+# Rule: this follows from the settings, the samples and the number of the step alone, so a resumed training goes on with
+# the batches that it would have read.
 #
 # A training has up to three phases: half-size samples alone, all samples, and samples of whole bodies alone.
 
-#: Tensors with fewer pixels are half-size ones, which alone are used at first because they are cheap.
+#: Tensors with fewer pixels are half-size ones. Training begins with them alone because they are cheap.
 SMALL_PIXELS = 160 * 160
-#: Bands whose samples show the whole body: the tensor is cut to the body, so it has one size in both.
+#: Bands whose samples show the whole body. The tensor is cut to the body, so the body has the same size in both bands.
 WHOLE_BANDS = [BAND_NAMES.index(name) for name in ("far", "full_body")]
-#: Zooms in one octave that batches of one zoom tell apart; every which row of a sample its zoom is measured on.
+#: Number of zooms in one octave that batches of one zoom tell apart; distance of the rows that a zoom is measured on.
 ZOOMS_PER_OCTAVE, ROW_STEP = 2, 8
 LEFT_OUT = -1
 
@@ -114,7 +118,10 @@ Batch = tuple[ShapeGroup, NDArray[np.int64]]
 
 @dataclass(frozen=True)
 class Phase:
-    """Steps from `first` to before `end`; `labels`, of all groups: as `batches` takes them."""
+    """The steps from `first` to before `end`.
+
+    `labels`: labels of all groups, as `batches` takes them.
+    """
 
     first: int
     end: int
@@ -122,7 +129,7 @@ class Phase:
 
 
 def batch_stream(groups: list[ShapeGroup], settings: TrainingSettings, count: int, step: int = 0) -> Iterator[Batch]:
-    """The batches of a training of `count` steps, from step `step` on; `batches_per_step` of them are one step's.
+    """Yield the batches of a training of `count` steps, from step `step` on; a step takes `batches_per_step` of them.
 
     Raises BadInputError when no sample is left for some steps.
     """
@@ -135,7 +142,7 @@ def batch_stream(groups: list[ShapeGroup], settings: TrainingSettings, count: in
 
 
 def phases(groups: list[ShapeGroup], settings: TrainingSettings, count: int) -> list[Phase]:
-    """The phases of a training of `count` steps; some may have no step. Raises BadInputError."""
+    """Return the phases of a training of `count` steps; some may have no step. Raises BadInputError."""
     labels = _labels(groups, settings)
     small = [math.prod(group.shape) < SMALL_PIXELS for group in groups]
     whole_from = math.ceil(settings.batches.full_body_from * count)
@@ -151,13 +158,16 @@ def phases(groups: list[ShapeGroup], settings: TrainingSettings, count: int) -> 
 
 
 def is_whole(batch: Batch) -> bool:
-    """Whether all samples of `batch` show the whole body."""
+    """Return whether all samples of `batch` show the whole body."""
     group, index = batch
     return bool(np.isin(group.band[index], WHOLE_BANDS).all())
 
 
 def zoom(group: ShapeGroup) -> NDArray[np.float64]:
-    """(N,): how many pixels of the tensor go to one side of the UV image; the median over pixels next to each other."""
+    """Return the zoom (N,) of each sample: tensor pixels that span one side of the UV image.
+
+    It is the median over pairs of neighbouring pixels.
+    """
     rows = group.uv[:, ::ROW_STEP].astype(np.int64)
     shown = group.covered[:, ::ROW_STEP] > 0
     steps = np.sqrt(np.square(np.diff(rows, axis=2)).sum(axis=-1)) / U16
@@ -166,7 +176,7 @@ def zoom(group: ShapeGroup) -> NDArray[np.float64]:
 
 
 def _labels(groups: list[ShapeGroup], settings: TrainingSettings) -> list[NDArray[np.int64]]:
-    """Of each group (N,): what the samples of a batch have in common; below 0 where a sample is not used."""
+    """Return the labels (N,) of each group: samples of a batch share one, and a label below 0 leaves a sample out."""
     options = settings.batches
     rng = np.random.default_rng((settings.seed, 3))
     found = []

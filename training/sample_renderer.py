@@ -1,6 +1,6 @@
-"""Renders one sample of the training: the UV image of the default body and the picture of it clothed.
+"""Renders one sample of the training: the UV image of the default body and a picture of it clothed.
 
-Rule: crop, tensor shape and both rasters are the pipeline's; a sample depends only on its seed; no near plane cuts the
+Rule: crop, tensor shape and both rasters are the pipeline's. A sample depends only on its seed. No near plane cuts the
 body or its clothes.
 """
 
@@ -36,13 +36,16 @@ PoseSource = Callable[[np.random.Generator], F64]
 
 @dataclass(frozen=True)
 class Sample:
-    """What to render. `pose` (55,3) axis-angle, radians. `band`: an index into BAND_NAMES, or ANYWHERE_BAND."""
+    """A sample to render.
+
+    `pose`: axis-angle (55,3), radians. `band`: an index into BAND_NAMES, or ANYWHERE_BAND.
+    """
 
     pose: F64
     view: View
     crop: Crop
     band: int
-    picture: int = 0  # there is none
+    picture: int = 0  # samples of the synthetic person are cut from no frame
 
 
 class SampleRenderer:
@@ -51,10 +54,10 @@ class SampleRenderer:
     def __init__(self, shaped: ShapedBody, threads: int | None = None, samples: int = 2, look: Look = DEFAULT) -> None:
         """Put clothes on the body and open the context.
 
-        `shaped`: the body; its offsets, if any, are what the UV image is drawn with, clothes are put on the skin.
-        `threads`: of a software OpenGL driver; None for its default.
-        `samples`: of the ground truth along each side of a pixel, an even number.
-        `look`: what the body wears; its build is that of `shaped`.
+        `shaped`: body. The UV image is drawn with its offsets, if any; clothes are put on the skin.
+        `threads`: threads of a software OpenGL driver; None for its default.
+        `samples`: samples of the ground truth along each side of a pixel, an even number.
+        `look`: clothes of the body; the build is that of `shaped`.
         Raises MissingPartError without OpenGL.
         """
         body = shaped.body
@@ -72,12 +75,12 @@ class SampleRenderer:
         self.clothed_body = ClothedBody(self.ctx, layers, landmarks, samples, look)
 
     def plan(self, seed: Sequence[int], source: PoseSource, band: str, size: str) -> Sample:
-        """The sample of `seed`: draws views until enough of the body is on the screen and none of it is cut.
+        """Plan the sample of `seed`: draw views until enough of the body is on the screen and none of it is cut.
 
         `seed`: numbers that alone decide the sample.
         `source`: draws the pose.
         `band`: a name of BANDS, or `anywhere`.
-        `size`: the tensor size, as `shape_buckets` takes it.
+        `size`: tensor size, as `shape_buckets` takes it.
         """
         rng = np.random.default_rng(seed)
         pose = source(rng)
@@ -92,16 +95,16 @@ class SampleRenderer:
                 return Sample(pose, view, crop, BAND_NAMES.index(band) if band in BANDS else ANYWHERE_BAND)
 
     def training_sample(self, seed: Sequence[int], band: str, size: str) -> Sample:
-        """As `plan`, in a random pose."""
+        """Plan a sample as `plan` does, in a random pose."""
         return self.plan(seed, random_pose, band, size)
 
     def placed(self, sample: Sample) -> tuple[F64, Placement]:
-        """The camera (4,4) of `sample`, and its body as the packed pass draws it; valid until the next pose."""
+        """Return the camera (4,4) of `sample`, and its body as the packed pass draws it; valid until the next pose."""
         joints, crop = self.skeleton.pose(sample.pose).matrices, sample.crop
         return sample.view.view, Placement(joints, crop.projection, (0, 0, *crop.shape))
 
     def render(self, sample: Sample) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """The UV image (h,w,3) float32 of u, v, coverage, and the ground truth (h,w,4) uint8, straight alpha."""
+        """Return the UV image (h,w,3) float32 of u, v, coverage, and the ground truth (h,w,4) uint8, straight alpha."""
         joints = self.skeleton.pose(sample.pose).matrices
         crop = sample.crop
         uv = self._uv.render(joints, sample.view.view, crop.projection, crop.shape)
@@ -111,11 +114,11 @@ class SampleRenderer:
 
 # The UV image of a skinned mesh: u and v of every pixel, as float32 or as bytes, before any texture is read.
 #
-# Rule: same vertices, same rasterisation and same pixel centres as the packed pass; no antialiasing.
+# Rule: vertices, rasterisation and pixel centres are those of the packed pass; there is no antialiasing.
 
 
 class _MeshTarget:
-    """Draws a mesh with one fragment shader into targets of any shape, which are kept by shape."""
+    """Draws a mesh with one fragment shader into framebuffers, and keeps one for each shape."""
 
     def __init__(self, ctx: Any, mesh: SkinnedMesh, fragment: str, components: int, dtype: str) -> None:
         self._ctx, self._mesh = ctx, mesh
@@ -124,7 +127,7 @@ class _MeshTarget:
         self._targets: dict[tuple[int, int], Any] = {}
 
     def draw(self, pose: BodyPose, view: Floats, projection: Floats, shape: tuple[int, int]) -> Any:
-        """The framebuffer of `shape` with the mesh in it; 0 elsewhere."""
+        """Return the framebuffer of `shape` with the mesh in it; pixels elsewhere are 0."""
         target = self._target(shape)
         target.use()
         self._mesh.prepare(self._ctx)
@@ -149,10 +152,12 @@ class UvRaster:
     def render(
         self, joints: F32, view: Floats, projection: Floats, shape: tuple[int, int], feature: F32 | None = None
     ) -> F32:
-        """The UV image (h,w,3) float32 of u, v, coverage, row 0 on top: coverage is 1 on the mesh; 0, 0, 0 elsewhere.
+        """Return the UV image (h,w,3) float32 of u, v, coverage, row 0 on top.
 
-        `joints`: (55,3,4) skinning matrices.
-        `view`, `projection`: (4,4) the camera; of a crop, its projection.
+        Coverage is 1 on the mesh; pixels elsewhere are 0, 0, 0.
+
+        `joints`: skinning matrices (55,3,4).
+        `view`, `projection`: matrices (4,4) of the camera; for a crop, the crop's projection.
         `shape`: (height, width) of the image.
         `feature`: (486,) of a mesh with pose blend shapes.
         """
@@ -180,8 +185,8 @@ class UvBytes:
         """Write u and v of every pixel as round(255 x), row 0 on top; 0 off the mesh.
 
         `tensor`: (h * w * 2,) uint8, written as (h, w, 2).
-        `joints`: (55,3,4) skinning matrices.
-        `view`, `projection`: (4,4) the camera; of a crop, its projection.
+        `joints`: skinning matrices (55,3,4).
+        `view`, `projection`: matrices (4,4) of the camera; for a crop, the crop's projection.
         `shape`: (height, width) of the image.
         `feature`: (486,) of a mesh with pose blend shapes.
         """

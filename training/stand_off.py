@@ -1,10 +1,10 @@
 """How far a person's clothes and hair stand off the body: offsets of its vertices, measured where masks end.
 
-Rule: an offset is measured only where the surface turns away from the camera, because there alone the outline shows it;
-other vertices get theirs from neighbours on the surface.
+Rule: an offset is measured only where the surface turns away from the camera, because the outline shows it only there.
+Other vertices get theirs from neighbours on the surface.
 
-The offsets are those of "SMPL+D" (Alldieck et al., Video Based Reconstruction of 3D People Models, CVPR 2018), found by
-reading along lines instead of by gradients.
+The offsets are those of "SMPL+D" (Alldieck et al., Video Based Reconstruction of 3D People Models, CVPR 2018), but they
+are found by reading along lines, not by gradients.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from trilane.training.subject import Subject
 from trilane.training.surface import Smoother, vertex_normals
 from trilane.writing import write_atomically
 
-#: Metres from the surface, along its normal, between which a mask's end is looked for, and the step.
+#: Range along the surface's normal in which the mask's end is searched, and the step, metres.
 INWARD_M, OUTWARD_M, STEP_M = -0.03, 0.1, 0.002
-#: Sine of the angle between the surface and the ray of sight, up to which a vertex is at the outline.
+#: Largest sine of the angle between surface and ray of sight at which a vertex is at the outline.
 RIM = 0.2
-#: Pixels inside of the outline where the drawn body must be, and outside of it where it must not be.
+#: Pixels inside the outline at which the body must be drawn, and outside at which it must not be.
 BESIDE_PX = 1.5
-#: Pixels that a metre along the normal must span: fewer say too little.
+#: Least number of pixels that a metre along the normal must span: fewer say too little.
 LEAST_PX_PER_M = 120.0
-#: Measurements of a vertex that count as certain.
+#: Number of measurements that make a vertex certain.
 ENOUGH = 12
-#: Weight of a difference between neighbours beside that of a certain measurement.
+#: Weight of a difference between neighbours, relative to that of a certain measurement.
 STIFFNESS = 0.6
 #: Rounds in which normals are smoothed, so that raised surfaces do not fold.
 NORMAL_ROUNDS = 6
@@ -50,8 +50,8 @@ NORMAL_ROUNDS = 6
 class Outline(NamedTuple):
     """One view of the person.
 
-    `joints` (55,3,4): skinning matrices. `feature` (486,) of pose blend shapes, or None. `view`, `projection` (4,4).
-    `covered` (h,w) bool: where the body is drawn. `mask` (h,w) in 0..1: where the person is.
+    `joints` (55,3,4): skinning matrices. `feature` (486,): factors of pose blend shapes, or None. `view`, `projection`
+    (4,4): the camera. `covered` (h,w) bool: where the body is drawn. `mask` (h,w) in 0..1: where the person is.
     """
 
     joints: NDArray[np.floating]
@@ -64,14 +64,20 @@ class Outline(NamedTuple):
 
 @dataclass(frozen=True)
 class StandOff:
-    """`offsets` (V,3) metres at rest. `measured`: share of the vertices that any outline showed."""
+    """Offsets that were found.
+
+    `offsets` (V,3): metres at rest. `measured`: share of the vertices that any outline showed.
+    """
 
     offsets: F32
     measured: float
 
 
 def stand_off(shaped: ShapedBody, outlines: Iterable[Outline]) -> StandOff:
-    """The offsets of the person that `outlines` show, beside those that `shaped`, which is drawn in them, has."""
+    """Return the offsets of the person that `outlines` show.
+
+    `shaped`: body that the outlines are drawn with; the result includes the offsets that it has already.
+    """
     faces = shaped.body.faces.astype(np.int64)
     rest = shaped.vertices.astype(np.float64)
     normals = smooth_normals(rest, faces)
@@ -88,15 +94,15 @@ def stand_off(shaped: ShapedBody, outlines: Iterable[Outline]) -> StandOff:
 
 
 def smooth_normals(vertices: F64, faces: Ints) -> F64:
-    """(V,3) unit normals, smoothed over neighbours."""
+    """Return unit normals (V,3), smoothed over neighbours."""
     normals = Smoother(faces, len(vertices)).smooth(vertex_normals(vertices, faces), NORMAL_ROUNDS)
     return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
 
 
 def measured_heights(shaped: ShapedBody, normals: F64, outline: Outline) -> tuple[Ints, F64, F64]:
-    """Vertices at the outline, how far beyond them along `normals` (V,3) the mask ends, metres, and a weight of each.
+    """Return vertices at the outline, the distance from each to the mask's end in metres, and a weight of each.
 
-    The weight is how many pixels a metre spans.
+    The distance is along `normals` (V,3). The weight is the number of pixels that a metre spans.
     """
     at, along_normal, true_normal = _posed(shaped, normals, outline)
     pixels = _Pixels(outline)
@@ -121,9 +127,10 @@ def measured_heights(shaped: ShapedBody, normals: F64, outline: Outline) -> tupl
 
 
 def smoothed(values: F64, certainty: F64, faces: Ints) -> F64:
-    """(V,): near `values` (V,) where `certainty` (V,) is large, and near the neighbours' everywhere.
+    """Return heights (V,) that are near `values` (V,) where `certainty` (V,) is large, and smooth everywhere.
 
-    The minimum of sum c (x - v)^2 + STIFFNESS sum over edges (x_i - x_j)^2; a part without any measurement gets 0.
+    They minimise sum c (x - v)^2 + STIFFNESS sum over edges (x_i - x_j)^2. A part of the mesh without any measurement
+    gets 0.
     """
     count = len(values)
     pairs = np.unique(np.sort(np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1), axis=0)
@@ -131,6 +138,7 @@ def smoothed(values: F64, certainty: F64, faces: Ints) -> F64:
     edges = sparse.coo_matrix((ones, (pairs[:, 0], pairs[:, 1])), (count, count))
     edges = edges + edges.T
     degree = np.asarray(edges.sum(axis=1)).ravel()
+    # The small term keeps the system regular where a part of the mesh has no measurement; it draws that part to 0.
     system = sparse.diags(certainty + STIFFNESS * degree + 1e-6) - STIFFNESS * edges
     return np.asarray(spsolve(system.tocsc(), certainty * values))
 
@@ -143,18 +151,18 @@ class _Pixels:
         self._clip = outline.projection @ outline.view
 
     def of(self, points: F64) -> F64:
-        """(N,2): column and row, pixels from the top left corner, of `points` (N,3)."""
+        """Return column and row (N,2) of `points` (N,3), in pixels from the top left corner."""
         height, width = self._outline.covered.shape
         clip = points @ self._clip[:, :3].T + self._clip[:, 3]
         over = clip[:, :2] / np.maximum(clip[:, 3:], 1e-6)
         return np.asarray((over * [1, -1] + 1) / 2 * [width, height])
 
     def covered(self, at: F64) -> NDArray[np.bool_]:
-        """Whether the body is drawn at `at` (...,2)."""
+        """Return whether the body is drawn at `at` (...,2)."""
         return np.asarray(self._read(self._outline.covered.astype(np.float32), at, 0) > 0)
 
     def mask(self, at: F64) -> F64:
-        """The mask at `at` (...,2), read bilinearly; NaN beyond the picture."""
+        """Return the mask at `at` (...,2), read bilinearly; NaN beyond the picture."""
         return self._read(self._outline.mask, at, 1, np.nan)
 
     def _read(self, image: F32, at: F64, order: int, beyond: float = 0.0) -> F64:
@@ -163,7 +171,7 @@ class _Pixels:
 
 
 def _posed(shaped: ShapedBody, normals: F64, outline: Outline) -> tuple[F64, F64, F64]:
-    """Of every vertex in the world: its place, the direction of `normals`, and the true normal; (V,3) each."""
+    """Return place, direction of `normals` and true normal of every vertex in the world, (V,3) each."""
     rest = shaped.vertices.astype(np.float64)
     if outline.feature is not None and shaped.body.posedirs is not None:
         rest = rest + (shaped.body.posedirs.reshape(-1, len(outline.feature)) @ outline.feature).reshape(-1, 3)
@@ -175,9 +183,9 @@ def _posed(shaped: ShapedBody, normals: F64, outline: Outline) -> tuple[F64, F64
 
 
 def _ends(values: F64) -> tuple[F64, NDArray[np.bool_]]:
-    """Along each row of `values` (N,K): the first place where they fall below a half, in steps; whether there is one.
+    """Find where each row of `values` (N,K) first falls below a half, in steps, and whether it does.
 
-    A row that begins below a half or leaves the picture before has none.
+    A row that begins below a half, or leaves the picture before falling, does not.
     """
     inside = values >= 0.5
     first = np.argmin(inside, axis=1)
@@ -190,7 +198,7 @@ def _ends(values: F64) -> tuple[F64, NDArray[np.bool_]]:
 
 
 def _medians(number: Ints, value: F64, weight: F64, count: int) -> tuple[F64, F64]:
-    """(V,): the weighted median of each vertex's values, 0 without any, and how many there are."""
+    """Return the weighted median (V,) of each vertex's values, 0 without any, and the number of values."""
     order = np.lexsort((value, number))
     number, value, weight = number[order], value[order], weight[order]
     total = np.bincount(number, weights=weight, minlength=count)
@@ -201,25 +209,26 @@ def _medians(number: Ints, value: F64, weight: F64, count: int) -> tuple[F64, F6
     return middle, np.bincount(number, minlength=count).astype(np.float64)
 
 
-# Finds the offsets of a subject: views of it are drawn, measured, and drawn again with what was found.
+# Finds the offsets of a subject: views of it are drawn and measured, then drawn again with the offsets found so far.
 #
 # Rule: only views that training may read are used, and the same seed finds the same offsets.
 
-#: Views that are measured, and rounds: the second draws the body with what the first has found, the third corrects it.
+#: Number of measured views, and of rounds: each round draws the body with the offsets of the round before and corrects
+#: them.
 VIEWS, ROUNDS = 300, 3
-#: Beside the seeds of samples.
+#: Added to the seed, so that the views differ from the samples.
 SEED = 7
-#: Views that are measured before all of them are, for what they will take.
+#: Number of views that are measured first, to estimate the cost of all.
 TRIED = 4
 
 
 def subject_with_offsets(
     subject: Subject, path: Path, seed: int, report: Callable[[str], None], track: Callable[[Any], Any] = iter
 ) -> Subject:
-    """`subject`, drawn with the offsets in the file `path`, which are measured and written where it is missing.
+    """Return `subject`, drawn with the offsets in the file `path`; they are measured and written if it is missing.
 
-    `seed`: of the views. `report`: takes a line that says what measuring takes. `track`: wraps the views of each round
-    to show progress.
+    `seed`: seed of the views. `report`: takes a line that says what measuring costs. `track`: wraps the views of each
+    round to show progress.
     """
     if not path.exists():
         offsets = measured_offsets(subject, seed, report, track)
@@ -231,7 +240,7 @@ def subject_with_offsets(
 def measured_offsets(
     subject: Subject, seed: int, report: Callable[[str], None], track: Callable[[Any], Any] = iter
 ) -> F32:
-    """(V,3) metres: how far what the masks show stands off the skin of `subject`."""
+    """Return offsets (V,3), metres: how far the surface that the masks show stands off the skin of `subject`."""
     samples = plan_training(subject.renderer, VIEWS, seed + SEED)
     report(_cost(subject, samples))
     for _ in range(ROUNDS):
@@ -242,7 +251,7 @@ def measured_offsets(
 
 
 def _cost(subject: Subject, samples: Sequence[Any]) -> str:
-    """What measuring `samples` in all rounds will take, by some that are measured."""
+    """Say what measuring `samples` in all rounds costs, by measuring some of them."""
     tried = samples[:: max(1, len(samples) // TRIED)][:TRIED]
     normals = smooth_normals(subject.shaped.vertices.astype(np.float64), subject.shaped.body.faces.astype(np.int64))
     start = time.monotonic()
@@ -256,7 +265,7 @@ def _cost(subject: Subject, samples: Sequence[Any]) -> str:
 
 
 def outlines(subject: Subject, samples: Sequence[Any]) -> Iterator[Outline]:
-    """What `samples` show of the outline of `subject`."""
+    """Yield an outline of `subject` for each of `samples`."""
     renderer: Any = subject.renderer
     for sample in samples:
         uv, rgba = renderer.render(sample)

@@ -1,7 +1,7 @@
 """Training by a number of steps, in one process: the same settings give the same weights.
 
-Rule: what a step does depends on its number, the settings and the state alone, so a training that was ended anywhere
-goes on as if it had not been ended.
+Rule: what a step does depends only on its number, the settings and the state. A training that was ended anywhere
+therefore goes on as if it had not been ended.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from trilane.writing import write_atomically
 
 #: Share of the steps in which the learning rate rises.
 WARM_UP = 0.02
-#: Steps that are measured to say what all will take.
+#: Number of steps that are measured to estimate what all of them take.
 MEASURED = 4
 #: Moves the number of a step into the bits above the seed.
 SEED_BITS = 31
@@ -53,7 +53,7 @@ def first_state(avatar: TrainableAvatar, settings: TrainingSettings, vgg: Vgg16 
     add_dropout(avatar.network, harder.dropout)
     add_activation_noise(avatar.network, settings.noise_steps)
     if settings.bytes_from < 1:
-        avatar.grid = ByteGrid(avatar.network)  # after the noise, so that what is rounded has it
+        avatar.grid = ByteGrid(avatar.network)  # the grid follows the noise, so that noisy activations are rounded
     avatar.network.to(memory_format=torch.channels_last)
     loss, rate = settings.loss, settings.discriminator_rate
     adversary = Adversary(settings.width, rate, settings.seed, device) if loss.judged else None
@@ -180,7 +180,7 @@ def _measured(
 
 # Where a training computes: the CPU, or a GPU that PyTorch can use.
 #
-# Rule: a device that was asked for by name is used, or its absence is said; only `auto` chooses.
+# Rule: a device that is asked for by name is used, or an error says that it is absent; only `auto` chooses.
 
 MB = 1e6
 
@@ -195,7 +195,10 @@ def chosen_device(asked: str) -> torch.device:
 
 
 def device_words(device: torch.device, threads: int) -> str:
-    """Name `device` in words. `threads`: threads of PyTorch on the CPU."""
+    """Return a name for `device` in words.
+
+    `threads`: threads of PyTorch on the CPU.
+    """
     if device.type == "cuda":
         return f"the GPU {torch.cuda.get_device_name(device)}"
     return f"{threads} {'thread' if threads == 1 else 'threads'} of the CPU"
@@ -209,10 +212,10 @@ def memory_words(device: torch.device) -> str:
     return f"{of_cpu}, {torch.cuda.max_memory_allocated(device) / MB:.0f} MB of the GPU's"
 
 
-# Adam and AdamW that leave numbers without a gradient as they are, with their moments.
+# Adam and AdamW that leave numbers without a gradient, and their moments, as they are.
 #
-# Rule: a texel that a batch does not show is no texel whose gradient is 0: plain Adam would go on moving it by its old
-# momentum, let that fade, and let its weight decay.
+# Rule: a texel that a batch does not show is not treated as a texel whose gradient is 0. Plain Adam would go on moving
+# it by its old momentum, let that momentum fade, and decay the texel.
 
 #: Key of the groups of parameters that are masked.
 MASKED = "masked"
@@ -220,14 +223,14 @@ MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 class _Masked(torch.optim.Optimizer):
-    """What is put before a class of Adam.
+    """What masking adds to a class of Adam.
 
-    In groups of parameters with `masked`, numbers whose gradient is exactly 0 do not take part in a step. The count of
-    steps, which corrects the moments' bias, goes on for all, as in `torch.optim.SparseAdam`.
+    In groups of parameters with `masked`, numbers whose gradient is exactly 0 take no part in a step. The count of
+    steps, which corrects the moments' bias, goes on for all of them, as in `torch.optim.SparseAdam`.
     """
 
     def step(self, closure: Callable[[], float] | None = None) -> Any:
-        """As the class behind this one."""
+        """Do a step as the class behind this one does, without the masked numbers."""
         groups = [group for group in self.param_groups if group.get(MASKED)]
         kept = [
             self._kept(parameter) for group in groups for parameter in group["params"] if parameter.grad is not None
@@ -239,7 +242,10 @@ class _Masked(torch.optim.Optimizer):
         return loss
 
     def _kept(self, parameter: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """`parameter`, where it has no gradient, and what it and its moments have there; moments begin at 0."""
+        """Return `parameter`, the places without a gradient, and what the parameter and its moments hold there.
+
+        Moments that do not exist yet begin at 0.
+        """
         unseen = parameter.grad == 0
         if self.state[parameter]:
             return parameter, unseen, [tensor.data[unseen].clone() for tensor in self._tensors(parameter)]
@@ -251,18 +257,18 @@ class _Masked(torch.optim.Optimizer):
 
 
 class MaskedAdam(_Masked, torch.optim.Adam):
-    """Adam, whose weight decay is part of the gradient and so is left out where there is none."""
+    """Adam; its weight decay is part of the gradient and so is skipped where there is no gradient."""
 
 
 class MaskedAdamW(_Masked, torch.optim.AdamW):
-    """AdamW."""
+    """AdamW, whose weight decay does not touch masked numbers."""
 
 
 # The optimiser of an avatar: Adam or AdamW, of three groups of parameters.
 #
-# Rule: a group is what shares a learning rate, a decay and moments; the table says which class steps it.
+# Rule: a group shares a learning rate, a decay and moments; the table says which class steps it.
 
-#: By kind, and whether texels without a gradient stay.
+#: Class by kind of optimiser, and by whether texels without a gradient stay.
 CLASSES: dict[tuple[str, bool], type[torch.optim.Optimizer]] = {
     ("adamw", False): torch.optim.AdamW,
     ("adamw", True): MaskedAdamW,
@@ -299,10 +305,11 @@ def clip_gradients(module: nn.Module, options: OptimiserOptions) -> None:
         nn.utils.clip_grad_norm_(module.parameters(), options.clip_norm)
 
 
-# Everything that a training by steps goes on from, as one .npz file: weights, their average and Adam's moments, and the
-# same of discriminators.
+# The whole state that a training resumes from, as one .npz file: weights, their average and Adam's moments, and the
+# same for discriminators.
 #
-# Rule: what was read computes the same bits as what was written, so tensors keep their layout in memory.
+# Rule: a state that was read computes the same bits as the one that was written, so tensors keep their layout in
+# memory.
 
 EXPECTED = "the state of this training"
 REMEDY = "remove it to begin again"
@@ -310,7 +317,10 @@ REMEDY = "remove it to begin again"
 
 @dataclass
 class TrainingState:
-    """`avatar`, trained by `optimiser` for the `objective`; the `average` of its weights; `step`s were done."""
+    """State of a training: an avatar, its optimiser, its objective and the average of its weights.
+
+    `step`: number of steps that were done.
+    """
 
     avatar: TrainableAvatar
     average: TrainableAvatar
@@ -319,7 +329,7 @@ class TrainingState:
     step: int = 0
 
     def tensors(self) -> dict[str, Tensor]:
-        """All tensors by name; they are the state's own."""
+        """Return all tensors by name; they are the state's own."""
         modules: dict[str, nn.Module] = {"avatar": self.avatar, "average": self.average}
         if self.objective.adversary is not None:
             modules["discriminators"] = self.objective.adversary.discriminators
@@ -335,11 +345,11 @@ class TrainingState:
 
     @property
     def device(self) -> torch.device:
-        """Where it is trained."""
+        """The device of the training."""
         return next(self.avatar.parameters()).device
 
     def optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """All optimisers by name, each of Adam's kind."""
+        """Return all optimisers by name, each of Adam's kind."""
         adversary = self.objective.adversary
         return {"optimiser": self.optimiser} | ({} if adversary is None else {"judges": adversary.optimiser})
 
@@ -356,7 +366,7 @@ def load_state(state: TrainingState, path: Path) -> None:
     try:
         with path.open("rb") as source, np.load(source, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-    except (*DAMAGED, TypeError) as error:  # TypeError: of a lone array
+    except (*DAMAGED, TypeError) as error:  # NumPy raises TypeError for a lone array
         raise BadInputError(path, reason(error).splitlines()[0], EXPECTED, REMEDY) from error
     for optimiser in state.optimisers().values():
         _add_moments(optimiser)
@@ -375,7 +385,7 @@ def _fill(tensors: dict[str, Tensor], arrays: dict[str, NDArray[np.generic]]) ->
 
 
 def _add_moments(optimiser: torch.optim.Optimizer) -> None:
-    """Adam's moments, as its first step makes them: laid out in memory as their parameters."""
+    """Create Adam's moments as its first step would: laid out in memory as their parameters are."""
     for group in optimiser.param_groups:
         for parameter in group["params"]:
             optimiser.state[parameter] = {
@@ -385,14 +395,18 @@ def _add_moments(optimiser: torch.optim.Optimizer) -> None:
             }
 
 
-# How far a training's loss fell: the same samples, before the first step and after the last.
+# How far a training's loss fell: the loss of the same samples, before the first step and after the last.
 #
-# Rule: it is a loss of the avatar alone, without what discriminators find, which is another measure after each step; it
-# is of the weights that become the avatar, over the same backgrounds, and computing it changes nothing of the training.
+# Rule: the loss is the avatar's alone. What discriminators find is left out: it is another measure after each step. The
+# loss is computed for the weights that become the avatar, over the same backgrounds, and computing it changes nothing
+# in the training.
 
 
 def probe_loss(state: TrainingState, groups: list[ShapeGroup]) -> float:
-    """The mean loss of the averaged avatar of `state`, as it would be written now, over first samples of `groups`."""
+    """Return the mean loss of the averaged avatar of `state`, over the first samples of `groups`.
+
+    The avatar is taken as it would be written now.
+    """
     judge = replace(state.objective, adversary=None)
     losses = list[float]()
     with torch.no_grad(), torch.random.fork_rng(devices=[]):

@@ -1,6 +1,6 @@
-"""Who an avatar is trained of: the default body, clothed, or the person of a capture.
+"""The subject of a training: the default body, clothed, or the person of a capture.
 
-Rule: this alone differs between the two; samples, training and bundle are the same.
+Rule: only this module differs between the two; samples, training and bundle are the same.
 """
 
 from __future__ import annotations
@@ -34,9 +34,10 @@ from trilane.training.sample_renderer import SampleRenderer
 
 @dataclass(frozen=True)
 class Person:
-    """Whose avatar it is. `body`: the file. `betas`, `expression`: coefficients of its shape.
+    """The person whom an avatar shows.
 
-    `offsets` (V,3): from the skin to what is drawn, metres at rest; None for nothing.
+    `body`: file of the body. `betas`, `expression`: coefficients of its shape.
+    `offsets` (V,3): vectors from the skin to the drawn surface, metres at rest; None for none.
     """
 
     body: Path
@@ -47,13 +48,14 @@ class Person:
 
 @dataclass(frozen=True)
 class Subject:
-    """Who is trained.
+    """The subject of a training, with everything that draws it.
 
-    `person`, `shaped`: the body. `renderer`: plans and renders samples. `opener`: opens another one like it, also in
-    another process, whose body is drawn with the offsets that it is given. `facts`: for the manifest. `truth`: renders
-    the person in any pose and view; None where only frames are known: then `frames` has them, of which those `held_out`
-    are for measuring. `unseen` (S,S): texels of the body that no frame of the training shows; None where all can be
-    drawn.
+    `person`, `shaped`: the person and the body. `renderer`: plans and renders samples. `opener`: opens another renderer
+    like it, also in another process; its body is drawn with the offsets that `opener` is given. `facts`: facts for the
+    manifest.
+    `truth`: renders the person in any pose and view; None where only frames are known. `frames`: renders those frames,
+    else None. `held_out`: numbers of the frames that are kept for measuring.
+    `unseen` (S,S): texels of the body that no training frame shows; None where all can be drawn.
     """
 
     person: Person
@@ -68,11 +70,11 @@ class Subject:
 
     @property
     def source(self) -> Callable[[], SampleSource[Any]]:
-        """Opens another renderer like this subject's."""
+        """A function that opens another renderer like this subject's."""
         return partial(self.opener, self.person.offsets)
 
     def with_offsets(self, offsets: F32) -> Subject:
-        """The same, drawn with `offsets` (V,3)."""
+        """Return the same subject, drawn with `offsets` (V,3)."""
         renderer: Any = self.opener(offsets)
         return replace(
             self,
@@ -85,7 +87,10 @@ class Subject:
 
 
 def clothed_subject(body: Path, threads: int, name: str = DEFAULT_NAME) -> Subject:
-    """The body in the file `body`, in the look `name`. `threads`: of a software OpenGL driver. Raises BadInputError."""
+    """Return the body in the file `body`, in the look `name`.
+
+    `threads`: threads of a software OpenGL driver. Raises BadInputError.
+    """
     look = look_named(name)
     shaped = load_body(body).shape(look.betas)
     facts = {"body": "the default body, clothed by trilane.training.clothing", KEY: name}
@@ -95,9 +100,9 @@ def clothed_subject(body: Path, threads: int, name: str = DEFAULT_NAME) -> Subje
 
 
 def captured_subject(folder: Path, threads: int, report: Callable[[str], None]) -> Subject:
-    """The person of the capture in `folder`; frames whose fits are bad, and those held out, are left out.
+    """Return the person of the capture in `folder`, without frames whose fits are bad and held-out frames.
 
-    `threads`: of a software OpenGL driver. `report`: takes a line that says how many frames these are.
+    `threads`: threads of a software OpenGL driver. `report`: takes a line that says how many frames these are.
     Raises BadInputError; FaultyCaptureError with all faults.
     """
     capture = open_capture(folder)
@@ -124,13 +129,13 @@ def captured_subject(folder: Path, threads: int, report: Callable[[str], None]) 
 
 
 def capture_source(capture: Capture, numbers: Sequence[int], offsets: F32 | None) -> CaptureRenderer:
-    """What renders the frames `numbers` of `capture`, on one thread; the body is drawn with `offsets` (V,3)."""
+    """Open a renderer of the frames `numbers` of `capture`, on one thread; the body is drawn with `offsets` (V,3)."""
     drawn = capture if offsets is None else replace(capture, shaped=capture.shaped.with_offsets(offsets))
     return CaptureRenderer(drawn, numbers, ViewRule(), threads=1)
 
 
 def _checked(capture: Capture, threads: int) -> tuple[list[CheckedFrame], TexelCoverage, list[U8]]:
-    """The frames of `capture` as they were checked, a coverage that counted none, and the packed texels of each."""
+    """Check the frames of `capture`; return them, a coverage that counted none, and each frame's packed texels."""
     raster, coverage = BodyRaster(capture.shaped, threads), coverage_of(capture)
     frames, drawn = [], []
     for number in range(len(capture)):
@@ -141,7 +146,7 @@ def _checked(capture: Capture, threads: int) -> tuple[list[CheckedFrame], TexelC
 
 
 def _unseen_line(coverage: TexelCoverage) -> str:
-    """What a person should know of texels that no frame shows."""
+    """Say which share of the texels no frame shows, and on which regions of the body."""
     regions = coverage.never_seen()
     names = f", among them all of {', '.join(regions)}" if regions else ""
     share = f"{1 - coverage.share():.1%} of the body's texels are seen by no frame{names}"

@@ -1,6 +1,6 @@
 """The surface of a body at rest: its arrays, and the geometry of triangles that clothes and textures are made from.
 
-Rule: float64 and int64, so that the geometry is computed without rounding to float32.
+Rule: arrays are float64 and int64, so that the geometry is computed without rounding to float32.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from trilane.body.body import ShapedBody
 
 @dataclass(frozen=True)
 class BodyArrays:
-    """`vertices` (V,3) metres at rest, `faces` (F,3), `uv` (T,2), `uv_faces` (F,3), `weights` (V,55).
+    """Arrays of a body at rest.
 
-    `joints` (55,3) at rest.
+    `vertices` (V,3) metres, `faces` (F,3), `uv` (T,2), `uv_faces` (F,3), `weights` (V,55), `joints` (55,3) metres.
     """
 
     vertices: F64
@@ -30,7 +30,7 @@ class BodyArrays:
 
 
 def body_arrays(shaped: ShapedBody) -> BodyArrays:
-    """The arrays of a body that clothes are made from."""
+    """Return the arrays of a body, from which clothes are made."""
     body = shaped.body
     return BodyArrays(
         vertices=shaped.vertices.astype(np.float64),
@@ -48,7 +48,7 @@ def body_arrays(shaped: ShapedBody) -> BodyArrays:
 
 
 def vertex_normals(vertices: F64, faces: Ints) -> F64:
-    """Unit normals (V,3) of the vertices: face normals weighted by area. A vertex without a face has +Y."""
+    """Return unit normals (V,3) of the vertices: face normals weighted by area. A vertex without a face has +Y."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     face_normal = np.cross(b - a, c - a)
     total = np.stack([_scatter(faces, np.repeat(face_normal[:, k], 3), len(vertices)) for k in range(3)], axis=1)
@@ -57,14 +57,14 @@ def vertex_normals(vertices: F64, faces: Ints) -> F64:
 
 
 def vertex_areas(vertices: F64, faces: Ints) -> F64:
-    """A third of the area of the faces around each vertex (V,), square metres."""
+    """Return a third of the area of the faces around each vertex (V,), square metres."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6.0
     return _scatter(faces, np.repeat(area, 3), len(vertices))
 
 
 class Smoother:
-    """Means over the neighbours of each vertex of a mesh; a vertex without a face keeps its value."""
+    """Computes means over the neighbours of each vertex of a mesh; a vertex without a face keeps its value."""
 
     def __init__(self, faces: Ints, count: int) -> None:
         edges = np.unique(np.sort(np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1), axis=0)
@@ -74,29 +74,29 @@ class Smoother:
         self._count = count
 
     def mean(self, values: F64) -> F64:
-        """The mean of the neighbours' `values`, (V,) or (V,C), in the same shape."""
+        """Return the mean of the neighbours' `values`, (V,) or (V,C), in the same shape."""
         columns = values.reshape(self._count, -1)
         sums = [np.bincount(self._to, weights=column[self._from], minlength=self._count) for column in columns.T]
         around = np.stack(sums, axis=1) / np.maximum(self._degree, 1)[:, None]
         return np.where(self._degree[:, None] > 0, around, columns).reshape(values.shape)
 
     def smooth(self, values: F64, rounds: int) -> F64:
-        """`values` moved half way to the mean of the neighbours, `rounds` times."""
+        """Return `values` moved half way to the mean of the neighbours, `rounds` times."""
         for _ in range(rounds):
             values = 0.5 * (values + self.mean(values))
         return values
 
 
 def shell(vertices: F64, faces: Ints, offset: F64, least: F64, rounds: int) -> F64:
-    """A smooth surface (V,3) over a mesh, which bridges hollows as cloth does.
+    """Return a smooth surface (V,3) over a mesh, which bridges hollows as cloth does.
 
     The mesh is raised along smoothed normals. Each round then smooths the surface and lifts it back along the normals
     to its least height.
 
-    `vertices`, `faces`: (V,3) and (F,3), the mesh.
-    `offset`: (V,) metres that it is raised by.
-    `least`: (V,) least height over the mesh, metres.
-    `rounds`: of smoothing.
+    `vertices`, `faces`: mesh, (V,3) and (F,3).
+    `offset`: height by which the mesh is raised, (V,), metres.
+    `least`: least height over the mesh, (V,), metres.
+    `rounds`: number of rounds of smoothing.
     """
     smoother = Smoother(faces, len(vertices))
     normal = smoother.smooth(vertex_normals(vertices, faces), 6)
@@ -110,14 +110,15 @@ def shell(vertices: F64, faces: Ints, offset: F64, least: F64, rounds: int) -> F
 
 
 def obscurance(points: F64, normals: F64, emitters: F64, emitter_normals: F64, areas: F64, reach: float) -> F64:
-    """Share of light (N,) in 0..1 that reaches points when discs stand in the way: disc-to-point form factors.
+    """Return the share of light (N,) in 0..1 that reaches points past discs that stand in the way.
 
-    M. Bunnell, Dynamic Ambient Occlusion and Indirect Lighting, GPU Gems 2, 2005.
+    The share follows from disc-to-point form factors: M. Bunnell, Dynamic Ambient Occlusion and Indirect Lighting, GPU
+    Gems 2, 2005.
 
-    `points`, `normals`: (N,3) where the light is computed.
-    `emitters`, `emitter_normals`: (M,3) centres and normals of the discs.
-    `areas`: (M,) of the discs, square metres.
-    `reach`: metres at which a disc's effect has faded out.
+    `points`, `normals`: places (N,3) where the light is computed.
+    `emitters`, `emitter_normals`: centres and normals (M,3) of the discs.
+    `areas`: areas (M,) of the discs, square metres.
+    `reach`: distance in metres at which a disc's effect has faded out.
     """
     left = np.empty(len(points))
     for part in np.array_split(np.argsort(points[:, 1]), max(1, len(points) // 256)):
@@ -136,7 +137,7 @@ def obscurance(points: F64, normals: F64, emitters: F64, emitter_normals: F64, a
 
 
 def smoothstep(low: float, high: float, values: F64) -> F64:
-    """0 at `low`, 1 at `high`, a cubic between them and constant beyond; `low` may be the larger of the two."""
+    """Return 0 at `low`, 1 at `high`, a cubic between them and a constant beyond; `low` may exceed `high`."""
     t = np.clip((values - low) / (high - low), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 

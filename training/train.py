@@ -1,7 +1,7 @@
 """Trains an avatar of a capture or of a clothed default body: draws samples, trains by steps, quantises and measures.
 
-Rule: what was finished is kept in the work folder and not done again; each part of the work says what it will cost
-before it starts.
+Rule: finished work is kept in the work folder and not done again. Each part of the work says what it will cost before
+it starts.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ LOSS_BEFORE = "loss-before.json"
 LEAST_STEPS = 10
 #: Most sheets of a training, evenly over its steps, and least steps between two: a sheet takes about as long as a step.
 SHEET_COUNT, SHEET_STEPS = 10, 10
-#: Seconds between two states on the disk.
+#: Seconds between two states that are written to the disk.
 SAVE_S = 60.0
 ANOTHER_WORK = "use another --work folder, or remove this one"
 
@@ -75,8 +75,9 @@ ANOTHER_WORK = "use another --work folder, or remove this one"
 class Places:
     """Folders and files of one training.
 
-    `capture`: folder; None where the settings have a look. `out`: of the bundle. `work`: of samples, state and sheets.
-    `name`: of the avatar. `vgg`: the file of VGG-16's weights, for a perceptual loss by its features.
+    `capture`: folder of the capture; None where the settings have a look. `out`: folder of the bundle. `work`: folder
+    of samples, state and sheets. `name`: name of the avatar. `vgg`: file of VGG-16's weights, for a perceptual loss by
+    its features.
     """
 
     capture: Path | None
@@ -87,7 +88,7 @@ class Places:
 
 
 class Listener(Protocol):
-    """Someone who is told how the work goes."""
+    """A listener, which is told how the work goes."""
 
     def say(self, line: str) -> None:
         """Take a line about what was found, or what the next part of the work costs."""
@@ -100,7 +101,7 @@ class Listener(Protocol):
 
 
 def train_avatar(places: Places, asked: TrainingSettings, listener: Listener) -> dict[str, Any]:
-    """Train as `asked`, write the bundle, and return facts of the training and of held-out frames.
+    """Train as `asked`, write the bundle, and return facts about the training and about held-out frames.
 
     A training that was ended before goes on from its last state.
     Raises BadInputError; FaultyCaptureError with all faults; MissingPartError without OpenGL.
@@ -159,7 +160,7 @@ def _subject(places: Places, settings: TrainingSettings, listener: Listener) -> 
 
 
 def with_vgg(asked: TrainingSettings, file: Path | None) -> TrainingSettings:
-    """Add the digest of the weights in `file` to `asked`. Raises BadInputError where one is given without the other."""
+    """Add the digest of the weights in `file` to `asked`. Raises BadInputError where only one of the two is given."""
     if file is None:
         if asked.vgg is not None:
             raise BadInputError("vgg", "no file of weights", f"that with SHA-256 {asked.vgg}", "give it with --vgg")
@@ -186,7 +187,7 @@ def _raised(subject: Subject, places: Places, settings: TrainingSettings, listen
 def resumed_settings(path: Path, asked: TrainingSettings) -> TrainingSettings:
     """Return the settings in the file `path` where a training has begun there, else `asked`.
 
-    A number of steps that was counted before stays. Raises BadInputError when the file differs from `asked`.
+    A number of steps that was worked out before stays. Raises BadInputError when the file differs from `asked`.
     """
     if not path.exists():
         return asked
@@ -201,7 +202,7 @@ def resumed_settings(path: Path, asked: TrainingSettings) -> TrainingSettings:
 
 
 def _draw_samples(subject: Subject, places: Places, settings: TrainingSettings, listener: Listener) -> None:
-    """Draw the samples into the work folder, unless they are there. Raises BadInputError where others are."""
+    """Draw the samples into the work folder, unless they are there. Raises BadInputError where other samples are."""
     facts = places.work / SAMPLE_FACTS
     decides = ("samples", "seed", "stand_off")
     who = {"look": settings.look} if places.capture is None else {"capture": str(places.capture.resolve())}
@@ -259,7 +260,7 @@ def _first_avatar(subject: Subject, places: Places, settings: TrainingSettings) 
 def _with_steps(
     avatar: TrainableAvatar, places: Places, settings: TrainingSettings, vgg: Vgg16 | None, listener: Listener
 ) -> TrainingSettings:
-    """Return `settings` with a number of steps, by default as many as fit into the minutes, and say what they take."""
+    """Return `settings` with a number of steps, and say what they take; by default as many as fit into the minutes."""
     seconds = step_seconds(avatar, open_groups(places.work / SAMPLES), settings, vgg)
     count = settings.steps or max(LEAST_STEPS, int(60 * settings.minutes / seconds))
     memory = memory_words(chosen_device(settings.device))
@@ -315,7 +316,7 @@ MOST_FRAMES = 6
 
 
 def write_sheet(path: Path, avatar: TrainableAvatar, subject: Subject) -> None:
-    """Write as PNG: a row for each of some held-out frames, the frame on the left. Without such frames, nothing.
+    """Write a PNG with a row for each of some held-out frames, the frame on the left; without such frames, nothing.
 
     Raises BadInputError when it cannot be written.
     """
@@ -331,17 +332,17 @@ def write_sheet(path: Path, avatar: TrainableAvatar, subject: Subject) -> None:
             Image.fromarray(np.vstack(rows)).save(draft, format="png")
 
 
-# How good an avatar is on frames of a capture that training never read.
+# The error of an avatar on frames of a capture that training never read.
 #
-# Rule: what is measured lies in the bundle and runs as in the pipeline; frames are taken whole, nothing is random.
+# Rule: the files in the bundle are measured, run as in the pipeline; frames are taken whole, and nothing is random.
 
 RUNTIME = "ort"
 
 
 def frame_errors(bundle: Bundle, renderer: CaptureRenderer, numbers: Sequence[int], threads: int) -> list[ImageError]:
-    """The error of `bundle` on each of the frames `numbers` that shows the person, against the frame and its mask.
+    """Return the error of `bundle` on each of the frames `numbers` that shows the person.
 
-    `threads`: of the runtime. Raises BadInputError, MissingPartError.
+    The truth is the frame and its mask. `threads`: threads of the runtime. Raises BadInputError, MissingPartError.
     """
     paint = integer_painter(renderer, bundle, RUNTIME, threads)
     errors = []
@@ -355,7 +356,10 @@ def frame_errors(bundle: Bundle, renderer: CaptureRenderer, numbers: Sequence[in
 
 
 def error_facts(errors: Sequence[ImageError]) -> dict[str, Any]:
-    """Means of `errors`, and how they were measured: keys `runtime`, `size`, `frames`, and those of an error."""
+    """Return the means of `errors` and how they were measured.
+
+    Keys: `runtime`, `size`, `frames`, and those of an error.
+    """
     names = [name for name in MEANS if name != "background"]
     means = (
         {name: round(float(np.mean([getattr(error, name) for error in errors])), 4) for name in names} if errors else {}
@@ -364,6 +368,6 @@ def error_facts(errors: Sequence[ImageError]) -> dict[str, Any]:
 
 
 def write_held_out_error(bundle: Bundle, facts: dict[str, Any]) -> None:
-    """Put `facts` of held-out frames into the provenance of the manifest of `bundle`."""
+    """Put `facts` about held-out frames into the provenance in the manifest of `bundle`."""
     provenance = bundle.manifest.provenance | {"held_out_error": facts}
     write_manifest(bundle.folder, bundle.manifest.model_copy(update={"provenance": provenance}))

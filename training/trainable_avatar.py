@@ -1,7 +1,7 @@
 """What is trained: a neural texture and a network, which turn a UV image into a picture.
 
-Rule: while training, the network's input is rounded to as many steps as its bytes have in the pipeline. Noise, where
-there is any, is in training mode alone.
+Rule: in training, the network's input is rounded to as many steps as its bytes have in the pipeline. Noise, if any,
+acts in training mode alone.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from trilane.training.validate import Painter
 
 Precision = Literal["float32", "bfloat16"]
-#: Steps of the network's input bytes on each side of zero.
+#: Number of steps of the network's input bytes on each side of zero.
 INPUT_STEPS = 127
 
 
@@ -41,10 +41,10 @@ class TrainableAvatar(nn.Module):
     """A neural texture and the network that reads it.
 
     `texture_noise`, `input_noise`: standard deviation of Gaussian noise on texels, and on the network's input. `grid`:
-    rounds weights and activations, where it is active.
+    byte grid that rounds weights and activations while it is active, or None.
     """
 
-    #: "bfloat16": the network is computed in it where that is safe; weights, texture and loss stay float32.
+    #: With "bfloat16" the network is computed in that format where it is safe; weights, texture and loss stay float32.
     precision: Precision = "float32"
 
     def __init__(self, texture: NeuralTexture, network: UNet) -> None:
@@ -54,7 +54,7 @@ class TrainableAvatar(nn.Module):
         self.grid: ByteGrid | None = None
 
     def forward(self, uv: Tensor, covered: Tensor) -> Tensor:
-        """`uv` (N,H,W,2) in 0..1 and `covered` (N,H,W) bool to pictures (N,4,H,W) in 0..1."""
+        """Turn `uv` (N,H,W,2) in 0..1 and `covered` (N,H,W) bool into pictures (N,4,H,W) in 0..1."""
         levels = [self._noisy(level, self.texture_noise) for level in self.texture.levels()]
         x = read_levels(levels, uv, covered)
         x = self._noisy(x, self.input_noise)
@@ -90,10 +90,11 @@ LIMIT = 1.0
 class NeuralTexture(nn.Module):
     """A Laplacian pyramid that sums to `start` (S,S,C) before training; S is the greatest of `sides`.
 
-    Each scale holds the difference of `start`, shrunk to its side, and the next coarser scale's image, enlarged. The
-    sum is clipped to -1..1, because the network's input has one byte range for all channels.
+    Each scale starts as `start`, shrunk to its side, minus the next coarser image, enlarged. The sum is clipped to
+    -1..1, because the network's input has one byte range for all channels.
 
-    `mip_levels`: smaller images, each of half the side, that are learnt on their own from `start`, shrunk.
+    `mip_levels`: number of smaller images, each of half the side, that start as `start`, shrunk, and are learnt
+    separately.
     """
 
     def __init__(self, start: F32, sides: tuple[int, ...] = SIDES, mip_levels: int = 0) -> None:
@@ -112,14 +113,14 @@ class NeuralTexture(nn.Module):
         )
 
     def image(self) -> Tensor:
-        """The texture (1, C, S, S)."""
+        """Return the texture (1, C, S, S)."""
         *finer, total = list(self.scales)
         for scale in reversed(finer):
             total = scale + _enlarged(total, scale.shape[-1])
         return total.clamp(-LIMIT, LIMIT)
 
     def levels(self) -> list[Tensor]:
-        """The texture and its smaller levels, (1, C, S, S), (1, C, S/2, S/2), ..."""
+        """Return the texture and its smaller levels, (1, C, S, S), (1, C, S/2, S/2), ..."""
         return [self.image(), *(level.clamp(-LIMIT, LIMIT) for level in self.mips)]
 
 
@@ -128,7 +129,7 @@ def _enlarged(scale: Tensor, side: int) -> Tensor:
 
 
 def read_texture(image: Tensor, uv: Tensor, covered: Tensor) -> Tensor:
-    """The network's input (N, C, H, W), channels last in memory: the texture read bilinearly at `uv`.
+    """Read the texture bilinearly at `uv`: the network's input (N, C, H, W), channels last in memory.
 
     `image` (1, C, S, S), `uv` (N, H, W, 2) in 0..1, `covered` (N, H, W) bool. Pixels that are not covered are 0.
     """
@@ -142,20 +143,20 @@ def read_texture(image: Tensor, uv: Tensor, covered: Tensor) -> Tensor:
     return filled.permute(0, 3, 1, 2)
 
 
-# Reads a texture that has smaller levels, as a GPU does: the more texels go by from pixel to pixel, the smaller.
+# Reads a texture with smaller levels as a GPU does: the more texels a pixel spans, the smaller the level.
 #
-# Rule: it is OpenGL's trilinear filter (specification 4.6, section 8.14): the level is the binary logarithm of the
-# texels that one pixel moves on, at most, and two levels next to it are mixed by it.
+# Rule: this is OpenGL's trilinear filter (specification 4.6, section 8.14). The level is the binary logarithm of the
+# most texels between one pixel and the next; the two levels next to it are mixed.
 #
-# A GPU knows a triangle's own derivatives; here the lesser of the differences to the two neighbours stands for them, so
-# that a seam, where u and v jump, does not count.
+# A GPU knows a triangle's own derivatives. Here the smaller of the differences to the two neighbours stands for them,
+# so that a seam, where u and v jump, does not count.
 
-#: Texels a pixel below which the level is 0 anyway.
+#: Lower bound of the texels between pixels, below which the level is 0 anyway.
 LEAST = 1e-3
 
 
 def read_levels(levels: Sequence[Tensor], uv: Tensor, covered: Tensor) -> Tensor:
-    """The network's input (N, C, H, W), as `read_texture` gives it of one level.
+    """Return the network's input (N, C, H, W), read from several levels; `read_texture` reads a single one.
 
     `levels`: (1, C, S, S), (1, C, S/2, S/2), ...; `uv` (N, H, W, 2) in 0..1; `covered` (N, H, W) bool.
     """
@@ -170,20 +171,20 @@ def read_levels(levels: Sequence[Tensor], uv: Tensor, covered: Tensor) -> Tensor
 
 
 def levels_of(bundle: Bundle) -> list[Tensor]:
-    """The texture of `bundle` and its smaller levels, as `read_levels` takes them. Raises BadInputError."""
+    """Return the texture of `bundle` and its smaller levels, as `read_levels` takes them. Raises BadInputError."""
     texture = bundle.read_texture()
     levels = [texture, *split_levels(bundle.read_levels(), texture.shape[1])]
     return [torch.from_numpy(level.transpose(2, 0, 1).copy())[None] for level in levels]
 
 
 def level_of_detail(uv: Tensor, covered: Tensor, side: int) -> Tensor:
-    """(N, H, W): 0 where a pixel moves on by a texel of `side` at most, 1 where by two, and so on."""
+    """Return the level (N, H, W): 0 where the next pixel is at most a texel of `side` away, 1 where two, and so on."""
     texels = torch.maximum(_least_step(uv, covered, 1), _least_step(uv, covered, 2)) * side
     return torch.log2(texels.clamp(min=LEAST)).clamp(min=0)
 
 
 def _least_step(uv: Tensor, covered: Tensor, axis: int) -> Tensor:
-    """(N, H, W): how far `uv` is from that of the nearer neighbour on the body along `axis`; 0 where there is none."""
+    """Return the distance (N, H, W) of `uv` to the nearer neighbour on the body along `axis`; 0 where there is none."""
     size = covered.shape[axis] - 1
     ends = (uv.narrow(axis, 0, size), uv.narrow(axis, 1, size))
     both = covered.narrow(axis, 0, size) & covered.narrow(axis, 1, size)
@@ -196,13 +197,13 @@ def _least_step(uv: Tensor, covered: Tensor, axis: int) -> Tensor:
 
 # Weights of a network as an .npz file.
 #
-# Rule: a file is complete or not there; weights are loaded only into a network that has every one of them.
+# Rule: a file is complete or not there; a network loads weights only from a file that has every one of them.
 
 SAVED_WEIGHTS = "weights that this network's training saved"
 
 
 def load_network(network: UNet, path: Path) -> UNet:
-    """Load the network of a file of `save_network` into `network`. Raises BadInputError."""
+    """Load into `network` a file that `save_network` wrote. Raises BadInputError."""
     weights = _read_weights(path)
     prefix = "network."
     _fill(network, {k.removeprefix(prefix): v.float() for k, v in weights.items() if k.startswith(prefix)}, path)
@@ -239,21 +240,21 @@ def _fill(module: nn.Module, weights: dict[str, Tensor], path: Path) -> None:
         raise BadInputError(path, f"no {missing[0]}" if missing else f"also {unexpected[0]}", SAVED_WEIGHTS)
 
 
-# The float network that an avatar's integers stand for, so that training goes on where only the avatar was kept.
+# Recovers the float network that an avatar's integers stand for, to train further where only the avatar was kept.
 #
-# Rule: it computes what the integer network computes, but for the rounding of activations. Batch norms, which were
-# folded into the convolutions before them, are there again with the statistics of training samples.
+# Rule: it computes what the integer network computes, except for the rounding of activations. Batch norms, which were
+# folded into the convolutions before them, are restored with the statistics of training samples.
 
-#: The two convolutions of the heads, which are exported side by side: colour first, then the mask.
+#: Names of the heads' two convolutions, which are exported side by side: colour first, then the mask.
 FIRST, SECOND, COLOURS = "first", "second", 3
-#: Samples that norms are measured on.
+#: Size and number of the batches that norms are measured on.
 BATCH, BATCHES = 8, 8
 
 
 def network_of(bundle: Bundle, groups: list[ShapeGroup], seed: int) -> UNet:
-    """The float network of `bundle`. `groups`: samples that norms are measured on, chosen by `seed`.
+    """Return the float network of `bundle`. Raises BadInputError.
 
-    Raises BadInputError.
+    `groups`: samples that norms are measured on. `seed`: seed of their choice.
     """
     entry = bundle.manifest.network
     network = UNet(entry.encoder, "batch", entry.width, entry.channels, input_skip=True)
@@ -277,7 +278,7 @@ def network_of(bundle: Bundle, groups: list[ShapeGroup], seed: int) -> UNet:
 
 
 def _inputs(bundle: Bundle, groups: list[ShapeGroup], seed: int) -> Iterator[Tensor]:
-    """(N,C,H,W): what the network of `bundle` reads of some samples."""
+    """Yield what the network of `bundle` reads of some samples, (N,C,H,W)."""
     texture = torch.from_numpy(bundle.read_texture()).permute(2, 0, 1)[None]
     for group, index in islice(batches(groups, BATCH, np.random.default_rng(seed)), BATCHES):
         uv, covered, _ = load_batch(group, index)
@@ -285,7 +286,7 @@ def _inputs(bundle: Bundle, groups: list[ShapeGroup], seed: int) -> Iterator[Ten
 
 
 def _constants(model: onnx.ModelProto) -> Iterator[tuple[str, tuple[F32, F32]]]:
-    """Name, kernel and bias of each convolution of `model` as the modules of a `UNet` have them."""
+    """Yield name, kernel and bias of each convolution of `model`, named as the modules of a `UNet`."""
     stored = {name: numpy_helper.to_array(tensor) for name, tensor in constants_of(model).items()}
     made_by = {node.output[0]: node for node in model.graph.node if node.op_type == "DequantizeLinear"}
 
@@ -310,7 +311,7 @@ def _constants(model: onnx.ModelProto) -> Iterator[tuple[str, tuple[F32, F32]]]:
 
 
 def _measure_norms(network: UNet, inputs: Iterable[Tensor]) -> None:
-    """Give the norms of `network`, which change nothing but add their biases, the statistics of `inputs`; in place."""
+    """Give the norms of `network` the statistics of `inputs`, in place; before, they only add their biases."""
     norms = [norm for _, _, norm in convolutions(network) if norm is not None]
     sums: dict[nn.Module, list[Tensor]] = {norm: [] for norm in norms}
 
@@ -339,7 +340,7 @@ def _measure_norms(network: UNet, inputs: Iterable[Tensor]) -> None:
 
 
 def float_painter(network: UNet, *levels: torch.Tensor) -> Painter:
-    """A painter that runs `network` on the texture of `levels` (1,C,S,S), (1,C,S/2,S/2), ..., where they are."""
+    """Return a painter that runs `network` on the texture of `levels` (1,C,S,S), (1,C,S/2,S/2), ..., where they are."""
     network.eval()
 
     def paint(_: Sample, uv: NDArray[np.float32]) -> U8:
@@ -353,7 +354,10 @@ def float_painter(network: UNet, *levels: torch.Tensor) -> Painter:
 
 
 def float_painter_of(bundle: Bundle, weights: Path) -> Painter:
-    """A painter that runs the network of a file of `save_network` on the texture of `bundle`. Raises BadInputError."""
+    """Return a painter that runs the network of a file of `save_network` on the texture of `bundle`.
+
+    Raises BadInputError.
+    """
     entry = bundle.manifest.network
     network = load_network(UNet(norm=entry.norm, width=entry.width, channels=entry.channels, input_skip=True), weights)
     return float_painter(network, *levels_of(bundle))

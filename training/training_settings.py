@@ -1,6 +1,6 @@
 """`training.toml`: everything that decides what a training makes, in one file that the bundle keeps.
 
-Rule: no folders are in it; the same file, capture and machine give the same avatar on one thread of a CPU.
+Rule: the file names no folders; the same file, capture and machine give the same avatar on one thread of a CPU.
 """
 
 from __future__ import annotations
@@ -17,21 +17,23 @@ from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_text
 from trilane.scene.schema import LISTED, Table
 
-# Options of a training, in tables of `training.toml`: the optimiser, how batches are made, what makes it harder.
+# Options of a training, in tables of `training.toml`: the optimiser, the batches, and what regularises the avatar.
 #
-# Rule: it needs no PyTorch, so that settings are read, and refused, where none is installed. The defaults change
+# Rule: this needs no PyTorch, so that settings are read, and refused, where none is installed. The defaults change
 # nothing.
 
 Repeats = Annotated[int, Field(ge=1, le=100)]
 
 
 class OptimiserOptions(Table):
-    """`[optimiser]`.
+    """Table `[optimiser]`.
 
-    `kind`: Adam (a decay of weights goes through its moments) or AdamW (it does not). `momentum`, `texture_momentum`:
-    Adam's first, of network and texture; 0 is off. `second_momentum`: Adam's second, of both. `clip_norm`: the norm of
-    all gradients is at most this; 0 is off. `clip_value`: each number of a gradient is at most this; 0 is off.
-    `batches_per_step`: whose mean gradient makes a step.
+    `kind`: Adam (a decay of weights goes through its moments) or AdamW (it does not).
+    `momentum`, `texture_momentum`: Adam's first momentum, for network and texture; 0 is off.
+    `second_momentum`: Adam's second momentum, for both.
+    `clip_norm`: upper bound of the norm of all gradients; 0 is off.
+    `clip_value`: upper bound of each number of a gradient; 0 is off.
+    `batches_per_step`: number of batches whose mean gradient makes a step.
     """
 
     kind: Literal["adamw", "adam"] = "adamw"
@@ -44,12 +46,14 @@ class OptimiserOptions(Table):
 
 
 class BatchOptions(Table):
-    """`[batches]`.
+    """Table `[batches]`.
 
-    `sample_share`: of the samples, drawn once, that are used. `same_zoom`: the samples of a batch have about one zoom.
-    `full_body_statistics`: batch statistics come from batches of whole bodies alone, other batches use them.
-    `full_body_from`: share of the steps after which all samples show whole bodies. `repeats`: how often an epoch has a
-    sample of each band: far, full body, upper body, face, anywhere.
+    `sample_share`: share of the samples, drawn once, that is used.
+    `same_zoom`: whether the samples of a batch have about the same zoom.
+    `full_body_statistics`: whether batch statistics come from batches of whole bodies alone; other batches then use
+    them.
+    `full_body_from`: share of the steps after which all samples show whole bodies.
+    `repeats`: number of times that an epoch has a sample of each band: far, full body, upper body, face, anywhere.
     """
 
     sample_share: float = Field(default=1.0, gt=0, le=1)
@@ -60,10 +64,11 @@ class BatchOptions(Table):
 
 
 class RegularisationOptions(Table):
-    """`[regularisation]`: what is done to the avatar in each step.
+    """Table `[regularisation]`: what is done to the avatar in each step.
 
     `texture_noise`, `input_noise`: standard deviation of Gaussian noise on every texel, and on every number of the
-    network's input. `dropout`: probability of each channel to be 0 after each level of encoder and decoder.
+    network's input.
+    `dropout`: probability that a channel is 0 after a level of encoder or decoder.
     """
 
     texture_noise: float = Field(default=0.0, ge=0, le=1)
@@ -73,14 +78,14 @@ class RegularisationOptions(Table):
 
 # Weights of the terms of the loss, by name.
 #
-# Rule: it needs no PyTorch, so that settings are read, and refused, where none is installed.
+# Rule: this needs no PyTorch, so that settings are read, and refused, where none is installed.
 
 
 class LossWeights(Table):
-    """Of each term of `losses.loss_terms`; 0 leaves it out. The defaults are the default avatar's.
+    """Weight of each term of `objective.loss_terms`; 0 leaves it out. The defaults are the default avatar's.
 
-    `perceptual` is by features of VGG-16 where their weights are given, else one minus MS-SSIM, as `structure` always
-    is. `adversarial` and `features` (feature matching) bring discriminators.
+    `perceptual` uses features of VGG-16 where their weights are given. Else it is one minus MS-SSIM, as `structure`
+    always is. `adversarial` and `features` (feature matching) bring discriminators.
     """
 
     composite: float = Field(default=0.4, ge=0, le=1000)
@@ -98,19 +103,20 @@ class LossWeights(Table):
 
     @property
     def judged(self) -> bool:
-        """Whether a term is about what discriminators find."""
+        """Whether a term needs discriminators."""
         return self.adversarial > 0 or self.features > 0
 
     def by_name(self) -> dict[str, float]:
-        """The weights as `losses.total_loss` takes them."""
+        """Return the weights as `objective.total_loss` takes them."""
         return {str(name): float(value) for name, value in self.model_dump().items()}
 
 
-# What is usual in a training where its settings do not say it: by its loss, by what it starts from, by its length.
+# What is usual in a training whose settings do not say it: by its loss, by what it starts from, by its length.
 #
-# Rule: these are values of `TrainingSettings`, nothing else, and all of them stand in the `training.toml` of an avatar.
+# Rule: usual values are values of `TrainingSettings` and nothing else, and all of them are written into the avatar's
+# `training.toml`.
 
-#: Losses by name: the weights, and the settings that belong to them where a training does not say others.
+#: Losses by name: the weights, and the settings that go with them unless a training sets others.
 LOSSES: dict[str, dict[str, Any]] = {
     "default": {"loss": {}},
     "thesis": {
@@ -123,18 +129,19 @@ LOSSES: dict[str, dict[str, Any]] = {
         "optimiser": {"kind": "adam", "second_momentum": 0.999, "clip_norm": 0.0},
     },
 }
-#: With a network that is trained already, and with a new one.
+#: Usual values with a network that is trained already, and with a new one.
 TRAINED: dict[str, Any] = {"small_until": 0.0, "freeze_norms_at": 0.3}
 NEW: dict[str, Any] = {"small_until": 0.12, "freeze_norms_at": 0.6}
-#: Of a new network that has less than so many minutes: cheap steps at a high rate (docs/decisions/avatar-training.md).
+#: A training of a new network in fewer minutes than this takes cheap steps at a high rate
+#: (docs/decisions/avatar-training.md).
 SHORT_MINUTES = 5.0
 SHORT: dict[str, Any] = {"batch": 2, "small_until": 0.8, "network_rate": 5e-3, "texture_rate": 1e-3}
 
 
 def with_usual(values: dict[str, Any], where: str | Path) -> dict[str, Any]:
-    """`values`, which stand at `where`, and what is usual with them; a loss that has a name by its weights.
+    """Return `values` with the usual values added; the name of a loss becomes its weights.
 
-    Raises BadInputError for a name that no loss has.
+    `where`: place of `values`, for messages. Raises BadInputError for a name that no loss has.
     """
     start, name = values.get("start", "default"), values.get("loss")
     usual = (NEW if start == "new" else TRAINED) | (_of_loss(name, where) if isinstance(name, str) else {})
@@ -156,7 +163,7 @@ def _is_short(values: dict[str, Any]) -> bool:
 
 
 def _over(usual: Any, value: Any) -> Any:
-    """`value`; of a table, what it does not say is as `usual`."""
+    """Return `value`; in a table, keys that it lacks come from `usual`."""
     return usual | value if isinstance(usual, dict) and isinstance(value, dict) else value
 
 
@@ -228,7 +235,7 @@ class TrainingSettings(Table):
 
 
 def read_settings(path: Path) -> TrainingSettings:
-    """The settings in the file `path`. Raises BadInputError."""
+    """Read the settings in the file `path`. Raises BadInputError."""
     try:
         values = tomllib.loads(read_text(path, EXPECTED))
     except tomllib.TOMLDecodeError as error:
@@ -237,7 +244,10 @@ def read_settings(path: Path) -> TrainingSettings:
 
 
 def parsed_settings(values: dict[str, Any], where: str | Path) -> TrainingSettings:
-    """The settings of `values`, which stand at `where`; `loss` may be the name of one. Raises BadInputError."""
+    """Return the settings of `values`, where `loss` may be the name of a loss.
+
+    `where`: place of `values`, for messages. Raises BadInputError.
+    """
     try:
         settings = TrainingSettings.model_validate(with_usual(values, where))
     except ValidationError as error:
@@ -248,7 +258,7 @@ def parsed_settings(values: dict[str, Any], where: str | Path) -> TrainingSettin
     return settings
 
 
-#: What does not go together: key, test, what is expected of the key, and another way.
+#: Settings that exclude each other: key, test, expected value of the key, and another remedy.
 CLASHES: tuple[tuple[str, Callable[[TrainingSettings], bool], str, str], ...] = (
     ("norm", lambda s: s.start != "new" and s.norm != "batch", "batch of a trained network", 'or start = "new"'),
     (
@@ -267,7 +277,7 @@ CLASHES: tuple[tuple[str, Callable[[TrainingSettings], bool], str, str], ...] = 
 
 
 def settings_text(settings: TrainingSettings) -> str:
-    """The text of a file of `settings`: every value, also where it is the default."""
+    """Return the text of a settings file: every value, also where it is the default."""
     values = settings.model_dump(by_alias=True, exclude_none=True)
     tables = {key: value for key, value in values.items() if isinstance(value, dict)}
     lines = [HEAD, *_lines({key: value for key, value in values.items() if key not in tables})]
@@ -281,7 +291,7 @@ def _lines(values: dict[str, Any]) -> list[str]:
 
 
 def _refused(details: dict[str, Any], where: str | Path) -> BadInputError:
-    """One of the `errors()` of a ValidationError."""
+    """Turn one of the `errors()` of a ValidationError into a BadInputError."""
     place, keys = f"{where}: {'.'.join(map(str, details['loc']))}", details["loc"]
     if details["type"] != "extra_forbidden":
         return BadInputError(place, repr(details["input"])[:80], details["msg"].removeprefix("Input should be "))

@@ -1,4 +1,4 @@
-"""Validates an avatar: what lies in its bundle is evaluated on held-out samples, and its manifest says how good it is.
+"""Validates an avatar: evaluates the files of its bundle on held-out samples and writes the result into its manifest.
 
 Rule: bundle, seeds, motions, size and runtimes alone decide the figures; the digests are of the files that were read.
 """
@@ -42,11 +42,12 @@ from trilane.training.dataset import VALIDATION_SIZE, plan_validation
 from trilane.training.image_error import ImageError, SampleError, image_error, over, summary
 from trilane.training.sample_renderer import BAND_NAMES, Sample, SampleRenderer
 
-# Evaluates an avatar on held-out samples: every painter's picture of a sample beside the sample's ground truth.
+# Evaluates an avatar on held-out samples: compares every painter's picture of a sample with the ground truth.
 #
-# Rule: the integer network is evaluated as it runs in the pipeline: bytes of the packed pass, through a runtime.
+# Rule: the integer network is evaluated as it runs in the pipeline: it reads bytes of the packed pass, through a
+# runtime.
 
-#: Paints the picture (h,w,4) of a sample and its UV image (h,w,3).
+#: A function that paints the picture (h,w,4) of a sample, given the sample and its UV image (h,w,3).
 Painter = Callable[[Any, NDArray[np.float32]], U8]
 
 
@@ -57,15 +58,15 @@ class Drawn(Protocol):
     mesh: SkinnedMesh
 
     def placed(self, sample: Any) -> tuple[F64, Placement]:
-        """The camera (4,4) of `sample`, and its body's pose, crop and place in the tensor."""
+        """Return the camera (4,4) of `sample`, and its body's pose, crop and place in the tensor."""
 
 
 @dataclass(frozen=True)
 class Evaluated:
-    """One sample.
+    """The result for one sample.
 
-    `number`: of the sample among those that were given. `band`: its name. `truth`: the ground truth (h,w,4).
-    `pictures`, `errors`: of each painter, by its name.
+    `number`: number of the sample among those that were given. `band`: name of its band. `truth`: ground truth (h,w,4).
+    `pictures`, `errors`: picture and error of each painter, by its name.
     """
 
     number: int
@@ -78,7 +79,7 @@ class Evaluated:
 def evaluate(
     renderer: SampleRenderer, samples: Iterable[Sample], painters: Mapping[str, Painter]
 ) -> Iterator[Evaluated]:
-    """Pictures and errors of `samples` by each of `painters`; samples that show no person are left out."""
+    """Yield pictures and errors of `samples` by each of `painters`; samples that show no person are left out."""
     for number, sample in enumerate(samples):
         uv, truth = renderer.render(sample)
         pictures = {name: paint(sample, uv) for name, paint in painters.items()}
@@ -89,12 +90,12 @@ def evaluate(
 
 
 def integer_painter(renderer: Drawn, bundle: Bundle, runtime: str, threads: int) -> Painter:
-    """A painter that runs the GPU unit's packed pass, then the integer network of `bundle` on `runtime`.
+    """Return a painter that runs the GPU unit's packed pass, then the integer network of `bundle` on `runtime`.
 
     `renderer`: the body and its OpenGL context.
-    `bundle`: whose texture and network are read.
-    `runtime`: its name.
-    `threads`: of the runtime.
+    `bundle`: bundle whose texture and network are read.
+    `runtime`: name of the runtime.
+    `threads`: threads of the runtime.
     Raises BadInputError, MissingPartError.
     """
     network, texture, runs = bundle.read_network(), bundle.read_texture(), load_runtime(runtime)
@@ -120,12 +121,12 @@ def integer_painter(renderer: Drawn, bundle: Bundle, runtime: str, threads: int)
 
 
 BUILTIN_HELD_OUT = "builtin:walk-wave-turn"
-#: Seeds of a validation; the worst of 96 samples differs by several dB from seed to seed.
+#: Seeds of a validation. There are several, because the worst of 96 samples differs by several dB from seed to seed.
 SEEDS = (1, 2, 3, 4, 5, 6, 7, 8)
 PER_BAND = 24
-#: The painter of the float network, beside those that have the names of runtimes.
+#: Name of the float network's painter; the other painters have the names of runtimes.
 FLOAT = "float"
-#: Who looks at each sample of a seed when it was evaluated.
+#: A function that is called with the seed's number and each sample after its evaluation.
 Look = Callable[[int, Evaluated], None]
 
 
@@ -133,10 +134,10 @@ Look = Callable[[int, Evaluated], None]
 class ValidationPlan:
     """What an avatar is evaluated on.
 
-    `held_out`: motions that poses come from, `builtin:NAME` or files. `seeds`: of the samples, `per_band` of each band
-    for each. `runtimes`: the first one's figures are the avatar's, the others stand beside. `size`: tensor size.
-    `threads`: of a software OpenGL driver and of each runtime. `revision`, `modified`: of Trilane's checkout, where
-    known.
+    `held_out`: motions that poses come from, `builtin:NAME` or files. `seeds`: seeds of the samples. `per_band`:
+    samples of each band for each seed. `runtimes`: names of runtimes; the first one's figures are the avatar's, the
+    others stand beside them. `size`: tensor size. `threads`: threads of a software OpenGL driver and of each runtime.
+    `revision`, `modified`: state of Trilane's checkout, where known.
     """
 
     held_out: tuple[str, ...] = (BUILTIN_HELD_OUT,)
@@ -151,19 +152,22 @@ class ValidationPlan:
 
 @dataclass(frozen=True)
 class FloatNetwork:
-    """The network before it was quantised. `name`: for the manifest. `paint`: its painter."""
+    """The network before it was quantised.
+
+    `name`: its name in the manifest. `paint`: its painter.
+    """
 
     name: str
     paint: Painter
 
 
 def held_out_motions(names: Iterable[str]) -> list[Motion]:
-    """The motions `names`. Raises BadInputError."""
+    """Return the motions `names`. Raises BadInputError."""
     return [load_motion(AvatarSpec(motion=name), Path.cwd()) for name in names]
 
 
 def open_renderer(bundle: Bundle, threads: int) -> SampleRenderer:
-    """The renderer of the samples of `bundle`'s body. Raises BadInputError, MissingPartError."""
+    """Open the renderer of samples of `bundle`'s body. Raises BadInputError, MissingPartError."""
     return SampleRenderer(bundle.shaped_body(), threads, look=look_of(bundle.manifest.provenance))
 
 
@@ -176,11 +180,11 @@ def validate(
 ) -> Validation:
     """Evaluate `bundle` and return its validation.
 
-    `bundle`: whose files are read.
-    `plan`: the samples and the runtimes.
-    `renderer`: of `open_renderer`.
-    `float_network`: evaluated beside; None for none.
-    `look`: gets every sample; painters have the names of runtimes and `FLOAT`.
+    `bundle`: bundle whose files are read.
+    `plan`: samples and runtimes.
+    `renderer`: renderer from `open_renderer`.
+    `float_network`: float network to evaluate too, or None.
+    `look`: called with every sample; painters have the names of runtimes and `FLOAT`.
     Raises BadInputError, MissingPartError.
     """
     digests = digests_of(bundle.folder, bundle.manifest)
@@ -228,7 +232,7 @@ def _made_with(plan: ValidationPlan, renderer: SampleRenderer) -> MadeWith:
 
 
 def _arranged(figures: Mapping[str, dict[str, Any]], runtimes: tuple[str, ...], float_network: str) -> dict[str, Any]:
-    """The keys of a validation with `figures` of each painter."""
+    """Arrange the `figures` of each painter under the keys of a validation."""
     first, *others = runtimes
     own = figures[first]
     arranged: dict[str, Any] = {
@@ -247,20 +251,23 @@ def _arranged(figures: Mapping[str, dict[str, Any]], runtimes: tuple[str, ...], 
 
 
 def _origin(motion: str) -> str:
-    """What the motion is beyond its name: built in, or the digest of its file."""
+    """Return where a motion comes from: `built in`, or the digest of its file."""
     return "built in" if motion.startswith("builtin:") else f"sha256 {sha256_of([Path(motion)])}"
 
 
-# What smaller tensors cost an avatar: the same views, painted at several sizes of tensor.
+# The cost of smaller tensors to an avatar's quality: the same views, painted at several sizes of tensor.
 #
-# Rule: a smaller picture is enlarged as the composite does it, bilinearly in linear light with its colours multiplied
-# by alpha, to the size of the largest; there all are compared with the same ground truth.
+# Rule: a smaller picture is enlarged to the size of the largest one as the composite does it: bilinearly, in linear
+# light, with colours multiplied by alpha. All are then compared with the same ground truth.
 
 DIGITS = 2
 
 
 def sizes_of(own: Shape) -> list[Shape]:
-    """Of a network's own tensor and the planner's smaller ones, in whole steps; each once, the largest first."""
+    """Return the sizes of a network's own tensor and of the planner's smaller ones, once each, the largest first.
+
+    Sides are whole steps.
+    """
     return list(dict.fromkeys((_stepped(own[0] * side), _stepped(own[1] * side)) for side in SIDES))
 
 
@@ -271,10 +278,10 @@ def _stepped(side: float) -> int:
 def measure_sizes(
     bundle: Bundle, plan: ValidationPlan, renderer: SampleRenderer, look: Callable[[], None] = lambda: None
 ) -> BySize:
-    """The figures of `bundle` by size of tensor.
+    """Measure the figures of `bundle` by size of tensor.
 
-    `plan`: of the validation; views of its first seed are painted on its first runtime.
-    `renderer`: of `trilane.training.validate.open_renderer`.
+    `plan`: plan of the validation; views of its first seed are painted on its first runtime.
+    `renderer`: renderer from `open_renderer`.
     `look`: called for every view.
     Raises BadInputError, MissingPartError.
     """
@@ -303,12 +310,12 @@ def measure_sizes(
 
 
 def with_sizes(validation: Validation, by_size: BySize) -> Validation:
-    """`validation` with what was just measured beside it."""
+    """Return `validation` with the figures `by_size`, measured now, added."""
     return with_figures_digest(validation.model_copy(update={"by_size": by_size}))
 
 
 def enlarged(picture: U8, shape: Shape) -> U8:
-    """`picture` (h,w,4) sRGB with straight alpha, enlarged to `shape` (height, width)."""
+    """Enlarge `picture` (h,w,4), sRGB with straight alpha, to `shape` (height, width)."""
     alpha = picture[..., 3:] / 255.0
     planes = np.dstack([_linear(picture[..., :3] / 255.0) * alpha, alpha]).astype(np.float32)
     larger = np.dstack([_resized(planes[..., plane], shape) for plane in range(4)])
@@ -321,34 +328,34 @@ def _resized(plane: NDArray[np.float32], shape: Shape) -> NDArray[np.float32]:
 
 
 def _linear(encoded: NDArray[np.float64]) -> NDArray[np.float64]:
-    """IEC 61966-2-1."""
+    """Decode sRGB to linear light (IEC 61966-2-1)."""
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def _encoded(linear: NDArray[np.floating]) -> NDArray[np.floating]:
-    """IEC 61966-2-1."""
+    """Encode linear light as sRGB (IEC 61966-2-1)."""
     return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 
 
 # Sheets that compare pictures: the ground truth and what each painter made of it, side by side.
 #
-# Rule: all pictures are before the same scenery, in which a transparent person shows, and none is enlarged.
+# Rule: all pictures stand before the same scenery, which shows through a transparent person, and none is enlarged.
 
 SHEET_CELL = (256, 192)
 
 
 def worst_sheet(samples: Sequence[Evaluated], painters: Sequence[str]) -> NDArray[np.uint8]:
-    """A row for each of `samples`: (height, width, 3) uint8."""
+    """Return an image (height, width, 3) uint8 with a row for each of `samples`."""
     return np.vstack([_cells(sample, painters) for sample in samples])
 
 
 def _cells(sample: Evaluated, painters: Sequence[str]) -> NDArray[np.uint8]:
-    """The ground truth and the pictures of `painters` side by side."""
+    """Put the ground truth and the pictures of `painters` side by side."""
     return side_by_side((sample.truth, *(sample.pictures[name] for name in painters)))
 
 
 def side_by_side(pictures: Iterable[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """`pictures` (h,w,4), each in a cell: (height, width, 3) uint8."""
+    """Put `pictures` (h,w,4) side by side, each in a cell: (height, width, 3) uint8."""
     return np.hstack([_cell(picture) for picture in pictures])
 
 

@@ -1,4 +1,4 @@
-"""What several benches share: fixtures, networks, load patterns and clocks.
+"""Parts that several benches share: fixtures, networks, load patterns and clocks.
 
 It may use what bench/ may, but no module of bench/ itself.
 """

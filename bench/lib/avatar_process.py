@@ -1,6 +1,7 @@
-"""Runs of an avatar, each asked of a process of its own, so that two can go on at once on the same cores.
+"""Runs of an avatar, each in a process of its own, so that two can go on at once on the same cores.
 
-Rule: the process is what `trilane run` is: its own scheduler, its own units; two of them share nothing but the machine.
+Rule: the process does what `trilane run` does, with its own scheduler and its own units; two of them share nothing but
+the machine.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ START_S, RUN_S = 120.0, 600.0
 class Asked:
     """A run of the default scene.
 
-    `avatar`, `size`, `frames`, `runtime`: as `trilane.stages.run_options.RunOptions` has them. `cores`: cores that its
-    units share by the rule for any run. `video`: whether one is encoded. `edge`: the rule of all edges.
+    `avatar`, `size`, `frames`, `runtime`: as in `trilane.stages.run_options.RunOptions`. `cores`: cores that its units
+    share by the rule for any run. `video`: whether a video is encoded. `edge`: rule of all edges.
     """
 
     avatar: str
@@ -37,35 +38,38 @@ class Asked:
 
 
 class Ran(NamedTuple):
-    """`jobs`: all that ended. `seats`: unit -> its cores, as text."""
+    """The result of a run.
+
+    `jobs`: all jobs that ended. `seats`: each unit's cores, as text.
+    """
 
     jobs: tuple[JobRecord, ...]
     seats: dict[str, str]
 
 
 class AvatarProcess:
-    """The parent's end."""
+    """The parent's end of a process."""
 
     def __init__(self, pipe: Connection, name: str) -> None:
         self._pipe, self._name = pipe, name
 
     def begin(self, policy: str) -> None:
-        """A run under `policy` begins."""
+        """Begin a run under `policy`."""
         self._pipe.send(policy)
 
     def result(self) -> Ran:
-        """Of the run that was begun. Raises TrilaneError when it failed."""
+        """Return the result of the run that was begun. Raises TrilaneError when it failed."""
         jobs, seats = self.receive(RUN_S)
         return Ran(tuple(JobRecord(*job) for job in jobs), seats)
 
     def receive(self, wait_s: float) -> Any:
-        """The process's next answer. Raises TrilaneError."""
+        """Return the process's next answer. Raises TrilaneError."""
         return answer_of(self._pipe, self._name, wait_s)
 
 
 @contextmanager
 def avatar_processes(asked: Sequence[Asked]) -> Iterator[list[AvatarProcess]]:
-    """A process for each, ready to run; they end with the block. Raises TrilaneError when one does not start."""
+    """Start a process for each, ready to run; they end with the block. Raises TrilaneError when one does not start."""
     with asked_processes() as start:
         found = [AvatarProcess(start(serve, each), f"{each.avatar} at {each.size}") for each in asked]
         for one in found:
@@ -74,7 +78,7 @@ def avatar_processes(asked: Sequence[Asked]) -> Iterator[list[AvatarProcess]]:
 
 
 def serve(pipe: Connection, asked: Asked) -> None:
-    """The process: say that it is ready, then run under each policy that comes, until `pipe` closes."""
+    """Run the process: say that it is ready, then run under each policy that comes, until `pipe` closes."""
     from trilane.hw_profiles.host import host_units
     from trilane.stages.avatar_pipeline import run_avatar
     from trilane.stages.configure import configure

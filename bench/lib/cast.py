@@ -1,6 +1,6 @@
-"""Who is seen in a frame and where, for pictures of a scene that are made without the stages.
+"""The avatars in a frame and their places, for pictures of a scene that are made without the stages.
 
-Rule: motion, camera and media time are the pose stage's, so a picture shows the moment that the run's frame shows.
+Rule: motion, camera and media time are the pose stage's, so a picture shows the same moment as the run's frame.
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ from trilane.stages.cpu.mesh_bounds import MeshBounds
 
 @dataclass(frozen=True)
 class Seen:
-    """One avatar in one frame. `index`: its number in the scene.
+    """One avatar in one frame.
 
-    `folder`: of its bundle. `pose` (55,3), `translation` (3,), `world` (4,4): as `Mover.sample` and `Mover` have them.
-    `joints` (55,3,4): its skinning matrices, of the house. `box`: the pixels of the picture that hold it, clothes
-    included. `depth`: camera z of the pelvis. `view` (4,4); `projection` (4,4): of the box.
+    `index`: number of the avatar in the scene. `folder`: folder of its bundle. `pose` (55,3), `translation` (3,),
+    `world` (4,4): as in `Mover.sample` and `Mover`. `joints` (55,3,4): skinning matrices, as the pose stage computes
+    them. `box`: pixels of the picture that hold it, clothes included. `depth`: camera z of the pelvis. `view` (4,4):
+    view matrix. `projection` (4,4): projection of the box.
     """
 
     index: int
@@ -54,10 +55,13 @@ class _Actor:
 
 
 class Cast:
-    """The avatars and the camera of a scene. `avatars`: each distinct one by the folder of its bundle."""
+    """The avatars and the camera of a scene.
+
+    `avatars`: each distinct avatar, by the folder of its bundle.
+    """
 
     def __init__(self, checked: Checked) -> None:
-        """Raises BadInputError."""
+        """Load the avatars. Raises BadInputError."""
         scene, folders = checked.config.scene, checked.config.avatar_dirs
         self._fps = scene.fps
         self._output: Shape = (scene.output.height, scene.output.width)
@@ -73,18 +77,18 @@ class Cast:
         ]
 
     def seen(self, frame: int) -> list[Seen]:
-        """The avatars that are on the screen in frame number `frame`."""
+        """Return the avatars that are on the screen in frame number `frame`."""
         t_s = frame / self._fps
         view, whole = self._camera.sample(t_s), self.projection(frame)
         found = (self._seen(actor, t_s, view, whole) for actor in self._actors)
         return [seen for seen in found if seen is not None]
 
     def boxes(self, frame: int) -> list[Box]:
-        """The parts of the picture that hold avatars in frame number `frame`."""
+        """Return the parts of the picture that hold avatars in frame number `frame`."""
         return [seen.box.on(self._output) for seen in self.seen(frame)]
 
     def projection(self, frame: int) -> F64:
-        """(4,4) of the whole picture in frame number `frame`."""
+        """Return the projection (4,4) of the whole picture in frame number `frame`."""
         return self._camera.projection(frame / self._fps, self._output)
 
     def _seen(self, actor: _Actor, t_s: float, view: F64, whole: F64) -> Seen | None:

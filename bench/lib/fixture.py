@@ -1,8 +1,8 @@
-"""What the GPU benches draw, what it is compared with, and how variants are timed in turns.
+"""The scene that the GPU benches draw, its reference, and the timing of variants in turns.
 
 Rule: the default body stands as high as a square picture, with the same numbers every time; only size and channels
-vary. Avatars and ground truth are made by the functions of runs and of training. A busy machine
-hits all variants alike.
+vary. Avatars and ground truth are made by the functions of runs and of training. A busy machine affects all variants
+alike.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ WARM_UP = 5
 class Fixture:
     """The body and how it is seen.
 
-    `shaped`: the body's shape.
+    `shaped`: body in its shape.
     `posed`: its joints, posed.
     `arrays`: its mesh for the GPU.
-    `joints`: (55,3,4) float32 skinning matrices.
-    `view`, `projection`: (4,4) float64.
+    `joints`: skinning matrices, (55,3,4) float32.
+    `view`, `projection`: matrices of the camera, (4,4) float64.
     `texture`: (512,512,C) float64, the same numbers every time.
     """
 
@@ -55,7 +55,10 @@ class Fixture:
 
 
 def standing(channels: int, weights: int = 8) -> Fixture:
-    """The body with arms half down. `channels`: of its texture; `weights`: 4, 8 or 12 skin weights a vertex."""
+    """Return the body with arms half down.
+
+    `channels`: channels of its texture. `weights`: number of skin weights a vertex, 4, 8 or 12.
+    """
     body = load_body(bundle_folder("default") / "body.npz")
     shaped = body.shape()
     top = largest_weights(body.weights, weights)
@@ -92,7 +95,10 @@ def _texture(channels: int) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class Drawable:
-    """An avatar as the GPU draws it, without a run around it. `texture`: (H,W,C) float32."""
+    """An avatar as the GPU draws it, without a run around it.
+
+    `texture`: (H,W,C) float32.
+    """
 
     arrays: MeshArrays
     texture: F32
@@ -100,14 +106,17 @@ class Drawable:
 
 
 def load_drawable(name: str) -> Drawable:
-    """The avatar `name`. Raises BadInputError."""
+    """Load the avatar `name`. Raises BadInputError."""
     avatar = load_avatar(load_bundle(name))
     packed = avatar.bundle.manifest.network.input
     return Drawable(avatar_mesh(avatar.shaped), avatar.texture, Quantisation(packed.scale, packed.zero_point))
 
 
 def ground_truth(bundle: Bundle) -> tuple[Any, Any]:
-    """The renderer of the bundle's body, clothed, and the `image_error` of two pictures. Raises MissingPartError."""
+    """Return the renderer of the bundle's body, clothed, and the `image_error` of two pictures.
+
+    Raises MissingPartError.
+    """
     try:
         from trilane.training.clothing.looks import look_of
         from trilane.training.image_error import image_error
@@ -118,7 +127,10 @@ def ground_truth(bundle: Bundle) -> tuple[Any, Any]:
 
 
 def interleaved_ms(variants: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, list[float]]:
-    """Milliseconds of each variant in each of `repeats` rounds, after a warm-up; a round runs every variant once."""
+    """Return milliseconds of each variant in each of `repeats` rounds, after a warm-up.
+
+    A round runs each variant once.
+    """
     times: dict[str, list[float]] = {name: [] for name in variants}
     for round_number in range(-WARM_UP, repeats):
         for name, run in variants.items():
@@ -130,7 +142,7 @@ def interleaved_ms(variants: Mapping[str, Callable[[], object]], repeats: int) -
 
 
 def summary_ms(times_ms: list[float]) -> dict[str, float]:
-    """Median, minimum and 90th percentile in milliseconds."""
+    """Return median, minimum and 90th percentile in milliseconds."""
     return {
         "median_ms": float(np.median(times_ms)),
         "min_ms": float(np.min(times_ms)),

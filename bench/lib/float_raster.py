@@ -1,8 +1,8 @@
-"""A reference rasteriser in float64 NumPy: what the GPU stage's pictures are compared with.
+"""A reference rasteriser in float64 NumPy, with which the GPU stage's pictures are compared.
 
-Rule: exact where a driver rounds. Pixel centres at half-integers, top-left rule, less-than depth test, no snapping of
-vertices, no clipping: triangles are evaluated in homogeneous coordinates (Olano and Greer, "Triangle scan conversion
-using 2D homogeneous coordinates", 1997) and cut by the near and far planes pixel by pixel.
+Rule: it is exact where a driver rounds. Pixel centres are at half-integers; it uses the top-left rule and a less-than
+depth test, and neither snaps vertices nor clips. Triangles are evaluated in homogeneous coordinates (Olano and Greer,
+"Triangle scan conversion using 2D homogeneous coordinates", 1997) and cut by the near and far planes pixel by pixel.
 """
 
 from __future__ import annotations
@@ -22,7 +22,10 @@ BATCH_SAMPLES = 4_000_000
 
 @dataclass(frozen=True)
 class ReferenceImage:
-    """`coverage` (h,w) bool. `triangle` (h,w) int64, -1 outside. `uv` (h,w,2) and `depth` (h,w) float64, 0 outside."""
+    """A rasterised image.
+
+    `coverage` (h,w) bool. `triangle` (h,w) int64, -1 outside. `uv` (h,w,2) and `depth` (h,w) float64, 0 outside.
+    """
 
     coverage: NDArray[np.bool_]
     triangle: NDArray[np.int64]
@@ -31,7 +34,7 @@ class ReferenceImage:
 
 
 def skin(arrays: MeshArrays, joints: NDArray[np.floating[Any]]) -> F64:
-    """World positions (N,3) of `arrays` under skinning matrices `joints` (55,3,4)."""
+    """Return world positions (N,3) of `arrays` under skinning matrices `joints` (55,3,4)."""
     matrices = np.einsum("nk,nkij->nij", arrays.weight.astype(np.float64), joints.astype(np.float64)[arrays.joint])
     return np.asarray(np.einsum("nij,nj->ni", matrices[..., :3], arrays.position.astype(np.float64)) + matrices[..., 3])
 
@@ -46,12 +49,12 @@ def rasterise(
 ) -> ReferenceImage:
     """Draw triangles; row 0 is the top one.
 
-    `world`: (N,3) vertices, metres.
-    `triangles`: (F,3) vertices of each.
-    `uv`: (N,2) of each vertex.
-    `clip`: (4,4), projection @ view.
+    `world`: vertices, (N,3) metres.
+    `triangles`: vertices of each triangle, (F,3).
+    `uv`: texture coordinates of each vertex, (N,2).
+    `clip`: projection @ view, (4,4).
     `shape`: (height, width) in pixels.
-    `cull`: leave out triangles that wind clockwise in the picture.
+    `cull`: whether to leave out triangles that wind clockwise in the picture.
     """
     corners = _target_corners(world, clip, shape)[triangles]
     pixel, depth, owner, share = _fragments(corners, shape, cull)
@@ -70,7 +73,7 @@ def rasterise(
 
 
 def sample(texture: F64, uv: F64) -> F64:
-    """Bilinear samples (..., C) of `texture` (H,W,C) at `uv` (..., 2), clamped to its edge."""
+    """Return bilinear samples (..., C) of `texture` (H,W,C) at `uv` (..., 2), clamped to its edge."""
     height, width = texture.shape[:2]
     column, row = uv[..., 0] * width - 0.5, uv[..., 1] * height - 0.5
     left, top = np.floor(column).astype(np.int64), np.floor(row).astype(np.int64)
@@ -85,16 +88,16 @@ def sample(texture: F64, uv: F64) -> F64:
 
 
 def quantise(real: F64, scale: float, zero_point: int) -> NDArray[np.uint8]:
-    """q = clamp(round(real / scale) + zero_point, 0, 255), halves to even."""
+    """Return q = clamp(round(real / scale) + zero_point, 0, 255), halves to even."""
     return np.asarray(np.clip(np.rint(real / scale) + zero_point, 0, 255), np.uint8)
 
 
 def tensor(image: ReferenceImage, texture: F64, scale: float, zero_point: int) -> NDArray[np.uint8]:
-    """The network's input (h,w,C) uint8.
+    """Return the network's input (h,w,C) uint8.
 
-    `image`: the mesh as it is seen.
+    `image`: rasterised mesh.
     `texture`: (H,W,C).
-    `scale`, `zero_point`: of the quantisation; the zero point stands outside the mesh.
+    `scale`, `zero_point`: scale and zero point of the bytes; pixels off the mesh have the zero point.
     """
     q = np.full((*image.coverage.shape, texture.shape[2]), zero_point, np.uint8)
     q[image.coverage] = quantise(sample(texture, image.uv[image.coverage]), scale, zero_point)
@@ -102,7 +105,7 @@ def tensor(image: ReferenceImage, texture: F64, scale: float, zero_point: int) -
 
 
 def _target_corners(world: F64, clip: F64, shape: tuple[int, int]) -> F64:
-    """Vertices (N,4): homogeneous column, row, clip z, clip w, so that column / w is a position in pixels."""
+    """Return vertices (N,4): homogeneous column, row, clip z, clip w, so that column / w is a position in pixels."""
     x, y, z, w = np.moveaxis(np.c_[world, np.ones(len(world))] @ (FLIP_Y @ clip).T, -1, 0)
     return np.stack([(x + w) * shape[1] / 2, (y + w) * shape[0] / 2, z, w], axis=-1)
 
@@ -110,7 +113,7 @@ def _target_corners(world: F64, clip: F64, shape: tuple[int, int]) -> F64:
 def _fragments(
     corners: F64, shape: tuple[int, int], cull: bool
 ) -> tuple[NDArray[np.int64], F64, NDArray[np.int64], F64]:
-    """Every covered sample of every triangle: pixel index, depth z/w, triangle, shares (P,3) of the corners."""
+    """Return every covered sample of every triangle: pixel index, depth z/w, triangle, shares (P,3) of the corners."""
     low, size = _boxes(corners, shape)
     if cull:
         size[_determinant(corners) >= 0] = 0
@@ -128,7 +131,7 @@ def _fragments(
 
 
 def _boxes(corners: F64, shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First pixel (F,2) column, row and side (F,) of a square that holds each triangle; side 0 when it is outside."""
+    """Return a square that holds each triangle: first column and row (F,2), and side (F,), 0 when it is outside."""
     limit = np.array([shape[1], shape[0]])
     w = corners[..., 3]
     in_front = (w > 0).all(axis=1)
@@ -168,10 +171,16 @@ def _cross(points: F64, first: int, second: int) -> F64:
 
 
 def _determinant(points: F64) -> F64:
-    """(F,): positive for triangles that wind clockwise in the picture (rows run downward)."""
+    """Return a determinant (F,) that is positive for triangles that wind clockwise in the picture.
+
+    Rows run downwards.
+    """
     return np.asarray((_cross(points, 1, 2) * points[:, 0][:, [0, 1, 3]]).sum(axis=-1))
 
 
 def _top_left(edges: F64) -> NDArray[np.bool_]:
-    """Which edges (F,3,3) own the samples on them, rows downward: left edges, and level ones with the inside below."""
+    """Return which edges (F,3,3) own the samples on them: left edges, and level ones with the inside below.
+
+    Rows run downwards.
+    """
     return np.asarray((edges[..., 0] > 0) | ((edges[..., 0] == 0) & (edges[..., 1] > 0)))

@@ -1,8 +1,8 @@
-"""The FP32 network of an avatar: what the plan `full` paints with.
+"""The FP32 network of an avatar, with which the plan `full` paints.
 
-Rule: a picture's source is said. The network that the avatar was quantised from is taken where it is known, by the
-digest that the avatar's manifest has of it. Else the integer network is run with its weights in float32 and without
-rounding between its layers: what quantising the weights cost is then in `full` too.
+Rule: every picture states its source. The network that the avatar was quantised from is taken where it is known, by its
+digest in the avatar's manifest. Otherwise the integer network runs with its weights in float32 and without rounding
+between its layers. The loss by quantising the weights is then in `full` too.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from trilane.avatars.network_file import NetworkFile, constants_of, reshaped
 from trilane.errors import MissingPartError
 from trilane.shapes import Shape
 
-#: Where Trilane keeps the weights of float networks.
+#: Folder in which Trilane keeps the weights of float networks.
 WEIGHTS = Path(__file__).resolve().parents[2] / "training"
 IN, OUT = "real_tensor", "real_rgba"
-#: (h,w,C) float64, real numbers, to (h,w,4) float32: straight colour (sRGB) and alpha in 0..1.
+#: A function from real numbers (h,w,C) float64 to (h,w,4) float32: straight colour (sRGB) and alpha in 0..1.
 Paint = Callable[[F64], F32]
 
 
 def float_network(bundle: Bundle) -> tuple[Paint, str]:
-    """The FP32 network of `bundle`, and what it is, for people. Raises BadInputError, MissingPartError."""
+    """Return the FP32 network of `bundle`, and its source, for people. Raises BadInputError, MissingPartError."""
     weights = require_float_network(bundle)
     if weights is None:
         return dequantised(
@@ -41,7 +41,10 @@ def float_network(bundle: Bundle) -> tuple[Paint, str]:
 
 
 def require_float_network(bundle: Bundle) -> Path | None:
-    """Its `float_weights`. Raises MissingPartError when they cannot be run here: found out before long work."""
+    """Return `float_weights` of `bundle`.
+
+    Raises MissingPartError when they cannot be run here, which is found out before long work.
+    """
     weights = float_weights(bundle)
     if weights is not None and not machine.here.has_package("torch"):
         raise MissingPartError("the FP32 network needs torch", extra="train")
@@ -49,7 +52,7 @@ def require_float_network(bundle: Bundle) -> Path | None:
 
 
 def float_weights(bundle: Bundle) -> Path | None:
-    """The file of the network that `bundle` was quantised from; None when its manifest names none that is here.
+    """Return the file of the network that `bundle` was quantised from; None when its manifest names none here.
 
     A manifest names it by file and digest, as `avatar validate --float-network` writes it, or with how the network was
     quantised.
@@ -63,12 +66,12 @@ def float_weights(bundle: Bundle) -> Path | None:
 
 
 def weights_name(weights: Path) -> str:
-    """The file of a float network as a manifest names it."""
+    """Return the name of a float network's file as a manifest has it."""
     return f"{weights.name}, sha256 {sha256_of([weights])}"
 
 
 def trained(bundle: Bundle, weights: Path) -> Paint:
-    """The network of a file that training saved. Raises BadInputError, ImportError without PyTorch."""
+    """Return the network of a file that training saved. Raises BadInputError, ImportError without PyTorch."""
     import torch
 
     from trilane.training.network import UNet
@@ -88,7 +91,7 @@ def trained(bundle: Bundle, weights: Path) -> Paint:
 
 
 def dequantised(network: NetworkFile) -> Paint:
-    """`network` in FP32 by ONNX Runtime: see `unrounded`."""
+    """Return `network` in FP32 by ONNX Runtime: see `unrounded`."""
     sessions: dict[Shape, onnxruntime.InferenceSession] = {}
 
     def paint(tensor: F64) -> F32:
@@ -105,9 +108,9 @@ def dequantised(network: NetworkFile) -> Paint:
 
 
 def as_written(network: NetworkFile) -> Paint:
-    """The integer network as its file says it, every rounding to bytes and nothing else: what runtimes are to compute.
+    """Return the integer network exactly as its file defines it, with every rounding to bytes: the runtimes' reference.
 
-    ONNX Runtime runs node by node, in FP32, with no optimisation. Its input is real numbers, which need not be of
+    ONNX Runtime runs node by node, in FP32, with no optimisation. Its input is real numbers, which need not be those of
     bytes.
     """
     settings = onnxruntime.SessionOptions()
@@ -127,7 +130,10 @@ def as_written(network: NetworkFile) -> Paint:
 
 
 def from_real(network: NetworkFile) -> onnx.ModelProto:
-    """`network` with an input `IN` of real numbers, (N,H,W,C) float32, in place of its bytes. Else it is unchanged."""
+    """Return `network` with an input `IN` of real numbers, (N,H,W,C) float32, in place of its bytes.
+
+    Otherwise it is unchanged.
+    """
     model = onnx.ModelProto()
     model.CopyFrom(network.model)
     graph = model.graph
@@ -142,10 +148,10 @@ def from_real(network: NetworkFile) -> onnx.ModelProto:
 
 
 def unrounded(network: NetworkFile) -> onnx.ModelProto:
-    """`network` between real numbers: input `IN` (N,H,W,C), output `OUT` (N,H,W,4), both float32.
+    """Return `network` between real numbers: input `IN` (N,H,W,C), output `OUT` (N,H,W,4), both float32.
 
-    Every tensor that was rounded to bytes keeps the range of those bytes, because a range that begins at 0 stands for
-    a rectifier; only the rounding goes. Weights and biases are what the integers stand for.
+    Every tensor that was rounded to bytes keeps the range of those bytes, because a range that begins at 0 stands for a
+    rectifier; only the rounding is removed. Weights and biases are the real numbers of the integers.
     """
     model = onnx.ModelProto()
     model.CopyFrom(network.model)
@@ -176,7 +182,7 @@ def unrounded(network: NetworkFile) -> onnx.ModelProto:
 
 
 def _keep_what_is_read(graph: onnx.GraphProto) -> None:
-    """Leave out the constants that no node of `graph` reads."""
+    """Remove the constants that no node of `graph` reads."""
     read = {name for node in graph.node for name in node.input}
     kept = [tensor for tensor in graph.initializer if tensor.name in read]
     del graph.initializer[:]
@@ -184,7 +190,7 @@ def _keep_what_is_read(graph: onnx.GraphProto) -> None:
 
 
 def _range(node: onnx.NodeProto, constants: Mapping[str, onnx.TensorProto]) -> tuple[float, float]:
-    """The least and the largest real number that the bytes of a QuantizeLinear stand for."""
+    """Return the least and the largest real number that the bytes of a QuantizeLinear stand for."""
     scale = float(numpy_helper.to_array(constants[node.input[1]]).item())
     zero = numpy_helper.to_array(constants[node.input[2]])
     limits = np.iinfo(zero.dtype)

@@ -1,14 +1,14 @@
-"""The picture of the plan `full`: everything is modelled, nothing is spared. What plans are compared with.
+"""The picture of the plan `full`: everything is modelled, nothing is spared. Other plans are compared with it.
 
-Rule: written a second time, slowly, where it can be. The body has every weight and every blend shape in float64; the
-neural texture is read at SAMPLES x SAMPLES points of a tensor pixel, whose mean is not rounded; each avatar has a
-tensor of its own, of about the area that its network is for, where it paints best; the tensor lies on the picture's
-grid, so that a square of pixels of one is a pixel of the other; the network is in FP32; its picture is blended in
-linear light, in float64, over the run's own background.
+Rule: it is a second, slow implementation where that is possible. The body has every weight and every blend shape in
+float64. The neural texture is read at SAMPLES x SAMPLES points of a tensor pixel, whose mean is not rounded. Each
+avatar has a tensor of its own, of about the area that its network is for, where it paints best. The tensor lies on the
+picture's grid, so that a square of pixels of one is a pixel of the other. The network is in FP32; its picture is
+blended in linear light, in float64, over the run's own background.
 
-Beside it stands the picture with the clothed body itself, drawn by what training draws its samples with: what an
-avatar's network was trained to paint, so it tells of every plan, `full` included, how good its picture is. Only the
-bundled avatars have one. Clothes are put on the skin, not on an avatar's offsets, which are these clothes already.
+Beside it stands the picture with the clothed body itself, drawn as training draws its samples. An avatar's network was
+trained to paint that picture, so it shows how good every plan's picture is, including `full`. Only the bundled avatars
+have one. Clothes are put on the skin, not on an avatar's offsets, which are these clothes already.
 """
 
 from __future__ import annotations
@@ -39,21 +39,21 @@ from trilane.training.clothing.layers import clothing_layers
 from trilane.training.clothing.looks import find_landmarks, look_of
 from trilane.training.surface import body_arrays
 
-#: Points of a tensor pixel, along each side, at which the neural texture is read.
+#: Number of points along each side of a tensor pixel at which the neural texture is read.
 SAMPLES = 4
-#: Of the clothed body, along each side of a pixel.
+#: Number of samples of the clothed body along each side of a pixel.
 CLOTHED_SAMPLES = 4
 
 
 class FullBody:
-    """The body in float64 with every blend shape and skin weight, joint by joint as the SMPL-X layout says it.
+    """The body in float64 with every blend shape and skin weight, joint by joint as the SMPL-X layout defines it.
 
-    `rest` (V,3): the rest shape, metres.
-    `joints` (55,3): its joints.
+    `rest` (V,3): rest shape, metres.
+    `joints` (55,3): joints of the rest shape, metres.
     """
 
     def __init__(self, body: Body, betas: Sequence[float] = (), expression: Sequence[float] = ()) -> None:
-        """`body` in the shape `betas` with the `expression`; missing coefficients are 0."""
+        """Shape `body` by `betas` and `expression`; missing coefficients are 0."""
         self._body = body
         self._weights = body.weights.astype(np.float64)
         self.rest = body.v_template.astype(np.float64)
@@ -64,11 +64,11 @@ class FullBody:
             self.rest = self.rest + body.offsets
 
     def vertices(self, pose: F64, translation: F64, world: F64) -> F64:
-        """(V,3) metres, in the world.
+        """Return the vertices (V,3) in the world, metres.
 
-        `pose`: (55,3) axis-angle, radians.
-        `translation`: (3,) of the root in body space, metres.
-        `world`: (4,4) from body space to the world.
+        `pose`: axis-angle (55,3), radians.
+        `translation`: translation (3,) of the root in body space, metres.
+        `world`: matrix (4,4) from body space to the world.
         """
         turns = rodrigues(np.asarray(pose, np.float64).reshape(JOINTS, 3))
         rest = self.rest
@@ -79,11 +79,11 @@ class FullBody:
         return np.asarray(np.einsum("vab,vb->va", moved[:, :, :3], rest) + moved[:, :, 3])
 
     def _placed(self, turns: F64, translation: F64, world: F64) -> F64:
-        """(55,3,4): from the rest shape to the world, for what each joint moves."""
+        """Return matrices (55,3,4) from the rest shape to the world, for what each joint moves."""
         placed: dict[int, F64] = {}
 
         def place(joint: int) -> F64:
-            """(4,4) of `joint`: its parent's, then a shift to the joint, the turn, and a shift back."""
+            """Return the matrix (4,4) of `joint`: its parent's, a shift to the joint, the turn, and a shift back."""
             if joint not in placed:
                 parent = int(self._body.parents[joint])
                 above = world @ _shift(translation) if parent < 0 else place(parent)
@@ -104,7 +104,10 @@ def _shift(by: F64) -> F64:
 
 @dataclass(frozen=True)
 class _Avatar:
-    """One distinct avatar. `area`: of the tensor that its network is for, in pixels. `network`: it, for people."""
+    """One distinct avatar.
+
+    `area`: pixels of the tensor that its network is for. `network`: source of the network, for people.
+    """
 
     body: FullBody
     mesh: MeshArrays
@@ -115,20 +118,20 @@ class _Avatar:
 
 
 class FullPictures:
-    """Pictures of a scene's cast by the plan `full`."""
+    """Makes pictures of a scene's cast by the plan `full`."""
 
     def __init__(self, cast: Cast) -> None:
-        """Raises BadInputError, MissingPartError."""
+        """Load the networks. Raises BadInputError, MissingPartError."""
         self._cast = cast
         self._avatars = {folder: _avatar(data) for folder, data in cast.avatars.items()}
 
     @property
     def networks(self) -> list[str]:
-        """What paints the avatars."""
+        """Sources of the networks that paint the avatars."""
         return sorted({avatar.network for avatar in self._avatars.values()})
 
     def frame(self, number: int, background: U8) -> U8:
-        """(h,w,3) uint8, sRGB: frame `number` over its `background` (h,w,3)."""
+        """Return frame `number` over its `background` (h,w,3): (h,w,3) uint8, sRGB."""
         return blended(background, [self._layer(seen) for seen in self._cast.seen(number)])
 
     def _layer(self, seen: Seen) -> Layer:
@@ -144,14 +147,14 @@ class FullPictures:
 
 
 def fineness(shape: Shape, area: int) -> Fraction:
-    """Tensor pixels for each pixel of the picture along a side: ..., 1/3, 1/2, 1, 2, 3, ...
+    """Return the tensor pixels for each pixel of the picture along a side: ..., 1/3, 1/2, 1, 2, 3, ...
 
-    It is the one that brings a box of `shape` (height, width) nearest to `area` pixels, in ratio.
+    The value brings a box of `shape` (height, width) nearest to `area` pixels, in ratio.
     """
     own = shape[0] * shape[1]
     larger, smaller = max(own, area), min(own, area)
     times = isqrt(larger // smaller)
-    # Of the two whole numbers about the root, in ratio, it is the larger one beyond their geometric mean.
+    # The nearer, in ratio, of the two whole numbers about the root is the larger one beyond their geometric mean.
     times += larger > smaller * times * (times + 1)
     return Fraction(times) if area > own else Fraction(1, times)
 
@@ -165,11 +168,13 @@ def _avatar(data: AvatarData) -> _Avatar:
 
 
 def supersampled(vertices: F64, mesh: MeshArrays, clip: F64, shape: Shape, texture: F32, samples: int = SAMPLES) -> F64:
-    """The network's input as real numbers, (h,w,C) float64: means of `samples` x `samples` reads, 0 off the mesh.
+    """Return the network's input as real numbers, (h,w,C) float64.
 
-    `vertices`: (V,3) of the body, in the world, metres.
+    Each is the mean of `samples` x `samples` reads, 0 off the mesh.
+
+    `vertices`: vertices (V,3) of the body, in the world, metres.
     `mesh`: its triangles and texture coordinates.
-    `clip`: (4,4), projection of the tensor @ view.
+    `clip`: projection of the tensor @ view, (4,4).
     `shape`: (height, width) of the tensor.
     `texture`: (H,W,C), read bilinearly.
     """
@@ -187,19 +192,22 @@ def supersampled(vertices: F64, mesh: MeshArrays, clip: F64, shape: Shape, textu
 
 
 class TruePictures:
-    """Pictures of a cast of bundled avatars as the clothed bodies that they were trained on."""
+    """Makes pictures of a cast of bundled avatars as the clothed bodies that they were trained on."""
 
     def __init__(self, cast: Cast, ctx: Any) -> None:
-        """`ctx`: the OpenGL context in use. Everybody in the cast must be a bundled avatar."""
+        """Prepare the clothed bodies. Everybody in the cast must be a bundled avatar.
+
+        `ctx`: OpenGL context in use.
+        """
         self._cast = cast
         self._clothed = {folder: _clothed(data, ctx) for folder, data in cast.avatars.items()}
 
     def frame(self, number: int, background: U8) -> U8:
-        """(h,w,3) uint8, sRGB: frame `number` over its `background` (h,w,3)."""
+        """Return frame `number` over its `background` (h,w,3): (h,w,3) uint8, sRGB."""
         return blended(background, self.layers(number))
 
     def layers(self, number: int) -> list[Layer]:
-        """Those who are seen in frame `number`, on the picture's grid."""
+        """Return the layers of those who are seen in frame `number`, on the picture's grid."""
         layers = []
         for seen in self._cast.seen(number):
             rgba = self._clothed[seen.folder].render(seen.joints, seen.view, seen.projection, seen.box.shape) / 255.0
@@ -208,7 +216,10 @@ class TruePictures:
 
 
 def true_pictures(cast: Cast, ctx: Any) -> TruePictures | None:
-    """Those of `cast`; None unless everybody in it is a bundled avatar. `ctx`: the OpenGL context in use."""
+    """Return the true pictures of `cast`; None unless everybody in it is a bundled avatar.
+
+    `ctx`: OpenGL context in use.
+    """
     is_known = set(cast.avatars) <= {bundle_folder(name).absolute() for name in BUILT_IN}
     return TruePictures(cast, ctx) if is_known else None
 

@@ -17,16 +17,19 @@ RING = 3
 
 
 class Readback(Protocol):
-    """Reads part of a framebuffer of 32-bit unsigned words. `lag`: how many submits later the bytes arrive."""
+    """Reads part of a framebuffer of 32-bit unsigned words.
+
+    `lag`: number of submits after which the bytes arrive.
+    """
 
     lag: int
 
     def submit(self, target: Any, box: Box, words: int, tensor: U8) -> None:
         """Start to read.
 
-        `target`: the framebuffer.
+        `target`: framebuffer.
         `box`: (x, y, width, height) in pixels.
-        `words`: components of a pixel.
+        `words`: number of components of a pixel.
         `tensor`: bytes to fill, `lag` submits later.
         """
 
@@ -40,14 +43,14 @@ class DirectReadback:
     lag = 0
 
     def __init__(self, ctx: Any, most_bytes: int) -> None:
-        """Nothing is allocated."""
+        """Do nothing: no memory is needed."""
 
     def submit(self, target: Any, box: Box, words: int, tensor: U8) -> None:
         """Read at once."""
         target.read_into(tensor, box, components=words, dtype="u4", alignment=1)
 
     def drain(self) -> None:
-        """Nothing waits."""
+        """Do nothing: no read is pending."""
 
 
 class PboReadback:
@@ -67,11 +70,11 @@ class PboReadback:
         self._buffer.read_into(tensor, size=tensor.nbytes)
 
     def drain(self) -> None:
-        """Nothing waits."""
+        """Do nothing: no read is pending."""
 
 
 class OrphanPboReadback(PboReadback):
-    """As `PboReadback`, with fresh memory for each frame, so that the driver need not wait for the old."""
+    """Reads as `PboReadback`, with fresh memory for each frame, so that the driver need not wait for the old."""
 
     orphan = True
 
@@ -117,14 +120,14 @@ class Upload(Protocol):
     """Writes a slot's bytes to a texture."""
 
     def write(self, texture: Any, image: U8) -> None:
-        """After this the caller may change `image`."""
+        """Write `image`; the caller may change it afterwards."""
 
 
 class SubUpload:
     """The driver copies from the slot."""
 
     def __init__(self, ctx: Any, most_bytes: int) -> None:
-        """Nothing is allocated."""
+        """Do nothing: no memory is needed."""
 
     def write(self, texture: Any, image: U8) -> None:
         """Copy at once."""
@@ -132,26 +135,26 @@ class SubUpload:
 
 
 class OrphanUpload:
-    """Through one pixel buffer, with fresh memory for each frame."""
+    """Uploads through one pixel buffer, with fresh memory for each frame."""
 
     def __init__(self, ctx: Any, most_bytes: int) -> None:
         self._buffer = ctx.buffer(reserve=most_bytes)
 
     def write(self, texture: Any, image: U8) -> None:
-        """Copy to fresh memory, from there the driver copies on."""
+        """Copy to fresh memory, from which the driver copies on."""
         self._buffer.orphan()
         self._buffer.write(image)
         texture.write(self._buffer, alignment=1)
 
 
 class RingUpload:
-    """Through a ring of pixel buffers; one is written again only after its fence."""
+    """Uploads through a ring of pixel buffers; one is written again only after its fence."""
 
     def __init__(self, ctx: Any, most_bytes: int) -> None:
         self._ring: deque[tuple[Any, int | None]] = deque((ctx.buffer(reserve=most_bytes), None) for _ in range(RING))
 
     def write(self, texture: Any, image: U8) -> None:
-        """Copy to the oldest buffer, from there the driver copies on."""
+        """Copy to the oldest buffer, from which the driver copies on."""
         buffer, sync = self._ring.popleft()
         if sync is not None:
             opengl.wait_fence(sync)

@@ -32,7 +32,7 @@ class Producer(Protocol):
     """The end that writes."""
 
     def buffer(self) -> U8:
-        """Where to write the next bytes."""
+        """Return the place to write the next bytes."""
 
     def hand_over(self) -> None:
         """Announce or send the bytes that were written to `buffer`."""
@@ -52,21 +52,21 @@ class Channel(Protocol):
     """A channel from one process to another: made in the parent, sent to both children, opened there."""
 
     def producer(self) -> Producer:
-        """The end of the child that writes, called there."""
+        """Return the writing end; called in the child that writes."""
 
     def consumer(self) -> Consumer:
-        """The end of the child that reads, called there."""
+        """Return the reading end; called in the child that reads."""
 
     def close(self) -> None:
-        """Called in the parent when both children have ended."""
+        """Release the channel; called in the parent when both children have ended."""
 
 
 class SlotChannel:
-    """As the pipeline: a slot of a sealed memfd region, announced by a message over a `JobPipe`.
+    """The pipeline's way: a slot of a sealed memfd region, announced by a message over a `JobPipe`.
 
-    One slot, because a run writes the slot that was given back last (transport/slots.py), and here each is given back
-    before the next is written. So does iceoryx2 with its samples: taking two by turns would double the memory that
-    passes through the caches, and with it the time that reading takes.
+    There is one slot: a run writes the slot that was given back last (transport/slots.py), and here each is given back
+    before the next is written. iceoryx2 does the same with its samples. Two slots by turns would double the memory that
+    passes through the caches, and with it the time of reading.
     """
 
     def __init__(self, size: int, _context: SpawnContext) -> None:
@@ -120,7 +120,7 @@ class _SlotEnd:
                 raise EOFError
 
     def release(self) -> None:
-        """Nothing to do: the bench's acknowledgement gives the slot back."""
+        """Do nothing: the bench's acknowledgement gives the slot back."""
 
 
 class QueueChannel:
@@ -154,11 +154,11 @@ class _QueueEnd:
         return array
 
     def release(self) -> None:
-        """Nothing to do: the array belongs to this process."""
+        """Do nothing: the array belongs to this process."""
 
 
 class PipeChannel:
-    """A `multiprocessing.Pipe` in its best form: raw bytes, received into an array that is there already."""
+    """A `multiprocessing.Pipe` in its best form: raw bytes, received into an existing array."""
 
     def __init__(self, size: int, context: SpawnContext) -> None:
         self._size, self._ends = size, context.Pipe()
@@ -191,11 +191,11 @@ class _PipeEnd:
         return self._own
 
     def release(self) -> None:
-        """Nothing to do: the array belongs to this process."""
+        """Do nothing: the array belongs to this process."""
 
 
 class ZmqChannel:
-    """The bytes themselves as a ZeroMQ frame, in pyzmq's best form: it copies neither what is sent nor what comes."""
+    """The bytes themselves as a ZeroMQ frame, in pyzmq's best form, which copies neither sent nor received bytes."""
 
     def __init__(self, size: int, _context: SpawnContext) -> None:
         self._folder = SocketFolder()
@@ -231,11 +231,11 @@ class _ZmqEnd:
         return np.frombuffer(self._socket.recv(copy=False).buffer, np.uint8)
 
     def release(self) -> None:
-        """Nothing to do: the bytes belong to this process."""
+        """Do nothing: the bytes belong to this process."""
 
 
 class IceoryxChannel:
-    """iceoryx2: a loaned sample is written in place and sent, an event wakes the other end. Nothing is copied.
+    """iceoryx2: a loaned sample is written in place and sent, and an event wakes the other end. Nothing is copied.
 
     Polling instead of the event would be sooner, but would keep a core busy while there is nothing to do.
 
@@ -313,8 +313,8 @@ class _IceoryxConsumer:
 
 
 SLOT, BARE = "slot", "slot, 256 KiB of it written"
-#: Variant: its channel. `SLOT` is Trilane's, with one message from process to process. `BARE` writes only part of the
-#: slot, which leaves out what writing does to the caches.
+#: Channel of each variant. `SLOT` is Trilane's, with one message from process to process. `BARE` writes only part of
+#: the slot, which leaves out the effect of writing on the caches.
 CHANNELS: dict[str, Callable[[int, SpawnContext], Channel]] = {
     SLOT: SlotChannel,
     BARE: SlotChannel,
@@ -323,5 +323,5 @@ CHANNELS: dict[str, Callable[[int, SpawnContext], Channel]] = {
     "pipe": PipeChannel,
     "pickled queue": QueueChannel,
 }
-#: Variant: bytes of each slot that are written and read, where it is not all of them.
+#: Number of bytes of each slot that are written and read, for variants that do not use all of them.
 WRITTEN = {BARE: 256 * 1024}

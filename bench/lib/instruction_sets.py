@@ -1,14 +1,14 @@
-"""The INT8 peak of a core by its instruction set: multiply-accumulates of an instruction, by instructions a cycle.
+"""The INT8 peak of a core by its instruction set: multiply-accumulates of an instruction, times instructions a cycle.
 
-Rule: how many multiply-accumulates an instruction does is its definition; how many of them a cycle takes is documented,
-and where cores with one set differ, what was measured says which of the documented rates this core has.
+Rule: the number of multiply-accumulates in an instruction is its definition; the number of instructions a cycle is
+documented. Where cores with the same set differ, the measurement says which of the documented rates this core has.
 
-What the cores do is measured by two loops that run by turns in short bursts on every core at once; the median of the
-bursts counts. One issues nothing but the set's instructions. In the other each of them is followed by dependent `imul`,
-each of which takes three cycles on every x86-64 core since Intel's Nehalem and AMD's Zen (uops.info IMUL_R64_R64): they
-are the longer path, so the time of the loop is that of three cycles for each, at the clock that the core holds under
-this very load. No counter of the processor is needed, which virtual machines do not have. The loops are machine code,
-because no compiler need be there; the bytes are GNU as's for the lines beside them.
+The cores are measured by two loops that run by turns in short bursts on every core at once; the median of the bursts
+counts. One loop issues nothing but the set's instructions. In the other, each of them is followed by dependent `imul`.
+An `imul` takes three cycles on every x86-64 core since Intel's Nehalem and AMD's Zen (uops.info IMUL_R64_R64). These
+form the longer path, so the loop takes three cycles for each, at the clock that the core holds under this very load. No
+processor counter is needed, because virtual machines have none. The loops are machine code, because a compiler may be
+missing; the bytes are GNU as's for the lines beside them.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from trilane.scheduler.stats import median_interval
 
 @dataclass(frozen=True)
 class InstructionSet:
-    """One row.
+    """One row of the table.
 
-    `flags`: of /proc/cpuinfo, all of which a core with it has.
+    `flags`: flags of /proc/cpuinfo that every core with the set has.
     `macs`: INT8 multiply-accumulates of one `sequence`, an instruction or the few that stand for one.
-    `rates`: sequences a cycle that cores with it are documented to reach.
-    `source`: of both.
+    `rates`: sequences a cycle that cores with the set are documented to reach.
+    `source`: source of `macs` and `rates`.
     """
 
     name: str
@@ -46,16 +46,16 @@ class InstructionSet:
     source: str
 
     def rate_nearest(self, measured: float) -> Fraction:
-        """Which of the documented rates a core has on which `measured` sequences a cycle were issued."""
+        """Return the documented rate of a core on which `measured` sequences a cycle were issued."""
         return min(self.rates, key=lambda rate: abs(float(rate) - measured))
 
     def macs_a_cycle(self, measured: float) -> float:
-        """Of a core on which `measured` sequences a cycle were issued."""
+        """Return the multiply-accumulates a cycle of a core on which `measured` sequences a cycle were issued."""
         return float(self.macs * self.rate_nearest(measured))
 
 
 ONE, TWO, FOUR = Fraction(1), Fraction(2), Fraction(4)
-#: From the widest to the narrowest: the first whose flags a core has is its own.
+#: From the widest to the narrowest: a core's own set is the first whose flags it has.
 INSTRUCTION_SETS = (
     InstructionSet(
         "AMX-INT8",
@@ -109,13 +109,13 @@ INSTRUCTION_SETS = (
 
 
 def instruction_set_of(flags: Iterable[str]) -> InstructionSet | None:
-    """The widest that a core with these `flags` has, or None for one that is not in the table."""
+    """Return the widest set that a core with these `flags` has, or None for one that is not in the table."""
     found = {*flags}
     return next((each for each in INSTRUCTION_SETS if found.issuperset(each.flags)), None)
 
 
 def peak_gmac_s(macs_a_cycle: float, clock_ghz: float, cores: int) -> float:
-    """1e9 multiply-accumulates a second: those of a cycle, by the cycles of all cores."""
+    """Return 1e9 multiply-accumulates a second: those of a cycle, times the cycles of all cores."""
     return macs_a_cycle * clock_ghz * cores
 
 
@@ -130,10 +130,12 @@ TILE_CONFIG = bytes([1, *[0] * 15, *[64, 0] * 8, *[0] * 16, *[16] * 8, *[0] * 8]
 
 @dataclass(frozen=True)
 class Kernel:
-    """`body`: instructions in hexadecimal, `sequences` of them without an input from one another.
+    """The machine code of a set's loop.
 
-    `imuls`: after each instruction in the loop that tells the clock: enough that they take longer than it.
-    `cycles`: that the body takes at least, for the length of a burst.
+    `body`: instructions in hexadecimal, `sequences` of them without an input from one another.
+    `imuls`: number of `imul` after each instruction in the loop that measures the clock: enough that they take longer
+    than it.
+    `cycles`: least number of cycles of the body, for the length of a burst.
     """
 
     body: str
@@ -187,7 +189,10 @@ KERNELS = {
 
 @dataclass(frozen=True)
 class Issued:
-    """`rate`: sequences a cycle, of the mean core. `clock_ghz`: of the mean core, and the interval of its median."""
+    """The measured rates of the cores.
+
+    `rate`: sequences a cycle of the mean core. `clock_ghz`: clock of the mean core, with the interval of its median.
+    """
 
     rate: float
     clock_ghz: float
@@ -196,12 +201,12 @@ class Issued:
 
 
 def rate_loop(kernel: Kernel) -> bytes:
-    """A function of the number of turns (%rdi) and of the tile configuration (%rsi) that issues the body."""
+    """Return a function that issues the body; it takes the number of turns (%rdi) and the tile configuration (%rsi)."""
     return _loop(kernel, bytes.fromhex(kernel.body))
 
 
 def clock_loop(kernel: Kernel) -> bytes:
-    """The same with `imul` after each instruction."""
+    """Return the same function with `imul` after each instruction."""
     return _loop(kernel, b"".join(bytes.fromhex(each) + IMUL * kernel.imuls for each in kernel.body.split()))
 
 
@@ -212,9 +217,10 @@ def _loop(kernel: Kernel, body: bytes) -> bytes:
 
 
 def measure_issued(name: str, cores: Sequence[int]) -> Issued:
-    """What every one of `cores` does while all of them work. `name`: key of `KERNELS`, of a set that this CPU has.
+    """Measure what every one of `cores` does while all of them work.
 
-    Raises OSError when the kernel refuses machine code in memory or the tiles of AMX.
+    `name`: key of `KERNELS` for a set that this CPU has. Raises OSError when the kernel refuses machine code in memory
+    or the tiles of AMX.
     """
     if machine.here.architecture() != "x86_64":
         raise OSError("there are no loops for this architecture")
@@ -235,14 +241,17 @@ def _mean(values: list[float]) -> float:
 
 
 def _ask_for_tiles() -> None:
-    """Linux gives a process the registers of AMX when it asks for them."""
+    """Ask Linux for the registers of AMX, which a process has only on request."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.syscall(SYS_ARCH_PRCTL, ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA):
         raise OSError(ctypes.get_errno(), "the tiles of AMX are refused")
 
 
 def _on_core(core: int, kernel: Kernel, together: threading.Barrier) -> tuple[float, list[float]]:
-    """Sequences a cycle, and the clock in GHz in each burst. The thread ends afterwards, and with it its core."""
+    """Return sequences a cycle, and the clock in GHz in each burst, on one core.
+
+    The thread ends afterwards, and with it its binding to the core.
+    """
     os.sched_setaffinity(0, {core})
     turns = BURST_CYCLES // kernel.cycles
     chain = turns * len(kernel.body.split()) * kernel.imuls * IMUL_CYCLES
@@ -272,7 +281,7 @@ class _Code:
         self._memory.close()
 
     def ns(self, turns: int) -> int:
-        """CPU time of so many turns; other threads of this process run meanwhile."""
+        """Return the CPU time of so many turns; other threads of this process run meanwhile."""
         begin = time.thread_time_ns()
         self._call(turns, TILE_CONFIG)
         return time.thread_time_ns() - begin

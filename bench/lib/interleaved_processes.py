@@ -1,6 +1,6 @@
 """Variants of inference that run interleaved, each in a process of its own: no variant's threads disturb another's.
 
-Rule: only one process computes at a time; the others wait on a pipe. An answer that is text is what went wrong; the
+Rule: only one process computes at a time; the others wait on a pipe. An answer that is text is an error message. The
 processes end with the block that started them.
 """
 
@@ -24,7 +24,7 @@ WARM_UP = 3
 
 
 def answer_of(pipe: Connection, name: str, wait_s: float) -> Any:
-    """The next answer of the process `name`. Raises TrilaneError when none comes, or it says what went wrong."""
+    """Return the next answer of the process `name`. Raises TrilaneError when none comes, or it is an error message."""
     if not pipe.poll(wait_s):
         raise TrilaneError(f"{name}: no answer in {wait_s:g} s")
     try:
@@ -38,7 +38,7 @@ def answer_of(pipe: Connection, name: str, wait_s: float) -> Any:
 
 @contextmanager
 def asked_processes() -> Iterator[Callable[[Callable[..., None], Any], Connection]]:
-    """Starts a process each time it is called with what the process runs, and with what it is given beside its pipe."""
+    """Yield a function that starts a process, given what it runs and what it gets beside its pipe."""
     context = multiprocessing.get_context("spawn")
     processes, pipes = [], list[Connection]()
 
@@ -66,9 +66,9 @@ class Variant:
     """One way to infer.
 
     `kind`: key of `KINDS`.
-    `network`: an ONNX file.
-    `runtime`: of the kind `runtime`, which one.
-    `threads`: None for the library's default.
+    `network`: ONNX file.
+    `runtime`: name of the runtime, for the kind `runtime`.
+    `threads`: number of threads; None for the library's default.
     `spin`: whether the threads may spin between runs.
     """
 
@@ -80,20 +80,23 @@ class Variant:
 
 
 class Runner:
-    """One variant, as the parent sees it. `startup_ms`: until its network was loaded, imports included."""
+    """One variant, as the parent sees it.
+
+    `startup_ms`: time until its network was loaded, imports included.
+    """
 
     def __init__(self, pipe: Connection, name: str) -> None:
         self._pipe, self._name = pipe, name
         self.startup_ms = float(answer_of(pipe, name, START_S))
 
     def run(self, count: int) -> list[float]:
-        """Milliseconds of `count` runs in a row."""
+        """Return milliseconds of `count` runs in a row."""
         self._pipe.send(count)
         times: list[float] = answer_of(self._pipe, self._name, START_S)
         return times
 
     def run_for(self, seconds: float) -> list[float]:
-        """Milliseconds of runs in a row for about `seconds`, at least one."""
+        """Return milliseconds of runs in a row for about `seconds`, at least one."""
         times: list[float] = []
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
@@ -103,13 +106,16 @@ class Runner:
 
 @contextmanager
 def runners(variants: Mapping[str, Variant]) -> Iterator[dict[str, Runner]]:
-    """A waiting process for each variant; they end with the block. Raises TrilaneError when one does not start."""
+    """Start a waiting process for each variant; they end with the block.
+
+    Raises TrilaneError when one does not start.
+    """
     with asked_processes() as start:
         yield {name: Runner(start(serve, variant), name) for name, variant in variants.items()}
 
 
 def serve(pipe: Connection, variant: Variant) -> None:
-    """The child: load, send the start-up time, then run as often as each message says, until `pipe` closes."""
+    """Run the child: load, send the start-up time, then run as often as each message says, until `pipe` closes."""
     try:
         begin = time.perf_counter()
         run = KINDS[variant.kind](variant)
@@ -134,7 +140,7 @@ def _timed(run: Callable[[], object], count: int) -> list[float]:
 
 
 def _runtime(variant: Variant) -> Callable[[], object]:
-    """As Trilane runs a network: arrays bound once."""
+    """Return a call as Trilane runs a network: arrays are bound once."""
     from trilane.avatars.network_file import read_network
     from trilane.bench.lib.networks import random_tensor
     from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
@@ -146,7 +152,7 @@ def _runtime(variant: Variant) -> Callable[[], object]:
 
 
 def _ort_default(variant: Variant) -> Callable[[], object]:
-    """As ONNX Runtime's first example does it: a session with defaults, `run` with an array."""
+    """Return a call as in ONNX Runtime's first example: a session with defaults, `run` with an array."""
     import onnxruntime
 
     settings = onnxruntime.SessionOptions()
@@ -163,7 +169,7 @@ def _ort_default(variant: Variant) -> Callable[[], object]:
 
 
 def _openvino_default(variant: Variant) -> Callable[[], object]:
-    """As OpenVINO's first example does it: compile a file, call the model with an array."""
+    """Return a call as in OpenVINO's first example: compile a file, call the model with an array."""
     from trilane.stages.dsp.runtime import quiet_openvino
 
     openvino = quiet_openvino()

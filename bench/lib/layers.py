@@ -1,7 +1,7 @@
-"""Layers of a picture, blended in linear light in float64: what the composite does, written a second time.
+"""Layers of a picture, blended in linear light in float64: a second implementation of the composite.
 
-Rule: a layer lies on the pixel grid of the picture and may hang over it. What lies on no grid of the picture is read
-for each of its pixels by `placed`.
+Rule: a layer lies on the pixel grid of the picture and may hang over it. A layer off the grid is read by `placed` at
+the picture's pixels.
 """
 
 from __future__ import annotations
@@ -31,23 +31,26 @@ class Box(NamedTuple):
         return self.bottom - self.top, self.right - self.left
 
     def rect(self, output: Shape) -> Rect:
-        """The same in normalised device coordinates of a picture of `output` (height, width)."""
+        """Return the box in normalised device coordinates of a picture of `output` (height, width)."""
         across, down = 2.0 / output[1], 2.0 / output[0]
         return Rect(self.left * across - 1, 1 - self.bottom * down, self.right * across - 1, 1 - self.top * down)
 
     def within(self, other: Box) -> Rect:
-        """The same in normalised device coordinates of a picture that fills `other`."""
+        """Return the box in normalised device coordinates of a picture that fills `other`."""
         moved = Box(self.top - other.top, self.left - other.left, self.bottom - other.top, self.right - other.left)
         return moved.rect(other.shape)
 
     def on(self, output: Shape) -> Box:
-        """The part that lies on a picture of `output` (height, width)."""
+        """Return the part that lies on a picture of `output` (height, width)."""
         return Box(max(self.top, 0), max(self.left, 0), min(self.bottom, output[0]), min(self.right, output[1]))
 
 
 @dataclass(frozen=True)
 class Layer:
-    """`light` (h,w,4): linear light times alpha, then alpha, 0..1. `depth`: camera z; the least is the farthest."""
+    """A layer of a picture.
+
+    `light` (h,w,4): linear light times alpha, then alpha, 0..1. `depth`: camera z; the least is the farthest.
+    """
 
     box: Box
     depth: float
@@ -55,14 +58,14 @@ class Layer:
 
 
 def box_around(rect: Rect, output: Shape) -> Box:
-    """Whole pixels that hold `rect`, and so many around it that both sides are multiples of 32."""
+    """Return whole pixels that hold `rect`, with enough around it that both sides are multiples of 32."""
     top, bottom = np.floor((1 - rect.y1) / 2 * output[0]), np.ceil((1 - rect.y0) / 2 * output[0])
     left, right = np.floor((1 + rect.x0) / 2 * output[1]), np.ceil((1 + rect.x1) / 2 * output[1])
     return grown(Box(int(top), int(left), int(bottom), int(right)), BUCKET_STEP)
 
 
 def grown(box: Box, step: int) -> Box:
-    """`box` with pixels around it until `step` divides both sides; an odd one goes to the bottom or the right."""
+    """Grow `box` until `step` divides both sides; an odd pixel goes to the bottom or the right."""
     rows, columns = _grown(box.top, box.bottom, step), _grown(box.left, box.right, step)
     return Box(rows[0], columns[0], rows[1], columns[1])
 
@@ -73,24 +76,24 @@ def _grown(first: int, last: int, step: int) -> tuple[int, int]:
 
 
 def premultiplied(rgba: Floats) -> F64:
-    """(h,w,4) linear light times alpha, and alpha, of `rgba` (h,w,4): sRGB with straight alpha, 0..1."""
+    """Return linear light times alpha, and alpha, (h,w,4), of `rgba` (h,w,4): sRGB with straight alpha, 0..1."""
     straight = np.asarray(rgba, np.float64)
     alpha = straight[..., 3:]
     return np.concatenate([to_light(straight[..., :3]) * alpha, alpha], axis=-1)
 
 
 def shrunk(light: F64, factor: int) -> F64:
-    """(h,w,C): the means of squares of `factor` x `factor` pixels of `light` (h * factor, w * factor, C)."""
+    """Return (h,w,C): the means of squares of `factor` x `factor` pixels of `light` (h * factor, w * factor, C)."""
     height, width, channels = light.shape
     squares = light.reshape(height // factor, factor, width // factor, factor, channels)
     return np.asarray(squares.mean(axis=(1, 3)))
 
 
 def enlarged(light: F64, factor: int) -> F64:
-    """(h * factor, w * factor, C): `light` (h,w,C) read bilinearly at the middles of smaller pixels.
+    """Return `light` (h,w,C) read bilinearly at the centres of smaller pixels: (h * factor, w * factor, C).
 
-    Each pixel becomes a square of `factor` x `factor`, with the same middle; beyond the middles of the outermost pixels
-    their values go on.
+    Each pixel becomes a square of `factor` x `factor`, with the same centre. Beyond the centres of the outermost pixels
+    their values continue.
     """
     return _enlarged_down(_enlarged_down(light, factor).swapaxes(0, 1), factor).swapaxes(0, 1)
 
@@ -104,10 +107,10 @@ def _enlarged_down(light: F64, factor: int) -> F64:
 
 
 def placed(light: F64, rect: Rect, output: Shape, depth: float) -> Layer:
-    """`light` (h,w,C), which fills `rect` of a picture of `output` (height, width), read at the picture's pixels.
+    """Read `light` (h,w,C), which fills `rect` of a picture of `output` (height, width), at the picture's pixels.
 
-    Each pixel whose middle lies in `rect` is the mean of as many bilinear reads as the composite takes, evenly over the
-    pixel; beyond the middles of the outermost pixels of `light` their values go on.
+    Each pixel whose centre lies in `rect` is the mean of as many bilinear reads as the composite takes, evenly over the
+    pixel. Beyond the centres of the outermost pixels of `light` their values continue.
     """
     top, bottom = (1 - rect.y1) / 2 * output[0], (1 - rect.y0) / 2 * output[0]
     left, right = (1 + rect.x0) / 2 * output[1], (1 + rect.x1) / 2 * output[1]
@@ -121,8 +124,10 @@ def placed(light: F64, rect: Rect, output: Shape, depth: float) -> Layer:
 
 
 def _reads(begin: float, end: float, count: int, side: int, taps: int) -> tuple[int, F64]:
-    """Along one axis: the first pixel of a picture of `side` whose middle lies in [begin, end), in its pixels, and for
-    it and the others (n, count) how much each of the `count` pixels between `begin` and `end` counts.
+    """Return the first pixel whose centre lies in [begin, end), and the weights (n, count) of the pixels between.
+
+    This is along one axis. The first pixel is in pixels of a picture of `side`. The weights say, for it and the
+    following ones, how much each of the `count` pixels between `begin` and `end` counts.
     """
     first, last = (min(max(int(np.ceil(place - 0.5)), 0), side) for place in (begin, end))
     middles = np.arange(first, last)[:, None] + 0.5
@@ -138,12 +143,12 @@ def _reads(begin: float, end: float, count: int, side: int, taps: int) -> tuple[
 
 
 def blended(background: U8, layers: Iterable[Layer]) -> U8:
-    """`layers` over `background`, both sRGB, (h,w,3) uint8; the farthest layer first."""
+    """Blend `layers` over `background`, both sRGB, (h,w,3) uint8; the farthest layer first."""
     return np.asarray(np.rint(laid_over(background, layers)[0] * 255), np.uint8)
 
 
 def laid_over(background: U8, layers: Iterable[Layer]) -> tuple[F64, F64]:
-    """The same (h,w,3) in 0..1, not rounded, and how much of each pixel (h,w) the layers cover."""
+    """Blend as `blended`, without rounding: (h,w,3) in 0..1, and how much of each pixel (h,w) the layers cover."""
     output = (background.shape[0], background.shape[1])
     light, seen_through = to_light(background / 255.0), np.ones(output)
     for layer in sorted(layers, key=lambda layer: layer.depth):
@@ -156,11 +161,11 @@ def laid_over(background: U8, layers: Iterable[Layer]) -> tuple[F64, F64]:
 
 
 def to_light(code: F64) -> F64:
-    """sRGB in 0..1 to linear light, IEC 61966-2-1."""
+    """Turn sRGB in 0..1 into linear light, IEC 61966-2-1."""
     return np.asarray(np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4))
 
 
 def to_code(light: F64) -> F64:
-    """Linear light to sRGB in 0..1, IEC 61966-2-1; light beyond 0..1 is cut off."""
+    """Turn linear light into sRGB in 0..1, IEC 61966-2-1; light beyond 0..1 is clipped."""
     light = np.clip(light, 0.0, 1.0)
     return np.asarray(np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055))

@@ -1,6 +1,6 @@
 """Ranges of the benches' options.
 
-Rule: an option means the same in every bench, so its range stands here once; a bench that needs a narrower one checks
+Rule: an option means the same in every bench, so its range stands here once; a bench that needs a narrower range checks
 it itself.
 """
 
@@ -12,7 +12,7 @@ from typing import Any
 from trilane import machine
 from trilane.errors import BadInputError
 
-#: Option: least and greatest value.
+#: Least and greatest value of each option.
 LIMITS: dict[str, tuple[float, float]] = {
     "repeats": (1, 100_000),
     "threads": (0, 4 * machine.here.core_count()),
@@ -34,7 +34,10 @@ LIMITS: dict[str, tuple[float, float]] = {
 
 
 def check_limits(asked: Mapping[str, Any]) -> None:
-    """`asked`: value or values of each option. Raises BadInputError for a number that is out of its option's range."""
+    """Raise BadInputError for a number that is out of its option's range.
+
+    `asked`: value or values of each option.
+    """
     for option, values in asked.items():
         low, high = LIMITS.get(option, (None, None))
         if low is None or high is None:

@@ -1,4 +1,4 @@
-"""The four load patterns of MLPerf inference and what makes a result valid.
+"""The four load patterns of MLPerf inference, and the conditions of a valid result.
 
 Rule: names, patterns and the number of queries that a percentile needs are LoadGen's, so that results can be compared
 with LoadGen's; the warm-up is not counted.
@@ -20,7 +20,7 @@ from trilane.pipeline.requests import FrameRequestQueue
 
 CONFIDENCE = 0.99
 WARM_UP = 8
-#: Scenario: the percentile of its queries' latency that decides. Offline is decided by its rate.
+#: Percentile of the queries' latency that decides in each scenario. Offline is decided by its rate.
 PERCENTILES = {"single-stream": 0.90, "multi-stream": 0.99, "server": 0.99, "offline": 0.90}
 STALLED_S = 60.0
 KEEPS_ALL = "single, double and fifo edges drop none, under the policies sequential and pipelined"
@@ -28,14 +28,14 @@ KEEPS_ALL = "single, double and fifo edges drop none, under the policies sequent
 
 @dataclass(frozen=True)
 class Load:
-    """What is asked of the pipeline.
+    """The load on the pipeline.
 
     `scenario`: key of `PATTERNS`.
     `seconds`: least duration.
     `rate`: queries a second of the server scenario.
-    `limit_ms`: of the server scenario, on the percentile of its latency.
-    `samples`: frames in a query of multi-stream.
-    `seed`: of the moments at which a server's queries arrive.
+    `limit_ms`: limit of the server scenario on the percentile of its latency.
+    `samples`: number of frames in a query of multi-stream.
+    `seed`: seed of the moments at which a server's queries arrive.
     """
 
     scenario: str
@@ -52,13 +52,14 @@ class Load:
 
 @dataclass
 class Queries:
-    """When each query was asked of a `FrameRequestQueue` and answered; the thread that asks and the run's share it.
+    """Times at which each query was asked of a `FrameRequestQueue` and answered; two threads share it.
 
-    `size`: frames of a query, which is answered with the last of them.
+    The threads are the one that asks and the run's.
+    `size`: number of frames in a query, which is answered with the last of them.
     `asked_s`, `answered_s`: monotonic seconds of the queries that count.
-    `over`: nothing more counts: the run has ended, or a frame was dropped or lost.
+    `over`: whether nothing more counts: the run has ended, or a frame was dropped or lost.
     `why`: in the second case, a sentence.
-    `changed`: notified with every answer and when it is over.
+    `changed`: condition that is notified with every answer and when it is over.
     """
 
     size: int = 1
@@ -120,16 +121,16 @@ class Queries:
 
     @property
     def latencies_ms(self) -> list[float]:
-        """Of the answered queries, in the order in which they were asked."""
+        """Latencies of the answered queries, in the order in which they were asked."""
         return [(end - begin) * 1e3 for begin, end in zip(self.asked_s, self.answered_s, strict=False)]
 
 
 def play(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
     """Ask as `load` says until the time has passed and there are enough queries, then wait for the answers.
 
-    `load`: the pattern and its limits.
-    `requests`: of the run.
-    `queries`: are filled.
+    `load`: pattern and its limits.
+    `requests`: queue of the run.
+    `queries`: times, which are filled in.
     """
     queries.warm_up(requests)
     PATTERNS[load.scenario](load, requests, queries)
@@ -156,7 +157,7 @@ def _poisson(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
 
 
 def _all_at_once(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
-    """As many queries as will take the time, by the rate that a first few show."""
+    """Ask as many queries at once as will take the time, by the rate that a first few show."""
     few = queries_needed(load.percentile)
     queries.ask(requests, few)
     queries.wait()
@@ -174,9 +175,9 @@ PATTERNS: dict[str, Callable[[Load, FrameRequestQueue, Queries], None]] = {
 
 
 def tail(queries: int, late: int, share: float) -> float:
-    """The tail of the binomial distribution: the chance of at most `late` late queries of `queries`.
+    """Return the tail of the binomial distribution: the chance of at most `late` late ones among `queries`.
 
-    `share`: chance of each to be late.
+    `share`: chance of each query to be late.
     """
     logs = [
         math.lgamma(queries + 1)
@@ -190,7 +191,7 @@ def tail(queries: int, late: int, share: float) -> float:
 
 
 def queries_needed(percentile: float, late: int = 1) -> int:
-    """The least number of queries that show, at `CONFIDENCE`, that `percentile` of all queries are within a limit.
+    """Return the least number of queries that show, at `CONFIDENCE`, that `percentile` of all are within a limit.
 
     `late` of them may be beyond it: 64 are needed for 0.90, 662 for 0.99, with one late query.
     """
@@ -204,9 +205,9 @@ def queries_needed(percentile: float, late: int = 1) -> int:
 
 
 def bound_ms(latencies_ms: list[float], percentile: float) -> float | None:
-    """The latency that `percentile` of all queries are within, at `CONFIDENCE`; None when there are too few queries.
+    """Return the latency that `percentile` of all queries are within, at `CONFIDENCE`; None with too few queries.
 
-    It is the k-th largest, k the number of queries that may be late, as in LoadGen.
+    It is the k-th largest, with k the number of queries that may be late, as in LoadGen.
     """
     if len(latencies_ms) < queries_needed(percentile):
         return None
@@ -217,11 +218,11 @@ def bound_ms(latencies_ms: list[float], percentile: float) -> float | None:
 
 
 def verdict(load: Load, latencies_ms: list[float], lasted_s: float) -> list[str]:
-    """What makes the result invalid, in sentences; empty when it is valid.
+    """Say in sentences why the result is invalid; empty when it is valid.
 
-    `load`: that was asked for.
-    `latencies_ms`: of all queries.
-    `lasted_s`: from the first query to the last answer.
+    `load`: load of the run.
+    `latencies_ms`: latencies of all queries.
+    `lasted_s`: seconds from the first query to the last answer.
     """
     needed = queries_needed(load.percentile)
     reasons = []

@@ -1,4 +1,4 @@
-"""A run evaluated by MLCommons LoadGen: it asks, it measures, and its own summary says valid or not.
+"""A run evaluated by MLCommons LoadGen: it asks, it measures, and its own summary says whether the run is valid.
 
 Rule: LoadGen decides when a query comes and what counts; here its queries become frames, and the answers go back.
 """
@@ -20,12 +20,12 @@ from trilane.pipeline.requests import FrameRequestQueue
 
 NAMES = {"single-stream": "SingleStream", "multi-stream": "MultiStream", "server": "Server", "offline": "Offline"}
 VERDICT = re.compile(r"^Result is : (\w+)", re.MULTILINE)
-SAMPLES = 64  # of the library that LoadGen draws from; whichever it draws, the motion's next frame is presented
+SAMPLES = 64  # size of the library that LoadGen draws from; whichever it draws, the motion's next frame is presented
 SUMMARY = "mlperf_log_summary.txt"
 
 
 def load_generator() -> Any:
-    """The module `mlperf_loadgen`. Raises MissingPartError."""
+    """Return the module `mlperf_loadgen`. Raises MissingPartError."""
     try:
         return importlib.import_module("mlperf_loadgen")
     except ImportError:
@@ -34,7 +34,10 @@ def load_generator() -> Any:
 
 @dataclass
 class LoadGenVerdict:
-    """Whether LoadGen calls the run `valid`, and its `summary` as it wrote it."""
+    """LoadGen's verdict.
+
+    `valid`: whether LoadGen calls the run valid. `summary`: its text as LoadGen wrote it.
+    """
 
     valid: bool = False
     summary: str = ""
@@ -44,9 +47,9 @@ class LoadGenVerdict:
 class LoadGenPlayer:
     """Lets LoadGen ask a run for frames.
 
-    `load`: the pattern and its limits, handed to LoadGen.
-    `queries`: is told of the frames too, and says when the run is over early.
-    `verdict`: filled by `play`.
+    `load`: pattern and its limits, which LoadGen gets.
+    `queries`: times that are told about the frames too, and know when the run is over early.
+    `verdict`: LoadGen's verdict, which `play` fills in.
     """
 
     load: Load

@@ -27,16 +27,16 @@ CALIBRATION_FRAMES = 5
 #: The paper's network as an avatar: the default avatar's body and texture around untrained weights, made once and kept.
 FULL_WIDTH = "resnet18"
 ENCODER, NORM, WIDTH = "resnet18", "batch", 64
-SIDE = 64  # the network is convolutional; a run reshapes it
+SIDE = 64  # any side will do: the network is convolutional; a run reshapes it
 
 
 @dataclass(frozen=True)
 class NetworkFixture:
     """A network to be timed.
 
-    `label`: its settings, as they stand in a bench's rows.
-    `integer`: the network with bytes in and out.
-    `parameters`, `gmac`: of the network as it is defined, whatever its file adds for layout.
+    `label`: its settings, as in a bench's rows.
+    `integer`: network with bytes in and out.
+    `parameters`, `gmac`: parameters and work of the network as defined, whatever its file adds for layout.
     """
 
     label: dict[str, Any]
@@ -48,13 +48,13 @@ class NetworkFixture:
 def untrained(
     encoder: str, norm: str, width: int, size: tuple[int, int], channels: int = 16, batch: int = 1
 ) -> NetworkFixture:
-    """An untrained network, quantised.
+    """Return an untrained network, quantised.
 
     `encoder`, `norm`: see `trilane.training.network.UNet`.
     `width`: 64 is full; every channel count scales with it.
     `size`: (height, width) of the tensor in pixels.
-    `channels`: of the tensor.
-    `batch`: frames that are inferred at once.
+    `channels`: channels of the tensor.
+    `batch`: number of frames that are inferred at once.
     Raises MissingPartError without PyTorch, BadInputError for wrong settings.
     """
     network, torch = _unet(encoder, norm, width, channels)
@@ -71,14 +71,20 @@ def untrained(
 
 
 def untrained_float(encoder: str, norm: str, width: int, size: tuple[int, int], channels: int = 16) -> onnx.ModelProto:
-    """The network that `untrained` quantises, in float: (1, C, H, W) float32. Parameters and errors as there."""
+    """Return the network that `untrained` quantises, in float: (1, C, H, W) float32.
+
+    Parameters and errors are those of `untrained`.
+    """
     from trilane.training.network import export_onnx
 
     return export_onnx(_unet(encoder, norm, width, channels)[0], *size)
 
 
 def fixture_of_file(network: NetworkFile, batch: int = 1) -> NetworkFixture:
-    """`network`, with the work of the layers in its file. `batch`: frames that are inferred at once."""
+    """Return `network` as a fixture, with the work of the layers in its file.
+
+    `batch`: number of frames that are inferred at once.
+    """
     facts = graph_facts(network.model)
     size = network.shape[1:3]
     label = {"network": network.where, "size": list(size)}
@@ -86,7 +92,7 @@ def fixture_of_file(network: NetworkFile, batch: int = 1) -> NetworkFixture:
 
 
 def random_tensor(network: NetworkFile) -> NDArray[np.uint8]:
-    """(N, H, W, C) random bytes, the same every time."""
+    """Return random bytes (N, H, W, C), the same every time."""
     return np.random.default_rng(1).integers(0, 256, network.shape, dtype=np.uint8)
 
 
@@ -102,7 +108,7 @@ def _unet(encoder: str, norm: str, width: int, channels: int) -> tuple[Any, Any]
 
 
 def _defined_macs(network: Any, torch: Any, channels: int) -> float:
-    """Multiply-accumulates of the convolutions for one pixel of the tensor."""
+    """Return the multiply-accumulates of the convolutions for one pixel of the tensor."""
     total = 0
 
     def add(module: Any, _inputs: Any, output: Any) -> None:
@@ -118,7 +124,7 @@ def _defined_macs(network: Any, torch: Any, channels: int) -> float:
 
 
 def full_width_bundle() -> Path:
-    """The folder of the full-width network's bundle, made when it is not there yet. Its pictures mean nothing.
+    """Return the folder of the full-width network's bundle, made when it is missing. Its pictures mean nothing.
 
     Raises MissingPartError without PyTorch, TrilaneError when no cache folder can be written.
     """

@@ -1,7 +1,7 @@
 """How far the frames of one plan are from those of another: PSNR, SSIM and FLIP.
 
-Rule: all pictures count alike, those with nobody in view too; so the PSNR is that of the mean square over all of them.
-In the box, that is where avatars are, the same, over the pixels of the boxes alone.
+Rule: all pictures count alike, including those with nobody in view; so the PSNR is that of the mean square over all of
+them. Figures in the box, where avatars are, are the same over the pixels of the boxes alone.
 
 Sources: Wang et al., "Image Quality Assessment", IEEE TIP 13 (2004), by scikit-image; Andersson et al., "FLIP: A
 Difference Evaluator for Alternating Images", HPG 2020, by its authors' flip-evaluator, at 67 pixels a degree.
@@ -19,15 +19,15 @@ from trilane.bench.lib.layers import Box
 from trilane.errors import MissingPartError
 
 MODULES = ("skimage", "flip_evaluator")
-#: The least mean square, of values in 0..1, that a PSNR is computed of, which makes 100 dB the most.
+#: Lower bound of the mean square of values in 0..1, which makes 100 dB the highest PSNR.
 LEAST_SQUARE = 1e-10
 
 
 class PictureErrors:
-    """The errors of pictures that were added, one after the other."""
+    """Sums up the errors of pictures that are added one after the other."""
 
     def __init__(self) -> None:
-        # Of pixels, first of the whole frames, then of the boxes.
+        # Number of pixels, first of the whole frames, then of the boxes.
         self._pixels = np.zeros(2)
         self._squares, self._similar, self._flip = np.zeros(2), np.zeros(2), np.zeros(2)
 
@@ -40,7 +40,7 @@ class PictureErrors:
                 total[part] += values[mask].sum()
 
     def figures(self, plan: str) -> dict[str, float | None]:
-        """`psnr_PLAN_db`, `ssim_PLAN`, `flip_PLAN` of the frames, the same with `box_` before, None without boxes."""
+        """Return `psnr_PLAN_db`, `ssim_PLAN`, `flip_PLAN` of the frames, and with `box_` before, None without boxes."""
         found: dict[str, float | None] = {}
         for part, prefix in enumerate(("", "box_")):
             count = self._pixels[part]
@@ -52,7 +52,7 @@ class PictureErrors:
 
 
 def psnr_of_frames(psnr_db: Sequence[float]) -> dict[str, float]:
-    """Of the PSNR of single frames, at least one: mean, worst and 1st percentile, linear between ranks.
+    """Return mean, worst and 1st percentile, linear between ranks, of the PSNR of single frames, at least one.
 
     A mean hides single bad frames, which people see; the worst of many frames depends on how many there are.
     """
@@ -64,20 +64,20 @@ def psnr_of_frames(psnr_db: Sequence[float]) -> dict[str, float]:
 
 
 def require_metrics() -> None:
-    """Raises MissingPartError when a library that computes an error is missing: found out before long work."""
+    """Raise MissingPartError when a library that computes an error is missing, which is found out before long work."""
     for module in MODULES:
         if not machine.here.has_package(module):
             raise MissingPartError(f"image errors need {module}", extra="metrics")
 
 
 def error_maps(picture: U8, reference: U8) -> tuple[F64, F64, F64]:
-    """For each pixel (h,w): the mean square of the differences, in 0..1; SSIM; FLIP."""
+    """Return for each pixel (h,w): the mean square of the differences, in 0..1; SSIM; FLIP."""
     shown, wanted = picture / 255, reference / 255
     return ((shown - wanted) ** 2).mean(axis=2), ssim_map(shown, wanted), flip_map(shown, wanted)
 
 
 def ssim_map(picture: F64, reference: F64) -> F64:
-    """(h,w): SSIM of each pixel of two pictures (h,w,3) in 0..1, mean over the colours, by windows of 7 x 7 pixels."""
+    """Return SSIM (h,w) of two pictures (h,w,3) in 0..1, mean over the colours, by windows of 7 x 7 pixels."""
     from skimage.metrics import structural_similarity
 
     _, similar = structural_similarity(picture, reference, channel_axis=2, data_range=1.0, full=True)
@@ -85,7 +85,7 @@ def ssim_map(picture: F64, reference: F64) -> F64:
 
 
 def flip_map(picture: F64, reference: F64) -> F64:
-    """(h,w): FLIP of each pixel of two pictures (h,w,3), sRGB in 0..1."""
+    """Return FLIP (h,w) of two pictures (h,w,3), sRGB in 0..1."""
     import flip_evaluator
 
     real = [np.ascontiguousarray(image, np.float32) for image in (reference, picture)]
@@ -94,7 +94,7 @@ def flip_map(picture: F64, reference: F64) -> F64:
 
 
 def inside(boxes: Sequence[Box], picture: U8) -> Mask:
-    """(h,w): which pixels of `picture` lie in one of `boxes`."""
+    """Return which pixels (h,w) of `picture` lie in one of `boxes`."""
     mask = np.zeros(picture.shape[:2], bool)
     for box in boxes:
         mask[box.top : box.bottom, box.left : box.right] = True
@@ -102,11 +102,11 @@ def inside(boxes: Sequence[Box], picture: U8) -> Mask:
 
 
 def psnr_db(square: float) -> float:
-    """PSNR in dB of values in 0..1 whose differences have the mean square `square`; at most 100."""
+    """Return PSNR in dB of values in 0..1 whose differences have the mean square `square`; at most 100."""
     return float(-10 * np.log10(max(square, LEAST_SQUARE)))
 
 
 def box_psnr_db(picture: U8, reference: U8, boxes: Sequence[Box]) -> float:
-    """PSNR of `picture` against `reference`, both (h,w,3) sRGB, over the pixels in `boxes`, at least one."""
+    """Return PSNR of `picture` against `reference`, both (h,w,3) sRGB, over the pixels in `boxes`, at least one."""
     mask = inside(boxes, picture)
     return psnr_db(float((((picture[mask] / 255) - reference[mask] / 255) ** 2).mean()))

@@ -1,7 +1,7 @@
 """The avatar's pipeline in SimPy, for comparison: the same chain, slots, held jobs and order as the `pipelined` policy.
 
-Rule: only what decides when a frame is presented; no ledger, no faults, no other policies. `SimpyPipeline` is written
-as SimPy's users write; `LeanPipeline` is as lean as SimPy allows.
+Rule: the models contain only what decides when a frame is presented: no ledger, no faults, no other policies.
+`SimpyPipeline` is written as SimPy's users write; `LeanPipeline` is as lean as SimPy allows.
 """
 
 from __future__ import annotations
@@ -19,7 +19,10 @@ from trilane.transport.slots import edge_rule
 
 
 class SimpyPipeline:
-    """Frames released every `period_ns`; after `run`, `presented_ns` are the ends of the last stage in order."""
+    """A model whose frames are released every `period_ns`.
+
+    After `run`, `presented_ns` are the ends of the last stage in order.
+    """
 
     def __init__(self, graph: Graph, service: Service, frames: int, period_ns: int) -> None:
         self.env = simpy.Environment()
@@ -32,7 +35,7 @@ class SimpyPipeline:
         self.env.process(self._source(frames, period_ns))
 
     def run(self) -> list[int]:
-        """Until the last frame is presented."""
+        """Run until the last frame is presented."""
         self.env.run()
         return self.presented_ns
 
@@ -63,8 +66,8 @@ class LeanPipeline:
     """The same with one timeout for each job and callbacks instead of processes; nothing is checked.
 
     SimPy keeps the clock and the order of events; slots, held jobs and queues are plain numbers. The instants are the
-    same to the nanosecond unless events tie, as with service times in whole milliseconds. Only for chains whose frames
-    stay in order: edges that drop nothing, and units that take the oldest frame, the one at the last of their stages.
+    same to the nanosecond unless events tie, as with service times in whole milliseconds. It only suits chains whose
+    frames stay in order: edges drop nothing, and a unit takes its oldest frame, which is at the last of its stages.
     """
 
     def __init__(self, graph: Graph, service: Service, frames: int, period_ns: int) -> None:
@@ -85,7 +88,7 @@ class LeanPipeline:
         self._after(0, None, self._release)
 
     def run(self) -> list[int]:
-        """Until the last frame is presented."""
+        """Run until the last frame is presented."""
         self.env.run()
         return self.presented_ns
 
@@ -100,7 +103,7 @@ class LeanPipeline:
         self._fill(self._chain[0][1])
 
     def _fill(self, unit: str) -> None:
-        """Hand the unit jobs until it holds enough or nothing can run."""
+        """Hand jobs to the unit until it holds enough or nothing can run."""
         while self._held[unit] < HELD_JOBS:
             for position in self._positions[unit]:
                 if self._waiting[position] and (position == self._last or self._free[position]):

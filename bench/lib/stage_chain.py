@@ -1,8 +1,8 @@
 """The composited frames of a run, made by its own stages, one after the other in this process.
 
-Rule: the stages are built by the pipeline's factories and bound as a unit's process binds them, so a frame has the
-bytes that a run presents. Frames come in any order, so none is made from an earlier one's picture; one with nobody in
-view takes the pipeline's bypass, as in a run.
+Rule: the pipeline's factories build the stages, and they are bound as a unit's process binds them, so a frame has the
+bytes that a run presents. Frames come in any order, so none is made from an earlier one's picture. A frame with nobody
+in view takes the pipeline's bypass, as in a run.
 """
 
 from __future__ import annotations
@@ -32,12 +32,18 @@ RASTER = 1
 
 
 def units_of(pipeline: Pipeline, assets: Assets) -> Units:
-    """What the stages of each unit share. Chains that draw in one process must share them too: one OpenGL context."""
+    """Return what the stages of each unit share.
+
+    Chains that draw in one process must share it too: one OpenGL context.
+    """
     return {name: UnitContext(name, settings, assets) for name, settings in pipeline.units.items()}
 
 
 class StageChain:
-    """All stages of a pipeline but the last, on one slot an edge. `made`: the stages themselves."""
+    """All stages of a pipeline but the last, with one slot per edge.
+
+    `made`: the stages.
+    """
 
     def __init__(self, pipeline: Pipeline, units: Units) -> None:
         """Build and bind the stages. Raises what their factories raise."""
@@ -55,27 +61,30 @@ class StageChain:
             self._stages.append(BoundStage(stage.name, made, inputs, [output], 0, unit, stage.name == begin))
 
     def run(self, frame: int, last: int | None = None) -> Packet:
-        """Do frame `frame` to stage number `last`, or the last one; what comes to the stage behind it."""
+        """Run frame `frame` up to stage number `last`, or the last one; return the input of the stage behind it."""
         self._next, self._slot_in = 0, -1
         return self.go_on(frame, last)
 
     def go_on(self, frame: int, last: int | None = None) -> Packet:
-        """The same for the stages that an earlier `run` of the frame left out."""
+        """Do the same for the stages that an earlier `run` of the frame left out."""
         last = len(self._stages) - 1 if last is None else last
         while self._next <= last:
             number = self._next
             metrics = self._stages[number].run(frame, self._slot_in, 0, 0, fresh=True)
-            # Each edge has one slot, so at the bypass's end slot 1 is that of the edge behind its beginning.
+            # Each edge has one slot, so slot 1 at the bypass's end belongs to the edge behind its beginning.
             self._next, self._slot_in = (self._end, 1) if isinstance(metrics, Skip) else (number + 1, 0)
             self._handed = self.packets[number]
         return self._handed
 
 
 class AvatarFrames:
-    """The frames of a scene, as a run presents them."""
+    """Makes the frames of a scene, as a run presents them."""
 
     def __init__(self, checked: Checked, units: Units | None = None) -> None:
-        """`units`: of other frames that are made in this process. Raises BadInputError, MissingPartError."""
+        """Build the stages. Raises BadInputError, MissingPartError.
+
+        `units`: units of other frames that are made in this process.
+        """
         pipeline = avatar_pipeline(checked.config, checked.assets)
         self.units = units_of(pipeline, checked.assets) if units is None else units
         self._chain = StageChain(pipeline, self.units)
@@ -84,45 +93,48 @@ class AvatarFrames:
         self._shape = (checked.config.scene.output.height, checked.config.scene.output.width, 3)
 
     def frame(self, number: int) -> U8:
-        """(h,w,3) uint8, sRGB: frame `number`, composited."""
+        """Return frame `number`, composited: (h,w,3) uint8, sRGB."""
         return self._picture(self._chain.run(number))
 
     @property
     def gl(self) -> Any:
-        """The OpenGL context that the stages draw with."""
+        """OpenGL context that the stages draw with."""
         return self.units["gpu"].shared(CONTEXT, open_context)
 
     def background(self, number: int) -> U8:
-        """(h,w,3) uint8: the same with everything that is under the avatars, their shadows too, but without them."""
+        """Return the frame without avatars, but with everything under them, also their shadows: (h,w,3) uint8."""
         self._chain.run(number, self._composite - 1).payload[:] = 0
         return self._picture(self._chain.go_on(number))
 
     def tensor_of(self, number: int) -> U8:
-        """(h,w,C) of frame `number`, as its raster stage drew it. Somebody must be seen in it."""
+        """Return the tensor (h,w,C) of frame `number`, as its raster stage drew it. Somebody must be seen in it."""
         payload = self._chain.run(number, RASTER).payload
         height, width = self.posed["tensor_shape"].tolist()
         tensor: U8 = payload[: height * width * self._channels].reshape(height, width, self._channels).copy()
         return tensor
 
     def composited(self, number: int, painted: U8) -> U8:
-        """(h,w,3) uint8: frame `number` with `painted` (h,w,4) in place of the network's picture, of its shape."""
+        """Return frame `number` with `painted` (h,w,4) in place of the network's picture: (h,w,3) uint8.
+
+        `painted` has the shape of that picture.
+        """
         self._chain.run(number, self._composite - 1).payload[: painted.size] = painted.reshape(-1)
         return self._picture(self._chain.go_on(number))
 
     @property
     def levels(self) -> Mapping[int, int]:
-        """Of the avatars that are in view in the frame that was made last, by number: the level of `DETAILS`."""
+        """Return the level in `DETAILS` of each avatar, by its number, that the latest frame shows."""
         pose = cast(PoseStage, self._chain.made[0])
         return {index: seen.level for index, seen in pose.plan.seen.items()}
 
     @property
     def posed(self) -> NDArray[np.void]:
-        """What the pose stage said of the frame that was made last: a header as in `stages/config.py`."""
+        """Return what the pose stage said about the latest frame: a header as in `stages/config.py`."""
         return self._chain.packets[0].header
 
     @property
     def tensor(self) -> str:
-        """Height x width of the last frame's tensor; `none` when nobody was seen and none was made."""
+        """Height x width of the latest frame's tensor; `none` when nobody was seen and none was made."""
         height, width = self.posed["tensor_shape"].tolist()
         return f"{height}x{width}" if int(self.posed["work"]) == FrameWork.FULL else "none"
 

@@ -1,4 +1,4 @@
 """Reads camera files and makes the built-in cameras: a view and a projection over time.
 
-It may use, of `scene/`, the rotations, the schema, and from `scene/motion/` the sampling in time.
+From `scene/` it may use the rotations, the schema, and the sampling in time of `scene/motion/`.
 """

@@ -1,9 +1,9 @@
 """COLMAP sparse models: a folder with `cameras` and `images`, as `.txt` or as `.bin`.
 
-Poses are world to camera with optical axes (x right, y down, looks along +Z). Views stand in the order of their photos'
-names. The map has no unit, no levelled axis and no times. Distortion is left out and noted.
-Format: https://colmap.github.io/format.html, https://colmap.github.io/cameras.html; the numbers of the camera models
-are those of COLMAP's `sensor/models.h`.
+Poses are world to camera with optical axes (x right, y down, looks along +Z). Views are in the order of their photos'
+names. The map has no unit, no levelled axis and no times. Distortion is left out and noted. Format:
+https://colmap.github.io/format.html, https://colmap.github.io/cameras.html; the numbers of the camera models are those
+of COLMAP's `sensor/models.h`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,10 @@ from trilane.scene.rotations import matrix_from_quat, normalised
 
 
 class CameraModel(NamedTuple):
-    """`parameters`: their names, in order; `f` is both focal lengths, `k` the first of radial distortion."""
+    """A camera model.
+
+    `parameters`: names of its parameters, in order; `f` is both focal lengths, `k` the first of radial distortion.
+    """
 
     name: str
     parameters: tuple[str, ...]
@@ -35,7 +38,7 @@ class CameraModel(NamedTuple):
 
 
 _F, _FXY = ("f", "cx", "cy"), ("fx", "fy", "cx", "cy")
-#: By COLMAP's number.
+#: Camera models by COLMAP's number.
 MODELS = {
     0: CameraModel("SIMPLE_PINHOLE", _F),
     1: CameraModel("PINHOLE", _FXY),
@@ -50,13 +53,16 @@ MODELS = {
     10: CameraModel("THIN_PRISM_FISHEYE", (*_FXY, "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"), is_fisheye=True),
 }
 BY_NAME = {model.name: model for model in MODELS.values()}
-#: Sides of pictures, in pixels, that are believed; letters of a photo's name.
+#: Largest plausible side of a picture, in pixels; most letters of a photo's name.
 MAX_SIDE_PX, MAX_NAME = 1e6, 256
 
 
 @dataclass(frozen=True)
 class ColmapCamera:
-    """`model`: its name. `values`: its parameters, by name."""
+    """A camera of the model.
+
+    `model`: name of its camera model. `values`: its parameters, by name.
+    """
 
     model: str
     width_px: float
@@ -64,19 +70,22 @@ class ColmapCamera:
     values: dict[str, float]
 
     def lens(self) -> Lens:
-        """The lens without its distortion."""
+        """Return the lens without its distortion."""
         v = self.values
         fx, fy = v.get("fx", v.get("f", 0.0)), v.get("fy", v.get("f", 0.0))
         return Lens(self.width_px, self.height_px, fx, fy, v["cx"], v["cy"])
 
     def bent(self) -> Bent:
-        """The lens with its distortion."""
+        """Return the lens with its distortion."""
         parameters = {key: value for key, value in self.values.items() if key[0] in "kp"}
         return Bent(self.lens(), parameters, BY_NAME[self.model].is_fisheye)
 
 
 class ColmapImage(NamedTuple):
-    """`quat`: w, x, y, z, and `shift`: world to camera. `camera`: its number."""
+    """A view of the model.
+
+    `quat` (w, x, y, z), `shift`: transform from world to camera. `camera`: number of its camera.
+    """
 
     name: str
     quat: tuple[float, ...]
@@ -87,7 +96,7 @@ class ColmapImage(NamedTuple):
 def checked_camera(
     where: str | Path, model: CameraModel, size: tuple[float, float], values: Sequence[float]
 ) -> ColmapCamera:
-    """A camera whose numbers make sense. Raises BadInputError."""
+    """Return a camera whose numbers make sense. Raises BadInputError."""
     if len(values) != len(model.parameters):
         raise BadInputError(where, f"{len(values)} parameters", f"{len(model.parameters)} of {model.name}")
     if not all(1 <= side <= MAX_SIDE_PX for side in size):
@@ -103,11 +112,11 @@ def checked_camera(
 
 CAMERAS = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS a line"
 IMAGES = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME a line, then its points"
-WORDS = 10  # of an image's first line, without blanks in its name
+WORDS = 10  # words of an image's first line, when its name has no blanks
 
 
 def read_cameras_text(path: Path) -> dict[int, ColmapCamera]:
-    """The cameras of `path` by their numbers. Raises BadInputError with the line."""
+    """Return the cameras of `path` by their numbers. Raises BadInputError with the line."""
     cameras = {}
     for number, line in _lines(path, CAMERAS):
         where, words = f"{path}, line {number}", line.split()
@@ -124,7 +133,7 @@ def read_cameras_text(path: Path) -> dict[int, ColmapCamera]:
 
 
 def read_images_text(path: Path) -> list[ColmapImage]:
-    """The images of `path`. Raises BadInputError with the line."""
+    """Return the images of `path`. Raises BadInputError with the line."""
     images, is_points = [], False
     for number, line in _lines(path, IMAGES, keeps_blank=True):
         is_image = _is_image(line)
@@ -142,7 +151,7 @@ def _lines(path: Path, expected: str, keeps_blank: bool = False) -> list[tuple[i
 
 
 def _is_image(line: str) -> bool:
-    """Whether the line has a name behind its numbers; points are triples of numbers."""
+    """Return whether the line has a name behind its numbers; points are triples of numbers."""
     words = line.split(maxsplit=WORDS - 1)
     if len(words) < WORDS:
         return False
@@ -176,7 +185,7 @@ class _Reader:
         self.path, self._file, self._size = path, file, size
 
     def require(self, count: int, what: str) -> None:
-        """Raises BadInputError unless the file has `count` bytes more."""
+        """Raise BadInputError unless the file has `count` bytes more."""
         left = self._size - self._file.tell()
         if count > left:
             raise BadInputError(self.path, f"{left} bytes, truncated", f"{count} bytes of {what}")
@@ -186,7 +195,7 @@ class _Reader:
         return form.unpack(self._file.read(form.size))
 
     def entries(self, least: int, what: str) -> Iterator[int]:
-        """Numbers of the entries, as many as the file says, each of `least` bytes."""
+        """Yield numbers of the entries, as many as the file says, each of at least `least` bytes."""
         count = self.take(COUNT, f"the count of {what}")[0]
         if count > MAX_ENTRIES:
             raise BadInputError(self.path, f"{count} {what}", f"at most {MAX_ENTRIES}")
@@ -194,7 +203,7 @@ class _Reader:
         return iter(range(count))
 
     def name(self) -> str:
-        """Text up to a NUL byte."""
+        """Read text up to a NUL byte."""
         at = self._file.tell()
         head, end, _ = self._file.read(MAX_NAME_BYTES).partition(b"\0")
         if not end:
@@ -208,7 +217,7 @@ class _Reader:
 
 
 def read_cameras_binary(path: Path) -> dict[int, ColmapCamera]:
-    """The cameras of `path` by their numbers. Raises BadInputError."""
+    """Return the cameras of `path` by their numbers. Raises BadInputError."""
     cameras = {}
     size = require_file(path, "a COLMAP cameras.bin")
     with path.open("rb") as file:
@@ -225,7 +234,7 @@ def read_cameras_binary(path: Path) -> dict[int, ColmapCamera]:
 
 
 def read_images_binary(path: Path) -> list[ColmapImage]:
-    """The images of `path`. Raises BadInputError."""
+    """Return the images of `path`. Raises BadInputError."""
     images = []
     size = require_file(path, "a COLMAP images.bin")
     with path.open("rb") as file:
@@ -241,13 +250,13 @@ def read_images_binary(path: Path) -> list[ColmapImage]:
 
 EXPECTED = "a COLMAP model: cameras.txt and images.txt, or cameras.bin and images.bin"
 MAX_VIEWS = 100_000
-#: Where the model is below the folder of a project.
+#: Places of the model below the folder of a project.
 BELOW = (Path(), Path("sparse/0"), Path("sparse"), Path("0"), Path("colmap/sparse/0"))
 ENDINGS = (".bin", ".txt")
 
 
 def model_in(folder: Path) -> tuple[Path, str] | None:
-    """The folder at or below `folder` that has a model, and the ending of its files."""
+    """Return the folder at or below `folder` that has a model, and the ending of its files."""
     for below in BELOW:
         for ending in ENDINGS:
             if all((folder / below / f"{name}{ending}").is_file() for name in ("cameras", "images")):
@@ -258,7 +267,7 @@ def model_in(folder: Path) -> tuple[Path, str] | None:
 def load_colmap(path: Path, rate_hz: float | None = None) -> RawCamera:
     """Read `path`, a folder or a file of the model. Raises BadInputError naming the file.
 
-    `rate_hz`: views a second by the scene.
+    `rate_hz`: views a second, from the scene.
     """
     found = model_in(path if path.is_dir() else path.parent)
     if found is None:
@@ -292,14 +301,14 @@ def _read(folder: Path, ending: str) -> tuple[dict[int, ColmapCamera], list[Colm
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """A key by which `img10` comes after `img9`."""
+    """Return a sort key that places `img10` after `img9`."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d{1,18})", name)]
 
 
 def _lenses(
     where: Path, views: Sequence[ColmapImage], cameras: Mapping[int, ColmapCamera]
 ) -> tuple[tuple[Lens, ...], tuple[str, ...]]:
-    """One lens for all views or one for each, and notes on what is left out of them."""
+    """Return one lens for all views or one for each, and notes on what is left out of them."""
     for image in views:
         if image.camera not in cameras:
             raise BadInputError(f"{where}: {image.name}", f"camera {image.camera}", "a camera of the model")

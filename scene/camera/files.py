@@ -1,7 +1,7 @@
-"""Loads the camera of a scene: a built-in one by name, or a file whose format is told by its content.
+"""Loads the camera of a scene: a built-in one by name, or a file whose format follows from its content.
 
 The scene may state the format. Else a folder is known by the names of its files, and a text by its column names, then
-by how many columns it has and what they hold. What fits a second format, or another order of columns, as well is a
+by the number of columns and what they hold. A file that fits a second format, or another order of columns, becomes a
 question to the user: the message names both and what settles it. A note gives the reason of each guess.
 """
 
@@ -64,33 +64,39 @@ COLMAP_FILES = tuple(f"{name}{ending}" for name in ("cameras", "images") for end
 
 
 class Guess(NamedTuple):
-    """`kind`: as the scene's `format` has it. `reason`: part of a sentence."""
+    """A guess at a file's format.
+
+    `kind`: format, as in the scene's `format`. `reason`: part of a sentence.
+    """
 
     kind: str
     reason: str
 
 
-#: Fewer rows than this tell nothing of how a camera moves.
+#: Least number of rows that tell how a camera moves.
 LEAST_ROWS = 5
-#: Median deviation of the steps of a column, in medians: below the first they are a clock's, above the second not.
+#: Median deviation of the steps of a column, in medians: below the first they are a clock's, above the second they are
+#: not.
 EVEN, UNEVEN = 0.1, 0.5
-#: No place is farther from the origin of its map, of whatever unit, but times since 1970 are.
+#: Largest distance of a place from the origin of its map, in any unit; times since 1970 are larger.
 FARTHEST = 1e8
-#: Numbers of more than three digits after the point are a quaternion's, or a matrix's, to this in most rows.
+#: Tolerance within which numbers of more than three digits form a quaternion or a rotation matrix, and largest share of
+#: rows beyond it.
 PRECISE, MOST_IMPRECISE = 1e-3, 0.25
-#: A pose is without a turn, and at the origin, to this.
+#: Tolerance within which a pose has no turn and is at the origin.
 EXACT = 1e-6
-#: Mean cosine of the camera's way with its axis, and of its axes with the world's, from which both are taken for one.
+#: Mean cosine between the camera's way and its axis, and between its axes and the world's, above which both count as
+#: one.
 ALONG, UPRIGHT = 0.9, 0.7
-#: Another order of a quaternion's parts that is cheaper by the first is likely, one that is not dearer by the second is
-#: possible. Both are asked about.
+#: Another order of a quaternion's parts is likely when it is cheaper by the first, and possible when it is not dearer
+#: by the second. The user is asked about both.
 MUCH_DEARER, AS_DEAR = 0.1, 0.02
 WHICH_MATRIX = (
     'set camera.format to "kitti" if the camera looks along +Z of its axes (x right, y down), to "arkit" if along -Z '
     "(x right, y up)"
 )
 
-#: Columns of what others save -> how it becomes usable.
+#: How a table becomes usable, by the columns that other programs save.
 OTHERS = {
     1: "part the numbers by blanks or commas",
     7: "if these are rotation vectors, as in ARKitScenes, or a place and a quaternion: write time, place and "
@@ -100,7 +106,10 @@ OTHERS = {
 
 
 def detect(path: Path, up_axis: str = AUTO) -> Guess:
-    """The format of `path`. `up_axis`: up by the scene. Raises BadInputError when it is none, or may be two."""
+    """Return the format of `path`. Raises BadInputError when it is none, or may be two.
+
+    `up_axis`: axis that is up, from the scene.
+    """
     if path.is_dir():
         return _of_folder(path)
     require_file(path, EXPECTED)
@@ -154,17 +163,17 @@ def _of_table(path: Path, layout: TableLayout, up_axis: str) -> Guess:
 
 
 def _require_pose(path: Path, layout: TableLayout) -> None:
-    """Raises BadInputError where column names have a part of a quaternion, but not the whole pose."""
+    """Raise BadInputError where column names have a part of a quaternion, but not the whole pose."""
     if any(name in layout.names for name in ("qw", "qx", "qy", "qz")):
         missing = ", ".join(name for name in POSE if name not in layout.names)
         raise BadInputError(path, f"column names without {missing}", f"names of {', '.join(POSE)} in any order")
 
 
 def _require_clock(path: Path, numbers: F64, others: Iterable[int]) -> None:
-    """Raises BadInputError where one of `others` of the columns (N, columns) has times, or grows as they do."""
+    """Raise BadInputError where one of the columns `others` of `numbers` (N, columns) has times, or grows like them."""
     if len(numbers) < LEAST_ROWS:
         return
-    is_even = np.ptp(numbers[:, 0]) == 0 or _unevenness(numbers[:, 0]) < UNEVEN  # one time: the reader says so
+    is_even = np.ptp(numbers[:, 0]) == 0 or _unevenness(numbers[:, 0]) < UNEVEN  # a single time: the reader says so
     for k in others:
         middle = float(np.median(numbers[:, k]))
         if abs(middle) > FARTHEST:
@@ -175,7 +184,7 @@ def _require_clock(path: Path, numbers: F64, others: Iterable[int]) -> None:
 
 
 def _unevenness(column: F64) -> float:
-    """The median deviation of the steps of `column` (N,) from their median, in medians; inf where it does not grow."""
+    """Return the median deviation of the steps of `column` (N,) from their median, in medians; inf unless it grows."""
     steps = np.diff(column)
     middle = float(np.median(steps))
     if not middle > 0 or (steps > 0).mean() < LEAST_GROWING:
@@ -184,7 +193,10 @@ def _unevenness(column: F64) -> float:
 
 
 def _of_matrices(path: Path, numbers: F64, up_axis: str) -> Guess:
-    """The format of a table (N, 12 or 13) of matrices. KITTI's and ARKit's cameras look along opposite axes."""
+    """Return the format of a table (N, 12 or 13) of matrices.
+
+    KITTI's and ARKit's cameras look along opposite axes.
+    """
     matrices = numbers[:, -MATRIX:].reshape(-1, 3, 4)
     rows = numbers[sound := are_rotations(matrices[:, :, :3])]
     has_time = numbers.shape[1] > MATRIX and not is_index(rows[:, 0])
@@ -195,7 +207,7 @@ def _of_matrices(path: Path, numbers: F64, up_axis: str) -> Guess:
         if (~precise).mean() > MOST_IMPRECISE:
             found = f"{columns}matrices that are nearly rotations, but not as exactly as their digits"
             raise BadInputError(path, found, "numbers row by row", WHICH_MATRIX)
-    is_readable = 0 < len(rows) >= len(numbers) / 2  # else the reader names the rows that are no rotation
+    is_readable = 0 < len(rows) >= len(numbers) / 2  # otherwise the reader names the rows that are no rotation
     if is_readable and (has_time or not path.with_name(KITTI_TIMES).is_file()):
         if has_time:
             _require_clock(path, rows, (4, 8, 12))
@@ -207,14 +219,14 @@ def _of_matrices(path: Path, numbers: F64, up_axis: str) -> Guess:
 
 
 def _ups(up_axis: str, *, has_time: bool) -> tuple[str, ...]:
-    """Axes of the world that a picture's Y cannot point against, but for KITTI's; a phone may be held upside down."""
+    """Return the world axes that a picture's Y can point against only in KITTI's files; a phone may be upside down."""
     if up_axis != AUTO:
         return (up_axis,)
     return ("z",) if has_time else ("z", "y")
 
 
 def _signs(matrices: F64, ups: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
-    """What poses (N, 3, 4) say for KITTI's axes (x right, y down, looks along +Z), and what for ARKit's."""
+    """Return what poses (N, 3, 4) say for KITTI's axes (x right, y down, looks along +Z), and what for ARKit's."""
     turns, places = matrices[:, :, :3], matrices[:, :, 3]
     own_up = {axis: float(turns[:, :, 1].mean(axis=0) @ UP[axis]) for axis in ups}
     steps = np.diff(places, axis=0)
@@ -240,10 +252,10 @@ def _signs(matrices: F64, ups: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
 
 
 def _require_one_order(path: Path, numbers: F64, names: tuple[str, ...]) -> None:
-    """Raises BadInputError where the quaternion's parts may be in another order than `names` of a table's columns.
+    """Raise BadInputError where the quaternion's parts may be in another order than `names` of a table's columns.
 
-    That is where another order makes cameras that are more level, or where the other usual one (scalar first or last)
-    makes them as level. A map of SLAM that begins without a turn has the 1 where its scalar is.
+    This holds where another order makes cameras more level, or where the other usual one (scalar first or last) makes
+    them as level. A map of SLAM that begins without a turn has the 1 where its scalar is.
     """
     at = names.index("qw"), names.index("qx"), names.index("qy"), names.index("qz")
     first_of = min(at)
@@ -272,16 +284,16 @@ def _require_one_order(path: Path, numbers: F64, names: tuple[str, ...]) -> None
 
 
 def _has_digits(numbers: F64) -> bool:
-    """Whether numbers have more than three digits after the point."""
+    """Return whether numbers have more than three digits after the point."""
     return bool((np.abs(numbers - np.round(numbers, 3)) > EXACT).any())
 
 
 def _price(quats: F64, order: tuple[int, ...]) -> float:
-    """How far from level a camera is whose w, x, y, z are the columns `order` of `quats` (N, 4)."""
+    """Return how far from level a camera is whose w, x, y, z are the columns `order` of `quats` (N, 4)."""
     return price_of(matrix_from_quat(normalised(quats[:, order])) @ OPENGL_FROM_OPTICAL, "z")
 
 
-#: Readers of a path and the scene's rate.
+#: Reader of each format, called with a path and the scene's rate.
 _READERS: dict[str, Callable[[Path, float | None], RawCamera]] = {
     "arkit": load_arkit,
     "colmap": load_colmap,
@@ -297,7 +309,7 @@ FOLDERS = ("colmap", "nerf", "record3d", "stray")
 
 
 def load_camera(spec: CameraSpec, base: Path) -> CameraPath:
-    """The camera that `spec.source` names; a relative path starts at `base`.
+    """Load the camera that `spec.source` names; a relative path starts at `base`.
 
     Raises BadInputError when there is no such camera or the file is unusable.
     """
@@ -312,7 +324,7 @@ def load_camera(spec: CameraSpec, base: Path) -> CameraPath:
     guess = detect(path, spec.up_axis) if spec.format == "auto" else Guess(spec.format, "")
     if not (path.is_dir() and guess.kind in FOLDERS):
         require_file(path, EXPECTED)
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is left out afterwards
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # non-finite values are left out later
         raw = _READERS[guess.kind](path, spec.rate_hz)
         camera = path_from_recording(raw, str(path), spec)
     reason = guess.reason or "as given"

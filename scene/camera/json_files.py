@@ -35,7 +35,10 @@ from trilane.scene.rotations import matrix_from_quat, normalised
 
 
 def read_object(path: Path, expected: str) -> dict[str, Any]:
-    """The object in `path`, `expected` in words; empty for another value. Raises BadInputError for what is no JSON."""
+    """Return the object in `path`, empty for another value. Raises BadInputError for anything but JSON.
+
+    `expected`: expected content in words.
+    """
     try:
         content = json.loads(read_text(path, expected), parse_int=whole_number)
     except (ValueError, RecursionError) as error:
@@ -48,12 +51,13 @@ NERF = "a NeRF transforms.json: `frames`, each with a 4x4 `transform_matrix`"
 DEFAULT_ANGLE_X = math.radians(50.0)
 DEFAULT_ASPECT = 4 / 3
 MAX_FRAMES = 100_000
-#: Of a matrix whose columns have unit length; that of a rotation is 1. A place far off makes it less: 1e-5 at 100 km.
+#: Least determinant of a matrix whose columns have unit length; a rotation's is 1. A place far off makes it less: 1e-5
+#: at 100 km.
 LEAST_DETERMINANT = 1e-9
 LENS_KEYS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
-FISHEYE = "FISHEYE"  # in the name of a camera model
-#: In the names of nerfstudio's models whose pictures no pinhole makes.
+FISHEYE = "FISHEYE"  # part of a camera model's name
+#: Parts of the names of nerfstudio's models whose pictures no pinhole makes.
 NO_LENS = ("EQUIRECTANGULAR", "OMNIDIRECTIONAL", "VR180", "ORTHOPHOTO")
 NO_LENS_REMEDY = "cut the pictures into perspective ones first (ns-process-data --camera-type equirectangular)"
 
@@ -62,8 +66,8 @@ def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
     """Read a NeRF `transforms.json`, or its folder: `frames[].transform_matrix`, 4x4, usually Z up, no times.
 
     The lens is that of the frame, else that of the file: `fl_x`, `fl_y`, `cx`, `cy` in pixels of `w` x `h`, or an
-    angle. Distortion is left out and noted. nerfstudio makes such files of the exports of Polycam and Record3D.
-    `rate_hz`: frames a second by the scene. Raises BadInputError naming the key.
+    angle. Distortion is left out and noted. nerfstudio makes such files from the exports of Polycam and Record3D.
+    `rate_hz`: frames a second, from the scene. Raises BadInputError naming the key.
     Format: https://docs.nerf.studio/quickstart/data_conventions.html.
     """
     path = path / NERF_FILE if path.is_dir() else path
@@ -98,7 +102,7 @@ def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
 
 
 def _nerf_lenses(path: Path, content: Mapping[str, Any], frames: Sequence[Any]) -> tuple[tuple[Lens, ...], str]:
-    """One lens for all views, or one for each where a view has a key of its own; and where they come from."""
+    """Return one lens for all views, or one for each where a view has a key of its own; and where they come from."""
     _check_models(path, (content, *frames))
     if not any(key in frame for frame in frames if isinstance(frame, dict) for key in LENS_KEYS):
         lens, source = _nerf_lens(path, content, "")
@@ -109,7 +113,7 @@ def _nerf_lenses(path: Path, content: Mapping[str, Any], frames: Sequence[Any]) 
 
 
 def _check_models(path: Path, tables: Sequence[Mapping[str, Any]]) -> None:
-    """Raises BadInputError where a camera of the file makes pictures that no pinhole makes."""
+    """Raise BadInputError where a camera of the file makes pictures that no pinhole makes."""
     for keys in tables:
         model = str(keys.get("camera_model", ""))
         if any(word in model.upper() for word in NO_LENS):
@@ -119,9 +123,9 @@ def _check_models(path: Path, tables: Sequence[Mapping[str, Any]]) -> None:
 def _distortion(
     path: Path, content: Mapping[str, Any], frames: Sequence[Any], lenses: Sequence[Lens]
 ) -> tuple[str, ...]:
-    """What is left out of the lens that is distorted the most."""
+    """Say what is left out of the most distorted lens."""
     bent = []
-    for lens, frame in zip(lenses, frames, strict=False):  # one lens may be that of all frames
+    for lens, frame in zip(lenses, frames, strict=False):  # a single lens stands for all frames
         keys = {**content, **frame}
         parameters = {key: _real(path, keys, key) for key in DISTORTION_KEYS}
         bent.append(Bent(lens, parameters, FISHEYE in str(keys.get("camera_model", ""))))
@@ -129,7 +133,7 @@ def _distortion(
 
 
 def _real(path: Path, content: Mapping[str, Any], key: str) -> float:
-    """A finite number of the file, 0 when the key is not there. Raises BadInputError."""
+    """Return a finite number of the file, 0 when the key is not there. Raises BadInputError."""
     value = content.get(key, 0.0)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise BadInputError(f"{path}: {key}", repr(value)[:40], "a number")
@@ -137,7 +141,7 @@ def _real(path: Path, content: Mapping[str, Any], key: str) -> float:
 
 
 def _pictures(frames: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
-    """The photo of each view as the file names it; nothing when a view has none."""
+    """Return the photo of each view as the file names it; nothing when a view has none."""
     names = tuple(frame.get("file_path") for frame in frames)
     return tuple(str(name) for name in names) if all(isinstance(name, str) and name for name in names) else ()
 
@@ -163,16 +167,19 @@ def _matrix(path: Path, index: int, frame: Any) -> NDArray[np.float64]:
 
 
 def _is_singular(matrix: NDArray[np.float64]) -> bool:
-    """Whether the columns of `matrix` (3 or 4, 4), however long they are, span less than all directions."""
+    """Return whether the columns of `matrix` (3 or 4, 4), of any length, do not span all directions."""
     square = matrix[:, : len(matrix)]
     if not np.isfinite(square).all():
-        return False  # a hole in a recording, which is interpolated across
+        return False  # a hole in a recording; sampling interpolates across it
     lengths = np.linalg.norm(square, axis=0)
     return bool(not lengths.all() or abs(np.linalg.det(square / lengths)) < LEAST_DETERMINANT)
 
 
 def _nerf_lens(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, str]:
-    """The lens, and where it comes from. `of`: the beginning of its keys, for messages."""
+    """Return the lens, and where it comes from.
+
+    `of`: beginning of its keys, for messages.
+    """
     lens, source = _measured(path, content, of)
     return checked_lens(f"{path}: {of.rstrip('.')}" if of else path, lens), source
 
@@ -197,7 +204,7 @@ def _measured(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, st
 def _by_angle(
     width: float | None, height: float | None, angle_x: float | None, angle_y: float | None
 ) -> tuple[Lens, str]:
-    """A lens for which the file has angles at most, and the source of its numbers."""
+    """Return a lens for which the file has angles at most, and the source of its numbers."""
     angles = {"camera_angle_x": angle_x, "camera_angle_y": angle_y}
     source = f"by {' and '.join(f'`{key}`' for key, value in angles.items() if value)}"
     if not (angle_x or angle_y):
@@ -213,7 +220,7 @@ def _by_angle(
 
 
 def _number(where: str, value: Any, key: str) -> float | None:
-    """A positive number of the file, or None when the key is not there. Raises BadInputError."""
+    """Return a positive number of the file, or None when the key is not there. Raises BadInputError."""
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float) or not (math.isfinite(value) and value > 0):
@@ -232,7 +239,7 @@ def load_record3d(path: Path, rate_hz: float | None = None) -> RawCamera:
 
     The world is ARKit's: levelled, Y up, metres. The lens is `perFrameIntrinsicCoeffs` (fx, fy, cx, cy), else `K`,
     column by column, in pixels of `w` x `h`. Times are `frameTimestamps`, else by `fps`.
-    `rate_hz`: frames a second by the scene. Raises BadInputError naming the key.
+    `rate_hz`: frames a second, from the scene. Raises BadInputError naming the key.
     Format: keys of the exports of https://record3d.app, as nerfstudio's `process_data/record3d_utils.py` takes them.
     """
     path = path / RECORD3D_FILE if path.is_dir() else path
@@ -253,7 +260,7 @@ def load_record3d(path: Path, rate_hz: float | None = None) -> RawCamera:
 
 
 def _array(path: Path, content: Mapping[str, Any], key: str, columns: int) -> F64:
-    """The table (N, columns) at `key`. Raises BadInputError."""
+    """Return the table (N, columns) at `key`. Raises BadInputError."""
     try:
         array = np.array(content.get(key), dtype=np.float64)
     except (TypeError, ValueError):
@@ -264,7 +271,7 @@ def _array(path: Path, content: Mapping[str, Any], key: str, columns: int) -> F6
 
 
 def _times(path: Path, content: Mapping[str, Any], count: int, rate_hz: float | None) -> tuple[F64, str]:
-    """Seconds (N,) of the poses, and where they come from."""
+    """Return the seconds (N,) of the poses, and where they come from."""
     if rate_hz is None and content.get("frameTimestamps"):
         values = content["frameTimestamps"]
         rows = {"frameTimestamps": [[value] for value in values] if isinstance(values, list) else None}
@@ -279,7 +286,7 @@ def _times(path: Path, content: Mapping[str, Any], count: int, rate_hz: float | 
 
 
 def _lenses(path: Path, content: Mapping[str, Any], count: int) -> tuple[tuple[Lens, ...], str]:
-    """One lens for all poses or one for each, and where they come from."""
+    """Return one lens for all poses or one for each, and where they come from."""
     width, height = (_side(path, content, key) for key in ("w", "h"))
     if content.get("perFrameIntrinsicCoeffs"):
         rows = _array(path, content, "perFrameIntrinsicCoeffs", 4)

@@ -1,7 +1,7 @@
-"""A camera over time, whatever its source: poses at increasing times, their lenses, and the built-in cameras.
+"""A camera over time, from any source: poses at increasing times, their lenses, and the built-in cameras.
 
 A pose is camera to world with OpenGL axes (x right, y up, looks along -Z) and world Y up. Between samples, place and
-lens are interpolated linearly, the turn by slerp. After the last sample the path loops or is run backwards (`wrap`). A
+lens are interpolated linearly, the turn by slerp. After the last sample the path loops or runs backwards (`wrap`). A
 built-in camera is a formula of time for a person at the origin who faces +Z, sampled over one cycle.
 """
 
@@ -24,7 +24,10 @@ HALFWAY = 0.5
 
 
 def view_from_pose(turn: F64, place: F64) -> F64:
-    """World to camera (4, 4) of a camera whose axes are the columns of `turn` (3, 3), standing at `place` (3,)."""
+    """Return the matrix (4, 4) from world to a camera whose axes are the columns of `turn` (3, 3).
+
+    `place`: place of the camera, (3,).
+    """
     view = np.eye(4)
     view[:3, :3] = turn.T
     view[:3, 3] = -turn.T @ place
@@ -32,12 +35,15 @@ def view_from_pose(turn: F64, place: F64) -> F64:
 
 
 def look_at(place: F64, target: F64) -> F64:
-    """World to camera (4, 4) of a level camera at `place` (3,) that looks at `target` (3,), not straight up or down."""
+    """Return the matrix (4, 4) from world to a level camera at `place` (3,) that looks at `target` (3,).
+
+    It must not look straight up or down.
+    """
     return view_from_pose(axes_towards(place[None], target)[0], place)
 
 
 def axes_towards(places: F64, target: F64) -> F64:
-    """Camera axes as columns (N, 3, 3) of level cameras at `places` (N, 3) that look at `target` (3,)."""
+    """Return camera axes as columns (N, 3, 3) of level cameras at `places` (N, 3) that look at `target` (3,)."""
     back = _unit_rows(places - target)
     right = _unit_rows(np.cross([0.0, 1.0, 0.0], back))
     return np.stack([right, np.cross(back, right), back], axis=-1)
@@ -49,11 +55,11 @@ def _unit_rows(vectors: F64) -> F64:
 
 
 def projection_matrix(fov_y_deg: float, aspect: float, near_m: float, far_m: float) -> F64:
-    """OpenGL perspective matrix (4, 4).
+    """Return an OpenGL perspective matrix (4, 4).
 
-    `fov_y_deg`: field of view of the picture's height.
+    `fov_y_deg`: field of view over the picture's height, degrees.
     `aspect`: width over height.
-    `near_m`, `far_m`: distances of the clip planes.
+    `near_m`, `far_m`: distances of the clip planes, metres.
     """
     f = 1 / np.tan(np.radians(fov_y_deg) / 2)
     depth = near_m - far_m
@@ -69,12 +75,12 @@ def projection_matrix(fov_y_deg: float, aspect: float, near_m: float, far_m: flo
 
 @dataclass(frozen=True)
 class Optics:
-    """How the camera's picture comes about.
+    """How the camera's picture is made.
 
-    `lenses`: one for all samples of the path, or one for each. `near_m`, `far_m`: distances of the clip planes.
+    `lenses`: one lens for all samples of the path, or one for each. `near_m`, `far_m`: distances of the clip planes.
     `filmed`: (height, width) of the background that the camera filmed, as it is shown, one for all samples or one for
-    each; empty where the background is not the camera's. `turned`: by how many quarters its pixels are turned clockwise
-    to be shown, likewise; empty for what its file says.
+    each; empty where the background is not the camera's. `turned`: number of quarters by which its pixels are turned
+    clockwise to be shown, likewise; empty for what its file says.
     """
 
     lenses: tuple[Lens, ...]
@@ -84,9 +90,9 @@ class Optics:
     turned: tuple[int, ...] = ()
 
     def lens(self, i: int, j: int, fraction: float, output: Shape) -> Lens:
-        """The lens of a picture of `output` (height, width), at `fraction` of the way from sample `i` to sample `j`.
+        """Return the lens for a picture of `output` (height, width), a `fraction` of the way from sample `i` to `j`.
 
-        Over what the camera filmed it is cut as that is; else the picture's height is the camera's.
+        Over a background that the camera filmed it is cut as that is; else the picture's height is the camera's.
         """
         first = self._shown(i, output)
         is_one = len(self.lenses) == 1 and len(self.filmed) <= 1
@@ -100,7 +106,10 @@ class Optics:
 
 
 def one_lens(fov_y_deg: float, near_m: float, far_m: float) -> Optics:
-    """Optics with one lens for all samples. `fov_y_deg`: field of view over the picture's height."""
+    """Return optics with one lens for all samples.
+
+    `fov_y_deg`: field of view over the picture's height, degrees.
+    """
     return Optics((of_fov_y(fov_y_deg),), near_m, far_m)
 
 
@@ -108,13 +117,13 @@ def one_lens(fov_y_deg: float, near_m: float, far_m: float) -> Optics:
 class CameraPath:
     """A camera over time.
 
-    `times_s` (N,): times from 0, strictly increasing. `quats` (N, 4) and `places` (N, 3), metres: camera to world.
-    `notes`: how the source was read, for people. `wrap`: what follows the last sample. `recorded`: whether the path
-    comes from a recording, which has to be placed in the scene. `detected`: what its file is. `pictures`: names of the
-    photos that the samples are of, one for each; empty where the file names none. `quarter`: quarters by which the
-    camera's picture was turned clockwise. `is_held`: whether each sample holds, halfway to its neighbours, because its
-    photo does. `repeat_s`: after which time the path starts again, as what it filmed does; 0 for `wrap` alone.
-    `began_s`: when it was recorded, seconds since 1970; None where the file does not say it.
+    `times_s` (N,): times from 0, strictly increasing. `quats` (N, 4), `places` (N, 3): transforms from camera to world,
+    metres. `notes`: how the source was read, for people. `wrap`: what follows the last sample. `recorded`: whether the
+    path comes from a recording, which has to be placed in the scene. `detected`: facts about its file. `pictures`: name
+    of the photo of each sample; empty where the file names none. `quarter`: number of quarters by which the camera's
+    picture was turned clockwise. `is_held`: whether each sample holds, halfway to its neighbours, because its photo
+    does. `repeat_s`: time after which the path starts again, as its background does; 0 for `wrap` alone. `began_s`:
+    time of the recording, seconds since 1970; None where the file does not say it.
     """
 
     times_s: F64
@@ -138,25 +147,25 @@ class CameraPath:
 
     @property
     def course(self) -> str:
-        """How long it lasts and what follows, for people."""
+        """Length of the path and what follows it, for people."""
         if len(self.times_s) == 1:
             return "one pose: held"
         then = "starts again with the background" if self.repeat_s else self.wrap.value
         return f"{self.duration_s:.2f} s, then {then}"
 
     def pose(self, t_s: float) -> tuple[F64, F64]:
-        """Turn (3, 3) and place (3,) of the camera at `t_s`."""
+        """Return turn (3, 3) and place (3,) of the camera at `t_s`."""
         i, j, fraction = self._between(t_s)
         turn = matrix_from_quat(slerp(self.quats[i], self.quats[j], fraction))
         return turn, self.places[i] + (self.places[j] - self.places[i]) * fraction
 
     def nearest(self, t_s: float) -> int:
-        """The sample that is nearest to `t_s`."""
+        """Return the sample that is nearest to `t_s`."""
         i, j, fraction = self._bracket(t_s)
         return i if fraction < HALFWAY else j
 
     def _between(self, t_s: float) -> tuple[int, int, float]:
-        """Two samples, and how far `t_s` is from the first to the second, 0 to 1."""
+        """Return two samples, and how far `t_s` is from the first to the second, 0 to 1."""
         if not self.is_held:
             return self._bracket(t_s)
         held = self.nearest(t_s)
@@ -168,21 +177,21 @@ class CameraPath:
         return bracket(self.times_s, wrapped_time(t_s, self.duration_s, self.wrap))
 
     def sample(self, t_s: float) -> F64:
-        """World to camera (4, 4) at `t_s`."""
+        """Return the matrix (4, 4) from world to camera at `t_s`."""
         return view_from_pose(*self.pose(t_s))
 
     def own_lens(self, t_s: float) -> Lens:
-        """The lens at `t_s`, for the picture that the camera took."""
+        """Return the lens at `t_s`, for the picture that the camera took."""
         i, j, fraction = self._between(t_s)
         lenses = self.optics.lenses
         return lenses[i % len(lenses)].between(lenses[j % len(lenses)], fraction) if len(lenses) > 1 else lenses[0]
 
     def lens(self, t_s: float, output: Shape) -> Lens:
-        """The lens at `t_s`, for a picture of `output` (height, width)."""
+        """Return the lens at `t_s`, for a picture of `output` (height, width)."""
         return self.optics.lens(*self._between(t_s), output)
 
     def projection(self, t_s: float, output: Shape) -> F64:
-        """OpenGL clip matrix (4, 4) at `t_s` for a picture of `output` (height, width)."""
+        """Return the OpenGL clip matrix (4, 4) at `t_s` for a picture of `output` (height, width)."""
         return self.lens(t_s, output).projection(self.optics.near_m, self.optics.far_m)
 
 
@@ -192,7 +201,7 @@ RATE_HZ = 30
 
 @dataclass(frozen=True)
 class Orbit:
-    """A swing of `swing_deg` either way round `target` in `period_s`, from `far_m` in to `near_m` and back."""
+    """A swing of `swing_deg` either way around `target` in `period_s`, from `far_m` in to `near_m` and back."""
 
     what: str
     target: tuple[float, float, float]
@@ -203,7 +212,7 @@ class Orbit:
     period_s: float
 
     def places(self, phase: F64) -> F64:
-        """Places (N, 3), metres, at `phase` (N,) of the cycle, radians."""
+        """Return places (N, 3), metres, at `phase` (N,) of the cycle, radians."""
         angle = np.radians(self.swing_deg) * np.sin(phase - 0.6)
         distance = self.far_m + (self.near_m - self.far_m) * (1 - np.cos(phase)) / 2
         return np.column_stack([distance * np.sin(angle), np.full(len(phase), self.height_m), distance * np.cos(angle)])
@@ -221,7 +230,7 @@ class Descent:
     period_s: float
 
     def places(self, phase: F64) -> F64:
-        """Places (N, 3), metres, at `phase` (N,): the top at 0, `low_m` after half a cycle."""
+        """Return places (N, 3), metres, at `phase` (N,): the top at 0, `low_m` after half a cycle."""
         top, low = np.radians(self.top_deg), np.arcsin((self.low_m - self.target[1]) / self.distance_m)
         angle = low + (top - low) * (1 + np.cos(phase)) / 2
         arc = np.column_stack([np.zeros(len(phase)), np.sin(angle), np.cos(angle)])
@@ -230,7 +239,7 @@ class Descent:
 
 @dataclass(frozen=True)
 class Stand:
-    """Stands at `place` and looks at `target`."""
+    """A camera that stands at `place` and looks at `target`."""
 
     what: str
     target: tuple[float, float, float]
@@ -238,7 +247,7 @@ class Stand:
     period_s: float = 1.0
 
     def places(self, phase: F64) -> F64:
-        """Its one place, for each of `phase` (N,): (N, 3), metres."""
+        """Return its one place, metres, for each of `phase` (N,): (N, 3)."""
         return np.tile(self.place, (len(phase), 1))
 
 
@@ -250,7 +259,7 @@ ORBITS = {
 }
 
 
-#: Name: the camera.
+#: Built-in cameras by name.
 BUILTIN: dict[str, Orbit | Descent | Stand] = {
     **ORBITS,
     "top-to-floor": Descent("whole person, from above down to the floor", (0.0, 0.90, 0.0), 3.9, 80.0, 0.12, 12.0),
@@ -263,7 +272,7 @@ def _pace(camera: Orbit | Descent | Stand) -> str:
 
 
 def load_builtin(name: str, spec: CameraSpec) -> CameraPath | None:
-    """The camera `name`, or None when there is none of that name."""
+    """Return the camera `name`, or None when there is none of that name."""
     camera = BUILTIN.get(name)
     if camera is None:
         return None

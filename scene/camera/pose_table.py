@@ -1,9 +1,9 @@
-"""Text tables of camera poses: one pose a line, numbers parted by blanks or commas, `#` for comments.
+"""Text tables of camera poses: one pose a line, numbers separated by blanks or commas, `#` for comments.
 
-Every line has as many numbers as the others; the error names the first that has not. An empty field between two commas
-is NaN, at the end of a line it is nothing. Column names, in a comment or in the first line, win over the order of the
-format. Columns that seldom hold a quaternion of length 1 are refused: another order of columns would give a camera that
-looks anywhere.
+Every line has as many numbers as the others; the error names the first line that has not. An empty field between two
+commas is NaN, at the end of a line it is nothing. Column names, in a comment or in the first line, win over the order
+of the format. Columns that seldom hold a quaternion of length 1 are refused: another order of columns would give a
+camera that looks anywhere.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from trilane.scene.camera.recorded import FILM_RATE_HZ
 from trilane.scene.rotations import matrix_from_quat, normalised
 
 MAX_ROWS = 1_000_000
-#: Rows by which it is told what columns hold.
+#: Number of rows that tell what columns hold.
 HEAD = 3000
 #: With a median step above this, times are in nanoseconds, else in seconds.
 LEAST_STEP_NS = 1e3
 #: A time above this is in nanoseconds whatever the steps are: in seconds it would be 30 million years.
 LEAST_TIME_NS = 1e15
-#: Lines of numbers by which a table's layout is told.
+#: Number of lines of numbers that tell a table's layout.
 LOOKED_AT = 20
-#: Whole numbers below this that mostly grow by 1, in this share of the steps at least, number frames.
+#: Whole numbers below the first number frames, when at least the second share of their steps is 1.
 MOST_FRAMES, LEAST_GROWING = 1e7, 0.75
 #: Unit of a first column that numbers frames.
 FRAMES = "frames"
-#: What is left out of a column's name: its unit, the frames of EuRoC's symbols, and all but letters and digits.
+#: Parts that are removed from a column's name: its unit, the frames of EuRoC's symbols, and all but letters and digits.
 UNIT, SYMBOLS, OTHER = re.compile(r"\[[^\[\]]*\]"), re.compile(r"_rs(_r)?_"), re.compile(r"[^a-z0-9]")
-#: A column's name -> what it holds.
+#: What a column holds, by its name.
 KNOWN = {
     **{name: "time" for name in ("timestamp", "time", "t", "timestamps", "timestampns")},
     **{name: axis for axis in "xyz" for name in (axis, f"t{axis}", f"p{axis}", f"pos{axis}")},
@@ -50,21 +50,24 @@ POSE = ("time", "x", "y", "z", "qw", "qx", "qy", "qz")
 
 
 class NumberTable(NamedTuple):
-    """`numbers` (N, columns): numbers of each pose. `lines` (N,): line of each, from 1 on."""
+    """The numbers of a table.
+
+    `numbers` (N, columns): numbers of each pose. `lines` (N,): line of each, from 1 on.
+    """
 
     numbers: NDArray[np.float64]
     lines: NDArray[np.int64]
 
     def place_of(self, index: int) -> str:
-        """Where pose `index` stands in the file."""
+        """Say where pose `index` stands in the file."""
         return f"line {self.lines[index]}"
 
 
 class TableLayout(NamedTuple):
-    """How the first line of a table with numbers looks.
+    """The layout of the first line of numbers in a table.
 
-    `columns`: how many there are. `names`: what each holds, by KNOWN, "" for others; none without column names.
-    `has_commas`: whether they part the numbers. `is_ns`: whether the first column has times in nanoseconds.
+    `columns`: number of columns. `names`: content of each, by KNOWN, "" for others; none without column names.
+    `has_commas`: whether commas separate the numbers. `is_ns`: whether the first column has times in nanoseconds.
     """
 
     columns: int
@@ -79,7 +82,7 @@ class TableLayout(NamedTuple):
 
 
 def read_table(path: Path, columns: int, expected: str) -> NumberTable:
-    """The poses of `path`, at least one; `nan` and `inf` stay. Raises BadInputError with the line."""
+    """Return the poses of `path`, at least one; `nan` and `inf` stay. Raises BadInputError with the line."""
     rows, lines = [], []
     for number, words in _rows(path, expected):
         if len(words) != columns:
@@ -95,14 +98,14 @@ def read_table(path: Path, columns: int, expected: str) -> NumberTable:
 
 
 def head_of(path: Path, columns: int, expected: str) -> NDArray[np.float64]:
-    """The numbers (N, columns) of the first rows that have as many; N may be 0. Raises BadInputError."""
+    """Return numbers (N, columns) of the first rows that have as many; N may be 0. Raises BadInputError."""
     rows = (words for _, words in islice(_rows(path, expected), HEAD))
     numbers = ([value for word in words for value in _number(word)] for words in rows)
     return np.array([row for row in numbers if len(row) == columns]).reshape(-1, columns)
 
 
 def layout_of(path: Path, expected: str) -> TableLayout:
-    """The layout of the first line of numbers; it has no columns where there is no such line. Raises BadInputError."""
+    """Return the layout of the first line of numbers; without such a line it has no columns. Raises BadInputError."""
     names: tuple[str, ...] = ()
     first: list[str] = []
     times: list[float] = []
@@ -122,7 +125,7 @@ def layout_of(path: Path, expected: str) -> TableLayout:
 
 
 def _number(word: str) -> list[float]:
-    """`word` as a number, if it is a finite one."""
+    """Return `word` as a number, if it is a finite one."""
     try:
         return [float(word)] if np.isfinite(float(word)) else []
     except ValueError:
@@ -130,7 +133,7 @@ def _number(word: str) -> list[float]:
 
 
 def names_in(line: str) -> tuple[str, ...]:
-    """What the columns hold, if `line`, which may be a comment, names four or more that are known; else nothing."""
+    """Return what the columns hold if `line`, maybe a comment, names four or more known ones; else nothing."""
     text = UNIT.sub("", line.strip().lstrip("#"))
     words = text.split(",") if "," in text else text.split()
     plain = (OTHER.sub("", SYMBOLS.sub("", word.strip().lower())) for word in words)
@@ -139,7 +142,10 @@ def names_in(line: str) -> tuple[str, ...]:
 
 
 def elapsed(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Times (N,) since the first finite one, and the median of their steps, 0 with fewer than two. NaNs stay NaN."""
+    """Return times (N,) since the first finite one, and the median of their steps, 0 with fewer than two.
+
+    NaNs stay NaN.
+    """
     finite = times[np.isfinite(times)]
     if len(finite) < 2:
         return times - times[0], 0.0
@@ -147,16 +153,17 @@ def elapsed(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
 
 
 def in_seconds(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, str]:
-    """Seconds since the first finite time, their median step, and the unit of `times` (N,), `ns` or `s`."""
+    """Return seconds since the first finite time, their median step, and the unit of `times` (N,), `ns` or `s`."""
     since, step = elapsed(times)
     unit, scale = ("ns", 1e-9) if step > LEAST_STEP_NS else ("s", 1.0)
     return since * scale, step * scale, unit
 
 
 class ColumnTimes(NamedTuple):
-    """`since_s` (N,): since the first finite one. `unit`: of the column, `s`, `ns` or `frames`.
+    """The times of a column.
 
-    `rate`: how many a second, for notes, such as `, 30/s`; empty where it is unknown.
+    `since_s` (N,): times since the first finite one. `unit`: unit of the column, `s`, `ns` or `frames`. `rate`: rate
+    for notes, such as `, 30/s`; empty where it is unknown.
     """
 
     since_s: NDArray[np.float64]
@@ -165,9 +172,9 @@ class ColumnTimes(NamedTuple):
 
 
 def times_of(column: NDArray[np.float64], rate_hz: float | None, usual_hz: float = FILM_RATE_HZ) -> ColumnTimes:
-    """The times in the first column of a table, or those of its numbers of frames.
+    """Return the times in the first column of a table, or those of its numbers of frames.
 
-    `rate_hz`: frames a second by the scene; None for `usual_hz`.
+    `rate_hz`: frames a second, from the scene; None for `usual_hz`.
     """
     if is_index(column):
         rate = rate_hz or usual_hz
@@ -179,7 +186,7 @@ def times_of(column: NDArray[np.float64], rate_hz: float | None, usual_hz: float
 
 
 def is_index(column: NDArray[np.float64]) -> bool:
-    """Whether a column (N,) numbers frames; some may be missing."""
+    """Return whether a column (N,) numbers frames; some may be missing."""
     finite = column[np.isfinite(column)]
     if len(finite) < 2 or not ((finite % 1 == 0) & (finite >= 0) & (finite < MOST_FRAMES)).all():
         return False
@@ -188,7 +195,7 @@ def is_index(column: NDArray[np.float64]) -> bool:
 
 
 def words_of(line: str) -> list[str]:
-    """The fields of a line without its comment."""
+    """Return the fields of a line without its comment."""
     text = line.split("#", 1)[0]
     if "," not in text:
         return text.split()
@@ -210,21 +217,21 @@ def _rows(path: Path, expected: str) -> Iterator[tuple[int, list[str]]]:
 
 USUAL = "as usual"
 SAY_ORDER = "say the order in a first line, such as `timestamp qx qy qz qw tx ty tz`"
-#: Columns of a 3x4 matrix.
+#: Number of columns of a 3x4 matrix.
 MATRIX = 12
-#: Times from 2001 to 2100 are those of a clock, others those of a device.
+#: Times from 2001 to 2100 are those of a clock; others are those of a device.
 EARLIEST_S, LATEST_S = 1e9, 4.1e9
-#: A quaternion has length 1; two digits after the point change it by 0.01 at most.
+#: Largest deviation of a quaternion's length from 1: two digits after the point change it by 0.01 at most.
 MOST_OFF = 0.02
 
 
 @dataclass(frozen=True)
 class PoseTable:
-    """`times_s` (N,): times from 0. `turns` (N, 3, 3) and `places` (N, 3): as the file has them.
+    """The poses of a table with quaternions.
 
-    `time`: unit of the file's times. `rate`: for notes, such as `, 30/s`. `order`: where the order of columns comes
-    from. `names`: what the columns of `table` hold. `began_s`: at a time of 0, seconds since 1970; None where the file
-    has other times.
+    `times_s` (N,): times from 0. `turns` (N, 3, 3), `places` (N, 3): poses as the file has them. `time`: unit of the
+    file's times. `rate`: rate for notes, such as `, 30/s`. `order`: source of the order of columns. `names`: contents
+    of the columns of `table`. `began_s`: seconds since 1970 at time 0; None where the file has other times.
     """
 
     times_s: F64
@@ -238,16 +245,16 @@ class PoseTable:
     began_s: float | None
 
     def column(self, name: str) -> F64:
-        """The numbers (N,) of the column that holds `name`."""
+        """Return the numbers (N,) of the column that holds `name`."""
         return self.table.numbers[:, self.names.index(name)]
 
 
 def read_pose_table(
     path: Path, rate_hz: float | None, usual: Sequence[str], expected: str, may_have_more: bool = False
 ) -> PoseTable:
-    """The poses of `path`.
+    """Return the poses of `path`.
 
-    `rate_hz`: frames a second by the scene. `usual`: contents of the columns by the format. `may_have_more`: whether
+    `rate_hz`: frames a second, from the scene. `usual`: contents of the columns by the format. `may_have_more`: whether
     other columns may follow. Raises BadInputError with the line.
     """
     layout = layout_of(path, expected)
@@ -269,7 +276,10 @@ def read_pose_table(
 
 
 class MatrixTable(NamedTuple):
-    """`turns` (N, 3, 3) and `places` (N, 3): as the file has them. `times`: None where it has none."""
+    """The poses of a table with matrices.
+
+    `turns` (N, 3, 3), `places` (N, 3): poses as the file has them. `times`: times, None where it has none.
+    """
 
     times: ColumnTimes | None
     turns: F64
@@ -278,9 +288,9 @@ class MatrixTable(NamedTuple):
 
 
 def read_matrix_table(path: Path, rate_hz: float | None, usual_hz: float, expected: str) -> MatrixTable:
-    """The poses of `path`, 3x4 matrices row by row, with a time or the number of the frame before each, or without.
+    """Return the poses of `path`: 3x4 matrices row by row, maybe with a time or a frame's number before each.
 
-    `rate_hz`: rate of numbered frames by the scene; None for `usual_hz`. Raises BadInputError with the line.
+    `rate_hz`: rate of numbered frames, from the scene; None for `usual_hz`. Raises BadInputError with the line.
     """
     columns = MATRIX if layout_of(path, expected).columns == MATRIX else MATRIX + 1
     table = read_table(path, columns, expected)
@@ -290,14 +300,17 @@ def read_matrix_table(path: Path, rate_hz: float | None, usual_hz: float, expect
 
 
 def _began(times: F64, unit: str) -> float | None:
-    """The first of `times`, seconds since 1970; None when it is no such time."""
+    """Return the first of `times`, seconds since 1970; None when it is no such time."""
     finite = times[np.isfinite(times)]
     first = float(finite[0]) * (1e-9 if unit == "ns" else 1.0) if len(finite) else 0.0
     return first if EARLIEST_S < first < LATEST_S else None
 
 
 def _require_quats(path: Path, quats: F64, table: NumberTable) -> None:
-    """Raises BadInputError when most of `quats` (N, 4) have not length 1. `table`: the table that has them."""
+    """Raise BadInputError when most of `quats` (N, 4) do not have length 1.
+
+    `table`: table that has them.
+    """
     off = is_off(quats)
     if 2 * np.count_nonzero(off) <= len(off):
         return
@@ -311,7 +324,7 @@ def _require_quats(path: Path, quats: F64, table: NumberTable) -> None:
 
 
 def is_off(quats: F64, most: float = MOST_OFF) -> NDArray[np.bool_]:
-    """Which rows (N, 4) have a length that differs from 1 by more than `most`; rows that are no rotation have not."""
+    """Return which rows (N, 4) have a length that differs from 1 by more than `most`; unusable rows do not count."""
     with np.errstate(over="ignore", invalid="ignore"):
         length = np.linalg.norm(quats, axis=1)
         return np.asarray(np.isfinite(length) & (length > 0) & (np.abs(length - 1) > most))

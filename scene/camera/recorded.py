@@ -1,15 +1,15 @@
 """Turns a recorded camera into a CameraPath: it finds the unit of the map, its up and how the device was held.
 
-The movement from pose to pose never changes. Three constants are applied: one turn of the world, so that +Y is up, one
-turn of the picture by a multiple of 90 degrees, as a phone turns its display, and one scale to metres.
+The movement from pose to pose never changes. Three constants are applied. One turn of the world makes +Y up. One turn
+of the picture by a multiple of 90 degrees acts as a phone does with its display. One scale leads to metres.
 
-**Unit.** The scene states it, or the format defines it as a metre. Where the format has none, or its cameras would be
-faster than anything that carries one, a person would fill the pictures where the cameras look.
+**Unit.** The scene states it, or the format defines it as a metre. Otherwise, or where cameras would be faster than
+anything that carries one, the scale is guessed: a person fills the pictures where the cameras look.
 
 **Up.** People hold a camera level. Each axis of the world is tried with each quarter turn of the picture. A guess costs
-more the farther the horizon is from level, the more steeply the camera looks down or up and the more that changes, and
-where it is not the format's usual axis or turns the picture. The cheapest guess wins; a near rival is named. Where no
-axis fits, and the horizons agree on a direction between the axes, that direction is up.
+more the farther the horizon is from level, and the more steeply the camera looks down or up and the more that changes.
+It also costs more where it is not the format's usual axis or turns the picture. The cheapest guess wins; a near rival
+is named. Where no axis fits, and the horizons agree on a direction between the axes, that direction is up.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from trilane.scene.recordings import NOTHING, Detected, PlaceOf, by_number, usab
 from trilane.scene.rotations import about, quat_from_matrix, shortest_turn
 from trilane.scene.schema import CameraSpec
 
-#: An origin from which the middle of all places is farther than this is moved there; beyond it, float32 no longer
+#: Distance of the places' middle from the origin beyond which it is moved there; farther off, float32 no longer
 #: resolves tenths of a millimetre.
 MAP_M = 1e3
-#: Above this median speed the unit of a map is no metre.
+#: Median speed above which the unit of a map is no metre.
 FASTEST_M_S = 40.0
-#: How high a person is, and which part of the picture's height one fills where the cameras look.
+#: Height of a person, and the share of the picture's height that a person fills where the cameras look.
 PERSON_M, SHARE = 1.7, 0.75
-#: Lines of sight that are less apart than this (least eigenvalue of their mean projection) meet nowhere.
+#: Least eigenvalue of the mean projection of the lines of sight; below it they are nearly parallel and meet nowhere.
 LEAST_SPREAD = 0.02
-#: How far a camera goes from end to end that looks at nothing in particular.
+#: Distance from end to end that a camera goes when it looks at nothing in particular.
 PATH_M = 2.0
 
 
@@ -50,7 +50,7 @@ class LengthUnit(Enum):
 
 
 def near_origin(places: F64) -> tuple[F64, tuple[str, ...]]:
-    """`places` (N, 3) without the offset of a map, such as UTM coordinates have, and a note on it."""
+    """Return `places` (N, 3) without the offset of a map, such as UTM coordinates have, and a note on it."""
     finite = np.isfinite(places).all(axis=1)
     middle = np.median(places[finite], axis=0) if finite.any() else np.zeros(3)
     if np.abs(middle).max() <= MAP_M:
@@ -63,10 +63,10 @@ def near_origin(places: F64) -> tuple[F64, tuple[str, ...]]:
 def metres_per_unit(
     turns: F64, places: F64, times_s: F64, fov_y_deg: float, unit: LengthUnit, spec: CameraSpec
 ) -> tuple[float, tuple[str, ...]]:
-    """The metres that a length of 1 of the map is, and notes on them.
+    """Return the metres in a length of 1 of the map, and notes on them.
 
-    `turns` (N, 3, 3) and `places` (N, 3): camera to world, OpenGL axes. `times_s` (N,). `fov_y_deg`: of the picture's
-    height. `unit`: unit of the format. `spec`: camera of the scene.
+    `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes. `times_s` (N,): times in seconds. `fov_y_deg`:
+    field of view over the picture's height. `unit`: unit of the format. `spec`: camera of the scene.
     """
     if spec.metres_per_unit is not None:
         return spec.metres_per_unit, (f"1 unit of the file is {spec.metres_per_unit:g} m, as given",)
@@ -81,14 +81,14 @@ def metres_per_unit(
 
 
 def _speed(places: F64, times_s: F64) -> float:
-    """The median speed, units a second; 0 of one place."""
+    """Return the median speed, units a second; 0 for a single place."""
     if len(places) < 2:
         return 0.0
     return float(np.median(np.linalg.norm(np.diff(places, axis=0), axis=1) / np.diff(times_s)))
 
 
 def _fitting(turns: F64, places: F64, fov_y_deg: float) -> tuple[float, str]:
-    """A scale by the shape of the path and where it looks alone, and its effect in words."""
+    """Return a scale that follows only from the path's shape and where it looks, and its effect in words."""
     distance = looked_at_from(turns, places)
     if distance is not None:
         wanted = PERSON_M / SHARE / (2 * np.tan(np.radians(fov_y_deg) / 2))
@@ -100,7 +100,7 @@ def _fitting(turns: F64, places: F64, fov_y_deg: float) -> tuple[float, str]:
 
 
 def looked_at_from(turns: F64, places: F64) -> float | None:
-    """The median distance of the cameras from the point that is nearest to all their lines of sight.
+    """Return the median distance of the cameras from the point that is nearest to all their lines of sight.
 
     None where the lines are nearly parallel, or meet behind the cameras. The point solves the normal equations of the
     distances: sum (1 - d d') (x - p) = 0 for places p and unit directions d.
@@ -125,10 +125,10 @@ UP: dict[str, tuple[float, float, float]] = {
     "-z": (0.0, 0.0, -1.0),
     "-x": (-1.0, 0.0, 0.0),
 }
-#: The mean cosine of a picture's up with the world's must be above this.
+#: Least mean cosine between a picture's up and the world's.
 LEAST_UP_COSINE = 0.3
-#: What a horizon is dear that is off by a radian (root mean square), a line of sight that goes up and down by a radian
-#: (standard deviation; people turn round, but seldom look up and down), and one that is never level.
+#: Cost of a horizon that is off by a radian (root mean square), of a line of sight that goes up and down by a radian
+#: (standard deviation; people turn round, but seldom look up and down), and of one that is never level.
 PER_ROLL, PER_TILT, PER_PITCH = 2.0, 1.0, 0.5
 
 
@@ -141,24 +141,27 @@ class _Prices:
     between: float | None
 
 
-#: Of a format whose world is whatever the program chose, and of one whose world is aligned with gravity by definition.
-#: In the first a turn of the device is believed after every axis: it costs what another axis costs, and what the
-#: picture's own up can be off an axis (45 degrees) besides.
+#: Costs in a format whose world is whatever the program chose, and in one whose world is aligned with gravity by
+#: definition. In the first, a turn of the device is believed only after every axis. It costs as much as another axis
+#: plus the most that the picture's own up can be off an axis (45 degrees).
 ANY_WORLD, LEVELLED = _Prices(0.2, 0.4, 0.25), _Prices(0.4, 0.1, None)
-#: A direction between the axes is believed when the cameras pan by this, in radians (root mean square), and it is
-#: farther than this cosine from every axis.
+#: A direction between the axes is believed when the cameras pan by at least this, in radians (root mean square), and
+#: its cosine with every axis is below this.
 LEAST_PAN, MOST_AXIS_COSINE = 0.15, 0.995
-#: Cosine above which the first picture's axes, OpenGL's or optical ones, are the world's; and what is said then, as
-#: nothing else tells it.
+#: Cosine above which the first picture's axes, OpenGL's or optical ones, are the world's; and the words for that case,
+#: as nothing else tells it.
 AS_FIRST = 1 - 1e-8
 OF_FIRST = "; the axes are those of the first picture: if that looked down or up, the floor is tilted by as much"
-#: A rival this much dearer than the best is named.
+#: A rival that is dearer than the best by at most this is named.
 NEAR = 0.1
 
 
 @dataclass(frozen=True)
 class Upright:
-    """`up` (3,): the world's, of unit length. `quarter`: how many times the picture is turned by 90 degrees."""
+    """Up of a world.
+
+    `up` (3,): unit vector. `quarter`: number of 90-degree turns of the picture.
+    """
 
     up: F64
     quarter: int
@@ -174,10 +177,10 @@ class _Guess:
 
 
 def find_upright(turns: F64, usual: str, is_levelled: bool, stated: str = AUTO) -> Upright:
-    """Up of a world, and the quarter turns of the picture, of cameras with axes `turns` (N, 3, 3), camera to world.
+    """Find up of a world, and the quarter turns of the picture, from camera axes `turns` (N, 3, 3), camera to world.
 
-    `usual`: the axis that is up in the format. `is_levelled`: whether the format's world is aligned with gravity by
-    definition. `stated`: what the scene says is up; only turns of the picture are tried then.
+    `usual`: axis that is up in the format. `is_levelled`: whether the format's world is aligned with gravity by
+    definition. `stated`: axis that the scene says is up; only turns of the picture are tried then.
     """
     expected = usual if stated == AUTO else stated
     guesses = _guesses(turns, expected, LEVELLED if is_levelled else ANY_WORLD, stated)
@@ -189,7 +192,7 @@ def find_upright(turns: F64, usual: str, is_levelled: bool, stated: str = AUTO) 
 
 
 def price_of(turns: F64, usual: str) -> float:
-    """The cost of the cheapest guess for cameras with axes `turns` (N, 3, 3): 0 where they are level about `usual`."""
+    """Return the cost of the cheapest guess for camera axes `turns` (N, 3, 3): 0 where they are level about `usual`."""
     return min((guess.price for guess in _guesses(turns, usual, ANY_WORLD, AUTO)), default=math.inf)
 
 
@@ -207,7 +210,10 @@ def _guesses(turns: F64, expected: str, prices: _Prices, stated: str) -> list[_G
 
 
 def _is_of_first(turns: F64, best: _Guess) -> bool:
-    """Whether the world's axes are those of the first of several pictures, as in a SLAM map, and up is its own up."""
+    """Return whether the world's axes are those of the first of several pictures, and up is its own up.
+
+    A SLAM map is such a world.
+    """
     first = turns[0]
     is_unturned = abs(first[0, 0]) > AS_FIRST and abs(first[1, 1]) > AS_FIRST
     return len(turns) > 1 and bool(is_unturned and first[0, 0] > 0 and first[:, 1] @ best.up > AS_FIRST)
@@ -218,13 +224,13 @@ def _why_without(stated: str) -> str:
 
 
 def _ups_and_rights(turns: F64, quarter: int) -> tuple[F64, F64]:
-    """Up and right (N, 3) of pictures that are turned by `quarter` times 90 degrees."""
+    """Return up and right (N, 3) of pictures that are turned by `quarter` times 90 degrees."""
     x, y = turns[:, :, 0], turns[:, :, 1]
     return ((y, x), (-x, y), (-y, -x), (x, -y))[quarter]
 
 
 def _price(turns: F64, up: F64, quarter: int) -> float | None:
-    """The cost of a pair by its horizons and lines of sight; None when the picture's up is not up at all."""
+    """Return the cost of a pair by its horizons and lines of sight; None when the picture's up is not up at all."""
     ups, rights = _ups_and_rights(turns, quarter)
     cosine = float((ups @ up).mean())
     if cosine <= LEAST_UP_COSINE:
@@ -234,7 +240,10 @@ def _price(turns: F64, up: F64, quarter: int) -> float | None:
 
 
 def _between(turns: F64, dearer: float) -> list[_Guess]:
-    """The direction to which the horizons of all pictures are level, most nearly: at right angles to their rights."""
+    """Return the direction to which the right axes of all pictures are most nearly at right angles.
+
+    The horizons are level about it.
+    """
     ups, rights = _ups_and_rights(turns, 0)
     spread, directions = np.linalg.eigh(rights.T @ rights / len(rights))
     direction = directions[:, 0] if (ups @ directions[:, 0]).mean() >= 0 else -directions[:, 0]
@@ -258,7 +267,7 @@ def _note(best: _Guess, usual: str, stated: str) -> str:
 
 
 def _rival(best: _Guess, guesses: list[_Guess], stated: str) -> str:
-    """The next guess, when it is nearly as cheap and the two are far apart."""
+    """Name the next guess, when it is nearly as cheap and the two are far apart."""
     rivals = [g for g in guesses if g.name and g is not best and g.price < best.price + NEAR]
     rivals = [g for g in rivals if g.quarter != best.quarter or g.up @ best.up < np.sqrt(0.5)]
     if not rivals or stated != AUTO:
@@ -273,9 +282,9 @@ FILM_STEP_DEG = 6.0
 
 
 def times_without(turns: F64, rate_hz: float | None) -> tuple[F64, str]:
-    """Seconds (N,) of views with camera axes `turns` (N, 3, 3), and how they were decided.
+    """Return seconds (N,) of views with camera axes `turns` (N, 3, 3), and how they were decided.
 
-    `rate_hz`: views a second by the scene, if it says so. Views less than FILM_STEP_DEG apart are a film, others are
+    `rate_hz`: views a second, from the scene, if it says so. Views less than FILM_STEP_DEG apart are a film, others are
     stills.
     """
     rate, how = _rate(turns) if rate_hz is None else (rate_hz, f"{rate_hz:g} a second as given")
@@ -292,12 +301,12 @@ def _rate(turns: F64) -> tuple[float, str]:
     return FILM_RATE_HZ, f"{FILM_RATE_HZ:g} a second assumed"
 
 
-#: A matrix is taken for a rotation when |R^T R - 1| is below this.
+#: A matrix counts as a rotation when |R^T R - 1| is below this.
 SKEW = 0.05
-#: Places are left out that are farther than this from the others.
+#: Places farther than this from the others are left out.
 FARTHEST_M = 1e5
 NOT_FINITE, FAR_OFF = "not finite", f"farther than {FARTHEST_M / 1000:.0f} km from the others"
-#: Optical axes (x right, y down, z ahead) to OpenGL axes.
+#: Turns optical axes (x right, y down, z ahead) into OpenGL axes.
 OPENGL_FROM_OPTICAL: F64 = np.diag([1.0, -1.0, -1.0])
 
 
@@ -305,13 +314,13 @@ OPENGL_FROM_OPTICAL: F64 = np.diag([1.0, -1.0, -1.0])
 class RawCamera:
     """The content of a camera file, before anything is left out or turned.
 
-    `times_s` (N,): seconds. `turns` (N, 3, 3) and `places` (N, 3), metres: camera to world, OpenGL axes. `usual_up`:
-    the axis of the world that is usually up in the format. `lenses`: of the picture as the axes of a pose have it, one
-    for all poses or one for each; `lens`: where they come from. `notes`: on the file, for people. `place_of`: where a
-    sample stands in the file. `detected`: what the file is, but for its axes and lens. `pictures`: names of the photos
-    that the poses are of, one for each, or none. `is_levelled`: whether the world of the format is aligned with
-    gravity, by its definition. `unit`: unit of the lengths. `began_s`: at a time of 0, seconds since 1970; None where
-    the file does not say it.
+    `times_s` (N,): times in seconds. `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes, metres.
+    `usual_up`: axis of the world that is usually up in the format. `lenses`: lens of the picture in the axes of a pose,
+    one for all poses or one for each. `lens`: source of the lenses. `notes`: notes on the file, for people. `place_of`:
+    place of a sample in the file. `detected`: facts about the file, without its axes and lens. `pictures`: name of the
+    photo of each pose, or none. `is_levelled`: whether the world of the format is aligned with gravity, by its
+    definition. `unit`: unit of the lengths. `began_s`: seconds since 1970 at time 0; None where the file does not say
+    it.
     """
 
     times_s: F64
@@ -330,10 +339,10 @@ class RawCamera:
 
 
 def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraPath:
-    """The camera path of a file.
+    """Return the camera path of a file.
 
-    `raw`: its content. `where`: its path, for messages. `spec`: camera of the scene, with its lens. Raises
-    BadInputError when more than half of the poses are unusable.
+    `raw`: content of the file. `where`: path of the file, for messages. `spec`: camera of the scene, with its lens.
+    Raises BadInputError when more than half of the poses are unusable.
     """
     near, offset_notes = near_origin(raw.places)
     faults = _faults(raw.times_s, raw.turns, near)
@@ -365,7 +374,7 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
 
 
 def _optics(raw: RawCamera, usable: NDArray[np.intp], quarter: int, spec: CameraSpec) -> tuple[Optics, str]:
-    """The lenses of the `usable` poses for a picture turned by `quarter`, and a note."""
+    """Return the lenses of the `usable` poses for a picture turned by `quarter`, and a note."""
     if spec.fov_y_deg is not None:
         optics = one_lens(spec.fov_y_deg, spec.near_m, spec.far_m)
         return optics, f"field of view {spec.fov_y_deg:.4g} degrees high, as given"
@@ -378,7 +387,7 @@ def _optics(raw: RawCamera, usable: NDArray[np.intp], quarter: int, spec: Camera
 
 
 def _faults(times_s: F64, turns: F64, places: F64) -> dict[str, NDArray[np.bool_]]:
-    """Faults of poses in words, and which poses (N,) have each; a pose has one fault at most."""
+    """Return faults of poses in words, and which poses (N,) have each; a pose has one fault at most."""
     finite = np.isfinite(times_s) & np.isfinite(turns).all(axis=(1, 2)) & np.isfinite(places).all(axis=1)
     safe, near = np.where(finite[:, None, None], turns, 0.0), np.where(finite[:, None], places, 0.0)
     rotation = are_rotations(safe)
@@ -387,7 +396,7 @@ def _faults(times_s: F64, turns: F64, places: F64) -> dict[str, NDArray[np.bool_
 
 
 def are_rotations(matrices: F64, skew: float = SKEW) -> NDArray[np.bool_]:
-    """Which of `matrices` (N, 3, 3) turn and do nothing else, where |R^T R - 1| below `skew` is a rotation."""
+    """Return which of `matrices` (N, 3, 3) are rotations, with |R^T R - 1| below `skew`."""
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(np.swapaxes(matrices, -1, -2) @ matrices - np.eye(3)).max(axis=(1, 2))
         return np.asarray((off < skew) & (np.linalg.det(matrices) > 0))

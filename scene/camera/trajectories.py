@@ -1,6 +1,6 @@
 """Readers of camera trajectories, which are text tables with a pose in each line: five formats.
 
-A format says the order of its columns, its axes and the lens that its devices usually have. `pose_table.py` reads the
+A format states the order of its columns, its axes and the lens that its devices usually have. `pose_table.py` reads the
 lines; a file's own column names win over the order of the format. Optical axes are x right, y down, looking along +Z.
 """
 
@@ -42,7 +42,8 @@ def load_arkit(path: Path, rate_hz: float | None = None) -> RawCamera:
     """Read an ARKit log: `time r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz` a line, camera to world, metres, Y up.
 
     Axes are those of the sensor in landscape (x right, y up, looks along -Z). Steps tell nanoseconds from seconds.
-    `rate_hz`: frames a second by the scene, for files without times; 30 by default. Raises BadInputError with the line.
+    `rate_hz`: frames a second, from the scene, for files without times; 30 by default. Raises BadInputError with the
+    line.
     """
     read = read_matrix_table(path, rate_hz, FILM_RATE_HZ, ARKIT)
     count = len(read.turns)
@@ -70,7 +71,7 @@ def load_arkit(path: Path, rate_hz: float | None = None) -> RawCamera:
 KITTI = "KITTI poses: the 12 numbers of a 3x4 matrix a line"
 KITTI_HZ = 10.0
 KITTI_TIMES = "times.txt"
-#: The left grey camera of the first sequences, rectified.
+#: Left grey camera of the first sequences, rectified.
 GREY = of_opencv(1241.0, 376.0, 718.856, 718.856, 607.1928, 185.2157)
 
 
@@ -78,7 +79,7 @@ def load_kitti(path: Path, rate_hz: float | None = None) -> RawCamera:
     """Read KITTI odometry poses: a 3x4 matrix a line, row by row, camera to the first camera's axes, metres.
 
     Axes are optical, so -Y is usually up. Some programs write a frame's number or a time before each matrix.
-    `rate_hz`: frames a second by the scene. Raises BadInputError with the line.
+    `rate_hz`: frames a second, from the scene. Raises BadInputError with the line.
     Format: https://www.cvlibs.net/datasets/kitti/eval_odometry.php, readme.txt of the development kit.
     """
     read = read_matrix_table(path, rate_hz, KITTI_HZ, KITTI)
@@ -91,7 +92,7 @@ def load_kitti(path: Path, rate_hz: float | None = None) -> RawCamera:
 
 
 def _kitti_times(path: Path, read: MatrixTable, rate_hz: float | None) -> tuple[F64, str]:
-    """Seconds (N,) of the poses and their source: the file, `times.txt` beside it, the scene or the usual rate."""
+    """Return seconds (N,) of the poses and their source: the file, `times.txt`, the scene or the usual rate."""
     if read.times is not None and read.times.unit != FRAMES:
         return read.times.since_s, f"by the times of the file, in {read.times.unit}"
     frames = np.arange(float(len(read.turns))) if read.times is None else read.table.numbers[:, 0]
@@ -108,15 +109,15 @@ def _kitti_times(path: Path, read: MatrixTable, rate_hz: float | None) -> tuple[
 TUM_NAMES = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
 TUM_COLUMNS = len(TUM_NAMES)
 TUM = "a TUM trajectory: time, tx ty tz, qx qy qz qw a line"
-#: The Kinect's colour camera, as calibrated for the first of these recordings: 49.8 degrees high, 63.5 wide.
+#: Colour camera of the Kinect, as calibrated for the first of these recordings: 49.8 degrees high, 63.5 wide.
 KINECT = centred(640, 480, 517.0)
 
 
 def load_tum(path: Path, rate_hz: float | None = None) -> RawCamera:
     """Read a TUM RGB-D trajectory: `time tx ty tz qx qy qz qw` a line, camera to world, metres, seconds.
 
-    Axes are optical. SLAM programs write their maps so too, some with times in nanoseconds.
-    `rate_hz`: frames a second by the scene. Raises BadInputError with the line.
+    Axes are optical. SLAM programs also write their maps in this format, some with times in nanoseconds.
+    `rate_hz`: frames a second, from the scene. Raises BadInputError with the line.
     Format: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats.
     """
     poses = read_pose_table(path, rate_hz, TUM_NAMES, TUM)
@@ -145,18 +146,18 @@ def load_tum(path: Path, rate_hz: float | None = None) -> RawCamera:
 EUROC_NAMES = ("time", "x", "y", "z", "qw", "qx", "qy", "qz")
 EUROC = "EuRoC poses: time in ns, x, y, z, qw, qx, qy, qz a line"
 EUROC_SENSOR = Path("cam0") / "sensor.yaml"
-#: The left camera of the data sets.
+#: Left camera of the data sets.
 CAM0 = of_opencv(752.0, 480.0, 458.654, 457.296, 367.215, 248.375)
-#: Key of the sensor's file -> how many numbers follow it.
+#: Keys of the sensor's file, and how many numbers follow each.
 SENSOR_KEYS = {"data": 16, "resolution": 2, "intrinsics": 4, "distortion_coefficients": 4}
 
 
 def load_euroc(path: Path, rate_hz: float | None = None) -> RawCamera:
     """Read EuRoC MAV poses, `data.csv`: time in nanoseconds, place, quaternion `w, x, y, z`, then any other columns.
 
-    Poses are those of the device's body; `cam0/sensor.yaml` beside them leads to the camera, and without it the
-    body's axes are taken. Camera axes are optical; the world's Z is up.
-    `rate_hz`: frames a second by the scene. Raises BadInputError with the line.
+    Poses are those of the device's body. `cam0/sensor.yaml` beside them leads to the camera; without it the body's axes
+    are used. Camera axes are optical; the world's Z is up.
+    `rate_hz`: frames a second, from the scene. Raises BadInputError with the line.
     Format: M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.
     """
     poses = read_pose_table(path, rate_hz, EUROC_NAMES, EUROC, may_have_more=True)
@@ -189,7 +190,7 @@ def _sensor_distortion(lens: Lens, numbers: Mapping[str, F64]) -> tuple[str, ...
 
 
 def _sensor(path: Path) -> dict[str, F64]:
-    """The numbers of a `sensor.yaml` by SENSOR_KEYS; each is a list in brackets. Raises BadInputError."""
+    """Return the numbers of a `sensor.yaml` by SENSOR_KEYS; each is a list in brackets. Raises BadInputError."""
     text = "\n".join(line.split("#", 1)[0] for line in read_text(path, "a EuRoC sensor.yaml").splitlines())
     numbers = {}
     for key, count in SENSOR_KEYS.items():
@@ -209,7 +210,7 @@ def _sensor(path: Path) -> dict[str, F64]:
 STRAY_FILE, STRAY_MATRIX = "odometry.csv", "camera_matrix.csv"
 STRAY_NAMES = ("time", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 STRAY = "a Stray Scanner odometry.csv: timestamp, frame, x, y, z, qx, qy, qz, qw"
-#: Width and height of the video; a principal point this near its middle belongs to it.
+#: Width and height of the video; a principal point within the last number of its middle belongs to it.
 VIDEO_PX, NEAR_PX = (1920.0, 1440.0), 100.0
 
 
@@ -218,7 +219,7 @@ def load_stray(path: Path, rate_hz: float | None = None) -> RawCamera:
 
     Axes are optical in ARKit's world, which is levelled, Y up, metres. Newer files have a lens for each frame, in
     pixels of the sensor in landscape; `camera_matrix.csv` beside older ones has one for all.
-    `rate_hz`: frames a second by the scene. Raises BadInputError with the line.
+    `rate_hz`: frames a second, from the scene. Raises BadInputError with the line.
     Format: https://docs.strayrobots.io/apps/scanner/format.html.
     """
     file = path / STRAY_FILE if path.is_dir() else path
@@ -233,7 +234,7 @@ def load_stray(path: Path, rate_hz: float | None = None) -> RawCamera:
 
 
 def _stray_lenses(file: Path, poses: PoseTable) -> tuple[tuple[Lens, ...], str]:
-    """One lens for all poses or one for each, and where they come from."""
+    """Return one lens for all poses or one for each, and where they come from."""
     parts = ("fx", "fy", "cx", "cy")
     if all(name in poses.names for name in parts):
         table = np.column_stack([poses.column(name) for name in parts])
@@ -251,7 +252,7 @@ def _stray_lenses(file: Path, poses: PoseTable) -> tuple[tuple[Lens, ...], str]:
 
 
 def _stray_lens(where: str | Path, numbers: F64) -> Lens:
-    """The lens of fx, fy, cx and cy; a principal point near the usual middle belongs to a video of the usual size.
+    """Return the lens of fx, fy, cx and cy; a principal point near the usual middle means a video of the usual size.
 
     Raises BadInputError about `where`.
     """

@@ -1,10 +1,10 @@
-"""Reads motions out of `.npy`, `.npz` and `.pkl` files: poses, dicts of arrays, or places of joints and nothing else.
+"""Reads motions from `.npy`, `.npz` and `.pkl` files: poses, dicts of arrays, or only places of joints.
 
-What is in a file decides how it is read, not its ending. Places of joints, as HumanML3D has them, are (T, 22, 3) in the
-order of SMPL's joints. Turns have the same shapes, so an array is told by its content. It has places if the distances
-that are bones are as long, beside the legs, as a person's, alike on both sides, and stay so, the hips lie on either
-side of the pelvis, and the trunk is not folded. `retarget.py` makes turns of places; what they cannot tell is chosen: a
-limb twists as its bend and the toes say, the head turns as the neck.
+The content of a file, not its ending, decides how it is read. Places of joints, as in HumanML3D, are (T, 22, 3) in the
+order of SMPL's joints. Turns have the same shapes, so the content tells them apart. An array has places if its bones,
+apart from the legs, are as long as a person's, alike on both sides, and rigid. The hips must also lie on either side of
+the pelvis, and the trunk must not be folded. `retarget.py` makes turns from places. What places cannot tell is chosen:
+a limb twists as its bend and the toes say, the head turns as the neck.
 
 HumanML3D: https://github.com/EricGuo5513/HumanML3D (`new_joints`: 20 frames a second, metres, Y up).
 """
@@ -32,29 +32,30 @@ from trilane.scene.motion.tracks import Tracks, leg_length
 from trilane.scene.recordings import Detected
 
 RATE_HZ = 20.0
-#: The joints that are read; others that follow, such as SMPL's hands or fingers, are not.
+#: Joints that are read; further ones, such as SMPL's hands or fingers, are not.
 NAMES = JOINT_NAMES[:22]
 COUNTS = (22, 24, 52, JOINTS)
 _ENDS = np.arange(1, len(NAMES))
 _STARTS = np.array(JOINT_PARENTS[1 : len(NAMES)])
-#: Thighs and shins, among the bones.
+#: Indices of thighs and shins among the bones.
 _LEGS = [index for index, end in enumerate(_ENDS) if NAMES[end].endswith(("knee", "ankle"))]
 #: Bones of the left side, and those of the right one in the same order.
 _LEFT, _RIGHT = (
     [index for index, end in enumerate(_ENDS) if NAMES[end].startswith(side)] for side in ("left", "right")
 )
 _TRUNK = [index for index, end in enumerate(_ENDS) if "_" not in NAMES[end]]
-#: A bone is at most so many times as long or short as a plain body's, beside the legs: of limbs; of the trunk, which
-#: skeletons divide as they like.
+#: Largest factor by which a bone may be longer or shorter than a plain body's, apart from the legs: for limbs, and for
+#: the trunk, which skeletons divide as they like.
 LIKE_A_LIMB, LIKE_A_SPINE = 2.0, 4.0
-#: And as the other side's; and as its own median.
+#: The same factor against the other side's bone, and against the bone's own median.
 LIKE_THE_OTHER, RIGID = 1.3, 1.25
-#: Least distance of the hips as a share of the way over the pelvis; of pelvis and neck, of the way along the spine.
+#: Least distance between the hips as a share of the way over the pelvis; least distance between pelvis and neck as a
+#: share of the way along the spine.
 HIPS_APART, TRUNK_STRAIGHT = 0.45, 0.7
 
 
 def places_in(array: NDArray[Any]) -> F64 | None:
-    """Places (T, 22, 3) of joints in `array`, (T, J, 3) or (T, 3 J); None when it holds none."""
+    """Return places (T, 22, 3) of joints in `array`, (T, J, 3) or (T, 3 J); None when it holds none."""
     flat = array.reshape(len(array), -1) if array.ndim in (2, 3) and array.size else np.zeros((0, 0))
     if flat.shape[1] not in [3 * count for count in COUNTS] or flat.dtype.kind not in "fiu":
         return None
@@ -64,7 +65,7 @@ def places_in(array: NDArray[Any]) -> F64 | None:
 
 
 def _sound(places: F64) -> NDArray[np.bool_]:
-    """Which frames (T,) have a person's bones, each as long as in the other frames."""
+    """Return which frames (T,) have a person's bones, each as long as in the other frames."""
     with np.errstate(all="ignore"):
         bones = _bones(places)
         usual = np.nanmedian(bones, axis=0) if np.isfinite(bones).any(axis=0).all() else np.zeros(len(_ENDS))
@@ -82,7 +83,7 @@ def _sound(places: F64) -> NDArray[np.bool_]:
 
 
 def _upright_parts(places: F64) -> NDArray[np.bool_]:
-    """Whether the hips are apart and the trunk is not folded, per frame (T,)."""
+    """Return whether the hips are apart and the trunk is not folded, per frame (T,)."""
     at = {name: places[:, index] for index, name in enumerate(NAMES)}
 
     def way(*names: str) -> F64:
@@ -94,17 +95,17 @@ def _upright_parts(places: F64) -> NDArray[np.bool_]:
 
 
 def _within(ratios: F64, times: float) -> bool:
-    """Whether all `ratios` are within `times` and its inverse."""
+    """Return whether all `ratios` are between `times` and its inverse."""
     return bool(((ratios < times) & (ratios > 1 / times)).all())
 
 
 def _bones(places: F64) -> F64:
-    """Lengths (T, 21) of the bones between joints (T, 22, 3)."""
+    """Return lengths (T, 21) of the bones between joints (T, 22, 3)."""
     return np.asarray(np.linalg.norm(places[:, _ENDS] - places[:, _STARTS], axis=-1))
 
 
 def motion_of_places(source: str, places: F64, units: str, rest: F64) -> RawMotion:
-    """The motion of joints whose `places` (T, 22, 3) `places_in` found.
+    """Return the motion of joints whose `places` (T, 22, 3) `places_in` found.
 
     `source`: ending of the file, for people. `units`: a key of UNITS_M, or `auto`. `rest` (55, 3): rest joints of the
     avatar, metres.
@@ -131,7 +132,7 @@ def motion_of_places(source: str, places: F64, units: str, rest: F64) -> RawMoti
 
 
 EXPECTED = "a motion: arrays of axis-angle poses of SMPL, SMPL-H or SMPL-X"
-#: The name that NumPy gives to an array that is saved without one.
+#: Name that NumPy gives to an array that is saved without one.
 NAMELESS = "arr_0"
 NPZ_KEYS = (*KEYS, ROMP_POSES, ROMP_PLACES, ROMP_PERSONS, NAMELESS)
 MOST_NAMED = 12
@@ -140,7 +141,7 @@ MOST_NAMED = 12
 def load_npy(path: Path, units: str = "auto", rest: F64 = T_POSE) -> RawMotion:
     """Read a `.npy` file. Raises BadInputError.
 
-    `units`: of places of joints, a key of UNITS_M or `auto`. `rest` (55, 3): rest joints of the avatar, metres.
+    `units`: unit of joints' places, a key of UNITS_M or `auto`. `rest` (55, 3): rest joints of the avatar, metres.
     """
     values = plain(npy_values(path, EXPECTED))
     places = places_in(values) if isinstance(values, np.ndarray) else None

@@ -1,7 +1,7 @@
 """The built-in motions: a person who walks, waves and turns; one who walks there and back; one who stands; the T pose.
 
 Tables say what happens when; the curves between are computed, and a cycle ends where it began. In the poses of arms and
-hands, `side` is +1 for left and -1 for right; turns are local to the parent joint, from the T pose: +X left, +Y up, +Z
+hands, `side` is +1 for left and -1 for right. Turns are local to the parent joint, from the T pose: +X left, +Y up, +Z
 ahead.
 """
 
@@ -34,7 +34,7 @@ CURL = {
 
 
 def hanging_arm(side: int, swing: F64) -> tuple[F64, F64, F64]:
-    """Shoulder, elbow and wrist (T, 3, 3) of an arm at the side, swung back by `swing` (T,) radians."""
+    """Return shoulder, elbow and wrist (T, 3, 3) of an arm at the side, swung back by `swing` (T,) radians."""
     shoulder = about(0, swing + 0.03) @ about(2, np.array(-side * HANG))
     bend = ELBOW_EASE + np.clip(-swing, 0, None) * 0.7 + 0.1 * np.abs(swing)
     elbow = about(1, -side * bend)
@@ -43,7 +43,10 @@ def hanging_arm(side: int, swing: F64) -> tuple[F64, F64, F64]:
 
 
 def waving_arm(wave: F64) -> tuple[F64, F64, F64]:
-    """Shoulder, elbow and wrist (T, 3, 3) of the right arm, palm to the viewer; `wave` (T,) in [-1, 1] is outward."""
+    """Return shoulder, elbow and wrist (T, 3, 3) of the right arm with the palm to the viewer.
+
+    `wave` (T,): position in the wave, -1 to 1; positive is outward.
+    """
     upper = normalised(np.array(UPPER_ARM) + 0.05 * wave[:, None] * np.array([-1.0, 0.5, 0.0]))
     fore = normalised(np.array(FOREARM) + WAVE_REACH * wave[:, None] * np.array([-1.0, 0.0, 0.0]))
     ahead = normalised(fore - (fore * upper).sum(axis=-1, keepdims=True) * upper)
@@ -54,14 +57,14 @@ def waving_arm(wave: F64) -> tuple[F64, F64, F64]:
 
 
 def relaxed_hands(side: int) -> F64:
-    """Axis-angle (15, 3) of one hand's fingers, SMPL-X order: index, middle, pinky, ring, thumb."""
+    """Return axis-angle (15, 3) of one hand's fingers, SMPL-X order: index, middle, pinky, ring, thumb."""
     fingers = [[(0.0, 0.0, -side * angle) for angle in CURL[name]] for name in ("index", "middle", "pinky", "ring")]
     thumb = [(0.1, -side * 0.15, 0.0), (0.0, side * 0.1, 0.0), (0.0, side * 0.12, 0.0)]
     return np.array([*fingers, thumb]).reshape(15, 3)
 
 
 RATE_HZ = 60
-#: An adult of 1.76 m; other bodies scale the translation by their legs.
+#: An adult of 1.76 m; the translation is scaled to other bodies by their legs.
 BUILD = Build(
     hip=(0.117, -0.008, -0.010),
     knee=(0.014, -0.408, 0.034),
@@ -71,7 +74,7 @@ BUILD = Build(
     heel_behind=0.057,
     feet_apart=0.19,
 )
-#: Largest distance of an ankle from its hip, as a part of the leg's length.
+#: Largest distance of an ankle from its hip, as a share of the leg's length.
 REACH = 0.993
 
 Changes = tuple[tuple[float, float, float], ...]
@@ -99,20 +102,20 @@ SWINGS = (
 )
 PERIOD_S = 10.0
 
-#: Of one who walks there and back: as above, over FAR_M metres either way in FAR_STEPS steps of STEP_S seconds.
+#: The motion there and back: the same tables, over FAR_M metres either way in FAR_STEPS steps of STEP_S seconds.
 FAR_M, FAR_STEPS, STEP_S = 5.0, 10, 0.58
 FAR_WALKS = ((0.50, 6.38, FAR_M), (7.90, 13.78, -FAR_M))
 FAR_TURNS = ((6.40, 7.60, np.pi), (13.80, 15.00, np.pi))
 FAR_PERIOD_S = 15.0
-#: Steps of a turn: lift and landing after the turn begins, seconds.
+#: Steps of a turn: seconds from the turn's beginning to lift and landing.
 TURN_STEPS = ((0.09, 0.41), (0.47, 0.77), (0.83, 1.13))
-#: The waving arm, seconds: starts to rise, is up, starts to sink, is down.
+#: Times of the waving arm, seconds: it starts to rise, is up, starts to sink, is down.
 WAVE_S = (2.45, 3.05, 4.75, 5.45)
 WAVES_PER_S = 1.7
 
 
 def walk_wave_turn() -> Motion:
-    """Ten seconds of a person who walks to the viewer, waves, turns, walks back and turns again."""
+    """Return ten seconds of a person who walks to the viewer, waves, turns, walks back and turns again."""
     times = np.arange(int(PERIOD_S * RATE_HZ)) / RATE_HZ
     walker = Walker(BUILD, _route, SWINGS, PERIOD_S)
     left, right = walker.foot(1, times), walker.foot(-1, times)
@@ -120,7 +123,7 @@ def walk_wave_turn() -> Motion:
 
 
 def there_and_back() -> Motion:
-    """Fifteen seconds of a person who walks five metres, turns, walks back and turns again, along z."""
+    """Return fifteen seconds of a person who walks five metres, turns, walks back and turns again, along z."""
     times = np.arange(int(FAR_PERIOD_S * RATE_HZ)) / RATE_HZ
     walker = Walker(BUILD, _far_route, far_swings(), FAR_PERIOD_S)
     left, right = walker.foot(1, times), walker.foot(-1, times)
@@ -128,7 +131,7 @@ def there_and_back() -> Motion:
 
 
 def far_swings() -> tuple[Swing, ...]:
-    """Steps of the one who walks there and back; the feet take turns, the right one first."""
+    """Return the steps of the person who walks there and back; the feet take turns, the right one first."""
     spans = []
     for (walk_s, _, _), (turn_s, _, _) in zip(FAR_WALKS, FAR_TURNS, strict=True):
         lifts = (walk_s + 0.05 + k * STEP_S for k in range(FAR_STEPS))
@@ -138,7 +141,7 @@ def far_swings() -> tuple[Swing, ...]:
 
 
 def idle() -> Motion:
-    """Eight seconds of a person who stands, breathes, shifts the weight and looks about."""
+    """Return eight seconds of a person who stands, breathes, shifts the weight and looks about."""
     times = np.arange(8 * RATE_HZ) / RATE_HZ
     tracks = [_standing(side, len(times)) for side in (1, -1)]
     poses, places = _body(times, tracks[0], tracks[1], wave=False, shift_m=0.018 * np.sin(np.pi * times / 4))
@@ -147,7 +150,7 @@ def idle() -> Motion:
 
 
 def t_pose() -> Motion:
-    """The rest pose, one frame."""
+    """Return the rest pose, one frame."""
     poses, places = np.zeros((1, JOINTS, 3)), np.array([[0.0, 0.94, 0.0]])
     return Motion(np.zeros(1), poses, places, None, ("built in: the T pose",), Wrap.LOOP, None, False)
 
@@ -161,7 +164,7 @@ BUILTIN: dict[str, Callable[[], Motion]] = {
 
 
 def _closed(times: F64, poses: F64, places: F64, what: str) -> Motion:
-    """A loop whose last frame is its first."""
+    """Return a loop whose last frame is its first."""
     times = np.append(times, len(times) / RATE_HZ)
     poses, places = np.concatenate([poses, poses[:1]]), np.concatenate([places, places[:1]])
     notes = (f"built in: {what}, {RATE_HZ} frames/s",)
@@ -177,14 +180,14 @@ def _far_route(times: F64) -> tuple[F64, F64, F64]:
 
 
 def _along_z(times: F64, start_m: float, walks: Changes, turns: Changes) -> tuple[F64, F64, F64]:
-    """A route (see `Route`) that begins at z = `start_m` and changes by the tables `walks` and `turns`."""
+    """Return a route (see `Route`) that begins at z = `start_m` and changes by the tables `walks` and `turns`."""
     z = start_m + sum(far * _eased((times - start) / (end - start)) for start, end, far in walks)
     heading = sum(angle * smooth_step((times - start) / (end - start)) for start, end, angle in turns)
     return np.zeros_like(times), np.asarray(z), np.asarray(heading)
 
 
 def _eased(x: F64) -> F64:
-    """0 to 1 at constant speed, with a soft start and end of a fifth each."""
+    """Map `x` to 0 to 1 at constant speed, with a soft start and end of a fifth each."""
     ramp = 0.22
     s = np.clip(x, 0.0, 1.0)
     speed = 1 / (1 - ramp)
@@ -201,12 +204,12 @@ def _standing(side: int, count: int) -> FootTrack:
 def _body(
     times: F64, left: FootTrack, right: FootTrack, wave: bool = True, shift_m: F64 | float = 0.0
 ) -> tuple[F64, F64]:
-    """Poses (T, 55, 3) and pelvis places (T, 3) of a body on two feet.
+    """Return poses (T, 55, 3) and pelvis places (T, 3) of a body on two feet.
 
     `times` (T,): seconds in the cycle.
     `left`, `right`: tracks of the feet.
     `wave`: whether the right arm waves.
-    `shift_m`: shift of the pelvis to its left, (T,) or one number.
+    `shift_m`: shift of the pelvis to its left, metres, (T,) or one number.
     """
     heading = blurred_heading(left, right)
     ahead = _along(heading, left.ankle - right.ankle)
@@ -229,7 +232,7 @@ def _body(
 
 
 def blurred_heading(left: FootTrack, right: FootTrack) -> F64:
-    """The pelvis's heading (T,), smoothed and midway between those of the feet; a cycle may end whole turns further."""
+    """Return the pelvis's heading (T,), smoothed and midway between the feet's; a cycle may end whole turns further."""
     sines, cosines = (f(left.heading) + f(right.heading) for f in (np.sin, np.cos))
     mean = np.unwrap(np.arctan2(sines, cosines))
     drift = np.linspace(0, round((mean[-1] - mean[0]) / (2 * np.pi)) * 2 * np.pi, len(mean), endpoint=False)
@@ -247,13 +250,13 @@ def _along(heading: F64, vectors: F64) -> F64:
 def _pelvis_place(
     left: FootTrack, right: FootTrack, heading: F64, pelvis: F64, weight: F64, shift_m: F64 | float
 ) -> F64:
-    """Pelvis places (T, 3): between the feet, towards the loaded one, and low enough for both legs to reach.
+    """Return pelvis places (T, 3): between the feet, towards the loaded one, and low enough for both legs to reach.
 
     `left`, `right`: tracks of the feet.
     `heading` (T,): heading of the pelvis.
-    `pelvis` (T, 3, 3): its turn.
+    `pelvis` (T, 3, 3): turn of the pelvis.
     `weight` (T,): 1 with all weight on the left foot, -1 on the right.
-    `shift_m`: further shift to the left.
+    `shift_m`: further shift to the left, metres.
     """
     between = blurred((left.ankle + right.ankle) / 2, 7)
     aside = 0.028 * weight + shift_m
@@ -267,17 +270,17 @@ def _pelvis_place(
 
 
 def _eroded(values: F64, reach: int) -> F64:
-    """Cyclic running minimum (T,) over `reach` samples either side."""
+    """Return the cyclic running minimum (T,) over `reach` samples either side."""
     return np.asarray(np.min([np.roll(values, k) for k in range(-reach, reach + 1)], axis=0))
 
 
 def _height_within_reach(side: int, foot: FootTrack, place: F64, pelvis: F64) -> F64:
-    """Greatest pelvis height (T,) at which the leg reaches its ankle.
+    """Return the greatest pelvis height (T,) at which the leg reaches its ankle.
 
     `side`: +1 left, -1 right.
-    `foot`: its track.
+    `foot`: track of the foot.
     `place` (T, 3): place of the pelvis; only x and z count.
-    `pelvis` (T, 3, 3): its turn.
+    `pelvis` (T, 3, 3): turn of the pelvis.
     """
     hip = pelvis @ BUILD.side(BUILD.hip, side)
     flat = foot.ankle - place - hip

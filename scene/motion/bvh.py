@@ -1,6 +1,6 @@
 """Reads BVH files: the skeleton, and the channels of every frame in the file's order.
 
-Rule: syntax only; `bvh_retarget.py` interprets the joints' names. Every error names the line.
+Rule: this module knows syntax only; `bvh_retarget.py` interprets the joints' names. Every error names the line.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ _CHANNEL_OF = {name.lower(): name for name in CHANNELS}
 class BvhJoint:
     """One joint of the file.
 
-    `parent`: index of its parent, -1 at a root; a file may have several roots. `offset` (3,): from its parent, file
-    units. `channels`: such as `Zrotation`, in file order. `first`: column of the first of them. `tip` (3,): offset of
-    its end site, None without.
+    `parent`: index of its parent, -1 at a root; a file may have several roots. `offset` (3,): vector from its parent,
+    file units. `channels`: names such as `Zrotation`, in file order. `first`: column of the first of them. `tip` (3,):
+    offset of its end site, None without.
     """
 
     name: str
@@ -43,14 +43,17 @@ class BvhJoint:
 
 @dataclass(frozen=True)
 class Bvh:
-    """The content of a file. `frames` (T, channels): file units and degrees. `frame_time_s`: seconds per frame."""
+    """The content of a file.
+
+    `frames` (T, channels): file units and degrees. `frame_time_s`: seconds per frame.
+    """
 
     joints: list[BvhJoint]
     frames: F64
     frame_time_s: float
 
     def forward(self) -> tuple[F64, F64]:
-        """Global rotations (T, J, 3, 3) and positions (T, J, 3) in file units of every joint."""
+        """Return global rotations (T, J, 3, 3) and positions (T, J, 3) of every joint, in file units."""
         count = len(self.frames)
         turns, places = np.empty((count, len(self.joints), 3, 3)), np.empty((count, len(self.joints), 3))
         for index, joint in enumerate(self.joints):
@@ -126,7 +129,7 @@ class _Hierarchy:
     columns: int = 0
 
     def read(self) -> None:
-        """Everything from HIERARCHY to the closing brace of the last root."""
+        """Read everything from HIERARCHY to the closing brace of the last root."""
         self.words.want("HIERARCHY")
         self.words.want("ROOT")
         self._tree()
@@ -176,7 +179,10 @@ class _Hierarchy:
 
 
 def load_bvh(path: Path) -> Bvh:
-    """Read `path`. Raises BadInputError with the line on syntax, on a short or long frame, on a file cut off."""
+    """Read `path`.
+
+    Raises BadInputError with the line for wrong syntax, a short or long frame, or a truncated file.
+    """
     lines = read_text(path, EXPECTED).splitlines()
     start = next((k for k, line in enumerate(lines) if line.strip().upper() == "MOTION"), len(lines))
     words = _Words(path, [(k + 1, word) for k, line in enumerate(lines[:start]) for word in line.split()])

@@ -1,8 +1,8 @@
-"""Reads the motion of a BVH skeleton: joints matched by name, and laid on the avatar's by `retarget.py`.
+"""Reads the motion of a BVH skeleton: joints are matched by name, and laid on the avatar's by `retarget.py`.
 
-A BVH states no unit: with `auto` it is the one that makes the legs nearest to USUAL_LEG_M, and where none makes human
-legs the file is scaled. A T pose at the beginning from which the recording jumps away is no part of the motion; one
-from which it moves on is.
+A BVH states no unit. With `auto` it is the one that makes the legs nearest to USUAL_LEG_M; where none makes human legs
+the file is scaled. A T pose at the beginning is no part of the motion when the recording jumps away from it; one from
+which it moves on is.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from trilane.scene.recordings import Detected
 #: Metres in one unit; `cmu` is the unit of the CMU recordings, 1/0.45 inches.
 UNITS_M = {"m": 1.0, "cm": 0.01, "in": 0.0254, "cmu": 0.0254 / 0.45}
 USUAL_LEG_M = 0.85
-#: Length over USUAL_LEG_M, from and to, of legs that are taken for human ones.
+#: Range of a human leg's length over USUAL_LEG_M.
 HUMAN_LEG = (0.6, 1.6)
 
 
 def unit_of(leg: float, units: str) -> tuple[str, float]:
-    """A note on the unit, and its length in metres.
+    """Return a note on the unit, and its length in metres.
 
     `leg`: length of a leg in the file's units. `units`: a key of UNITS_M, or `auto` to guess.
     """
@@ -46,17 +46,18 @@ def unit_of(leg: float, units: str) -> tuple[str, float]:
     return f"unknown, scaled to a leg of {USUAL_LEG_M} m", USUAL_LEG_M / leg
 
 
-#: How far arms may be from the line of the hips, and legs from that of the trunk; how far a still bone turns; radians.
+#: Largest angle of arms to the line of the hips, and of legs to that of the trunk; largest turn of a still bone;
+#: radians.
 IN_T, STILL = np.radians(20.0), np.radians(2.0)
-#: A bone that turns by more between two frames jumps, radians.
+#: Least turn between two frames with which a bone jumps, radians.
 JUMP = np.radians(20.0)
 CHAINS = (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"))
 
 
 def leading_t_pose(tracks: Tracks, trunk: F64) -> tuple[int, tuple[str, ...]]:
-    """How many frames at the beginning are a T pose from which the motion jumps away, and a note on a T pose there.
+    """Return the number of frames in a T pose before the motion jumps away from it, and a note on a T pose there.
 
-    `trunk`: its line (T, 3).
+    `trunk`: line of the trunk, (T, 3).
     """
     pairs = [(f"{side}_{start}", f"{side}_{end}") for start, end in CHAINS for side in SIDES]
     if tracks.frames < 2 or not all(tracks.has(*pair) for pair in pairs):
@@ -72,26 +73,26 @@ def leading_t_pose(tracks: Tracks, trunk: F64) -> tuple[int, tuple[str, ...]]:
 
 
 def _in_t(tracks: Tracks, trunk: F64, bones: F64) -> NDArray[np.bool_]:
-    """Whether the bones (8, T, 3) of CHAINS are in a T pose, per frame (T,)."""
+    """Return whether the bones (8, T, 3) of CHAINS are in a T pose, per frame (T,)."""
     left = tracks.across("hip")
     expected = np.array([left, -left, left, -left, -trunk, -trunk, -trunk, -trunk])
     return np.asarray((angle_between(bones, expected) < IN_T).all(axis=0))
 
 
 LEAST_LENGTH = 1e-6
-#: An end site that is nearer to its joint than this share of the legs is a mark, not the end of a bone.
+#: Least distance of an end site from its joint, as a share of the legs; a nearer one is a mark, not the end of a bone.
 LEAST_TIP = 0.02
-#: Axes that are tried as up; along X a body is taken to lie.
+#: Axes that are tried as up; along X a body would lie.
 UPS = ("y", "z", "-y", "-z")
-#: A coordinate beyond this, in the file's units, is a damaged one.
+#: Largest coordinate in the file's units; a larger one is damaged.
 FARTHEST = 1e9
 
 
 def load_retargeted(path: Path, units: str, joint_map: Mapping[str, str] = NO_MAP, rest: F64 = T_POSE) -> RawMotion:
     """Read a BVH file onto the 55 joints.
 
-    `units`: a key of UNITS_M or `auto`. `joint_map`: as of `match_names`. `rest` (55, 3): rest joints of the avatar,
-    metres. Raises BadInputError when the file is no BVH or its names are of no known skeleton.
+    `units`: a key of UNITS_M or `auto`. `joint_map`: as in `match_names`. `rest` (55, 3): rest joints of the avatar,
+    metres. Raises BadInputError when the file is no BVH or its names belong to no known skeleton.
     """
     bvh = load_bvh(path)
     dialect, index_of, of_roots = _person(path, bvh.joints, joint_map)
@@ -131,7 +132,7 @@ def load_retargeted(path: Path, units: str, joint_map: Mapping[str, str] = NO_MA
 
 
 def _without_partner(index_of: Collection[str]) -> tuple[str, ...]:
-    """A note on those joints of the body, without the hands, that are not in `index_of`."""
+    """Return a note on the joints of the body, without the hands, that are not in `index_of`."""
     missing = [name for name in BODY_JOINTS if name not in index_of]
     if not missing:
         return ()
@@ -141,10 +142,10 @@ def _without_partner(index_of: Collection[str]) -> tuple[str, ...]:
 def _person(
     path: Path, joints: Sequence[BvhJoint], joint_map: Mapping[str, str]
 ) -> tuple[str, dict[str, int], tuple[str, ...]]:
-    """The family of names, {SMPL-X name: index} of the person, and a note when there are several roots.
+    """Return the family of names, {SMPL-X name: index} of the person, and a note when there are several roots.
 
-    Of several persons it is the one with the most joints, or the first of equals; a person may also be spread over all
-    roots. Raises BadInputError as `match_names` does.
+    The person with the most joints is taken, or the first of equals; a person may also be spread over all roots. Raises
+    BadInputError as `match_names` does.
     """
     names = [joint.name for joint in joints]
     roots = [index for index, joint in enumerate(joints) if joint.parent < 0]
@@ -166,7 +167,7 @@ def _person(
 
 
 def feet_of(tracks: Tracks) -> F64:
-    """Places (T, 2, n, 3) of the ankles, and of the toes or what else is at the end of both feet."""
+    """Return places (T, 2, n, 3) of the ankles, and of the toes or another end of both feet."""
     feet = [[tracks.places[f"{side}_ankle"]] for side in SIDES]
     ends = [tracks.places.get(f"{side}_foot", tracks.tips.get(f"{side}_ankle")) for side in SIDES]
     if all(end is not None for end in ends):
@@ -175,7 +176,7 @@ def feet_of(tracks: Tracks) -> F64:
 
 
 def tracks_of(bvh: Bvh, index_of: dict[str, int]) -> tuple[Tracks, NDArray[np.bool_]]:
-    """The named joints over the frames whose numbers are usable, and which frames (T,) these are."""
+    """Return the named joints over the frames whose numbers are usable, and which frames (T,) these are."""
     turns, places = bvh.forward()
     with np.errstate(invalid="ignore"):
         readable = np.asarray((np.abs(places) < FARTHEST).all(axis=(1, 2)) & np.isfinite(turns).all(axis=(1, 2, 3)))
@@ -191,7 +192,7 @@ def tracks_of(bvh: Bvh, index_of: dict[str, int]) -> tuple[Tracks, NDArray[np.bo
 
 
 def _tip(bvh: Bvh, index: int, turns: F64, places: F64, least: float) -> F64 | None:
-    """Place (T, 3) of what a joint's own bone ends at: its end site or the next joint below, the furthest of several.
+    """Return the place (T, 3) where a joint's own bone ends: its end site or the furthest of the next joints below.
 
     A joint at the same place counts as the joint itself; thumbs do not count. None when there is nothing below, or
     nothing further than `least`, in the file's units.
@@ -211,7 +212,7 @@ def _tip(bvh: Bvh, index: int, turns: F64, places: F64, least: float) -> F64 | N
 
 
 def among_all(values: F64, readable: NDArray[np.bool_]) -> F64:
-    """`values` of the readable frames among all frames; the others are NaN."""
+    """Put `values` of the readable frames among all frames; the others are NaN."""
     spread = np.full((len(readable), *values.shape[1:]), np.nan)
     spread[readable] = values
     return spread

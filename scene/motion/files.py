@@ -1,8 +1,8 @@
 """Loads the motion of a scene's avatar, a built-in one by name or a file, and plays the part that the scene asks for.
 
 The ending of the file decides which reader is used; the reader's errors name the file. A key that a format has no use
-for is refused, not ignored. `start_s` and `end_s` are times of the motion itself, before `speed`. A part of a motion
-stands as a whole one does: it faces +Z at first and is centred on the ground that it covers.
+for is refused, not ignored. `start_s` and `end_s` are times of the motion itself, before `speed`. A part of a motion is
+placed as a whole one: it faces +Z at first and is centred on the ground that it covers.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from trilane.scene.rotations import matrix_from_rotvec, rotvec_from_matrix
 from trilane.scene.schema import BUILT_IN_PREFIX, AvatarSpec
 
 WRAPS = {"repeat": Wrap.LOOP, "back-and-forth": Wrap.BOUNCE, "hold": Wrap.HOLD}
-#: A repeat that moves the body by more than this is said, metres.
+#: Least move of the body at a repeat that a note mentions, metres.
 JUMP_M = 0.05
 
 
 def as_played(motion: Motion, spec: AvatarSpec, where: str) -> Motion:
-    """`motion` as `spec` plays it; notes say what was changed and what follows the last frame.
+    """Return `motion` as `spec` plays it; notes say what was changed and what follows the last frame.
 
-    `where`: names the motion in messages. Raises BadInputError when it is shorter than `spec` takes it to be.
+    `where`: name of the motion in messages. Raises BadInputError when it is shorter than `spec` requires.
     """
     played = replace(motion, wrap=WRAPS.get(spec.loop, motion.wrap))
     changes = []
@@ -57,7 +57,7 @@ def _check_length(motion: Motion, start_s: float, end_s: float, where: str) -> N
 
 
 def _part(motion: Motion, start_s: float, end_s: float) -> Motion:
-    """What `motion` does between two of its times, which become 0 and its length."""
+    """Return the part of `motion` between two of its times, which become 0 and its length."""
     inside = (motion.times_s > start_s) & (motion.times_s < end_s)
     ends = replace(motion, wrap=Wrap.HOLD)
     (first, here), (last, there) = ends.sample(start_s), ends.sample(end_s)
@@ -72,7 +72,7 @@ def _part(motion: Motion, start_s: float, end_s: float) -> Motion:
 
 
 def _standing_alone(motion: Motion) -> Motion:
-    """`motion`, turned to face +Z in its first frame, in the middle of its ground."""
+    """Turn `motion` to face +Z in its first frame, and move it to the middle of its ground."""
     roots = matrix_from_rotvec(motion.poses[:, 0])
     turn = facing(roots[0])
     poses = motion.poses.copy()
@@ -102,7 +102,7 @@ NAMED = (".bvh",)
 
 
 def load_motion(spec: AvatarSpec, base: Path, rest: F64 = T_POSE) -> Motion:
-    """The motion that `spec.motion` names, as `spec` plays it; a relative path starts at `base`.
+    """Load the motion that `spec.motion` names, as `spec` plays it; a relative path starts at `base`.
 
     `rest` (55, 3): rest joints of the avatar that does it, metres; those of a plain body when there is none. Raises
     BadInputError when there is no such motion or the file is unusable.
@@ -127,7 +127,7 @@ def load_motion(spec: AvatarSpec, base: Path, rest: F64 = T_POSE) -> Motion:
 
 
 def _of_no_reader(path: Path) -> BadInputError:
-    """What is wrong with a file that has the ending of no motion."""
+    """Return the error for a file that has the ending of no motion."""
     expected = f"a motion file: {', '.join(_READERS)}"
     try:
         require_file(path, expected)
@@ -138,6 +138,6 @@ def _of_no_reader(path: Path) -> BadInputError:
 
 
 def _check_named(spec: AvatarSpec, motion: str | Path) -> None:
-    """Raises BadInputError when `spec` maps joints of a `motion` that has no names."""
+    """Raise BadInputError when `spec` maps joints of a `motion` that has no names."""
     if spec.joint_map and Path(motion).suffix.lower() not in NAMED:
         raise BadInputError(motion, "joint_map", f"none: only joints of {', '.join(NAMED)} files have names")

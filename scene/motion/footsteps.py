@@ -1,7 +1,7 @@
 """Walking on planned footprints: the tracks of the feet over a cycle, and the leg joints that reach them.
 
 Rule: a foot that carries weight does not move, and the legs are solved to reach it, so that feet do not slide. All
-times wrap round the cycle. Positions are in metres, Y up; headings in radians about +Y, 0 faces +Z.
+times wrap around the cycle. Positions are in metres, Y up; headings are in radians about +Y, and 0 faces +Z.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ class Build:
 
     @property
     def leg_m(self) -> float:
-        """Hip to knee to ankle."""
+        """Length from hip over knee to ankle."""
         return float(np.linalg.norm(self.knee) + np.linalg.norm(self.ankle))
 
     def side(self, offset: tuple[float, float, float], side: int) -> F64:
-        """`offset` for side +1 (left) or -1 (right)."""
+        """Return `offset` for side +1 (left) or -1 (right)."""
         return np.array([offset[0] * side, offset[1], offset[2]])
 
 
 @dataclass(frozen=True)
 class Swing:
-    """One foot (+1 left, -1 right) in the air from `start_s` to `end_s`."""
+    """The time of one foot (+1 left, -1 right) in the air, from `start_s` to `end_s`."""
 
     side: int
     start_s: float
     end_s: float
 
 
-#: Times (T,) -> x, z, heading, each (T,): where the walker would stand.
+#: Function from times (T,) to x, z, heading, each (T,), at which the walker would stand.
 Route = Callable[[F64], tuple[F64, F64, F64]]
 
 
@@ -55,8 +55,8 @@ Route = Callable[[F64], tuple[F64, F64, F64]]
 class FootTrack:
     """One foot over time.
 
-    `ankle` (T, 3): its place. `heading` (T,). `pitch` (T,): radians, positive with the heel up. `load` (T,): 1 on the
-    ground, 0 in the air.
+    `ankle` (T, 3): place of the ankle. `heading` (T,): heading of the foot. `pitch` (T,): radians, positive with the
+    heel up. `load` (T,): 1 on the ground, 0 in the air.
     """
 
     ankle: F64
@@ -66,13 +66,13 @@ class FootTrack:
 
 
 def smooth_step(x: F64) -> F64:
-    """0 to 1 with flat ends and flat slopes: 6x^5 - 15x^4 + 10x^3."""
+    """Map `x` from 0 to 1 with flat ends and flat slopes: 6x^5 - 15x^4 + 10x^3."""
     s = np.clip(x, 0.0, 1.0)
     return np.asarray(s * s * s * (s * (6 * s - 15) + 10))
 
 
 def blurred(values: F64, sigma: float) -> F64:
-    """Cyclic Gaussian blur of (T, ...) along time, `sigma` in samples."""
+    """Blur (T, ...) cyclically along time by a Gaussian, `sigma` in samples."""
     frequency = np.fft.rfftfreq(len(values)).reshape(-1, *[1] * (values.ndim - 1))
     gain = np.exp(-2 * (np.pi * sigma * frequency) ** 2)
     return np.fft.irfft(np.fft.rfft(values, axis=0) * gain, n=len(values), axis=0)
@@ -90,7 +90,7 @@ class Walker:
     plant_s: float = 0.1
 
     def foot(self, side: int, times_s: F64) -> FootTrack:
-        """The track of one foot at `times_s` (T,)."""
+        """Return the track of one foot at `times_s` (T,)."""
         swings = sorted((s for s in self.swings if s.side == side), key=lambda s: s.start_s)
         tracks = [self._step(swings, k, times_s) for k in range(len(swings))]
         in_part = np.stack([inside for inside, _ in tracks])
@@ -101,9 +101,9 @@ class Walker:
         return FootTrack(columns[:, :3], columns[:, 3], columns[:, 4], columns[:, 5])
 
     def _step(self, swings: list[Swing], k: int, times_s: F64) -> tuple[NDArray[np.bool_], F64]:
-        """The part of the cycle from the start of swing `k` to the start of the next one.
+        """Return the part of the cycle from the start of swing `k` to the start of the next one.
 
-        Returns which times are in it (T,), and a table (T, 6): ankle, heading, pitch, load.
+        It is which times are in it (T,), and a table (T, 6): ankle, heading, pitch, load.
         """
         swing, after = swings[k], swings[(k + 1) % len(swings)]
         before = swings[k - 1]
@@ -133,7 +133,7 @@ class Walker:
         return local < until_next, table
 
     def _print(self, swing: Swing, after: Swing) -> tuple[float, float, float]:
-        """The footprint between two swings: x and z of the point below the ankle, and heading."""
+        """Return the footprint between two swings: x and z of the point below the ankle, and heading."""
         stance = (after.start_s - swing.end_s) % self.period_s
         middle = np.array([(swing.end_s + stance / 2) % self.period_s])
         x, z, heading = (float(value[0]) for value in self.route(middle))
@@ -142,13 +142,13 @@ class Walker:
 
     @staticmethod
     def _pitches(old: tuple[float, float, float], new: tuple[float, float, float]) -> tuple[float, float]:
-        """Pitch at toe-off, heel up, and at heel strike, toes up; both grow with the length of the stride."""
+        """Return the pitch at toe-off, heel up, and at heel strike, toes up; both grow with the stride."""
         ahead = np.array([np.sin(new[2]), np.cos(new[2])]) @ (np.array(new[:2]) - np.array(old[:2]))
         size = float(np.clip(ahead / 0.9, 0.0, 1.0))
         return 0.12 + 0.55 * size, -0.28 * size
 
     def _ankle(self, place: F64, pitch: F64) -> F64:
-        """Ankle (T, 3) of a foot that stands at `place` (x, z, heading) with `pitch` (T,), on its ball or heel."""
+        """Return the ankle (T, 3) of a foot at `place` (x, z, heading) with `pitch` (T,), on its ball or heel."""
         turn = about(1, np.full(len(pitch), place[2])) @ about(0, pitch)
         flat = about(1, np.array(place[2]))
         ball = np.array(self.build.ball)
@@ -159,13 +159,13 @@ class Walker:
 
 
 def solve_leg(build: Build, side: int, hip: F64, pelvis: F64, foot: FootTrack) -> tuple[F64, F64, F64]:
-    """Local turns (T, 3, 3) of hip, knee and ankle that put the ankle on its track.
+    """Return local turns (T, 3, 3) of hip, knee and ankle that put the ankle on its track.
 
     `build`: measures of the leg.
     `side`: +1 left, -1 right.
     `hip` (T, 3): place of the hip joint.
     `pelvis` (T, 3, 3): turn of the pelvis.
-    `foot`: track of the foot. Towards an ankle out of reach the leg is stretched.
+    `foot`: track of the foot. The leg is stretched towards an ankle out of reach.
     """
     thigh, shin = build.side(build.knee, side), build.side(build.ankle, side)
     to_ankle = foot.ankle - hip
@@ -179,14 +179,14 @@ def solve_leg(build: Build, side: int, hip: F64, pelvis: F64, foot: FootTrack) -
 
 
 def _knee_angle(thigh: F64, shin: F64, distance: F64) -> F64:
-    """Flexion (T,) about +X at which |thigh + R shin| = distance: a cos + b sin = c."""
+    """Return the flexion (T,) about +X at which |thigh + R shin| = distance: a cos + b sin = c."""
     a, b = thigh[1] * shin[1] + thigh[2] * shin[2], thigh[2] * shin[1] - thigh[1] * shin[2]
     c = (distance**2 - thigh @ thigh - shin @ shin) / 2 - thigh[0] * shin[0]
     return np.asarray(np.arctan2(b, a) + np.arccos(np.clip(c / np.hypot(a, b), -1.0, 1.0)))
 
 
 def _frame(along: F64, lateral: F64) -> F64:
-    """Matrices (T, 3, 3) whose second column is `along` and whose first is nearest to `lateral`."""
+    """Return matrices (T, 3, 3) whose second column is `along` and whose first is nearest to `lateral`."""
     second = normalised(along)
     third = normalised(np.cross(np.broadcast_to(lateral, second.shape), second))
     return np.stack([np.cross(second, third), second, third], axis=-1)

@@ -1,8 +1,8 @@
-"""Which joint of a file is which joint of the body: names that programs have for the SMPL-X joints.
+"""Matches a file's joints to the body's: names that programs have for the SMPL-X joints.
 
-What the scene states (`joint_map`) comes first; a table of names fills the rest; no joint of the file is two of the
-body's. There is one table per family of skeletons, and names are compared without prefix, case and separators. The
-family whose table has the most of a file's names is taken; of equals, the one that stands first.
+The statements of the scene (`joint_map`) come first; a table of names fills the rest; no joint of the file stands for
+two of the body's. There is one table per family of skeletons, and names are compared without prefix, case and
+separators. The family whose table has the most of a file's names is taken, the first one among equals.
 
 Sources of the names, besides files of those programs: Unity's `HumanBodyBones`
 (https://docs.unity3d.com/ScriptReference/HumanBodyBones.html); VRM's humanoid bones, 0.x and 1.0
@@ -22,17 +22,17 @@ from pathlib import Path
 from trilane.body.joints import JOINT_NAMES
 from trilane.errors import BadInputError, did_you_mean
 
-#: What stands before all names: a namespace, or what Mixamo, 3ds Max, Rigify, VRoid and Character Creator write.
+#: Prefixes before all names: a namespace, or those that Mixamo, 3ds Max, Rigify, VRoid and Character Creator write.
 _PREFIX = re.compile(r"^(?:.*:)?(?:mixamorig\d*_?(?=[a-z])|bip0*1|def-|org-|j_bip_|cc_base_)?")
 
 
 def plain(name: str) -> str:
-    """`name` without prefix, case and separators: `mixamorig:Left_Hand` -> `lefthand`."""
+    """Return `name` without prefix, case and separators: `mixamorig:Left_Hand` -> `lefthand`."""
     return re.sub(r"[^a-z0-9]", "", _PREFIX.sub("", name.lower()))
 
 
 def _sided(pattern: dict[str, str], left: str, right: str, *, behind: bool = False) -> dict[str, str]:
-    """`pattern` for both sides, whose marks stand before the names, or `behind` them."""
+    """Return `pattern` for both sides, with the sides' marks before the names, or `behind` them."""
     sides = ((left, "left"), (right, "right"))
     return {
         plain(source + side if behind else side + source): f"{name}_{target}"
@@ -52,7 +52,10 @@ _RIGIFY_FINGERS = {
 
 
 def _phalanges(thumb: tuple[str, str, str]) -> dict[str, str]:
-    """Unity's names of the fingers' bones; `thumb`: those of its three."""
+    """Return Unity's names of the fingers' bones.
+
+    `thumb`: names of the thumb's three bones.
+    """
     usual = ("proximal", "intermediate", "distal")
     return {
         f"{theirs}{bone}": f"{ours}{k}"
@@ -86,7 +89,7 @@ _UNITY_TRUNK = {
     "jaw": "jaw",
 }  # fmt: skip
 
-#: Skeleton family -> {plain name: SMPL-X name}.
+#: Tables {plain name: SMPL-X name} by family of skeletons.
 DIALECTS: dict[str, dict[str, str]] = {
     "Mixamo": {
         "hips": "pelvis", "spine": "spine1", "spine1": "spine2", "spine2": "spine3", "neck": "neck", "head": "head",
@@ -222,17 +225,17 @@ DIALECTS: dict[str, dict[str, str]] = {
 
 
 REQUIRED = ("pelvis", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle")
-#: What the pelvis is called in most families: found beside any other table, since it is one joint and no limb.
+#: Names of the pelvis in most families: found beside any other table, since it is one joint and no limb.
 PELVIS = ("hips", "pelvis", "hip")
-#: What names the joints that are in no table.
+#: Source of the names of joints that are in no table.
 STATED = "joint_map"
 NO_MAP: Mapping[str, str] = {}
 
 
 def match_names(path: Path, names: list[str], joint_map: Mapping[str, str] = NO_MAP) -> tuple[str, dict[str, int]]:
-    """The source of the names, such as the family that has most of `names`, and {SMPL-X name: index in `names`}.
+    """Return the source of the names, such as the family that fits best, and {SMPL-X name: index in `names`}.
 
-    `joint_map`: SMPL-X name -> name in the file, or empty for none; it overrules the tables. Raises BadInputError about
+    `joint_map`: name in the file by SMPL-X name, or empty for none; it overrules the tables. Raises BadInputError about
     `path` when the file has no joint that the map names, or REQUIRED ones have no partner.
     """
     stated = {target: _stated(path, names, target, source) for target, source in joint_map.items()}
@@ -254,12 +257,12 @@ def match_names(path: Path, names: list[str], joint_map: Mapping[str, str] = NO_
 
 
 def _missing(found: Mapping[str, int], stated: Mapping[str, int | None]) -> list[str]:
-    """Those of REQUIRED that neither has."""
+    """Return the REQUIRED joints that neither has."""
     return [name for name in REQUIRED if name not in found and stated.get(name) is None]
 
 
 def _stated(path: Path, names: list[str], target: str, source: str) -> int | None:
-    """Index of the joint `source`, written as in the file or in another case; None for an empty one."""
+    """Return the index of the joint `source`, in the file's case or another one; None for an empty name."""
     if not source:
         return None
     if source in names:
@@ -272,7 +275,7 @@ def _stated(path: Path, names: list[str], target: str, source: str) -> int | Non
 
 
 def _by_table(table: Mapping[str, str], index_of: Mapping[str, int]) -> dict[str, int]:
-    """{SMPL-X name: index} of what `table` finds, and the pelvis; of several names the first in the table."""
+    """Return {SMPL-X name: index} of what `table` finds, and the pelvis; of several names the first in the table."""
     found: dict[str, int] = {}
     for source, target in table.items():
         if source in index_of:
@@ -284,7 +287,7 @@ def _by_table(table: Mapping[str, str], index_of: Mapping[str, int]) -> dict[str
 
 
 def _overruled(found: Mapping[str, int], stated: Mapping[str, int | None]) -> dict[str, int]:
-    """`found` beside what is `stated`: without joints that are stated, or whose joint of the file is."""
+    """Return `found` without joints that are `stated`, or whose joint of the file is."""
     taken = set(stated.values())
     kept = {target: index for target, index in found.items() if target not in stated and index not in taken}
     return kept | {target: index for target, index in stated.items() if index is not None}

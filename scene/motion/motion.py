@@ -1,4 +1,4 @@
-"""A motion, whatever its source: SMPL-X poses at increasing times, sampled at any time between and beyond them.
+"""A motion from any source: SMPL-X poses at increasing times, sampled at any time between and beyond them.
 
 A motion of one frame can be sampled like one of a thousand; nothing here depends on a file format.
 """
@@ -16,7 +16,7 @@ from trilane.body.joints import JOINT_INDEX, JOINT_NAMES
 from trilane.scene.recordings import NOTHING, Detected
 from trilane.scene.rotations import quat_from_rotvec, rotvec_from_quat, slerp
 
-#: Millimetres, the pelvis at the origin; right joints are the left ones, mirrored.
+#: Places in millimetres with the pelvis at the origin; right joints are the left ones, mirrored.
 _PLACES_MM = {
     "pelvis": (0, 0, 0), "left_hip": (117, -8, -10), "spine1": (0, 87, -35), "left_knee": (131, -416, 24),
     "spine2": (0, 239, -29), "left_ankle": (131, -859, -1), "spine3": (0, 368, -47), "left_foot": (143, -908, 146),
@@ -31,7 +31,7 @@ _PLACES_MM = {
 
 
 def _joints() -> F64:
-    """(55, 3), metres."""
+    """Return the joints (55, 3), metres."""
     rows = [
         np.multiply(_PLACES_MM[name.replace("right_", "left_")], (-1 if name.startswith("right_") else 1, 1, 1))
         for name in JOINT_NAMES
@@ -45,12 +45,12 @@ T_POSE = _joints()
 
 #: Rest place of the pelvis of the published neutral SMPL-X body, metres; translations in AMASS files start from it.
 REST_PELVIS: F64 = np.array([0.003, -0.351, 0.012])
-#: The same of SMPL's neutral body, to some 2 cm: its betas and sex move it by as much.
+#: Rest place of the pelvis of SMPL's neutral body, to some 2 cm: betas and sex move it by as much.
 SMPL_REST_PELVIS: F64 = np.array([-0.002, -0.23, 0.028])
 
 
 def rest_leg_m(joints: F64) -> float:
-    """Length of the left leg of rest `joints` (55, 3), hip to knee to ankle, metres."""
+    """Return the length of the left leg of rest `joints` (55, 3), hip to knee to ankle, metres."""
     hip, knee, ankle = (joints[JOINT_INDEX[f"left_{name}"]] for name in ("hip", "knee", "ankle"))
     return float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
 
@@ -64,7 +64,7 @@ class Wrap(enum.Enum):
 
 
 def wrapped_time(t_s: float, length_s: float, wrap: Wrap) -> float:
-    """The time in [0, length_s] whose frame is shown at `t_s`; 0 for a length of 0."""
+    """Return the time in [0, length_s] whose frame is shown at `t_s`; 0 for a length of 0."""
     if length_s <= 0:
         return 0.0
     if wrap is Wrap.HOLD:
@@ -76,7 +76,7 @@ def wrapped_time(t_s: float, length_s: float, wrap: Wrap) -> float:
 
 
 def bracket(times_s: F64, t_s: float) -> tuple[int, int, float]:
-    """Indices `i <= j` of the neighbours of `t_s` in increasing `times_s` (T,); how far it is from i to j, 0 to 1."""
+    """Return the neighbours `i <= j` of `t_s` in increasing `times_s` (T,), and its share of the way, 0 to 1."""
     last = len(times_s) - 1
     j = min(max(int(np.searchsorted(times_s, t_s, side="right")), 1), last) if last else 0
     i = max(j - 1, 0)
@@ -87,13 +87,14 @@ def bracket(times_s: F64, t_s: float) -> tuple[int, int, float]:
 
 @dataclass(frozen=True)
 class Motion:
-    """Poses over time, upright, facing +Z at first, in the middle of the ground it covers.
+    """Poses over time, upright, facing +Z at first, in the middle of the ground they cover.
 
     `times_s` (T,): times from 0, strictly increasing. `poses` (T, 55, 3): axis-angle, radians, SMPL-X joint order.
-    `translation` (T, 3): place of the pelvis, metres, Y up. `betas` (n,) or None. `notes`: how the source was read, for
-    people. `wrap`: what follows the last frame. `leg_m`: hip to ankle of the recorded person, by which the translation
-    is scaled to another body; None when unknown. `travels`: whether the translation was recorded. `detected`: what its
-    file is. `stance` (T,): how much the recorded feet stand on the floor, 0 to 1; None when unknown.
+    `translation` (T, 3): place of the pelvis, metres, Y up. `betas` (n,): coefficients of the shape, or None. `notes`:
+    how the source was read, for people. `wrap`: what follows the last frame. `leg_m`: hip to ankle of the recorded
+    person, by which the translation is scaled to another body; None when unknown. `travels`: whether the translation
+    was recorded. `detected`: facts about its file. `stance` (T,): how much the recorded feet stand on the floor, 0 to
+    1; None when unknown.
     """
 
     times_s: F64
@@ -114,18 +115,18 @@ class Motion:
 
     @cached_property
     def quats(self) -> F64:
-        """`poses` as unit quaternions (T, 55, 4)."""
+        """Return `poses` as unit quaternions (T, 55, 4)."""
         return quat_from_rotvec(self.poses)
 
     def sample(self, t_s: float) -> tuple[F64, F64]:
-        """Pose (55, 3) and translation (3,) at `t_s`: turns interpolated by slerp, the translation linearly."""
+        """Return pose (55, 3) and translation (3,) at `t_s`: turns interpolated by slerp, the translation linearly."""
         i, j, fraction = bracket(self.times_s, wrapped_time(t_s, self.duration_s, self.wrap))
         pose = rotvec_from_quat(slerp(self.quats[i], self.quats[j], fraction))
         start, end = self.translation[i], self.translation[j]
         return pose, start + (end - start) * fraction
 
     def sample_all(self, times_s: F64) -> tuple[F64, F64]:
-        """Poses (N, 55, 3) and translations (N, 3) at `times_s` (N,), each as `sample` gives it."""
+        """Return poses (N, 55, 3) and translations (N, 3) at `times_s` (N,), each as `sample` gives it."""
         brackets = [bracket(self.times_s, wrapped_time(float(t_s), self.duration_s, self.wrap)) for t_s in times_s]
         i, j = (np.array([neighbours[k] for neighbours in brackets]) for k in (0, 1))
         fraction = np.array([fraction for _, _, fraction in brackets])

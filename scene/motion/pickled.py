@@ -1,14 +1,14 @@
 """Reads the plain values and arrays of a Python pickle without running anything that it says.
 
-Rule: nothing is imported, called or built but None, numbers, text, bytes, lists, tuples, dicts and NumPy arrays of
-numbers. `pickletools` splits the file into operations; the tables below do those that make such values. What the
-file wants built beside them becomes a `Foreign` that holds its name alone. An operation that is not in a table ends
-the reading.
+Rule: only None, numbers, text, bytes, lists, tuples, dicts and NumPy arrays of numbers are built; nothing else is
+imported, called or built. `pickletools` splits the file into operations, and the tables below execute those that make
+such values. Anything else that the file wants built becomes a `Foreign`, which holds only its name. An operation that
+is not in a table ends the reading.
 
-What a file can make this use is bounded by its own size: text and bytes are pieces of the file, an array is a view of
-such bytes and must have exactly as many as its shape says, the number of operations is limited, and keys of dicts are
-text (whose hash a file cannot foresee) or are left out. Values may contain themselves, so whoever looks for something
-in them must limit how deep.
+The size of a file limits the memory that it can take. Text and bytes are pieces of the file; an array is a view of such
+bytes and must have exactly as many as its shape says. The number of operations is limited. Keys of dicts are text
+(whose hash a file cannot foresee) or are left out. Values may contain themselves, so a search in them must limit its
+depth.
 
 The format: https://docs.python.org/3/library/pickle.html, `pickletools`, PEP 3154 and PEP 574; what NumPy writes:
 `numpy.ndarray.__reduce__`, `__setstate__` and `numpy.dtype.__setstate__`.
@@ -35,7 +35,7 @@ MAX_INDEX = 1 << 32
 MAX_NAME = 200
 MAX_SIDES = 32
 ARRAYS = "save its arrays with NumPy where it was made: numpy.savez(FILE, poses=..., trans=..., mocap_frame_rate=...)"
-#: Types of numbers that NumPy writes: kind and bytes of one.
+#: Types of numbers that NumPy writes: kind, and bytes of one number.
 _NUMBERS = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248])")
 _OBJECT = "O"
 _ORDERS = ("<", ">", "|", "=")
@@ -43,14 +43,20 @@ _ORDERS = ("<", ">", "|", "=")
 
 @dataclass(frozen=True)
 class Foreign:
-    """Something that is not built. `name`: name of its class or function, module first."""
+    """Something that is not built.
+
+    `name`: name of its class or function, module first.
+    """
 
     name: str
 
 
 @dataclass
 class StoredArray:
-    """An array of the file. `values`: its numbers; a list of what an array of objects holds; None until they come."""
+    """An array of the file.
+
+    `values`: its numbers; for an array of objects, a list of its content; None until they come.
+    """
 
     values: NDArray[Any] | list[Any] | None = None
 
@@ -78,8 +84,10 @@ _MARK = _Mark()
 
 @dataclass
 class _Reader:
-    """`stack` and `memo`: as the format has them. `encoded`: bytes of text that holds bytes, by the text's identity.
-    `paired`: how many items were given to dicts in lists.
+    """The state of reading.
+
+    `stack`, `memo`: as in the format. `encoded`: bytes of a text that holds bytes, by the text's identity. `paired`:
+    number of items that were given to dicts in lists.
     """
 
     stack: list[Any] = field(default_factory=list)
@@ -88,7 +96,7 @@ class _Reader:
     paired: int = 0
 
     def since_mark(self) -> list[Any]:
-        """The values above the last mark; both leave the stack."""
+        """Return the values above the last mark; they and the mark leave the stack."""
         values: list[Any] = []
         while True:
             value = self.stack.pop()
@@ -97,7 +105,10 @@ class _Reader:
             values.append(value)
 
     def bytes_of(self, raw: Any) -> bytes:
-        """`raw` itself, or the text as which Python 2 and older protocols wrote it; the same text gives the same."""
+        """Return `raw` itself, or the bytes of the text as which Python 2 and older protocols wrote it.
+
+        The same text gives the same bytes object.
+        """
         if isinstance(raw, str):
             known = self.encoded.get(id(raw))
             if known is None:
@@ -107,7 +118,7 @@ class _Reader:
 
 
 def values_of(data: bytes) -> Any:
-    """What the pickle `data` holds, its arrays as StoredArray.
+    """Return the content of the pickle `data`, with its arrays as StoredArray.
 
     Raises UnexpectedValue when it is damaged, too large, or does what no file of plain values and arrays does.
     """
@@ -124,7 +135,7 @@ def values_of(data: bytes) -> Any:
 
 
 def _run(data: bytes) -> Any:
-    """What the operations of `data` make. Raises UnexpectedValue, and what Python raises of values that do not fit."""
+    """Return what the operations of `data` make. Raises UnexpectedValue, and what Python raises for unfit values."""
     reader = _Reader()
     for count, (operation, value, _) in enumerate(pickletools.genops(data)):
         if operation.name == "STOP":
@@ -136,12 +147,12 @@ def _run(data: bytes) -> Any:
 
 
 def printable(text: str) -> str:
-    """`text` in a form and of a length that every console can show."""
+    """Return `text` in a form and of a length that every console can show."""
     return ascii(text[:MAX_NAME])[1:-1]
 
 
 def wanted(value: Any, kind: type, what: str) -> Any:
-    """`value`, which must be of the type `kind`; raises TypeError that says `what` was expected."""
+    """Return `value`, which must be of the type `kind`; raises TypeError that says `what` was expected."""
     if type(value) is not kind:
         found = "nothing" if value is None else type(value).__name__
         raise TypeError(f"{found} in place of {what}")
@@ -159,7 +170,7 @@ def _refuse(name: str) -> Callable[[_Reader, Any], None]:
 
 
 def _ignore(reader: _Reader, value: Any) -> None:
-    """Says nothing about values."""
+    """Do nothing, for an operation that says nothing about values."""
 
 
 def _push(reader: _Reader, value: Any) -> None:
@@ -216,7 +227,7 @@ def _update(target: Any, items: list[Any]) -> None:
 
 
 def _dict_of(items: list[Any]) -> dict[str, Any]:
-    """Keys and values that stand in turns; numbers become text, and what is neither is left out."""
+    """Return a dict of alternating keys and values; numbers become text, and other keys are left out."""
     keys = ((str(key) if type(key) is int and abs(key) < 1 << 64 else key) for key in items[::2])
     return {key: value for key, value in zip(keys, items[1::2], strict=True) if type(key) is str}
 
@@ -292,7 +303,7 @@ def _build(reader: _Reader, _value: Any) -> None:
 
 
 def _array(reader: _Reader, shape: Any, kind: Any, fortran: Any, raw: Any) -> NDArray[Any] | list[Any]:
-    """The array of a state: as many bytes as its shape and type say, or the list of an array of objects."""
+    """Return the array of a state, with as many bytes as shape and type say, or the list of an array of objects."""
     sides = wanted(shape, tuple, "a shape")
     if len(sides) > MAX_SIDES or any(type(side) is not int or side < 0 for side in sides):
         raise ValueError("a shape that none can have")
@@ -335,7 +346,7 @@ def _encoded(reader: _Reader, arguments: tuple[Any, ...]) -> bytes:
 
 
 def _no_bytes(_reader: _Reader, arguments: tuple[Any, ...]) -> bytes:
-    """Empty bytes, as older protocols write them."""
+    """Return empty bytes, as older protocols write them."""
     if arguments:
         raise ValueError("bytes of something")
     return b""

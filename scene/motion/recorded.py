@@ -1,12 +1,12 @@
 """Turns a recorded motion into a Motion: bad frames left out, Y up, facing +Z at first, centred on its ground.
 
 **Up** is the axis that the scene states, else the one that the body's own up points along on average, else the usual
-one of the format. A body that lies or stands on its hands throughout does not turn the world over: files that have a
+one of the format. A body that lies or stands on its hands throughout does not turn the world over. Files that have a
 floor have it at 0, so a body is on the floor along an axis when its lowest joint hardly leaves 0. Where that does not
 tell either, a note says what else may be up.
 
-**Stance** says when the feet stand. Ankles and toes each have a height at which they are while their foot stands; a
-person stands while at least one of them is at its own height.
+**Stance** says when the feet stand. Ankles and toes each have their own height while their foot stands; a person stands
+while at least one of them is at its height.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from trilane.scene.motion.motion import T_POSE, Motion, Wrap, rest_leg_m
 from trilane.scene.recordings import NOTHING, Detected, usable_samples
 from trilane.scene.rotations import Y_UP_FROM_Z_UP, about, matrix_from_rotvec, rotvec_from_matrix
 
-#: The joints of the body; hands and face follow them.
+#: Number of the body's joints; hands and face follow them.
 BODY_JOINT_COUNT = 22
-#: So many frames, evenly spread, tell it.
+#: Most frames, evenly spread, that are examined.
 MOST_LOOKED_AT = 200
-#: Height of the lowest joint of one who lies or stands on the hands: from, to, and how far it goes up and down between
-#: a tenth and nine tenths of the frames. Joints of one who lies are up to half a trunk's depth above the floor.
+#: Height of the lowest joint of a person who lies or stands on the hands: least and greatest, and largest range between
+#: a tenth and nine tenths of the frames. Joints of a lying person are up to half a trunk's depth above the floor.
 LIES_M, LIES_SPREAD_M = (-0.02, 0.17), 0.08
-#: The same of one who walks; toes are 2 to 5 cm above the floor, and floors of recordings are off by centimetres.
+#: The same for a person who walks; toes are 2 to 5 cm above the floor, and floors of recordings are off by centimetres.
 STANDS_M, STANDS_SPREAD_M = (-0.12, 0.25), 0.25
 
 
 def joint_places(poses: F64, places: F64, leg_m: float | None) -> F64:
-    """Places (T, 22, 3) of the joints of a plain body whose legs are `leg_m` long; its own when that is None.
+    """Return places (T, 22, 3) of a plain body's joints, scaled to legs of length `leg_m`; unscaled for None.
 
     `poses` (T, 55, 3): axis-angle. `places` (T, 3): places of the pelvis, metres.
     """
@@ -49,18 +49,21 @@ def joint_places(poses: F64, places: F64, leg_m: float | None) -> F64:
 
 
 def lowest(poses: F64, places: F64, leg_m: float | None, up: F64) -> F64:
-    """Heights (n,) along `up` (3,) of the lowest joint in at most MOST_FRAMES of the frames; the rest as above."""
+    """Return heights (n,) along `up` (3,) of the lowest joint in at most MOST_LOOKED_AT of the frames.
+
+    The other parameters are those of `joint_places`.
+    """
     some = np.linspace(0, len(poses) - 1, min(len(poses), MOST_LOOKED_AT)).round().astype(int)
     return np.asarray((joint_places(poses[some], places[some], leg_m) @ up).min(axis=1))
 
 
 def lies(heights: F64) -> bool:
-    """Whether `heights` (n,) of the lowest joint are those of one who lies, or stands on the hands, on the floor."""
+    """Return whether `heights` (n,) of the lowest joint are those of a person lying, or on the hands, on the floor."""
     return _are_within(heights, LIES_M, LIES_SPREAD_M)
 
 
 def stands(heights: F64) -> bool:
-    """Whether they are those of one who stands or walks on the floor."""
+    """Return whether `heights` (n,) are those of a person who stands or walks on the floor."""
     return _are_within(heights, STANDS_M, STANDS_SPREAD_M)
 
 
@@ -69,16 +72,16 @@ def _are_within(heights: F64, within: tuple[float, float], spread: float) -> boo
     return bool(within[0] <= middle <= within[1] and high - low <= spread)
 
 
-#: The height at which a joint stands is that below which it is in this share of the frames, percent.
+#: Percentile of a joint's heights that is the height at which it stands.
 STANDING_PERCENTILE = 5.0
-#: At most so far above it a joint still stands; from `FLIES_M` on it does not; metres.
+#: Height above that, up to which a joint still stands, and from which on it does not; metres.
 FOOT_STANDS_M, FOOT_FLIES_M = 0.03, 0.06
 
 
 def stance(heights: F64) -> F64:
-    """How much the person stands, per frame (T,): 1 on the floor, 0 in the air.
+    """Return how much the person stands, per frame (T,): 1 on the floor, 0 in the air.
 
-    `heights` (T, 2, n): of the n joints of both feet that are recorded, left and right, metres along up.
+    `heights` (T, 2, n): heights along up of the n recorded joints of both feet, left and right, metres.
     """
     standing = np.percentile(heights, STANDING_PERCENTILE, axis=(0, 1))
     above = (heights - standing).min(axis=(1, 2))
@@ -88,7 +91,7 @@ def stance(heights: F64) -> F64:
 MAX_FRAMES = 200_000
 MAX_ANGLE_RAD = 64.0
 MAX_PLACE_M = 10_000.0
-#: Axis that is up -> the turn (3, 3) that makes it +Y.
+#: Turn (3, 3) that makes an axis +Y, by the axis.
 UPRIGHT: dict[str, F64] = {
     "y": np.eye(3),
     "z": Y_UP_FROM_Z_UP,
@@ -97,9 +100,9 @@ UPRIGHT: dict[str, F64] = {
     "-z": about(0, np.pi / 2),
     "-x": about(2, -np.pi / 2),
 }
-#: Axes that may be up in a world, and in the coordinates of anything, such as a camera.
+#: Axes that may be up in a world, and in any coordinates, such as a camera's.
 WORLD, ANY = ("y", "z"), tuple(UPRIGHT)
-#: The body's own up decides when the cosine between it, on average, and an axis is above this.
+#: Least mean cosine between the body's own up and an axis with which it decides.
 LEAST_UP_COSINE = 0.7
 
 
@@ -108,11 +111,11 @@ class RawMotion:
     """The content of a motion file, before anything is left out or turned.
 
     `times_s` (T,): seconds; NaNs and repeated times are still in. `poses` (T, 55, 3): axis-angle, radians, SMPL-X joint
-    order. `translation` (T, 3): places of the pelvis, metres; None when the format has none. `betas` (n,) or None.
-    `up`: the axis that is usually up in the format; `ups`: the axes that may be up in it. `notes`: on the file, for
-    people. `leg_m`: hip to ankle of the recorded person; None when unknown. `detected`: what the file is, but for its
-    axes. `feet` (T, 2, n, 3): places of n joints of the left and the right foot, metres; None when the format has no
-    places.
+    order. `translation` (T, 3): places of the pelvis, metres; None when the format has none. `betas` (n,): coefficients
+    of the shape, or None. `up`: axis that is usually up in the format. `ups`: axes that may be up in it. `notes`: notes
+    on the file, for people. `leg_m`: hip to ankle of the recorded person; None when unknown. `detected`: facts about
+    the file, without its axes. `feet` (T, 2, n, 3): places of n joints of the left and the right foot, metres; None
+    when the format has no places.
     """
 
     times_s: F64
@@ -128,10 +131,11 @@ class RawMotion:
 
 
 def motion_from_recording(raw: RawMotion, where: str, up_axis: str) -> Motion:
-    """The motion of a file.
+    """Return the motion of a file.
 
-    `raw`: its content. `where`: its path, for messages. `up_axis`: a key of UPRIGHT, or `auto`. Raises BadInputError
-    when it has more than MAX_FRAMES frames, is in degrees, or is unreadable in more than half of its frames.
+    `raw`: content of the file. `where`: path of the file, for messages. `up_axis`: a key of UPRIGHT, or `auto`. Raises
+    BadInputError when it has more than MAX_FRAMES frames, is in degrees, or is unreadable in more than half of its
+    frames.
     """
     if len(raw.times_s) > MAX_FRAMES:
         raise BadInputError(where, f"{len(raw.times_s)} frames", f"at most {MAX_FRAMES}")
@@ -164,14 +168,14 @@ def motion_from_recording(raw: RawMotion, where: str, up_axis: str) -> Motion:
 
 
 def _readable(poses: F64, shift: F64) -> NDArray[np.bool_]:
-    """Whether the numbers of each frame (T,) are finite and its place is within MAX_PLACE_M."""
+    """Return whether the numbers of each frame (T,) are finite and its place is within MAX_PLACE_M."""
     finite = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(shift).all(axis=1)
     with np.errstate(invalid="ignore"):
         return np.asarray(finite & (np.abs(shift) < MAX_PLACE_M).all(axis=1))
 
 
 def _broken_as(poses: F64, shift: F64) -> str:
-    """What those frames are that are not readable."""
+    """Say what is wrong with the unreadable frames."""
     not_finite = not (np.isfinite(poses).all() and np.isfinite(shift).all())
     with np.errstate(invalid="ignore"):
         is_far = bool((np.abs(np.where(np.isfinite(shift), shift, 0.0)) >= MAX_PLACE_M).any())
@@ -187,9 +191,9 @@ def _check_angles(poses: F64, where: str) -> None:
 
 
 def _up_axis(poses: F64, places: F64 | None, raw: RawMotion, stated: str) -> tuple[str, str, tuple[str, ...]]:
-    """The axis that is up, how it was decided, and a note where another one may be it.
+    """Return the axis that is up, how it was decided, and a note where another one may be it.
 
-    `poses` (T, 55, 3) and `places` (T, 3) of the pelvis, if recorded: of the usable frames.
+    `poses` (T, 55, 3), `places` (T, 3) of the pelvis, if recorded: those of the usable frames.
     """
     if stated != "auto":
         return stated, "as given", ()
@@ -210,7 +214,10 @@ def _up_axis(poses: F64, places: F64 | None, raw: RawMotion, stated: str) -> tup
 
 
 def facing(root: F64) -> F64:
-    """Turn about Y (3, 3) after which a body with root turn `root` (3, 3) faces +Z; the identity for one that lies."""
+    """Return the turn about Y (3, 3) after which a body with root turn `root` (3, 3) faces +Z.
+
+    It is the identity for a body that lies.
+    """
     x, _, z = root[:, 2]
     if np.hypot(x, z) < 0.3:
         return np.eye(3)
@@ -218,7 +225,7 @@ def facing(root: F64) -> F64:
 
 
 def centred(translation: F64) -> F64:
-    """`translation` (T, 3), shifted so that the rectangle of ground that it covers has its middle at the origin."""
+    """Shift `translation` (T, 3) so that the rectangle of ground that it covers has its middle at the origin."""
     low, high = translation.min(axis=0), translation.max(axis=0)
     middle = (low + high) / 2
     return np.asarray(translation - np.array([middle[0], 0.0, middle[2]]))

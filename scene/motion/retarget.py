@@ -1,7 +1,7 @@
 """Puts recorded joints on the 55 SMPL-X joints of an avatar.
 
 Turns come from places: limbs point where the recorded ones point; pelvis and trunk turn as hip line, trunk and shoulder
-line do. The file's own turns tell only how limbs twist (`turns.py`), and how head and toes turn. So neither a file's
+line do. The file's own turns only say how limbs twist (`turns.py`), and how head and toes turn. So neither a file's
 zero pose nor its axes matter. A joint that the file does not have follows its parent.
 """
 
@@ -46,13 +46,14 @@ from trilane.scene.rotations import about, rotvec_from_matrix
 
 UP, LEFT, FORWARD = (np.eye(3)[k] for k in (1, 0, 2))
 FINGERS = ("index", "middle", "pinky", "ring", "thumb")
-#: What a hand points to: the first of these that the file has, else what its bone ends at.
+#: Joints that a hand points to: the first of these that the file has, else the end of its bone.
 HAND_ENDS = ("middle1", "index1", "ring1", "pinky1")
-#: Weights of what tells a twist beside the bend of a limb: toes, and the least twist from the part above.
+#: Weights of evidence for a twist beside the bend of a limb: toes, and the least twist from the part above.
 OF_TOES, OF_LEAST_TWIST = 0.5, 0.02
-#: A foot whose bone is steeper or flatter than the avatar's by more than this stands on its sole, not along its bone.
+#: Difference in slope above which a foot stands on its sole, not along its bone: its bone is steeper or flatter than
+#: the avatar's.
 SAME_SLOPE = np.radians(8.0)
-#: No program's feet are steeper than the avatar's by more: what is more is a heel that is raised throughout.
+#: Largest difference by which a program's feet are steeper than the avatar's; beyond it, a heel is raised throughout.
 MOST_STEEPER = np.radians(27.0)
 
 
@@ -60,9 +61,9 @@ MOST_STEEPER = np.radians(27.0)
 class Retarget:
     """The turns of one recording on one avatar, filled in from the pelvis outwards.
 
-    `tracks`: the recording. `rest`: the avatar's joints. `stands` (T,): the frames in which the person stands. `own`:
-    whether the skeleton is built like the avatar's. `turns`: global, (T, 3, 3) of each joint that is done. `notes`: for
-    people.
+    `tracks`: the recording. `rest`: joints of the avatar. `stands` (T,): frames in which the person stands. `own`:
+    whether the skeleton is built like the avatar's. `turns`: global turns (T, 3, 3) of each joint that is done.
+    `notes`: notes for people.
     """
 
     tracks: Tracks
@@ -73,11 +74,11 @@ class Retarget:
     notes: list[str] = field(default_factory=list)
 
     def bone(self, start: str, end: str) -> F64:
-        """A bone (3,) of the avatar at rest."""
+        """Return a bone (3,) of the avatar at rest."""
         return unit(self.rest.bone(start, end)[0])
 
     def above(self, name: str) -> F64:
-        """The turn of a joint's parent."""
+        """Return the turn of a joint's parent."""
         return self.turns[JOINT_NAMES[JOINT_PARENTS[JOINT_INDEX[name]]]]
 
     def lay(self, name: str, bone: F64, recorded: F64, evidence: list[Evidence]) -> None:
@@ -91,17 +92,17 @@ class Retarget:
 
 
 def retarget(tracks: Tracks, joints: F64) -> tuple[F64, F64, tuple[str, ...]]:
-    """Poses (T, 55, 3), axis-angle; places (T, 3) of the avatar's pelvis in the unit of `tracks`; notes for people.
+    """Return poses (T, 55, 3), axis-angle, places (T, 3) of the avatar's pelvis, and notes for people.
 
-    `tracks`: the recording; hips, knees and ankles must be in it, and the hips apart. `joints` (55, 3): the avatar's
-    rest joints in metres.
+    Places are in the unit of `tracks`. `tracks`: the recording; it must have hips, knees and ankles, with the hips
+    apart. `joints` (55, 3): rest joints of the avatar, metres.
     """
     rest = at_rest(joints)
     line = trunk_line(tracks)
     trunk = line.along(tracks)
     stands = standing_frames(tracks, trunk)
     work = Retarget(tracks, rest, stands, built_alike(tracks, rest))
-    shares, by_collars = line.shares(rest), work.own or bool(stands.any())  # else the collars are as at rest
+    shares, by_collars = line.shares(rest), work.own or bool(stands.any())  # otherwise the collars are as at rest
     recorded, ours = (trunk_of(joints_of, line, shares, by_collars) for joints_of in (tracks, rest))
     spine = turns_of_trunk(recorded, ours, stands, work.own)
     upper = spine | turns_of_collars(tracks, rest, spine["spine3"], stands, work.own)
@@ -141,7 +142,7 @@ def _leg(work: Retarget, side: str, up: F64, steeper: float) -> None:
 
 
 def _foot(tracks: Tracks, side: str) -> F64 | None:
-    """The way from the ankle to the toes, or to the end of its bone (T, 3); None when the foot has no length."""
+    """Return the way (T, 3) from the ankle to the toes, or to the end of its bone; None when the foot has no length."""
     ankle, toes = f"{side}_ankle", f"{side}_foot"
     end = tracks.places.get(toes, tracks.tips.get(ankle))
     if end is None:
@@ -151,9 +152,9 @@ def _foot(tracks: Tracks, side: str) -> F64 | None:
 
 
 def _steeper(work: Retarget, up: F64) -> float:
-    """How much steeper a bone the recorded feet have than the avatar's while they are planted, radians.
+    """Return how much steeper a bone the recorded feet have than the avatar's while they are planted, radians.
 
-    Of both feet the flatter one counts, as the other may stand on its toes. 0 where they are nearly as steep.
+    The flatter of both feet counts, as the other may stand on its toes. The result is 0 where they are nearly as steep.
     """
     found = []
     for side in SIDES:
@@ -174,7 +175,7 @@ def _steeper(work: Retarget, up: F64) -> float:
 
 
 def _levelled(work: Retarget, name: str, base: F64) -> F64:
-    """The file's turns of a joint, equal to `base` on average over the frames that stand, or over all if none does."""
+    """Return the file's turns of a joint, equal to `base` on average over standing frames, or all if none stands."""
     turns = work.tracks.turns.get(name)
     if turns is None:
         return base
@@ -199,7 +200,7 @@ def _arm(work: Retarget, side: str) -> None:
 
 
 def _arm_bone(tracks: Tracks, start: str, end: str) -> F64 | None:
-    """The way (T, 3) from one joint of an arm to the next, or to the end of its bone where there is no next one."""
+    """Return the way (T, 3) from one joint of an arm to the next, or to the end of its bone where there is none."""
     if not tracks.has(start):
         return None
     far = tracks.places.get(end, tracks.tips.get(start))
@@ -223,7 +224,7 @@ def _hand(work: Retarget, side: str) -> None:
 
 
 def _palm(work: Retarget, side: str) -> list[Evidence]:
-    """What tells how a hand is turned about its length: from the little finger to the index finger, or the thumb."""
+    """Return evidence for a hand's turn about its length: from the little finger to the index finger, or the thumb."""
     for start, end in (("pinky1", "index1"), ("wrist", "thumb1")):
         names = f"{side}_{start}", f"{side}_{end}"
         if work.tracks.has(*names):
@@ -246,7 +247,7 @@ def _head(work: Retarget) -> None:
 
 
 def _local(turns: dict[str, F64], frames: int) -> F64:
-    """Axis-angle (T, 55, 3) of each joint relative to its parent."""
+    """Return axis-angle (T, 55, 3) of each joint relative to its parent."""
     poses = np.zeros((frames, JOINTS, 3))
     for index, name in enumerate(JOINT_NAMES):
         above = turns[JOINT_NAMES[JOINT_PARENTS[index]]] if index else np.eye(3)
@@ -255,7 +256,7 @@ def _local(turns: dict[str, F64], frames: int) -> F64:
 
 
 def _pelvis_places(work: Retarget, joints: F64) -> F64:
-    """Places (T, 3) of the avatar's pelvis that bring the middle of its hips to the middle of the recorded ones."""
+    """Return places (T, 3) of the avatar's pelvis that bring the middle of its hips to the recorded one."""
     scale = leg_length(work.tracks) / leg_length(work.rest)
     from_hips = joints[0] - work.rest.between("hip")[0]
     return np.asarray(work.tracks.between("hip") + turned(work.turns["pelvis"], from_hips * scale))
@@ -282,7 +283,7 @@ def _notes(work: Retarget) -> list[str]:
 
 
 def _backwards(work: Retarget) -> list[str]:
-    """A note when the feet point to where left and right say is the back."""
+    """Return a note when the feet point to where left and right say is the back."""
     feet = [foot for foot in (_foot(work.tracks, side) for side in SIDES) if foot is not None]
     ahead = [np.median(turned(transposed(work.turns["pelvis"]), unit(foot))[:, 2]) for foot in feet]
     if not ahead or max(ahead) > -0.3:

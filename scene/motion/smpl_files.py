@@ -1,10 +1,10 @@
-"""Motions of the SMPL family from arrays, whatever file they are in: AMASS, AIST++, GLAMR, smplx, ROMP, or one array.
+"""Motions of the SMPL family from arrays in any file: AMASS, AIST++, GLAMR, smplx, ROMP, or one array.
 
-How a program names its arrays is an `ArrayLayout`, which is data. Joints that a layout does not have are at rest; other
-keys are ignored. Of several persons the one with the most frames is read, and a note says so.
+An `ArrayLayout`, which is data, says how a program names its arrays. Joints that a layout does not have are at rest;
+other keys are ignored. The person with the most frames is read, and a note says so when there are several.
 
-An array alone has no frame rate: where neighbouring frames are similar 30 a second are assumed, and where they differ
-by more than POSE_SET_STEP_RAD they are separate poses, one a second. ROMP saves a dict for each frame, with a row for
+An array alone has no frame rate. Where neighbouring frames are similar, 30 a second are assumed. Where they differ by
+more than POSE_SET_STEP_RAD, they are separate poses, one a second. ROMP saves a dict for each frame, with a row for
 each person in it; the number in a frame's name is its time, and coordinates are the camera's, y down.
 
 Sources: AMASS (https://amass.is.tue.mpg.de); `smplx` (https://github.com/vchoutas/smplx, arguments of `forward`);
@@ -35,35 +35,39 @@ from trilane.scene.motion.stored import Found, contents, tables_in
 from trilane.scene.recordings import Detected
 from trilane.scene.rotations import matrix_from_rotvec, rotvec_from_matrix
 
-#: In place of a joint, for turns of SMPL's two hands.
+#: Stands for a joint where turns belong to SMPL's two hands.
 NO_JOINT = -1
-#: Number of columns -> the joints, in their order, and whose they are.
+#: By number of columns: the joints, in their order, and the layout that has them.
 Widths = Mapping[int, tuple[tuple[int, ...], str]]
 BODY = tuple(range(22))
 SMPL_HANDS = (NO_JOINT, NO_JOINT)
 FINGERS = tuple(range(25, JOINTS))
-#: Whole poses, from the pelvis on.
+#: Widths of whole poses, from the pelvis on.
 WHOLE: Widths = {
     66: (BODY, "SMPL body"),
     72: ((*BODY, *SMPL_HANDS), "SMPL"),
     156: ((*BODY, *FINGERS), "SMPL-H"),
     165: (tuple(range(JOINTS)), "SMPL-X"),
 }
-#: Parts of poses that have arrays of their own.
+#: Widths of parts of poses that have arrays of their own.
 PELVIS: Widths = {3: ((0,), "")}
 BELOW_PELVIS: Widths = {63: (BODY[1:], "SMPL-X body"), 69: ((*BODY[1:], *SMPL_HANDS), "SMPL")}
 BOTH_HANDS: Widths = {90: (FINGERS, "")}
 
 
 def from_joint(joint: str, count: int) -> Widths:
-    """`count` joints from `joint` on."""
+    """Return the widths of `count` joints from `joint` on."""
     first = JOINT_INDEX[joint]
     return {3 * count: (tuple(range(first, first + count)), "")}
 
 
 @dataclass(frozen=True)
 class JointTurns:
-    """`turns` (T, 55, 3): axis-angle. `columns`: of the array; `whose`: they are. `notes`: for people."""
+    """The turns in an array.
+
+    `turns` (T, 55, 3): axis-angle. `columns`: number of the array's columns. `whose`: layout that they belong to.
+    `notes`: notes for people.
+    """
 
     turns: F64
     columns: int
@@ -72,9 +76,9 @@ class JointTurns:
 
 
 def turns_in(where: str, array: NDArray[Any], widths: Widths) -> JointTurns:
-    """The turns of an `array` (T, W) or (T, W / 3, 3), whose W is one of `widths`; other joints are at rest.
+    """Return the turns of an `array` (T, W) or (T, W / 3, 3), whose W is one of `widths`; other joints are at rest.
 
-    `where`: the array, for messages. Raises BadInputError for any other shape, and for anything but numbers.
+    `where`: name of the array, for messages. Raises BadInputError for any other shape, and for anything but numbers.
     """
     flat = array.reshape(len(array), -1) if array.ndim == 3 and array.shape[2] == 3 and len(array) else array
     if flat.ndim != 2 or flat.shape[1] not in widths or not len(flat):
@@ -90,14 +94,17 @@ def turns_in(where: str, array: NDArray[Any], widths: Widths) -> JointTurns:
 
 
 def shapes(widths: Widths) -> str:
-    """`(T, 66), (T, 72) or (T, 156)`."""
+    """Return the shapes as text: `(T, 66), (T, 72) or (T, 156)`."""
     *others, last = [f"(T, {width})" for width in widths]
     return f"{', '.join(others)} or {last}" if others else last
 
 
 @dataclass(frozen=True)
 class PoseArray:
-    """An array of axis-angle turns. `needed`: whether the layout cannot be without it."""
+    """An array of axis-angle turns.
+
+    `needed`: whether the layout requires it.
+    """
 
     key: str
     widths: Widths
@@ -106,11 +113,12 @@ class PoseArray:
 
 @dataclass(frozen=True)
 class ArrayLayout:
-    """One way to name things.
+    """The way in which a program names its arrays.
 
-    `place`: key of the pelvis's places, or, with `rest_pelvis` (3,), of shifts of the whole body, whose pelvis is there
-    at rest. `scale`: key of what places are divided by. `mask`: key of the frames that are measured. `rate_hz`:
-    assumed, as `rate_why` says, when no key of RATE_KEYS is there; None when one must be. `up`, `ups`: as of RawMotion.
+    `place`: key of the pelvis's places. With `rest_pelvis` (3,) it is the key of shifts of the whole body, whose pelvis
+    is there at rest. `scale`: key of the divisor of places. `mask`: key of the frames that are measured. `rate_hz`:
+    rate that is assumed, for the reason `rate_why`, without any key of RATE_KEYS; None when one is required. `up`,
+    `ups`: as in RawMotion.
     """
 
     name: str
@@ -140,7 +148,7 @@ class ArrayLayout:
 RATE_KEYS = ("mocap_framerate", "mocap_frame_rate", "fps", "frame_rate")
 _VIDEO = "no rate in the file, 30 frames/s assumed"
 
-#: The first whose needed keys a dict has is its layout.
+#: The layout of a dict is the first one whose needed keys it has.
 LAYOUTS = (
     ArrayLayout(
         "AMASS", (PoseArray("poses", WHOLE),), "trans", "betas", None, "", "z", REST_PELVIS,
@@ -182,7 +190,7 @@ EXPECTED = "; or ".join(f"{' and '.join(f'`{key}`' for key in layout.needs)} ({l
 ASSUMED_RATE_HZ = 30.0
 POSE_SET_STEP_RAD = 0.7
 _AS_VECTORS = "turn them into axis-angle vectors, such as with scipy.spatial.transform.Rotation.as_rotvec"
-#: Shape of a row of what others save -> how it becomes usable.
+#: How an array becomes usable, by the shape of a row that other programs save.
 OTHERS: dict[tuple[int, ...], str] = {
     (263,): "these are HumanML3D's features: make places of joints of them with its recover_from_ric and save those",
     (322,): "these are rows of Motion-X: its columns 0 to 155 are `poses`, 309 to 311 `trans` of an .npz",
@@ -196,9 +204,9 @@ OTHERS: dict[tuple[int, ...], str] = {
 
 
 def motion_of_array(where: str, source: str, array: NDArray[Any]) -> RawMotion:
-    """The motion of an `array` (T, W) or (T, W / 3, 3), whose W is a key of WHOLE.
+    """Return the motion of an `array` (T, W) or (T, W / 3, 3), whose W is a key of WHOLE.
 
-    `where`: the file. `source`: its ending, for people. Raises BadInputError for anything else.
+    `where`: name of the file. `source`: ending of the file, for people. Raises BadInputError for anything else.
     """
     if array.shape[1:] in OTHERS:
         raise BadInputError(where, f"shape {array.shape}", f"{shapes(WHOLE)}, axis-angle", OTHERS[array.shape[1:]])
@@ -223,7 +231,7 @@ def motion_of_array(where: str, source: str, array: NDArray[Any]) -> RawMotion:
 
 
 def median_step_rad(poses: NDArray[np.float64]) -> float:
-    """The largest turn among the 22 body joints from one frame to the next, as the median over all; 0 for one frame."""
+    """Return the median over all frames of the largest turn among the 22 body joints; 0 for one frame."""
     readable = poses[np.isfinite(poses).all(axis=(1, 2)) & (np.abs(poses) < 100).all(axis=(1, 2))]
     if len(readable) < 2:
         return 0.0
@@ -233,7 +241,7 @@ def median_step_rad(poses: NDArray[np.float64]) -> float:
 
 
 def hands_note(poses: NDArray[np.float64]) -> str:
-    """A note on whether the fingers are posed."""
+    """Return a note on whether the fingers are posed."""
     return "posed (flat-hand zero)" if np.nan_to_num(poses[:, 25:]).any() else "all zero, flat"
 
 
@@ -243,9 +251,9 @@ _NUMBER = re.compile(r"(\d+)(?:\.[A-Za-z]+)?$")
 
 
 def motion_of_frames(found: list[Found], source: str) -> RawMotion:
-    """The motion of one person over the frames `found`, which all have ROMP_POSES.
+    """Return the motion of one person over the frames `found`, which all have ROMP_POSES.
 
-    `source`: ending of the file, for people. Raises BadInputError when the arrays of a frame are none, or do not fit.
+    `source`: ending of the file, for people. Raises BadInputError when a frame's arrays are no arrays, or do not fit.
     """
     rows, who = _rows_of_person(found)
     numbers, how = _frame_numbers(found)
@@ -277,7 +285,7 @@ def motion_of_frames(found: list[Found], source: str) -> RawMotion:
 
 
 def _frame_numbers(found: list[Found]) -> tuple[NDArray[np.int64], str]:
-    """The number of each frame, by its name where all names end in numbers and no two in the same one."""
+    """Return the number of each frame, by its name where all names end in different numbers, and a note."""
     matches = [_NUMBER.search(frame.name) for frame in found]
     named = [int(match[1][-9:]) for match in matches if match is not None]
     if len(named) == len(found) == len(set(named)):
@@ -286,7 +294,7 @@ def _frame_numbers(found: list[Found]) -> tuple[NDArray[np.int64], str]:
 
 
 def _rows_of_person(found: list[Found]) -> tuple[list[int], str]:
-    """The row of the person in each frame, -1 where there is none; and a note on who it is."""
+    """Return the row of the person in each frame, -1 where there is none; and a note on who it is."""
     counts = [len(_rows_in(frame, ROMP_POSES)) for frame in found]
     if all(frame.has(ROMP_PERSONS) for frame in found):
         persons = [
@@ -314,7 +322,7 @@ def _row_turns(frame: Found, row: int) -> JointTurns:
 
 
 def _row_place(frame: Found, row: int) -> F64 | None:
-    """Where the body is (3,) before the camera, metres."""
+    """Return the place (3,) of the body in the camera's coordinates, metres."""
     if not frame.has(ROMP_PLACES):
         return None
     places = _rows_in(frame, ROMP_PLACES)
@@ -338,10 +346,10 @@ NO_RATE = "save it again with mocap_frame_rate=..., or its poses alone as .npy, 
 
 
 def motion_of(where: str, source: str, values: Any, there: str = "") -> RawMotion:
-    """The motion in `values`, which a file holds.
+    """Return the motion in `values`, which a file holds.
 
-    `where`: the file. `source`: its ending, for people. `there`: what is in it, for messages, when `values` are not
-    all. Raises BadInputError when no layout fits.
+    `where`: name of the file. `source`: ending of the file, for people. `there`: content of the file, for messages,
+    when `values` are not all of it. Raises BadInputError when no layout fits.
     """
     tables = [Found(f"{where}[{printable(name)}]" if name else where, name, table) for name, table in tables_in(values)]
     frames_of_romp = [table for table in tables if table.has(ROMP_POSES)]
@@ -386,7 +394,7 @@ def motion_of(where: str, source: str, values: Any, there: str = "") -> RawMotio
 
 
 def _layout_of(tables: list[Found]) -> tuple[ArrayLayout, list[Found]] | None:
-    """The first layout that one of `tables` has, and all that have it."""
+    """Return the first layout that one of `tables` has, and all tables that have it."""
     for layout in LAYOUTS:
         found = [table for table in tables if all(table.has(key) for key in layout.needs)]
         if found:
@@ -395,7 +403,7 @@ def _layout_of(tables: list[Found]) -> tuple[ArrayLayout, list[Found]] | None:
 
 
 def _turns(layout: ArrayLayout, found: Found) -> JointTurns:
-    """The turns of all of the layout's arrays, which add up since each has joints of its own."""
+    """Return the turns of all of the layout's arrays, which add up since each has joints of its own."""
     parts, notes = [], []
     for array in layout.arrays:
         if not found.has(array.key):
@@ -429,7 +437,7 @@ def _rate(layout: ArrayLayout, found: Found) -> tuple[float, str]:
 
 
 def _places(layout: ArrayLayout, found: Found, frames: int) -> tuple[F64 | None, tuple[str, ...]]:
-    """Places of the pelvis (T, 3), metres, or None; and notes."""
+    """Return places of the pelvis (T, 3), metres, or None; and notes."""
     key = layout.place
     if not found.has(key):
         return None, (f"no `{key}`: stays in place",)
@@ -457,7 +465,7 @@ def _scale(layout: ArrayLayout, found: Found) -> float:
 
 
 def _measured(layout: ArrayLayout, found: Found, frames: int) -> NDArray[np.bool_]:
-    """Which frames (T,) hold the person; all where the layout does not say."""
+    """Return which frames (T,) hold the person; all where the layout does not say."""
     if not found.has(layout.mask):
         return np.ones(frames, dtype=bool)
     mask = found.array(layout.mask)
@@ -467,7 +475,7 @@ def _measured(layout: ArrayLayout, found: Found, frames: int) -> NDArray[np.bool
 
 
 def _betas(layout: ArrayLayout, found: Found) -> F64 | None:
-    """The betas of the whole motion; the mean of those that each frame has."""
+    """Return the betas of the whole motion; the mean where each frame has its own."""
     if not found.has(layout.betas):
         return None
     where = f"{found.where}[{layout.betas}]"

@@ -1,7 +1,7 @@
 """The content of a `.npy`, `.npz` or `.pkl` file as plain values: dicts, lists, numbers, text and arrays.
 
-Rule: sizes are known before memory is taken, nothing in a file is executed (`pickled.py`), and of an archive only
-arrays are read that somebody asked for by name. What holds what can be without end, so a search goes a few levels deep.
+Rule: sizes are known before memory is taken; nothing in a file is executed (`pickled.py`); only requested arrays of an
+archive are read. Nesting may be endless, so a search goes a few levels deep.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ MOST_NAMED = 12
 
 
 def npy_values(path: Path, expected: str) -> Any:
-    """The array of a `.npy` file, or what it holds when that is an object. Raises BadInputError."""
+    """Return the array of a `.npy` file, or the object that it holds. Raises BadInputError."""
     pickled = npy_pickle(path, MAX_BYTES, expected)
     return read_npy(path, expected) if pickled is None else _values(path, pickled)
 
 
 def npz_values(path: Path, keys: Collection[str], expected: str) -> dict[str, Any]:
-    """Those arrays of an `.npz` file that `keys` names, and everything in it that is an object.
+    """Return the arrays of an `.npz` file that `keys` names, and everything in it that is an object.
 
     Raises BadInputError.
     """
@@ -53,7 +53,7 @@ def npz_values(path: Path, keys: Collection[str], expected: str) -> dict[str, An
 
 
 def pickle_values(path: Path, expected: str) -> Any:
-    """What a pickle holds. Raises BadInputError."""
+    """Return the content of a pickle. Raises BadInputError."""
     data = read_bytes(path, MAX_BYTES, expected)
     refuse_other(path, expected, PICKLE)
     return _values(path, data)
@@ -67,14 +67,17 @@ def _values(where: Path | str, data: bytes) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """`value`, or the one object in an array of one, as NumPy stores an object."""
+    """Return `value`, or the one object in an array of one, as NumPy stores an object."""
     if isinstance(value, StoredArray) and isinstance(value.values, list) and len(value.values) == 1:
         return value.values[0]
     return value.values if isinstance(value, StoredArray) else value
 
 
 def tables_in(value: Any) -> Iterator[tuple[str, dict[str, Any]]]:
-    """The dicts in `value` with the names on the way to them, `.` between, from the outermost inwards; each once."""
+    """Yield the dicts in `value`, from the outermost inwards, each once.
+
+    Each comes with the names on the way to it, joined by `.`.
+    """
     seen: set[int] = set()
     level = [("", plain(value))]
     for _ in range(DEEPEST + 1):
@@ -90,13 +93,13 @@ def tables_in(value: Any) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def _items(value: dict[str, Any] | list[Any]) -> list[tuple[Any, Any]]:
-    """Keys, or places in the list, and values of what may hold a dict."""
+    """Return keys, or places in the list, and values of a value that may hold a dict."""
     pairs = value.items() if isinstance(value, dict) else enumerate(value)
     return [(key, below) for key, below in pairs if isinstance(below, dict | list | StoredArray)]
 
 
 def array_of(value: Any) -> NDArray[Any] | None:
-    """`value` as an array, if it is one, a number, or a list of numbers; else None."""
+    """Return `value` as an array, if it is one, a number, or a list of numbers; else None."""
     value = plain(value)
     if isinstance(value, np.ndarray):
         return value
@@ -107,7 +110,7 @@ def array_of(value: Any) -> NDArray[Any] | None:
 
 
 def contents(value: Any) -> str:
-    """What is in `value`, for messages: names of its outermost dict that has arrays, with their shapes."""
+    """Say what is in `value`, for messages: names of its outermost dict that has arrays, with their shapes."""
     value = plain(value)
     for name, table in tables_in(value):
         arrays = {key: array_of(each) for key, each in table.items()}
@@ -126,18 +129,21 @@ def contents(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Found:
-    """A dict of a file. `where`: of it, for messages; `name`: its own in the file, empty for the outermost."""
+    """A dict of a file.
+
+    `where`: its place, for messages. `name`: its own name in the file, empty for the outermost.
+    """
 
     where: str
     name: str
     table: Mapping[str, Any]
 
     def has(self, key: str) -> bool:
-        """Whether there is a value, not None, of that name."""
+        """Return whether there is a value, not None, of that name."""
         return bool(key) and self.table.get(key) is not None
 
     def array(self, key: str) -> NDArray[Any]:
-        """The array `key`. Raises BadInputError when it is none."""
+        """Return the array `key`. Raises BadInputError when it is none."""
         value = self.table[key]
         array = array_of(value)
         if array is None:
@@ -147,5 +153,5 @@ class Found:
         return array
 
     def numbers(self, key: str) -> F64:
-        """The array `key` as numbers. Raises BadInputError."""
+        """Return the array `key` as numbers. Raises BadInputError."""
         return as_numbers(f"{self.where}[{key}]", self.array(key), "numbers")

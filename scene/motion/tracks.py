@@ -1,7 +1,7 @@
-"""Places, turns and end sites of named joints over time: the input of retargeting, whatever file it comes from.
+"""Places, turns and end sites of named joints over time: the input of retargeting, from any file.
 
-Names are those of the SMPL-X joints; units and axes are the file's own, the same in all arrays. Which frames stand, and
-whether a skeleton is built like the avatar's, is told by places alone: the file's zero pose does not matter.
+Names are those of the SMPL-X joints; units and axes are the file's own, the same in all arrays. Places alone tell which
+frames stand, and whether a skeleton is built like the avatar's: the file's zero pose does not matter.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ SIDES = ("left", "right")
 class Tracks:
     """Joints over T frames.
 
-    `places`: name -> (T, 3). `turns`: name -> global turn (T, 3, 3), where the file has one. `tips`: name -> place
-    (T, 3) of what its bone ends at, a joint of any name or an end site.
+    `places`: place (T, 3) of each joint. `turns`: global turn (T, 3, 3) of each joint, where the file has one. `tips`:
+    place (T, 3) where a joint's bone ends, at a joint of any name or an end site.
     """
 
     places: Mapping[str, F64]
@@ -32,52 +32,53 @@ class Tracks:
 
     @property
     def frames(self) -> int:
-        """How many frames there are."""
+        """Number of frames."""
         return len(self.places["left_hip"])
 
     def has(self, *names: str) -> bool:
-        """Whether all of these joints have places."""
+        """Return whether all of these joints have places."""
         return all(name in self.places for name in names)
 
     def between(self, part: str) -> F64:
-        """Middle (T, 3) of the left and the right joint of a pair, such as `hip`."""
+        """Return the middle (T, 3) of the left and the right joint of a pair, such as `hip`."""
         return (self.places[f"left_{part}"] + self.places[f"right_{part}"]) / 2
 
     def across(self, part: str) -> F64:
-        """The way (T, 3) from the right joint of a pair to the left one."""
+        """Return the way (T, 3) from the right joint of a pair to the left one."""
         return self.places[f"left_{part}"] - self.places[f"right_{part}"]
 
     def bone(self, start: str, end: str) -> F64:
-        """The way (T, 3) from one joint to another."""
+        """Return the way (T, 3) from one joint to another."""
         return self.places[end] - self.places[start]
 
 
 def at_rest(joints: F64) -> Tracks:
-    """One frame of Tracks: the rest joints (55, 3) of an avatar."""
+    """Return one frame of Tracks: the rest joints (55, 3) of an avatar."""
     return Tracks({name: joints[None, index] for index, name in enumerate(JOINT_NAMES[: len(joints)])})
 
 
 def unit(vectors: F64) -> F64:
-    """Vectors (..., 3) at unit length; a zero vector stays zero."""
+    """Scale vectors (..., 3) to unit length; a zero vector stays zero."""
     length = np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True))
     return np.asarray(vectors / np.where(length > 0, length, 1.0))
 
 
 def angle_between(a: F64, b: F64) -> F64:
-    """Angles (...) between vectors (..., 3), radians; exact near 0 and pi."""
+    """Return angles (...) between vectors (..., 3), radians; exact near 0 and pi."""
     cross = np.cross(a, b)
     return np.asarray(np.arctan2(np.sqrt((cross * cross).sum(axis=-1)), (a * b).sum(axis=-1)))
 
 
-#: Who stands has thighs less than this from the line of the trunk, and knees that bend less; radians.
+#: Largest angle between the thighs and the trunk's line, and largest bend of the knees, of a person who stands;
+#: radians.
 STRAIGHT_HIP, STANDING_KNEE = np.radians(25.0), np.radians(50.0)
-#: Of the frames that stand, those with the straightest knees: with less than this, or so much more than the best.
+#: Bend of the knees below which a standing frame counts as straight, and how much more than the best one's it may be.
 STRAIGHT_KNEE, LITTLE_MORE = np.radians(10.0), np.radians(5.0)
-#: A leg is below its hip when it leans less, radians; of such frames this share has the foot flat on the floor.
+#: Largest lean of a leg that is below its hip, radians; share of such frames in which the foot is flat on the floor.
 LEG_BELOW, PLANTED_SHARE = np.radians(35.0), 0.25
-#: Cosine of the angle within which the direction that a body stands in is taken for the axis beside it.
+#: Cosine of the angle within which the direction that a body stands in counts as the axis beside it.
 NEAR_AXIS = np.cos(np.radians(30.0))
-#: Distances of which some are the same in two skeletons that are built alike: pairs of joints of one bone or one part.
+#: Pairs of joints of one bone or one part: some of their distances are the same in two skeletons that are built alike.
 RIGID = (
     ("left_hip", "right_hip"),
     ("pelvis", "left_hip"),
@@ -92,12 +93,12 @@ RIGID = (
     ("left_collar", "left_shoulder"),
     ("left_ankle", "left_foot"),
 )
-#: How far such distances may differ, as a share of them and of the legs.
+#: Largest difference of such distances, as a share of them and of the legs.
 SAME_SHARE, SAME_LEGS = 0.02, 0.003
 
 
 def standing_frames(tracks: Tracks, trunk: F64) -> NDArray[np.bool_]:
-    """Which frames (T,) stand straightest: thighs in line with the trunk (T, 3), and straight knees."""
+    """Return which frames (T,) stand straightest: thighs in line with the trunk (T, 3), and straight knees."""
     bend = np.zeros(tracks.frames)
     stands = np.ones(tracks.frames, dtype=bool)
     for side in SIDES:
@@ -111,9 +112,9 @@ def standing_frames(tracks: Tracks, trunk: F64) -> NDArray[np.bool_]:
 
 
 def upward(tracks: Tracks, trunk: F64, stands: NDArray[np.bool_]) -> F64:
-    """The direction (3,) that is up in the recording: the file's axis nearest to the mean direction of trunk and legs.
+    """Return up (3,) in the recording: the file's axis nearest to the mean direction of trunk and legs.
 
-    The mean is over the frames that stand, or over all when none does; it is up itself where no axis is near.
+    The mean is over the frames that stand, or over all when none does. It is up itself where no axis is near.
     """
     legs = tracks.between("hip") - tracks.between("ankle")
     both = unit(trunk) + unit(legs)
@@ -123,7 +124,7 @@ def upward(tracks: Tracks, trunk: F64, stands: NDArray[np.bool_]) -> F64:
 
 
 def planted_frames(tracks: Tracks, side: str, foot: F64, up: F64) -> NDArray[np.bool_]:
-    """The frames (T,) in which a foot most likely lies flat: ankle and toes hardly move, and the leg is below the hip.
+    """Return the frames (T,) in which a foot most likely lies flat: it hardly moves, and the leg is below the hip.
 
     `foot` (T, 3): way from the ankle to the toes. `up` (3,): direction that is up in the recording.
     """
@@ -136,7 +137,7 @@ def planted_frames(tracks: Tracks, side: str, foot: F64, up: F64) -> NDArray[np.
 
 
 def leg_length(tracks: Tracks) -> float:
-    """Mean length of both legs, hip to knee to ankle: the median over all frames."""
+    """Return the mean length of both legs, hip to knee to ankle: the median over all frames."""
     bones = [
         np.linalg.norm(tracks.bone(f"{side}_{start}", f"{side}_{end}"), axis=-1)
         for side in SIDES
@@ -146,7 +147,7 @@ def leg_length(tracks: Tracks) -> float:
 
 
 def built_alike(tracks: Tracks, rest: Tracks) -> bool:
-    """Whether `tracks` and `rest` have the same distances between joints, beside the length of their legs."""
+    """Return whether `tracks` and `rest` have the same distances between joints, relative to their legs."""
     scale = leg_length(tracks) / leg_length(rest)
     pairs = [pair for pair in RIGID if tracks.has(*pair)]
     for pair in pairs:

@@ -1,13 +1,13 @@
 """Turns of trunk and limbs from directions, for retargeting: where bones point, and what decides their twist.
 
-**Trunk.** The same frames are built of hip line, line of the trunk and shoulder line in the recording and in the
-avatar's rest pose; a joint's turn takes one to the other. Programs put the joints of the trunk at different depths in
-the body. So in a skeleton that is not built like the avatar's, the constant pitch of each frame is that of the frames
-in which the person stands straight.
+**Trunk.** Hip line, line of the trunk and shoulder line define frames, alike in the recording and in the avatar's rest
+pose; a joint's turn takes one to the other. Programs put the joints of the trunk at different depths in the body. In a
+skeleton that is not built like the avatar's, the constant pitch of each part therefore comes from the moments in which
+the person stands straight.
 
 **Limbs.** A bone points where the recorded one points. The twist about it follows the file's own turns, so it never
-flips where a limb is straight. Those turns are right up to one constant angle: the angle at which elbows and knees
-bend, toes and fingers point, on average over the recording, as the avatar's do. No zero pose is needed for it.
+flips where a limb is straight. Those turns are right up to one constant angle. At this angle elbows and knees bend, and
+toes and fingers point, as the avatar's do, on average over the recording. No zero pose is needed for it.
 
 Functions take (T, 3) and (T, 3, 3) arrays and give proper rotations where their input is finite.
 """
@@ -24,27 +24,27 @@ from trilane.arrays import F64
 from trilane.scene.motion.tracks import SIDES, Tracks, unit
 from trilane.scene.rotations import about, matrix_from_quat, matrix_from_rotvec, normalised
 
-#: Of a direction along another one: the part beside it that is too short to tell a turn.
+#: Share of a direction at right angles to another one below which it is too short to tell a turn.
 TOO_SHORT = 1e-6
 
 
 def transposed(turns: F64) -> F64:
-    """The inverse of each turn (T, 3, 3)."""
+    """Return the inverse of each turn (T, 3, 3)."""
     return np.swapaxes(turns, -1, -2)
 
 
 def turned(turns: F64, vectors: F64) -> F64:
-    """Vectors (T, 3) or (3,) under turns (T, 3, 3) or (3, 3)."""
+    """Return vectors (T, 3) or (3,) under turns (T, 3, 3) or (3, 3)."""
     return np.asarray((turns @ vectors[..., None])[..., 0])
 
 
 def beside(vectors: F64, axis: F64) -> F64:
-    """The part of vectors (T, 3) that is perpendicular to unit vectors `axis` (T, 3)."""
+    """Return the part of vectors (T, 3) that is perpendicular to unit vectors `axis` (T, 3)."""
     return np.asarray(vectors - (vectors * axis).sum(axis=-1, keepdims=True) * axis)
 
 
 def frames_along(exact: F64, other: F64, first: str) -> F64:
-    """Frames (T, 3, 3) with left, up and forward as columns.
+    """Return frames (T, 3, 3) with left, up and forward as columns.
 
     `first`: `left` when `exact` (T, 3) is the left and `other` (T, 3) is towards up; `up` when it is the other way
     round. Where both are along one line, any perpendicular direction takes the place of `other`.
@@ -58,7 +58,7 @@ def frames_along(exact: F64, other: F64, first: str) -> F64:
 
 
 def least_turns(source: F64, target: F64) -> F64:
-    """The turn (T, 3, 3) of the least angle from each direction `source` (T, 3) to `target` (T, 3).
+    """Return the turn (T, 3, 3) of the least angle from each direction `source` (T, 3) to `target` (T, 3).
 
     As a quaternion it is (1 + cos, cross product), at unit length. Between opposite directions the axis is any
     perpendicular one.
@@ -74,7 +74,7 @@ def least_turns(source: F64, target: F64) -> F64:
 
 
 def mean_turn(turns: F64) -> F64:
-    """The rotation (3, 3) nearest to the mean of turns (T, 3, 3), in the sense of least squares of their entries.
+    """Return the rotation (3, 3) nearest to the mean of turns (T, 3, 3), by least squares of their entries.
 
     Moakher, "Means and averaging in the group of rotations", SIAM J. Matrix Analysis 24(1), 2002.
     """
@@ -83,23 +83,23 @@ def mean_turn(turns: F64) -> F64:
 
 
 def level_with(turns: F64, base: F64, where: NDArray[np.bool_]) -> F64:
-    """`turns` (T, 3, 3), with a constant turn before them, so that on average over `where` (T,) they equal `base`."""
+    """Return `turns` (T, 3, 3) after one constant turn, so that on average over `where` (T,) they equal `base`."""
     return np.asarray(turns @ mean_turn(transposed(base[where]) @ turns[where]).T)
 
 
-#: Of a sine: below it a limb counts as straight, so that a knee bent backwards a little turns nothing round.
+#: Sine of the bend below which a limb counts as straight, so that a knee bent backwards a little turns nothing round.
 LEAST_BEND = np.sin(np.radians(15.0))
 
-#: What tells the twist: a direction in the avatar at rest (3,), and where it points in the recording (T, 3); how long
-#: these are beside the bone is their weight.
+#: Evidence for a twist: a direction in the avatar at rest (3,), and where it points in the recording (T, 3). Their
+#: length beside the bone is their weight.
 Evidence = tuple[F64, F64]
 
 
 def limb_turns(bone: F64, recorded: F64, carrier: F64, evidence: Sequence[Evidence]) -> F64:
-    """Global turns (T, 3, 3) that lay the avatar's rest bone (3,) on the recorded ones (T, 3).
+    """Return global turns (T, 3, 3) that lay the avatar's rest bone (3,) on the recorded ones (T, 3).
 
-    `carrier` (T, 3, 3): turns that the bone takes part in; only their change over time counts. `evidence`: what
-    tells the twist; without any it is the least one from the rest pose to the carrier.
+    `carrier` (T, 3, 3): turns that the bone takes part in; only their change over time counts. `evidence`: evidence for
+    the twist; without any, the twist is the least one from the rest pose to the carrier.
     """
     target = unit(recorded)
     within = unit(turned(transposed(carrier), target).mean(axis=0))
@@ -109,7 +109,7 @@ def limb_turns(bone: F64, recorded: F64, carrier: F64, evidence: Sequence[Eviden
 
 
 def _twist(held: F64, axis: F64, laid: F64, evidence: Sequence[Evidence]) -> F64:
-    """The turn (3, 3) about `axis` (3,) that brings all of the evidence closest to the recorded directions."""
+    """Return the turn (3, 3) about `axis` (3,) that brings all of the evidence closest to the recorded directions."""
     cosine = sine = 0.0
     inside = transposed(held)
     for ours, theirs in evidence:
@@ -123,34 +123,40 @@ def _twist(held: F64, axis: F64, laid: F64, evidence: Sequence[Evidence]) -> F64
 
 
 def hinge(upper: F64, lower: F64) -> F64:
-    """Axes (T, 3) about which a limb bends from `upper` to `lower` (T, 3); the more it bends the longer, up to 1."""
+    """Return axes (T, 3) about which a limb bends from `upper` to `lower` (T, 3).
+
+    Their length grows with the bend, up to 1.
+    """
     axes = np.cross(unit(upper), unit(lower))
     sines = np.linalg.norm(axes, axis=-1, keepdims=True)
     return np.asarray(axes * np.clip(1 - LEAST_BEND / np.maximum(sines, TOO_SHORT), 0.0, 1.0))
 
 
 def swung(parent: F64, bone: F64, recorded: F64) -> F64:
-    """Turns (T, 3, 3) that lay `bone` (3,) on the recorded ones (T, 3) with the least turn from `parent` (T, 3, 3)."""
+    """Return turns (T, 3, 3) that lay `bone` (3,) on `recorded` (T, 3) with the least turn from `parent` (T, 3, 3)."""
     return least_turns(turned(parent, bone), recorded) @ parent
 
 
 SPINE = ("spine1", "spine2", "spine3")
-#: What the line of the trunk ends at: the first that the recording has.
+#: Upper end of the trunk's line: the first of these that the recording has.
 TOPS = ("neck", "shoulder", "head", "spine3")
-#: Collar joints are told from the spine when they are this far apart, as a share of the shoulders.
+#: Least distance of the collar joints, as a share of the shoulders', at which they count as apart from the spine.
 LEAST_COLLARS = 0.1
-#: How far each part of the spine has turned from the hips' left to the shoulders' left.
+#: Share of the turn from the hips' left to the shoulders' left that each part of the spine has made.
 TWIST = {"pelvis": 0.0, "spine1": 1 / 3, "spine2": 2 / 3, "spine3": 1.0}
 
 
 @dataclass(frozen=True)
 class TrunkLine:
-    """The line of the trunk. `top`: of TOPS, or `knee` for a recording without trunk, which is seen from the hips."""
+    """The line of the trunk.
+
+    `top`: a name of TOPS, or `knee` for a recording without trunk, which is seen from the hips.
+    """
 
     top: str
 
     def end(self, tracks: Tracks) -> F64:
-        """Its upper end (T, 3)."""
+        """Return its upper end (T, 3)."""
         if self.top == "shoulder":
             return tracks.between("shoulder")
         if self.top == "knee":
@@ -158,27 +164,27 @@ class TrunkLine:
         return tracks.places[self.top]
 
     def along(self, tracks: Tracks) -> F64:
-        """The way (T, 3) from the pelvis to its upper end."""
+        """Return the way (T, 3) from the pelvis to its upper end."""
         return self.end(tracks) - tracks.places["pelvis"]
 
     def points(self, tracks: Tracks) -> F64:
-        """The middle of the hips, the joints of the spine that the recording has, the upper end: (n, T, 3)."""
+        """Return the middle of the hips, the recorded joints of the spine, and the upper end: (n, T, 3)."""
         inner = [tracks.places[name] for name in self.inner if name in tracks.places]
         return np.stack([tracks.between("hip"), *inner, self.end(tracks)])
 
     @property
     def inner(self) -> tuple[str, ...]:
-        """The joints of the spine that may lie between its ends."""
+        """Names of the joints of the spine that may lie between its ends."""
         return {"knee": (), "spine3": SPINE[:2]}.get(self.top, SPINE)
 
     def shares(self, rest: Tracks) -> F64:
-        """How far along it (3,) the spine's joints are in an avatar; 1 for those at its end and above."""
+        """Return how far along the line (3,) the spine's joints are in an avatar; 1 for those at its end and above."""
         inner = line_shares(self.points(rest))[1:-1, 0]
         return np.append(inner, np.ones(len(SPINE) - len(inner)))
 
 
 def trunk_line(tracks: Tracks) -> TrunkLine:
-    """The line of the trunk that the joints of `tracks` allow."""
+    """Return the line of the trunk that the joints of `tracks` allow."""
     for top in TOPS:
         names = [f"{side}_{top}" for side in SIDES] if top == "shoulder" else [top]
         if tracks.has(*names):
@@ -187,14 +193,14 @@ def trunk_line(tracks: Tracks) -> TrunkLine:
 
 
 def line_shares(points: F64) -> F64:
-    """How far along a line (n, T, 3) each of its points lies: 0 at its beginning, 1 at its end, (n, T)."""
+    """Return how far along a line (n, T, 3) each of its points lies: 0 at its beginning, 1 at its end, (n, T)."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=-1)
     reached = np.concatenate([np.zeros((1, points.shape[1])), np.cumsum(steps, axis=0)])
     return np.asarray(reached / np.where(reached[-1] > 0, reached[-1], 1.0))
 
 
 def points_at(points: F64, shares: F64) -> F64:
-    """The points (m, T, 3) of a line (n, T, 3) at constant `shares` (m,) of its length."""
+    """Return the points (m, T, 3) of a line (n, T, 3) at constant `shares` (m,) of its length."""
     at = line_shares(points)
     found = np.empty((len(shares), *points.shape[1:]))
     for k, share in enumerate(shares):
@@ -210,7 +216,7 @@ def points_at(points: F64, shares: F64) -> F64:
 class Trunk:
     """Frames over time of a trunk, before they are laid on the avatar's.
 
-    `frames`: joint -> (T, 3, 3), left, up and forward as columns. `line`: (T, 3).
+    `frames`: frame (T, 3, 3) of each joint, with left, up and forward as columns. `line` (T, 3): line of the trunk.
     """
 
     frames: dict[str, F64]
@@ -218,7 +224,7 @@ class Trunk:
 
 
 def trunk_of(tracks: Tracks, line: TrunkLine, shares: F64, by_collars: bool) -> Trunk:
-    """The frames of pelvis and spine, with the joints of the spine at `shares` (3,) of the line.
+    """Return the frames of pelvis and spine, with the joints of the spine at `shares` (3,) of the line.
 
     `by_collars`: whether the chest turns with its collar joints, where they are apart, or with the shoulders.
     """
@@ -234,7 +240,7 @@ def trunk_of(tracks: Tracks, line: TrunkLine, shares: F64, by_collars: bool) -> 
 
 
 def _across_chest(tracks: Tracks, hips: F64, by_collars: bool) -> F64:
-    """The left (T, 3) of the chest: along the collar joints if they are apart, else along the shoulders."""
+    """Return the left (T, 3) of the chest: along the collar joints if they are apart, else along the shoulders."""
     if not tracks.has("left_shoulder", "right_shoulder"):
         return hips
     shoulders = tracks.across("shoulder")
@@ -244,7 +250,7 @@ def _across_chest(tracks: Tracks, hips: F64, by_collars: bool) -> F64:
 
 
 def collars_apart(tracks: Tracks) -> bool:
-    """Whether the recording has collar joints that stand beside the spine, not in it."""
+    """Return whether the recording has collar joints that stand beside the spine, not in it."""
     if not tracks.has("left_collar", "right_collar", "left_shoulder", "right_shoulder"):
         return False
     widths = [np.median(np.linalg.norm(tracks.across(part), axis=-1)) for part in ("collar", "shoulder")]
@@ -252,16 +258,16 @@ def collars_apart(tracks: Tracks) -> bool:
 
 
 def pitch_in(frames: F64, vectors: F64) -> F64:
-    """Angle (T,) of vectors (T, 3) from up to forward, in frames (T, 3, 3); radians."""
+    """Return the angle (T,) of vectors (T, 3) from up to forward, in frames (T, 3, 3); radians."""
     local = turned(transposed(frames), vectors)
     return np.asarray(np.arctan2(local[:, 2], local[:, 1]))
 
 
 def turns_of_trunk(recorded: Trunk, rest: Trunk, stands: NDArray[np.bool_], own: bool) -> dict[str, F64]:
-    """Global turns (T, 3, 3) of pelvis and spine.
+    """Return global turns (T, 3, 3) of pelvis and spine.
 
-    `recorded`, `rest`: of the recording, and of the avatar. `stands` (T,): the frames in which the person stands
-    straight, from which the pitch of each part is taken unless `own`, for a skeleton that is built like the avatar's.
+    `recorded`, `rest`: trunk of the recording, and of the avatar. `stands` (T,): frames in which the person stands
+    straight, which give the pitch of each part unless `own`. `own`: whether the skeleton is built like the avatar's.
     """
     turns = {}
     for name, frames in recorded.frames.items():
@@ -274,11 +280,11 @@ def turns_of_trunk(recorded: Trunk, rest: Trunk, stands: NDArray[np.bool_], own:
 
 
 def with_neck_on(line: F64, turns: dict[str, F64], rest: Tracks) -> dict[str, F64]:
-    """Turns of the spine whose lower two parts are turned once more, so that the neck lies along `line` (T, 3).
+    """Turn the lower two parts of the spine once more, so that the neck lies along `line` (T, 3).
 
-    `line`: direction from the pelvis, of any length. The neck is at q + R c, where R is the turn looked for, c from the
-    lowest joint of the spine to the highest, and q the rest of the way; so it is at s times the direction of `line` for
-    the s at which q is |c| from it.
+    `line`: direction from the pelvis, of any length. The neck is at q + R c: R is the turn to find, c the way from the
+    lowest joint of the spine to the highest, and q the rest of the way. So the neck is at s times the direction of
+    `line`, for the s at which q is |c| from it.
     """
     joint = {name: rest.places[name][0] for name in ("pelvis", *SPINE, "neck")}
     along = unit(line)
@@ -294,10 +300,10 @@ def with_neck_on(line: F64, turns: dict[str, F64], rest: Tracks) -> dict[str, F6
 
 
 def turns_of_collars(tracks: Tracks, rest: Tracks, chest: F64, stands: NDArray[np.bool_], own: bool) -> dict[str, F64]:
-    """Global turns (T, 3, 3) of both collar joints: from where they point in the chest, whose turns are `chest`.
+    """Return global turns (T, 3, 3) of both collar joints from where they point in the chest, whose turns are `chest`.
 
     With `own` false they point, on average over the frames that stand, as the avatar's do at rest, the same on both
-    sides; when none stands, they stay as at rest in the chest.
+    sides. When none stands, they stay as at rest in the chest.
     """
     still = {f"{side}_collar": chest for side in SIDES}
     if not tracks.has(*still, "left_shoulder", "right_shoulder") or not (own or stands.any()):
@@ -315,7 +321,7 @@ def turns_of_collars(tracks: Tracks, rest: Tracks, chest: F64, stands: NDArray[n
 
 
 def with_shoulders_on(across: F64, turns: dict[str, F64], rest: Tracks) -> dict[str, F64]:
-    """Turns of chest and collars, turned once more by the least turn that lays the shoulders along `across` (T, 3)."""
+    """Turn chest and collars once more by the least turn that lays the shoulders along `across` (T, 3)."""
     ends = []
     for side in SIDES:
         chest, collar, shoulder = (rest.places[name][0] for name in ("spine3", f"{side}_collar", f"{side}_shoulder"))
@@ -325,7 +331,7 @@ def with_shoulders_on(across: F64, turns: dict[str, F64], rest: Tracks) -> dict[
 
 
 def turns_of_neck(tracks: Tracks, rest: Tracks, chest: F64) -> F64:
-    """Global turns (T, 3, 3) of the neck: it points to the head as recorded; its left is the chest's."""
+    """Return global turns (T, 3, 3) of the neck: it points to the head as recorded; its left is the chest's."""
     if not tracks.has("neck", "head"):
         return chest
     left = chest[:, :, 0]

@@ -1,7 +1,7 @@
 """Trilane: run, measure and predict a neural-avatar pipeline on CPU, GPU and DSP units.
 
 `run`, `predict` and `load_run` are its interface for programs and notebooks (docs/python.md). Rule: importing this
-module imports nothing else; what is asked of it is looked up then.
+module imports nothing else; the names of the interface are looked up on first use.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ __all__ = ["Prediction", "Run", "RunFailedError", "load_run", "predict", "run"]
 
 
 def __getattr__(name: str) -> Any:
-    """A name of the interface; `__version__`, whose reading takes longer than a unit's start."""
+    """Return a name of the interface, or `__version__`: reading it takes longer than a unit's start."""
     if name in __all__:
         from importlib import import_module
 
@@ -29,5 +29,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """The names of the interface too, so that shells complete them."""
+    """Return the names of the interface too, so that shells complete them."""
     return [*globals(), *__all__]

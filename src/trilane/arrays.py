@@ -1,4 +1,4 @@
-"""Names for the array types of annotations. Rule: a name says the element type; docstrings say the shape."""
+"""Names for the array types in annotations. Rule: a name states the element type; docstrings state the shape."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What was worked out before and would be worked out again. Rule: a cache saves time and never decides anything.
+"""A cache of results that are expensive to compute. Rule: the cache saves time and never decides anything.
 
-It lies under XDG_CACHE_HOME. An entry's name is a digest of all that it was made from; one that cannot be read is made
-again, and where nothing can be written nothing is kept.
+It lies under XDG_CACHE_HOME. An entry's name is a digest of everything that it was made from. An entry that cannot be
+read is made again, and where nothing can be written nothing is kept.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from trilane.errors import BadInputError
 from trilane.writing import write_atomically
 
 ARRAYS = "arrays"
-MAX_ENTRIES = 64  # of arrays, some MB each; the oldest go first
+MAX_ENTRIES = 64  # entries of arrays, some MB each; the oldest go first
 
 Arrays = Mapping[str, NDArray[Any]]
 
 
 def cache_dir(name: str) -> Path | None:
-    """The folder of the cache `name`; None when it cannot be written."""
+    """Return the folder of the cache `name`; None when it cannot be written."""
     try:
         folder = machine.here.cache_home() / "trilane" / name
         folder.mkdir(parents=True, exist_ok=True)
@@ -37,15 +37,15 @@ def cache_dir(name: str) -> Path | None:
 
 
 def cached_arrays(name: str, sources: Iterable[NDArray[Any] | str], make: Callable[[], Arrays]) -> Arrays:
-    """What `make` returns, from the cache when it was made from the same `sources` before.
+    """Return the result of `make`, from the cache when it was made from the same `sources` before.
 
-    `name`: of what is made, with a number that grows when the code that makes it changes.
+    `name`: name of the result, with a number that grows when the code that makes it changes.
     """
     folder = cache_dir(ARRAYS)
     if folder is None:
         return make()
     entry = folder / f"{_digest(name, sources)}.npz"
-    if entry.exists() and not entry.is_file():  # a pipe, which would be waited for
+    if entry.exists() and not entry.is_file():  # a pipe, say, on which reading would wait
         return make()
     stored = _read(entry)
     if stored is not None:
@@ -59,7 +59,7 @@ def cached_arrays(name: str, sources: Iterable[NDArray[Any] | str], make: Callab
 
 
 def _read(entry: Path) -> Arrays | None:
-    """The arrays of `entry`; None when it is missing or damaged in any way, because they can be made again."""
+    """Return the arrays of `entry`; None when it is missing or damaged in any way, because they can be made again."""
     try:
         with entry.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             return {key: stored[key] for key in stored.files}

@@ -1,9 +1,9 @@
 """The errors that reach a person: each says what was found, what was expected and how to mend it.
 
 Code raises these for anything a user can cause; the command line turns them into one sentence and an exit code. The
-parts of a sentence are fields: nothing reads them out of a text. A remedy may be the word that a person most likely
-meant, or the command that installs what is missing, to be typed as it is. That command fits the way this Trilane was
-installed, and nobody is sent to a package index for Trilane: none has it.
+parts of a sentence are fields: no code parses them out of a text. A remedy may be the word that a person most likely
+meant, or the command that installs what is missing, to be typed as it is. That command fits the way in which this
+Trilane was installed. It never fetches Trilane from a package index: none has it.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from trilane.unexpected_value import UnexpectedValue
 
 
 def did_you_mean(word: str, known: Iterable[str], prefix: str = "") -> str:
-    """`did you mean 'x'?` for the word of `known` that is most like `word`, as a remedy; empty when none is near.
+    """Return the remedy `did you mean 'x'?` with the word of `known` most like `word`; empty when none is near.
 
-    A word whose letters are few beside those of the one that alone begins with it is near, too.
+    A word is also near when it is the only one that begins with `word`.
 
-    `prefix`: stands before the word that is suggested; `word` and `known` are compared without.
+    `prefix`: text before the suggested word; `word` and `known` are compared without it.
     """
     words = list(known)
     near = get_close_matches(word, words, n=1) or _only_one([each for each in words if word and each.startswith(word)])
@@ -36,20 +36,23 @@ def _only_one(words: list[str]) -> list[str]:
 
 
 PACKAGE = Path(__file__).resolve().parent
-#: Where no distribution lists them: a folder that was copied without its pyproject.toml.
+#: Stands for the packages where no distribution lists them: in a folder that was copied without its pyproject.toml.
 UNKNOWN = "(the packages that Trilane's pyproject.toml lists)"
 #: EGL and a software OpenGL driver, on Debian and Ubuntu.
 EGL_LINE = "apt-get install libegl1 libgl1-mesa-dri"
 
 
 def clone() -> Path | None:
-    """The folder of the source tree that this Trilane runs from, also by an editable install; None for a wheel's."""
+    """Return the source tree that this Trilane runs from, also by an editable install; None for a wheel."""
     root = PACKAGE.parents[1]
     return root if PACKAGE.parent.name == "src" and (root / "pyproject.toml").is_file() else None
 
 
 def pip() -> str:
-    """The command that runs the pip of this Python; relative when the user stands in the clone whose .venv this is."""
+    """Return the command that runs this Python's pip.
+
+    It is relative when the user stands in the clone whose .venv this is.
+    """
     root = clone()
     if root is None or Path(sys.prefix).resolve() != root / ".venv":
         return f"{shlex.quote(sys.executable)} -m pip"
@@ -57,12 +60,12 @@ def pip() -> str:
 
 
 def package_line(name: str) -> str:
-    """The command that installs the package `name` of a package index."""
+    """Return the command that installs the package `name` from a package index."""
     return f"{pip()} install {name}"
 
 
 def install_line(extra: str = "") -> str:
-    """The command that installs the packages of an `extra` of Trilane; without one, those that every run needs."""
+    """Return the command that installs the packages of an `extra`; without one, those that every run needs."""
     root = clone()
     if root is not None:
         source = ("." if _stands_in(root) else str(root)) + (f"[{extra}]" if extra else "")
@@ -79,7 +82,7 @@ def _stands_in(root: Path) -> bool:
 
 
 def _requirements(extra: str) -> Iterator[str]:
-    """What the installed distribution requires for `extra` (for "": in any case), without the markers."""
+    """Yield what the installed distribution requires for `extra` (for "": in any case), without the markers."""
     try:
         lines = importlib.metadata.requires("trilane") or []
     except importlib.metadata.PackageNotFoundError:
@@ -91,12 +94,12 @@ def _requirements(extra: str) -> Iterator[str]:
             yield requirement.strip()
 
 
-#: Letters of what was found that are shown.
+#: Most letters of what was found that are shown.
 LONGEST_FOUND = 500
 
 
 def reason(error: Exception) -> str:
-    """Why it failed, as part of a sentence: an OSError without its number and path, any other error's own text."""
+    """Return the reason of `error` as part of a sentence: an OSError without number and path, else its own text."""
     if not isinstance(error, OSError):
         return str(error)
     text = error.strerror or str(error)
@@ -106,7 +109,7 @@ def reason(error: Exception) -> str:
 class TrilaneError(Exception):
     """A failure with a message for people. Exit code 1: the run failed.
 
-    `details`: lines that follow the message, where it takes more than one to say.
+    `details`: lines that follow the message where a single one is not enough.
     """
 
     exit_code = 1
@@ -132,24 +135,24 @@ class BadInputError(TrilaneError):
 
     @classmethod
     def at(cls, where: str | Path, unexpected: UnexpectedValue) -> BadInputError:
-        """`unexpected`, whose place is `where`."""
+        """Return `unexpected` as an error about the place `where`."""
         return cls(where, unexpected.found, unexpected.expected, unexpected.remedy)
 
     @classmethod
     def of_os_error(cls, where: str | Path, error: OSError, expected: str, remedy: str = "") -> BadInputError:
-        """What the system said when `where` was opened, read or written.
+        """Return the error for what the system said when `where` was opened, read or written.
 
-        `where`: the file or folder.
-        `error`: its reason is what was found.
+        `where`: file or folder.
+        `error`: error of the system; its reason is what was found.
         `expected`, `remedy`: sentence parts.
         """
         return cls(where, reason(error), expected, remedy)
 
 
 class UnwrittenError(TrilaneError):
-    """A file that was being written could not be written on, such as on a full disk. Exit code 1.
+    """A file could not be written any further, for example on a full disk. Exit code 1.
 
-    `path`: of the file. `error`: what the system said.
+    `path`: path of the file. `error`: error of the system.
     """
 
     def __init__(self, path: str | Path, error: OSError) -> None:
@@ -161,13 +164,13 @@ class UnwrittenError(TrilaneError):
 
 
 class UnitLostError(TrilaneError):
-    """A unit cannot go on, but a new process in its place can: it ends, and the scheduler restarts it."""
+    """A unit cannot go on, but a new process in its place can: the unit ends, and the scheduler restarts it."""
 
 
 class MissingPartError(TrilaneError):
     """The environment lacks something. Exit code 3.
 
-    `what` is missing. `install` is the line to type; `extra` in its place names one of Trilane's extras.
+    `what`: what is missing. `install`: line to type. `extra`: one of Trilane's extras, in place of `install`.
     """
 
     exit_code = 3

@@ -1,4 +1,4 @@
-"""Where a figure comes from, in the words that every report, table and bench has. Rule: each phrase stands once."""
+"""Where a figure comes from, in words that all reports, tables and benches share. Rule: each phrase stands once."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import datetime
 
 MEASURED = "measured in this run"
 COMPUTED = "computed"
-#: Of two figures, one measured and one computed.
+#: Source of a ratio of a measured figure to a computed one.
 COMPARED = "measured in this run, over computed"
-#: In place of a figure that is not this avatar's.
+#: Stands for a figure that is not this avatar's.
 NO_FIGURES = "no figures"
 
 
 def from_validation(date: datetime.date | None) -> str:
-    """The source of a figure that an avatar's validation of `date` brought."""
+    """Return the source of a figure that an avatar's validation of `date` brought."""
     return f"from the avatar's validation of {date}"

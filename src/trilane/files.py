@@ -1,8 +1,8 @@
-"""Input files opened with suspicion: sizes are read from headers before memory is taken, nothing is unpickled.
+"""Input files are opened with suspicion: sizes are read from headers before memory is taken, nothing is unpickled.
 
-Whatever is wrong with a file becomes one BadInputError that names it. What a file is, whatever its name ends in, is
-told by its first bytes: a signature is one that the format's own specification, or libmagic's list, gives. A format
-that nothing of Trilane reads has a way to one that it reads.
+Any defect of a file becomes one BadInputError that names it. The first bytes tell what a file is, not its ending;
+signatures come from the format's own specification, or from libmagic's list. A format that Trilane does not read comes
+with a way to convert it.
 """
 
 from __future__ import annotations
@@ -35,14 +35,17 @@ _ARRAYS = "save its arrays with NumPy: np.savez(FILE, poses=..., trans=..., moca
 
 @dataclass(frozen=True)
 class Signature:
-    """`name`: with its article. `group`: one of the words above. `remedy`: how it is made usable."""
+    """A known file format.
+
+    `name`: name with its article. `group`: one of the words above. `remedy`: how the file is made usable.
+    """
 
     name: str
     group: str = FOREIGN
     remedy: str = ""
 
 
-#: The first that matches the head of a file counts.
+#: The first signature that matches the head of a file counts.
 SIGNATURES: tuple[tuple[bytes, Signature], ...] = (
     (rb"Kaydara FBX Binary|; FBX ", Signature("an FBX file", remedy=_OTHER_3D)),
     (rb"glTF", Signature("a binary glTF file (GLB, VRM)", remedy=_OTHER_3D)),
@@ -89,14 +92,14 @@ _PATTERNS = tuple((re.compile(pattern, re.DOTALL), signature) for pattern, signa
 
 
 def signature_of(path: Path) -> Signature | None:
-    """What the regular file `path` is; None when its head says nothing. Raises OSError when it cannot be read."""
+    """Return what the regular file `path` is; None when its head says nothing. Raises OSError when it is unreadable."""
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
     return signature_of_head(head)
 
 
 def signature_of_head(head: bytes) -> Signature | None:
-    """What a file is that begins with `head`, which is up to HEAD_BYTES long."""
+    """Return what a file is that begins with `head`, which is up to HEAD_BYTES long."""
     return next((signature for pattern, signature in _PATTERNS if pattern.match(head)), None)
 
 
@@ -104,7 +107,7 @@ MAX_ARRAY_BYTES = 1 << 30
 MAX_TEXT_BYTES = 256 << 20
 LONGEST_WHOLE = 300  # digits; floats have up to 309
 
-#: What NumPy and zipfile raise on damaged files.
+#: Errors that NumPy and zipfile raise on damaged files.
 DAMAGED = (
     OSError,
     ValueError,
@@ -123,7 +126,10 @@ _HEADERS = {
 
 
 def require_file(path: Path, expected: str, if_empty: str = "") -> int:
-    """Size of a regular, non-empty file in bytes. Raises BadInputError; `if_empty`: remedy for an empty file."""
+    """Return the size of a regular, non-empty file in bytes. Raises BadInputError.
+
+    `if_empty`: remedy for an empty file.
+    """
     try:
         if not path.is_file():
             raise BadInputError(path, instead_of_file(path), expected)
@@ -136,7 +142,7 @@ def require_file(path: Path, expected: str, if_empty: str = "") -> int:
 
 
 def instead_of_file(path: Path) -> str:
-    """What `path` is, which is no regular file."""
+    """Say what `path` is, which is no regular file."""
     if path.is_dir():
         return "a folder"
     try:
@@ -149,12 +155,13 @@ def instead_of_file(path: Path) -> str:
 
 
 def read_text(path: Path, expected: str) -> str:
-    """The file as text. Raises BadInputError when it is missing, empty, over 256 MiB, not UTF-8 or not text."""
+    """Return the file as text. Raises BadInputError when it is missing, empty, over 256 MiB, not UTF-8 or not text."""
     size = require_file(path, expected)
     if size > MAX_TEXT_BYTES:
         raise BadInputError(path, f"{size} bytes", f"at most {MAX_TEXT_BYTES}")
     try:
         refuse_other(path, expected)
+        # utf-8-sig drops a byte order mark, which is no part of the text.
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         found = f"a file that cannot be read as text ({reason(error)})"
@@ -168,7 +175,7 @@ def read_text(path: Path, expected: str) -> str:
 
 
 def refuse_other(path: Path, expected: str, *groups: str) -> None:
-    """Raises BadInputError for a file whose head tells a known format outside of `groups`."""
+    """Raise BadInputError for a file whose head belongs to a known format outside of `groups`."""
     try:
         signature = signature_of(path)
     except OSError as error:
@@ -178,7 +185,10 @@ def refuse_other(path: Path, expected: str, *groups: str) -> None:
 
 
 def read_npy(path: Path, expected: str) -> NDArray[Any]:
-    """The array of a `.npy` file. Raises BadInputError; pickled, truncated and huge files are refused unread."""
+    """Return the array of a `.npy` file.
+
+    Raises BadInputError; pickled, truncated and huge files are refused unread.
+    """
     size = require_file(path, expected)
     try:
         refuse_other(path, expected, ARRAY)
@@ -193,9 +203,9 @@ def read_npy(path: Path, expected: str) -> NDArray[Any]:
 
 
 def read_npz(path: Path, keys: Collection[str], expected: str) -> dict[str, NDArray[Any]]:
-    """Those of `keys` that the `.npz` file has; other members are not opened. Raises BadInputError.
+    """Return those of `keys` that the `.npz` file has; other members are not opened. Raises BadInputError.
 
-    All together have at most MAX_ARRAY_BYTES and a header each.
+    Together they may have at most MAX_ARRAY_BYTES, and a header each.
     """
     require_file(path, expected)
     try:
@@ -212,7 +222,7 @@ def read_npz(path: Path, keys: Collection[str], expected: str) -> dict[str, NDAr
 
 
 def npz_names(path: Path, expected: str) -> list[str]:
-    """The names of the arrays of an `.npz` file, in its order; none is opened. Raises BadInputError."""
+    """Return the names of the arrays in an `.npz` file, in its order; none is opened. Raises BadInputError."""
     require_file(path, expected)
     try:
         refuse_other(path, expected, ARRAY, ARCHIVE)
@@ -223,9 +233,9 @@ def npz_names(path: Path, expected: str) -> list[str]:
 
 
 def npz_pickles(path: Path, keys: Collection[str], most: int, expected: str) -> dict[str, bytes]:
-    """The unread pickles of those `keys` of an `.npz` file that hold Python objects. Raises BadInputError.
+    """Return the unread pickles of those `keys` in an `.npz` file that hold Python objects. Raises BadInputError.
 
-    `most`: bytes that they may have together.
+    `most`: most bytes that they may have together.
     """
     require_file(path, expected)
     found: dict[str, bytes] = {}
@@ -242,7 +252,7 @@ def npz_pickles(path: Path, keys: Collection[str], most: int, expected: str) -> 
 
 
 def _pickle_in(where: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, most: int) -> bytes | None:
-    """The pickle of a member that holds objects; None for any other, which is not read."""
+    """Return the pickle of a member that holds objects; None for any other, which is not read."""
     with archive.open(info) as file:
         if not _holds_objects(file):
             return None
@@ -252,9 +262,9 @@ def _pickle_in(where: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, most
 
 
 def npy_pickle(path: Path, most: int, expected: str) -> bytes | None:
-    """The pickle of a `.npy` file that holds Python objects, unread; None for any other. Raises BadInputError.
+    """Return the unread pickle of a `.npy` file that holds Python objects; None for any other. Raises BadInputError.
 
-    `most`: bytes that it may have.
+    `most`: most bytes that it may have.
     """
     size = require_file(path, expected)
     try:
@@ -272,7 +282,7 @@ def npy_pickle(path: Path, most: int, expected: str) -> bytes | None:
 
 
 def _holds_objects(file: IO[bytes]) -> bool:
-    """Whether the array that comes next in `file` is one of Python objects; leaves `file` after its header.
+    """Return whether the array that comes next in `file` holds Python objects; leave `file` after its header.
 
     Raises one of DAMAGED on a broken header.
     """
@@ -281,7 +291,7 @@ def _holds_objects(file: IO[bytes]) -> bool:
 
 
 def read_bytes(path: Path, most: int, expected: str) -> bytes:
-    """The whole file. Raises BadInputError when it is missing, empty or has more than `most` bytes."""
+    """Return the whole file. Raises BadInputError when it is missing, empty or has more than `most` bytes."""
     size = require_file(path, expected)
     if size > most:
         raise BadInputError(path, f"{size} bytes", f"at most {most}")
@@ -303,7 +313,7 @@ def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDAr
 
 
 def read_header(where: Path | str, file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, Fortran order and type of the array whose `.npy` header comes next in `file`.
+    """Return shape, Fortran order and type of the array whose `.npy` header comes next in `file`.
 
     Raises BadInputError on pickled objects and unknown versions, one of DAMAGED on a broken header.
     """
@@ -335,7 +345,7 @@ def _read_array(file: IO[bytes]) -> NDArray[Any]:
 
 
 def _checked_bytes(where: Path | str, file: IO[bytes], expected: str) -> int:
-    """Bytes of data that the header announces; leaves `file` at their start."""
+    """Return the number of data bytes that the header announces; leave `file` at their start."""
     shape, _, dtype = read_header(where, file)
     if any(side < 0 for side in shape):
         raise BadInputError(where, f"shape {shape}", expected)
@@ -346,12 +356,12 @@ def _checked_bytes(where: Path | str, file: IO[bytes], expected: str) -> int:
 
 
 def whole_number(digits: str) -> int | float:
-    """A whole number of a JSON document; infinity for one that no float can hold."""
+    """Return a whole number of a JSON document; infinity for one that no float can hold."""
     return int(digits) if len(digits) < LONGEST_WHOLE else math.copysign(math.inf, -1 if digits.startswith("-") else 1)
 
 
 def as_numbers(where: Path | str, array: NDArray[Any], expected: str) -> NDArray[np.float64]:
-    """`array` as float64. Raises BadInputError when it holds no real numbers."""
+    """Return `array` as float64. Raises BadInputError when it holds no real numbers."""
     if array.dtype.kind not in "fiu":
         raise BadInputError(where, f"dtype {array.dtype}", expected)
     with np.errstate(invalid="ignore"):

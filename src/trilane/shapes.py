@@ -1,4 +1,4 @@
-"""Sizes of tensors as text and as shape buckets. Rule: (height, width), sides in multiples of `BUCKET_STEP`."""
+"""Sizes of tensors as text and as shape buckets. Rule: shapes are (height, width), sides multiples of `BUCKET_STEP`."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from trilane.unexpected_value import UnexpectedValue
 
 MAX_SIDE = 4096
 BUCKET_STEP = 32
-MOST_ASPECT = 4  # of a bucket's longer side to its shorter one
+MOST_ASPECT = 4  # largest ratio of a bucket's longer side to its shorter one
 
 Shape = tuple[int, int]
 
 
 def parse_shape(text: str) -> Shape:
-    """`HxW` to (height, width). Raises UnexpectedValue."""
+    """Parse `HxW` as (height, width). Raises UnexpectedValue."""
     match = re.fullmatch(r"(\d+)x(\d+)", text)
     if match is None:
         raise UnexpectedValue(repr(text), "HEIGHTxWIDTH such as 256x256")
@@ -23,10 +23,10 @@ def parse_shape(text: str) -> Shape:
 
 
 def shape_buckets(size: str) -> list[Shape]:
-    """Tensor shapes (height, width) that `size` allows.
+    """Return the tensor shapes (height, width) that `size` allows.
 
     `HxW` gives that one shape. A single number S gives shapes of at most S² pixels, with sides in multiples of 32 and
-    an aspect within 1:4. No shape holds another: they are tall for a standing body, wide for a lying one, S x S
+    an aspect within 1:4. No shape contains another: they are tall for a standing body, wide for a lying one, S x S
     between. Raises UnexpectedValue when a side is no multiple of 32 or out of range.
     """
     if re.fullmatch(r"\d+", size):
@@ -36,7 +36,7 @@ def shape_buckets(size: str) -> list[Shape]:
 
 
 def shapes_within(pixels: int) -> list[Shape]:
-    """The shapes (height, width) of at most `pixels`, at least `BUCKET_STEP`²; none holds another.
+    """Return the shapes (height, width) of at most `pixels`, at least `BUCKET_STEP`²; none contains another.
 
     Their sides are multiples of `BUCKET_STEP`, the longer one at most `MOST_ASPECT` times the shorter one.
     """
@@ -53,6 +53,6 @@ def _check_side(side: int) -> int:
 
 
 def checked_size(size: str) -> str:
-    """`size` itself. Raises UnexpectedValue as `shape_buckets`."""
+    """Return `size` itself. Raises UnexpectedValue as `shape_buckets`."""
     shape_buckets(size)
     return size

@@ -1,9 +1,9 @@
 """The avatar's U-Nets as tables: encoders, decoder, heads and normalisations.
 
-Rule: each channel count, kernel and stride stands once, here; the trained network (`training/`) and the shapes that the
+Rule: each channel count, kernel and stride stands once, here. The trained network (`training/`) and the shapes that the
 predictions count (`hw_profiles/`) are both built from these tables.
-Sources: He et al. 2015 (ResNet18); Sandler et al. 2018 (MobileNetV2); Howard et al. 2019 (MobileNetV3 large);
-Tan and Le 2019 with the changes of TensorFlow's EfficientNet-Lite (no squeeze, ReLU6, stem and head unscaled).
+Sources: He et al. 2015 (ResNet18); Sandler et al. 2018 (MobileNetV2); Howard et al. 2019 (MobileNetV3 large); Tan and
+Le 2019 with the changes of TensorFlow's EfficientNet-Lite (no squeeze, ReLU6, stem and head unscaled).
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ DECODER = (256, 128, 64, 64, 64)
 #: Channels of the colour head and of the mask head.
 HEADS = (3, 1)
 NORMS = ("batch", "instance", "group")
-#: Groups of a group norm; of fewer channels, the greatest common divisor of both.
+#: Number of groups in a group norm; with fewer channels, their greatest common divisor with it.
 NORM_GROUPS = 8
-#: Of ResNet18: channels of the stem, then (channels, stride) of the four stages, two residual blocks each.
+#: ResNet18: channels of the stem, then (channels, stride) of the four stages, two residual blocks each.
 RESNET18_STEM = 64
 RESNET18_STAGES = ((64, 1), (128, 2), (256, 2), (512, 2))
 
@@ -42,8 +42,8 @@ class MobileBlock:
 class MobileEncoder:
     """An encoder of inverted residual blocks.
 
-    `stem`: channels of the first 3x3 convolution; `activation`: its activation, and that of the last layer; `last`:
-    channels of the last 1x1 convolution.
+    `stem`: channels of the first 3x3 convolution. `activation`: activation of the stem and of the last layer. `rows`:
+    blocks in order. `last`: channels of the last 1x1 convolution.
     """
 
     stem: int
@@ -53,12 +53,18 @@ class MobileEncoder:
 
 
 def squeeze_channels(channels: int) -> int:
-    """Channels inside a squeeze-and-excitation: a quarter of `channels`, rounded to a multiple of 8, at least 8."""
+    """Return the channels inside a squeeze-and-excitation.
+
+    They are a quarter of `channels`, rounded to a multiple of 8, at least 8.
+    """
     return max(8, (channels // 4 + 4) // 8 * 8)
 
 
 def _repeated(spec: Sequence[tuple[int, int, int, int, int]], before: int) -> tuple[MobileBlock, ...]:
-    """Rows from (kernel, expansion factor, channels, repeats, stride); `before`: channels that enter the first."""
+    """Return rows from (kernel, expansion factor, channels, repeats, stride).
+
+    `before`: channels that enter the first row.
+    """
     rows = []
     for kernel, expansion, channels, repeats, stride in spec:
         for i in range(repeats):

@@ -1,7 +1,7 @@
-"""A value that is not what it should be, said in parts.
+"""A value that is not what it should be, described in parts.
 
-Rule: raised where the value's place (a file, key or option) is not known; whoever knows it makes a `BadInputError`
-with `BadInputError.at`. It imports nothing, so the scheduler's core may raise it too.
+Rule: it is raised where the value's place (a file, key or option) is not known. A caller that knows the place makes a
+`BadInputError` with `BadInputError.at`. This module imports nothing, so the scheduler's core may raise the error too.
 """
 
 from __future__ import annotations
@@ -11,7 +11,10 @@ from typing import Any
 
 
 class UnexpectedValue(ValueError):  # noqa: N818 - the value is at fault, as in ValueError
-    """`found` and `expected` are sentence parts; `remedy` says how to mend it and may be empty."""
+    """A value that is not what it should be.
+
+    `found`, `expected`: sentence parts. `remedy`: how to mend the value; may be empty.
+    """
 
     def __init__(self, found: str, expected: str, remedy: str = "") -> None:
         super().__init__(found, expected, remedy)
@@ -22,6 +25,6 @@ class UnexpectedValue(ValueError):  # noqa: N818 - the value is at fault, as in 
 
 
 def unexpected_in(details: Mapping[str, Any]) -> UnexpectedValue | None:
-    """The error that a validator raised, out of one of the `errors()` of a pydantic ValidationError; else None."""
+    """Return the error that a validator raised, from one of the `errors()` of a pydantic ValidationError; else None."""
     cause = details.get("ctx", {}).get("error")
     return cause if isinstance(cause, UnexpectedValue) else None

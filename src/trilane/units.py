@@ -10,7 +10,7 @@ UNITS: tuple[UnitName, ...] = get_args(UnitName)
 
 
 class PerformanceProfile(StrEnum):
-    """Caps by SNPE's and QNN's names, from the highest power to the lowest."""
+    """Names of SNPE's and QNN's performance profiles, from the highest power to the lowest."""
 
     BURST = "burst"
     SUSTAINED_HIGH_PERFORMANCE = "sustained_high_performance"
@@ -25,10 +25,10 @@ PERFORMANCE_PROFILES = tuple(profile.value for profile in PerformanceProfile)
 BURST = PerformanceProfile.BURST.value
 SUSTAINED = PerformanceProfile.SUSTAINED_HIGH_PERFORMANCE.value
 
-#: The stages of the avatar's pipeline before and after those of the network, and the unit of each.
+#: Stages of the avatar's pipeline before and after the network's, and the unit of each.
 BEFORE_INFER: tuple[tuple[str, UnitName], ...] = (("pose", "cpu"), ("raster", "gpu"))
 INFER: tuple[str, UnitName] = ("infer", "dsp")
 AFTER_INFER: tuple[tuple[str, UnitName], ...] = (("composite", "gpu"), ("present", "cpu"))
 LATENCY_TO = "composite"
-#: Frames that need no new picture of the avatars go from the first of these to the second.
+#: Frames that need no new picture of the avatars skip the stages between these two.
 BYPASS = ("pose", "composite")

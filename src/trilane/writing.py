@@ -1,7 +1,7 @@
-"""Output files that are whole or not there: written under a temporary name beside their place, then renamed.
+"""Output files that are whole or absent: written under a temporary name beside their place, then renamed.
 
-Rule: whatever ends the writing, the file that stood there before stays as it was, and no other file is left. Only a
-process that is killed outright may leave its temporary file, `.trilane-*`.
+Rule: when writing ends early for any reason, the old file stays as it was, and no other file is left. Only a process
+that is killed outright may leave its temporary file, `.trilane-*`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ PREFIX = ".trilane-"
 
 @contextmanager
 def write_atomically(path: Path, remedy: str = "") -> Iterator[Path]:
-    """A name to write to, with the suffix of `path`; it becomes `path` when the block ends without an error.
+    """Yield a name to write to, with the suffix of `path`; it becomes `path` when the block ends without an error.
 
     No file has the name yet, and no two calls get the same one. A device or a pipe (/dev/stdout) is itself the name.
     Raises BadInputError with `remedy` when the file cannot be written; an OSError about another file passes.
@@ -51,17 +51,17 @@ def require_writable(path: Path) -> None:
 
 
 def write_bytes(path: Path, content: bytes, remedy: str = "") -> None:
-    """`content` as the file `path`, by `write_atomically`. Raises BadInputError."""
+    """Write `content` as the file `path`, by `write_atomically`. Raises BadInputError."""
     with write_atomically(path, remedy) as draft:
         draft.write_bytes(content)
 
 
 @contextmanager
 def write_folder(folder: Path) -> Iterator[Path]:
-    """An empty folder to write files to; they take their places in `folder` when the block ends without an error.
+    """Yield an empty folder to write files to; they move into `folder` when the block ends without an error.
 
-    Each file of `folder` is whole at any moment, but they change one after the other; other files in it stay.
-    Raises BadInputError when a file cannot be written; an OSError about a file elsewhere passes.
+    Each file of `folder` is whole at any moment, but they change one after the other; other files in it stay. Raises
+    BadInputError when a file cannot be written; an OSError about a file elsewhere passes.
     """
     with _os_errors_about(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -77,7 +77,10 @@ def write_folder(folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def _os_errors_about(path: Path, remedy: str = "", own: Sequence[Path] = ()) -> Iterator[None]:
-    """Raises BadInputError about `path` for an OSError; with `own`, not for one that names a file outside these."""
+    """Raise BadInputError about `path` for an OSError in the block.
+
+    `own`: if given, an OSError that names a file outside these places passes unchanged.
+    """
     try:
         yield
     except OSError as error:
@@ -97,7 +100,7 @@ def _move_files(source: Path, target: Path) -> None:
 
 
 def _is_stream(path: Path) -> bool:
-    """Is it a device, a pipe or a socket, which a file must not replace."""
+    """Return whether `path` is a device, a pipe or a socket, which a file must not replace."""
     return path.exists() and not path.is_file() and not path.is_dir()
 
 

@@ -1,9 +1,9 @@
 """The screen rectangle of a skinned mesh, exact, at a fraction of the cost of skinning it.
 
 No part of the mesh that is on the screen lies outside the rectangle; parts behind the near plane or beside the screen
-do not widen it. Spheres that hold patches of the mesh in any pose tell which patches are off the screen, which ones the
-near plane cuts, and which ones can reach the rectangle's sides. Only the last two kinds are looked at in finer patches,
-and only their vertices are skinned.
+do not widen it. Each patch of the mesh lies in a sphere, in any pose. The spheres tell which patches are off the
+screen, which the near plane cuts, and which can reach the rectangle's sides. Only the last two kinds are examined in
+finer patches, and only their vertices are skinned.
 
 **Patches** are neighbouring triangles with similar skin weights. A patch's radius is proved, not sampled. Let c be the
 rest position of the patch's centre, a vertex with weights u, and p another of its vertices with weights w; G_j is the
@@ -11,16 +11,18 @@ rigid motion of joint j. Then
 
     x_p - x_c = sum_j w_j (G_j p - G_j c) + sum_j (w_j - u_j) G_j c.
 
-The first sum is at most |p - c|. The second is a change of weights at c as in `skinning.weight_error_bound`, so it is
-at most sum_b |E_b| |G_b c - G_parent c|, where E_b is the sum of w_j - u_j over b and the joints below it; and as b
-turns about its centre c_b by its own angle t_b, |G_b c - G_parent c| <= 2 sin(t_b / 2) |c - c_b|.
+The first sum is at most |p - c|. The second is a change of weights at c as in `skinning.weight_error_bound`. So it is
+at most sum_b |E_b| |G_b c - G_parent c|, where E_b is the sum of w_j - u_j over b and the joints below it. As b turns
+about its centre c_b by its own angle t_b, |G_b c - G_parent c| <= 2 sin(t_b / 2) |c - c_b|.
 
-**Skinned bodies** are projected in float32, in memory that is allocated once; vertices whose place on the screen comes
-within twice the rounding error of the furthest are handed on, and float64 decides. So the furthest of them in float64
-is the furthest of all. With u = 2**-24, a clip coordinate c = r . v + d is a sum of three products of rounded factors
-and d, so it is off by at most 6 u (sum |r_k| |v_k| + |d|), and 8 u of that, the sphere's reach added, holds what the
-reach and its rounding add: call it e_c. A quotient q = c / w, with w >= w_least, is off by at most (e_c + |q| e_w) /
-w_least + 4 u |q|, where |q| is at most 1 for what is on the screen.
+**Skinned bodies** are projected in float32, in memory that is allocated once. Vertices whose place on the screen is
+within twice the rounding error of the furthest one are handed on, and float64 decides between them. So the furthest of
+them in float64 is the furthest of all.
+
+The rounding error follows with u = 2**-24. A clip coordinate c = r . v + d is a sum of three products of rounded
+factors and d, so it is off by at most 6 u (sum |r_k| |v_k| + |d|). The bound e_c is 8 u of that, with the sphere's
+reach added, which covers what the reach and its rounding add. A quotient q = c / w, with w >= w_least, is off by at
+most (e_c + |q| e_w) / w_least + 4 u |q|, where |q| is at most 1 for anything on the screen.
 """
 
 from __future__ import annotations
@@ -39,13 +41,13 @@ from trilane.body.skinning import blend_matrices, branch_sums, joint_distance, l
 from trilane.cache import Arrays, cached_arrays
 from trilane.scene.crop import Rect
 
-#: Half the distance from 1 to the next float32: a rounding is off by this share at most.
+#: Half the distance from 1 to the next float32: the largest relative error of a rounding.
 U = 2.0**-24
 W_LEAST = 1e-9
 
 
 class Outermost:
-    """Finds outermost vertices of bodies with `count` vertices."""
+    """Finds the outermost vertices of bodies with `count` vertices."""
 
     def __init__(self, count: int) -> None:
         self.count = count
@@ -54,9 +56,9 @@ class Outermost:
         self._is_far = np.empty(count, np.bool_)
 
     def of(self, vertices: F32, camera: F64, radius: float) -> I64 | None:
-        """Numbers of the vertices (N,) that may be outermost of spheres of `radius` metres about `vertices` (V,3).
+        """Return numbers (N,) of the vertices whose spheres of `radius` metres about `vertices` (V,3) may be outermost.
 
-        `camera`: (4,4) to clip space. None when a sphere may reach over the screen's edge or a clip plane.
+        `camera`: matrix (4,4) to clip space. None when a sphere may reach over the screen's edge or a clip plane.
         """
         reach = radius * np.linalg.norm(camera[:, :3], axis=1)
         error = self._project(vertices, camera, reach)
@@ -78,14 +80,17 @@ class Outermost:
         return np.concatenate(found) if len(found) == len(sides) else None
 
     def _project(self, vertices: F32, camera: F64, reach: F64) -> F64:
-        """Write the clip coordinates; by how much each of the four may be off."""
+        """Write the clip coordinates, and return the error bound of each of the four."""
         np.matmul(camera[:, :3].astype(np.float32), vertices.T, out=self._flat)
         self._flat += camera[:, 3:].astype(np.float32)
         furthest = max(float(vertices.max()), -float(vertices.min()))
         return np.asarray(8 * U * (np.abs(camera[:, :3]).sum(axis=1) * furthest + np.abs(camera[:, 3]) + reach))
 
     def _side(self, row: F32, reach: float, sign: int, slack: float) -> I64 | None:
-        """The vertices that may be lowest along `row` of clip coordinates (`sign` 1) or highest (-1)."""
+        """Return the vertices that may be lowest along `row` of clip coordinates (`sign` 1) or highest (-1).
+
+        None when one may be beyond the screen's edge.
+        """
         scratch, least, most = self._scratch
         place = np.subtract(row, np.float32(reach), out=scratch) if sign > 0 else np.negative(row, out=scratch)
         if sign < 0:
@@ -97,21 +102,21 @@ class Outermost:
         return np.flatnonzero(np.less_equal(place, np.float32(lowest + slack + U), out=self._is_far))
 
 
-#: Largest distance between the middles of a patch's triangles, metres: of coarse patches, and of fine ones.
+#: Largest distance between the middles of a patch's triangles, metres, for coarse and for fine patches.
 EXTENTS_M = (0.08, 0.02)
 LEAST_FACES = 4
-#: Joint angle, radians, that patches are cut for: triangles that move apart at this angle are put into other patches.
+#: Joint angle, radians, for which patches are cut: triangles that move apart at this angle are in different patches.
 TYPICAL_TURN = 0.5
-VERSION = "patches 1"  # to be raised when the same body gives other patches
+VERSION = "patches 1"  # raise it when the same body gives other patches
 
 
 @dataclass(frozen=True)
 class Level:
     """P patches of one level of detail.
 
-    `centres`: (P,) vertex indices.
-    `size`, `give`: (P,) and (P,54). The sphere about a patch's posed centre has the radius
-    size + sum_b give_b 2 sin(t_b / 2), metres, where t_b is the angle of joint b = 1..54.
+    `centres`: vertex indices (P,).
+    `size`, `give`: (P,) and (P,54). The sphere about a patch's posed centre has the radius size + sum_b give_b 2
+    sin(t_b / 2), metres, where t_b is the angle of joint b = 1..54.
     `blend`: (P,54) the furthest that the pose blend shapes of a joint move a vertex, metres per unit of |R - I|.
     `parts`: for each patch, the indices of its patches in the next level; in the last level, of its vertices.
     `faces`: for each patch, the indices of its triangles.
@@ -126,12 +131,12 @@ class Level:
 
 
 def join(groups: list[I64], chosen: I64) -> I64:
-    """The indices of the groups that `chosen` lists, in one array."""
+    """Join the indices of the groups that `chosen` lists into one array."""
     return np.concatenate([groups[patch] for patch in chosen]) if len(chosen) else np.zeros(0, np.int64)
 
 
 def build_levels(shaped: ShapedBody, weights: F64) -> list[Level]:
-    """Coarse and fine patches of all triangles of the body, skinned with `weights` (V,55); cached."""
+    """Return coarse and fine patches of all triangles of the body, skinned with `weights` (V,55); cached."""
     body = shaped.body
     sources: list[NDArray[Any]] = [shaped.vertices, shaped.joints, body.parents, body.faces, weights]
     sources += [body.posedirs] if body.posedirs is not None else []
@@ -195,7 +200,7 @@ def _level(
 
 
 def _blend_reach(posedirs: NDArray[np.float32] | None, count: int) -> F64:
-    """(V,54) metres: how far each joint's pose blend shapes can move each vertex at |R - I| = 1."""
+    """Return how far (V,54), metres, each joint's pose blend shapes can move each vertex at |R - I| = 1."""
     if posedirs is None:
         return np.zeros((count, 54))
     blocks = posedirs.reshape(count, 3, 54, 9)
@@ -203,7 +208,7 @@ def _blend_reach(posedirs: NDArray[np.float32] | None, count: int) -> F64:
 
 
 def _bisect(features: F64, rows: I64, extent: float) -> list[I64]:
-    """`rows` in groups: halved along the longest axis of their `features` until no axis is longer than `extent`."""
+    """Halve `rows` along the longest axis of their `features` until no axis of a group is longer than `extent`."""
     here = features[rows]
     low, high = here.min(axis=0), here.max(axis=0)
     axis = int((high - low).argmax())
@@ -225,25 +230,25 @@ ROUNDING_NDC = 1e-6
 
 @dataclass
 class _Extent:
-    """Least and greatest (x, y) of the points added so far, normalised device coordinates."""
+    """Least and greatest (x, y) of the points added so far, in normalised device coordinates."""
 
     low: F64 = field(default_factory=lambda: np.full(2, np.inf))
     high: F64 = field(default_factory=lambda: np.full(2, -np.inf))
 
     def add(self, low: F64, high: F64) -> None:
-        """Widen by points whose bounds are `low` and `high` (N,2)."""
+        """Widen the extent by points whose bounds are `low` and `high` (N,2)."""
         if len(low):
             np.minimum(self.low, low.min(axis=0), out=self.low)
             np.maximum(self.high, high.max(axis=0), out=self.high)
 
     def widened_by(self, low: F64, high: F64) -> Mask:
-        """(N,) which of the bounds `low`, `high` (N,2) would move a side that is not yet at the screen's edge."""
+        """Return which (N,) of the bounds `low`, `high` (N,2) would move a side that is not at the screen's edge."""
         return np.asarray(
             (((low < self.low) & (self.low > -1.0)) | ((high > self.high) & (self.high < 1.0))).any(axis=1)
         )
 
     def rect(self) -> Rect | None:
-        """The rectangle, clipped to the screen; None when it is empty."""
+        """Return the rectangle, clipped to the screen; None when it is empty."""
         low, high = np.maximum(self.low - ROUNDING_NDC, -1.0), np.minimum(self.high + ROUNDING_NDC, 1.0)
         if not (low < high).all():
             return None
@@ -252,9 +257,10 @@ class _Extent:
 
 @dataclass(frozen=True)
 class _View:
-    """One frame: the camera, (4,4) to clip space, with the norms of its rows, and the body's pose.
+    """The camera and the body's pose in one frame.
 
-    `per_joint` (55,16): each joint's matrix from rest to clip space. `turned` (54,): |R - I| of joints 1 to 54.
+    The camera is a matrix (4,4) to clip space, with the norms of its rows. `per_joint` (55,16): each joint's matrix
+    from rest to clip space. `turned` (54,): |R - I| of joints 1 to 54.
     """
 
     camera: F64
@@ -283,16 +289,16 @@ class _View:
 
 
 class MeshBounds:
-    """Bounds of one shaped body, for any pose and camera."""
+    """Computes bounds of one shaped body, for any pose and camera."""
 
     def __init__(
         self, shaped: ShapedBody, weight_count: int | None = None, standoff_m: float = 0.0, pose_blend: bool = True
     ) -> None:
         """Cut the body into patches.
 
-        `shaped`: the body.
-        `weight_count`: how many skin weights of a vertex it is drawn with; None for all.
-        `standoff_m`: how far clothes and hair reach from the mesh, metres.
+        `shaped`: body.
+        `weight_count`: number of skin weights with which a vertex is drawn; None for all.
+        `standoff_m`: distance that clothes and hair reach from the mesh, metres.
         `pose_blend`: whether its pose blend shapes, if any, are drawn.
         """
         body = shaped.body
@@ -307,9 +313,10 @@ class MeshBounds:
         self.reach_m = _reach(shaped, self._weights, self._levels) + standoff_m + ROUNDING_M
 
     def is_off_screen(self, root: F64, clip: ArrayLike) -> bool:
-        """Whether the mesh is surely off the screen, in any pose, with its root joint at `root` (3,), world metres.
+        """Return whether the mesh is certainly off the screen in any pose.
 
-        The body lies in a sphere about its root joint, which is compared with the six planes of the clip volume.
+        `root`: place of its root joint, (3,), world metres. The body lies in a sphere about this joint, which is
+        compared with the six planes of the clip volume.
         """
         camera = np.asarray(clip, np.float64)
         planes = np.concatenate([camera[3] + camera[:3], camera[3] - camera[:3]])
@@ -317,18 +324,18 @@ class MeshBounds:
         return bool((away < -self.reach_m * np.linalg.norm(planes[:, :3], axis=1)).any())
 
     def may_be_seen(self, posed: Posed, clip: ArrayLike) -> bool:
-        """Whether the mesh may be on the screen, by its largest patches: no when it surely is not, at little cost."""
+        """Return whether the mesh may be on the screen, by its largest patches: false only when it certainly is not."""
         view = _View.of(posed, clip)
         level = self._levels[0]
         touching, cut = self._sort_out(level, np.arange(len(level.centres)), view, _Extent())
         return bool(len(touching) or len(cut))
 
     def rect(self, posed: Posed, clip: ArrayLike, vertices: NDArray[np.float32] | None = None) -> Rect | None:
-        """The mesh's rectangle on the screen, clipped to it; None when nothing is visible.
+        """Return the mesh's rectangle on the screen, clipped to it; None when nothing is visible.
 
-        `posed`: the frame, of `Skeleton.pose`.
-        `clip`: (4,4) projection @ view, of any lens.
-        `vertices`: (V,3) the frame's skinned vertices where the caller has them: a body wholly on the screen then needs
+        `posed`: a frame of `Skeleton.pose`.
+        `clip`: projection @ view (4,4), of any lens.
+        `vertices`: skinned vertices (V,3) of the frame, if the caller has them: a body wholly on the screen then needs
         no patches.
         """
         view = _View.of(posed, clip)
@@ -344,7 +351,7 @@ class MeshBounds:
         return seen.rect()
 
     def _rect_of_whole(self, vertices: NDArray[np.float32], view: _View) -> Rect | None:
-        """The rectangle of a body that is wholly on the screen; None when a part of it may be off the screen."""
+        """Return the rectangle of a body that is wholly on the screen; None when a part of it may be off the screen."""
         radius = self._standoff + ROUNDING_M
         if self._outermost is None or self._outermost.count != len(vertices):
             self._outermost = Outermost(len(vertices))
@@ -357,7 +364,7 @@ class MeshBounds:
         return seen.rect() if (seen.low > -1.0).all() and (seen.high < 1.0).all() else None
 
     def _sort_out(self, level: Level, rows: I64, view: _View, seen: _Extent) -> tuple[I64, I64]:
-        """Indices of the patches `rows` that may widen `seen`, and of the ones that the near plane may cut."""
+        """Return the patches of `rows` that may widen `seen`, and those that the near plane may cut, as indices."""
         radius = level.size[rows] + (self._standoff + ROUNDING_M)
         radius += np.einsum("pj,j->p", level.give[rows], view.turned / np.sqrt(2.0))
         if self._blend is not None:
@@ -366,14 +373,14 @@ class MeshBounds:
         front, cut = _against_near(centres, radius, view)
         low, high = _quotients(centres, radius, view)
         front &= ((high >= -1.0) & (low <= 1.0)).all(axis=1)
-        # A point of each patch that is surely covered widens the rectangle now, so that fewer patches need refining:
-        # the centre, or where blend shapes may have moved the centre, the inner side of its sphere.
+        # A point of each patch that is certainly covered widens the rectangle now, so that fewer patches need refining.
+        # It is the centre, or where blend shapes may have moved the centre, the inner side of its sphere.
         point = _quotients(centres[front], np.full(int(front.sum()), self._standoff), view)
         seen.add(*(point if self._blend is None else (high[front], low[front])))
         return rows[front][seen.widened_by(low[front], high[front])], rows[cut]
 
     def _project(self, vertices: NDArray[np.integer[Any]], view: _View, blend: bool = True) -> F64:
-        """(N,4) clip coordinates of `vertices` (N,); `blend`: apply the pose blend shapes."""
+        """Return clip coordinates (N,4) of `vertices` (N,). `blend`: whether to apply the pose blend shapes."""
         rest = self._rest[vertices]
         if blend and self._blend is not None:
             rest[:, :3] += np.einsum("naf,f->na", self._blend[vertices], view.posed.feature)
@@ -392,22 +399,22 @@ class MeshBounds:
 
 
 def _reach(shaped: ShapedBody, weights: F64, levels: list[Level]) -> float:
-    """Metres: the furthest that any pose brings a vertex from the root joint.
+    """Return the furthest, in metres, that any pose brings a vertex from the root joint.
 
-    A joint is no further from the root than the bones between them are long, a point that it moves no further from it
-    than at rest, and a skinned vertex is a mean of such points. |R - I| of a joint is at most 2 sqrt(2).
+    A joint is no further from the root than the sum of the bones between them. A point that it moves is no further from
+    it than at rest, and a skinned vertex is a mean of such points. |R - I| of a joint is at most 2 sqrt(2).
     """
     parents, joints = shaped.body.parents, shaped.joints
     bones = np.linalg.norm(joints - np.where(parents[:, None] < 0, joints, joints[parents]), axis=1)
     bones[0] = 0.0
-    chain = branch_sums(parents, np.eye(JOINTS)) @ bones  # of all joints from the root to each
+    chain = branch_sums(parents, np.eye(JOINTS)) @ bones  # length of the bones from the root to each joint
     furthest = np.where(weights > 0, joint_distance(shaped) + chain, 0.0).max()
     blend = max(float(level.blend.sum(axis=1).max()) for level in levels) * 2.0 * np.sqrt(2.0)
     return float(furthest + blend)
 
 
 def _against_near(centres: F64, radius: F64, view: _View) -> tuple[Mask, Mask]:
-    """(N,) which spheres lie wholly in front of the near plane (and W = 0), and (N,) which cross it.
+    """Return which spheres (N,) lie wholly in front of the near plane (and W = 0), and which (N,) cross it.
 
     A sphere that is neither is not visible.
     """
@@ -418,9 +425,10 @@ def _against_near(centres: F64, radius: F64, view: _View) -> tuple[Mask, Mask]:
 
 
 def _quotients(points: F64, radius: F64, view: _View) -> tuple[F64, F64]:
-    """Least and greatest (X/W, Y/W), each (N,2), over spheres of `radius` (N,) about clip coordinates `points` (N,4).
+    """Return the least and greatest (X/W, Y/W), (N,2) each, over spheres about clip coordinates `points` (N,4).
 
-    X, Y and W are linear in the point, so over a sphere each varies by the radius times the norm of its matrix row.
+    `radius`: (N,). X, Y and W are linear in the point, so over a sphere each varies by the radius times the norm of its
+    matrix row.
     """
     reach = radius[:, None] * view.norms[:2]
     least = np.maximum(points[:, 3] - radius * view.norms[3], W_LEAST)[:, None]
@@ -430,9 +438,9 @@ def _quotients(points: F64, radius: F64, view: _View) -> tuple[F64, F64]:
 
 
 def _clip_near(triangles: F64, slack: float) -> F64:
-    """(N,4) clip coordinates of the corners in front of the near plane, and of the points where edges cross it.
+    """Return clip coordinates (N,4) of the corners in front of the near plane, and of the points where edges cross it.
 
-    `triangles` (F,3,4). `slack`: how far the plane is moved back, in clip coordinates.
+    `triangles` (F,3,4). `slack`: distance that the plane is moved back, in clip coordinates.
     """
     near = triangles[:, :, 2] + triangles[:, :, 3] + slack
     points = [triangles[near > 0.0]]

@@ -1,8 +1,8 @@
-"""The pose stage: from a frame's number to everything that the other stages have to know about it.
+"""The pose stage: from a frame's number to everything that the other stages have to know about the frame.
 
-Motion and camera are asked for the frame's media time, frame / fps; nothing that is not finite leaves here. A frame
-that shows what an earlier one showed, or nobody, skins nothing and skips the stages that would draw it. Of each body as
-much is modelled as the picture needs: the cheapest level of detail within the budget of pixels.
+Motion and camera are sampled at the frame's media time, frame / fps; no number that is not finite leaves this stage. A
+frame that shows what an earlier one showed, or nobody, skins nothing and skips the stages that would draw it. Each body
+gets the cheapest level of detail whose error is within the budget of pixels.
 """
 
 from __future__ import annotations
@@ -43,7 +43,10 @@ FINEST = len(DETAILS) - 1
 
 @dataclass(frozen=True)
 class SeenAvatar:
-    """An avatar on the screen. `level`: of `DETAILS`. `error_px`: the bound on what the level moves on the picture."""
+    """An avatar on the screen.
+
+    `level`: an index into `DETAILS`. `error_px`: bound of the level's error on the picture, pixels.
+    """
 
     rect: Rect
     level: int
@@ -53,8 +56,8 @@ class SeenAvatar:
 class ModelledBody:
     """A body that several avatars of a scene may share, with what each level of detail needs.
 
-    `skins`: whether the CPU unit skins it. `budget_px`: the largest error of a level on the picture; 0: everything is
-    modelled.
+    `skins`: whether the CPU unit skins it. `budget_px`: largest error of a level on the picture, pixels; with 0
+    everything is modelled.
     """
 
     def __init__(self, shaped: ShapedBody, skins: bool, budget_px: float) -> None:
@@ -65,7 +68,7 @@ class ModelledBody:
         self.moved_to_skin = [moved_of_kept(skinner.constant_bytes) for skinner in self.skinners]
 
     def _skinners(self) -> list[FrameSkinner]:
-        """One for each level; only the finest when nothing may be left out."""
+        """Return a skinner for each level; the finest for all when nothing may be left out."""
         if self.budget_px == 0.0:
             return [FrameSkinner(self.shaped)] * len(DETAILS)
         return [FrameSkinner(self.shaped, detail) for detail in DETAILS]
@@ -78,7 +81,7 @@ class ModelledBody:
         return Skeleton(self.shaped.joints, self.shaped.body.parents)
 
     def choose(self, posed: Posed, clip: F64, output: Shape) -> tuple[int, float]:
-        """The level of detail of a frame, and the bound on its error in pixels of a picture of `output`."""
+        """Return the level of detail of a frame, and the bound on its error in pixels of a picture of `output`."""
         if self.budget_px == 0.0:
             return FINEST, 0.0
         w = least_w(posed, clip, self.detail.reach, self.detail.blend_m(posed))
@@ -91,8 +94,9 @@ class ModelledBody:
     ) -> SeenAvatar | None:
         """Skin the body into `vertices`, if given, and find its rectangle; None when nothing of it is visible.
 
-        `posed`: the frame. `clip` (4,4): projection @ view. `output`: (height, width) of the picture. `moved`: counts
-        the vertices, which are written, then read to find the rectangle, and what skinning reads from memory.
+        `posed`: pose of the frame. `clip`: projection @ view, (4,4). `output`: (height, width) of the picture. `moved`:
+        counter of the vertices, which are written, then read to find the rectangle, and of what skinning reads from
+        memory.
         """
         level, error = self.choose(posed, clip, output)
         if vertices is not None:
@@ -105,7 +109,7 @@ class ModelledBody:
 
 
 def widened(rect: Rect, error_px: float, output: Shape) -> Rect:
-    """`rect` with `error_px` pixels more on every side, clipped to the screen."""
+    """Return `rect` with `error_px` pixels more on every side, clipped to the screen."""
     x, y = 2.0 * error_px / output[1], 2.0 * error_px / output[0]
     low = max(rect.x0 - x, SCREEN.x0), max(rect.y0 - y, SCREEN.y0)
     high = min(rect.x1 + x, SCREEN.x1), min(rect.y1 + y, SCREEN.y1)
@@ -120,11 +124,11 @@ class _Actor:
     body: ModelledBody
 
     def is_off_screen(self, translation: F64, clip: F64) -> bool:
-        """Whether no pose at `translation` (3,), before the mover's `world`, brings the body onto the screen."""
+        """Return whether no pose at `translation` (3,), before the mover's `world`, brings the body onto the screen."""
         return self.body.bounds.is_off_screen(self.pivot(translation), clip)
 
     def pivot(self, translation: F64) -> F64:
-        """Where the body's root is (3,) at `translation` (3,), in the scene."""
+        """Return the place of the body's root (3,) in the scene when it is at `translation` (3,)."""
         return np.asarray(
             self.mover.world[:3, :3] @ (self.body.shaped.joints[0] + translation) + self.mover.world[:3, 3]
         )
@@ -132,8 +136,9 @@ class _Actor:
 
 @dataclass(frozen=True)
 class FramePlan:
-    """What was decided for a frame: its work, the tensor's shape, None with nobody in view, and by its number each
-    visible avatar.
+    """The decisions for a frame.
+
+    They are its work, the tensor's shape, None with nobody in view, and each visible avatar by its number.
     """
 
     work: FrameWork
@@ -151,15 +156,18 @@ class _Made:
     plan: FramePlan
 
 
-#: Fields of the header in which frames that show the same differ.
+#: Fields of the header that differ even between frames that show the same.
 OF_THE_FRAME = {*(name for name, _ in FRAME_FIELDS), "media_time_s", "work"}
 
 
 class PoseStage:
-    """Stage `pose` of the CPU unit: no input edge, an output edge of headers. `plan`: plan of the last frame."""
+    """Stage `pose` of the CPU unit: no input edge, an output edge of headers.
+
+    `plan`: plan of the last frame.
+    """
 
     def __init__(self, config: RunConfig, assets: Assets) -> None:
-        """The scene of `config`, whose avatars, motions and camera lie in `assets`."""
+        """Prepare the scene of `config`, whose avatars, motions and camera lie in `assets`."""
         scene = config.scene
         self._fps = scene.fps
         self._output = (scene.output.height, scene.output.width)
@@ -196,11 +204,14 @@ class PoseStage:
         self._vertices = [posed_vertices(packet.payload, self._counts) for packet in outputs]
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
-        """Fill `outputs[slot_out]` for `frame`. A `Skip` but for full work, which all frames of a fixed plan are.
+        """Fill `outputs[slot_out]` for `frame`; the result is a `Skip` except for full work.
 
-        Metrics: `visible`, how many avatars are; of a full frame `level` of `body.skinning.DETAILS` and `error_px`, the
-        bound on what it moves on the picture, both of the worst avatar; `density` of a planned tensor; the bytes moved.
-        The least: what was sampled of motions and camera, the header, and of avatars that were skinned the vertices.
+        All frames of a fixed plan are full work.
+
+        Metrics: `visible`, number of visible avatars; for a full frame `level` of `body.skinning.DETAILS` and
+        `error_px`, the bound on its error on the picture, both of the worst avatar; `density` of a planned tensor; the
+        bytes moved.
+        The least bytes: what was sampled of motions and camera, the header, and the vertices of skinned avatars.
 
         Raises ValueError without `slot_out`, TrilaneError when a number of the frame is not finite.
         """
@@ -226,18 +237,19 @@ class PoseStage:
         else:
             packet["picture"] = frame if work is FrameWork.FULL else -1
             self.plan = replace(self.plan, work=work)
+            # Copied, because a later frame is written to the same slot.
             self._made[work] = _Made(shown, packet.copy(), self.plan)
         return _metrics(self.plan, self._moved)
 
     def _count(self, packet: NDArray[np.void], view: F64, moved: Sequence[tuple[F64, F64]]) -> None:
-        """The bytes of every frame: what was sampled, and the header."""
+        """Count the bytes of every frame: what was sampled, and the header."""
         sampled = view.nbytes + sum(array.nbytes for pair in moved for array in pair)
         self._moved.read += sampled
         self._moved.written += packet.nbytes
         self._moved.least += sampled + packet.nbytes
 
     def _view(self, t_s: float, moved: Sequence[tuple[F64, F64]]) -> F64:
-        """World to camera (4, 4): the scene's camera, turned about the first avatar as somebody steers it."""
+        """Return the matrix (4, 4) from world to camera: the scene's camera, steered about the first avatar."""
         view = self._camera.sample(t_s)
         if self._window is None:
             return view
@@ -250,20 +262,20 @@ class PoseStage:
         return FrameWork.FULL
 
     def forget(self) -> None:
-        """The next frame in which anybody is seen is a full one."""
+        """Make the next frame in which anybody is seen a full one."""
         self._made.pop(FrameWork.FULL, None)
 
     def step_to(self, rung: int) -> None:
-        """Tensors have the pixels of `RunConfig.works[rung]` from now on."""
+        """Give tensors the pixels of `RunConfig.works[rung]` from now on."""
         self._rung = rung
 
     def _shown_by(self, work: FrameWork) -> bytes | None:
         return self._made[work].shown if work in self._made else None
 
     def _make(self, slot_out: int, frame: int, view: F64, projection: F64, moved: Sequence[tuple[F64, F64]]) -> bool:
-        """Fill what the header of slot `slot_out` says of camera and avatars; whether an avatar is visible.
+        """Fill the header of slot `slot_out` with camera and avatars, and return whether an avatar is visible.
 
-        `view` and `projection` (4,4), and `moved`, each avatar's pose and place, are those of `frame`.
+        `view`, `projection` (4,4), and `moved`, each avatar's pose and place, are those of `frame`.
         """
         packet = self._slots[slot_out]
         packet["avatar_count"] = len(self._actors)
@@ -280,7 +292,7 @@ class PoseStage:
         return bool(seen)
 
     def _lay_out(self, packet: NDArray[np.void], seen: list[tuple[NDArray[np.void], SeenAvatar]]) -> FramePlan:
-        """Crop rectangles, cells and the tensor's shape; the smallest shape when nothing is to be drawn."""
+        """Set crop rectangles, cells and the tensor's shape; the smallest shape when nothing is to be drawn."""
         if not seen:
             packet["tensor_shape"] = min(self._buckets, key=lambda shape: shape[0] * shape[1])
             return FramePlan(FrameWork.NONE, None, None, {})
@@ -298,11 +310,11 @@ class PoseStage:
         return FramePlan(FrameWork.FULL, layout.shape, density, {int(avatar["avatar"]): one for avatar, one in seen})
 
     def _foreseen(self, t_s: float) -> Shape | None:
-        """The tensor's shape at `t_s`; None where it was not foreseen."""
+        """Return the tensor's shape at `t_s`; None where it was not foreseen."""
         if not self._changes:
             return None
         changes = self._changes[self._rung]
-        # Half a microsecond, so that rounding does not make a change one frame late.
+        # Half a microsecond is added so that rounding does not make a change one frame late.
         return changes[max(bisect_right(changes, t_s + 5e-7, key=lambda change: change[0]) - 1, 0)][1]
 
     def _see(
@@ -314,10 +326,10 @@ class PoseStage:
         frame: int,
         clip: NDArray[np.float64],
     ) -> SeenAvatar | None:
-        """Fill one avatar's joints, and `vertices` if given; where it is on the screen, None when it is not visible.
+        """Fill one avatar's joints, and `vertices` if given, and find it on the screen; None when it is not visible.
 
-        One that is far off the screen is not posed; one that was not seen in the last frame that was made is looked for
-        by its patches before it is skinned.
+        An avatar that is far off the screen is not posed. One that the last made frame did not show is looked for by
+        its patches before it is skinned.
         """
         pose, translation = moved[actor.index]
         avatar["avatar"], avatar["visible"] = actor.index, False
@@ -340,7 +352,7 @@ class PoseStage:
 
 
 def build(settings: Mapping[str, Any], unit: UnitContext) -> PoseStage:
-    """The pose stage of the configuration in `settings`."""
+    """Build the pose stage of the configuration in `settings`."""
     return PoseStage(RunConfig.model_validate(settings["config"]), unit.assets)
 
 
@@ -355,7 +367,7 @@ def _metrics(plan: FramePlan, moved: ByteCounter) -> Mapping[str, float]:
 
 
 def _copy_same(source: NDArray[np.void], target: NDArray[np.void]) -> None:
-    """All of a header but what belongs to its frame alone."""
+    """Copy a header without the fields that belong to its frame alone."""
     for name in source.dtype.names or ():
         if name not in OF_THE_FRAME:
             target[name] = source[name]

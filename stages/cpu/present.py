@@ -1,9 +1,9 @@
-"""The present stage: frames become a segment of video, and a digest of every frame a line beside it.
+"""The present stage: turns frames into a segment of video, and writes a line with a digest of every frame beside it.
 
-What is presented is what the slot held, digested before anything else is done to it. Each process writes one segment,
-named so that none replaces another; the parent joins them (`trilane.apps.video`). A segment is fragmented MP4: when its
-writer is killed it is readable, short of the last frame at most. Frames that somebody wants to compare when the run is
-over are kept as arrays beside it.
+The stage presents the bytes of the slot and digests them before anything else is done to them. Each process writes one
+segment, named so that none replaces another; the parent joins them (`trilane.apps.video`). A segment is fragmented MP4:
+when its writer is killed it is readable, short of the last frame at most. Frames that are to be compared after the run
+are kept as arrays beside it.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from trilane.transport.packets import Packet
 
 SEGMENTS = "segments"
 KEYFRAME_EVERY = 30
-#: One thread, no look-ahead, no reordering: every frame leaves the encoder before the next one comes.
+#: One thread, no look-ahead and no reordering: every frame leaves the encoder before the next one comes.
 ENCODER_OPTIONS = {"preset": "ultrafast", "crf": "20", "tune": "zerolatency"}
-#: Every frame is a fragment of its own and goes to the file at once.
+#: Every frame is a fragment of its own and goes to the file at once, so a killed writer loses the last one at most.
 FRAGMENTS = {"movflags": "empty_moov+default_base_moof+frag_every_frame", "flush_packets": "1"}
-MS = 1e-6  # of a nanosecond
+MS = 1e-6  # milliseconds in a nanosecond
 NOTHING = ByteCounter().figures()
 
 
 class Segment:
-    """One file of H.264 video, written frame by frame, and beside it a text file of digests.
+    """One file of H.264 video, written frame by frame, and a text file of digests beside it.
 
-    A digest line is the frame's number and the SHA-256 of its bytes (row 0 first, RGB). `moved`: bytes of the frame
-    that was begun last; the least of them are a new frame's, and those that the encoder gave.
+    A digest line is the frame's number and the SHA-256 of its bytes (row 0 first, RGB). `moved`: bytes that the latest
+    frame moved; the least are those of a new frame, and those that the encoder gave.
     """
 
     def __init__(self, path: Path, fps: float, height: int, width: int) -> None:
@@ -57,12 +57,13 @@ class Segment:
         self._digest = ""
         self._picture: Any = None
         self.moved = ByteCounter()
+        # Line buffering keeps the digests of finished frames when the process is killed.
         self._digests = path.with_suffix(".sha256").open("w", encoding="ascii", buffering=1)
 
     def digest(self, frame: int, pixels: NDArray[np.uint8], repeats: bool = False) -> None:
-        """Note the digest of `pixels`, (height, width, 3) and C-contiguous.
+        """Write the digest of `pixels`, (height, width, 3) and C-contiguous.
 
-        `repeats`: they are those of the last call.
+        `repeats`: whether they are those of the last call.
         """
         if not repeats:
             self._digest = hashlib.sha256(pixels.data).hexdigest()
@@ -72,7 +73,7 @@ class Segment:
     def add(self, frame: int, pixels: NDArray[np.uint8], repeats: bool = False) -> None:
         """Show `pixels`, (height, width, 3) RGB, from the instant of frame number `frame` on.
 
-        `repeats`: they are those of the last call, which was converted for the encoder already.
+        `repeats`: whether they are those of the last call, which are converted for the encoder already.
         """
         if not repeats:
             rgb = av.VideoFrame.from_numpy_buffer(pixels, format="rgb24")
@@ -100,7 +101,7 @@ class Segment:
 class PresentStage:
     """Stage `present` of the CPU unit: one input edge of frames, no output.
 
-    Figures of a job that is recorded: `digest_ms`, `encode_ms`, and the bytes moved; of another, that none were.
+    Figures of a recorded job: `digest_ms`, `encode_ms`, and the bytes moved; of any other job, that none were.
     """
 
     def __init__(self, config: RunConfig) -> None:
@@ -115,7 +116,7 @@ class PresentStage:
         self._kept = KeptFrames(config.out_dir, config.kept)
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
-        """Views of the slots as frames, and the encoder, made ready. Raises ValueError when the stage has outputs."""
+        """Make views of the slots as frames, and the encoder. Raises ValueError when the stage has outputs."""
         if outputs:
             raise ValueError("the present stage has no output edge")
         size = self._height * self._width * 3
@@ -156,7 +157,7 @@ class PresentStage:
 
 
 def build(settings: Mapping[str, Any], unit: UnitContext) -> PresentStage:  # noqa: ARG001 - a factory's signature
-    """The present stage of the configuration in `settings`."""
+    """Build the present stage of the configuration in `settings`."""
     return PresentStage(RunConfig.model_validate(settings["config"]))
 
 
@@ -164,14 +165,14 @@ KEPT_FOLDER = "kept"
 
 
 class KeptFrames:
-    """Keeps frames `numbers`, which rise, in `folder`/`FOLDER`."""
+    """Keeps frames `numbers`, which ascend, in `folder`/`KEPT_FOLDER`."""
 
     def __init__(self, folder: Path, numbers: Sequence[int]) -> None:
         self._folder, self._numbers = folder / KEPT_FOLDER, list(numbers)
         self._next = self._numbers.pop(0) if self._numbers else None
 
     def see(self, frame: int, pixels: U8) -> None:
-        """Keep frame `frame`, (h,w,3), if it is asked for."""
+        """Keep frame `frame`, (h,w,3), if it is among the numbers."""
         if self._next is None or frame < self._next:
             return
         self._folder.mkdir(exist_ok=True)
@@ -181,7 +182,7 @@ class KeptFrames:
 
 
 def kept_frames(folder: Path) -> dict[int, Path]:
-    """The files of the frames that were kept in `folder`, by number."""
+    """Return the files of the frames that were kept in `folder`, by number."""
     return {
         int(file.stem): file for file in sorted((folder / KEPT_FOLDER).glob("*.npy"), key=lambda file: int(file.stem))
     }

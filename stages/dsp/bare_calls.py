@@ -1,7 +1,8 @@
-"""What a network by itself takes on this machine: its own calls, on distinct inputs, in a process as a unit of a run.
+"""Measures the calls of a network alone on this machine, on distinct inputs, in a process like a unit of a run.
 
-Rule: what was measured is kept with all that it depends on, so a machine, package or network that changed is measured
-again. A network of integers runs as an avatar's does; any other one runs in ONNX Runtime, with its own numbers.
+Rule: a measurement is kept with everything that it depends on, so a machine, package or network that changed is
+measured again. A network of integers runs as an avatar's does; any other one runs in ONNX Runtime, with its own number
+types.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from trilane.transport.packets import Packet
 CACHE = "network-calls-1"
 UNIT, STAGE = "dsp", "infer"
 CALLS, INPUTS = 100, 4
-#: ONNX Runtime's names of the numbers that an input may have.
+#: NumPy types by ONNX Runtime's names of the number types that an input may have.
 NUMBERS: Mapping[str, type[np.generic]] = {
     "tensor(float)": np.float32,
     "tensor(float16)": np.float16,
@@ -45,7 +46,10 @@ Shapes = Mapping[str, Sequence[int]]
 
 
 class Calls(NamedTuple):
-    """`took_ns`: nanoseconds of each call, by number of threads. `runtime`: its name. `at`: date and time, UTC."""
+    """The measured calls of a network.
+
+    `took_ns`: nanoseconds of each call, by number of threads. `runtime`: name of the runtime. `at`: date and time, UTC.
+    """
 
     took_ns: Mapping[int, Sequence[int]]
     runtime: str
@@ -55,11 +59,11 @@ class Calls(NamedTuple):
 def calls_of(
     path: Path, shapes: Shapes, runtime: str, counts: Sequence[int], cores: Sequence[int], say: Callable[[], None]
 ) -> Calls:
-    """How long calls of the network in `path` take, without the time in which they had no core.
+    """Measure how long calls of the network in `path` take, without the time in which they had no core.
 
     `shapes`: shapes of inputs by name, in place of the file's. `runtime`: runtime of a network of integers. `counts`:
-    numbers of threads. `cores`: cores to run on, the last ones first. `say`: is called before it takes seconds. Raises
-    BadInputError for a file that cannot be read, TrilaneError when the network cannot be run.
+    numbers of threads. `cores`: cores to run on, the last ones first. `say`: is called before this takes seconds.
+    Raises BadInputError for a file that cannot be read, TrilaneError when the network cannot be run.
     """
     runs = runtime if not shapes and _integers(path) is not None else ORT
     asked = [runs, str([*cores]), str([*counts]), str(sorted(shapes.items()))]
@@ -92,7 +96,7 @@ def _measured(
 
 
 def _integers(path: Path) -> NetworkFile | None:
-    """The network in `path`, where it is one that an avatar may have."""
+    """Return the network in `path` if it is an integer network that an avatar may have; else None."""
     try:
         return read_network(path)
     except BadInputError:
@@ -100,29 +104,29 @@ def _integers(path: Path) -> NetworkFile | None:
 
 
 def _digest(path: Path) -> str:
-    """A digest of the file and its size; weights beside it do not change how long it takes."""
+    """Return a digest of the file and its size; weights beside it do not change how long a call takes."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 class CallStage:
-    """`trilane.pipeline.stage.Stage`. Frame n is a call with input n modulo the number of inputs."""
+    """A `trilane.pipeline.stage.Stage`. Frame n is a call with input n modulo the number of inputs."""
 
     def __init__(self, calls: Sequence[Callable[[], object]]) -> None:
         self._calls = calls
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
-        """There are no slots: the inputs are made with the calls."""
+        """Do nothing: there are no slots, and the inputs are made with the calls."""
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
         self._calls[frame % len(self._calls)]()
         return {}
 
     def close(self) -> None:
-        """Nothing is left."""
+        """Do nothing: nothing is left."""
 
 
 def build(settings: Mapping[str, Any], unit: UnitContext) -> CallStage:
-    """The stage that calls the network in `settings["path"]`. Raises BadInputError, MissingPartError."""
+    """Build the stage that calls the network in `settings["path"]`. Raises BadInputError, MissingPartError."""
     path, options = Path(settings["path"]), RuntimeOptions(unit.settings.threads, unit.settings.spin)
     network = None if settings["shapes"] else _integers(path)
     if network is None:
@@ -134,7 +138,10 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> CallStage:
 
 
 def _float_calls(path: Path, shapes: Shapes, options: RuntimeOptions) -> list[Callable[[], object]]:
-    """Calls in ONNX Runtime. Raises BadInputError for a graph that it cannot load or whose inputs are no numbers."""
+    """Return calls in ONNX Runtime.
+
+    Raises BadInputError for a graph that it cannot load or whose inputs are no numbers.
+    """
     import onnxruntime
 
     from trilane.stages.dsp.ort import LOAD_ERRORS, PROVIDER, settings_of
@@ -153,7 +160,7 @@ def _float_calls(path: Path, shapes: Shapes, options: RuntimeOptions) -> list[Ca
 
 
 def _random(seed: int, shape: Sequence[int], numbers: type[np.generic]) -> NDArray[Any]:
-    """Random numbers, the same for a seed: bytes of all values, floats of a normal distribution, else 0 and 1."""
+    """Return random numbers, the same for a seed: bytes of all values, normally distributed floats, else 0 and 1."""
     rng = np.random.default_rng(seed)
     if numbers is np.uint8:
         return rng.integers(0, 256, shape, dtype=np.uint8)

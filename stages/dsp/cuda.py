@@ -24,9 +24,10 @@ SILENT = 4
 
 
 def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
-    """Compile `network` for the GPU; `options.device`: settings of the CUDA provider.
+    """Compile `network` for the GPU.
 
-    Raises BadInputError when a node of it does not run there, MissingPartError when no GPU works.
+    `options.device`: settings of the CUDA provider. Raises BadInputError when a node of the network does not run there,
+    MissingPartError when no GPU works.
     """
     _check_gpu()
     check_integer_layers(network)
@@ -43,7 +44,7 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
 
 @cache
 def _check_gpu() -> None:
-    """Raises MissingPartError when the CUDA provider cannot be loaded; ONNX Runtime itself reports no error then."""
+    """Raise MissingPartError when the CUDA provider cannot be loaded; ONNX Runtime itself reports no error then."""
     values = [helper.make_tensor_value_info(name, TensorProto.UINT8, [1]) for name in ("x", "y")]
     graph = helper.make_graph([helper.make_node("Identity", ["x"], ["y"])], "probe", values[:1], values[1:])
     probe = helper.make_model(graph, opset_imports=[helper.make_opsetid("", PROBE_OPSET)], ir_version=PROBE_IR)

@@ -1,8 +1,8 @@
 """The infer stage: bytes of a slot in, bytes of a slot out, by the avatar's integer network or a part of it.
 
-Sessions and bindings are all made in `bind`, a frame allocates nothing, and with nobody in view nothing is run. The
-tensors that cross a cut of the network lie in a slot in the order of the cut, each on its own cache lines; every
-process that looks at the same configuration finds the same places.
+`bind` makes all sessions and bindings, a frame allocates nothing, and nothing runs with nobody in view. The tensors
+that cross a cut of the network lie in a slot in the order of the cut, each on its own cache lines. Every process that
+reads the same configuration finds the same places.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from trilane.stages.config import RunConfig
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, Session, copies_slots, has_device, load_runtime, resolve
 from trilane.transport.packets import Packet
 
-VERSION = "network parts 1"  # to be raised when the same network and cuts give other parts
+VERSION = "network parts 1"  # raise it when the same network and cuts give other parts
 SHAPES = ("inputs", "outputs", "crossing_in", "crossing_out")
 LINE = 64  # bytes of a cache line, and of the widest vector register
 
 
 def parts_for(config: RunConfig, network: NetworkFile, shape: Shape) -> list[NetworkPart]:
-    """The parts of `network` for tensors of `shape`, cut as `config` says; one part when it is not cut.
+    """Return the parts of `network` for tensors of `shape`, cut as `config` says; one part when it is not cut.
 
     They are cached: inferring every shape of the graph again takes longer than reading them.
     """
@@ -51,7 +51,7 @@ def parts_for(config: RunConfig, network: NetworkFile, shape: Shape) -> list[Net
 
 
 def _to_arrays(parts: Sequence[NetworkPart]) -> dict[str, NDArray[Any]]:
-    """The model's bytes of each part, and its shapes as JSON."""
+    """Return the model's bytes of each part, and its shapes as JSON."""
     arrays: dict[str, NDArray[Any]] = {}
     for number, part in enumerate(parts):
         shapes = json.dumps({name: list(getattr(part, name).items()) for name in SHAPES})
@@ -71,7 +71,7 @@ def _from_arrays(arrays: Arrays, where: str) -> list[NetworkPart]:
 
 
 def crossing_bytes(config: RunConfig, network: NetworkFile) -> list[int]:
-    """Bytes that cross each cut of `network`, for the scene's shape that needs most. Raises BadInputError."""
+    """Return the bytes that cross each cut of `network`, for the scene's largest need. Raises BadInputError."""
     if not config.cuts:
         return []
     shapes = [[part.crossing_out for part in parts_for(config, network, shape)[:-1]] for shape in config.buckets]
@@ -79,7 +79,7 @@ def crossing_bytes(config: RunConfig, network: NetworkFile) -> list[int]:
 
 
 def constant_bytes(model: onnx.ModelProto) -> int:
-    """Bytes of the constants of `model`: weights, biases, scales."""
+    """Return the number of bytes in the constants of `model`: weights, biases, scales."""
     return sum(
         math.prod(tensor.dims) * onnx.helper.tensor_dtype_to_np_dtype(tensor.data_type).itemsize
         for tensor in constants_of(model).values()
@@ -87,12 +87,12 @@ def constant_bytes(model: onnx.ModelProto) -> int:
 
 
 def extent(shapes: Shapes) -> int:
-    """Bytes that tensors of `shapes` take up in a slot."""
+    """Return the number of bytes that tensors of `shapes` take up in a slot."""
     return sum(-(-math.prod(shape) // LINE) * LINE for shape in shapes.values())
 
 
 def views(payload: U8, shapes: Shapes) -> dict[str, U8]:
-    """Tensors of `shapes` in a slot, in their order. Raises ValueError when the slot is too small."""
+    """Return the tensors of `shapes` in a slot, in their order. Raises ValueError when the slot is too small."""
     found, start = {}, 0
     for name, shape in shapes.items():
         size = math.prod(shape)
@@ -110,9 +110,10 @@ LOAD_AT_ONCE = ("openvino", "ort")
 
 @dataclass(frozen=True)
 class BoundPart:
-    """A part on a pair of slots. `passed`: (from, to) tensors that a later part reads as this one was given them.
+    """A part on a pair of slots.
 
-    `in_bytes`, `out_bytes`: of what the network reads, its weights included where they come from memory, and writes.
+    `passed`: pairs (from, to) of tensors that a later part reads unchanged. `in_bytes`: bytes that the network reads,
+    with its weights where they come from memory. `out_bytes`: bytes that it writes.
     """
 
     binding: Binding
@@ -131,10 +132,10 @@ class BoundPart:
 
 
 class InferStage:
-    """`trilane.pipeline.stage.Stage`. One inference a frame; a whole network turns H·W·C bytes into H·W·4.
+    """A `trilane.pipeline.stage.Stage` with one inference a frame; a whole network turns H·W·C bytes into H·W·4.
 
-    `network`: of all avatars, which share the tensor, each in its `tensor_rect`.
-    `part`: which one of the parts that the configuration's cuts make.
+    `network`: network of all avatars, which share the tensor, each in its `tensor_rect`.
+    `part`: number of the part that the configuration's cuts make.
     Raises BadInputError, MissingPartError when made or bound.
     """
 
@@ -153,7 +154,10 @@ class InferStage:
         self._outputs: Sequence[Packet] = ()
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
-        """Compile every shape, bind every pair of slots, run each shape once: as many at a time as there are cores."""
+        """Compile every shape, bind every pair of slots, run each shape once.
+
+        As many shapes are prepared at a time as there are cores, for runtimes that allow it.
+        """
         self._inputs, self._outputs = inputs, outputs
         at_once = len(machine.here.cores()) if self.runtime in LOAD_AT_ONCE else 1
         with ThreadPoolExecutor(at_once) as pool:
@@ -161,7 +165,7 @@ class InferStage:
                 self._bindings |= {(shape, *pair): binding for pair, binding in bindings.items()}
 
     def _prepare(self, shape: Shape) -> dict[tuple[int, int], BoundPart]:
-        """The part for tensors of `shape` on each pair of slots."""
+        """Return the part for tensors of `shape` on each pair of slots."""
         part = parts_for(self._config, self._network, shape)[self._part]
         session = self._module.load(part, self._options)
         pairs = product(enumerate(self._inputs), enumerate(self._outputs))
@@ -169,14 +173,15 @@ class InferStage:
         bindings = {
             (i, o): _bound(session, part, source.payload, target.payload, weights) for (i, source), (o, target) in pairs
         }
+        # A session allocates memory in its first run; later runs, those of frames, do not.
         bindings[0, 0].run(ByteCounter())
         return bindings
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
         """Infer the tensor unless nobody is in view; then the picture is transparent.
 
-        Figures: `inferred`, 0 or 1, and the bytes moved. The least: what the network is given and what it gives, and
-        its weights where they do not fit into the last-level cache.
+        Figures: `inferred`, 0 or 1, and the bytes moved. The least bytes are the network's input and output, and its
+        weights where they do not fit into the last-level cache.
         """
         assert slot_in is not None and slot_out is not None
         pose, picture, moved = self._inputs[slot_in].header, self._outputs[slot_out].payload, self._moved
@@ -194,7 +199,7 @@ class InferStage:
 
     @property
     def sessions(self) -> int:
-        """How many compiled networks are ready: one for each shape."""
+        """Number of compiled networks that are ready: one for each shape."""
         return len({shape for shape, _, _ in self._bindings})
 
     def close(self) -> None:
@@ -211,7 +216,7 @@ class InferStage:
 
 
 def build(settings: Mapping[str, Any], unit: UnitContext) -> InferStage:
-    """The stage that runs part `settings["part"]` of the network. Raises BadInputError, MissingPartError."""
+    """Build the stage that runs part `settings["part"]` of the network. Raises BadInputError, MissingPartError."""
     config = RunConfig.model_validate(settings["config"])
     if has_device(config.runtime):
         unit.use_device(config.runtime)
@@ -219,7 +224,10 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> InferStage:
 
 
 def _bound(session: Session, part: NetworkPart, source: U8, target: U8, weights: int) -> BoundPart:
-    """`weights`: bytes of the network's own that each run reads from memory."""
+    """Bind `part` to the slots `source` and `target`.
+
+    `weights`: bytes of the network's own that each run reads from memory.
+    """
     given, handed_on = views(source, part.crossing_in), views(target, part.crossing_out)
     inputs, outputs = [given[name] for name in part.inputs], [handed_on[name] for name in part.outputs]
     passed = [(given[name], handed_on[name]) for name in handed_on if name not in part.outputs]

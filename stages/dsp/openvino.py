@@ -52,7 +52,7 @@ class OpenvinoSession:
 
 
 def load(network: IntegerNetwork, options: RuntimeOptions) -> OpenvinoSession:
-    """Compile `network`, or take what was compiled before.
+    """Compile `network`, or read what was compiled before from the cache.
 
     Raises BadInputError when OpenVINO cannot load it or would run a layer in float.
     """
@@ -74,13 +74,13 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OpenvinoSession:
         raise BadInputError(network.where, str(error), "a network that OpenVINO loads") from error
     _check_integer(compiled, network)
     if stored is not None:
-        with contextlib.suppress(BadInputError):  # a full disk: it is compiled again the next time
+        with contextlib.suppress(BadInputError):  # a full disk: it is compiled again next time
             write_bytes(stored, _with_digest(compiled.export_model().getvalue()))
     return OpenvinoSession(compiled)
 
 
 def _key(network: IntegerNetwork, settings: Mapping[str, Any]) -> str:
-    """What a compiled network depends on, as a file name: also the processor that it was compiled for."""
+    """Return a file name from everything that a compiled network depends on, including its processor."""
     core = _core()
     machine = [str(core.get_property(DEVICE, name)) for name in ("FULL_DEVICE_NAME", "OPTIMIZATION_CAPABILITIES")]
     parts = (network.digest, version(), *machine, *(f"{name}={value}" for name, value in settings.items()))
@@ -92,7 +92,10 @@ def _with_digest(blob: bytes) -> bytes:
 
 
 def _without_digest(content: bytes) -> bytes:
-    """The blob of a file of `_with_digest`. Raises ValueError when it is damaged: OpenVINO itself would not notice."""
+    """Return the blob in a file that `_with_digest` made.
+
+    Raises ValueError when it is damaged: OpenVINO itself would not notice.
+    """
     size = hashlib.sha256().digest_size
     if hashlib.sha256(content[size:]).digest() != content[:size]:
         raise ValueError("a damaged blob")
@@ -101,7 +104,7 @@ def _without_digest(content: bytes) -> bytes:
 
 @cache
 def _core() -> Any:
-    """OpenVINO's core, one for all shapes."""
+    """Return OpenVINO's core, one for all shapes."""
     return openvino.Core()
 
 

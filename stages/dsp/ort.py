@@ -78,7 +78,7 @@ def version() -> str:
 
 
 def check_integer(optimised: onnx.ModelProto, network: IntegerNetwork) -> None:
-    """Raises BadInputError naming the layers that compute in float in `optimised`, the optimised graph of `network`."""
+    """Raise BadInputError naming the layers that compute in float in `optimised`, the optimised graph of `network`."""
     layers = {node_name(node) for node in optimised.graph.node if node.op_type in FLOAT_LAYERS}
     float_layers = sorted(layers - network.float_layers)
     if float_layers:

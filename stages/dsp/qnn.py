@@ -24,7 +24,7 @@ from trilane.stages.dsp.runtime import RuntimeOptions
 from trilane.writing import write_atomically
 
 NAME = onnxruntime_qnn.get_ep_name()
-#: Snapdragon 888: SoC number of Qualcomm's SDK, Hexagon v68.
+#: Snapdragon 888: SoC number in Qualcomm's SDK, Hexagon v68.
 SOCS = {"sm8350": {"soc_model": "30", "htp_arch": "68"}}
 DEFAULTS = {**SOCS["sm8350"], "htp_performance_mode": "burst"}
 
@@ -40,7 +40,7 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
     if folder is None:
         return OrtSession(_session(network.where, source, device, {}))
     compiled = folder / f"{_key(network, device)}.onnx"
-    with contextlib.suppress(OSError, BadInputError):  # missing or damaged: it is compiled again
+    with contextlib.suppress(OSError, BadInputError):  # a missing or damaged file: the network is compiled again
         return OrtSession(_session(network.where, compiled.read_bytes(), device, {}))
     with write_atomically(compiled) as draft:
         session = _session(network.where, source, device, _context(draft))
@@ -64,7 +64,7 @@ def version() -> str:
 
 
 def _key(network: IntegerNetwork, device: Mapping[str, str]) -> str:
-    """A file name from everything that a compiled network depends on."""
+    """Return a file name from everything that a compiled network depends on."""
     parts = (
         network.digest,
         version(),
@@ -75,7 +75,7 @@ def _key(network: IntegerNetwork, device: Mapping[str, str]) -> str:
 
 
 def _context(path: Path) -> dict[str, str]:
-    """Session entries that make ONNX Runtime write the compiled network to `path`."""
+    """Return session entries that make ONNX Runtime write the compiled network to `path`."""
     return {"ep.context_enable": "1", "ep.context_embed_mode": "1", "ep.context_file_path": str(path)}
 
 

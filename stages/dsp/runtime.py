@@ -22,8 +22,9 @@ X86 = ("x86_64", "AMD64")
 
 @dataclass(frozen=True)
 class RuntimeOptions:
-    """`threads`: number of computing threads, the calling one included. `spin`: whether they may spin between jobs.
+    """Options of a runtime.
 
+    `threads`: number of computing threads, the calling one included. `spin`: whether they may spin between jobs.
     `device`: settings that only one runtime has, by its own names, such as `htp_arch` of `qnn`.
     """
 
@@ -50,7 +51,7 @@ class Session(Protocol):
 
 
 class Runtime(Protocol):
-    """What each runtime's module of this folder offers."""
+    """The interface that each runtime's module in this folder offers."""
 
     def load(self, network: IntegerNetwork, options: RuntimeOptions) -> Session:
         """Compile `network` for its shape. Raises BadInputError naming a node that it cannot run in integers."""
@@ -63,8 +64,8 @@ class Runtime(Protocol):
 class RuntimeEntry:
     """A runtime: its module, the package it needs, the command that installs it, and a file the package must contain.
 
-    `file`: relative to the package's folder; empty when the package alone suffices.
-    `copies`: whether each run copies the slots to memory of a device, and back.
+    `file`: path relative to the package's folder; empty when the package alone suffices.
+    `copies`: whether each run copies the slots to a device's memory, and back.
     """
 
     module: str
@@ -75,13 +76,13 @@ class RuntimeEntry:
 
     @property
     def is_installed(self) -> bool:
-        """Whether the package, and its `file`, are there."""
+        """Return whether the package, and its `file`, are there."""
         begins = machine.here.package_file(self.package)
         return begins is not None and (not self.file or (begins.parent / self.file).is_file())
 
 
 def cuda_line() -> str:
-    """The command for the runtime `cuda`: the build for GPUs replaces the other, whose modules it has."""
+    """Return the command for the runtime `cuda`: the build for GPUs replaces the other, whose modules it contains."""
     here = pip()
     return f"{here} uninstall -y onnxruntime && {here} install onnxruntime-gpu  # on a machine with an NVIDIA GPU"
 
@@ -101,12 +102,12 @@ RUNTIMES = {
 
 
 def installed() -> Sequence[str]:
-    """Names of the runtimes that are installed."""
+    """Return the names of the installed runtimes."""
     return [name for name, entry in RUNTIMES.items() if entry.is_installed]
 
 
 def resolve(name: str) -> str:
-    """`name` itself. Raises BadInputError when it is no runtime, MissingPartError when the runtime is not installed."""
+    """Return `name` itself. Raises BadInputError when it is no runtime, MissingPartError when it is not installed."""
     if name not in RUNTIMES:
         raise BadInputError("runtime", f"{name!r}", f"one of {', '.join(RUNTIMES)}")
     entry = RUNTIMES[name]
@@ -117,26 +118,26 @@ def resolve(name: str) -> str:
 
 
 def has_device(name: str) -> bool:
-    """Whether runtime `name` computes on hardware of its own; on x86, `qnn` is an emulator that runs on the cores."""
+    """Return whether runtime `name` computes on hardware of its own; on x86, `qnn` emulates it on the cores."""
     return name == "cuda" or (name == "qnn" and machine.here.architecture() not in X86)
 
 
 def copies_slots(name: str) -> bool:
-    """Whether runtime `name` copies slots to its device and back in every run; the others work in the slots."""
+    """Return whether runtime `name` copies slots to its device and back in every run; the others work in the slots."""
     return RUNTIMES[name].copies
 
 
 def load_runtime(name: str) -> Runtime:
-    """The module of runtime `name`. Raises as `resolve`."""
+    """Return the module of runtime `name`. Raises as `resolve`."""
     module: Runtime = import_module(RUNTIMES[resolve(name)].module)
     return module
 
 
 def quiet_openvino() -> Any:
-    """OpenVINO, imported without its telemetry; everybody imports it by this function.
+    """Import OpenVINO without its telemetry; all code imports it by this function.
 
-    Imported by itself it tells a server of its maker that it was imported, and keeps a number for that in the home
-    folder. Where the package `openvino_telemetry` is missing it uses a stand-in of its own, which does neither.
+    Imported directly, it reports to its maker's server that it was imported, and keeps a number for that in the home
+    folder. Without the package `openvino_telemetry` it uses a stand-in of its own, which does neither.
     """
     cast(dict[str, Any], sys.modules).setdefault("openvino_telemetry", None)
     import openvino

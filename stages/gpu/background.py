@@ -1,9 +1,9 @@
 """Backgrounds from the user's files: a picture, a folder of pictures, a video.
 
-Every frame covers the output: it is scaled until no border is left, and what overhangs is cut off equally on both
-sides, by `cover`, as its lens is. Videos and folders start again when they end; photos that belong to the camera's
-views are shown with them. A picture is turned as its EXIF tag says, unless its reader is told otherwise. What Pillow
-would show wrongly is brought to eight bits, or refused.
+Every frame covers the output: `cover` scales the picture until no border is left, and crops the overhang equally on
+both sides; the picture's lens is changed alike. Videos and folders start again when they end; photos that belong to the
+camera's views are shown with them. A picture is turned as its EXIF tag says, unless its reader is told otherwise. What
+Pillow would show wrongly is converted to eight bits, or refused.
 """
 
 from __future__ import annotations
@@ -27,13 +27,14 @@ from trilane.shapes import Shape
 from trilane.stages.gpu.video_reader import VideoReader
 
 PICTURES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff"})
-#: Photos that a phone writes and Pillow does not read; FFmpeg would show one tile of them.
+#: Photos that phones write and Pillow does not read; FFmpeg would show a single tile of them.
 PHONE_PHOTOS = frozenset({".heic", ".heif", ".hif"})
 MAX_PIXELS = 64_000_000
-DEEP_STEP = 257  # from eight bits to sixteen
+DEEP_STEP = 257  # factor from eight bits to sixteen
 DEEP_MODES = frozenset({"I;16", "I;16L", "I;16B", "I;16N"})
 REFUSED_MODES = {"F": "numbers with fractions, as high-range pictures have", "I": "whole numbers of 32 bits"}
-#: How a picture is brought upright, by its EXIF tag; and by how many quarters that turns it clockwise, mirrored or not.
+#: For each EXIF tag, how a picture is brought upright, and by how many quarters that turns it clockwise, mirrored or
+#: not.
 BY_TAG = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -49,7 +50,7 @@ EXPECTED = "a PNG, JPEG, BMP, WebP or TIFF file"
 
 
 def look_at_picture(path: Path) -> Stored:
-    """The size of the picture in `path`, by its head alone. Raises BadInputError."""
+    """Return the size of the picture in `path`, by its head alone. Raises BadInputError."""
     with _opened(path) as image:
         return Stored((image.height, image.width), QUARTERS.get(_orientation(image), 0))
 
@@ -62,9 +63,9 @@ def check_picture(path: Path) -> None:
 
 
 def read_picture(path: Path, shape: Shape, turned: int | None = None) -> U8:
-    """The picture in `path` covering `shape` (h,w): (h,w,3) uint8. Raises BadInputError.
+    """Return the picture in `path` covering `shape` (h,w): (h,w,3) uint8. Raises BadInputError.
 
-    `turned`: by how many quarters it is turned clockwise; None for what its EXIF tag says.
+    `turned`: number of quarters that it is turned clockwise; None for its EXIF tag.
     """
     with _opened(path) as image:
         how = BY_TAG.get(_orientation(image)) if turned is None else CLOCKWISE.get(turned % 4)
@@ -76,7 +77,7 @@ def read_picture(path: Path, shape: Shape, turned: int | None = None) -> U8:
 
 
 def _orientation(image: Image.Image) -> int:
-    """The EXIF tag; of a PNG as far as it stands before the pixels, which are not decoded for it."""
+    """Return the EXIF tag; for a PNG only if it stands before the pixels, which are not decoded for it."""
     return int(Image.Image.getexif(image).get(ExifTags.Base.Orientation, 1))
 
 
@@ -105,16 +106,16 @@ class Background(Protocol):
     """A background of a fixed shape (height, width)."""
 
     def at(self, time_s: float) -> U8 | None:
-        """The picture (h,w,3) uint8 sRGB at `time_s`, or None when it is the one of the last call."""
+        """Return the picture (h,w,3) uint8 sRGB at `time_s`, or None when it is that of the last call."""
 
     def close(self) -> None:
         """Release files and threads."""
 
 
 def open_background(path: Path, shape: Shape, fps: float, camera: CameraPath | None = None) -> Background:
-    """The background in `path`; a folder's pictures follow each other at `fps`. Raises BadInputError.
+    """Open the background in `path`; a folder's pictures follow each other at `fps`. Raises BadInputError.
 
-    `camera`: the one that may have filmed it.
+    `camera`: camera that may have filmed it.
     """
     turned = () if camera is None else camera.optics.turned
     if camera is not None and camera.is_held:
@@ -129,12 +130,12 @@ def open_background(path: Path, shape: Shape, fps: float, camera: CameraPath | N
 
 
 def is_picture(path: Path) -> bool:
-    """Whether the name of `path` says that it is a picture."""
+    """Return whether the name of `path` says that it is a picture."""
     return path.suffix.lower() in PICTURES | PHONE_PHOTOS
 
 
 def pictures_in(folder: Path) -> list[Path]:
-    """Its pictures, in order. Raises BadInputError without any."""
+    """Return the pictures in `folder`, in order. Raises BadInputError without any."""
     names = _names_in(folder)
     if not names:
         near = next((sub for sub in sorted(folder.iterdir()) if sub.is_dir() and _names_in(sub)), None)
@@ -142,12 +143,12 @@ def pictures_in(folder: Path) -> list[Path]:
         raise BadInputError(folder, "no pictures", f"files that end in {', '.join(sorted(PICTURES))}", remedy)
     pictures = [folder / name for name in in_order(names)]
     for path in pictures:
-        require_file(path, "a picture")  # a pipe of such a name would be waited for
+        require_file(path, "a picture")  # refuses a pipe of such a name, which would be waited for
     return pictures
 
 
 def _names_in(folder: Path) -> list[str]:
-    """Names of its pictures. Raises BadInputError when it cannot be read."""
+    """Return the names of pictures in `folder`. Raises BadInputError when it cannot be read."""
     try:
         return [path.name for path in folder.iterdir() if path.suffix.lower() in PICTURES]
     except OSError as error:
@@ -155,18 +156,24 @@ def _names_in(folder: Path) -> list[str]:
 
 
 class PictureSequence:
-    """Pictures in files, one after the other. `number_at`: the number of the one that is shown at a time."""
+    """Pictures in files, one after the other.
+
+    `number_at`: function that gives the number of the picture shown at a time.
+    """
 
     def __init__(
         self, paths: Sequence[Path], number_at: Callable[[float], int], shape: Shape, turned: Sequence[int] = ()
     ) -> None:
-        """`turned`: by how many quarters each is turned, or all are; empty for what the files say."""
+        """Keep the files.
+
+        `turned`: number of quarters that each is turned, or a single one for all; empty for what the files say.
+        """
         self._paths, self._number_at, self._shape, self._turned = paths, number_at, shape, turned
         self._shown = -1
         self._first: U8 | None = self._read(0)
 
     def at(self, time_s: float) -> U8 | None:
-        """The picture whose turn it is."""
+        """Return the picture whose turn it is."""
         number = self._number_at(time_s)
         if number == self._shown:
             return None
@@ -175,7 +182,7 @@ class PictureSequence:
         return first if first is not None and number == 0 else self._read(number)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: no file is held."""
 
     def _read(self, number: int) -> U8:
         turned = self._turned[number % len(self._turned)] if self._turned else None

@@ -15,27 +15,33 @@ from trilane.cache import cached_arrays
 
 FLOOR_PERIOD_M = 2.4
 FLOOR_SIDE = 1024
-PLANKS = 16  # across one period
-PLANK_ROWS = 2  # lengths of plank in one period
+PLANKS = 16  # number across one period
+PLANK_ROWS = 2  # number of plank lengths in one period
 WALL_PERIOD_M = 2.0
-WALL_TEXTURE_M = 4.0  # height that the wall texture spans; above it the paint goes on
+WALL_TEXTURE_M = 4.0  # height that the wall texture spans; the paint goes on above it
 WALL_SHAPE = (1024, 256)
 SKIRTING_M = 0.11
 MARGIN_M = 0.6
 GRID = np.array([0, 0.04, 0.12, 0.5, 0.88, 0.96, 1])
 SEED = 7
-VERSION = "room textures 1"  # to be raised when the textures change
+VERSION = "room textures 1"  # raise it when the textures change
 
 
 @dataclass(frozen=True)
 class Extent:
-    """Inside of the room in metres: `low` and `high` corners (x, y, z). The floor is y = 0."""
+    """Inside of the room in metres.
+
+    `low`, `high`: corners (x, y, z). The floor is y = 0.
+    """
 
     low: tuple[float, float, float] = (-4.0, 0.0, -4.0)
     high: tuple[float, float, float] = (4.0, 3.0, 4.0)
 
     def holding(self, eye: F64) -> Extent:
-        """This room, or a larger one with walls and ceiling at least MARGIN_M beyond camera position `eye` (3,)."""
+        """Return this room, or a larger one that holds the camera position `eye` (3,).
+
+        Walls and ceiling are then at least MARGIN_M beyond it.
+        """
         low = (min(self.low[0], eye[0] - MARGIN_M), self.low[1], min(self.low[2], eye[2] - MARGIN_M))
         high = tuple(max(side, float(at) + MARGIN_M) for side, at in zip(self.high, eye, strict=True))
         grown = Extent((float(low[0]), low[1], float(low[2])), (high[0], high[1], high[2]))
@@ -44,7 +50,10 @@ class Extent:
 
 @dataclass(frozen=True)
 class RoomMesh:
-    """`vertices` (N,8) float32: position, uv, light. `floor` and `rest` (M,3) uint32: triangles facing inwards."""
+    """The mesh of the room.
+
+    `vertices` (N,8) float32: position, uv, light. `floor` and `rest` (M,3) uint32: triangles facing inwards.
+    """
 
     vertices: F32
     floor: NDArray[np.uint32]
@@ -52,7 +61,7 @@ class RoomMesh:
 
 
 def room_mesh(extent: Extent) -> RoomMesh:
-    """The six sides of `extent`, light baked per vertex: dim corners, brighter towards the window side (-x, +z)."""
+    """Return the six sides of `extent`, light baked per vertex: dim corners, brighter towards the windows (-x, +z)."""
     low, high = np.array(extent.low), np.array(extent.high)
     sides = [_side(low, high, axis, end) for axis in (1, 0, 2) for end in (0, 1)]
     count = GRID.size**2
@@ -65,13 +74,13 @@ def room_mesh(extent: Extent) -> RoomMesh:
 
 
 def room_textures() -> tuple[U8, U8]:
-    """The floor's and the wall's texture; the cache keeps them, as their noise takes a good part of a second."""
+    """Return the floor's and the wall's texture; they are cached, because their noise takes a good part of a second."""
     stored = cached_arrays(VERSION, (), lambda: {"floor": floor_texture(), "wall": wall_texture()})
     return stored["floor"], stored["wall"]
 
 
 def floor_texture() -> U8:
-    """Planks of oak, (1024, 1024, 4) uint8 sRGB, repeating in both directions."""
+    """Return planks of oak, (1024, 1024, 4) uint8 sRGB, repeating in both directions."""
     rng = np.random.default_rng(SEED)
     row, column = np.indices((FLOOR_SIDE, FLOOR_SIDE)) / FLOOR_SIDE
     plank = np.floor(column * PLANKS).astype(int)
@@ -90,7 +99,7 @@ def floor_texture() -> U8:
 
 
 def wall_texture() -> U8:
-    """Painted wall with a skirting board, (1024, 256, 4) uint8 sRGB; row 0 is the floor, u repeats."""
+    """Return a painted wall with a skirting board, (1024, 256, 4) uint8 sRGB; row 0 is the floor, u repeats."""
     rng = np.random.default_rng(SEED + 1)
     height = (np.arange(WALL_SHAPE[0]) + 0.5) / WALL_SHAPE[0] * WALL_TEXTURE_M
     paint = np.array([218, 213, 201]) * (1 + 0.007 * _noise(rng, WALL_SHAPE, (12.0, 12.0)))[..., None]
@@ -142,7 +151,10 @@ def _triangles(turned: bool) -> NDArray[np.int64]:
 
 
 def _noise(rng: np.random.Generator, shape: tuple[int, int], length: tuple[float, float]) -> F64:
-    """Periodic noise of mean 0 and deviation 1. `length`: Gaussian correlation lengths, across columns and rows."""
+    """Return periodic noise of mean 0 and deviation 1.
+
+    `length`: Gaussian correlation lengths, across columns and rows.
+    """
     frequency = [np.fft.fftfreq(n)[:, None] if k == 0 else np.fft.fftfreq(n)[None] for k, n in enumerate(shape)]
     spread = (frequency[0] * length[1]) ** 2 + (frequency[1] * length[0]) ** 2
     field = np.fft.ifft2(np.fft.fft2(rng.normal(size=shape)) * np.exp(-2 * np.pi**2 * spread / 4)).real

@@ -1,16 +1,16 @@
-"""The composite stage: background, planes, contact shadow, avatars, display, in that order, to the presented frame.
+"""The composite stage: draws background, planes, contact shadow, avatars and display, in that order.
 
-Avatars are drawn far to near; one that is not visible leaves no trace. A frame that would be drawn as one that an
-output slot still holds is copied, not drawn: only the composite writes to its output slots, so their bytes stay until
-it writes there again.
+Avatars are drawn far to near; one that is not visible leaves no trace. A frame that would equal one that an output slot
+still holds is copied instead of drawn. Only the composite writes to its output slots, so their bytes stay until it
+writes there again.
 
-While the camera stands still, what lies under the avatars is drawn twice and copied from then on. The first frame of a
+While the camera stands still, everything under the avatars is drawn twice and copied from then on. The first frame of a
 view is only drawn, because most views of a moving camera never come again. The second one is kept in host memory: a
 software driver copies it from there in a tenth of a millisecond, and takes twenty times as long to copy between
 framebuffers.
 
-The display shows frame number and time of the picture. Rate and age, which this stage measures, are updated four times
-a second so that they can be read, and start again when frame numbers do.
+The display shows frame number and time of the picture. This stage measures rate and age. They are updated four times a
+second so that they can be read, and start again when frame numbers do.
 """
 
 from __future__ import annotations
@@ -57,27 +57,27 @@ from trilane.stages.gpu.opengl import (
 )
 from trilane.transport.packets import Packet
 
-#: Picture of the avatars, picture of the background, view and projection.
+#: Number of the avatars' picture, number of the background's picture, view and projection.
 Drawing = tuple[int, int, bytes, bytes]
 
 
 class DrawnFrames:
-    """Notes of what was drawn, by slot."""
+    """Remembers what was drawn in each slot."""
 
     def __init__(self) -> None:
         self._slots: dict[int, tuple[Drawing | None, int]] = {}
 
     def slot_of(self, drawing: Drawing | None, preferred: int) -> int | None:
-        """A slot that holds `drawing`, `preferred` if that does; None when there is none, or `drawing` is None."""
+        """Return a slot that holds `drawing`, preferably `preferred`; None without one, or for None."""
         if drawing is None:
             return None
         held = [slot for slot, (there, _) in self._slots.items() if there == drawing]
         return preferred if preferred in held else held[0] if held else None
 
     def note(self, slot: int, drawing: Drawing | None, frame: int, copied_from: int | None) -> int:
-        """`slot` holds `drawing` of `frame` from now on; what `repeats` of the frame's header is to be.
+        """Note that `slot` holds `drawing` of `frame` from now on; return `repeats` of the frame's header.
 
-        `copied_from`: the slot that held it already; None when it was drawn now.
+        `copied_from`: slot that held it already; None when it was drawn now.
         """
         drawn = frame if copied_from is None else self._slots[copied_from][1]
         self._slots[slot] = (drawing, drawn)
@@ -94,7 +94,7 @@ class StillBackground:
         self._is_kept = False
 
     def draw(self, shown: Hashable, draw: Callable[[], None]) -> None:
-        """Fill the target with the background that `shown`, which is not None, stands for: by `draw`, or a copy."""
+        """Fill the target with the background that `shown` identifies: by `draw`, or a copy. `shown` is not None."""
         if shown == self._shown and self._is_kept:
             upload(self._target.ctx, self._target.color_attachments[0], self._bytes)
             return
@@ -114,7 +114,7 @@ SHEET, INK = (0, 0, 0, 150), (255, 255, 255, 255)
 
 
 class Hud:
-    """Draws into the lower left corner of a target; a target smaller than the display shows a part of it."""
+    """Draws the display into the lower left corner of a target; a smaller target shows a part of it."""
 
     def __init__(self, ctx: Any) -> None:
         self._ctx = ctx
@@ -152,7 +152,10 @@ class Hud:
 
 
 def measured_line(pose: NDArray[np.void], presented_ns: list[int]) -> str:
-    """The line of rate and age. `presented_ns`: when the last frames were composed, this frame's time last."""
+    """Return the line of rate and age.
+
+    `presented_ns`: times at which the last frames were composed, this frame's last.
+    """
     span = presented_ns[-1] - presented_ns[0]
     rate = f"{(len(presented_ns) - 1) * 1e9 / span:.1f} fps" if span > 0 else "- fps"
     age_ms = (presented_ns[-1] - int(pose["t_sampled_ns"])) / 1e6
@@ -160,7 +163,7 @@ def measured_line(pose: NDArray[np.void], presented_ns: list[int]) -> str:
 
 
 def hud_lines(pose: NDArray[np.void], measured: str) -> list[str]:
-    """The three lines of the display; `measured` is the middle one."""
+    """Return the three lines of the display; `measured` is the middle one."""
     height, width = pose["tensor_shape"].tolist()
     visible = int(sum(avatar["visible"] for avatar in pose["avatars"][: int(pose["avatar_count"])]))
     return [
@@ -171,7 +174,7 @@ def hud_lines(pose: NDArray[np.void], measured: str) -> list[str]:
 
 
 def hud_picture(lines: list[str], font: Any) -> NDArray[np.uint8]:
-    """(62,232,4) uint8, straight alpha: `lines` on a dark background."""
+    """Return `lines` on a dark background, (62,232,4) uint8, straight alpha."""
     image = Image.new("RGBA", SIZE, SHEET)
     ImageDraw.Draw(image).multiline_text((8, 3), "\n".join(lines), INK, font, spacing=3)
     return np.asarray(image)
@@ -185,10 +188,10 @@ class CompositeStage:
 
     `shapes`: tensor shapes that may come.
     `rest`: rest joints (55,3) of each avatar of the scene, metres.
-    `background`: None for the built-in room.
-    `eyes`: places (3,) that the room holds from the first frame on, so that it does not grow, nor after a restart.
-    `planes`: detected ones to show.
-    `hud`: show frame, rate and age.
+    `background`: background from files; None for the built-in room.
+    `eyes`: places (3,) that the room holds from the first frame on, so that it never grows, not even after a restart.
+    `planes`: detected planes to show.
+    `hud`: whether to show frame, rate and age.
     """
 
     def __init__(
@@ -213,7 +216,7 @@ class CompositeStage:
         self._shadow = ShadowPainter(ctx, len(DISCS) * len(rest))
         self._painter = AvatarPainter(ctx, list(shapes))
         self._held: NDArray[np.void] | None = None  # header of the frame whose picture of the avatars was uploaded
-        self._shows_background = 0  # grows with each picture of it
+        self._shows_background = 0  # number of background pictures so far
         self._drawn = DrawnFrames()
         self._inputs: Sequence[Packet] = ()
         self._outputs: Sequence[Packet] = ()
@@ -225,10 +228,11 @@ class CompositeStage:
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
         """Write the frame, (h,w,3) uint8 sRGB, row 0 on top.
 
-        Figures: of a job, 1 or 0 for `nobody` (on the screen), `reused` (the picture of an earlier frame is the right
-        one), `stale` (it is not, but that one never came), and `copied` (not drawn: it is an earlier frame's). And the
-        bytes moved. The least: what is new of the background, and of the network's picture in the cells of avatars in
-        view; and the frame, where it is not one that a slot holds already.
+        Figures: 1 or 0 for `nobody` (nobody is on the screen), `reused` (the picture of an earlier frame is the right
+        one), `stale` (the right one never came, so an earlier one is shown), and `copied` (the frame was copied from an
+        earlier one, not drawn); and the bytes moved.
+        The least bytes: what is new of the background, and of the network's picture in the cells of avatars in view;
+        and the frame, unless a slot holds it already.
         """
         if slot_in is None or slot_out is None:
             raise ValueError("composite needs an input and an output slot")
@@ -238,6 +242,7 @@ class CompositeStage:
         with checked(self._ctx):
             self._take(pose, packet.payload)
             drawing = self._drawing(pose)
+            # A full frame brings a new picture of the avatars, so no slot can hold it already.
             repeated = None if int(pose["work"]) == FrameWork.FULL else self._drawn.slot_of(drawing, slot_out)
             frame_bytes = math.prod(self._shape) * 3
             if repeated is None:
@@ -264,7 +269,7 @@ class CompositeStage:
         self._draw(pose)
 
     def _take(self, pose: NDArray[np.void], image: NDArray[np.uint8]) -> None:
-        """Upload what is new in this frame: the background's picture, and the avatars' of a full one."""
+        """Upload what is new in this frame: the background's picture, and for a full frame the avatars' picture."""
         if self._background is not None and self._picture is not None:
             picture = self._background.at(float(pose["media_time_s"]))
             if picture is not None:
@@ -272,6 +277,7 @@ class CompositeStage:
                 self._picture.upload(picture)
                 counter_of(self._ctx).least += picture.nbytes
         if int(pose["work"]) == FrameWork.FULL:
+            # Copied, because a later frame is written to the same slot.
             self._held = pose.copy()
             if _visible(pose):
                 shape = _tensor_shape(pose)
@@ -279,11 +285,11 @@ class CompositeStage:
                 counter_of(self._ctx).least += _cells_bytes(pose)
 
     def _holds(self, picture: int) -> bool:
-        """Whether the picture of the avatars that was uploaded is that of frame `picture`."""
+        """Return whether the uploaded picture of the avatars is that of frame `picture`."""
         return self._held is not None and int(self._held["picture"]) == picture
 
     def _drawing(self, pose: NDArray[np.void]) -> Drawing | None:
-        """What the frame's bytes depend on; None when it is like no other."""
+        """Return what the frame's bytes depend on; None when it is like no other."""
         if self._hud is not None:
             return None
         nobody = self._held is None or int(pose["work"]) == FrameWork.NONE
@@ -324,7 +330,7 @@ class CompositeStage:
             self._planes.draw(pose["view"], pose["projection"])
 
     def _depth(self, pose: NDArray[np.void], avatar: Any) -> float:
-        """Camera z of the pelvis: the most negative is the farthest."""
+        """Return camera z of the pelvis: the most negative is the farthest."""
         pelvis = avatar["joints"][0] @ np.append(self._rest[int(avatar["avatar"])][0], 1.0)
         return float(pose["view"][2, :3] @ pelvis + pose["view"][2, 3])
 
@@ -334,7 +340,7 @@ def _visible(pose: NDArray[np.void]) -> list[Any]:
 
 
 def _cells_bytes(pose: NDArray[np.void]) -> int:
-    """Bytes of the network's picture in the rectangles of the avatars in view."""
+    """Return the bytes of the network's picture in the rectangles of the avatars in view."""
     return sum(4 * int(avatar["tensor_rect"][2]) * int(avatar["tensor_rect"][3]) for avatar in _visible(pose))
 
 
@@ -343,7 +349,7 @@ def _tensor_shape(pose: NDArray[np.void]) -> Shape:
 
 
 def build(settings: Mapping[str, Any], unit: UnitContext) -> CompositeStage:
-    """The composite stage of the configuration in `settings`. Raises BadInputError, MissingPartError."""
+    """Build the composite stage of the configuration in `settings`. Raises BadInputError, MissingPartError."""
     config = RunConfig.model_validate(settings["config"])
     scene = config.scene
     shape, folders = (scene.output.height, scene.output.width), distinct(config)

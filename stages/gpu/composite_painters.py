@@ -1,11 +1,11 @@
 """The painters of the composite, one class per layer of the frame: room, picture, planes, contact shadows, avatars.
 
-Background bytes are copied unchanged, as sRGB; whatever is blended over them is blended in linear light. Planes are
+Background bytes are copied unchanged, as sRGB; everything blended over them is blended in linear light. Planes are
 those of the scene file; nothing is detected here. A contact shadow is a disc under a joint, which grows and fades with
 the height of its joint above the floor.
 
-A body fills about half of its rectangle; a software driver takes as long for a pixel that stays as it is as for any
-other. So the network's picture is cut into bands of rows, and each band to the columns between its first and last texel
+A body fills about half of its rectangle, and a software driver takes as long for a pixel that stays as for any other.
+So the network's picture is cut into bands of rows. Each band is cut to the columns between its first and last texel
 that is not transparent, widened by what a screen pixel may read beside its middle.
 """
 
@@ -27,14 +27,15 @@ from trilane.stages.gpu import opengl
 from trilane.stages.gpu.builtin_room import Extent, room_mesh, room_textures
 from trilane.stages.gpu.opengl import build_program, counter_of, eye_of, target_clip, upload, uploaded_buffer
 
-BAND = 16  # rows
+BAND = 16  # rows of a band
 WHOLE: F32 = np.array([[0, 0, 1, 1]], np.float32)
 
 
 def spans(shown: Mask, margin: int) -> F32:
-    """(N,4) float32: left, top, right, bottom of each part, as shares of the picture's sides.
+    """Return the parts (N,4) float32 to draw: left, top, right, bottom of each, as shares of the picture's sides.
 
-    `shown`: (h,w) where the picture is not transparent. `margin`: texels that are read beside a pixel's middle.
+    `shown`: (h,w), where the picture is not transparent. `margin`: number of texels that are read beside a pixel's
+    middle.
     """
     height, width = shown.shape
     has_any = shown.any(axis=1)
@@ -43,7 +44,7 @@ def spans(shown: Mask, margin: int) -> F32:
     tops = np.arange(0, height, BAND)
     bottoms = np.minimum(tops + BAND, height)
     rows = np.column_stack([np.maximum(tops - margin, 0), np.minimum(bottoms + margin, height)]).ravel()
-    left = np.minimum.reduceat(np.append(first, width), rows)[::2] - margin  # of the rows of each pair
+    left = np.minimum.reduceat(np.append(first, width), rows)[::2] - margin  # reduces over the rows of each pair
     right = np.maximum.reduceat(np.append(end, 0), rows)[::2] + margin
     is_shown = right - left > 2 * margin
     edges = np.column_stack([np.maximum(left, 0), tops, np.minimum(right, width), bottoms])[is_shown]
@@ -72,7 +73,7 @@ _RADIUS, _STRENGTH, _FADE = np.array([numbers for _, *numbers in DISCS]).T
 
 
 def floor_discs(joints: NDArray[np.floating[Any]], rest: F64) -> NDArray[np.float32]:
-    """Discs (N,4) float32: x, z, radius, strength, for skinning matrices (55,3,4) and rest joints (55,3)."""
+    """Return discs (N,4) float32: x, z, radius, strength, for skinning matrices (55,3,4) and rest joints (55,3)."""
     matrices = np.asarray(joints, np.float64)[_JOINT]
     place = np.einsum("nij,nj->ni", matrices[..., :3], rest[_JOINT]) + matrices[..., 3]
     height = np.maximum(place[:, 1], 0.0)
@@ -82,23 +83,26 @@ def floor_discs(joints: NDArray[np.floating[Any]], rest: F64) -> NDArray[np.floa
 
 
 MAX_TAPS = 8
-#: Pixels of the screen from which on less is drawn in the time that it takes to find what is transparent.
+#: Least number of screen pixels at which drawing less saves more time than finding what is transparent takes.
 WORTH_CUTTING_PX = 60_000
 HALF_TEXEL_INWARD = np.array([0.5, 0.5, -0.5, -0.5])
 UNDER_THE_FLOOR = (70, 66, 60)
 
 
 class RoomPainter:
-    """The built-in room, which is made larger when a camera leaves it."""
+    """Draws the built-in room, which is made larger when a camera leaves it."""
 
     def __init__(self, ctx: Any, eyes: Sequence[Floats] = ()) -> None:
-        """`eyes`: places (3,) of cameras that the room holds from the beginning."""
+        """Make the room.
+
+        `eyes`: places (3,) of cameras that the room holds from the beginning.
+        """
         self._ctx = ctx
         self._program = build_program(ctx, "room.vert", "room.frag")
         floor, wall = room_textures()
         self._textures = [
             _detail(ctx, floor, moderngl.LINEAR_MIPMAP_LINEAR),
-            _detail(ctx, wall, moderngl.LINEAR_MIPMAP_NEAREST),  # too smooth to show where levels change
+            _detail(ctx, wall, moderngl.LINEAR_MIPMAP_NEAREST),  # the wall is too smooth to show where levels change
         ]
         self._extent = reduce(Extent.holding, (np.asarray(eye, np.float64) for eye in eyes), Extent())
         self._batches: list[Any] = []
@@ -130,7 +134,7 @@ class RoomPainter:
 
 
 class PicturePainter:
-    """A background picture of the output's size, (h,w,3) uint8."""
+    """Draws a background picture of the output's size, (h,w,3) uint8."""
 
     def __init__(self, ctx: Any, shape: tuple[int, int]) -> None:
         self._ctx = ctx
@@ -150,7 +154,7 @@ class PicturePainter:
 
 
 class ShadowPainter:
-    """Contact shadows: up to `blobs` soft discs on the floor."""
+    """Draws contact shadows: up to `blobs` soft discs on the floor."""
 
     def __init__(self, ctx: Any, blobs: int) -> None:
         self._ctx, self._count = ctx, blobs
@@ -158,7 +162,10 @@ class ShadowPainter:
         self._discs = ctx.vertex_array(self._program, [])
 
     def draw(self, view: Floats, projection: Floats, blobs: F32) -> None:
-        """Darken the target in use. `blobs` (N,4) float32: x, z, radius in metres, strength 0..1."""
+        """Darken the target in use.
+
+        `blobs` (N,4) float32: x, z, radius in metres, strength 0..1.
+        """
         if not len(blobs) or eye_of(view)[1] <= 0:
             return
         self._ctx.enable_only(moderngl.BLEND)
@@ -172,7 +179,7 @@ class ShadowPainter:
 
 
 class AvatarPainter:
-    """The network's picture: uploaded once a frame, then drawn avatar by avatar at their crop rectangles."""
+    """Draws the network's picture: uploaded once a frame, then drawn avatar by avatar at their crop rectangles."""
 
     def __init__(self, ctx: Any, shapes: list[tuple[int, int]]) -> None:
         self._ctx = ctx
@@ -200,9 +207,9 @@ class AvatarPainter:
     ) -> None:
         """Blend one avatar's part of the picture over `target`.
 
-        `target`: the framebuffer.
+        `target`: framebuffer.
         `shape`: (height, width) of the picture that was uploaded.
-        `rect`: where the avatar is on the screen, x0, y0, x1, y1 in normalised device coordinates.
+        `rect`: rectangle of the avatar on the screen, x0, y0, x1, y1 in normalised device coordinates.
         `tensor_rect`: its part of the picture: top, left, height, width.
         """
         top, left, height, width = tensor_rect
@@ -236,9 +243,9 @@ class AvatarPainter:
 
 
 def taps_of(cell: tuple[int, int], pixels: tuple[float, float]) -> int:
-    """How many reads, along a side, a pixel of the screen is the mean of, when `cell` of a picture fills `pixels`.
+    """Return how many reads along a side a screen pixel is the mean of, when `cell` of a picture fills `pixels`.
 
-    Both (height, width).
+    Both are (height, width).
     """
     return int(np.clip(np.ceil(_density(cell, pixels) - 0.25), 1, MAX_TAPS))
 
@@ -254,7 +261,7 @@ def _detail(ctx: Any, image: U8, minify: int) -> Any:
     return texture
 
 
-UPRIGHT = 0.9  # sides of a plane whose unit normal has |y| above this are aligned with the world's x, others with its y
+UPRIGHT = 0.9  # a plane whose unit normal has |y| above this is aligned with the world's x, any other with its y
 
 
 class PlanePainter:
@@ -279,7 +286,10 @@ class PlanePainter:
 
 
 def half_sides(plane: PlaneSpec) -> tuple[F32, F32]:
-    """Half of each side of `plane` as a vector (3,), metres: at right angles to each other and to the normal."""
+    """Return half of each side of `plane` as a vector (3,), metres.
+
+    The vectors are at right angles to each other and to the normal.
+    """
     normal = np.asarray(plane.normal, np.float64) / np.linalg.norm(plane.normal)
     towards = np.array([1.0, 0.0, 0.0]) if abs(normal[1]) > UPRIGHT else np.array([0.0, 1.0, 0.0])
     along = np.cross(normal, towards)

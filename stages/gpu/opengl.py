@@ -1,12 +1,12 @@
 """OpenGL as the GPU unit uses it: the context, calls that moderngl lacks, programs, copies and camera matrices.
 
-There is one off-screen EGL context per process, hardware or software; no other file creates one, and the calling thread
+There is one off-screen EGL context per process, hardware or software. No other file creates one, and the calling thread
 must have it current. Each shader is a file of `trilane.shaders`; Python only adds `#define NAME VALUE` lines after its
 `#version`.
 
 Every copy of a frame between the CPU's memory and the GPU's is made by a function here, and counted as it is made. A
-context has one counter: the stages that draw with it do one job at a time. Software drivers copy in the same memory;
-they copy all the same.
+context has one counter, because the stages that draw with it do one job at a time. Software drivers copy within the
+same memory, and these copies count too.
 
 A target's first row in memory is the top row of the image, so y is flipped in the projection by `target_clip`, and
 nowhere else.
@@ -33,14 +33,17 @@ from trilane.errors import EGL_LINE, MissingPartError, TrilaneError, UnitLostErr
 from trilane.pipeline.moved_bytes import ByteCounter
 
 REQUIRED_VERSION = 330
-CONTEXT = "OpenGL context"  # its key among what the stages of the unit share
-LIBRARY = "libEGL.so.1"  # eglGetProcAddress gives every OpenGL function, so libGL need not be there
+CONTEXT = "OpenGL context"  # key of the context among what the stages of the unit share
+LIBRARY = "libEGL.so.1"  # eglGetProcAddress gives every OpenGL function, so libGL is not needed
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swr", "swiftshader", "swrast")
 
 
 @dataclass(frozen=True)
 class Driver:
-    """The OpenGL driver. `hardware` is False for a renderer that runs on the CPU."""
+    """The OpenGL driver.
+
+    `hardware`: False for a renderer that runs on the CPU.
+    """
 
     vendor: str
     renderer: str
@@ -49,10 +52,10 @@ class Driver:
 
 
 def open_context(threads: int | None = None) -> Any:
-    """A new off-screen `moderngl.Context` of OpenGL 3.3 or later, current on the calling thread.
+    """Open an off-screen `moderngl.Context` of OpenGL 3.3 or later, current on the calling thread.
 
-    `threads`: CPU threads that a software driver may use, the calling thread included; Mesa reads the number once, when
-    the process makes its first context. Raises MissingPartError when no context can be made.
+    `threads`: number of CPU threads that a software driver may use, the calling thread included; Mesa reads it once,
+    when the process makes its first context. Raises MissingPartError when no context can be made.
     """
     if threads is not None:
         os.environ["LP_NUM_THREADS"] = str(threads if threads > 1 else 0)
@@ -64,7 +67,7 @@ def open_context(threads: int | None = None) -> Any:
 
 
 def check(ctx: Any) -> None:
-    """Raises UnitLostError when the context was lost, TrilaneError when a call since the last check failed.
+    """Raise UnitLostError when the context was lost, TrilaneError when a call since the last check failed.
 
     Without a current context OpenGL calls do nothing and report no error, so an old tensor would look like a new one.
     """
@@ -88,7 +91,7 @@ def checked(ctx: Any) -> Iterator[None]:
 
 
 def current() -> bool:
-    """Whether the calling thread has a current EGL context."""
+    """Return whether the calling thread has a current EGL context."""
     return bool(_current_context()())
 
 
@@ -100,7 +103,7 @@ def _current_context() -> Any:
 
 
 def describe(ctx: Any) -> Driver:
-    """The driver of `ctx`, by the names it gives itself."""
+    """Return the driver of `ctx`, by the names it gives itself."""
     info = ctx.info
     renderer = str(info["GL_RENDERER"])
     software = any(name in renderer.lower() for name in SOFTWARE_RENDERERS)
@@ -131,7 +134,7 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
 
 @cache
 def function(name: str) -> Callable[..., Any]:
-    """OpenGL function `name` of `_SIGNATURES`. Raises MissingPartError when the driver lacks it."""
+    """Return OpenGL function `name` of `_SIGNATURES`. Raises MissingPartError when the driver lacks it."""
     library = ctypes.CDLL(LIBRARY)
     library.eglGetProcAddress.restype = ctypes.c_void_p
     address = library.eglGetProcAddress(name.encode())
@@ -153,7 +156,10 @@ def clear_depth() -> None:
 
 
 def write_level(texture: int, level: int, size: tuple[int, int, int], pixels: bytes) -> None:
-    """Put half-float RGBA `pixels` into a `level` of array texture `texture`; `size`: width, height, layers of it."""
+    """Write half-float RGBA `pixels` to a `level` of array texture `texture`.
+
+    `size`: width, height and layers of the level.
+    """
     function("glBindTexture")(TEXTURE_2D_ARRAY, texture)
     function("glPixelStorei")(UNPACK_ALIGNMENT, 1)
     function("glTexSubImage3D")(TEXTURE_2D_ARRAY, level, 0, 0, 0, *size, RGBA, HALF_FLOAT, pixels)
@@ -161,7 +167,7 @@ def write_level(texture: int, level: int, size: tuple[int, int, int], pixels: by
 
 
 def fence() -> int:
-    """A fence after every command issued so far. It must be passed to `wait_fence` exactly once."""
+    """Return a fence after every command issued so far. It must be passed to `wait_fence` exactly once."""
     return int(function("glFenceSync")(SYNC_GPU_COMMANDS_COMPLETE, 0))
 
 
@@ -175,7 +181,7 @@ def wait_fence(sync: int, timeout_ns: int = 1_000_000_000) -> None:
 
 @contextmanager
 def srgb_target() -> Iterator[None]:
-    """Draws inside the block blend in linear light when the target is sRGB; outside it bytes are written unchanged."""
+    """Draw inside the block with blending in linear light when the target is sRGB; outside, bytes are not converted."""
     function("glEnable")(FRAMEBUFFER_SRGB)
     try:
         yield
@@ -184,7 +190,7 @@ def srgb_target() -> Iterator[None]:
 
 
 def shader_source(name: str | Path, **defines: int | str) -> str:
-    """Text of shader `name`, a file of `trilane.shaders` or a path, with the definitions inserted."""
+    """Return the text of shader `name`, a file of `trilane.shaders` or a path, with the definitions inserted."""
     file = name if isinstance(name, Path) else files("trilane.shaders") / name
     text = file.read_text(encoding="utf-8")
     version, _, body = text.partition("\n")
@@ -193,9 +199,9 @@ def shader_source(name: str | Path, **defines: int | str) -> str:
 
 
 def build_program(ctx: Any, vertex: str | Path, fragment: str | Path, **defines: int | str) -> Any:
-    """A linked program of two shaders.
+    """Build and link a program of two shaders.
 
-    `ctx`: the OpenGL context.
+    `ctx`: OpenGL context.
     `vertex`, `fragment`: files of `trilane.shaders`, or paths.
     `defines`: preprocessor definitions of both.
     Raises TrilaneError with the compiler's log.
@@ -214,7 +220,7 @@ def set_uniforms(program: Any, values: dict[str, Any]) -> None:
 
 
 def counter_of(ctx: Any) -> ByteCounter:
-    """The counter of context `ctx`, made on first use."""
+    """Return the counter of context `ctx`, made on first use."""
     if ctx.extra is None:
         ctx.extra = ByteCounter()
     counter: ByteCounter = ctx.extra
@@ -224,20 +230,23 @@ def counter_of(ctx: Any) -> ByteCounter:
 def upload(ctx: Any, target: Any, data: Any, **how: Any) -> None:
     """Write `data`, bytes or a contiguous array, to `target`: a buffer, a texture, or a uniform that is an array.
 
-    `how`: what `target.write` takes.
+    `how`: further arguments of `target.write`.
     """
     target.write(data, **how)
     counter_of(ctx).uploaded += memoryview(data).nbytes
 
 
 def uploaded_buffer(ctx: Any, data: bytes) -> Any:
-    """A new buffer that holds `data`."""
+    """Return a new buffer that holds `data`."""
     counter_of(ctx).uploaded += len(data)
     return ctx.buffer(data)
 
 
 def read_into(ctx: Any, framebuffer: Any, pixels: U8, *box: Any, **how: Any) -> None:
-    """Copy `framebuffer` into `pixels`, which it fills. `box`, `how`: what `Framebuffer.read_into` takes."""
+    """Copy `framebuffer` into `pixels`, which it fills.
+
+    `box`, `how`: further arguments of `Framebuffer.read_into`.
+    """
     framebuffer.read_into(pixels, *box, **how)
     counter_of(ctx).read_back += pixels.nbytes
 
@@ -246,15 +255,15 @@ FLIP_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 def target_clip(view: Floats, projection: Floats) -> bytes:
-    """The matrix `clip_from_world` of a target whose first row is the top one: column-major float32 bytes of a `mat4`.
+    """Return the matrix `clip_from_world` of a target whose first row is the top one.
 
-    `view`, `projection` (4,4), OpenGL.
+    It is column-major float32 bytes of a `mat4`. `view`, `projection`: OpenGL matrices (4,4).
     """
     clip = FLIP_Y @ np.asarray(projection, np.float64) @ np.asarray(view, np.float64)
     return clip.T.astype(np.float32).tobytes()
 
 
 def eye_of(view: Floats) -> NDArray[np.float64]:
-    """Position (3,) of the camera in the world, metres; `view` (4,4) is a rotation and a translation."""
+    """Return the position (3,) of the camera in the world, metres; `view` (4,4) is a rotation and a translation."""
     rotation = np.asarray(view, np.float64)[:3, :3]
     return -rotation.T @ np.asarray(view, np.float64)[:3, 3]

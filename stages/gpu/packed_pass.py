@@ -22,7 +22,7 @@ from trilane.stages.gpu import opengl
 from trilane.stages.gpu.opengl import build_program, read_into, set_uniforms, upload
 from trilane.stages.gpu.skinned_mesh import BodyPose, Mesh, MeshDraw
 
-#: How the neural texture is read: the filter when it is shrunk, and the greatest anisotropy (a driver may allow less).
+#: How the neural texture is read: the filter when it is shrunk, and the greatest anisotropy, which a driver may limit.
 FILTERS = {
     "linear": (moderngl.LINEAR, 1.0),
     "mipmap": (moderngl.LINEAR_MIPMAP_LINEAR, 1.0),
@@ -32,10 +32,10 @@ FP16_MAX = float(np.finfo(np.float16).max)
 
 
 def texture_array(ctx: Any, texture: Floats, filtering: str = "linear", levels: Sequence[Floats] = ()) -> Any:
-    """An FP16 array texture of C/4 RGBA layers from `texture` (H,W,C), clamped at its edge.
+    """Return an FP16 array texture of C/4 RGBA layers from `texture` (H,W,C), clamped at its edge.
 
-    `filtering`: one of FILTERS. `levels`: smaller ones that were learnt; they are read in place of the driver's means,
-    and none below them, so `linear` becomes `mipmap`.
+    `filtering`: one of FILTERS. `levels`: smaller levels that were learnt. They replace the driver's means, and no
+    level is read below them, so `linear` becomes `mipmap`.
     """
     height, width, channels = texture.shape
     array = ctx.texture_array((width, height, channels // 4), 4, _pixels(texture), dtype="f2")
@@ -52,7 +52,7 @@ def texture_array(ctx: Any, texture: Floats, filtering: str = "linear", levels: 
 
 
 def filter_of(asked: str, learnt: bool) -> str:
-    """The filter of a texture for which the scene has `asked`; one with `learnt` levels is never read without them."""
+    """Return the filter of a texture for which the scene has `asked`; `learnt` levels are always read."""
     return "mipmap" if learnt and asked == "linear" else asked
 
 
@@ -63,7 +63,7 @@ def _pixels(texture: Floats) -> bytes:
 
 
 def check_texture(texture: Floats, channels: int) -> None:
-    """Raises BadInputError unless `texture` is (H,W,channels) and all its numbers fit into FP16."""
+    """Raise BadInputError unless `texture` is (H,W,channels) and all its numbers fit into FP16."""
     if texture.ndim != 3 or texture.shape[2] != channels:
         raise BadInputError("neural texture", f"shape {texture.shape}", f"(height, width, {channels})")
     largest = float(np.abs(texture).max()) if texture.size else 0.0
@@ -73,8 +73,8 @@ def check_texture(texture: Floats, channels: int) -> None:
 
 CHANNELS = (4, 8, 12, 16)
 WORD_TYPES = {1: "uint", 2: "uvec2", 3: "uvec4", 4: "uvec4"}
-#: 32-bit words of a target's pixel by the tensor's. OpenGL does not promise drawable targets of three words, so they
-#: have four, of which the fourth is not read back.
+#: Number of 32-bit words in a target's pixel, by the tensor's. OpenGL does not promise drawable targets of three words,
+#: so those have four, and the fourth is not read back.
 TARGET_WORDS = {1: 1, 2: 2, 3: 4, 4: 4}
 
 
@@ -82,7 +82,7 @@ TARGET_WORDS = {1: 1, 2: 2, 3: 4, 4: 4}
 class Quantisation:
     """How the tensor's bytes stand for real numbers: real = (q - zero_point) * scale, q in 0..255.
 
-    Raises BadInputError when made with a scale that is not positive or a zero point that is not a byte.
+    Raises BadInputError for a scale that is not positive or a zero point that is not a byte.
     """
 
     scale: float
@@ -97,9 +97,10 @@ class Quantisation:
 
 @dataclass(frozen=True)
 class Placement:
-    """One avatar in a tensor. `rect`: top, left, height, width in tensor pixels. `clip_projection` (4,4): of its crop.
+    """One avatar in a tensor.
 
-    `joints`, `feature`, `vertices`: its pose, as in `BodyPose`.
+    `rect`: top, left, height, width in tensor pixels. `clip_projection` (4,4): projection of its crop. `joints`,
+    `feature`, `vertices`: its pose, as in `BodyPose`.
     """
 
     joints: F32
@@ -116,9 +117,10 @@ class Placement:
 
 @dataclass(frozen=True)
 class Target:
-    """`words`: framebuffer of the tensor. Of a deferred pass also `uv_image` and its framebuffer `uv`, with one depth.
+    """A target of the pass.
 
-    `blank`: bytes of an empty tensor; software drivers copy them faster than they clear a target.
+    `words`: framebuffer of the tensor. `uv_image`, `uv`: image of u and v in a deferred pass, and its framebuffer; they
+    share one depth. `blank`: bytes of an empty tensor, which software drivers copy faster than they clear a target.
     """
 
     words: Any
@@ -135,11 +137,12 @@ class PackedPass:
     ) -> None:
         """Check the settings; targets are made on first use.
 
-        `ctx`: the OpenGL context.
-        `channels`: of the tensors and textures, one of `CHANNELS`.
+        `ctx`: OpenGL context.
+        `channels`: channels of the tensors and textures, one of `CHANNELS`.
         `quantisation`: scale and zero point of the bytes.
-        `deferred`: draw u and v of every pixel first, then read the texture once for each visible pixel. The bytes are
-        the same. It is faster on software drivers, which shade whole blocks of pixels for each small triangle.
+        `deferred`: whether to draw u and v of every pixel first, then read the texture once for each visible pixel. The
+        bytes are the same. It is faster on software drivers, which shade whole blocks of pixels for each small
+        triangle.
         `filtering`: a name of `FILTERS`. A deferred pass has no derivatives of u and v, so it takes only `linear`.
         Raises BadInputError.
         """
@@ -165,7 +168,7 @@ class PackedPass:
         return {"neural": 0, "uv_image": 1, "scale": encoding.scale, "zero_point": float(encoding.zero_point)}
 
     def target(self, shape: Shape) -> Target:
-        """The target for tensors of `shape` (height, width); made on first use."""
+        """Return the target for tensors of `shape` (height, width); it is made on first use."""
         if shape not in self._targets:
             self._targets[shape] = self._make_target(shape[::-1])
         return self._targets[shape]
@@ -208,9 +211,9 @@ class PackedAvatar:
     """One avatar's mesh and texture, which a `PackedPass` draws."""
 
     def __init__(self, packed: PackedPass, mesh: Mesh, texture: Floats, levels: Floats | None = None) -> None:
-        """`texture` (H,W,C) is uploaded here, with its smaller `levels`, which a deferred pass cannot read.
+        """Upload `texture` (H,W,C) and its smaller `levels`, which a deferred pass cannot read.
 
-        Raises BadInputError when FP16 cannot hold a texture or C is not the pass's.
+        Raises BadInputError when FP16 cannot hold a texture, or C is not the pass's number of channels.
         """
         check_texture(texture, packed.channels)
         smaller = split_levels(levels, texture.shape[1])
@@ -234,8 +237,8 @@ class PackedAvatar:
         """Draw into `target`, which `PackedPass.begin` has cleared.
 
         `target`: target of the pass.
-        `view`: (4,4) the camera.
-        `placement`: the avatar's pose, crop and rectangle of the tensor.
+        `view`: matrix (4,4) of the camera.
+        `placement`: pose, crop and rectangle of the avatar.
         """
         top, left, height, width = placement.rect
         box = (left, top, width, height)

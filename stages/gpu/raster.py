@@ -26,9 +26,10 @@ from trilane.transport.packets import Packet
 
 
 class RasterStage:
-    """`avatars[i]` draws the scene's avatar i. `shapes`: tensor shapes (height, width) that may come.
+    """The raster stage.
 
-    `posed_vertices`: how many vertices of each avatar come skinned in the input slot; empty when the GPU skins.
+    `avatars[i]`: draws the scene's avatar i. `shapes`: tensor shapes (height, width) that may come.
+    `posed_vertices`: number of skinned vertices of each avatar in the input slot; empty when the GPU skins.
     """
 
     def __init__(
@@ -51,9 +52,9 @@ class RasterStage:
             self._packed.target(shape)
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
-        """Write frame `frame`'s tensor, (h,w,C) uint8.
+        """Write the tensor of frame `frame`, (h,w,C) uint8.
 
-        Figures: the bytes moved. The least: of each avatar in view the pose that its mesh takes, and the tensor.
+        Figures: the bytes moved. The least bytes: for each avatar in view the pose that its mesh takes, and the tensor.
 
         Raises TrilaneError when a joint is not a finite number, UnitLostError with the context.
         """
@@ -105,9 +106,9 @@ def _refuse_nan(frame: int, avatars: Sequence[Any]) -> None:
 
 
 def build(settings: Mapping[str, Any], unit: UnitContext) -> RasterStage:
-    """The raster stage of the configuration in `settings`. Raises BadInputError, MissingPartError.
+    """Build the raster stage of the configuration in `settings`. Raises BadInputError, MissingPartError.
 
-    The driver's kind decides how the packed pass is drawn, no more.
+    The driver's kind only decides how the packed pass is drawn.
     """
     config = RunConfig.model_validate(settings["config"])
     ctx = unit.shared(CONTEXT, lambda: open_context(unit.settings.threads))

@@ -1,10 +1,10 @@
 """A body's mesh on the GPU: its arrays, its vertex and index buffers, the pose of a frame, and how it is drawn.
 
 There is one vertex per distinct (position, UV) corner, and triangles are ordered so that neighbours are drawn together.
-A mesh offers `Mesh`, whether the vertex shader skins its vertices (`SkinnedMesh`) or the CPU unit (`PosedMesh`).
+A mesh implements `Mesh`: the vertex shader skins the vertices of a `SkinnedMesh`, the CPU unit those of a `PosedMesh`.
 
 A triangle whose corners have at most four weights is skinned with four, and so on. Positions are the same to the last
-bit, because a weight of 0 adds nothing. How many weights a body needs is worked out once and then cached.
+bit, because a weight of 0 adds nothing. The number of weights that a body needs is computed once and then cached.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ MAX_OPEN = 0.005
 class MeshArrays:
     """Per-vertex arrays after the split at UV seams.
 
-    `position` (N,3) metres, rest pose. `uv` (N,2). `joint` (N,K) uint8 and `weight` (N,K), largest first, rows sum to
+    `position` (N,3): metres, rest pose. `uv` (N,2). `joint` (N,K) uint8 and `weight` (N,K): largest first, rows sum to
     1. `triangles` (F,3) uint32. `source` (N,) int64: the body's vertex that each row is a copy of. `surface`: arrays
-    `normal` (N,3) and `colour` (N,4) of meshes that are shaded, else empty. `closed`: whether the triangles enclose a
-    volume, so that those facing away from the camera are never seen from outside.
+    `normal` (N,3) and `colour` (N,4) of shaded meshes, else empty. `closed`: whether the triangles enclose a volume, so
+    that those facing away from the camera are never seen from outside.
     """
 
     position: F32
@@ -66,12 +66,12 @@ def mesh_arrays(
     """Split vertices at UV seams and order them for the vertex cache. Vertices that no face uses are left out.
 
     `vertices`: (V,3) metres.
-    `faces`: (F,3) indices of `vertices`.
-    `uv`: (T,2).
-    `uv_faces`: (F,3) indices of `uv`, per corner.
-    `joint`: (V,K) joint indices, K of 4, 8 or 12.
-    `weight`: (V,K) their skin weights.
-    `normal`, `colour`: (V,3) unit normals and (V,4) colours of a mesh that is shaded.
+    `faces`: indices of `vertices`, (F,3).
+    `uv`: texture coordinates, (T,2).
+    `uv_faces`: indices of `uv`, (F,3), per corner.
+    `joint`: joint indices (V,K), K of 4, 8 or 12.
+    `weight`: their skin weights (V,K).
+    `normal`, `colour`: unit normals (V,3) and colours (V,4) of a mesh that is shaded.
     Raises BadInputError when shapes, indices or values cannot be drawn.
     """
     _check(vertices, faces, uv, uv_faces, joint, weight)
@@ -97,7 +97,7 @@ def _surface(normal: Floats | None, colour: Floats | None, source: NDArray[np.in
 
 
 def is_closed(vertices: Floats, faces: Ints) -> bool:
-    """Whether the faces (F,3) wind outward around a volume with at most a share `MAX_OPEN` of their edges open.
+    """Return whether the faces (F,3) wind outward around a volume, with at most a share `MAX_OPEN` of open edges.
 
     Bodies have small openings that no camera sees, such as the backs of the eyes.
     """
@@ -124,10 +124,10 @@ def split_corners(faces: Ints, uv_faces: Ints) -> tuple[NDArray[np.int64], NDArr
 
 
 def patch_order(centres: NDArray[np.float64], patch: int = PATCH_TRIANGLES) -> NDArray[np.int64]:
-    """Order of triangles (F,) in compact patches: groups are halved along their longest side down to `patch` triangles.
+    """Return an order of triangles (F,) in compact patches.
 
-    `centres` (F,3). Software drivers shade vertices again for each batch of about a thousand indices, and compact
-    patches have few vertices in common.
+    Groups are halved along their longest side down to `patch` triangles; `centres` (F,3). Software drivers shade
+    vertices again for each batch of about a thousand indices, and compact patches have few vertices in common.
     """
     pending, done = [np.arange(len(centres))], []
     while pending:
@@ -144,7 +144,7 @@ def patch_order(centres: NDArray[np.float64], patch: int = PATCH_TRIANGLES) -> N
 
 
 def weight_batches(arrays: MeshArrays) -> dict[int, NDArray[np.uint32]]:
-    """Triangles (F_k,3) by the number of skin weights, 4, 8 or 12, that suffices for all three of their corners."""
+    """Return triangles (F_k,3) by the number of skin weights, 4, 8 or 12, that suffices for all three corners."""
     used = np.count_nonzero(arrays.weight, axis=1)
     needed = np.maximum(-(-used // 4) * 4, 4)[arrays.triangles].max(axis=1)
     return {k: arrays.triangles[needed == k] for k in WEIGHT_COUNTS if (needed == k).any()}
@@ -172,12 +172,12 @@ def _indexes(values: Any, count: int) -> bool:
     return bool(values.size) and int(values.min()) >= 0 and int(values.max()) < count
 
 
-LARGEST_LOSS = 1e-3  # of a vertex's weight
-VERSION = "avatar mesh 1"  # to be raised when the same body gives other arrays
+LARGEST_LOSS = 1e-3  # share of a vertex's weight
+VERSION = "avatar mesh 1"  # raise it when the same body gives other arrays
 
 
 def avatar_mesh(shaped: ShapedBody) -> MeshArrays:
-    """Vertices, triangles and weights of `shaped`, in the order in which they are drawn."""
+    """Return vertices, triangles and weights of `shaped`, in the order in which they are drawn."""
     body = shaped.body
     sources = (shaped.vertices, body.faces, body.uv, body.uv_faces, body.weights)
     arrays: dict[str, Any] = dict(cached_arrays(VERSION, sources, lambda: _arrays(shaped)))
@@ -193,7 +193,7 @@ def _arrays(shaped: ShapedBody) -> Arrays:
 
 
 def enough_weights(body: Body) -> int:
-    """The smallest K of 4, 8, 12 whose K largest weights hold all but LARGEST_LOSS of every vertex; else 12."""
+    """Return the smallest K of 4, 8, 12 whose K largest weights hold all but LARGEST_LOSS of every vertex; else 12."""
     left = -np.sort(-body.weights, axis=1)
     lost = {k: float(left[:, k:].sum(axis=1).max(initial=0.0)) for k in WEIGHT_COUNTS}
     return next((k for k in WEIGHT_COUNTS if lost[k] <= LARGEST_LOSS), WEIGHT_COUNTS[-1])
@@ -205,9 +205,10 @@ GROUPS = "abc"
 
 @dataclass(frozen=True)
 class BodyPose:
-    """One body in one frame. `joints` (55,3,4): skinning matrices. `feature` (486,): factors of the pose blend shapes.
+    """One body in one frame.
 
-    `vertices` (V,3): the body's vertices in the world, metres, when the CPU unit has skinned them.
+    `joints` (55,3,4): skinning matrices. `feature` (486,): factors of the pose blend shapes. `vertices` (V,3): the
+    body's vertices in the world, metres, when the CPU unit has skinned them.
     """
 
     joints: F32
@@ -216,9 +217,9 @@ class BodyPose:
 
 
 class Mesh(Protocol):
-    """What `MeshDraw` draws: buffers, a vertex shader, and the pose of a frame.
+    """A mesh that `MeshDraw` draws: buffers, a vertex shader, and the pose of a frame.
 
-    `batches`: pairs of a number of skin weights and the index buffer of the triangles drawn with as many.
+    `batches`: pairs of a number of skin weights and the index buffer of the triangles drawn with that many.
     `pose_bytes`: bytes of a frame's pose, each number of it once.
     """
 
@@ -235,7 +236,7 @@ class Mesh(Protocol):
         """Enable the depth test, and for a closed mesh leave out the triangles that face away."""
 
     def vertex_array(self, program: Any, indices: Any) -> Any:
-        """A vertex array of this mesh for `program`, drawn in the order of index buffer `indices`."""
+        """Return a vertex array of this mesh for `program`, drawn in the order of index buffer `indices`."""
 
     def upload_pose(self, pose: BodyPose) -> None:
         """Write a frame's pose to the GPU. Raises ValueError when it lacks an array that the mesh needs."""
@@ -263,7 +264,7 @@ class PosedMesh:
         _prepare(ctx, self.arrays.closed)
 
     def vertex_array(self, program: Any, indices: Any) -> Any:
-        """A vertex array of this mesh for `program`."""
+        """Return a vertex array of this mesh for `program`."""
         content = [(self._positions, "3f", "position"), (self._uv, "2f", "uv")]
         return _vertex_array(self._ctx, program, content, indices, self.arrays)
 
@@ -271,17 +272,20 @@ class PosedMesh:
         """Write the body's vertices to the GPU. Raises ValueError without them."""
         if pose.vertices is None:
             raise ValueError("a posed mesh needs the frame's vertices")
-        np.take(pose.vertices, self.arrays.source, axis=0, out=self._corners, mode="clip")  # "raise" copies twice
+        np.take(pose.vertices, self.arrays.source, axis=0, out=self._corners, mode="clip")  # mode "raise" copies twice
         self._positions.orphan()
         counter_of(self._ctx).read += self._corners.nbytes
         upload(self._ctx, self._positions, self._corners)
 
     def bind_pose(self, program: Any) -> None:
-        """Does nothing: the positions are vertex attributes."""
+        """Do nothing: the positions are vertex attributes."""
 
 
 class SkinnedMesh:
-    """A mesh whose vertices the vertex shader skins. `posedirs` (V,3,486): pose blend shapes of the body's vertices."""
+    """A mesh whose vertices the vertex shader skins.
+
+    `posedirs` (V,3,486): pose blend shapes of the body's vertices.
+    """
 
     vertex_shader = "skin.vert"
 
@@ -312,7 +316,7 @@ class SkinnedMesh:
         _prepare(ctx, self.arrays.closed)
 
     def vertex_array(self, program: Any, indices: Any) -> Any:
-        """A vertex array of this mesh for `program`; attributes that the shader's compiler removed are skipped."""
+        """Return a vertex array of this mesh for `program`, without attributes that the shader's compiler removed."""
         return _vertex_array(self._ctx, program, [self._content], indices, self.arrays)
 
     def upload_pose(self, pose: BodyPose) -> None:
@@ -337,7 +341,7 @@ class SkinnedMesh:
 
 
 def _index_size(arrays: MeshArrays) -> int:
-    """Bytes of an index: two where they suffice, because software drivers read them faster."""
+    """Return the bytes of an index: two where they suffice, because software drivers read them faster."""
     return 2 if len(arrays.position) <= 1 << 16 else 4
 
 
@@ -358,7 +362,7 @@ def _prepare(ctx: Any, closed: bool) -> None:
 
 
 def _layout(arrays: MeshArrays, with_source: bool) -> tuple[list[str], list[str], list[NDArray[Any]]]:
-    """Names, moderngl formats and columns of the interleaved vertex buffer."""
+    """Return names, moderngl formats and columns of the interleaved vertex buffer."""
     columns: dict[str, tuple[str, NDArray[Any]]] = {"position": ("3f", arrays.position), "uv": ("2f", arrays.uv)}
     columns |= {name: (f"{values.shape[1]}f", values) for name, values in arrays.surface.items()}
     for group in range(arrays.weights_per_vertex // 4):
@@ -386,9 +390,9 @@ class MeshDraw:
     def __init__(self, ctx: Any, mesh: Mesh, fragment: str | Path, **defines: int | str) -> None:
         """Build a program for each number of skin weights.
 
-        `ctx`: the OpenGL context.
-        `mesh`: what to draw.
-        `fragment`: a file of `trilane.shaders`, or a path.
+        `ctx`: OpenGL context.
+        `mesh`: mesh to draw.
+        `fragment`: file of `trilane.shaders`, or a path.
         `defines`: preprocessor definitions of both shaders.
         Raises TrilaneError when a shader does not compile.
         """

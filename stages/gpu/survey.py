@@ -1,7 +1,7 @@
-"""What the background of a scene is, looked at before a run.
+"""Checks the background of a scene before a run, and says what it is.
 
-Rule: whatever the run will show is opened here: each picture is decoded, and a video's frames are counted, so that a
-broken file is named before a process is started. A note says size, rate and range.
+Rule: everything that the run will show is opened here: each picture is decoded, and a video's frames are counted. A
+broken file is then named before a process is started. A note says size, rate and range.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from trilane.scene.footage import Footage, Stored, film_of
 from trilane.stages.gpu.background import check_picture, is_picture, look_at_picture, pictures_in
 from trilane.stages.gpu.video_reader import DEFAULT_STEP_S, Pixels, check_size, pixels_of, quarters_of, video_stream
 
-#: Steps between a video's frames that differ by more than this share of the usual one are of a variable rate.
+#: A video has a variable rate when a step between its frames differs from the usual one by more than this share.
 STEADY = 0.25
 MOST_PACKETS = 500_000
-#: Of the frames that a whole file names, so many are in it.
+#: Least share of its stated frames that a whole file contains.
 LEAST_WHOLE = 0.99
 A_VIDEO = "a video, a picture, or a folder of pictures"
-#: Control characters but those that lay out a text.
+#: Control characters, except those that lay out a text.
 NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
 QUARTER_WORDS = {1: ", turned by 90 degrees", 2: ", turned by 180 degrees", 3: ", turned by 270 degrees"}
 EIGHT_BITS = 8
 
 
 def survey(path: Path, fps: float) -> Footage:
-    """What `path` is; a folder's pictures follow each other at `fps`. Raises BadInputError."""
+    """Return what `path` is; a folder's pictures follow each other at `fps`. Raises BadInputError."""
     if path.is_dir():
         return _folder(path, fps)
     require_file(path, A_VIDEO)
@@ -48,9 +48,9 @@ def survey(path: Path, fps: float) -> Footage:
 
 
 def check_pictures(path: Path, fps: float, frames: int, camera: CameraPath) -> None:
-    """Decode each picture of `path` that a run of so many `frames` shows. Raises BadInputError naming a bad one.
+    """Decode each picture of `path` that a run of `frames` frames shows. Raises BadInputError naming a bad one.
 
-    `camera`: the scene's, whose views the pictures may belong to.
+    `camera`: camera of the scene, whose views the pictures may belong to.
     """
     if path.is_dir():
         for _ in _checked(_shown(path, fps, frames, camera)):
@@ -91,7 +91,10 @@ def _size(stored: Stored) -> str:
 
 
 class _Head(NamedTuple):
-    """A video's first frame, and the facts of its stream. `bits`: bits a colour."""
+    """A video's first frame, and the facts of its stream.
+
+    `bits`: bits per colour.
+    """
 
     stored: Stored
     pixels: Pixels
@@ -100,7 +103,10 @@ class _Head(NamedTuple):
 
 
 def require_video(path: Path) -> None:
-    """Raises BadInputError for what is no video, though FFmpeg may show it, or files that it names: text, archives."""
+    """Raise BadInputError for a file that is no video, even where FFmpeg may show it or files that it names.
+
+    Texts and archives are such files.
+    """
     try:
         with path.open("rb") as file:
             head = file.read(HEAD_BYTES)
@@ -114,7 +120,7 @@ def require_video(path: Path) -> None:
 
 
 def is_text(head: bytes) -> bool:
-    """Whether a file that begins with `head` has none of the bytes that no text has, and every video."""
+    """Return whether a file that begins with `head` may be text: every video has bytes that no text has."""
     return not NO_TEXT.search(head)
 
 
@@ -153,7 +159,7 @@ def _head(container: Any, path: Path) -> _Head:
 
 
 def _times(container: Any, path: Path) -> list[float]:
-    """Increasing times of the frames, seconds; they are not decoded. Raises BadInputError when the file was cut off."""
+    """Return increasing times of the frames, seconds, without decoding. Raises BadInputError for a truncated file."""
     stream = video_stream(container, path)
     times, count = set(), 0
     for packet in container.demux(stream):
@@ -168,7 +174,7 @@ def _times(container: Any, path: Path) -> list[float]:
 
 
 def _rate(steps: Sequence[float], period_s: float) -> str:
-    """The rate in words, by the sorted `steps` between frames."""
+    """Say the rate in words, by the sorted `steps` between frames."""
     if not steps:
         return "one frame"
     usual = median(steps)

@@ -1,12 +1,12 @@
-"""A video as a background: decoded ahead on a thread, in step with media time, and brought to sRGB.
+"""A video as a background: decoded ahead on a thread, in step with media time, and converted to sRGB.
 
-Each frame is shown at the time that the file gives it, whatever the rate. The thread decodes at most AHEAD frames in
-advance, and `at` waits for at most one frame to be decoded.
+Each frame is shown at the time that the file gives it, at any rate. The thread decodes at most AHEAD frames in advance,
+and `at` waits for at most one frame to be decoded.
 
-The light of a high-range video, PQ or HLG, is computed by the published curves, rolled off above what a common display
-shows by the curve of ITU-R BT.2390 on the largest of the three primaries, which keeps the hue, and only then brought to
-the primaries of sRGB. Sources: PQ, HLG and its system gamma are ITU-R BT.2100-2; the roll-off is BT.2390-10, 5.4.1;
-reference white at 203 cd/m2 is BT.2408-5; the matrix is that of BT.2087-0.
+The light of a high-range video, PQ or HLG, is computed by the published curves. The curve of ITU-R BT.2390 then rolls
+off light above what a common display shows, on the largest of the three primaries, which keeps the hue. At last the
+light is converted to the primaries of sRGB. Sources: PQ, HLG and its system gamma are ITU-R BT.2100-2; the roll-off is
+BT.2390-10, 5.4.1; reference white at 203 cd/m2 is BT.2408-5; the matrix is that of BT.2087-0.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from trilane.scene.lens import cover
 from trilane.shapes import Shape
 
 PQ, HLG = "PQ", "HLG"
-#: Light of white in the result, and the brightest light that is told from it, cd/m2.
+#: Light of white in the result, and the brightest light that can be told from it, cd/m2.
 WHITE, PEAK = 203.0, 1000.0
-HLG_GAMMA = 1.2  # of a display whose peak is 1000 cd/m2
+HLG_GAMMA = 1.2  # HLG's system gamma for a display whose peak is 1000 cd/m2
 STEPS = 4096
 M1 = 0.1593017578125
 LUMA_2020 = np.array([0.2627, 0.6780, 0.0593], np.float32)
@@ -42,7 +42,7 @@ SRGB_FROM_2020 = np.array(
 
 
 def to_srgb(codes: NDArray[np.uint16], transfer: str, is_wide: bool) -> U8:
-    """(h,w,3) uint8 sRGB of `codes` (h,w,3), R'G'B' of `transfer`, 0 to 65535.
+    """Convert `codes` (h,w,3), R'G'B' of `transfer`, 0 to 65535, to sRGB (h,w,3) uint8.
 
     `is_wide`: whether their primaries are those of BT.2020; else they are those of sRGB.
     """
@@ -61,7 +61,7 @@ def to_srgb(codes: NDArray[np.uint16], transfer: str, is_wide: bool) -> U8:
 
 @cache
 def _eotf(transfer: str) -> F32:
-    """Light of each of STEPS codes: PQ's in cd/m2; HLG's of the scene, 0 to 1."""
+    """Return the light of each of STEPS codes: PQ's in cd/m2; HLG's of the scene, 0 to 1."""
     code = np.arange(STEPS) / (STEPS - 1)
     if transfer == PQ:
         return pq_light(code).astype(np.float32)
@@ -71,27 +71,27 @@ def _eotf(transfer: str) -> F32:
 
 
 def pq_light(code: F64) -> F64:
-    """cd/m2 of PQ's `code`, 0 to 1."""
+    """Return the light in cd/m2 of PQ's `code`, 0 to 1."""
     power = np.power(code, 1 / 78.84375)
     return np.asarray(10000 * np.power(np.maximum(power - 0.8359375, 0) / (18.8515625 - 18.6875 * power), 1 / M1))
 
 
 def pq_code(light: F64) -> F64:
-    """PQ's code, 0 to 1, of `light` in cd/m2."""
+    """Return PQ's code, 0 to 1, for `light` in cd/m2."""
     power = np.power(light / 10000, M1)
     return np.asarray(np.power((0.8359375 + 18.8515625 * power) / (1 + 18.6875 * power), 78.84375))
 
 
 @cache
 def _gains() -> F32:
-    """Factors on light, in STEPS steps of its square root from 0 to the square root of PEAK."""
+    """Return factors on light, in STEPS steps of its square root from 0 to the square root of PEAK."""
     light = np.maximum(np.linspace(0, np.sqrt(PEAK), STEPS), 1e-3) ** 2
     gains: F32 = (roll_off(light) / light).astype(np.float32)
     return gains
 
 
 def roll_off(light: F64) -> F64:
-    """Light of a display, 1 for white, of `light` up to PEAK: BT.2390's spline between codes of PQ."""
+    """Return the light of a display, 1 for white, for `light` up to PEAK: BT.2390's spline between codes of PQ."""
     peak = pq_code(np.array(PEAK))
     code, most = pq_code(light) / peak, float(pq_code(np.array(WHITE)) / peak)
     knee = 1.5 * most - 0.5
@@ -102,7 +102,7 @@ def roll_off(light: F64) -> F64:
 
 @cache
 def _srgb() -> U8:
-    """sRGB of the square of each of STEPS numbers from 0 to 1."""
+    """Return sRGB of the square of each of STEPS numbers from 0 to 1."""
     light = (np.arange(STEPS) / (STEPS - 1)) ** 2
     curve = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.power(light, 1 / 2.4) - 0.055)
     return (curve * 255 + 0.5).astype(np.uint8)
@@ -112,32 +112,32 @@ AHEAD = 4
 MAX_PIXELS = 64_000_000
 DEFAULT_STEP_S = 1 / 30
 ROUNDING_S = 1e-6
-#: By their numbers in ITU-T H.273, which are FFmpeg's.
+#: Transfers and primaries by their numbers in ITU-T H.273, which FFmpeg uses.
 TRANSFERS, BT2020_PRIMARIES = {16: PQ, 18: HLG}, 9
-MIN_ASPECT = 0.1  # of a pixel; what is beyond is a mistake of the file
-MICROSECONDS = 1e6  # of a second: the unit of a container's duration and of its seeks
+MIN_ASPECT = 0.1  # least aspect of a pixel; anything beyond is a mistake in the file
+MICROSECONDS = 1e6  # in a second: the unit of a container's duration and of its seeks
 
 
 class VideoReader:
     """The first video stream of a file, scaled and cropped to `shape`, played in a loop. Raises BadInputError.
 
-    `turned`: by how many quarters it is turned clockwise; None for what the file says.
+    `turned`: number of quarters that it is turned clockwise; None for what the file says.
     """
 
     def __init__(self, path: Path, shape: Shape, turned: int | None = None) -> None:
         self._path, self._shape, self._turned = path, shape, turned
-        self._start_s: float | None = None  # of the file's first frame, in its own time
-        self._period_s = 0.0  # of the loop; 0 until the video has ended once
+        self._start_s: float | None = None  # time of the file's first frame, by the file's own clock
+        self._period_s = 0.0  # length of the loop; 0 until the video has ended once
         self._shown_s = -1.0
         self._next: tuple[float, U8]
         self._queue: queue.Queue[tuple[float, U8] | TrilaneError]
         self._open(0.0)
 
     def at(self, time_s: float) -> U8 | None:
-        """The newest frame (h,w,3) uint8 not after `time_s`; None when the last call returned that frame already.
+        """Return the newest frame (h,w,3) uint8 not after `time_s`; None when the last call returned it already.
 
-        Times may go back, as they do from the frames that are measured before a run to its first one: then the video
-        is opened again. Raises BadInputError when the file cannot be decoded.
+        Times may go back, as they do from the frames that are measured before a run to its first one: then the video is
+        opened again. Raises BadInputError when the file cannot be decoded.
         """
         if time_s + ROUNDING_S < self._shown_s:
             self.close()
@@ -184,7 +184,7 @@ class VideoReader:
                 return self._queue.put(item, timeout=0.1)
 
     def _frames(self, from_s: float) -> Iterator[tuple[float, U8]]:
-        """Pairs of time and picture without end, from `from_s` or a little earlier.
+        """Yield pairs of time and picture without end, from `from_s` or a little earlier.
 
         Raises BadInputError for a video without frames.
         """
@@ -193,7 +193,7 @@ class VideoReader:
         while True:
             last, step = -1.0, DEFAULT_STEP_S
             for time_s, picture in self._one_round(seek_s):
-                at = max(time_s, last)  # in some files times decrease
+                at = max(time_s, last)  # times decrease in some files
                 step = at - last if at > last >= 0 else step
                 last = at
                 yield begin + at, picture
@@ -203,7 +203,7 @@ class VideoReader:
             begin, seek_s = begin + self._period_s, 0.0
 
     def _one_round(self, seek_s: float) -> Iterator[tuple[float, U8]]:
-        """The frames from the last key frame before `seek_s` to the end, with their times from the file's first one."""
+        """Yield the frames from the last key frame before `seek_s` to the end, with times from the first frame on."""
         try:
             with av.open(str(self._path), metadata_errors="replace") as container:
                 stream = video_stream(container, self._path)
@@ -222,9 +222,9 @@ class VideoReader:
 
 
 def fitted(frame: Any, pixels: Pixels, shape: Shape, turned: int | None = None) -> U8:
-    """`frame`, of `pixels`, covering `shape` (h,w), turned clockwise by `turned` quarters, or as its file says.
+    """Return `frame` covering `shape` (h,w), turned clockwise by `turned` quarters, or as its file says.
 
-    What the file mirrors is mirrored only in the latter case.
+    `pixels`: facts about its pixels. A frame that the file mirrors is mirrored only when the file decides.
     """
     quarters = quarters_of(frame) if turned is None else turned % 4
     stored = (frame.height, round(frame.width * pixels.aspect))
@@ -238,15 +238,15 @@ def fitted(frame: Any, pixels: Pixels, shape: Shape, turned: int | None = None) 
 
 
 def quarters_of(frame: Any) -> int:
-    """Quarters by which `frame` is turned clockwise to be shown, by its file."""
+    """Return the quarters by which `frame` is turned clockwise to be shown, by its file."""
     return int(-round(frame.rotation / 90) % 4)
 
 
 def is_mirrored(frame: Any) -> bool:
-    """Whether `frame` is to be mirrored top to bottom before it is turned, as its file says: a selfie's display matrix.
+    """Return whether the file says to mirror `frame` top to bottom before turning it, as a selfie's matrix does.
 
-    FFmpeg takes its angle from where x goes (`av_display_rotation_get`), so what is left of a mirror image is that y is
-    reversed.
+    FFmpeg takes its angle from where x goes (`av_display_rotation_get`), so all that remains of a mirror image is that
+    y is reversed.
     """
     for side in frame.side_data:
         if side.type == Type.DISPLAYMATRIX:
@@ -256,22 +256,23 @@ def is_mirrored(frame: Any) -> bool:
 
 
 def check_size(path: Path, frame: Any) -> None:
-    """Raises BadInputError when `frame` of `path` is too large."""
+    """Raise BadInputError when `frame` of `path` is too large."""
     if frame.width * frame.height > MAX_PIXELS:
         raise BadInputError(path, f"{frame.width}x{frame.height} pixels", f"at most {MAX_PIXELS} pixels")
 
 
 def video_stream(container: Any, path: Path) -> Any:
-    """The first video stream. Raises BadInputError when there is none."""
+    """Return the first video stream. Raises BadInputError when there is none."""
     if not container.streams.video:
         raise BadInputError(path, "no video stream", "a video")
     return container.streams.video[0]
 
 
 class Pixels(NamedTuple):
-    """Those of a video. `aspect`: width over height of one. `transfer`: PQ or HLG, empty for the usual range.
+    """The pixels of a video.
 
-    `is_wide`: whether their primaries are those of BT.2020.
+    `aspect`: width of a pixel over its height. `transfer`: PQ or HLG, empty for the usual range. `is_wide`: whether
+    their primaries are those of BT.2020.
     """
 
     aspect: float = 1.0
@@ -280,7 +281,7 @@ class Pixels(NamedTuple):
 
 
 def pixels_of(stream: Any) -> Pixels:
-    """Those of a video `stream`."""
+    """Return the facts about the pixels of a video `stream`."""
     codec = stream.codec_context
     aspect = float(codec.sample_aspect_ratio or 0)
     return Pixels(

@@ -1,7 +1,7 @@
 """A capture: frames of one person, each with its mask and the fit of the body, and the camera that took them.
 
-Rule: a `Capture` is whole; everything that is wrong with a folder is found before anything starts and is listed
-together. Layout on disk: docs/captures.md.
+Rule: a `Capture` is whole. All faults of a folder are found before anything starts and are listed together. Layout on
+disk: docs/captures.md.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from trilane.training.capture.capture_file import (
 from trilane.training.capture.fits import NAMES, SHAPE, Fit, read_fit
 from trilane.unexpected_value import UnexpectedValue
 
-#: One for each side of a person.
+#: Least number of frames: one for each side of a person.
 LEAST_FRAMES = 4
-#: From this value on a pixel of a mask counts as the person's.
+#: Least value of a mask's pixel that counts as the person's.
 HALF = 128
 EXPECTED_FITS = "a folder of .npz files named like the frames, or one .npz"
 BODY = "body.npz"
@@ -48,9 +48,10 @@ Track = Callable[[Sequence[int]], Iterable[int]]
 
 @dataclass(frozen=True)
 class Capture:
-    """A capture without faults. `fits`, `views` (4,4): of each frame; `mask_of`: the number of its mask.
+    """A capture without faults.
 
-    `shaped`: the body, whose shape is the mean of that of the fits. `body_file`: where it was read.
+    `fits`: fit of each frame. `views` (4,4): view matrix of each frame. `mask_of`: number of each frame's mask.
+    `shaped`: body, whose shape is the mean of the fits' shapes. `body_file`: file from which it was read.
     """
 
     folder: Path
@@ -75,29 +76,33 @@ class Capture:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the frames."""
+        """Names of the frames."""
         return self.frames.names
 
     def picture(self, number: int) -> U8:
-        """Frame `number` with its mask as alpha (h,w,4), straight. Raises UnexpectedValue when it was changed since."""
+        """Return frame `number` (h,w,4) with its mask as straight alpha.
+
+        Raises UnexpectedValue when a file has changed since the capture was opened.
+        """
         return np.dstack([self.frames.read(number), self.masks.read(self.mask_of[number])])
 
     def directions(self) -> list[tuple[float, float]]:
-        """Of each frame: yaw and height of the camera, degrees, as `camera_direction`."""
+        """Return yaw and height of each frame's camera, degrees, as `camera_direction` defines them."""
         return directions(self.shaped, self.fits, self.views)
 
 
 def directions(shaped: ShapedBody, fits: Sequence[Fit], views: Sequence[F64]) -> list[tuple[float, float]]:
-    """Of each of `fits` of a body, seen by the camera (4,4) of `views`: its yaw and height, see `camera_direction`."""
+    """Return yaw and height of each of the cameras `views` (4,4) that see `fits` of a body, see `camera_direction`."""
     root = shaped.joints[0]
     return [camera_direction(fit.pose, root + fit.place, view) for fit, view in zip(fits, views, strict=True)]
 
 
 def open_capture(folder: Path, track: Track = iter) -> Capture:
-    """The capture in `folder`, after every picture and fit has been looked at.
+    """Open the capture in `folder` and check every picture and fit.
 
     `track`: wraps the numbers of the frames to show progress.
-    Raises BadInputError for a capture.toml that cannot be read, FaultyCaptureError with all faults of what it names.
+    Raises BadInputError for a capture.toml that cannot be read, FaultyCaptureError with all faults of the files that it
+    names.
     """
     return _Opening(folder, read_capture_file(folder)).opened(track)
 
@@ -148,7 +153,7 @@ class _Opening:
             self.faults.append(Fault(self.file.frames, count, expected))
 
     def _matched(self, frames: Pictures, masks: Pictures) -> list[int]:
-        """The number of each frame's mask: by name in folders, else by place; -1 where there is none."""
+        """Return the number of each frame's mask: by name in folders, else by place; -1 where there is none."""
         if isinstance(frames, PictureFolder) and isinstance(masks, PictureFolder):
             by_stem = {Path(name).stem: number for number, name in enumerate(masks.names)}
             found = [by_stem.get(Path(name).stem, -1) for name in frames.names]
@@ -185,7 +190,7 @@ class _Opening:
         return picture
 
     def _fits(self, names: Sequence[str], body: Body) -> list[Fit]:
-        """Those fits that could be read."""
+        """Return the fits that could be read."""
         path, fits = self.folder / self.file.fits, []
         one = self._try(lambda: _fits_of_file(path, len(names))) if path.is_file() else None
         if not path.is_dir() and one is None:
@@ -210,7 +215,10 @@ class _Opening:
             return None
 
     def _require_sides(self, seen: Sequence[tuple[float, float]], frames: int) -> None:
-        """`seen`: yaw and height of each camera whose fit could be read, of so many `frames`."""
+        """Add a fault where a side of the person is shown by no frame.
+
+        `seen`: yaw and height of each camera whose fit could be read. `frames`: number of frames.
+        """
         shown = frames_by_side([yaw for yaw, _ in seen])
         missing = [side for side, count in shown.items() if not count and side not in self.file.missing_views]
         if missing:
@@ -221,13 +229,13 @@ class _Opening:
 
 
 def _mean(rows: Sequence[F64]) -> F64:
-    """The mean of rows of coefficients; one that a row does not have is 0."""
+    """Return the mean of rows of coefficients; a row that lacks a coefficient counts as 0 there."""
     longest = max(len(row) for row in rows)
     return np.asarray(np.mean([np.pad(row, (0, longest - len(row))) for row in rows], axis=0))
 
 
 def _fits_of_file(path: Path, count: int) -> list[Mapping[str, NDArray[Any]]]:
-    """The arrays of each frame out of one file; those of the shape may hold for all. Raises BadInputError."""
+    """Return the arrays of each frame from one file; shape arrays may hold for all frames. Raises BadInputError."""
     arrays = read_npz(path, NAMES, EXPECTED_FITS)
     shared = {name: arrays.pop(name) for name in SHAPE if name in arrays and arrays[name].ndim < 2}
     for name, array in arrays.items():
@@ -236,20 +244,21 @@ def _fits_of_file(path: Path, count: int) -> list[Mapping[str, NDArray[Any]]]:
     return [shared | {name: array[number] for name, array in arrays.items()} for number in range(count)]
 
 
-# From which sides a capture shows the person: the direction of the camera in the body's own axes.
+# The sides from which a capture shows the person: the direction of the camera in the body's own axes.
 #
-# Rule: directions are those of the root joint; +Z is the way that the body faces, +X its left.
+# Rule: directions are relative to the root joint; +Z is the way that the body faces, +X its left.
 
-#: Degrees about the body at which the camera sees each side: 0 from the front, 90 from the body's left.
+#: Angle about the body, in degrees, from which the camera sees each side: 0 from the front, 90 from the body's left.
 SIDES = {"front": 0.0, "left": 90.0, "back": 180.0, "right": -90.0}
-#: Width of an entry of the table of directions.
+#: Width of a step in the table of directions, degrees.
 STEP_DEG = 30
 
 
 def camera_direction(pose: F64, root: F64, view: F64) -> tuple[float, float]:
-    """Degrees: yaw (0 front, 90 left, in -180..180) and height above the horizon of the camera, as the body has them.
+    """Return the camera's yaw (0 front, 90 left, in -180..180) and height above the body's own horizon, degrees.
 
-    `pose` (55,3). `root` (3,): place of the posed root joint. `view` (4,4): from the world of both to the camera.
+    `pose`: (55,3). `root`: place of the posed root joint, (3,). `view`: matrix (4,4) from the world of both to the
+    camera.
     """
     eye = np.linalg.inv(view)[:3, 3]
     x, y, z = rodrigues(pose[0]).T @ (eye - root)
@@ -257,17 +266,17 @@ def camera_direction(pose: F64, root: F64, view: F64) -> tuple[float, float]:
 
 
 def side_of(yaw_deg: float) -> str:
-    """The side that a camera at `yaw_deg` sees most of."""
+    """Return the side that a camera at `yaw_deg` sees most of."""
     return min(SIDES, key=lambda side: abs((yaw_deg - SIDES[side] + 180) % 360 - 180))
 
 
 def frames_by_side(yaws_deg: Sequence[float]) -> dict[str, int]:
-    """Number of frames that show each side."""
+    """Return the number of frames that show each side."""
     sides = [side_of(yaw) for yaw in yaws_deg]
     return {side: sides.count(side) for side in SIDES}
 
 
 def widest_gap_deg(yaws_deg: Sequence[float]) -> float:
-    """The widest turn about the body, degrees, from which no frame was taken; 360 of one frame."""
+    """Return the widest gap between the frames' directions about the body, degrees; 360 for one frame."""
     turns = np.sort(np.asarray(yaws_deg) % 360)
     return float(np.diff(turns, append=turns[0] + 360).max())

@@ -1,7 +1,7 @@
 """`capture.toml`: where a capture's frames, masks and fits lie, and the camera that took them.
 
-Rule: only types and ranges are checked here, and every defect of the file is listed; `capture.py` looks at the files
-that it names.
+Rule: only types and ranges are checked here, and every defect of the file is listed; `capture.py` checks the files that
+it names.
 """
 
 from __future__ import annotations
@@ -25,17 +25,20 @@ from trilane.scene.schema import LISTED, Finite, Table
 from trilane.shapes import MAX_SIDE, Shape
 from trilane.unexpected_value import UnexpectedValue
 
-# What is wrong with a capture: all of it together, so that a person mends everything before trying again.
+# The faults of a capture: they are listed together, so that a person mends all of them before trying again.
 #
-# Rule: a fault names the file, what was found and what was expected; those that differ in the file alone are one entry.
+# Rule: a fault names the file, what was found and what was expected; faults that differ only in the file are one entry.
 
-#: Files that one entry of the list names; the number of all others stands behind them.
+#: Most files that one entry of the list names; the number of the others follows.
 MOST_NAMED = 12
 
 
 @dataclass(frozen=True)
 class Fault:
-    """`where`: the file, with key or number of the frame. `found`, `expected`, `remedy`: sentence parts."""
+    """A fault of a capture.
+
+    `where`: file, with key or number of the frame. `found`, `expected`, `remedy`: sentence parts.
+    """
 
     where: str
     found: str
@@ -44,7 +47,7 @@ class Fault:
 
     @classmethod
     def of(cls, error: BadInputError) -> Fault:
-        """What `error` says."""
+        """Return the fault that `error` reports."""
         return cls(error.where, error.found, error.expected, error.remedy)
 
 
@@ -62,7 +65,7 @@ class FaultyCaptureError(BadInputError):
 
 
 def fault_lines(faults: Sequence[Fault]) -> list[str]:
-    """A line for each kind of fault, with the files that have it, in the order in which they were found."""
+    """Return a line for each kind of fault, with the files that have it, in the order in which they were found."""
     kinds: dict[tuple[str, str, str], list[str]] = {}
     for fault in faults:
         kinds.setdefault((fault.found, fault.expected, fault.remedy), []).append(fault.where)
@@ -79,15 +82,15 @@ EXPECTED = "a capture file (TOML): docs/captures.md"
 NEAR_M, FAR_M = 0.05, 100.0
 Side = Literal["front", "left", "back", "right"]
 Row = Annotated[tuple[Finite, Finite, Finite], LISTED]
-#: From a camera that looks along +Z with y down, as OpenCV's, to one that looks along -Z with y up.
+#: Turns a camera that looks along +Z with y down, as OpenCV's, into one that looks along -Z with y up.
 OPENGL_FROM_OPENCV: F64 = np.diag([1.0, -1.0, -1.0])
 
 
 class CameraTable(Table):
-    """The camera; its lens is that of `scene/lens.py`: pixels are counted from the picture's top left corner.
+    """The camera. Its lens is that of `scene/lens.py`: pixels are counted from the picture's top left corner.
 
-    `axes`: of the camera that fits are in, or that `rotation` (rows) and `translation`, metres, lead to from the world
-    of the fits.
+    `axes`: convention of the camera's axes. `rotation` (rows), `translation`: transform from the world of the fits to
+    the camera, metres; without them, fits are in camera axes.
     """
 
     width: int = Field(ge=64, le=2 * MAX_SIDE)
@@ -107,15 +110,18 @@ class CameraTable(Table):
 
     @property
     def lens(self) -> Lens:
-        """That made the frames."""
+        """Lens that made the frames."""
         return Lens(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
     def projection(self) -> F64:
-        """OpenGL clip matrix (4,4) of a frame."""
+        """Return the OpenGL clip matrix (4,4) of a frame."""
         return self.lens.projection(NEAR_M, FAR_M)
 
     def view(self, rotation: Any = None, translation: Any = None) -> F64:
-        """(4,4) from the world of the fits to the OpenGL camera; a frame's own `rotation`, `translation` go before."""
+        """Return the matrix (4,4) from the world of the fits to the OpenGL camera.
+
+        `rotation`, `translation`: a frame's own camera, which replaces this table's.
+        """
         axes = OPENGL_FROM_OPENCV if self.axes == "opencv" else np.eye(3)
         view = np.eye(4)
         view[:3, :3] = axes @ np.asarray(self.rotation if rotation is None else rotation, np.float64)
@@ -124,11 +130,11 @@ class CameraTable(Table):
 
 
 class CaptureFile(Table):
-    """A capture. Names of files are relative to its folder.
+    """The content of `capture.toml`. Names of files are relative to its folder.
 
     `body`: `default` or a body file. `frames`, `masks`: a folder of pictures or a video. `fits`: a folder with a .npz
     for each frame, or one .npz for all. `flat_hand_mean`: false where the body's mean hand has to be added to the fits'
-    hands. `missing_views`: sides of the person that no frame has to show.
+    hands. `missing_views`: sides of the person that need no frame.
     """
 
     schema_: Literal[1] = Field(default=1, alias="schema")
@@ -142,7 +148,7 @@ class CaptureFile(Table):
 
 
 def read_capture_file(folder: Path) -> CaptureFile:
-    """`capture.toml` of `folder`. Raises BadInputError; FaultyCaptureError with every defect of its keys."""
+    """Read `capture.toml` of `folder`. Raises BadInputError; FaultyCaptureError with every defect of its keys."""
     path = folder / NAME
     try:
         values = tomllib.loads(read_text(path, EXPECTED))
@@ -155,7 +161,7 @@ def read_capture_file(folder: Path) -> CaptureFile:
 
 
 def _fault(details: dict[str, Any]) -> Fault:
-    """One of the `errors()` of a ValidationError."""
+    """Turn one of the `errors()` of a ValidationError into a fault."""
     where = f"{NAME}: {'.'.join(map(str, details['loc']))}"
     if details["type"] == "missing":
         return Fault(where, "nothing", "a value", "add the key")
@@ -169,11 +175,11 @@ def _fault(details: dict[str, Any]) -> Fault:
 # Pictures of a capture: a folder of files, or a video.
 #
 # Rule: a picture is read as it is stored; one of another kind is refused and never converted. A video is decoded
-# forwards, so whoever reads in order decodes it once.
+# forwards, so a reader that goes in order decodes it once.
 
 ENDINGS = (".png", ".jpg", ".jpeg")
 VIDEO_ENDINGS = (".mp4", ".mkv", ".mov", ".avi", ".webm")
-#: Mode of a picture's file -> what it has, for people.
+#: What the picture of a mode holds, in words for people.
 MODES = {
     "L": "one channel (grey)",
     "1": "one channel (black and white)",
@@ -183,7 +189,8 @@ MODES = {
     "RGBA": "four channels (RGBA)",
     "CMYK": "four channels (CMYK)",
 }
-#: Kind of picture -> modes that it is stored in, what is expected, and how to mend it; and PyAV's format of a video.
+#: For each kind of picture, the modes that it is stored in, what is expected, how to mend it, and PyAV's format of a
+#: video.
 FRAME, MASK = "frame", "mask"
 STORED: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     FRAME: (
@@ -197,16 +204,19 @@ STORED: dict[str, tuple[tuple[str, ...], str, str, str]] = {
 
 
 class Pictures(Protocol):
-    """Frames or masks of a capture. `names`: of each, in their order."""
+    """Frames or masks of a capture.
+
+    `names`: name of each picture, in their order.
+    """
 
     names: tuple[str, ...]
 
     def read(self, number: int) -> U8:
-        """Picture `number`: (h,w,3) of a frame, (h,w) of a mask. Raises UnexpectedValue."""
+        """Return picture `number`: (h,w,3) for a frame, (h,w) for a mask. Raises UnexpectedValue."""
 
 
 def open_pictures(path: Path, kind: str) -> Pictures:
-    """The pictures at `path`, a folder or a video. Raises BadInputError when there are none."""
+    """Open the pictures at `path`, a folder or a video. Raises BadInputError when there are none."""
     expected = f"a folder of {kind}s ({', '.join(ENDINGS)}) or a video ({', '.join(VIDEO_ENDINGS)})"
     if path.is_dir():
         names = sorted(each.name for each in path.iterdir() if each.suffix.lower() in ENDINGS)
@@ -227,7 +237,7 @@ class PictureFolder:
         self.folder, self.names, self._kind = folder, names, kind
 
     def read(self, number: int) -> U8:
-        """As `Pictures.read`."""
+        """Return a picture as `Pictures.read` does."""
         modes, expected, remedy, _ = STORED[self._kind]
         try:
             with Image.open(self.folder / self.names[number]) as image:
@@ -252,7 +262,7 @@ class PictureVideo:
             raise BadInputError(path, "a video without frames", f"a video of {kind}s")
 
     def read(self, number: int) -> U8:
-        """As `Pictures.read`; going back opens the video again."""
+        """Return a picture as `Pictures.read` does; going back opens the video again."""
         if number < self._next or not self._next:
             self._stream, self._next = self._frames(), 0
         frame = None
@@ -265,7 +275,7 @@ class PictureVideo:
         return np.asarray(frame.to_ndarray(format=form))
 
     def __getstate__(self) -> dict[str, Any]:
-        """For another process, which opens the video anew."""
+        """Return the state for another process, which opens the video anew."""
         return self.__dict__ | {"_stream": iter(()), "_next": 0}
 
     def _frames(self) -> Iterator[Any]:

@@ -1,7 +1,7 @@
 """Samples of a capture for training: random views of its frames, cropped as the pipeline crops.
 
-Rule: the UV image is drawn with the view's own camera, the ground truth is resampled once from the whole frame, and
-both are empty where the frame ends. A sample depends only on its seed.
+Rule: the UV image is drawn with the view's own camera, and the ground truth is resampled once from the whole frame.
+Both are empty where the frame ends. A sample depends only on its seed.
 """
 
 from __future__ import annotations
@@ -32,20 +32,21 @@ from trilane.training.random_views import ANYWHERE, BANDS, OUTPUT_ROWS, SCREENS,
 from trilane.training.sample_renderer import ANYWHERE_BAND, BAND_NAMES, LEAST_PIXELS, UvRaster
 from trilane.training.surface import vertex_areas
 
-#: Draws of a view before it is said that no frame has one.
+#: Number of draws of a view before an error says that no frame has one.
 TRIES = 1000
-#: Frames that are kept decoded, because samples of one frame follow each other.
+#: Number of frames that are kept decoded, because samples of one frame follow each other.
 KEPT = 4
-#: Of successive frames one is held out.
+#: One frame of this many successive ones is held out.
 HELD_OUT_EVERY = 10
 
 
 @dataclass(frozen=True)
 class CaptureSample:
-    """What to render. `picture`: number of the frame. `crop`: its projection draws the body, before it is mirrored.
+    """A sample to render.
 
-    `by` (3,3): from the frame's pixels to the tensor's. `mirrored`: whether `by` mirrors, see `unmirrored`. `band`: an
-    index into BAND_NAMES, or ANYWHERE_BAND.
+    `picture`: number of the frame. `crop`: crop whose projection draws the body, before it is mirrored.
+    `by` (3,3): map from the frame's pixels to the tensor's. `mirrored`: whether `by` mirrors, see `unmirrored`. `band`:
+    an index into BAND_NAMES, or ANYWHERE_BAND.
     """
 
     picture: int
@@ -68,10 +69,11 @@ class CaptureRenderer:
     ) -> None:
         """Open the context.
 
-        `capture`: whose frames `numbers` are shown.
-        `rule`: of the views.
-        `centres`: what they are centred on; vertices by area if None.
-        `threads`: of a software OpenGL driver.
+        `capture`: capture whose frames are shown.
+        `numbers`: numbers of these frames.
+        `rule`: how views are drawn.
+        `centres`: draws the centres of views; None for vertices by area.
+        `threads`: threads of a software OpenGL driver.
         Raises MissingPartError without OpenGL.
         """
         self.capture, self._numbers, self._rule = capture, list(numbers), rule
@@ -83,9 +85,9 @@ class CaptureRenderer:
         self._kept: OrderedDict[int, U8] = OrderedDict()
 
     def training_sample(self, seed: Sequence[int], band: str, size: str) -> CaptureSample:
-        """The sample of `seed`: draws frames and views until enough of the body is on the screen.
+        """Plan the sample of `seed`: draw frames and views until enough of the body is on the screen.
 
-        `band`: a name of BANDS, or `anywhere`. `size`: the tensor size, as `shape_buckets` takes it.
+        `band`: a name of BANDS, or `anywhere`. `size`: tensor size, as `shape_buckets` takes it.
         Raises BadInputError when no frame has such a view.
         """
         rng = np.random.default_rng(seed)
@@ -97,7 +99,7 @@ class CaptureRenderer:
         raise BadInputError(self.capture.folder, found, "frames that show the whole person")
 
     def whole_sample(self, number: int, size: str) -> CaptureSample | None:
-        """Frame `number` as it is, cropped to the person; None where nothing of the body is in it."""
+        """Return frame `number` unaugmented, cropped to the person; None where nothing of the body is in it."""
         posed, view, frame = (
             self._raster.posed(self.capture.fits[number]),
             self.capture.views[number],
@@ -110,7 +112,7 @@ class CaptureRenderer:
         return CaptureSample(number, crop, by, False, ANYWHERE_BAND)
 
     def placed(self, sample: CaptureSample) -> tuple[F64, Placement]:
-        """The camera (4,4) of a sample that is not mirrored, and its body as the packed pass draws it."""
+        """Return the camera (4,4) of a sample that is not mirrored, and its body as the packed pass draws it."""
         pose, crop = self._raster.body_pose(self.capture.fits[sample.picture]), sample.crop
         placement = Placement(pose.joints, crop.projection, (0, 0, *crop.shape), pose.feature)
         return self.capture.views[sample.picture], placement
@@ -134,7 +136,7 @@ class CaptureRenderer:
         return CaptureSample(number, crop, whole, mirrored, BAND_NAMES.index(band) if band in BANDS else ANYWHERE_BAND)
 
     def render(self, sample: CaptureSample) -> tuple[F32, U8]:
-        """The UV image (h,w,3) float32 of u, v, coverage, and the ground truth (h,w,4) uint8, straight alpha."""
+        """Return the UV image (h,w,3) float32 of u, v, coverage, and the ground truth (h,w,4) uint8, straight alpha."""
         capture, crop = self.capture, sample.crop
         view = capture.views[sample.picture]
         uv = self._raster.uv(capture.fits[sample.picture], view, crop.projection, crop.shape)
@@ -152,7 +154,7 @@ class CaptureRenderer:
 
 
 def held_out_frames(count: int, bad: Sequence[int]) -> tuple[list[int], list[int]]:
-    """Of `count` frames, none of them `bad`: those to train on, and every tenth, which training never reads."""
+    """Split `count` frames without the `bad` ones into training frames and every tenth, which training never reads."""
     good = [number for number in range(count) if number not in set(bad)]
     held_out = good[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY]
     return [number for number in good if number not in set(held_out)], held_out
@@ -160,14 +162,17 @@ def held_out_frames(count: int, bad: Sequence[int]) -> tuple[list[int], list[int
 
 # The body of a capture as the pipeline rasterises it: UV images of its fits.
 #
-# Rule: the pipeline's mesh, skinning and raster; a body that has pose blend shapes is drawn with them.
+# Rule: mesh, skinning and raster are the pipeline's; a body that has pose blend shapes is drawn with them.
 
 
 class BodyRaster:
     """Draws one shaped body, with an OpenGL context of its own."""
 
     def __init__(self, shaped: ShapedBody, threads: int | None = None) -> None:
-        """Open the context. `threads`: of a software OpenGL driver. Raises MissingPartError without OpenGL."""
+        """Open the context.
+
+        `threads`: threads of a software OpenGL driver. Raises MissingPartError without OpenGL.
+        """
         self.ctx = open_context(threads)
         self._blended = shaped.body.posedirs is not None
         self.mesh = SkinnedMesh(self.ctx, avatar_mesh(shaped), shaped.body.posedirs)
@@ -175,32 +180,35 @@ class BodyRaster:
         self.skeleton = Skeleton(shaped.joints, shaped.body.parents)
 
     def posed(self, fit: Fit) -> Posed:
-        """The body of `fit`; valid until the next call."""
+        """Return the posed body of `fit`; valid until the next call."""
         return self.skeleton.pose(fit.pose, fit.place)
 
     def body_pose(self, fit: Fit) -> BodyPose:
-        """The same as the mesh takes it; valid until the next call."""
+        """Return the pose of `fit` as the mesh takes it; valid until the next call."""
         posed = self.posed(fit)
         return BodyPose(posed.matrices, posed.feature if self._blended else None)
 
     def uv(self, fit: Fit, view: F64, projection: F64, shape: Shape) -> F32:
-        """The UV image (h,w,3) of `fit`: u, v, coverage. `view`, `projection` (4,4); `shape` (height, width)."""
+        """Return the UV image (h,w,3) of `fit`: u, v, coverage.
+
+        `view`, `projection`: matrices (4,4) of the camera. `shape`: (height, width).
+        """
         pose = self.body_pose(fit)
         return self._raster.render(pose.joints, view, projection, shape, pose.feature)
 
     def uv_of(self, capture: Capture, number: int) -> F32:
-        """The UV image of frame `number` of `capture`, as large as the frame."""
+        """Return the UV image of frame `number` of `capture`, as large as the frame."""
         return self.uv(capture.fits[number], capture.views[number], capture.file.camera.projection(), capture.shape)
 
 
 # Affine maps from a frame to a tensor's picture, and the same maps applied to the camera: camera-space augmentation.
 #
-# Rule: one map, in pixels, resamples the ground truth from its full resolution and, brought into clip space, moves the
-# camera that rasterises the body. So both agree for any camera matrix, any turn, scale, flip and shift, and pictures of
-# any aspect; the body is rasterised anew and never resampled.
+# Rule: a single map, in pixels, resamples the ground truth from its full resolution. The same map, brought into clip
+# space, moves the camera that rasterises the body. So both agree for any camera matrix, any turn, scale, flip and
+# shift, and any aspect; the body is rasterised anew and never resampled.
 #
 # The thesis (section 3.3, formulas 3.18 to 3.20) turns and scales the extrinsics and moves the principal point, which
-# is the same for lenses with fx = fy alone. After projection the map is exact for every lens.
+# is the same only for lenses with fx = fy. After projection the map is exact for every lens.
 #
 # Pixels: x to the right, y down, from the picture's corner; the middle of the first pixel is (0.5, 0.5).
 
@@ -211,10 +219,10 @@ NO_FLIP = (False, False)
 class Augmentation:
     """What is done to a frame.
 
-    `centre` (x, y): the point of the frame, in its pixels, that comes to the middle of the target. `turn_rad`: about
-    it, clockwise as the picture is seen. `scale` (x, y): pixels of the target for a pixel of the frame, along its rows
-    and columns, before it is turned. `flip` (left-right, upside-down): before it is turned. `shift` (x, y): afterwards,
-    in pixels of the target.
+    `centre` (x, y): point of the frame, in its pixels, that moves to the middle of the target. `turn_rad`: turn about
+    that point, clockwise as the picture is seen, radians. `scale` (x, y): target pixels for a pixel of the frame along
+    its rows and columns, before the turn. `flip` (left-right, upside-down): mirroring before the turn. `shift` (x, y):
+    shift after the turn, in pixels of the target.
     """
 
     centre: tuple[float, float]
@@ -225,7 +233,7 @@ class Augmentation:
 
 
 def image_map(augmentation: Augmentation, target: Shape) -> F64:
-    """(3,3): from pixels of the frame to pixels of a target of shape (height, width)."""
+    """Return the map (3,3) from pixels of the frame to pixels of a target of shape (height, width)."""
     c, s = np.cos(augmentation.turn_rad), np.sin(augmentation.turn_rad)
     signed = np.where(augmentation.flip, -1.0, 1.0) * augmentation.scale
     result = np.eye(3)
@@ -236,14 +244,14 @@ def image_map(augmentation: Augmentation, target: Shape) -> F64:
 
 
 def moved(points: ArrayLike, by: F64) -> F64:
-    """`points` (..., 2) in pixels, moved by the map `by` (3,3)."""
+    """Return `points` (..., 2), in pixels, moved by the map `by` (3,3)."""
     return np.asarray(points, np.float64) @ by[:2, :2].T + by[:2, 2]
 
 
 def augmented_projection(projection: ArrayLike, by: F64, frame: Shape, target: Shape) -> F64:
-    """(4,4): the camera's `projection` (4,4), which draws pictures of shape `frame`, moved by `by` (3,3) to `target`.
+    """Return a camera's `projection` (4,4) after the map `by` (3,3), from pictures of shape `frame` to `target`.
 
-    Depth and the sense in which nothing but a flip turns triangles stay as they are.
+    Depth does not change, and only a flip changes the sense in which triangles turn.
     """
     plane = _ndc_from_pixels(target) @ by @ np.linalg.inv(_ndc_from_pixels(frame))
     after = np.eye(4)
@@ -252,7 +260,7 @@ def augmented_projection(projection: ArrayLike, by: F64, frame: Shape, target: S
 
 
 def map_between(before: ArrayLike, after: ArrayLike, frame: Shape, target: Shape) -> F64:
-    """(3,3): the map of which `augmented_projection` makes `after` (4,4) from `before` (4,4): its inverse."""
+    """Return the map (3,3) by which `augmented_projection` makes `after` (4,4) from `before` (4,4): its inverse."""
     clip = np.asarray(after, np.float64) @ _inverse(np.asarray(before, np.float64))
     plane = np.eye(3)
     plane[:2, :2], plane[:2, 2] = clip[:2, :2], clip[:2, 3]
@@ -260,16 +268,19 @@ def map_between(before: ArrayLike, after: ArrayLike, frame: Shape, target: Shape
 
 
 def projected(points: ArrayLike, clip: F64, shape: Shape) -> F64:
-    """(..., 2): pixels of a picture of `shape` at which `points` (..., 3) lie, by `clip` (4,4), projection @ view."""
+    """Return the pixels (..., 2) of `points` (..., 3) in a picture of `shape`.
+
+    `clip`: projection @ view, (4,4).
+    """
     homogeneous = np.asarray(points, np.float64) @ clip[:, :3].T + clip[:, 3]
     ndc = homogeneous[..., :2] / homogeneous[..., 3:]
     return moved(ndc, _inverse(_ndc_from_pixels(shape)))
 
 
 def unmirrored(by: F64, target: Shape) -> tuple[F64, bool]:
-    """`by` without its mirroring, and whether the columns of what is drawn with it must be reversed afterwards.
+    """Return `by` without its mirroring, and whether columns drawn with it must be reversed afterwards.
 
-    A mirrored camera would turn triangles over, and rasters leave out those that face away. Pixels' middles lie
+    A mirrored camera would turn triangles over, and rasters leave out triangles that face away. Pixel centres lie
     symmetrically, so reversing the columns is exact.
     """
     if np.linalg.det(by[:2, :2]) > 0:
@@ -279,17 +290,17 @@ def unmirrored(by: F64, target: Shape) -> tuple[F64, bool]:
 
 
 def seen_of_frame(by: F64, frame: Shape, target: Shape) -> Mask:
-    """(h,w): which pixels of the target have their middle inside the frame: of the others nothing is known."""
+    """Return the target's pixels (h,w) whose centre lies inside the frame; nothing is known of the others."""
     rows, columns = np.mgrid[: target[0], : target[1]] + 0.5
     x, y = np.moveaxis(moved(np.stack([columns, rows], axis=-1), _inverse(by)), -1, 0)
     return np.asarray((x >= 0) & (x < frame[1]) & (y >= 0) & (y < frame[0]))
 
 
 def resampled(rgba: U8, by: F64, target: Shape) -> U8:
-    """The picture (h,w,4) of shape `target` that `by` (3,3) makes of `rgba` (H,W,4), both with straight alpha.
+    """Return the picture (h,w,4) of shape `target` that `by` (3,3) makes of `rgba` (H,W,4), both with straight alpha.
 
-    Each side is shrunk by the greatest whole number that the map allows, as the mean of its pixels, then the picture
-    is read bilinearly once; outside of `rgba` it is 0, 0, 0, 0. Colours are weighted by alpha.
+    Each side is first shrunk to the mean of its pixels, by the greatest whole number that the map allows. The result is
+    read bilinearly once; outside of `rgba` it is 0, 0, 0, 0. Colours are weighted by alpha.
     """
     whole = Image.fromarray(rgba, "RGBA").convert("RGBa")
     columns, rows = (max(1, int(1 / length)) for length in np.linalg.norm(by[:2, :2], axis=0))
@@ -300,7 +311,7 @@ def resampled(rgba: U8, by: F64, target: Shape) -> U8:
 
 
 def _ndc_from_pixels(shape: Shape) -> F64:
-    """(3,3): from pixels of a picture of `shape`, y down, to normalised device coordinates, y up."""
+    """Return the map (3,3) from pixels of a picture of `shape`, y down, to normalised device coordinates, y up."""
     return np.array([[2.0 / shape[1], 0.0, -1.0], [0.0, -2.0 / shape[0], 1.0], [0.0, 0.0, 1.0]])
 
 
@@ -308,31 +319,34 @@ def _inverse(matrix: F64) -> F64:
     return np.asarray(np.linalg.inv(matrix), np.float64)
 
 
-# Points of the body that close-ups are centred on: joints, or vertices drawn so that all of the surface is alike.
+# Points of the body that close-ups are centred on: joints, or vertices drawn so that all parts of the surface are
+# equally probable.
 #
 # Rule: a vertex is drawn by its share of the surface's area. SMPL-X has about as many vertices in the head as
-# elsewhere; the thesis (section 3.3) weights joints by the volume about them to make up for that, which areas do
-# exactly.
+# elsewhere. To make up for that, the thesis (section 3.3) weights joints by the volume about them; areas do so exactly.
 
 
 class Centres(Protocol):
     """Draws centres of views."""
 
     def draw(self, rng: np.random.Generator, band: str, posed: Posed) -> F64:
-        """(3,), world metres: a point of the body `posed` for a view of `band`, of `BANDS` or `anywhere`."""
+        """Draw a point (3,), world metres, of the body `posed` for a view of `band`.
+
+        `band`: a name of `BANDS`, or `anywhere`.
+        """
 
 
 class JointCentres:
-    """The joints of a band, each as often as any other."""
+    """Draws the joints of a band with equal probability."""
 
     def draw(self, rng: np.random.Generator, band: str, posed: Posed) -> F64:
-        """As `Centres.draw`."""
+        """Draw a point as `Centres.draw` does."""
         names = BANDS[band][0] if band in BANDS else ANYWHERE
         return np.array(posed.joints[JOINT_INDEX[names[rng.integers(len(names))]]])
 
 
 class VertexCentres:
-    """Vertices that the joints of a band move more than others do, by their area; `anywhere` is the whole body."""
+    """Draws vertices by their area, among those that a band's joints move most; `anywhere` is the whole body."""
 
     def __init__(self, shaped: ShapedBody) -> None:
         self._shaped = shaped
@@ -340,26 +354,26 @@ class VertexCentres:
         self._joint = shaped.body.weights.argmax(axis=1)
 
     def shares(self, band: str) -> F64:
-        """(V,): how probable each vertex is in `band`; they sum to 1."""
+        """Return the probability (V,) of each vertex in `band`; they sum to 1."""
         names = BANDS[band][0] if band in BANDS else JOINT_NAMES
         area = self._area * np.isin(self._joint, [JOINT_INDEX[name] for name in names])
         return np.asarray(area / area.sum())
 
     def draw(self, rng: np.random.Generator, band: str, posed: Posed) -> F64:
-        """As `Centres.draw`."""
+        """Draw a point as `Centres.draw` does."""
         vertex = int(rng.choice(len(self._area), p=self.shares(band)))
         weights = self._shaped.body.weights[vertex : vertex + 1].astype(np.float64)
         matrix = blend_matrices(weights, posed.matrices.reshape(JOINTS, 12).astype(np.float64)).reshape(3, 4)
         return np.asarray(matrix[:, :3] @ self._shaped.vertices[vertex] + matrix[:, 3])
 
 
-# Random views of a frame of a capture: which part of it becomes the screen, by the bands of zoom of `random_views`.
+# Random views of a frame of a capture: the part of it that becomes the screen, by the bands of zoom of `random_views`.
 #
 # Rule: a view is a map of the frame's pixels, applied to its camera as well (`image_map`). Bands say how many metres
-# fill the screen's height, so they mean the same as for the synthetic person; a frame is enlarged by a stated amount at
-# most.
+# fill the screen's height, so they mean the same as for the synthetic person. A frame is enlarged by at most a stated
+# factor.
 
-#: Metres over the screen's height in band `anywhere`, as `random_view` has them.
+#: Range of metres over the screen's height in band `anywhere`, as in `random_view`.
 ANYWHERE_M = (0.4, 2.5)
 
 
@@ -367,9 +381,9 @@ ANYWHERE_M = (0.4, 2.5)
 class ViewRule:
     """How views are drawn.
 
-    `turn_deg`: they are turned by up to so much. `squeeze`: rows are scaled by up to so much more or less than columns.
-    `flip_share`: share of views whose left and right are exchanged. `shift`: the centre lies up to so much of the
-    screen's height beside its middle. `most_enlarged`: pixels of the screen for a pixel of the frame, along a side.
+    `turn_deg`: largest turn. `squeeze`: largest share by which rows are scaled more or less than columns. `flip_share`:
+    share of views whose left and right are exchanged. `shift`: largest distance of the centre from the screen's middle,
+    as a share of its height. `most_enlarged`: most pixels of the screen for a pixel of the frame, along a side.
     """
 
     turn_deg: float = 8.0
@@ -381,7 +395,10 @@ class ViewRule:
 
 @dataclass(frozen=True)
 class Camera:
-    """A frame's camera. `view` and `projection` (4,4)."""
+    """A frame's camera.
+
+    `view`, `projection`: matrices (4,4).
+    """
 
     view: F64
     projection: F64
@@ -394,16 +411,16 @@ class Camera:
 
 
 def screen_shape(rng: np.random.Generator) -> Shape:
-    """(height, width) of a random screen of `OUTPUT_ROWS` rows."""
+    """Return (height, width) of a random screen of `OUTPUT_ROWS` rows."""
     return OUTPUT_ROWS, round(OUTPUT_ROWS * SCREENS[rng.integers(len(SCREENS))])
 
 
 def zoomed_view(
     rng: np.random.Generator, band: str, posed: Posed, camera: Camera, centres: Centres, rule: ViewRule, screen: Shape
 ) -> F64 | None:
-    """(3,3): a random map of `band` from the frame to a screen; None when its centre is not in the frame.
+    """Return a random map (3,3) of `band` from the frame to a screen; None when its centre is not in the frame.
 
-    `band`: a name of `BANDS`, or `anywhere`. `posed`: the body in the frame. `screen`: (height, width).
+    `band`: a name of `BANDS`, or `anywhere`. `posed`: body in the frame. `screen`: (height, width).
     """
     least, most = BANDS[band][1:] if band in BANDS else ANYWHERE_M
     point = centres.draw(rng, band, posed)

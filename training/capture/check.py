@@ -1,6 +1,6 @@
-"""Checks a capture: does the body lie where the masks are, from where is the person seen, and what is never seen.
+"""Checks a capture: whether the body lies where the masks are, from where the person is seen, and what is never seen.
 
-Rule: the body is drawn as training draws it; what is bad is said by frame, and no frame is changed.
+Rule: the body is drawn as training draws it. Bad fits are reported by frame, and no frame is changed.
 """
 
 from __future__ import annotations
@@ -21,18 +21,21 @@ from trilane.training.capture.capture_samples import BodyRaster
 from trilane.training.first_texture import LEAST_WEIGHT, grown, head_on, lay_out
 from trilane.training.surface import BodyArrays, body_arrays, vertex_normals
 
-#: Below it body and mask have less in common than either has alone with nothing: a third each, and a third shared.
+#: Below a half, body and mask have less in common than the two have alone, taken together.
 LEAST_IOU = 0.5
-#: A frame is an outlier where it lies further below the median than this many deviations (scaled to a normal
-#: distribution's), as usual for the median absolute deviation, and by no less than what outlines of pixels make.
+#: A frame is an outlier when its IoU lies below the median by more than this many deviations, and by at least
+#: `LEAST_DROP`. The deviation is the median absolute one, scaled to a normal distribution's; `LEAST_DROP` is what rough
+#: outlines cause.
 OUTLYING, NORMAL_MAD = 4.0, 1.4826
 LEAST_DROP = 0.05
 
 
 @dataclass(frozen=True)
 class CheckedFrame:
-    """`iou` of the drawn body and the mask; `outside`: share of the drawn body that the mask does not cover.
+    """The agreement of a frame's body and mask.
 
+    `iou`: intersection over union of the drawn body and the mask. `outside`: share of the drawn body that the mask does
+    not cover.
     Clothes and hair make the mask larger than the body, so a good fit has a small `outside`, and an IoU below 1.
     """
 
@@ -42,7 +45,7 @@ class CheckedFrame:
 
 
 def check_frames(capture: Capture, raster: BodyRaster, coverage: TexelCoverage) -> Iterator[CheckedFrame]:
-    """Each frame of `capture` as it was checked; `coverage` counts the texels that it shows."""
+    """Yield the check of each frame of `capture`; `coverage` counts the texels that it shows."""
     for number in range(len(capture)):
         frame, uv, mask = checked_frame(capture, raster, number)
         coverage.add(coverage.drawn(uv, mask))
@@ -50,21 +53,21 @@ def check_frames(capture: Capture, raster: BodyRaster, coverage: TexelCoverage) 
 
 
 def checked_frame(capture: Capture, raster: BodyRaster, number: int) -> tuple[CheckedFrame, F32, Mask]:
-    """Frame `number` as it was checked, the UV image (h,w,3) of its body, and the person (h,w)."""
+    """Return the check of frame `number`, the UV image (h,w,3) of its body, and the mask of the person (h,w)."""
     uv = raster.uv_of(capture, number)
     mask = np.asarray(capture.masks.read(capture.mask_of[number]) >= HALF)
     return checked(number, uv[..., 2] > 0, mask), uv, mask
 
 
 def checked(number: int, drawn: Mask, mask: Mask) -> CheckedFrame:
-    """Frame `number`, whose body is `drawn` (h,w) where the person is `mask` (h,w)."""
+    """Return the check of frame `number`, whose body is `drawn` (h,w) and whose person is `mask` (h,w)."""
     together, both = int((drawn | mask).sum()), int((drawn & mask).sum())
     bodys = int(drawn.sum())
     return CheckedFrame(number, both / max(together, 1), 1 - both / bodys if bodys else 1.0)
 
 
 def bad_frames(frames: Sequence[CheckedFrame]) -> list[CheckedFrame]:
-    """Frames whose fit is off, worst first: an IoU below `LEAST_IOU`, or far below that of the other frames."""
+    """Return the frames whose fit is off, worst first: an IoU below `LEAST_IOU`, or far below that of the others."""
     ious = np.array([frame.iou for frame in frames])
     median = float(np.median(ious))
     deviation = NORMAL_MAD * float(np.median(np.abs(ious - median)))
@@ -73,15 +76,15 @@ def bad_frames(frames: Sequence[CheckedFrame]) -> list[CheckedFrame]:
 
 
 def coverage_of(capture: Capture) -> TexelCoverage:
-    """Nothing counted yet of the body of `capture`."""
+    """Return an empty coverage for the body of `capture`."""
     return TexelCoverage(body_arrays(capture.shaped))
 
 
-# Regions of a body's surface, by name, for reports of what a capture shows.
+# Regions of a body's surface, by name, for reports on what a capture shows.
 #
 # Rule: every vertex is in one region; all are found from the body at rest: its joints, skin weights and normals.
 
-#: Region -> beginnings of the names of the joints that move its vertices most; the first that fits.
+#: For each region, prefixes of the joints that move its vertices most; the first region that fits counts.
 BY_JOINT = {
     "face and head": ("head", "jaw", "left_eye", "right_eye", "neck"),
     "left hand": ("left_wrist", *(f"left_{finger}" for finger in ("index", "middle", "pinky", "ring", "thumb"))),
@@ -93,14 +96,15 @@ BY_JOINT = {
 }
 SOLES, ARMPITS, CROWN = "soles", "armpits", "top of head"
 REGIONS = (*BY_JOINT, SOLES, ARMPITS, CROWN)
-#: A normal that points down, or up, by at least this much: within 45 degrees of the vertical.
+#: Least vertical part of a normal that points down or up: within 45 degrees of the vertical.
 STEEP = 0.7
-#: Part of the head's height that is its top; reach of an armpit about the shoulder, of the upper arm's length.
+#: Share of the head's height that is its top; reach of an armpit about the shoulder, as a share of the upper arm's
+#: length.
 CROWN_SHARE, ARMPIT_REACH = 0.25, 0.5
 
 
 def vertex_regions(body: BodyArrays) -> NDArray[np.int64]:
-    """(V,): the index in `REGIONS` of each vertex."""
+    """Return the index (V,) in `REGIONS` of each vertex."""
     by_joint = np.array([_region_of(name) for name in JOINT_NAMES])
     regions: NDArray[np.int64] = by_joint[body.weights.argmax(axis=1)]
     up = vertex_normals(body.vertices, body.faces)[:, 1]
@@ -135,17 +139,17 @@ def _on_crown(body: BodyArrays, regions: NDArray[np.int64]) -> Mask:
 
 # Which texels of the body a capture shows: each pixel of a UV image that lies on the mask sees its texel.
 #
-# Rule: a texel counts as seen where its surface was seen less steeply than the outline; regions that no frame shows are
-# named, because their colours are filled from what is round them.
+# Rule: a texel counts as seen where its surface was seen less steeply than at the outline. Regions that no frame shows
+# are named, because their colours are filled from their surroundings.
 
-#: Of a region that counts as never seen, at most this share of texels was seen.
+#: Largest share of seen texels in a region that counts as never seen.
 HARDLY = 0.05
-#: Side of the texture that coverage is counted on.
+#: Side of the texture on which coverage is counted, in texels.
 SIDE = 256
 
 
 class TexelCoverage:
-    """Which texels of one body were seen, frame by frame."""
+    """Counts which texels of one body were seen, frame by frame."""
 
     def __init__(self, body: BodyArrays, side: int = SIDE) -> None:
         regions = np.eye(len(REGIONS))[vertex_regions(body)]
@@ -159,7 +163,10 @@ class TexelCoverage:
         self._drawn |= drawn
 
     def drawn(self, uv: F32, mask: Mask) -> Mask:
-        """(S,S): texels at which pixels of a frame lie. `uv` (h,w,3): its UV image. `mask` (h,w): its person."""
+        """Return the texels (S,S) that a frame's pixels lie on.
+
+        `uv` (h,w,3): UV image of the frame. `mask` (h,w): mask of the person.
+        """
         shown = (head_on(uv[..., :2].astype(np.float64), uv[..., 2] > 0, self._side) > LEAST_WEIGHT) & mask
         texel = np.minimum((uv[..., :2][shown] * self._side).astype(np.int64), self._side - 1)
         found = np.zeros_like(self._drawn)
@@ -168,20 +175,20 @@ class TexelCoverage:
 
     @property
     def seen(self) -> Mask:
-        """(S,S): texels of the body that were seen, or lie beside one that was: a pixel spans a texel or two."""
+        """Texels (S,S) of the body that were seen, or lie beside a seen one: a pixel spans a texel or two."""
         return np.asarray(grown(self._drawn) & self.used)
 
     @property
     def unseen(self) -> Mask:
-        """(S,S): texels of the body that were not."""
+        """Texels (S,S) of the body that were not seen."""
         return np.asarray(self.used & ~self.seen)
 
     def share(self) -> float:
-        """Share of the body's texels that were seen."""
+        """Return the share of the body's texels that were seen."""
         return float(self.seen.sum() / self.used.sum())
 
     def share_by_region(self) -> dict[str, float]:
-        """The same of each region's texels."""
+        """Return the share of seen texels in each region."""
         seen, shares = self.seen, {}
         for number, name in enumerate(REGIONS):
             inside = self.used & (self.region == number)
@@ -189,17 +196,17 @@ class TexelCoverage:
         return shares
 
     def never_seen(self) -> list[str]:
-        """Regions of which hardly any texel was seen."""
+        """Return the regions of which hardly any texel was seen."""
         return [name for name, share in self.share_by_region().items() if share <= HARDLY]
 
 
-# What a check of a capture found, as plain data for people and for JSON.
+# The result of a capture's check, as plain data for people and for JSON.
 #
 # Rule: every figure was measured by the check.
 
 
 def require_fits(capture: Capture, frames: Sequence[CheckedFrame], sheet: object) -> None:
-    """Raises FaultyCaptureError, which points to `sheet`, when most bodies are not where the masks are."""
+    """Raise FaultyCaptureError, which points to `sheet`, when most bodies are not where the masks are."""
     median = float(np.median([frame.iou for frame in frames]))
     if median < LEAST_IOU:
         found = f"bodies that overlap the masks by a median IoU of {median:.2f}"
@@ -211,7 +218,10 @@ def require_fits(capture: Capture, frames: Sequence[CheckedFrame], sheet: object
 def capture_facts(
     capture: Capture, frames: Sequence[CheckedFrame], bad: Sequence[CheckedFrame], coverage: TexelCoverage
 ) -> dict[str, Any]:
-    """Keys: `capture`, `frames`, `size`, `betas`, `fit`, `bad`, `views`, `texels`; see docs/captures.md."""
+    """Return the facts of a check.
+
+    Keys: `capture`, `frames`, `size`, `betas`, `fit`, `bad`, `views`, `texels`; see docs/captures.md.
+    """
     ious, outside = ([getattr(frame, name) for frame in frames] for name in ("iou", "outside"))
     return {
         "capture": str(capture.folder),
@@ -230,13 +240,16 @@ def capture_facts(
 
 
 def texel_facts(coverage: TexelCoverage) -> dict[str, Any]:
-    """`seen`: share of the body's texels. `regions`: of each region's. `never_seen`: regions hardly seen."""
+    """Return the facts of a coverage.
+
+    `seen`: share of the body's texels. `regions`: share of each region's texels. `never_seen`: regions hardly seen.
+    """
     names = coverage.never_seen()
     return {"seen": coverage.share(), "regions": coverage.share_by_region(), "never_seen": names}
 
 
 def view_facts(directions: Sequence[tuple[float, float]]) -> dict[str, Any]:
-    """Frames by side and by direction, of the (yaw, height) of cameras in degrees.
+    """Count frames by side and by direction, from the (yaw, height) of cameras in degrees.
 
     `by_yaw`: number of frames in steps of `STEP_DEG` from behind over the right, the front and the left.
     """
@@ -253,7 +266,7 @@ def view_facts(directions: Sequence[tuple[float, float]]) -> dict[str, Any]:
 
 # A sheet that shows how the fits of a capture lie over its frames.
 #
-# Rule: the drawn body is red and what the mask has beyond it is blue, over the frame; each cell says its frame and IoU.
+# Rule: over the frame, the drawn body is red and the rest of the mask is blue; each cell says its frame and IoU.
 
 COLUMNS, MOST_CELLS = 4, 16
 CELL_WIDTH = 320
@@ -261,7 +274,7 @@ BODY_COLOUR, MASK_COLOUR = (255.0, 0.0, 0.0), (0.0, 64.0, 255.0)
 
 
 def chosen(frames: Sequence[CheckedFrame], bad: Sequence[CheckedFrame]) -> list[CheckedFrame]:
-    """Frames for the sheet: the worst of those that are `bad`, in half of it at most, then others at even steps."""
+    """Choose frames for the sheet: the worst of the `bad` ones for at most half of it, then others at even steps."""
     worst = list(bad[: MOST_CELLS // 2])
     others = [frame for frame in frames if frame not in bad]
     room = min(MOST_CELLS - len(worst), len(others))
@@ -269,7 +282,7 @@ def chosen(frames: Sequence[CheckedFrame], bad: Sequence[CheckedFrame]) -> list[
 
 
 def overlaid(picture: U8, uv: F32) -> U8:
-    """A frame with its mask as alpha (h,w,4), and the body of the UV image (h,w,3) over it: (h,w,3)."""
+    """Draw the body of the UV image (h,w,3) over a frame with its mask as alpha (h,w,4), and return (h,w,3)."""
     result = picture[..., :3].astype(np.float64)
     drawn, mask = uv[..., 2] > 0, picture[..., 3] >= HALF
     for where, colour in ((drawn, BODY_COLOUR), (mask & ~drawn, MASK_COLOUR)):
@@ -278,7 +291,7 @@ def overlaid(picture: U8, uv: F32) -> U8:
 
 
 def sheet(cells: Sequence[tuple[str, U8]]) -> Image.Image:
-    """Pictures (h,w,3) of one size in rows, each under its line of text."""
+    """Arrange pictures (h,w,3) of one size in rows, each under its line of text."""
     height, width = cells[0][1].shape[:2]
     size = (CELL_WIDTH, max(1, round(CELL_WIDTH * height / width)))
     columns = min(COLUMNS, len(cells))

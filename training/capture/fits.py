@@ -1,6 +1,6 @@
 """Fits: pose, place and shape of the body in each frame, from .npz files with the names of SMPL-X or AMASS.
 
-Rule: a fit is what the `smplx` library is given; every array is checked, and each defect is a fault of its own.
+Rule: a fit holds the arguments of the `smplx` library; every array is checked, and each defect is a fault of its own.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from trilane.body.kinematics import MAX_VALUE
 from trilane.scene.motion.smpl_files import WHOLE as WIDTHS
 from trilane.training.capture.capture_file import Fault
 
-#: The place of a part of the pose among its 165 numbers -> the names that files have for it.
+#: For each part of the pose, its place among the 165 numbers and the names that files have for it.
 PARTS: dict[tuple[int, int], tuple[str, ...]] = {
     (0, 3): ("global_orient", "root_orient"),
     (3, 66): ("body_pose", "pose_body"),
@@ -36,9 +36,9 @@ PLACE = ("transl", "trans")
 CAMERA = {"camera_rotation": 9, "camera_translation": 3}
 SHAPE = ("betas", "expression")
 NAMES = (*WHOLE, *(name for names in PARTS.values() for name in names), *PLACE, *SHAPE, *CAMERA)
-#: Sizes of arrays of other bodies -> what they are, for people.
+#: Sizes of other bodies' arrays, and what they are in words for people.
 OTHER_BODIES = {69: "23 joints: the SMPL layout", 72: "24 joints: the SMPL layout", 66: "22 joints", 63: "21 joints"}
-#: Number of columns of a whole pose, of SMPL-H and SMPL-X -> its joints.
+#: Joints of a whole pose, by its number of columns in SMPL-H and SMPL-X.
 COLUMNS = {width: WIDTHS[width][0] for width in (156, 165)}
 REMEDY = "convert the fits to SMPL-X"
 
@@ -47,9 +47,11 @@ Arrays = Mapping[str, NDArray[Any]]
 
 @dataclass(frozen=True)
 class Fit:
-    """One frame. `pose` (55,3) axis-angle, radians. `place` (3,): added to the root joint, metres.
+    """The fit of one frame.
 
-    `betas`, `expression`: coefficients. `rotation` (3,3), `translation` (3,): the frame's own camera, or None.
+    `pose`: axis-angle (55,3), radians. `place`: translation (3,) added to the root joint, metres.
+    `betas`, `expression`: coefficients of the shape. `rotation` (3,3), `translation` (3,): the frame's own camera, or
+    None.
     """
 
     pose: F64
@@ -61,9 +63,10 @@ class Fit:
 
 
 def read_fit(where: str, arrays: Arrays, body: Body, flat_hand_mean: bool) -> tuple[Fit | None, list[Fault]]:
-    """The fit in the `arrays` of one frame, and what is wrong with them; None with faults.
+    """Return the fit in the `arrays` of one frame, or None, and its faults.
 
-    `where`: the file. `body`: for hands that are given as a few components, and its mean hand unless `flat_hand_mean`.
+    `where`: name of the file. `body`: body that gives hand components and the mean hand. `flat_hand_mean`: whether the
+    fit's hands already include the mean hand.
     """
     faults: list[Fault] = []
     values = {name: _numbers(f"{where}[{name}]", arrays[name], faults) for name in NAMES if name in arrays}
@@ -85,12 +88,12 @@ def read_fit(where: str, arrays: Arrays, body: Body, flat_hand_mean: bool) -> tu
 
 
 def _numbers(where: str, array: NDArray[Any], faults: list[Fault]) -> F64:
-    """`array` as a row of numbers; what is no finite number is a fault, and 0."""
+    """Return `array` as a row of numbers; one with anything but finite numbers is a fault, and gives zeros."""
     if array.dtype.kind not in "fiu":
         faults.append(Fault(where, f"dtype {array.dtype}", "numbers"))
         return np.zeros(array.size)
     row = array.astype(np.float64).reshape(-1)
-    if not (np.abs(row) <= MAX_VALUE).all():  # also where it is NaN
+    if not (np.abs(row) <= MAX_VALUE).all():  # `not` includes NaN, which no comparison holds for
         faults.append(Fault(where, "NaN, infinity or a huge number", "finite numbers", "fit the frame again"))
         return np.zeros(array.size)
     return row
@@ -104,7 +107,7 @@ def _require_size(where: str, row: F64, size: int, faults: list[Fault]) -> bool:
 
 
 def _pose(where: str, values: Mapping[str, F64], body: Body, faults: list[Fault]) -> F64:
-    """(165,): of the whole pose's array, or of its parts, of which only root and body must be there."""
+    """Return the pose (165,) from the whole pose's array or from its parts; only root and body are required."""
     for name in WHOLE:
         if name in values:
             return _whole(f"{where}[{name}]", values[name], faults)

@@ -1,7 +1,7 @@
 """A capture of the default body, clothed: as many frames as wanted, in random poses, from all sides.
 
-Rule: a frame depends on the seed and its number alone; what noise is put on fits and masks is stated, and the truth is
-kept beside them as a capture of its own.
+Rule: a frame depends only on the seed and its number. The noise on fits and masks is stated, and the truth is kept
+beside them as a capture of its own.
 """
 
 from __future__ import annotations
@@ -33,25 +33,27 @@ TRUTH = "truth"
 FOV_Y_DEG = 40.0
 PITCH_DEG = (-12.0, 4.0, 30.0)
 ROLL_DEG = 1.0
-#: Of the turn between two frames, by which each is off its even place: so little that four frames show all sides.
+#: Largest deviation of a frame from its even place, as a share of the turn between two frames: small enough that four
+#: frames show all sides.
 JITTER = 0.3
-#: The person reaches over this share of the frame's half sides at most, and at least that over `MOST_FARTHER`.
+#: Largest share of the frame's half sides that the person reaches over; the least is this over `MOST_FARTHER`.
 FILLED = 0.94
 MOST_FARTHER = 1.3
 FAST_PNG = 1
-#: Size of the patches in which the outline of an imperfect mask is moved alike, and of the background's, pixels.
+#: Size in pixels of the patches in which the outline of an imperfect mask moves alike, and of the background's patches.
 MASK_PATCH_PX, BACKGROUND_PATCH_PX = 24, 160
-#: A blurred straight outline has a tenth of its height this many standard deviations from it.
+#: A blurred straight outline falls to a tenth of its height at this many standard deviations.
 TENTH_AT = 1.2816
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """`frames` pictures of `shape` (height, width), drawn from `seed`.
+    """What a synthetic capture shows.
 
-    `fit_deg`: each joint of a fit is turned about a random axis by up to so many degrees. `fit_mm`: the body is moved
-    by up to so many millimetres along each axis. `mask_px`: the outline of a mask is moved by up to so many pixels.
-    `look`: of the person, a name of `LOOKS`.
+    `frames`: number of pictures. `shape`: (height, width) of a picture. `seed`: seed of all of them.
+    `fit_deg`: largest turn of each joint of a fit about a random axis, degrees. `fit_mm`: largest move of the body
+    along each axis, millimetres. `mask_px`: largest move of a mask's outline, pixels. `look`: look of the person, a
+    name of `LOOKS`.
     """
 
     frames: int
@@ -68,19 +70,23 @@ class Recipe:
 
     @property
     def betas(self) -> F64:
-        """(10,) of the look's body."""
+        """Shape coefficients (10,) of the look's body."""
         return np.array([*look_named(self.look).betas, *[0.0] * 10][:10])
 
     @property
     def lens(self) -> Lens:
-        """Of the camera, which has square pixels."""
+        """Lens of the camera, which has square pixels."""
         height, width = self.shape
         return centred(width, height, height / 2 / np.tan(np.radians(FOV_Y_DEG) / 2))
 
 
 @dataclass(frozen=True)
 class SyntheticFrame:
-    """`frame` (h,w,3), `mask` (h,w). `pose` (55,3) and `place` (3,), as a fit has them, in the camera's OpenCV axes."""
+    """One frame and its truth.
+
+    `frame` (h,w,3), `mask` (h,w). `pose` (55,3), `place` (3,): pose and place as a fit has them, in the camera's OpenCV
+    axes.
+    """
 
     frame: U8
     mask: U8
@@ -99,7 +105,7 @@ class SyntheticCapture:
         self._background = _patches(np.random.default_rng((recipe.seed, 4)), recipe.shape, BACKGROUND_PATCH_PX, 3)
 
     def frame(self, number: int) -> SyntheticFrame:
-        """Frame `number`, without noise."""
+        """Return frame `number`, without noise."""
         recipe, renderer = self._recipe, self._renderer
         rng = np.random.default_rng((recipe.seed, 3, number))
         pose = random_pose(rng)
@@ -113,7 +119,7 @@ class SyntheticCapture:
         return SyntheticFrame(frame, rgba[..., 3].copy(), *in_camera(pose, self._root, view))
 
     def noisy(self, number: int, exact: SyntheticFrame) -> SyntheticFrame:
-        """`exact`, which is frame `number`, with the recipe's noise on its fit and its mask."""
+        """Return `exact`, which is frame `number`, with the recipe's noise on its fit and its mask."""
         recipe = self._recipe
         rng = np.random.default_rng((recipe.seed, 5, number))
         pose = turned_at_random(rng, exact.pose, recipe.fit_deg)
@@ -123,10 +129,10 @@ class SyntheticCapture:
 
 
 def framing_view(rng: np.random.Generator, yaw: float, points: F64, projection: F64) -> F64:
-    """(4,4) of a camera at `yaw` about `points` (N,3) that has all of them in its picture, which they nearly fill.
+    """Return the view (4,4) of a camera at `yaw` whose picture holds all `points` (N,3) and is nearly filled by them.
 
-    A point at (x, y, z) from the aim, in camera axes, is in a picture whose half sides have the tangents t from the
-    distance |x| / t + z on.
+    Let (x, y, z) be a point relative to the aim, in camera axes, and t the tangent of half the picture's angle. The
+    point is in the picture from a distance of |x| / t + z on.
     """
     aim = (points.min(axis=0) + points.max(axis=0)) / 2
     pitch = np.radians(rng.triangular(*PITCH_DEG))
@@ -140,25 +146,25 @@ def framing_view(rng: np.random.Generator, yaw: float, points: F64, projection: 
 
 
 def in_camera(pose: F64, root: F64, view: F64) -> tuple[F64, F64]:
-    """The pose (55,3) and the place (3,) in OpenCV camera axes of a body that stands in the world as `pose` has it.
+    """Return the pose (55,3) and the place (3,) in OpenCV camera axes of a body that stands in the world in `pose`.
 
-    `root` (3,): the root joint at rest, about which the body turns and to which the place is added. `view` (4,4).
+    `root`: root joint at rest, (3,), about which the body turns and to which the place is added. `view`: matrix (4,4).
     """
-    to_camera = OPENGL_FROM_OPENCV @ view[:3]  # its own inverse
+    to_camera = OPENGL_FROM_OPENCV @ view[:3]  # the matrix is its own inverse
     turned = pose.copy()
     turned[0] = rotvec_from_matrix(to_camera[:, :3] @ rodrigues(pose[0]))
     return turned, to_camera[:, :3] @ root + to_camera[:, 3] - root
 
 
 def turned_at_random(rng: np.random.Generator, pose: F64, most_deg: float) -> F64:
-    """`pose` (55,3) with each joint turned about a random axis by up to `most_deg`."""
+    """Return `pose` (55,3) with each joint turned about a random axis by up to `most_deg`."""
     axes = rng.standard_normal((JOINTS, 3))
     turns = axes / np.linalg.norm(axes, axis=1, keepdims=True) * np.radians(rng.uniform(0, most_deg, (JOINTS, 1)))
     return np.asarray(rotvec_from_matrix(rodrigues(turns) @ rodrigues(pose)))
 
 
 def moved_outline(rng: np.random.Generator, mask: U8, most_px: float) -> U8:
-    """`mask` (h,w), 255 or 0, with its outline moved inwards and outwards by up to `most_px`, patch by patch.
+    """Return `mask` (h,w), 255 or 0, with its outline moved in or out by up to `most_px`, patch by patch.
 
     The mask is blurred and cut at a level that differs from place to place, from a tenth to nine tenths.
     """
@@ -168,14 +174,14 @@ def moved_outline(rng: np.random.Generator, mask: U8, most_px: float) -> U8:
 
 
 def _patches(rng: np.random.Generator, shape: Shape, side: int, channels: int) -> F64:
-    """(h,w,channels) in -1..1: random values `side` pixels apart, smooth between."""
+    """Return random values (h,w,channels) in -1..1, `side` pixels apart and smooth between."""
     coarse = rng.uniform(-1, 1, (channels, shape[0] // side + 2, shape[1] // side + 2)).astype(np.float32)
     planes = [np.asarray(Image.fromarray(plane).resize(shape[::-1], Image.Resampling.BILINEAR)) for plane in coarse]
     return np.stack(planes, axis=-1).astype(np.float64)
 
 
 def write_capture(folder: Path, capture: SyntheticCapture, recipe: Recipe) -> Iterator[int]:
-    """Write the frames of `recipe` to `folder`, which is empty; yields the number of each that is written."""
+    """Write the frames of `recipe` to `folder`, which is empty, and yield the number of each written frame."""
     for part in ("frames", "masks", "fits", *((f"{TRUTH}/masks", f"{TRUTH}/fits") if recipe.is_noisy else ())):
         (folder / part).mkdir(parents=True)
     (folder / NAME).write_text(capture_text(recipe, "frames"), encoding="utf-8")
@@ -196,7 +202,7 @@ def _write_shot(folder: Path, number: int, shot: SyntheticFrame, recipe: Recipe)
 
 
 def fit_arrays(pose: F64, place: F64, betas: F64) -> dict[str, Any]:
-    """A fit by the names of SMPL-X, float32: `pose` (55,3), `place` (3,), `betas` (10,)."""
+    """Return a fit under the names of SMPL-X, float32: `pose` (55,3), `place` (3,), `betas` (10,)."""
     row = pose.reshape(-1)
     parts: dict[str, Floats] = {
         "global_orient": row[:3],
@@ -213,7 +219,7 @@ def fit_arrays(pose: F64, place: F64, betas: F64) -> dict[str, Any]:
 
 
 def capture_text(recipe: Recipe, frames: str) -> str:
-    """`capture.toml` of a synthetic capture whose frames lie at `frames`."""
+    """Return `capture.toml` of a synthetic capture whose frames lie at `frames`."""
     lens = recipe.lens
     noise = f"fits up to {recipe.fit_deg:g} degrees and {recipe.fit_mm:g} mm, masks up to {recipe.mask_px:g} pixels off"
     return f"""\
@@ -238,14 +244,14 @@ cy = {float(lens.cy)!r}
 
 @dataclass(frozen=True)
 class Cost:
-    """`seconds` and `disk_bytes` of a frame, measured."""
+    """The measured cost of a frame: `seconds` and `disk_bytes`."""
 
     seconds: float
     disk_bytes: int
 
 
 def measured_cost(capture: SyntheticCapture, recipe: Recipe) -> Cost:
-    """What a frame of `recipe` takes: of one that is drawn and written to memory, after another that warms up."""
+    """Measure what a frame of `recipe` costs: one is drawn and written to memory, after another that warms up."""
     capture.frame(0)
     start = time.monotonic()
     exact = capture.frame(recipe.frames // 2)

@@ -31,11 +31,11 @@ class ClothedBody:
     def __init__(self, ctx: Any, layers: list[Layer], landmarks: Landmarks, samples: int, look: Look = DEFAULT) -> None:
         """Put the layers on the GPU.
 
-        `ctx`: the OpenGL context.
-        `layers`: of `clothing_layers`.
-        `landmarks`: of the body at rest.
-        `samples`: along each side of a pixel, an even number.
-        `look`: of the layers.
+        `ctx`: OpenGL context.
+        `layers`: layers from `clothing_layers`.
+        `landmarks`: landmarks of the body at rest.
+        `samples`: number of samples along each side of a pixel, even.
+        `look`: look of the layers.
         """
         placed, definitions = _places(landmarks), look.definitions(landmarks)
         self._meshes = [
@@ -49,10 +49,10 @@ class ClothedBody:
     def render(
         self, joints: NDArray[np.float32], view: Any, projection: Any, shape: tuple[int, int]
     ) -> NDArray[np.uint8]:
-        """The picture (h,w,4) uint8, sRGB, straight alpha.
+        """Return the picture (h,w,4) uint8, sRGB, straight alpha.
 
-        `joints`: (55,3,4) skinning matrices.
-        `view`, `projection`: (4,4) the camera.
+        `joints`: skinning matrices (55,3,4).
+        `view`, `projection`: matrices (4,4) of the camera.
         `shape`: (height, width) of the picture.
         """
         return self._raster.render(self._meshes, joints, view, projection, shape)
@@ -74,7 +74,7 @@ def _mesh(ctx: Any, layer: Layer) -> SkinnedMesh:
 
 
 def _places(landmarks: Landmarks) -> dict[str, Any]:
-    """The uniforms of `paint.frag` that say where things are on the body."""
+    """Return the uniforms of `paint.frag` that say where things are on the body."""
     joints = landmarks.joints
     named = {
         "pelvis": joints[joint.PELVIS],
@@ -92,7 +92,7 @@ def _places(landmarks: Landmarks) -> dict[str, Any]:
     }
 
 
-# Draws skinned meshes with a fragment shader of the caller, supersampled: pictures of the ground truth.
+# Draws skinned meshes with a fragment shader of the caller, supersampled: the ground truth pictures.
 #
 # Rule: shaders write linear light; samples are averaged in linear light, then written as sRGB with straight alpha.
 
@@ -110,11 +110,11 @@ class ShadedMesh:
     ) -> None:
         """Compile the shader.
 
-        `ctx`: the OpenGL context.
-        `mesh`: what to draw.
-        `fragment`: the shader's file.
-        `uniforms`: its own, which never change.
-        `definitions`: what it is compiled with.
+        `ctx`: OpenGL context.
+        `mesh`: mesh to draw.
+        `fragment`: file of the shader.
+        `uniforms`: uniforms of the shader, which never change.
+        `definitions`: preprocessor definitions that it is compiled with.
         Raises TrilaneError when the shader does not compile.
         """
         self._draw = MeshDraw(ctx, mesh, fragment, **definitions)
@@ -123,15 +123,18 @@ class ShadedMesh:
     def draw(self, joints: F32, view: Floats, projection: Floats) -> None:
         """Draw into the target in use.
 
-        `joints`: (55,3,4) skinning matrices.
-        `view`, `projection`: (4,4) the camera.
+        `joints`: skinning matrices (55,3,4).
+        `view`, `projection`: matrices (4,4) of the camera.
         """
         self._draw.set({"view": tuple(np.asarray(view, np.float64).T.ravel()), "eye": tuple(eye_of(view))})
         self._draw.draw(BodyPose(joints), view, projection)
 
 
 class ShadedRaster:
-    """Supersampled pictures of shaded meshes. `samples`: samples along each side of a pixel (2 is 2x2), even."""
+    """Draws supersampled pictures of shaded meshes.
+
+    `samples`: number of samples along each side of a pixel (2 is 2x2), even.
+    """
 
     def __init__(self, ctx: Any, samples: int) -> None:
         self._ctx, self._samples = ctx, samples
@@ -142,11 +145,13 @@ class ShadedRaster:
     def render(
         self, meshes: list[ShadedMesh], joints: F32, view: Floats, projection: Floats, shape: tuple[int, int]
     ) -> U8:
-        """The picture (h,w,4) uint8, sRGB, straight alpha, row 0 on top; pixels that no mesh covers are 0, 0, 0, 0.
+        """Return the picture (h,w,4) uint8, sRGB, straight alpha, row 0 on top.
 
-        `meshes`: what to draw, depth tested.
-        `joints`: (55,3,4) skinning matrices of all meshes.
-        `view`, `projection`: (4,4) the camera.
+        Pixels that no mesh covers are 0, 0, 0, 0.
+
+        `meshes`: meshes to draw, depth tested.
+        `joints`: skinning matrices (55,3,4) of all meshes.
+        `view`, `projection`: matrices (4,4) of the camera.
         `shape`: (height, width) of the picture.
         """
         large, samples, small = self._target(shape)

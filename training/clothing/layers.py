@@ -17,7 +17,7 @@ from trilane.training.clothing import looks as joint
 from trilane.training.clothing.looks import ANKLES, DEFAULT, Landmarks, Look
 from trilane.training.surface import BodyArrays, Smoother, obscurance, shell, smoothstep, vertex_areas, vertex_normals
 
-#: Their order is that of `material` in `paint.frag`.
+#: The order of the materials is that of `material` in `paint.frag`.
 MATERIALS = ("skin", "trousers", "shirt", "hair", "shoe", "sole", "shorts", "jacket", "bob")
 OBSCURANCE_REACH_M = 0.25
 #: Number of vertices, of all layers together, that obscure others.
@@ -28,9 +28,9 @@ EMITTERS = 6000
 class Layer:
     """A mesh of one material.
 
-    `vertices` (N,3) metres at rest, `faces` (F,3). `below` (N,3): the point of the body under each vertex. `weights`
-    (N,55): skin weights. `normal` (N,3) unit. `light` (N,): obscurance, 1 in the open. `mark` (N,): 1 on the eyeballs,
-    else 0.
+    `vertices` (N,3): metres at rest. `faces` (F,3). `below` (N,3): point of the body under each vertex. `weights`
+    (N,55): skin weights. `normal` (N,3): unit normals. `light` (N,): share of light that reaches each vertex, 1 in the
+    open. `mark` (N,): 1 on the eyeballs, else 0.
     """
 
     material: str
@@ -44,7 +44,7 @@ class Layer:
 
 
 class _Sheet(NamedTuple):
-    """A layer before its normals and its light are known; fields as of `Layer`."""
+    """A layer whose normals and light are not known yet; its fields are those of `Layer`."""
 
     material: str
     vertices: F64
@@ -54,7 +54,7 @@ class _Sheet(NamedTuple):
 
 
 def clothing_layers(body: BodyArrays, landmarks: Landmarks, look: Look = DEFAULT) -> list[Layer]:
-    """All layers of the body in `look`, outer ones first. Both shoes are one layer, their soles another."""
+    """Return all layers of the body in `look`, outer ones first. Both shoes are one layer, their soles another."""
     sheets = [
         *(_garment(body, landmarks, name) for name in look.garments),
         *_shoes(body, landmarks),
@@ -93,7 +93,7 @@ def _shoes(body: BodyArrays, landmarks: Landmarks) -> list[_Sheet]:
 
 
 def _nearest(points: F64, vertices: F64, count: int = 8) -> NDArray[np.int64]:
-    """(N,count) indices of the `vertices` (V,3) nearest to each of `points` (N,3), nearest first."""
+    """Return the indices (N,count) of the `vertices` (V,3) nearest to each of `points` (N,3), nearest first."""
     candidates = np.flatnonzero(vertices[:, 1] < points[:, 1].max() + 0.05)
     square = ((points[:, None] - vertices[None, candidates]) ** 2).sum(axis=2)
     order = np.argsort(square, axis=1)[:, :count]
@@ -101,7 +101,7 @@ def _nearest(points: F64, vertices: F64, count: int = 8) -> NDArray[np.int64]:
 
 
 def _lights(sheets: list[_Sheet], normals: list[F64]) -> list[F64]:
-    """The obscurance of each sheet's vertices by all sheets."""
+    """Return the share of light at each sheet's vertices, which all sheets can obscure."""
     vertices = np.vstack([sheet.vertices for sheet in sheets])
     areas = np.concatenate([vertex_areas(sheet.vertices, sheet.faces) for sheet in sheets])
     step = -(-len(vertices) // EMITTERS)
@@ -126,7 +126,7 @@ def _mark(name: str, landmarks: Landmarks, count: int) -> F64:
 
 # The garments that are shells of the body: which vertices each may cover, and how far it stands off.
 #
-# Rule: one table; a garment is placed by the body's landmarks, never by coordinates.
+# Rule: there is one table, and a garment is placed by the body's landmarks, never by coordinates.
 
 Covers = Callable[[F64, Landmarks], NDArray[np.bool_]]
 Thickness = Callable[[F64, Landmarks], tuple[F64, F64, int]]
@@ -214,7 +214,7 @@ def _jacket_thickness(at: F64, landmarks: Landmarks) -> tuple[F64, F64, int]:
 
 
 def _bob_thickness(at: F64, landmarks: Landmarks) -> tuple[F64, F64, int]:
-    """Hair that falls straight to the jaw, over the ears."""
+    """Return offset, least offset and rounds for hair that falls straight to the jaw, over the ears."""
     up = smoothstep(landmarks.eye[1] + 0.01, landmarks.crown - 0.02, at[:, 1])
     front = smoothstep(landmarks.eye[2] - 0.07, landmarks.eye[2] - 0.01, at[:, 2])
     end = smoothstep(landmarks.eye[1] - 0.03, landmarks.eye[1] - 0.09, at[:, 1])
@@ -224,7 +224,7 @@ def _bob_thickness(at: F64, landmarks: Landmarks) -> tuple[F64, F64, int]:
     return offset, 0.75 * offset, 16
 
 
-#: Garment to the vertices it may cover, and its offset, least offset (metres) and rounds of relaxation.
+#: For each garment, the vertices that it may cover; and its offset, least offset (metres) and rounds of relaxation.
 GARMENTS: dict[str, tuple[Covers, Thickness]] = {
     "trousers": (_trousers_covers, _trousers_thickness),
     "shirt": (_shirt_covers, _shirt_thickness),
@@ -235,10 +235,10 @@ GARMENTS: dict[str, tuple[Covers, Thickness]] = {
 }
 
 
-# A shoe: horizontal slices of the foot, one over the other, each convex and a little wider than the foot.
+# A shoe: horizontal slices of the foot on top of each other, each convex and a little wider than the foot.
 #
-# Rule: a slice is the support function of the foot's vertices seen from above; the shoe is closed below and open at the
-# ankle.
+# Rule: a slice comes from the support function of the foot's vertices seen from above; the shoe is closed below and
+# open at the ankle.
 
 ANGLES = 48
 MARGIN_M = 0.009
@@ -249,12 +249,12 @@ UPPER_STEP_M, FLANGE_M = 0.004, 0.005
 
 
 def shoe(vertices: F64, ankle: F64, side: int, sole: bool) -> tuple[F64, NDArray[np.int64]]:
-    """Vertices (N,3), metres, and faces (F,3) of one shoe's upper or of its sole.
+    """Return vertices (N,3), metres, and faces (F,3) of one shoe's upper or of its sole.
 
-    `vertices`: (V,3) the body at rest.
-    `ankle`: (3,) the joint of the foot.
+    `vertices`: body at rest, (V,3).
+    `ankle`: place of the foot's joint, (3,).
     `side`: 1 for the left foot, -1 for the right one.
-    `sole`: the sole instead of the upper.
+    `sole`: whether to return the sole instead of the upper.
     """
     foot = vertices[(vertices[:, 0] * side > 0) & (vertices[:, 1] < ankle[1] + TOP_M + 0.02)]
     ground = foot[:, 1].min()
@@ -273,7 +273,7 @@ def shoe(vertices: F64, ankle: F64, side: int, sole: bool) -> tuple[F64, NDArray
 
 
 def _ring(foot: F64, height: float, margin: float) -> F64:
-    """The slice (ANGLES,3) at `height`, `margin` wider than the vertices `foot` (N,3), metres."""
+    """Return the slice (ANGLES,3) at `height`, wider than the vertices `foot` (N,3) by `margin`, metres."""
     flat = foot[:, [2, 0]]
     centre = 0.5 * (flat.min(axis=0) + flat.max(axis=0))
     angle = np.arange(ANGLES) * (2 * np.pi / ANGLES)
@@ -287,7 +287,7 @@ def _ring(foot: F64, height: float, margin: float) -> F64:
 
 
 def _stitch(rings: int, capped: bool) -> NDArray[np.int64]:
-    """Faces between consecutive rings, and a fan over the first one; when `capped`, also over the last one."""
+    """Return faces between consecutive rings and a fan over the first one; when `capped`, also over the last one."""
     here = np.arange(ANGLES)
     after = (here + 1) % ANGLES
     faces = []

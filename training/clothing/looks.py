@@ -1,6 +1,7 @@
 """Looks: build, garments, hair and colours of the synthetic persons.
 
-Rule: one table; a look is numbers and names alone, and what is made of them is in `garments.py` and `paint.frag`.
+Rule: there is one table, and a look is numbers and names alone; `layers.py` and `paint.frag` turn it into clothes and
+paint.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from trilane.arrays import F64
 from trilane.body.joints import JOINT_INDEX
 from trilane.errors import BadInputError
 
-#: Key of an avatar's provenance.
+#: Key of the look's name in an avatar's provenance.
 KEY = "look"
 DEFAULT_NAME = "default"
 Triple = tuple[float, float, float]
@@ -25,13 +26,14 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Look:
-    """A person to draw.
+    """The look of a person.
 
-    `betas`: the shape of the body. `garments`: names of `GARMENTS`, outer ones last. `colours`: of `paint.frag`, sRGB
-    from 0 to 1. `hairline`: height of forehead, temple and nape over the eyes, metres. `fringe`: how ragged the
-    hairline is, 1 or less. `whorl`: direction from the middle of the head to where strands begin. `ear_ring`: size of
-    the gap in the hair round an ear. `sleeve_end`: from the shoulder, 0, over the elbow, 1. `legs_end`: a joint and the
-    metres over it where trousers end. `sock_end`: metres over the ankle.
+    `betas`: coefficients of the body's shape. `garments`: names of `GARMENTS`, outer ones last. `colours`: colours of
+    `paint.frag`, sRGB from 0 to 1. `hairline`: height of forehead, temple and nape over the eyes, metres. `fringe`:
+    raggedness of the hairline, at most 1. `whorl`: direction from the middle of the head to where strands begin.
+    `ear_ring`: size of the gap in the hair around an ear. `sleeve_end`: place along the arm where sleeves end: 0 is the
+    shoulder, 1 the elbow. `legs_end`: a joint, and the height over it where trousers end, metres. `sock_end`: height
+    over the ankle, metres.
     """
 
     betas: tuple[float, ...]
@@ -46,7 +48,10 @@ class Look:
     sock_end: float
 
     def definitions(self, landmarks: Landmarks) -> dict[str, str]:
-        """What `paint.frag` is compiled with, on the body of `landmarks`; as constants they are rounded once."""
+        """Return the definitions that `paint.frag` is compiled with for the body of `landmarks`.
+
+        Constants, unlike uniforms, are rounded once.
+        """
         joint, over = self.legs_end
         end = landmarks.joints[JOINT_INDEX[joint], 1] - landmarks.joints[ANKLES[1], 1] + over
         triples = {**self.colours, "HAIRLINE": self.hairline, "WHORL": self.whorl}
@@ -117,32 +122,32 @@ HIKER = Look(
     sock_end=0.13,
 )
 
-#: Look to what it is.
+#: Looks by name.
 LOOKS: dict[str, Look] = {DEFAULT_NAME: DEFAULT, "hiker": HIKER}
 
 
 def look_of(provenance: Mapping[str, Any]) -> Look:
-    """The look of the person whom an avatar with `provenance` in its manifest shows. Raises BadInputError."""
+    """Return the look of the person in an avatar whose manifest has `provenance`. Raises BadInputError."""
     return look_named(str(provenance.get(KEY, DEFAULT_NAME)))
 
 
 def look_named(name: str) -> Look:
-    """The look `name`. Raises BadInputError for one that is not known."""
+    """Return the look `name`. Raises BadInputError for an unknown one."""
     if name not in LOOKS:
         raise BadInputError("look", repr(name), f"one of {', '.join(LOOKS)}")
     return LOOKS[name]
 
 
-# Landmarks of a body at rest, by which garments and paint are placed: joints, eyes, ears, top and bottom.
+# Landmarks of a body at rest, which place garments and paint: joints, eyes, ears, top and bottom.
 #
 # Rule: everything is measured from the body's arrays (rest pose, metres); no coordinate is a constant.
 
 PELVIS, NECK, HEAD = JOINT_INDEX["pelvis"], JOINT_INDEX["neck"], JOINT_INDEX["head"]
-#: Of joints that both sides have, the left one.
+#: Index of the left joint, for joints that both sides have.
 HIP, KNEE, ANKLE, FOOT = (JOINT_INDEX[f"left_{name}"] for name in ("hip", "knee", "ankle", "foot"))
 SHOULDER, ELBOW, WRIST = (JOINT_INDEX[f"left_{name}"] for name in ("shoulder", "elbow", "wrist"))
 LEFT_EYE, RIGHT_EYE = JOINT_INDEX["left_eye"], JOINT_INDEX["right_eye"]
-#: Ankle of each foot by its side: 1 is the left one (+X), -1 the right one.
+#: Index of each foot's ankle by its side: 1 is the left one (+X), -1 the right one.
 ANKLES = {1: JOINT_INDEX["left_ankle"], -1: JOINT_INDEX["right_ankle"]}
 
 
@@ -164,7 +169,10 @@ class Landmarks:
 
 
 def find_landmarks(vertices: F64, joints: F64, weights: NDArray[np.floating[Any]]) -> Landmarks:
-    """Landmarks of a body at rest. `vertices` (V,3), `joints` (55,3), `weights` (V,55)."""
+    """Find the landmarks of a body at rest.
+
+    `vertices` (V,3), `joints` (55,3), `weights` (V,55).
+    """
     eyeball = weights[:, [LEFT_EYE, RIGHT_EYE]].sum(axis=1) > 0.5
     left = vertices[weights[:, LEFT_EYE] > 0.5]
     eye = 0.5 * (left.min(axis=0) + left.max(axis=0))

@@ -1,4 +1,4 @@
-"""From a float network to the integer network that the DSP runs: calibration, scales and zero points, equalisation.
+"""Makes the integer network that the DSP runs from a float one: calibration, scales and zero points, equalisation.
 
 It may use `avatars/` and the modules in `src/trilane`, but nothing else of `training/`.
 """

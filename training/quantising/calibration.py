@@ -1,7 +1,7 @@
 """Calibration: the range of each tensor of a network on real frames.
 
-Rule: ranges are measured; after that they are only narrowed where bytes cannot show the difference, widened where a
-norm over the picture reads them, or made one range where an operator only moves bytes.
+Rule: ranges are measured. They change afterwards in three cases alone. They are narrowed where bytes cannot show the
+difference, widened where a norm over the picture reads them, and made equal where an operator only moves bytes.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ class _OneFrame(CalibrationDataReader):
 
 
 def measure(path: Path, frames: Sequence[NDArray[np.float32]], method: str, operators: Sequence[str]) -> Any:
-    """Ranges of the tensors, ONNX Runtime's TensorsData.
+    """Return the ranges of the tensors, ONNX Runtime's TensorsData.
 
-    `path`: of the float network; a second file is written beside it.
+    `path`: file of the float network; a second file is written beside it.
     `frames`: (H, W, C) float32, fed one by one, so that memory does not grow with their number.
     `method`: a name of `METHODS`.
     `operators`: types of the operators whose inputs and outputs are measured.
@@ -62,7 +62,7 @@ def measure(path: Path, frames: Sequence[NDArray[np.float32]], method: str, oper
                 nchw = np.ascontiguousarray(frame.transpose(2, 0, 1)[None], np.float32)
                 calibrator.collect_data(_OneFrame(name, nchw))
             ranges = calibrator.compute_data()
-        except ValueError as error:  # a histogram of numbers that are none, or of too many sizes
+        except ValueError as error:  # a histogram of NaN, or of values of too different sizes
             raise BadInputError("calibration", str(error), FINITE) from error
     for tensor in ranges.keys():  # noqa: SIM118 - no dict
         if not all(np.isfinite(bound).all() for bound in (ranges[tensor].lowest, ranges[tensor].highest)):
@@ -81,7 +81,7 @@ def limit_logits(model: onnx.ModelProto, ranges: Any) -> None:
 
 
 def saturated(frames: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float32]]:
-    """Every value of `frames` at the end of their common range that is on its side of 0; 0 stays.
+    """Return `frames` with every value moved to the end of their common range on its side of 0; 0 stays.
 
     These are the bytes of the strongest contrast that the network's input can hold.
     """
@@ -91,17 +91,17 @@ def saturated(frames: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float32]
 
 
 def norm_inputs(model: onnx.ModelProto) -> set[str]:
-    """The tensors that norms over the picture read, and those that these were moved from."""
+    """Return the tensors that norms over the picture read, and those that were moved to become them."""
     makers = {out: node for node in model.graph.node for out in node.output}
     norms = (node for node in model.graph.node if node.op_type == "InstanceNormalization")
     return {source for node in norms for source in _sources(node.input[0], makers)}
 
 
 def widen(ranges: Any, names: set[str], wider: Any) -> None:
-    """Extend the ranges of tensors `names` to those of `wider`. In place.
+    """Extend the ranges of tensors `names` to those of `wider`, in place.
 
-    A norm divides by the picture's own deviation, so what it reads carries the same picture at any contrast; cut off at
-    the contrast of usual frames, a stronger picture would be another one.
+    A norm divides by the picture's own deviation, so its input carries the same picture at any contrast. Clipped at the
+    contrast of usual frames, a stronger picture would become a different one.
     """
     for name in names & set(ranges.keys()):
         ranges[name].lowest = np.minimum(ranges[name].lowest, wider[name].lowest)
@@ -130,7 +130,7 @@ def share_ranges(model: onnx.ModelProto, ranges: Any) -> None:
 
 
 def _sources(name: str, makers: dict[str, onnx.NodeProto]) -> Iterator[str]:
-    """`name`, and the tensors that operators of `MOVES` made it from."""
+    """Yield `name`, and the tensors from which operators of `MOVES` made it."""
     yield name
     while name in makers and makers[name].op_type in MOVES:
         name = makers[name].input[0]

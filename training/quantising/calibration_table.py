@@ -22,10 +22,10 @@ from trilane.training.quantising.calibration import METHODS
 from trilane.training.quantising.quantise import quantise
 from trilane.writing import write_atomically
 
-#: Errors that are this near to each other are a tie.
+#: Errors that are this close to each other are a tie.
 TIE_DB = 0.1
 COUNTS = (5, 10, 50, 100)
-#: Frames that pictures are evaluated on, unless more are held out: the last ones.
+#: Number of frames that pictures are evaluated on, unless more are held out: the last ones.
 EVALUATED = 5
 PROVIDERS = ["CPUExecutionProvider"]
 ERRORS_ONLY = 3
@@ -38,12 +38,14 @@ def calibration_table(
     counts: Sequence[int] = COUNTS,
     held_out: int = EVALUATED,
 ) -> Iterator[dict[str, Any]]:
-    """Rows `method`, `count`, `psnr_db` (mean over the last `held_out` frames), `mean` and `largest` error (of 255).
+    """Yield rows `method`, `count`, `psnr_db`, `mean` and `largest` error (of 255).
 
-    `model`: the float network (1, C, H, W).
+    `psnr_db` is the mean over the last `held_out` frames.
+
+    `model`: float network (1, C, H, W).
     `frames`: (H, W, C) each.
     `methods`: names of `METHODS`.
-    `counts`: of calibration frames; a count that would include evaluated frames is left out.
+    `counts`: numbers of calibration frames; a count that would include evaluated frames is left out.
     Raises BadInputError when there are too few frames for the smallest count, or for an unknown method.
     """
     spare = len(frames) - held_out
@@ -66,9 +68,9 @@ def calibration_table(
 
 
 def recommended(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
-    """The row of the table to follow: of those within `TIE_DB` of the best one, that with the fewest frames.
+    """Return the row of the table to follow: among those within `TIE_DB` of the best, the one with the fewest frames.
 
-    Of several with as few, the one with the least error. Raises ValueError without rows.
+    Among rows with as few frames, the one with the least error counts. Raises ValueError without rows.
     """
     best = max(float(row["psnr_db"]) for row in rows)
     ties = [row for row in rows if best - float(row["psnr_db"]) <= TIE_DB]
@@ -76,7 +78,7 @@ def recommended(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
 
 
 def recommendation(rows: Sequence[Mapping[str, Any]]) -> str:
-    """One line for people: which row of the table to follow, and how near to the best one it is."""
+    """Say in one line which row of the table to follow, and how close to the best one it is."""
     row, best = recommended(rows), max(float(row["psnr_db"]) for row in rows)
     return (
         f"{row['method']} on {row['count']} frames: {row['psnr_db']:.2f} dB, {best - row['psnr_db']:.2f} dB below the "
@@ -85,7 +87,7 @@ def recommendation(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _session(model: onnx.ModelProto) -> Any:
-    """A function from the network's one input to its one output."""
+    """Return a function from the network's one input to its one output."""
     settings = onnxruntime.SessionOptions()
     settings.log_severity_level = ERRORS_ONLY
     session = onnxruntime.InferenceSession(model.SerializeToString(), settings, providers=PROVIDERS)
@@ -103,7 +105,7 @@ def _errors(float_pictures: Sequence[F32], pictures: Sequence[NDArray[np.uint8]]
     }
 
 
-# A picture of the calibration table: the error of the picture over the number of frames, a line for each method.
+# Draws the calibration table: the error of the picture over the number of frames, a line for each method.
 #
 # Rule: nothing is computed here.
 
@@ -111,7 +113,7 @@ def _errors(float_pictures: Sequence[F32], pictures: Sequence[NDArray[np.uint8]]
 def plot_calibrations(rows: Sequence[Mapping[str, Any]], recommendation: str, path: Path) -> None:
     """Draw `rows` of the calibration table into a file, with the `recommendation` above.
 
-    `path`: its ending is one of SUFFIXES.
+    `path`: file whose ending is one of SUFFIXES.
     Raises MissingPartError without Matplotlib, BadInputError for another ending or a file that cannot be written.
     """
     figure = figure_for(path, (9, 4.5))

@@ -1,7 +1,7 @@
 """Predicts how far an integer network's picture is from the float network's, without running integers.
 
-Rule: the float network is computed with an error at every place where the integer network rounds or clips: uniform,
-of half a step to either side, for each stored tensor and each weight. The derivation is in docs/networks.md.
+Rule: the float network is computed with an error at every place where the integer network rounds or clips. The error is
+uniform, of half a step to either side, for each stored tensor and each weight. The derivation is in docs/networks.md.
 
 Sources: uniform rounding error, Widrow & Kollar 2008, "Quantization Noise", chapter 4; prediction interval for one more
 draw, Hahn & Meeker 1991, "Statistical Intervals", section 4.2.
@@ -37,9 +37,9 @@ STUDENT_T = 3.7328
 PROVIDERS = ["CPUExecutionProvider"]
 ERRORS_ONLY = 3
 PICTURE = 255
-#: Operators that keep multiples of a step multiples of it.
+#: Operators whose output consists of multiples of a step when their inputs do.
 KEEPS_STEPS = (*SHARING, "Relu", "Identity")
-#: Byte of a stored tensor: unsigned, 0 to 255.
+#: Largest byte of a stored tensor: unsigned, 0 to 255.
 TOP = 255
 
 
@@ -47,8 +47,9 @@ TOP = 255
 class NoiseModel:
     """A network in floats that rounds and clips where the integer network does.
 
-    `model`: reads the same bytes; its further inputs are the constants and the offset of each stored tensor's steps.
-    `constants`: name to the float value and the largest error of each element.
+    `model`: model that reads the same bytes; its further inputs are the constants and the offset of each stored
+    tensor's steps.
+    `constants`: float value and largest error of each element, by the constant's name.
     `offsets`: names of the inputs that are drawn from -½..½.
     """
 
@@ -61,7 +62,7 @@ class NoiseModel:
         return session(self.model)
 
     def pictures(self, tensor: U8, draws: int, seed: int) -> Iterator[F32]:
-        """`draws` pictures (N, H, W, 4), of 255, for the bytes `tensor` (N, H, W, C)."""
+        """Yield `draws` pictures (N, H, W, 4), in 0..255, for the bytes `tensor` (N, H, W, C)."""
         rng = np.random.default_rng(seed)
         source = self.model.graph.input[0].name
         for _ in range(draws):
@@ -74,7 +75,7 @@ class NoiseModel:
 
 
 def float_picture(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> F32:
-    """The float network's picture (N, H, W, 4), of 255, for the real numbers that `tensor` (N, H, W, C) stands for."""
+    """Return the float network's picture (N, H, W, 4), in 0..255, for the real numbers of `tensor` (N, H, W, C)."""
     encoding = quantised.network.input
     real = (tensor.astype(np.float32) - encoding.zero_point) * np.float32(encoding.scale)
     runner = session(model)
@@ -84,11 +85,12 @@ def float_picture(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> F
 
 
 def predicted_bound(model: NoiseModel, wanted: F32, tensor: U8, seed: int = 0) -> tuple[float, float]:
-    """The expected mean absolute error of the picture, and the bound that one more draw keeps but for `RISK`.
+    """Return the expected mean absolute error of the picture, and a bound that one more draw exceeds with `RISK`.
 
-    `wanted`: the float network's picture (N, H, W, 4), of 255.
-    `tensor`: the bytes (N, H, W, C).
-    bound = m + t s sqrt(1 + 1/n), with m and s of n = `DRAWS` draws and `STUDENT_T`. Both in steps of 1/255.
+    `wanted`: float network's picture (N, H, W, 4), in 0..255.
+    `tensor`: bytes (N, H, W, C).
+    bound = m + t s sqrt(1 + 1/n), with mean m and deviation s of n = `DRAWS` draws and t = `STUDENT_T`. Both are in
+    steps of 1/255.
     """
     errors = [float(np.abs(picture - wanted).mean()) for picture in model.pictures(tensor, DRAWS, seed)]
     mean = float(np.mean(errors))
@@ -96,7 +98,7 @@ def predicted_bound(model: NoiseModel, wanted: F32, tensor: U8, seed: int = 0) -
 
 
 def noise_model(quantised: Quantised) -> NoiseModel:
-    """The noise model of an integer network. Raises BadInputError when a constant has no float value."""
+    """Return the noise model of an integer network. Raises BadInputError when a constant has no float value."""
     graph = NoiseGraph(quantised)
     for node in quantised.network.model.graph.node:
         graph.take(node)
@@ -104,13 +106,13 @@ def noise_model(quantised: Quantised) -> NoiseModel:
 
 
 class NoiseGraph:
-    """The graph of a noise model while it is written, node by node; its steps and ranges are the integer network's."""
+    """The graph of a noise model while it is built, node by node; its steps and ranges are the integer network's."""
 
     def __init__(self, quantised: Quantised) -> None:
         self.source = quantised.network.model.graph
         self.values = {tensor.name: numpy_helper.to_array(tensor) for tensor in self.source.initializer}
         self.floats = quantised.float_constants
-        #: Rounding alike leaves every second multiple of a scale unused, by weights and biases.
+        #: Weights and biases use every second multiple of a scale where all runtimes round alike.
         self.multiples = 2 if quantised.facts["rounds_alike"] else 1
         self.makers = {name: node for node in self.source.node for name in node.output}
         self.nodes: list[onnx.NodeProto] = []
@@ -119,7 +121,7 @@ class NoiseGraph:
         self.limits: list[onnx.TensorProto] = []
 
     def take(self, node: onnx.NodeProto) -> None:
-        """Write what stands for `node`."""
+        """Add what stands for `node`."""
         if node.op_type == "QuantizeLinear":
             self.store(node)
         elif node.op_type == "DequantizeLinear" and node.input[0] in self.values:
@@ -130,25 +132,25 @@ class NoiseGraph:
             self.nodes.append(node)
 
     def _constant(self, node: onnx.NodeProto) -> None:
-        """A weight, bias or vector becomes an input that is drawn about its float value."""
+        """Turn a weight, bias or vector into an input that is drawn about its float value."""
         self.constants[node.output[0]] = self.constant(node)
 
     def constant(self, node: onnx.NodeProto) -> tuple[F32, NDArray[np.float64]]:
-        """The float value of what `node` reads, and the largest error of each element."""
+        """Return the float value of what `node` reads, and the largest error of each element."""
         stored, scale = self.values[node.input[0]], np.asarray(self.values[node.input[1]], np.float64)
         axis = next((attribute.i for attribute in node.attribute if attribute.name == "axis"), 1)
         if scale.ndim and stored.ndim:
             scale = scale.reshape([-1 if side == axis else 1 for side in range(stored.ndim)])
         exact_value = self.float_value(node.input[0], stored.shape)
         half = np.broadcast_to(scale * self.multiples / 2, stored.shape)
-        # A weight of exactly 0 is stored exactly, if 0 is a multiple that weights may have: biases have odd ones.
+        # A float value of exactly 0 is stored exactly where 0 is among the stored multiples; biases have odd ones only.
         exact = (exact_value == 0) & (stored == 0)
-        # Where they have none at 0, the error is always `half`: its variance is that of a uniform one sqrt(3) as wide.
+        # Where 0 is not among them, the error is always `half`; a uniform error sqrt(3) as wide has the same variance.
         farthest = (exact_value == 0) & (stored != 0)
         return exact_value, np.where(exact, 0.0, np.where(farthest, 3**0.5, 1.0) * half)
 
     def float_value(self, stored: str, shape: tuple[int, ...]) -> F32:
-        """The float constant of `stored`; ONNX Runtime numbers the copies of a bias that several layers read."""
+        """Return the float constant of `stored`; ONNX Runtime numbers the copies of a bias that several layers read."""
         name = stored.removesuffix("_quantized")
         originals = [known for known in self.floats if name.startswith(known) and f"0{name[len(known) :]}".isdigit()]
         value = self.floats[max(originals, key=len)] if originals else None
@@ -157,7 +159,7 @@ class NoiseGraph:
         return value.astype(np.float32)
 
     def store(self, node: onnx.NodeProto) -> None:
-        """A stored tensor is clipped; inside its range, if it rounds at all, it goes to shifted steps."""
+        """Clip a stored tensor, and round it to shifted steps inside its range unless it consists of multiples."""
         x, y = node.input[0], node.output[0]
         lowest, highest, step = self.bytes_of(node)
         low, high = self._limit(f"{y}.low", lowest), self._limit(f"{y}.high", highest)
@@ -168,12 +170,15 @@ class NoiseGraph:
             self._round(x, y, step, (low, high))
 
     def bytes_of(self, node: onnx.NodeProto) -> tuple[float, float, float]:
-        """The real numbers of bytes 0 and 255 of the tensor that `node` stores, and its step."""
+        """Return the real numbers of bytes 0 and 255 of the tensor that `node` stores, and its step."""
         step, zero = float(self.values[node.input[1]]), int(self.values[node.input[2]])
         return -zero * step, (TOP - zero) * step, step
 
     def _round(self, x: str, y: str, step: float, ends: tuple[str, str]) -> None:
-        """Inside the range and off 0, `y` = (round(`x` / step + offset) - offset) step: an error of +-½ step."""
+        """Add nodes for `y` = (round(`x` / step + offset) - offset) step, an error of +-½ step.
+
+        They act inside the range and off 0.
+        """
         step_name, none = self._limit(f"{y}.step", step), self._limit(f"{y}.none", 0.0)
         offset = f"{y}.offset"
         self.offsets.append(offset)
@@ -198,7 +203,7 @@ class NoiseGraph:
         return name
 
     def is_multiple(self, name: str, step: float) -> bool:
-        """Whether tensor `name` consists of multiples of `step` already."""
+        """Return whether tensor `name` consists of multiples of `step` already."""
         maker = self.makers.get(name)
         if maker is None:
             return False
@@ -210,7 +215,7 @@ class NoiseGraph:
         return all(self.is_multiple(source, step) for source in data)
 
     def finished(self) -> NoiseModel:
-        """The model, with the constants and offsets as inputs."""
+        """Return the model, with the constants and offsets as inputs."""
         inputs = [
             *(helper.make_tensor_value_info(n, TensorProto.FLOAT, v.shape) for n, (v, _) in self.constants.items()),
             *(helper.make_tensor_value_info(name, TensorProto.FLOAT, []) for name in self.offsets),
@@ -231,19 +236,21 @@ def session(model: onnx.ModelProto) -> Any:
     return onnxruntime.InferenceSession(model.SerializeToString(), settings, providers=PROVIDERS)
 
 
-# The noise model of an ideal quantiser: its steps follow from the float network and the input, not from the quantiser.
+# The noise model of an ideal quantiser, whose steps follow from the float network and the input, not from the real
+# quantiser.
 #
-# Rule: of the integer network only the places are used where it rounds, and whether its steps are powers of two. A
-# stored tensor has 255 steps from the least to the greatest value that the float network gives it on this very input; a
-# weight has `LARGEST_WEIGHT` to either side of 0, by output channel; biases are exact. Where steps are powers of two,
-# each is `POWER_OF_TWO` times as wide: the most that rounding up to a power of two costs a stored tensor; for a weight
-# the even multiples, which rounding alike leaves, cost as much already. The picture has its own steps, of 1/255.
+# Rule: only two facts are taken from the integer network: the places where it rounds, and whether its steps are powers
+# of two. A stored tensor has 255 steps from the least to the greatest value that the float network gives it on this
+# very input. A weight has `LARGEST_WEIGHT` steps to either side of 0, by output channel; biases are exact. Where steps
+# are powers of two, each is `POWER_OF_TWO` times as wide: that is the most that rounding up to a power of two costs a
+# stored tensor. For a weight, using even multiples alone costs as much already. The picture has its own steps, of
+# 1/255.
 
-#: Greatest ratio of the least power of two that is large enough to the step that is large enough.
+#: Greatest ratio between a step that was rounded up to a power of two and the step itself.
 POWER_OF_TWO = 2
 BYTE_TOP, INT16_TOP = 255, 2**15 - 1
-#: AVX2 without VNNI adds two products of a byte and a weight in 16 bits and cuts off what is beyond (Intel's manual,
-#: VPMADDUBSW). A bundle gives the same picture on every CPU, so no quantiser may use weights that are larger.
+#: AVX2 without VNNI adds two products of a byte and a weight in 16 bits and saturates (Intel's manual, VPMADDUBSW). A
+#: bundle gives the same picture on every CPU, so no quantiser may use larger weights.
 LARGEST_WEIGHT = INT16_TOP // (2 * BYTE_TOP)
 #: Operators whose output consists of values of their input.
 MOVES_VALUES = (*MOVES, "Relu", "Identity")
@@ -251,9 +258,9 @@ Range = tuple[float, float]
 
 
 def ideal_noise_model(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> NoiseModel:
-    """The noise model with the ideal steps for the bytes `tensor` (N, H, W, C).
+    """Return the noise model with the ideal steps for the bytes `tensor` (N, H, W, C).
 
-    `model`: the float network that `quantised` was made from. Raises BadInputError as `noise_model`.
+    `model`: float network from which `quantised` was made. Raises BadInputError as `noise_model`.
     """
     graph = _IdealGraph(quantised, float_ranges(model, quantised, tensor))
     for node in quantised.network.model.graph.node:
@@ -262,7 +269,7 @@ def ideal_noise_model(model: onnx.ModelProto, quantised: Quantised, tensor: U8) 
 
 
 def float_ranges(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> dict[str, Range]:
-    """Of each stored tensor, by its Quantize node's output: least and greatest value in floats, 0 included."""
+    """Return the least and greatest float value of each stored tensor, 0 included, by its Quantize node's output."""
     graph = _FloatGraph(model, quantised)
     for node in quantised.network.model.graph.node:
         graph.take(node)
@@ -279,7 +286,8 @@ def float_ranges(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> di
 class _FloatGraph(NoiseGraph):
     """A network in floats that rounds nothing, with the names of the tensors that would be stored.
 
-    In integers a rectifier is the lower end of its output's range, so it is put back where `model` has one.
+    In integers the lower end of an output's range acts as the rectifier, so the Relu is added again where `model` has
+    one.
     """
 
     def __init__(self, model: onnx.ModelProto, quantised: Quantised) -> None:
@@ -318,7 +326,7 @@ class _IdealGraph(NoiseGraph):
         return self.widened * low, self.widened * high, step
 
     def is_multiple(self, name: str, step: float) -> bool:
-        """Whether tensor `name` is a stored one that was only moved; joined and added ones have steps of their own."""
+        """Return whether tensor `name` is a stored one that was only moved; joined and added ones have own steps."""
         maker = self.makers.get(name)
         if maker is None or maker.op_type == "DequantizeLinear":
             return maker is not None
@@ -334,10 +342,10 @@ MAX_DB = 200.0
 
 
 def layer_report(model: onnx.ModelProto, quantised: Quantised, frame: NDArray[np.float32]) -> list[dict[str, Any]]:
-    """Rows `name`, `op_type`, `sqnr_db`, worst first, of the layers that both networks have.
+    """Return rows `name`, `op_type`, `sqnr_db`, worst first, for the layers that both networks have.
 
-    `model`: the float network (1, C, H, W). `frame`: (H, W, C). SQNR = 10 log10(sum x² / sum (x - q)²), where x and q
-    are a layer's output after its activation, as the integer network stores it.
+    `model`: float network (1, C, H, W). `frame`: (H, W, C). SQNR = 10 log10(sum x² / sum (x - q)²). Here x and q are a
+    layer's output in the two networks, after its activation, as the integer network stores it.
     """
     network = quantised.network
     tensor = np.clip(np.round(frame / network.input.scale) + network.input.zero_point, 0, 255).astype(np.uint8)
@@ -354,7 +362,7 @@ def layer_report(model: onnx.ModelProto, quantised: Quantised, frame: NDArray[np
 
 
 def _stored(network: NetworkFile) -> dict[str, tuple[onnx.NodeProto, str]]:
-    """Each dequantised tensor to the layer that made it and to its name in the float network, after a folded ReLU."""
+    """Map each dequantised tensor to the layer that made it and its name in the float network, after a folded ReLU."""
     graph = network.model.graph
     quantisers = {node.input[0]: node for node in graph.node if node.op_type == "QuantizeLinear"}
     readers = {node.input[0]: node for node in graph.node if node.op_type == "DequantizeLinear"}

@@ -1,10 +1,10 @@
 """Makes the scales powers of two and keeps sums off the middle between two bytes, so that all runtimes round alike.
 
 Rule: between bytes there are only integer sums and shifts, so float32, float64 and fixed point agree on every sum.
-Weights are even and biases odd, so every sum is odd and never half way between two bytes; how a runtime rounds halves
-then makes no difference.
+Weights are even and biases odd, so every sum is odd and never half way between two bytes. It then makes no difference
+how a runtime rounds halves.
 
-A scale covers the share `COVER` of the measured range when that halves the step; values beyond it are cut off.
+A scale covers only the share `COVER` of the measured range when that halves the step; values beyond it are clipped.
 """
 
 from __future__ import annotations
@@ -23,36 +23,36 @@ from trilane.training.quantising.calibration import MOVES
 
 COVER = 0.75
 BYTE = 255
-#: Operators that round nothing when their inputs and their output have one scale.
+#: Operators that round nothing when their inputs and their output have the same scale.
 SHARING = (*MOVES, "Concat", "Add")
-#: A network made of these can round alike. Other operators (norms over the picture, means, products) round inside, and
-#: runtimes differ in how they do.
+#: A network of these operators alone can round alike. Other operators (norms over the picture, means, products) round
+#: inside, and runtimes differ in how they do so.
 ALIKE = {*SHARING, "Conv", "Relu", "Sigmoid", "Constant", "Identity"}
-#: Largest integer weight, by `reduce_range`; all are even.
+#: Largest integer weight, by `reduce_range`; all weights are even.
 WEIGHT_TOP = {True: 64, False: 126}
-#: Least size of an accumulator's unit, in steps of its output: float32 then represents every sum exactly.
+#: Least size of an accumulator's unit, in steps of its output, with which float32 represents every sum exactly.
 FINEST = 2.0**-16
-#: Greatest size, in the same steps. At a half, all odd sums would be half way between bytes; above a quarter, HTP was
-#: seen to give another picture.
+#: Greatest size of that unit, in the same steps. At a half, all odd sums would be half way between bytes; above a
+#: quarter, HTP was seen to give another picture.
 COARSEST = 0.25
 #: Largest bias in units of the accumulator, so that float32 represents every sum exactly.
 LARGEST_BIAS = 2.0**22
 
 
 class CannotRoundAlikeError(ValueError):
-    """A layer's weights are so large that a unit of its sum is more than `COARSEST` of its output's step."""
+    """A layer's weights are so large that a unit of its sum exceeds `COARSEST` steps of its output."""
 
 
 def may_round_alike(model: onnx.ModelProto) -> bool:
-    """Whether all operators of float network `model` can be made to round alike on every runtime."""
+    """Return whether all operators of the float network `model` can be made to round alike on every runtime."""
     return all(node.op_type in ALIKE for node in model.graph.node)
 
 
 def power_of_two_ranges(model: onnx.ModelProto, ranges: Any) -> None:
-    """Change each range of `ranges`, ONNX Runtime's TensorsData, to 256 steps of a power of two. In place.
+    """Change each range of `ranges`, ONNX Runtime's TensorsData, to 256 steps of a power of two, in place.
 
-    Tensors that are moved, joined or added get one step, so that a Concat and an Add round nothing. Ranges of rectified
-    tensors begin at 0.
+    Tensors that are moved, joined or added get the same step, so that a Concat and an Add round nothing. Ranges of
+    rectified tensors begin at 0.
     """
     cut = {name: _cut(name, ranges[name], model) for name in ranges.keys()}  # noqa: SIM118 - no dict
     for members in _groups(model, cut):
@@ -64,10 +64,10 @@ def power_of_two_ranges(model: onnx.ModelProto, ranges: Any) -> None:
 
 
 def power_of_two_weights(model: onnx.ModelProto, ranges: Any, reduce_range: bool) -> dict[str, list[dict[str, Any]]]:
-    """Round the weights and biases of every Conv in place; their scales, a power of two for each output channel.
+    """Round the weights and biases of every Conv in place, and return their scales, a power of two by output channel.
 
     Weights become even numbers of steps and biases odd ones, so that no sum is half way between two bytes. The scales
-    are ONNX Runtime's `TensorQuantOverrides`, by the weights' name. `ranges`: of `power_of_two_ranges`. Raises
+    are ONNX Runtime's `TensorQuantOverrides`, by the weights' name. `ranges`: ranges from `power_of_two_ranges`. Raises
     CannotRoundAlikeError.
     """
     stored = _stored_as(model)
@@ -96,7 +96,7 @@ def power_of_two_weights(model: onnx.ModelProto, ranges: Any, reduce_range: bool
 def _bias_of(
     node: onnx.NodeProto, kernel: onnx.TensorProto, constants: dict[str, onnx.TensorProto], model: onnx.ModelProto
 ) -> onnx.TensorProto:
-    """The bias of Conv `node`; a Conv without one is given a bias of zeros."""
+    """Return the bias of Conv `node`; a Conv without one is given a bias of zeros."""
     if len(node.input) == 2:
         zeros = numpy_helper.from_array(np.zeros(kernel.dims[0], np.float32), f"{node.output[0]}_bias")
         constants[zeros.name] = model.graph.initializer.add()
@@ -106,7 +106,7 @@ def _bias_of(
 
 
 def _stored_as(model: onnx.ModelProto) -> dict[str, str]:
-    """Each tensor to the tensor that is stored in bytes for it: the output of its Relu, if only a Relu reads it."""
+    """Map each tensor to the one that is stored in bytes for it: the output of its Relu, if only a Relu reads it."""
     readers: dict[str, list[onnx.NodeProto]] = {}
     for node in model.graph.node:
         for name in node.input:
@@ -135,8 +135,8 @@ def _round_weights(kernel: onnx.TensorProto, finest: NDArray[np.float64], top: i
 def _round_bias(bias: onnx.TensorProto, scales: NDArray[np.float64]) -> None:
     """Round `bias` (O,) to odd multiples of `scales` (O,), in place.
 
-    Half way between two of them, as a bias of 0 is, every second channel goes up and the others go down: all of them
-    going up would move the whole picture.
+    A bias of 0 lies half way between two odd multiples. Every second channel then goes up and the others down, because
+    the whole picture would move if all went up.
     """
     steps = numpy_helper.to_array(bias).astype(np.float64) / scales
     below = 2 * np.floor(steps / 2) + 1
@@ -153,10 +153,10 @@ def _step_of(data: Any) -> float:
 
 
 def _cut(name: str, data: Any, model: onnx.ModelProto) -> tuple[float, float]:
-    """The part of the measured range `data` that bytes will cover; it includes 0.
+    """Return the part of the measured range `data` that bytes will cover; it includes 0.
 
-    Of the network's input, its output and the logits the whole range is covered: cut logits would leave no pixel fully
-    transparent.
+    The whole range is covered for the network's input, its output and the logits: clipped logits would leave no pixel
+    fully transparent.
     """
     makers = {out: node for node in model.graph.node for out in node.output}
     ends = {value.name for value in (model.graph.input[0], model.graph.output[0])}
@@ -168,7 +168,7 @@ def _cut(name: str, data: Any, model: onnx.ModelProto) -> tuple[float, float]:
 
 
 def _step(low: float, high: float) -> float:
-    """The least power of two that is a large enough step: 256 steps reach from `low` to within a step of `high`."""
+    """Return the least power of two that suffices as a step: 256 steps reach from `low` to within a step of `high`."""
     step = 2.0 ** math.ceil(math.log2(max(high - low, 1e-9) / (BYTE + 1)))
     while high / step + _zero_point(low, step) > BYTE + 1:
         step *= 2
@@ -180,7 +180,7 @@ def _zero_point(low: float, step: float) -> int:
 
 
 def _groups(model: onnx.ModelProto, known: Iterable[str]) -> list[set[str]]:
-    """The tensors `known`, in groups that share a step."""
+    """Return the tensors `known`, in groups that share a step."""
     group = {name: {name} for name in known}
     for names in _sharing(model):
         together: set[str] = set().union(*(group[name] for name in names if name in group))
@@ -189,7 +189,7 @@ def _groups(model: onnx.ModelProto, known: Iterable[str]) -> list[set[str]]:
 
 
 def _sharing(model: onnx.ModelProto) -> Iterator[list[str]]:
-    """For each operator of `SHARING`, its tensors; for an Add with a Relu behind it, also the Relu's output."""
+    """Yield the tensors of each operator of `SHARING`; for an Add with a Relu behind it, also the Relu's output."""
     followers = {name: node for node in model.graph.node for name in node.input}
     for node in model.graph.node:
         if node.op_type in SHARING:

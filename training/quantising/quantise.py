@@ -1,9 +1,10 @@
 """Makes the INT8 network: a float network is calibrated on real frames and becomes an integer one.
 
-Rule: unsigned 8-bit activations, signed symmetric weights with a scale per channel, real 0 exact, output bytes are the
-picture. All runtimes round alike where the network allows it, see `power_of_two_scales`.
+Rule: activations are unsigned bytes; weights are signed and symmetric with a scale per channel; real 0 is exact; the
+output bytes are the picture. All runtimes round alike where the network allows it, see `power_of_two_scales`.
 
-With `reduce_range`, weights stay within 64: on a CPU without VNNI two products of larger ones overflow 16 bits.
+With `reduce_range`, weights stay within 64: on a CPU without VNNI, the sum of two products of larger ones overflows 16
+bits.
 """
 
 from __future__ import annotations
@@ -42,9 +43,10 @@ MIN_FRAMES, MAX_FRAMES = 1, 1000
 
 @dataclass(frozen=True)
 class Quantised:
-    """An integer network, and the `facts` of how it was made: method, frames, weight bits, float layers, version.
+    """An integer network and how it was made.
 
-    `float_constants`: by name, the weights and biases as they were before rounding.
+    `facts`: method, frames, weight bits, float layers, version.
+    `float_constants`: weights and biases before rounding, by name.
     """
 
     network: NetworkFile
@@ -54,8 +56,9 @@ class Quantised:
 
 @dataclass(frozen=True)
 class ByteRanges:
-    """`ends`: of each tensor of a float network by name, the real values of bytes 0 and 255.
+    """The byte ranges of a float network's tensors.
 
+    `ends`: real values of bytes 0 and 255, by the tensor's name.
     `alike`: whether weights are even multiples of powers of two, so that all runtimes round alike.
     """
 
@@ -65,7 +68,10 @@ class ByteRanges:
 
 @dataclass(frozen=True)
 class _Calibrated:
-    """A float network with the ranges of its tensors. `overrides`: scales of weights, empty when they are measured."""
+    """A float network with the ranges of its tensors.
+
+    `overrides`: scales of weights; empty when they are measured.
+    """
 
     model: onnx.ModelProto
     ranges: Any
@@ -82,10 +88,10 @@ def quantise(
 ) -> Quantised:
     """Quantise a float NCHW network.
 
-    `model`: one float32 input (1, C, H, W), one output (1, 4, H, W) in 0..1 made by a Sigmoid.
-    `frames`: real inputs (H, W, C) float32, 1 to 1000, which it is calibrated on.
-    `method`: of calibration, a name of `METHODS`.
-    `reduce_range`: weights of 7 bits instead of 8.
+    `model`: network with one float32 input (1, C, H, W) and one output (1, 4, H, W) in 0..1 made by a Sigmoid.
+    `frames`: real inputs for its calibration, (H, W, C) float32, 1 to 1000.
+    `method`: calibration method, a name of `METHODS`.
+    `reduce_range`: whether weights have 7 bits instead of 8.
     `keep_float`: names of nodes that stay in float.
     Raises BadInputError for wrong frames, an unknown method or layer, or a network that is not finite.
     """
@@ -116,7 +122,10 @@ def quantise(
 
 
 def byte_ranges(model: onnx.ModelProto, frames: Sequence[F32], method: str = "minmax") -> ByteRanges:
-    """What `quantise` would give the tensors of `model`, by the same arguments. Raises BadInputError as it does."""
+    """Return the ranges that `quantise` would give the tensors of `model`, from the same arguments.
+
+    Raises BadInputError as `quantise` does.
+    """
     _check_frames(model, frames)
     _check_weights(model)
     plain, ranges = _measured(model, frames, method)
@@ -131,14 +140,14 @@ def byte_ranges(model: onnx.ModelProto, frames: Sequence[F32], method: str = "mi
 
 
 def _float_constants(plain: onnx.ModelProto, rounded: onnx.ModelProto) -> dict[str, NDArray[Any]]:
-    """The constants of float model `plain`; those that `rounded` has besides are biases that were 0."""
+    """Return the constants of float model `plain`; those that only `rounded` has are biases that were 0."""
     known = {name: numpy_helper.to_array(tensor) for name, tensor in constants_of(plain).items()}
     added = {name: np.zeros(tensor.dims, np.float32) for name, tensor in constants_of(rounded).items()}
     return added | known
 
 
 def _measured(model: onnx.ModelProto, frames: Sequence[F32], method: str) -> tuple[onnx.ModelProto, Any]:
-    """The model as ONNX Runtime prepares it for quantisation, and the measured ranges of its tensors."""
+    """Return the model as ONNX Runtime prepares it for quantisation, and the measured ranges of its tensors."""
     with tempfile.TemporaryDirectory(prefix="trilane-quantise-") as folder:
         prepared = Path(folder) / "prepared.onnx"
         source = Path(folder) / "float.onnx"
@@ -153,7 +162,7 @@ def _measured(model: onnx.ModelProto, frames: Sequence[F32], method: str) -> tup
 
 
 def _calibrated(model: onnx.ModelProto, ranges: Any, reduce_range: bool, keep_float: Sequence[str]) -> _Calibrated:
-    """Scales with which all runtimes round alike; where that is not possible, the measured ranges."""
+    """Return scales with which all runtimes round alike; where that is not possible, the measured ranges."""
     if not keep_float and may_round_alike(model):
         rounded, widened = copy.deepcopy(model), copy.deepcopy(ranges)
         power_of_two_ranges(rounded, widened)
@@ -185,7 +194,7 @@ def _check_weights(model: onnx.ModelProto) -> None:
 
 
 def _describe(model: onnx.ModelProto, keep_float: Sequence[str]) -> None:
-    """Remove what runtimes do not read: all but one operator set, and metadata but the layers kept in float."""
+    """Remove what runtimes do not read: all operator sets but one, and all metadata except the layers kept in float."""
     for entry in [entry for entry in model.opset_import if entry.domain not in ("", "ai.onnx")]:
         model.opset_import.remove(entry)
     del model.metadata_props[:]
@@ -203,10 +212,10 @@ SCALE_LIMITS = (1e-2, 1e2)
 
 
 def equalised(model: onnx.ModelProto) -> onnx.ModelProto:
-    """A copy of the float network with every Conv -> ReLU -> Conv chain equalised; grouped layers are not changed.
+    """Return a copy of the float network with every Conv -> ReLU -> Conv chain equalised, except grouped layers.
 
-    With r1 the range of the weights that make a channel and r2 of those that read it, s = sqrt(r1 r2) / r2: the first
-    layer's row is divided by s, the second layer's column is multiplied by it.
+    Let r1 be the range of the weights that make a channel, r2 that of the weights that read it, and s = sqrt(r1 r2) /
+    r2. The first layer's row is divided by s, the second layer's column is multiplied by it.
     """
     result = copy.deepcopy(model)
     weights = {tensor.name: tensor for tensor in result.graph.initializer}
@@ -223,7 +232,7 @@ def equalised(model: onnx.ModelProto) -> onnx.ModelProto:
 def _pairs(
     graph: onnx.GraphProto, weights: dict[str, onnx.TensorProto]
 ) -> Iterator[tuple[onnx.NodeProto, onnx.NodeProto]]:
-    """Pairs of Convs with only a ReLU between them."""
+    """Yield pairs of Convs with only a ReLU between them."""
     users: dict[str, list[onnx.NodeProto]] = {}
     for node in graph.node:
         for name in node.input:
@@ -236,13 +245,13 @@ def _pairs(
 
 
 def _only(users: dict[str, list[onnx.NodeProto]], node: onnx.NodeProto) -> onnx.NodeProto | None:
-    """The only node that reads the output of `node`; None when there are others or none."""
+    """Return the only node that reads the output of `node`; None when there are others or none."""
     readers = users.get(node.output[0], [])
     return readers[0] if len(readers) == 1 else None
 
 
 def _plain(node: onnx.NodeProto, weights: dict[str, onnx.TensorProto], users: dict[str, list[onnx.NodeProto]]) -> bool:
-    """Whether `node` is a Conv of one group that shares its weights with no other node."""
+    """Return whether `node` is a Conv of one group that shares its weights with no other node."""
     if node.op_type != "Conv" or any(a.name == "group" and a.i != 1 for a in node.attribute):
         return False
     return all(name in weights and len(users[name]) == 1 for name in node.input[1:])
@@ -259,10 +268,10 @@ def _equalise(first: onnx.NodeProto, second: onnx.NodeProto, arrays: dict[str, N
         arrays[first.input[2]] /= scale
 
 
-# Writes scales and zero points into a network, as Quantize and Dequantize nodes round its layers.
+# Writes scales and zero points into a network, as Quantize and Dequantize nodes around its layers.
 #
-# Rule: every tensor at `QUANTISED_OPERATORS` has unsigned bytes; weights are signed bytes with a scale per channel and
-# zero point 0; the output has the scale 1/255 and zero point 0, so its bytes are the picture.
+# Rule: every tensor at `QUANTISED_OPERATORS` has unsigned bytes. Weights are signed bytes with a scale per channel and
+# zero point 0. The output has the scale 1/255 and zero point 0, so its bytes are the picture.
 
 OUTPUT_SCALE = 1 / 255
 QUANTISED_OPERATORS = [
@@ -274,7 +283,7 @@ QUANTISED_OPERATORS = [
 
 @contextmanager
 def _no_axis_warnings() -> Iterator[None]:
-    """Suppress the quantiser's warning that vectors, of norms, have no second axis; they need none."""
+    """Suppress the quantiser's warning that vectors, such as those of norms, have no second axis; they need none."""
 
     def other(record: logging.LogRecord) -> bool:
         return "is out-of-range for weight" not in record.getMessage()
@@ -290,12 +299,12 @@ def _no_axis_warnings() -> Iterator[None]:
 def insert_scales_and_zero_points(
     model: onnx.ModelProto, ranges: Any, overrides: dict[str, Any], reduce_range: bool, keep_float: Sequence[str]
 ) -> onnx.ModelProto:
-    """`model` with Quantize and Dequantize nodes.
+    """Return `model` with Quantize and Dequantize nodes.
 
-    `model`: the float network.
-    `ranges`: of its tensors, ONNX Runtime's TensorsData.
+    `model`: float network.
+    `ranges`: ranges of its tensors, ONNX Runtime's TensorsData.
     `overrides`: scales of weights by name, ONNX Runtime's `TensorQuantOverrides`.
-    `reduce_range`: weights of 7 bits instead of 8.
+    `reduce_range`: whether weights have 7 bits instead of 8.
     `keep_float`: names of nodes that stay in float.
     """
     quantiser = QDQQuantizer(
@@ -355,7 +364,7 @@ def replace_ends_by_bytes(model: onnx.ModelProto) -> None:
 
 
 def _nhwc_to_real(inner: list[onnx.NodeProto], source: str, quantised: str) -> list[onnx.NodeProto]:
-    """The nodes that dequantise and transpose the input; `inner` reads their output instead of `quantised`."""
+    """Return the nodes that dequantise and transpose the input; `inner` reads their output instead of `quantised`."""
     readers = [node for node in inner if quantised in node.input]
     scale, zero_point = readers[0].input[1:3]
     nchw = readers[0].output[0]
