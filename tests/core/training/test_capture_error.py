@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("skimage")
+pytest.importorskip("torch")
 
 from support.small_inputs import write_capture_folder
 from trilane.avatars.bundle import load_bundle
