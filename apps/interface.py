@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.apps.asked_run import run_asked
-from trilane.apps.explained.job_table import COLUMNS, figure_names, job_rows
-from trilane.apps.explained.run import explain_run, open_journal
+from trilane.apps.explain.explained_run import COLUMNS, explain_run, figure_names, job_rows, open_journal
 from trilane.apps.report import Report, read_report
 from trilane.apps.run_html import prediction_html, run_html
 from trilane.errors import BadInputError, MissingPartError, TrilaneError, did_you_mean

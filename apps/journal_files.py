@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from trilane.apps.tracing.writer import NAME, TraceWriter
+from trilane.apps.explain.trace import NAME, TraceWriter
 from trilane.pipeline.journal import Begun, Stepped, read_journal
 from trilane.scheduler.recording import header_line, step_line
 

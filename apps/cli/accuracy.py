@@ -123,7 +123,7 @@ def _hard_cases(names: list[str], as_json: bool) -> bool:
     from rich.progress import Progress
 
     from trilane.apps.experiments.hard_cases import INPUTS, NETWORKS, SOURCE, UNIT, hard_cases
-    from trilane.apps.experiments.hard_numbers.all_rows import COUNT, hard_numbers
+    from trilane.apps.experiments.hard_numbers import COUNT, hard_numbers
 
     console = stderr_console()
     with stdout_kept(), Progress(console=console, disable=not console.is_terminal) as progress:

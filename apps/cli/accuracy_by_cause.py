@@ -31,7 +31,7 @@ class Files:
 def show_by_cause(scene: str, request: dict[str, Any], frames: int, files: Files, as_json: bool) -> None:
     """Measure and print. `request`: options of the run. Raises BadInputError, MissingPartError."""
     from trilane.apps.experiments.error_by_cause import error_by_cause
-    from trilane.apps.experiments.lpips_error import Lpips
+    from trilane.apps.experiments.picture_errors import Lpips
     from trilane.stages.configure import configure, required_machine
     from trilane.stages.run_options import RunOptions
     from trilane.writing import write_folder

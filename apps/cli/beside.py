@@ -119,7 +119,7 @@ def _write_trace(
     target: Path,
 ) -> None:
     """The simulated runs of the pipelines as one trace."""
-    from trilane.apps.tracing.files import write_predicted
+    from trilane.apps.explain.trace import write_predicted
     from trilane.hw_profiles.beside import together
     from trilane.hw_profiles.performance_profiles import corners_of
 

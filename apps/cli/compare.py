@@ -1,6 +1,6 @@
 """`trilane compare`: runs, reports and predictions beside each other, and a verdict with its uncertainty.
 
-Rule: this module reads options and shows; every figure comes from `trilane.apps.comparison`.
+Rule: this module reads options and shows; every figure comes from `trilane.apps.compare`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from trilane.apps.cli.options import JsonOption
 from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
-    from trilane.apps.comparison.compared import Comparison
-    from trilane.apps.comparison.difference import Outcome
+    from trilane.apps.compare.comparison import Comparison
+    from trilane.apps.compare.difference import Finding
 
 app = Commands()
 
@@ -73,9 +73,9 @@ def compare(
         _compare_sweeps(base, others, html, show_all, limit, json)
         return
     from trilane.apps.cli.compare_table import comparison_lines
-    from trilane.apps.comparison.compared import compare as compared
-    from trilane.apps.comparison.compared import document
-    from trilane.apps.comparison.sides import read_side
+    from trilane.apps.compare.comparison import compare as compared
+    from trilane.apps.compare.comparison import document
+    from trilane.apps.compare.sides import read_side
 
     comparisons = compared(read_side(base), [read_side(other) for other in others])
     if html is not None:
@@ -90,13 +90,13 @@ def compare(
     _leave(limit, [comparison.slower_than(limit) for comparison in comparisons] if limit is not None else [])
 
 
-def _leave(limit: float | None, outcomes: Sequence[Outcome]) -> None:
+def _leave(limit: float | None, outcomes: Sequence[Finding]) -> None:
     """With the exit code that --fail-if-slower asks for."""
-    from trilane.apps.comparison.difference import Outcome
+    from trilane.apps.compare.difference import Finding
 
-    if Outcome.DIFFERS in outcomes:
+    if Finding.DIFFERS in outcomes:
         raise typer.Exit(SLOWER)
-    if limit is not None and Outcome.UNKNOWN in outcomes:
+    if limit is not None and Finding.UNKNOWN in outcomes:
         text = f"cannot tell whether frames take longer by more than {100 * limit:g} %; {MORE}"
         stderr_console().print(text, soft_wrap=True, markup=False)
         raise typer.Exit(CANNOT_TELL)
@@ -104,7 +104,7 @@ def _leave(limit: float | None, outcomes: Sequence[Outcome]) -> None:
 
 def _are_sweeps(names: list[str]) -> bool:
     """Raises BadInputError for sweeps beside something else."""
-    from trilane.apps.comparison.sweeps import is_sweep
+    from trilane.apps.compare.compared_sweeps import is_sweep
 
     sweeps = [name for name in names if is_sweep(name)]
     if sweeps and len(sweeps) < len(names):
@@ -117,7 +117,7 @@ def _compare_sweeps(
     base: str, others: list[str], html: Path | None, show_all: bool, limit: float | None, json: bool
 ) -> None:
     from trilane.apps.cli.compare_table import sweep_lines
-    from trilane.apps.comparison.sweeps import compare_sweeps
+    from trilane.apps.compare.compared_sweeps import compare_sweeps
 
     if len(others) > 1:
         raise BadInputError("compare", f"{1 + len(others)} sweeps", "two")
@@ -144,7 +144,7 @@ def _share(text: str | None) -> float | None:
 
 
 def _write_page(path: Path, comparisons: list[Comparison]) -> None:
-    from trilane.apps.comparison.page import page
+    from trilane.apps.compare.page import page
     from trilane.writing import write_bytes
 
     write_bytes(path, page(comparisons).encode(), "choose another --html")

@@ -7,19 +7,18 @@ from typing import TYPE_CHECKING
 
 from rich.markup import escape
 
-from trilane.apps.comparison.compared import METHOD
-from trilane.apps.comparison.difference import Outcome
-from trilane.apps.comparison.rows import MS
-from trilane.apps.comparison.sweeps import METHOD as SWEEP_METHOD
-from trilane.apps.comparison.words import bounds_text, change_of, interval_of, name_of, setting, value_of
+from trilane.apps.compare.compared_sweeps import METHOD as SWEEP_METHOD
+from trilane.apps.compare.comparison import METHOD, bounds_text, change_of, interval_of, name_of, setting, value_of
+from trilane.apps.compare.difference import Finding
+from trilane.apps.compare.rows import MS
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from trilane.apps.comparison.compared import Comparison
-    from trilane.apps.comparison.configuration import Change
-    from trilane.apps.comparison.rows import Figure
-    from trilane.apps.comparison.sweeps import SweepComparison, TrialPair
+    from trilane.apps.compare.compared_sweeps import SweepComparison, TrialPair
+    from trilane.apps.compare.comparison import Comparison
+    from trilane.apps.compare.rows import Figure
+    from trilane.apps.compare.sides import Change
 
 #: Measures of which one statistic is shown even where nothing differs.
 ALWAYS = ("frame time", "latency", "instructions", "time of an instruction", "work", "busy")
@@ -94,7 +93,7 @@ def _trial_table(pairs: Sequence[TrialPair]) -> Table:
 def _left_out(comparison: Comparison, shown: Sequence[Figure]) -> Iterator[str]:
     """How many figures are not in the table; those of which nobody knows whether they differ apart."""
     left = [comparison.outcome(figure) for figure in comparison.rows if figure not in shown]
-    unknown = left.count(Outcome.UNKNOWN)
+    unknown = left.count(Finding.UNKNOWN)
     if alike := len(left) - unknown:
         yield f"{alike} more {'figure does' if alike == 1 else 'figures do'} not differ: --all shows them"
     if unknown:

@@ -1,6 +1,6 @@
 """`trilane explain RUN`: where the time of a run went, as tables.
 
-Rule: every figure is one of the document's (`trilane.apps.explained.run`); nothing is computed here.
+Rule: every figure is one of the document's (`trilane.apps.explain.explained_run`); nothing is computed here.
 """
 
 from __future__ import annotations
@@ -66,8 +66,7 @@ def refuse_options(typed: set[str], *, of_a_run: bool) -> None:
 
 def explain_folder(folder: Path, slowest: int, jobs: Path | None, as_json: bool) -> None:
     """Print where the time of the run in `folder` went. `jobs`: write its jobs there. Raises BadInputError."""
-    from trilane.apps.explained.job_table import check_ending, write_jobs
-    from trilane.apps.explained.run import explain_run
+    from trilane.apps.explain.explained_run import check_ending, explain_run, write_jobs
     from trilane.writing import require_writable
 
     if jobs is not None:
@@ -126,7 +125,7 @@ def _head(document: Mapping[str, Any]) -> Iterator[str]:
 def _efficiency(document: Mapping[str, Any]) -> Iterator[str]:
     """What bounded the run, and what all cores did."""
     if bound := document.get("bound"):
-        from trilane.apps.explained.advice import bound_text
+        from trilane.apps.explain.reasons import bound_text
 
         yield f"bound: {bound_text(bound)}"
     if document["cores"]:

@@ -1,6 +1,6 @@
 """`trilane inspect`: what a file is, what was detected in it, and what to do if it is not usable.
 
-Rule: this module shows what `trilane.apps.inspection` found; nothing is decided here.
+Rule: this module shows what `trilane.apps.inspect` found; nothing is decided here.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def inspect(file: FileArgument, out: SheetOption = None, json: JsonOption = Fals
 
     Nothing is run. The sheet shows a skeleton or the path of a camera from three sides, or pictures.
     """
-    from trilane.apps.inspection.inspect_file import inspect_file
+    from trilane.apps.inspect.inspect_file import inspect_file
     from trilane.errors import BadInputError
     from trilane.writing import require_writable
 

@@ -257,7 +257,7 @@ def _write_trace(
     chip: Profile, plan: Plan, performance_profile: str, wanted: Wanted, answer: dict[str, Any], target: Path
 ) -> None:
     """The simulated run that the prediction has its shares of time from, as a trace."""
-    from trilane.apps.tracing.files import write_predicted
+    from trilane.apps.explain.trace import write_predicted
     from trilane.hw_profiles.predict import predicted_run
 
     done = predicted_run(chip, plan, performance_profile, wanted)

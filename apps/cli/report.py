@@ -1,6 +1,6 @@
 """`trilane report`: runs, predictions and sweeps in one page, with what each speed costs in image error.
 
-Rule: this module reads options and writes files; the rows come from `trilane.apps.overview`.
+Rule: this module reads options and writes files; the rows come from `trilane.apps.compare`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from trilane.apps.cli.options import JsonOption
 from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
-    from trilane.apps.overview.entry import Entry
+    from trilane.apps.compare.overview import Entry
 
 app = Commands()
 
@@ -57,9 +57,8 @@ def report(
     machines and the command of each entry. An error is that of the run itself where it has one (`run --check`), else
     of its avatar's validation; the table says which.
     """
-    from trilane.apps.overview.page import page
-    from trilane.apps.overview.sources import read_entries
-    from trilane.apps.overview.table_rows import table_rows, write_csv, write_parquet
+    from trilane.apps.compare.overview import read_entries, table_rows, write_csv, write_parquet
+    from trilane.apps.compare.overview_page import page
     from trilane.writing import require_writable, write_bytes
 
     targets = [target for target in (out, csv, parquet) if target is not None]

@@ -1,6 +1,6 @@
 """`trilane sweep`: many configurations of one command, each tried once, in a folder that remembers what is done.
 
-Rule: this file talks to the person; what a sweep is, and how it is run, is in `trilane.apps.sweeps`.
+Rule: this file talks to the person; what a sweep is, and how it is run, is in `trilane.apps.sweep`.
 """
 
 from __future__ import annotations
@@ -24,10 +24,8 @@ from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
     from trilane.apps.cli.sweep_options import SweptCommand
-    from trilane.apps.sweeps.definition import Definition
-    from trilane.apps.sweeps.store import Store
-    from trilane.apps.sweeps.sweep import Engine
-    from trilane.apps.sweeps.trial import Trial
+    from trilane.apps.sweep.definition import Definition, Trial
+    from trilane.apps.sweep.store import Engine, Store
 
 app = Commands()
 
@@ -95,7 +93,7 @@ def sweep(
         _print_planned(trials, as_json)
         return
     if engine is EngineName.RAY:
-        from trilane.apps.sweeps.ray_engine import required_ray
+        from trilane.apps.sweep.engines import required_ray
 
         required_ray()
     else:
@@ -109,8 +107,7 @@ def _of_file(
     words: Sequence[str], as_list: bool, random: int | None, seed: int | None
 ) -> tuple[str, Definition, SweptCommand]:
     from trilane.apps.cli.sweep_options import SweptCommand
-    from trilane.apps.sweeps.definition import Definition
-    from trilane.apps.sweeps.toml_file import read_sweep
+    from trilane.apps.sweep.definition import Definition, read_sweep
 
     path = Path(words[0])
     if len(words) > 1:
@@ -131,7 +128,7 @@ def _of_words(
     words: Sequence[str], as_list: bool, random: int | None, seed: int | None
 ) -> tuple[str, Definition, SweptCommand]:
     from trilane.apps.cli.sweep_options import SweptCommand
-    from trilane.apps.sweeps.definition import Definition, Kind
+    from trilane.apps.sweep.definition import Definition, SweepKind
 
     if as_list and random is not None:
         raise BadInputError("options", "--list and --random", "one of them")
@@ -143,13 +140,13 @@ def _of_words(
     values = command.values_of(words[count:])
     options = {name: several[0] for name, several in values.items() if len(several) == 1}
     axes = {name: several for name, several in values.items() if len(several) > 1}
-    kind = Kind.LIST if as_list else Kind.RANDOM if random is not None else Kind.GRID
+    kind = SweepKind.LIST if as_list else SweepKind.RANDOM if random is not None else SweepKind.GRID
     return "-".join(command.words), Definition(command.words, options, axes, kind, random, seed or 0), command
 
 
 def _trials(first: str, definition: Definition, command: SweptCommand) -> list[Trial]:
     """Errors of a definition that came from a file, the `first` word, name it."""
-    from trilane.apps.sweeps.definition import trials_of
+    from trilane.apps.sweep.definition import trials_of
 
     try:
         return trials_of(definition, command.words_of)
@@ -188,8 +185,7 @@ def _run(
     """Run what is left and print how it ended. Returns: is there a trial that is not done?"""
     from trilane.apps.cli.sweep_output import print_summary, progress
     from trilane.apps.made import made_facts
-    from trilane.apps.sweeps.store import Store, is_ended
-    from trilane.apps.sweeps.sweep import run_sweep, summary
+    from trilane.apps.sweep.store import Store, is_ended, run_sweep, summary
 
     about = {"made": made_facts(("trilane", *sys.argv[1:])), "definition": _described(definition)}
     with Store(folder, trials, about, resume=resume) as store:
@@ -214,15 +210,14 @@ def _run(
 @contextmanager
 def _engine(name: EngineName, store: Store) -> Iterator[Engine]:
     if name is EngineName.RAY:
-        from trilane.apps.sweeps.ray_engine import cluster
+        from trilane.apps.sweep.engines import cluster
 
         with stdout_kept(), cluster(store.folder) as engine:  # Ray tells of dead machines on stdout
             yield engine
         return
-    from trilane.apps.sweeps.local_engine import run_here
-    from trilane.apps.sweeps.perform import Place
+    from trilane.apps.sweep.engines import TrialPlace, run_here
 
-    yield partial(run_here, place=Place(store.folder), inherited=(store.lock,))
+    yield partial(run_here, place=TrialPlace(store.folder), inherited=(store.lock,))
 
 
 def _described(definition: Definition) -> dict[str, Any]:
@@ -238,7 +233,7 @@ def _described(definition: Definition) -> dict[str, Any]:
 
 
 def _say_interrupted(trials: Sequence[Trial], store: Store) -> None:
-    from trilane.apps.sweeps.store import is_ended
+    from trilane.apps.sweep.store import is_ended
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # what is left to do is to say so
     ended = sum(is_ended(store.done.get(trial.id)) for trial in trials)
@@ -247,7 +242,7 @@ def _say_interrupted(trials: Sequence[Trial], store: Store) -> None:
 
 
 def _print_planned(trials: Sequence[Trial], as_json: bool) -> None:
-    from trilane.apps.sweeps.sweep import row_of
+    from trilane.apps.sweep.store import row_of
 
     if as_json:
         print_json({"schema": 1, "trials": [row_of(trial, None) for trial in trials]})

@@ -15,7 +15,7 @@ import typer
 
 from trilane.apps.cli.bench import BENCHES, bench_command
 from trilane.apps.cli.main import COMMANDS as ALL_COMMANDS
-from trilane.apps.sweeps.trial import COMMANDS, Options, Value
+from trilane.apps.sweep.definition import COMMANDS, Options, Value
 from trilane.errors import BadInputError, did_you_mean
 
 #: Options of a trial that are not its configuration: why a sweep does not take them.

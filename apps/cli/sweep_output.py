@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from trilane.apps.cli.console import stderr_console, stdout_console
 
 if TYPE_CHECKING:
-    from trilane.apps.sweeps.definition import Definition
+    from trilane.apps.sweep.definition import Definition
 
 #: Of a trial's result, where it has them: what the table shows beside how it ended.
 FIGURES = {"fps": ("fps",), "frame ms": ("frame_time_ms", "mean")}

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from trilane.apps.cli.run_table import DASH, NEEDED, TOO_FEW, accuracy_line
-from trilane.apps.explained.advice import bound_text
+from trilane.apps.explain.reasons import bound_text
 from trilane.apps.live.figures import Figures, Moved, UnitFigures
 from trilane.apps.live.followed_run import RunState
 from trilane.apps.live.live_figures import LEAST

@@ -1,6 +1,6 @@
 """`trilane trace`: the timeline of a run for trace viewers, made again from its journal.
 
-Rule: this file talks to the person; what a trace holds is in `trilane.apps.tracing`.
+Rule: this file talks to the person; what a trace holds is in `trilane.apps.explain`.
 """
 
 from __future__ import annotations
@@ -33,9 +33,8 @@ def trace(run: RunArgument, chrome_json: ChromeOption = False, out: OutOption = 
 
     docs/trace.md says what every track is.
     """
+    from trilane.apps.explain.trace import CHROME_NAME, NAME, write_run
     from trilane.apps.live.followed_run import RunState, follow
-    from trilane.apps.tracing.files import write_run
-    from trilane.apps.tracing.writer import CHROME_NAME, NAME
 
     followed = follow(run)
     if out is None and followed.state is RunState.GOES_ON:

@@ -1,4 +1,4 @@
-"""How far are the runtimes from each other on the frames of a scene?
+"""How far apart are the runtimes on the frames of a scene?
 
 Rule: every runtime gets the same bytes, drawn by the pipeline's own pose and raster stages; the largest difference of
 any byte stands beside the mean.
@@ -27,17 +27,16 @@ from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
 from trilane.stages.gpu.raster import build as build_raster
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
-#: Of 255: bounds on the difference of any two runtimes.
+#: Bounds on the difference of any two runtimes, of 255.
 MEAN_BOUND, LARGEST_BOUND = 0.5, 4
 MAX_FRAMES = 10_000
 
 
 def runtime_differences(checked: Checked, runtimes: Sequence[str], frames: int) -> dict[str, Any]:
-    """How far the pictures of each pair of runtimes are apart.
+    """Return how far apart the pictures of each pair of runtimes are.
 
-    `checked`: the scene and its avatars.
-    `runtimes`: two or more, by name.
-    `frames`: how many, evenly spread over the scene.
+    `checked`: the scene and its avatars. `runtimes`: names of two or more runtimes. `frames`: number of frames, evenly
+    spread over the scene.
     Keys: `rows`, one per pair: `first`, `second`, `mean`, `largest` (of 255, over all channels and frames),
     `worst_frame`; `sources`; `bounds`; `frames` (numbers of those that show an avatar); `runtimes` (name to version).
     Raises BadInputError and MissingPartError.
@@ -69,7 +68,7 @@ def runtime_differences(checked: Checked, runtimes: Sequence[str], frames: int) 
 
 
 def _row(pair: tuple[str, str], steps: list[tuple[float, int, int]]) -> dict[str, Any]:
-    """`steps`: (mean, largest, number) of each frame."""
+    """Return the row of a pair. `steps`: (mean, largest, number) of each frame."""
     return {
         "first": pair[0],
         "second": pair[1],
@@ -88,7 +87,7 @@ class _Sessions:
         self._bound: dict[tuple[str, Shape], tuple[U8, U8, Binding]] = {}
 
     def picture(self, runtime: str, tensor: U8) -> U8:
-        """(h,w,4) of `tensor` (h,w,C)."""
+        """Return the picture (h,w,4) that `runtime` makes of `tensor` (h,w,C)."""
         shape = (int(tensor.shape[0]), int(tensor.shape[1]))
         if (runtime, shape) not in self._bound:
             slots = np.empty((1, *tensor.shape), np.uint8), np.empty((1, *shape, 4), np.uint8)
@@ -102,7 +101,7 @@ class _Sessions:
 
 
 def _tensors(checked: Checked, frames: int) -> Iterator[tuple[int, U8]]:
-    """(number, tensor (h,w,C)) of frames that are evenly spread over the scene, where an avatar is seen."""
+    """Yield (number, tensor (h,w,C)) of the frames, evenly spread over the scene, that show an avatar."""
     total, painter = checked.config.scene.frames, DrawnTensors(checked)
     count = min(frames, total)
     for frame in (index * total // count for index in range(count)):
@@ -127,7 +126,7 @@ class DrawnTensors:
         self._channels = network_of(assets).channels
 
     def tensor(self, frame: int) -> U8:
-        """(h, w, C) of frame `frame`, valid until the next call; what no avatar of it is seen in has no pixels."""
+        """Return the tensor (h, w, C) of frame `frame`, valid until the next call; without avatars it has no pixels."""
         self._pose.run(frame, None, 0)
         self._raster.run(frame, 0, 0)
         height, width = self._posed.header["tensor_shape"].tolist()

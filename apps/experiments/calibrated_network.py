@@ -1,7 +1,7 @@
 """The avatar of a scene with its network quantised anew, by another method of calibration; all else is as it was.
 
-Rule: the network is quantised from the one that the avatar was quantised from, on views drawn as the training draws
-them; what cannot be found is refused, nothing else is taken in its place.
+Rule: it is quantised from the same float network as the avatar's own, on views drawn as in the training. A part that
+cannot be found is refused; nothing else takes its place.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from trilane.errors import BadInputError, MissingPartError
 from trilane.stages.avatar_assets import distinct, with_network
 from trilane.stages.configure import Checked
 
-#: The network of the avatar's own file.
+#: The name for the network of the avatar's own file.
 AS_IT_IS = "as-it-is"
-#: Views that a network is calibrated on.
+#: Number of views that a network is calibrated on.
 VIEWS = 50
 
 
@@ -33,7 +33,7 @@ class Calibrations:
         self._made: dict[str, NetworkFile] = {}
 
     def changed(self, checked: Checked, method: str) -> Checked:
-        """`checked` with the network by `method`, `AS_IT_IS` or a name of METHODS.
+        """Return `checked` with the network by `method`, which is `AS_IT_IS` or a name of METHODS.
 
         Raises BadInputError without the float network, MissingPartError without PyTorch.
         """
@@ -54,9 +54,9 @@ class Calibrations:
 
 
 def drawn_material(avatar: str, views: int, held_out: int) -> tuple[onnx.ModelProto, list[F32]]:
-    """The float network of `avatar`, and inputs (H,W,C): `views` of the training's kind, then `held_out` others.
+    """Return the float network of `avatar`, and inputs (H,W,C): `views` of the training's kind, then `held_out` others.
 
-    Raises BadInputError for an avatar whose float network is not here, MissingPartError without PyTorch or OpenGL.
+    Raises BadInputError for an avatar without a float network here, MissingPartError without PyTorch or OpenGL.
     """
     bundle = load_bundle(avatar)
     weights = float_weights(bundle)

@@ -1,12 +1,10 @@
 """How far is a run's picture from the reference, and which cause costs how much?
 
-Rule: two counts, and what each of them leaves. One at a time: each cause alone in the reference (with what it needs),
-whose sum need not be the whole. In order: each added to those before; the picture then goes from the reference's to
-the run's in steps, so differences of MAE, differences of mean squares and the products of each step with the whole add
-up to the whole by construction, but for float64's rounding. Figures are of the region that holds the avatars.
-
-A heat map shows the picture, the reference and their difference: the mean over the colours of its size, times a power
-of two that is written on it; what is beyond the bar has the bar's last colour.
+Rule: causes are counted in two ways, and each way says what it leaves. One at a time: each cause acts alone in the
+reference, with what it needs; the sum need not be the whole. In order: each cause joins those before it, and the
+picture goes in steps from the reference's to the run's. So the differences of MAE, those of mean squares, and the
+products of each step with the whole add up to the whole, but for float64's rounding. Figures are of the region with
+the avatars.
 """
 
 from __future__ import annotations
@@ -20,19 +18,20 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from trilane.apps.experiments.picture_errors import LEAST_MS_SSIM_PX, ErrorFigures, Perceived, figures, require_metrics
+from trilane.apps.experiments.picture_errors import ErrorFigures, Perceived, figures, require_metrics
 from trilane.apps.experiments.reference_path import (
     BODY,
     HALF,
     NOTHING,
     WHAT,
     Cause,
-    Moment,
     ReferenceFrame,
+    ReferenceMoment,
     ReferencePath,
     needs,
     up_to,
 )
+from trilane.apps.experiments.scene_pictures import region, spread
 from trilane.arrays import F64, U8
 from trilane.bench.lib.layers import Box, Layer, laid_over
 from trilane.bench.lib.picture_error import psnr_db
@@ -42,17 +41,16 @@ from trilane.shapes import Shape
 from trilane.stages.configure import Checked
 from trilane.writing import write_bytes
 
-MAX_FRAMES = 10_000
 STEPS = 255
-#: Pairs of a picture and the one that it is compared with, besides the causes.
+#: Names of pairs of a picture and its reference, besides the causes.
 WHOLE, REMAINDER = "whole", "remainder"
 Frames = Callable[[Sequence[int]], Iterable[int]]
 #: The bar's colours from no difference to the largest: black, violet, red, orange, pale yellow.
 COLOURS = np.array([(0, 0, 4), (87, 16, 110), (188, 55, 84), (249, 142, 9), (252, 255, 164)], np.float64)
 LARGEST_FACTOR = 1024
-#: So much of the pixels has to be on the bar.
+#: Share of the pixels that has to fit on the bar.
 ON_THE_BAR = 0.999
-#: A panel's longer side is enlarged by a whole number to at least so many pixels.
+#: Least pixels of a panel's longer side; smaller panels are enlarged by a whole number.
 LEAST_SIDE_PX = 320
 BORDER_PX, LINE_PX, BAR_PX, FONT_PX, SCALE_WIDTH_PX = 8, 18, 16, 13, 56
 
@@ -64,22 +62,21 @@ def error_by_cause(
     shown: Frames = lambda numbers: numbers,
     lpips: Perceived | None = None,
 ) -> dict[str, Any]:
-    """The error of `frames` frames, evenly spread over the scene in `checked`, split by cause.
+    """Return the error of `frames` frames, evenly spread over the scene in `checked`, split by cause.
 
-    `out`: a folder for heat maps; None for none. `shown`: what the frames' numbers go through, such as a progress bar.
-    `lpips`: says LPIPS; None: it is not said.
+    `out`: folder for heat maps; None for none. `shown`: passes the frames' numbers on, such as a progress bar. `lpips`:
+    computes LPIPS; None leaves it out.
     Keys: `causes`, a row of each: `cause`, `what`, `needs`, `alone` and `step` (figures against the picture without
     the cause: in the reference, and in the sequence), `so_far` (against the reference), `adds` (`mae`, `square`,
     `product`), `moved` of causes of the body; `whole`; `sums`; `remainder` of the run's own frames against the
     sequence's end; `truth`; `frames`, `empty_frames` (nobody in view), `network`, `sources`, `config`.
     Raises BadInputError, MissingPartError.
     """
-    if not 1 <= frames <= MAX_FRAMES:
-        raise BadInputError("--frames", str(frames), f"1 to {MAX_FRAMES}")
+    numbers = spread(checked.config.scene.frames, frames)
     require_metrics()
     path = ReferencePath(checked)
     truth = _truth(path)
-    split, empty, numbers = _Split(path.output, out, lpips), [], _spread(checked.config.scene.frames, frames)
+    split, empty = _Split(path.output, out, lpips), []
     for number in shown(numbers):
         moment = path.moment(number)
         if not moment.boxes:
@@ -101,27 +98,8 @@ def error_by_cause(
     }
 
 
-def region(boxes: Sequence[Box], output: Shape) -> Box:
-    """The smallest rectangle of a picture of `output` that holds `boxes`, with room for MS-SSIM where there is any."""
-    top, left = min(box.top for box in boxes), min(box.left for box in boxes)
-    bottom, right = max(box.bottom for box in boxes), max(box.right for box in boxes)
-    rows, columns = _with_room(top, bottom, output[0]), _with_room(left, right, output[1])
-    return Box(rows[0], columns[0], rows[1], columns[1])
-
-
-def _with_room(first: int, last: int, side: int) -> tuple[int, int]:
-    length = min(max(last - first, LEAST_MS_SSIM_PX), side)
-    begin = min(max((first + last - length) // 2, 0), side - length)
-    return begin, begin + length
-
-
-def _spread(total: int, frames: int) -> list[int]:
-    count = min(frames, total)
-    return [index * total // count for index in range(count)]
-
-
 def _truth(path: ReferencePath) -> Any:
-    """The clothed bodies of the scene, where they are known; else None."""
+    """Return the clothed bodies of the scene, where they are known; else None."""
     from trilane.bench.lib.full_picture import true_pictures
 
     return true_pictures(path.cast, path.gl)
@@ -129,7 +107,7 @@ def _truth(path: ReferencePath) -> Any:
 
 @dataclass
 class _Pooled:
-    """Figures of pairs of pictures: MAE and mean square over all pixels, of the others the mean over the frames."""
+    """Figures of pairs of pictures: MAE and mean square over all pixels, all others as means over the frames."""
 
     lpips: Perceived | None = None
     values: int = 0
@@ -146,12 +124,12 @@ class _Pooled:
 
     @property
     def mae(self) -> float:
-        """In steps of 1/255."""
+        """Mean absolute error, in steps of 1/255."""
         return STEPS * self.absolute / self.values if self.values else 0.0
 
     @property
     def mean_square(self) -> float:
-        """In squares of steps of 1/255."""
+        """Mean square error, in squares of steps of 1/255."""
         return STEPS**2 * self.square / self.values if self.values else 0.0
 
     def as_json(self) -> dict[str, float | None]:
@@ -183,7 +161,7 @@ class _Moved:
 
 
 def _pixels(vertices: F64, clip: F64, output: Shape) -> tuple[F64, Any]:
-    """Where `vertices` (V,3) are on the picture, (V,2) pixels, and which are on it, (V,)."""
+    """Return where `vertices` (V,3) are on the picture, (V,2) pixels, and which are on it, (V,)."""
     x, y, _, w = (np.c_[vertices, np.ones(len(vertices))] @ clip.T).T
     in_front = w > 0
     place = np.stack([x, y], axis=1) / np.where(in_front, w, 1.0)[:, None]
@@ -191,7 +169,7 @@ def _pixels(vertices: F64, clip: F64, output: Shape) -> tuple[F64, Any]:
 
 
 class _Split:
-    """What was counted of the frames that were added."""
+    """The counts of the added frames, by cause."""
 
     def __init__(self, output: Shape, out: Path | None, lpips: Perceived | None = None) -> None:
         self._output, self._out = output, out
@@ -201,7 +179,7 @@ class _Split:
         self._remainder = _Pooled(lpips)
         self._truth = {"reference": _Pooled(lpips), "run": _Pooled(lpips)}
 
-    def add(self, moment: Moment) -> None:
+    def add(self, moment: ReferenceMoment) -> None:
         """Count a frame in which somebody is seen."""
         box = region(moment.boxes, self._output)
         reference = _cut(moment.frame(NOTHING), box)
@@ -225,7 +203,7 @@ class _Split:
         self._remainder.add(own, end)
         self._show(moment.number, WHOLE, own, reference)
 
-    def add_truth(self, moment: Moment, true: Sequence[Layer]) -> None:
+    def add_truth(self, moment: ReferenceMoment, true: Sequence[Layer]) -> None:
         """Count a frame against its ground truth, which is laid over the frame's background."""
         box = region(moment.boxes, self._output)
         picture, cover = laid_over(moment.background, true)
@@ -236,7 +214,7 @@ class _Split:
             self._show(moment.number, f"{name} against truth", shown, wanted)
 
     def document(self) -> dict[str, Any]:
-        """The figures, under the keys of `error_by_cause`."""
+        """Return the figures, under the keys of `error_by_cause`."""
         rows = [self._row(cause, before) for before, cause in zip([None, *Cause], Cause, strict=False)]
         last = list(Cause)[-1]
         whole = self._so_far[last]
@@ -280,8 +258,8 @@ class _Split:
             write_heat_map(self._out / name, f"frame {number}, {what}", picture.picture, reference.picture)
 
 
-def _run(moment: Moment) -> ReferenceFrame:
-    """The run's own frame; its mask is that of the sequence's end."""
+def _run(moment: ReferenceMoment) -> ReferenceFrame:
+    """Return the run's own frame; its mask is that of the sequence's end."""
     return ReferenceFrame(moment.number, moment.own, moment.frame(frozenset(Cause)).mask, moment.boxes)
 
 
@@ -307,7 +285,11 @@ def write_heat_map(file: Path, title: str, picture: F64, reference: F64) -> None
 
 
 def heat_map(title: str, picture: F64, reference: F64) -> U8:
-    """(h,w,3): `picture`, `reference`, both (h,w,3) sRGB in 0..1, their difference, and the colours' bar."""
+    """Return a heat map (h,w,3): picture, reference, their difference, and the bar of its colours.
+
+    The difference is the mean over the colours of its size, times a power of two that is written on the map. What is
+    beyond the bar has the bar's last colour. `picture`, `reference`: (h,w,3) sRGB in 0..1.
+    """
     difference = np.abs(picture - reference).mean(axis=2)
     factor = shown_factor(difference)
     times = max(1, -(-LEAST_SIDE_PX // max(difference.shape)))
@@ -329,9 +311,9 @@ def heat_map(title: str, picture: F64, reference: F64) -> U8:
 
 
 def shown_factor(difference: F64) -> int:
-    """The largest power of two, times which nearly all of `difference`, in 0..1, is at most 1; 1 when nothing differs.
+    """Return the largest power of two that keeps nearly all of `difference`, in 0..1, at most 1.
 
-    It is at most `LARGEST_FACTOR`.
+    It is at most `LARGEST_FACTOR`, and 1 when nothing differs.
     """
     most = float(np.quantile(difference, ON_THE_BAR))
     if most == 0.0:
@@ -340,14 +322,14 @@ def shown_factor(difference: F64) -> int:
 
 
 def coloured(values: F64) -> U8:
-    """(..., 3): the bar's colours of `values`, 0 to 1; larger ones have the last."""
+    """Return the bar's colours (..., 3) of `values` in 0 to 1; larger values have the last."""
     place = np.clip(values, 0, 1) * (len(COLOURS) - 1)
     channels = [np.interp(place, np.arange(len(COLOURS)), COLOURS[:, channel]) for channel in range(3)]
     return np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
 
 
 def _draw_bar(sheet: Image.Image, draw: Any, place: tuple[int, int, int], most: float, font: Any) -> None:
-    """The colour bar at `place` (left, top, height), with what its ends and its middle stand for, of 255."""
+    """Draw the colour bar at `place` (left, top, height), with the values of its ends and its middle, of 255."""
     left, top, height = place
     bar = coloured(np.linspace(1, 0, height))[:, None].repeat(BAR_PX, axis=1)
     sheet.paste(Image.fromarray(bar), (left, top))

@@ -1,8 +1,8 @@
 """What does a speed cost in image error, for each size of tensor on each runtime?
 
-Rule: all rows are of the same moments and of the same part of the picture, the one that holds the avatars. The pictures
-are made first, which warms up; then the frames are made again in the order of the scene, the rows in turns, one job at
-a time: with two frames or more, no frame follows itself. Time without a core does not count.
+Rule: all rows have the same moments and the same part of the picture, the one with the avatars. The pictures come
+first, which warms up. Then the frames are made again in the order of the scene, the rows in turns, one job at a time;
+with two frames or more, no frame follows itself. Time without a core does not count.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from trilane.scheduler.stats import median_interval
 from trilane.stages.configure import Checked, configure
 from trilane.stages.run_options import RunOptions
 
-#: Jobs that an interval of 95 % needs: the median lies between the least and the largest of n with 1 - 2 / 2^n.
+#: Jobs that an interval of 95 % needs: the median of n jobs lies between the least and the largest with 1 - 2 / 2^n.
 LEAST_JOBS = 6
 
 
 @dataclass(frozen=True)
-class Row:
-    """What was found for one size on one runtime. Times in milliseconds, `errors` one for each frame."""
+class SizeRow:
+    """The results of one size on one runtime. `infer_ms`, `frame_ms`: times of the jobs. `errors`: one per frame."""
 
     size: str
     runtime: str
@@ -41,13 +41,13 @@ class Row:
     errors: list[ErrorFigures] = field(default_factory=list)
 
     def time(self, number: int) -> None:
-        """Make frame `number`, and count its times."""
+        """Make frame `number`, and keep its times."""
         _, times = self.pictures.frame(number)
         self.infer_ms.append(sum(ms for stage, ms in times.items() if stage.startswith("infer")))
         self.frame_ms.append(sum(times.values()))
 
     def as_json(self) -> dict[str, Any]:
-        """The row of `measure`."""
+        """Return the row of `measure`."""
         low, high = median_interval(self.infer_ms) if len(self.infer_ms) >= LEAST_JOBS else (None, None)
         ssim = [error.ssim for error in self.errors if error.ssim is not None]
         return {
@@ -120,14 +120,14 @@ def measure(
 
 
 def refuse_twice(option: str, values: Sequence[str]) -> None:
-    """Raises BadInputError unless there are `values`, each once."""
+    """Raise BadInputError unless there are `values`, each once."""
     if not values or len(set(values)) < len(values):
         raise BadInputError(option, ", ".join(values) or "none", "one or more, each once")
 
 
-def _rows(asked: Sequence[RunOptions], checked: Sequence[Checked]) -> list[Row]:
-    rows: list[Row] = []
+def _rows(asked: Sequence[RunOptions], checked: Sequence[Checked]) -> list[SizeRow]:
+    rows: list[SizeRow] = []
     for request, one in zip(asked, checked, strict=True):
         pictures = ScenePictures(one, rows[0].pictures.gpu if rows else None)
-        rows.append(Row(str(request.size), one.config.runtime, pictures, one.config.units["dsp"].threads))
+        rows.append(SizeRow(str(request.size), one.config.runtime, pictures, one.config.units["dsp"].threads))
     return rows

@@ -1,8 +1,8 @@
 """How restless is the error of successive frames, which a person sees as flicker?
 
 Rule: flicker of a pair of frames is the mean change of the error, |(P_t - G_t) - (P_t-1 - G_t-1)|, with P the picture
-and G what it should be; so what moves because the scene moves is none, and an error that stays where it is is none.
-An error that moves with the surface counts where it passes over a pixel: surfaces are not followed.
+and G what it should be. So neither the motion of the scene nor an error that stays in place is flicker. An error that
+moves with a surface counts where it passes over a pixel, because surfaces are not followed.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ STEPS = 255
 
 
 def flicker(before: F64, now: F64) -> float:
-    """Mean change of the error of two successive frames, in steps of 1/255.
+    """Return the mean change of the error of two successive frames, in steps of 1/255.
 
-    `before`, `now`: picture minus what it should be, of the same shape, in 0..1.
+    `before`, `now`: errors of the frames, picture minus what it should be; equal shapes, pictures in 0..1.
     """
     return float(np.abs(now - before).mean() * STEPS)
 
 
-class Row:
-    """What was found for one way to make pictures. `changes`: the flicker of each pair of frames."""
+class FlickerRow:
+    """The results of one way to make pictures. `changes`: flicker of each pair of frames."""
 
     def __init__(self, runtime: str, calibration: str, texture_filter: str, pictures: ScenePictures) -> None:
         self.pictures = pictures
@@ -49,14 +49,14 @@ class Row:
         self._errors: list[float] = []
 
     def add(self, error: F64, part: tuple[slice, slice]) -> None:
-        """Count a frame whose error (h,w,3) is looked at in `part`, where the avatars of it and the last one are."""
+        """Count the next frame. `error`: its error (h,w,3). `part`: where avatars of it and of the last frame are."""
         if self._before is not None:
             self.changes.append(flicker(self._before[part], error[part]))
         self._errors.append(float(np.abs(error[part]).mean() * STEPS))
         self._before = error
 
     def as_json(self) -> dict[str, Any]:
-        """The row of `measure`."""
+        """Return the row of `measure`."""
         return {
             **self._way,
             "flicker": fmean(self.changes),
@@ -101,9 +101,9 @@ def measure(
         (engine, method, name, _filtered(made.changed(one, method), name))
         for (engine, one), method, name in product(checked.items(), calibration, texture_filter)
     ]
-    rows: list[Row] = []
+    rows: list[FlickerRow] = []
     for engine, method, name, one in ways:
-        rows.append(Row(engine, method, name, ScenePictures(one, rows[0].pictures.gpu if rows else None)))
+        rows.append(FlickerRow(engine, method, name, ScenePictures(one, rows[0].pictures.gpu if rows else None)))
     wanted, against = wanted_pictures(cast, rows[0].pictures.gl)
     numbers = list(range(frames))
     scene_change = _follow(cast, rows, wanted, numbers)
@@ -127,8 +127,8 @@ def _filtered(checked: Checked, name: str) -> Checked:
     return checked.changed(scene=checked.config.scene.model_copy(update={"texture_filter": name}))
 
 
-def _follow(cast: Cast, rows: Sequence[Row], wanted: Callable[[int, U8], U8], numbers: Iterable[int]) -> float:
-    """Count the frames `numbers` for each of `rows`; how much the scene itself changes, in steps of 1/255."""
+def _follow(cast: Cast, rows: Sequence[FlickerRow], wanted: Callable[[int, U8], U8], numbers: Iterable[int]) -> float:
+    """Count the frames `numbers` for each of `rows`, and return how much the scene itself changes, in 1/255."""
     last: F64 | None = None
     boxes_before, changes = cast.boxes(0), []
     for number in numbers:

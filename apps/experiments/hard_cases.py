@@ -1,13 +1,10 @@
 """How near an integer network's picture stays to the float network's on hard networks and inputs, on every runtime.
 
-Rule: a bound is the smaller of two, which follow from the network, the input and the steps: the integer network's own
-(`noise_model`), and an ideal quantiser's (`ideal_noise`), so that coarse steps do not raise the bound of their error.
-Neither follows from a runtime's picture. A row whose bound a wrong picture would keep fails, whatever its error is.
-
-Networks are seeded and untrained, and made so that a wrong picture shows: kernels are partly smooth and each level
-weakens what comes from deeper ones, as in trained networks, so that rounding errors do not drown the picture; the heads
-give every colour its own mean and contrast. No input is the same everywhere: where the expected picture is a constant
-one, a constant picture is the right answer and nothing can be told.
+Rule: a bound is the smaller of two that follow from network, input and steps, never from a runtime's picture: the
+integer network's own (`noise_model`), and an ideal quantiser's (`ideal_noise_model`). So coarse steps do not raise the
+bound of their error. A row fails, whatever its error is, if a wrong picture would keep the bound. Networks are seeded,
+untrained, and made so that a wrong picture shows. No input is the same everywhere: where a constant picture is the
+right answer, nothing can be told.
 """
 
 from __future__ import annotations
@@ -39,18 +36,18 @@ if TYPE_CHECKING:
 UNIT = "mean step of 1/255"
 SOURCE = "computed: the float network with the rounding errors of every stored tensor and weight (docs/networks.md)"
 OWN_STEPS, IDEAL_STEPS = "computed with the integer network's steps", "computed with ideal steps"
-#: Pixels by which a shifted picture is shifted.
+#: Shift of a shifted picture, pixels.
 SHIFT = 8
 HOLDS, EXCEEDED, UNTOLD = "holds", "FAILS: error above the bound", "FAILS: a wrong picture would keep the bound"
 SIDE, CHANNELS, WIDTH = 64, 4, 8
 OUTLIER = 100.0
-#: How many times the values of usual frames "saturating" has; the input's bytes end at about three.
+#: Factor of the input "saturating" over usual frames; the input's bytes end at about three.
 EXCESS = 10.0
 CALIBRATION_FRAMES = 8
 CASE_SEED, NETWORK_SEED = 7, 0
-#: Semi-axes of the figure, of the side, and how far its centre may be from the middle.
+#: Semi-axes of the figure and the largest distance of its centre from the middle, as shares of the side.
 FIGURE_HEIGHT, FIGURE_WIDTH, OFF_CENTRE = 0.42, 0.25, 0.1
-#: Size of the figure of "little but background", of the usual one's.
+#: Size of the figure in "little but background", as a share of the usual one's.
 SMALL = 0.7
 #: Sides of the cells of smooth and of flat texture, in pixels.
 SMOOTH_CELL, FLAT_CELL = 8, 16
@@ -58,7 +55,7 @@ SMOOTH_CELL, FLAT_CELL = 8, 16
 GAIN, RANDOM_PART = 2**0.5, 0.5
 #: Factor of deeper features, largest bias of a norm, standard deviation of logits.
 DEEP, BIAS, CONTRAST = 0.25, 0.05, 1.5
-#: Network: its norm, and whether one channel of the stem is a hundredfold.
+#: Network -> its norm, and whether one channel of the stem is a hundredfold.
 NETWORKS: dict[str, tuple[str, bool]] = {
     "batch": ("batch", False),
     "instance": ("instance", False),
@@ -74,8 +71,8 @@ INPUTS: dict[str, Callable[[np.random.Generator], F32]] = {
 
 
 @dataclass(frozen=True)
-class Pair:
-    """A network in float and in integers, calibrated on usual frames, and the model of the integers' noise."""
+class NetworkPair:
+    """A network in float, the same in integers, calibrated on usual frames, and the model of the integers' noise."""
 
     network: onnx.ModelProto
     quantised: Quantised
@@ -84,14 +81,14 @@ class Pair:
 
 @dataclass(frozen=True)
 class Case:
-    """A network with an input: what is expected, and what a picture's error may be.
+    """A network with an input, the expected picture, and the bound on a picture's error.
 
-    `tensor`: bytes (1, H, W, C). `wanted`: the float network's picture (1, H, W, 4), of 255.
-    `predicted`, `bound`: expected error and bound, with the steps of `source`, whose bound is smaller.
-    `own_bound`: the bound with the integer network's steps. `wrong`: least error of each kind of wrong picture.
+    `tensor`: bytes (1, H, W, C). `wanted`: the float network's picture (1, H, W, 4), of 255. `predicted`, `bound`:
+    expected error and bound, with the steps of `source`, whose bound is the smaller one. `own_bound`: bound with the
+    integer network's steps. `wrong`: least error of each kind of wrong picture.
     """
 
-    pair: Pair
+    pair: NetworkPair
     tensor: U8
     wanted: F32
     predicted: float
@@ -106,21 +103,21 @@ class Case:
         return self.bound < min(self.wrong.values())
 
     def verdict(self, error: float) -> str:
-        """What a picture's `error` means; an error that is not a number is above the bound."""
+        """Return what a picture's `error` means; an error that is not a number is above the bound."""
         if not self.tells:
             return UNTOLD
         return HOLDS if error <= self.bound else EXCEEDED
 
 
-def make_pair(name: str) -> Pair:
-    """The pair of row `name` of `NETWORKS`. Raises MissingPartError without PyTorch."""
+def make_pair(name: str) -> NetworkPair:
+    """Return the pair of row `name` of `NETWORKS`. Raises MissingPartError without PyTorch."""
     network = float_network(name)
     quantised = quantise(network, calibration_frames())
-    return Pair(network, quantised, noise_model(quantised))
+    return NetworkPair(network, quantised, noise_model(quantised))
 
 
-def make_case(pair: Pair, case: str) -> Case:
-    """Row `case` of `INPUTS` on the networks of `pair`."""
+def make_case(pair: NetworkPair, case: str) -> Case:
+    """Return row `case` of `INPUTS` on the networks of `pair`."""
     encoding = pair.quantised.network.input
     steps = np.round(case_input(case) / encoding.scale) + encoding.zero_point
     tensor = np.ascontiguousarray(np.clip(steps, 0, 255).astype(np.uint8)[None])
@@ -132,7 +129,7 @@ def make_case(pair: Pair, case: str) -> Case:
 
 
 def error_of(case: Case, runtime: str) -> float:
-    """Mean difference of `runtime`'s picture in steps of 1/255; NaN when the float network gives no number."""
+    """Return the mean error of `runtime`'s picture in steps of 1/255; NaN when the float network gives no number."""
     image = np.zeros(case.wanted.shape, np.uint8)
     session = load_runtime(runtime).load(case.pair.quantised.network, RuntimeOptions())
     session.bind([case.tensor], [image]).run()
@@ -140,11 +137,11 @@ def error_of(case: Case, runtime: str) -> float:
 
 
 def wrong_answers(wanted: F32) -> dict[str, float]:
-    """The errors of pictures that are wrong, against `wanted` (H, W, 4), of 255: of each kind, the least.
+    """Return the least error of each kind of wrong picture against `wanted` (H, W, 4), of 255.
 
-    `constant_error`: the best picture of one colour, which is the median of each channel.
-    `shifted_error`: `wanted` moved by `SHIFT` pixels, up, down, left or right, wrapped or with its edge repeated.
-    `swapped_error`: red and blue exchanged.
+    `constant_error`: for the best picture of one colour, which is the median of each channel. `shifted_error`: for
+    `wanted` moved by `SHIFT` pixels, up, down, left or right, wrapped or with its edge repeated. `swapped_error`: for
+    red and blue exchanged.
     """
     shifted = (
         np.abs(moved - wanted).mean() for axis in (0, 1) for by in (SHIFT, -SHIFT) for moved in _moved(wanted, by, axis)
@@ -157,17 +154,17 @@ def wrong_answers(wanted: F32) -> dict[str, float]:
 
 
 def _moved(picture: F32, by: int, axis: int) -> Iterator[F32]:
-    """`picture` moved along `axis`, wrapped and with its edge repeated."""
+    """Yield `picture` moved along `axis`, first wrapped, then with its edge repeated."""
     places = np.arange(picture.shape[axis]) - by
     yield np.take(picture, places % len(places), axis)
     yield np.take(picture, np.clip(places, 0, len(places) - 1), axis)
 
 
 def hard_cases(runtimes: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Rows of every network, input and runtime. Raises MissingPartError.
+    """Yield rows of every network, input and runtime. Raises MissingPartError.
 
     Keys: `name`, `error`, `bound`, `unit`, `source` (of the bound), `predicted_error`, those of `wrong_answers`,
-    `verdict`, `passed`. `error` is None where it is no number, which is above every bound.
+    `verdict`, `passed`. `error` is None where it is not a number, which counts as above every bound.
     """
     for network in NETWORKS:
         pair = make_pair(network)
@@ -190,7 +187,7 @@ def hard_cases(runtimes: Sequence[str]) -> Iterator[dict[str, Any]]:
 
 
 def _smooth(rng: np.random.Generator) -> F32:
-    """(SIDE, SIDE, CHANNELS), linear between normal values at the corners of cells."""
+    """Return a texture (SIDE, SIDE, CHANNELS), linear between normal values at the corners of cells."""
     cells = SIDE // SMOOTH_CELL
     corners = rng.normal(size=(cells + 1, cells + 1, CHANNELS))
     place = np.linspace(0, cells, SIDE)
@@ -202,14 +199,14 @@ def _smooth(rng: np.random.Generator) -> F32:
 
 
 def _flat(rng: np.random.Generator) -> F32:
-    """(SIDE, SIDE, CHANNELS), one normal value in each cell."""
+    """Return a texture (SIDE, SIDE, CHANNELS) with one normal value in each cell."""
     cells = SIDE // FLAT_CELL
     values = rng.normal(size=(cells, cells, CHANNELS)).astype(np.float32)
     return values.repeat(FLAT_CELL, axis=0).repeat(FLAT_CELL, axis=1)
 
 
 def _in_figure(rng: np.random.Generator, texture: Callable[[np.random.Generator], F32], size: float = 1.0) -> F32:
-    """`texture` inside an ellipse, 0 outside."""
+    """Return `texture` inside an ellipse, 0 outside."""
     row, column = np.mgrid[:SIDE, :SIDE] / SIDE - 0.5
     down, right = rng.uniform(-OFF_CENTRE, OFF_CENTRE, 2)
     inside = ((row - down) / FIGURE_HEIGHT) ** 2 + ((column - right) / FIGURE_WIDTH) ** 2 < size**2
@@ -218,18 +215,22 @@ def _in_figure(rng: np.random.Generator, texture: Callable[[np.random.Generator]
 
 
 def case_input(case: str) -> F32:
-    """(SIDE, SIDE, CHANNELS) of row `case` of `INPUTS`; no frame of the calibration."""
+    """Return the input (SIDE, SIDE, CHANNELS) of row `case` of `INPUTS`; it is no frame of the calibration."""
     return INPUTS[case](np.random.default_rng(CASE_SEED))
 
 
 def calibration_frames() -> list[F32]:
-    """Usual frames, each (SIDE, SIDE, CHANNELS)."""
+    """Return usual frames, each (SIDE, SIDE, CHANNELS)."""
     rng = np.random.default_rng(NETWORK_SEED)
     return [INPUTS["usual"](rng) for _ in range(CALIBRATION_FRAMES)]
 
 
 def float_network(name: str) -> onnx.ModelProto:
-    """The float network of row `name` of `NETWORKS`. Raises MissingPartError without PyTorch."""
+    """Return the float network of row `name` of `NETWORKS`. Raises MissingPartError without PyTorch.
+
+    Kernels are partly smooth, and each level weakens what comes from deeper ones, as in trained networks, so that
+    rounding errors do not drown the picture. The heads give every colour its own mean and contrast.
+    """
     try:
         import torch
     except ImportError:
@@ -254,7 +255,7 @@ def float_network(name: str) -> onnx.ModelProto:
 
 
 def _draw(module: Any, generator: Any) -> None:
-    """New weights for a convolution, new biases for a norm. A channel's weights add up to about 0 over its inputs."""
+    """Draw weights for a convolution or biases for a norm. A channel's weights add up to about 0 over its inputs."""
     import torch
 
     if isinstance(module, torch.nn.Conv2d):

@@ -1,7 +1,7 @@
 """Is what `trilane predict --profile host` says true: of runs of an avatar, and of networks by themselves?
 
-Rule: each prediction is made first, then what it is of runs as it always does: a whole `trilane run` in processes of
-its own; calls of the network in a process that the prediction did not start. Nothing of these comes into a prediction.
+Rule: each prediction comes first, then its subject runs as it always does: a whole `trilane run` in processes of its
+own; calls of the network in a process that the prediction did not start. No measured time enters a prediction.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from trilane.stages.run_options import RunOptions
 from trilane.units import BURST
 
 RUN, ALONE = "run", "network"
-MIN_FRAMES = 100  # of a run that is placed by its times
+MIN_FRAMES = 100  # frames of a run that is placed by its times
 
 
 class Predicted(NamedTuple):
-    """Milliseconds, and the 80 % interval; None where nothing could be measured."""
+    """A predicted time in milliseconds, and its 80 % interval; None where nothing could be measured."""
 
     ms: float
     low_ms: float | None
@@ -85,7 +85,7 @@ def _of_run(avatar: str) -> Predicted:
 
 
 def _run(avatar: str, frames: int, out: Path) -> tuple[float, float | None]:
-    """Milliseconds between the frames of a run, and what other programs had of the cores."""
+    """Return the milliseconds between the frames of a run, and the share of the cores that other programs had."""
     options = RunOptions(avatar=avatar, frames=frames, baseline_frames=0, out=out)
     report = run_asked(options, quiet, ("trilane", "bench")).report
     return report.frame_time_ms.mean, report.other_programs
@@ -120,7 +120,7 @@ def _row(name: str, what: str, predicted: Predicted, measured_ms: float, others:
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Of rows of one kind, at least two."""
+    """Return the summary of rows of one kind, at least two."""
     squares = [math.log1p(row["error"]) ** 2 for row in rows]
     left_out = [(sum(squares) - one) / (len(squares) - 1) for one in squares]
     return {
@@ -134,5 +134,5 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[Hooks]:
-    """Hooks of a run that nobody watches."""
+    """Give the hooks of a run that nobody watches."""
     yield Hooks(lambda *_: None, lambda _: None)

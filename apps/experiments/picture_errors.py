@@ -1,25 +1,27 @@
-"""How far a picture is from another one, and a mask from another one, by the errors that people know.
+"""How far a picture is from another one, and a mask from another one, by the usual measures.
 
-Rule: pure functions. Pictures are (h,w,3) sRGB, bytes or real numbers in 0..1, masks (h,w) of bools; what a library
-has is the library's. SSIM is as in the avatars' validations: windows of 7 x 7 pixels, mean over the colours.
-
-Sources: SSIM: Wang et al., "Image Quality Assessment", IEEE TIP 13 (2004); MS-SSIM: Wang, Simoncelli and Bovik,
-"Multiscale structural similarity", Asilomar 2003; FLIP: Andersson et al., HPG 2020, at 67 pixels a degree.
+Rule: pictures are (h,w,3) sRGB, bytes or real numbers in 0..1, masks (h,w) of bools. SSIM is as in the avatars'
+validations: windows of 7 x 7 pixels, mean over the colours. LPIPS has weights that somebody gives by path: nothing is
+downloaded, and nothing but tensors is read from the file. Sources: SSIM: Wang et al., "Image Quality Assessment", IEEE
+TIP 13 (2004); MS-SSIM: Wang, Simoncelli and Bovik, "Multiscale structural similarity", Asilomar 2003; FLIP: Andersson
+et al., HPG 2020, at 67 pixels a degree; LPIPS: Zhang et al., "Unreasonable Effectiveness", CVPR 2018, version 0.1.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from trilane.arrays import F64, Floats, Mask
 from trilane.bench.lib import picture_error
 from trilane.bench.lib.picture_error import flip_map, require_metrics, ssim_map
+from trilane.errors import BadInputError, MissingPartError
 
 __all__ = ["ErrorFigures", "dice", "figures", "flip", "iou", "mae", "ms_ssim", "psnr_db", "require_metrics", "ssim"]
-
 #: Exponents of MS-SSIM's scales, the finest first.
 SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 #: MS-SSIM's window: a Gaussian of this deviation, in pixels, over 11 x 11 of them.
@@ -30,17 +32,33 @@ LEAST_MS_SSIM_PX = WINDOW_PX * 2 ** (len(SCALES) - 1)
 LEAST_SSIM_PX = 7
 #: Constants that keep SSIM's quotients from 0 / 0, of values in 0..1.
 C1, C2 = 0.01**2, 0.03**2
-#: LPIPS of a picture and its reference, real numbers in 0..1: `trilane.apps.experiments.lpips_error.Lpips`.
+#: LPIPS of a picture and its reference, real numbers in 0..1: `trilane.apps.experiments.picture_errors.Lpips`.
 Perceived = Callable[[F64, F64], float | None]
+LPIPS_FILE = "a file of all weights of lpips.LPIPS(net='alex')"
+LPIPS_REMEDY = "torch.save(lpips.LPIPS().state_dict(), FILE) writes one"
+#: AlexNet's convolutions: name in the file, outputs, inputs, side, stride, padding, whether pooling comes before.
+LPIPS_LAYERS = (
+    ("slice1.0", 64, 3, 11, 4, 2, False),
+    ("slice2.3", 192, 64, 5, 1, 2, True),
+    ("slice3.6", 384, 192, 3, 1, 1, True),
+    ("slice4.8", 256, 384, 3, 1, 1, False),
+    ("slice5.10", 256, 256, 3, 1, 1, False),
+)
+#: A picture in -1..1 less the shift, divided by the scale, is the network's input.
+LPIPS_SHIFT, LPIPS_SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+#: Keeps an all-zero feature vector from 0 / 0.
+LPIPS_TINY = 1e-10
+#: The least side of a picture for which every layer has an output.
+LEAST_LPIPS_PX = 64
 
 
 @dataclass(frozen=True)
 class ErrorFigures:
     """Errors of a picture against a reference.
 
-    `mae`: mean difference, in steps of 1/255. `psnr_db`: at most 100, which is a picture without an error. `ssim`,
-    `ms_ssim`: 1 without an error; None where the picture is too small for them. `flip`: mean, 0 without an error.
-    `dice`, `iou`: of the masks, 1 where they are the same; None without masks. `lpips`: 0 without an
+    `mae`: mean absolute difference, in steps of 1/255. `psnr_db`: PSNR, at most 100, which means no error. `ssim`,
+    `ms_ssim`: similarity, 1 without an error; None where the picture is too small. `flip`: mean FLIP, 0 without an
+    error. `dice`, `iou`: agreement of the masks, 1 where they are the same; None without masks. `lpips`: 0 without an
     error; None without its weights and where the picture is too small.
     """
 
@@ -54,7 +72,7 @@ class ErrorFigures:
     lpips: float | None = None
 
     def as_json(self) -> dict[str, float | None]:
-        """The figures by their names."""
+        """Return the figures by their names."""
         return asdict(self)
 
 
@@ -65,8 +83,9 @@ def figures(
     reference_mask: Mask | None = None,
     lpips: Perceived | None = None,
 ) -> ErrorFigures:
-    """All errors of `picture` against `reference`, with both masks those of the masks, with `lpips` what it says.
+    """Return all errors of `picture` against `reference`.
 
+    `mask`, `reference_mask`: masks to compare, or None. `lpips`: computes LPIPS; None leaves it out.
     Raises ValueError when shapes or numbers are not those of two pictures, ImportError without the extra `metrics`.
     """
     masks = None if mask is None or reference_mask is None else (mask, reference_mask)
@@ -85,7 +104,7 @@ def figures(
 
 
 def _no_error(side: int, masks: tuple[Mask, Mask] | None, lpips: Perceived | None) -> ErrorFigures:
-    """Figures of two pictures that are the same, whose shorter side is `side`: nothing has to be computed."""
+    """Return the figures of two equal pictures, without computing anything. `side`: their shorter side, pixels."""
     return ErrorFigures(
         mae=0.0,
         psnr_db=picture_error.psnr_db(0.0),
@@ -99,30 +118,30 @@ def _no_error(side: int, masks: tuple[Mask, Mask] | None, lpips: Perceived | Non
 
 
 def mae(picture: Floats, reference: Floats) -> float:
-    """Mean difference of all values, in steps of 1/255."""
+    """Return the mean absolute difference of all values, in steps of 1/255."""
     shown, wanted = _pair(picture, reference)
     return float(np.abs(shown - wanted).mean() * 255)
 
 
 def mse(picture: Floats, reference: Floats) -> float:
-    """Mean square of the differences of all values, in 0..1."""
+    """Return the mean square of the differences of all values, in 0..1."""
     shown, wanted = _pair(picture, reference)
     return float(((shown - wanted) ** 2).mean())
 
 
 def psnr_db(picture: Floats, reference: Floats) -> float:
-    """-10 log10 of the mean square; at most 100 dB."""
+    """Return PSNR, -10 log10 of the mean square; at most 100 dB."""
     return picture_error.psnr_db(mse(picture, reference))
 
 
 def ssim(picture: Floats, reference: Floats) -> float | None:
-    """Mean SSIM; None when a side is shorter than `LEAST_SSIM_PX`."""
+    """Return the mean SSIM; None when a side is shorter than `LEAST_SSIM_PX`."""
     shown, wanted = _pair(picture, reference)
     return None if min(shown.shape[:2]) < LEAST_SSIM_PX else float(ssim_map(shown, wanted).mean())
 
 
 def ms_ssim(picture: Floats, reference: Floats) -> float | None:
-    """MS-SSIM of five scales, mean over the colours; None when a side is shorter than `LEAST_MS_SSIM_PX`.
+    """Return MS-SSIM of five scales, mean over the colours; None when a side is shorter than `LEAST_MS_SSIM_PX`.
 
     Between scales squares of 2 x 2 pixels are averaged. A mean contrast and structure below 0 counts as 0.
     """
@@ -138,24 +157,24 @@ def ms_ssim(picture: Floats, reference: Floats) -> float | None:
 
 
 def flip(picture: Floats, reference: Floats) -> float:
-    """Mean FLIP."""
+    """Return the mean FLIP."""
     return float(flip_map(*_pair(picture, reference)).mean())
 
 
 def dice(mask: Mask, reference: Mask) -> float:
-    """Twice what both masks have, over the sum of what each has; 1 when both are empty."""
+    """Return Dice's coefficient: twice the common area over the sum of both areas; 1 when both are empty."""
     total = int(mask.sum()) + int(reference.sum())
     return 1.0 if total == 0 else 2 * int((mask & reference).sum()) / total
 
 
 def iou(mask: Mask, reference: Mask) -> float:
-    """What both masks have over what either has; 1 when both are empty."""
+    """Return intersection over union; 1 when both masks are empty."""
     either = int((mask | reference).sum())
     return 1.0 if either == 0 else int((mask & reference).sum()) / either
 
 
 def _similarity(picture: F64, reference: F64) -> tuple[F64, F64]:
-    """Of each colour (3,): mean SSIM, and mean of its contrast and structure alone, where windows lie inside."""
+    """Return for each colour (3,) the mean SSIM, and the mean of its contrast and structure, where windows fit."""
     from skimage.metrics import structural_similarity
 
     _, whole = structural_similarity(
@@ -176,7 +195,7 @@ def _similarity(picture: F64, reference: F64) -> tuple[F64, F64]:
 
 
 def _means(picture: F64) -> F64:
-    """The window's weighted means about each pixel, as `structural_similarity` has them."""
+    """Return the window's weighted mean around each pixel, as `structural_similarity` computes it."""
     from skimage.filters import gaussian
 
     reach = WINDOW_PX // 2 / DEVIATION_PX
@@ -197,7 +216,7 @@ def _pair(picture: Floats, reference: Floats) -> tuple[F64, F64]:
 
 
 def _real(picture: Floats) -> F64:
-    """`picture` in 0..1. Raises ValueError when it is none."""
+    """Return `picture` as real numbers in 0..1. Raises ValueError when it is no picture."""
     if picture.ndim != 3 or picture.shape[2] != 3 or not picture.size:
         raise ValueError(f"a picture of shape {picture.shape}, expected (height, width, 3)")
     if picture.dtype == np.uint8:
@@ -206,3 +225,67 @@ def _real(picture: Floats) -> F64:
     if not (real.min() >= 0 and real.max() <= 1):
         raise ValueError("a picture with numbers outside 0 to 1, or none at all")
     return real
+
+
+class Lpips:
+    """LPIPS with AlexNet and the weights of a file.
+
+    The file has the weights of `lpips.LPIPS(net="alex")` under the names of its authors' library, as
+    `torch.save(lpips.LPIPS().state_dict(), FILE)` writes them.
+    """
+
+    def __init__(self, weights: Path) -> None:
+        """Raises BadInputError, MissingPartError without PyTorch."""
+        try:
+            import torch
+        except ImportError as error:
+            raise MissingPartError(f"LPIPS needs {error.name}", extra="train") from None
+        try:
+            state = torch.load(weights, map_location="cpu", weights_only=True)
+        except OSError as error:
+            raise BadInputError.of_os_error(weights, error, LPIPS_FILE) from None
+        except Exception:  # of whatever kind: PyTorch raises many, some with the advice to read the file less carefully
+            raise BadInputError(str(weights), "a file that is not of tensors alone", LPIPS_FILE, LPIPS_REMEDY) from None
+        self._state = {name: _tensor(state, name, shape, weights) for name, shape in _shapes()}
+
+    def __call__(self, picture: F64, reference: F64) -> float | None:
+        """Return LPIPS of pictures (h,w,3), sRGB in 0..1; 0 without an error, None below `LEAST_LPIPS_PX` a side."""
+        import torch
+
+        if min(picture.shape[:2]) < LEAST_LPIPS_PX:
+            return None
+        with torch.no_grad():
+            pairs = zip(self._features(picture), self._features(reference), strict=True)
+            return sum(
+                float(((first - second).square() * self._state[f"lin{number}.model.1.weight"]).sum(1).mean())
+                for number, (first, second) in enumerate(pairs)
+            )
+
+    def _features(self, picture: F64) -> Iterator[Any]:
+        """Yield the unit feature vectors of each layer, (1,C,h,w)."""
+        import torch
+        from torch.nn import functional
+
+        scaled = np.ascontiguousarray(((2 * picture - 1 - LPIPS_SHIFT) / LPIPS_SCALE).transpose(2, 0, 1), np.float32)
+        values = torch.from_numpy(scaled)[None]
+        for name, _, _, _, stride, padding, pooled in LPIPS_LAYERS:
+            values = functional.max_pool2d(values, 3, 2) if pooled else values
+            kernel, bias = self._state[f"net.{name}.weight"], self._state[f"net.{name}.bias"]
+            values = functional.relu(functional.conv2d(values, kernel, bias, stride, padding))
+            yield values / (values.square().sum(1, keepdim=True).sqrt() + LPIPS_TINY)
+
+
+def _shapes() -> Iterator[tuple[str, tuple[int, ...]]]:
+    """Yield the names and shapes that the file needs."""
+    for number, (name, outputs, inputs, side, *_) in enumerate(LPIPS_LAYERS):
+        yield f"net.{name}.weight", (outputs, inputs, side, side)
+        yield f"net.{name}.bias", (outputs,)
+        yield f"lin{number}.model.1.weight", (1, outputs, 1, 1)
+
+
+def _tensor(state: Any, name: str, shape: tuple[int, ...], weights: Path) -> Any:
+    found = state.get(name) if isinstance(state, dict) else None
+    if found is None or tuple(found.shape) != shape:
+        what = "no tensor" if found is None else f"shape {tuple(found.shape)}"
+        raise BadInputError(f"{weights}: {name}", what, f"shape {shape}: {LPIPS_FILE}", LPIPS_REMEDY)
+    return found.float()

@@ -2,12 +2,9 @@
 
 Rule: with no cause it is the plan `full` (`bench/lib/full_picture.py`): float64 body with everything on, supersampled
 float64 raster, float texture, unrounded tensor of the network's own area, FP32 network, blend in linear light in
-float64, not rounded. Each cause replaces one of these by what the run has; with all of them the picture is the run's.
-Motion, camera, background and contact shadows are the run's own throughout.
-
-A cause that cannot stand alone in the reference says which others have to be there: bytes for a runtime, the run's
-tensor for the stages that draw into it or read from it. Of the body, float64 is written out joint by joint and float32
-is the house's own skinning; with everything on, the CPU unit's vertices come out to the bit.
+float64, not rounded. Each cause replaces one of these by the run's; with all of them the picture is the run's. Motion,
+camera, background and contact shadows are always the run's. A cause that cannot stand alone names the causes it needs:
+bytes for a runtime, the run's tensor for stages that draw into it or read it.
 """
 
 from __future__ import annotations
@@ -42,12 +39,12 @@ from trilane.stages.configure import Checked
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
 from trilane.stages.gpu.skinned_mesh import MeshArrays, avatar_mesh, enough_weights
 
-#: From so much cover on a pixel belongs to a mask.
+#: Least cover of a pixel that belongs to a mask.
 HALF = 0.5
 
 
 class Cause(StrEnum):
-    """Why a run's picture is not the reference's, in the order in which causes are added."""
+    """A cause of the difference between a run's picture and the reference's, in the order of adding them."""
 
     WEIGHTS = "skin weights"
     BLEND = "blend shapes"
@@ -87,18 +84,18 @@ WHAT: dict[Cause, str] = {
 
 
 def needs(cause: Cause) -> Causes:
-    """What has to be there for `cause` to be switched on."""
+    """Return the causes that `cause` needs to be switched on."""
     return NEEDS.get(cause, NOTHING)
 
 
 def up_to(cause: Cause) -> Causes:
-    """`cause` and all before it."""
+    """Return `cause` and all causes before it."""
     order = list(Cause)
     return frozenset(order[: order.index(cause) + 1])
 
 
 def require_complete(causes: Iterable[Cause]) -> Causes:
-    """`causes` as a set. Raises ValueError when one lacks what it needs."""
+    """Return `causes` as a set. Raises ValueError when one lacks what it needs."""
     found = frozenset(causes)
     for cause in found:
         if missing := needs(cause) - found:
@@ -107,7 +104,11 @@ def require_complete(causes: Iterable[Cause]) -> Causes:
 
 
 class RunBody:
-    """One distinct avatar. `on_cpu`: whether the CPU unit skins it, else the GPU unit does."""
+    """The body of one distinct avatar.
+
+    In float64 it is written out joint by joint; in float32 it is Trilane's own skinning, so with everything on the CPU
+    unit's vertices come out to the bit. `on_cpu`: whether the CPU unit skins it, else the GPU unit does.
+    """
 
     def __init__(self, data: AvatarData, *, on_cpu: bool) -> None:
         self._data, self._on_cpu = data, on_cpu
@@ -116,10 +117,10 @@ class RunBody:
         self._skinners: dict[Detail, FrameSkinner] = {}
 
     def vertices(self, seen: Seen, level: int | None, causes: Causes) -> F64:
-        """(V,3) metres, in the world.
+        """Return the vertices (V,3), metres, in the world.
 
-        `seen`: the avatar in a frame. `level`: of `DETAILS`, by the run's plan; None where the run does not show it.
-        `causes`: those of them that are of the body count.
+        `seen`: the avatar in a frame. `level`: index into `DETAILS` by the run's plan; None where the run does not show
+        it. `causes`: causes that are switched on; those of the body count.
         """
         detail = self._detail(level, causes)
         if Cause.FLOAT32 not in causes:
@@ -128,7 +129,7 @@ class RunBody:
         return (self._by_cpu(detail, posed) if self._on_cpu else self._by_gpu(detail, posed)).astype(np.float64)
 
     def _detail(self, level: int | None, causes: Causes) -> Detail:
-        """What is modelled: of the run's detail only what `causes` say."""
+        """Return what is modelled: the run's detail where `causes` say so, else everything."""
         run = EVERYTHING
         if self._on_cpu:
             run = EVERYTHING if level is None else DETAILS[level]
@@ -150,7 +151,7 @@ class RunBody:
         return self._full[detail]
 
     def _blend(self, detail: Detail) -> F32 | None:
-        """Pose blend shapes. The GPU unit never leaves them out, but has them in float16."""
+        """Return the pose blend shapes. The GPU unit never leaves them out, but has them in float16."""
         if detail.pose_blend or self._body.posedirs is None:
             return self._body.posedirs
         return None if self._on_cpu else self._body.posedirs.astype(np.float16).astype(np.float32)
@@ -163,7 +164,7 @@ class RunBody:
         return vertices
 
     def _by_gpu(self, detail: Detail, posed: Posed) -> F32:
-        """The vertex shader's formula, rounded to float32 after each step."""
+        """Return vertices by the vertex shader's formula, rounded to float32 after each step."""
         rest, blend = self._data.shaped.vertices.astype(np.float32), self._blend(detail)
         if blend is not None:
             rest = rest + (blend.reshape(-1, POSE_FEATURES) @ posed.feature).reshape(-1, 3)
@@ -173,9 +174,10 @@ class RunBody:
 
 @dataclass(frozen=True)
 class ReferenceFrame:
-    """Frame `number`. `picture` (h,w,3): sRGB in 0..1. `mask` (h,w): where avatars cover at least half of a pixel.
+    """Frame `number`.
 
-    `boxes`: the parts of the picture that hold avatars.
+    `picture`: (h,w,3) sRGB in 0..1. `mask`: pixels (h,w) that avatars cover at least half. `boxes`: parts of the
+    picture with avatars.
     """
 
     number: int
@@ -185,7 +187,10 @@ class ReferenceFrame:
 
 
 class ReferencePath:
-    """The frames of the scene in `checked`. `networks`: what paints the reference, for people. `gl`: the context."""
+    """The frames of the scene in `checked`.
+
+    `networks`: names of the networks that paint the reference. `gl`: OpenGL context.
+    """
 
     def __init__(self, checked: Checked) -> None:
         """Raises BadInputError, MissingPartError."""
@@ -204,16 +209,19 @@ class ReferencePath:
         return self.frames.gl
 
     def frame(self, number: int) -> ReferenceFrame:
-        """Frame `number` by the reference."""
+        """Return frame `number` by the reference."""
         return self.moment(number).frame(NOTHING)
 
-    def moment(self, number: int) -> Moment:
-        """Frame `number`, to be made with any causes."""
-        return Moment(self, number)
+    def moment(self, number: int) -> ReferenceMoment:
+        """Return frame `number`, which can be made with any causes."""
+        return ReferenceMoment(self, number)
 
 
-class Moment:
-    """One frame, whose parts are made once. `own` (h,w,3): the run's picture. `seen`: who is, by number."""
+class ReferenceMoment:
+    """One frame, each part of which is made once.
+
+    `own`: the run's picture, (h,w,3) in 0..1. `seen`: visible avatars by number.
+    """
 
     def __init__(self, path: ReferencePath, number: int) -> None:
         self._path, self.number = path, number
@@ -225,7 +233,7 @@ class Moment:
         self._made: dict[Hashable, Any] = {}
 
     def frame(self, causes: Causes) -> ReferenceFrame:
-        """The frame with `causes` switched on. Raises ValueError when one lacks what it needs."""
+        """Return the frame with `causes` switched on. Raises ValueError when one lacks what it needs."""
         made: ReferenceFrame = self._once(("frame", require_complete(causes)), lambda: self._frame(causes))
         return made
 
@@ -236,7 +244,7 @@ class Moment:
         return ReferenceFrame(self.number, picture, cover >= HALF, self.boxes)
 
     def vertices(self, index: int, causes: Causes) -> F64:
-        """(V,3) metres of avatar `index`, which is seen."""
+        """Return the vertices (V,3), metres, of the visible avatar `index`."""
         seen = self.seen[index]
         body = self._path.avatars[seen.folder].body
         level = self._levels.get(index)
@@ -245,7 +253,7 @@ class Moment:
         return vertices
 
     def clip(self, index: int) -> F64:
-        """(4,4) of the whole picture: projection @ view."""
+        """Return projection @ view (4,4) of the whole picture."""
         return self._path.cast.projection(self.number) @ self.seen[index].view
 
     def _layers(self, causes: Causes) -> list[Layer]:
@@ -261,7 +269,7 @@ class Moment:
         ]
 
     def _own_layer(self, seen: Seen, causes: Causes) -> Layer:
-        """Of an avatar with a tensor of its own, on the picture's grid, as in the plan `full`."""
+        """Return the layer of an avatar with a tensor of its own, on the picture's grid, as in the plan `full`."""
         avatar = self._path.avatars[seen.folder]
         times = fineness(seen.box.shape, avatar.area)
         box = grown(seen.box, BUCKET_STEP * times.denominator)
@@ -273,19 +281,19 @@ class Moment:
         return Layer(box, seen.depth, enlarged(shrunk(painted, times.numerator), times.denominator))
 
     def _cells(self) -> list[tuple[Seen, Rect, Cell]]:
-        """Who is in the run's tensor, the crop rectangle, and its part of the tensor."""
+        """Return the avatars in the run's tensor, each with its crop rectangle and its part of the tensor."""
         if int(self._header["work"]) != FrameWork.FULL:
             return []
         visible = [row for row in self._header["avatars"] if row["visible"] and int(row["avatar"]) in self.seen]
         return [(self.seen[int(row["avatar"])], Rect(*map(float, row["rect"])), _cell(row)) for row in visible]
 
     def _painted(self, causes: Causes) -> F32:
-        """(h,w,4): the picture of the run's tensor, which all avatars share."""
+        """Return the picture (h,w,4) of the run's tensor, which all avatars share."""
         avatar = next(iter(self._path.avatars.values()))
         return self._paint(avatar, self._tensor(avatar, causes), causes)
 
     def _tensor(self, avatar: _Avatar, causes: Causes) -> F64:
-        """(h,w,C) real numbers: of the run's shape and crops."""
+        """Return the tensor (h,w,C) of the run's shape and crops, in real numbers."""
         if Cause.RASTER in causes:
             drawn = self._once("drawn", lambda: self._path.frames.tensor_of(self.number))
             return avatar.real(drawn)
@@ -298,7 +306,7 @@ class Moment:
         return avatar.packed(tensor, causes)
 
     def _drawn(self, seen: Seen, clip: F64, shape: Shape, causes: Causes) -> F64:
-        """(h,w,C): one avatar by the float64 rasteriser."""
+        """Return one avatar (h,w,C) by the float64 rasteriser."""
         avatar = self._path.avatars[seen.folder]
         vertices, texture = self.vertices(seen.index, causes), avatar.texture
         if Cause.FLOAT16 in causes:
@@ -318,7 +326,7 @@ class Moment:
         return painted
 
     def _composited(self, causes: Causes) -> F64:
-        """(h,w,3): by the composite stage, of the network's picture in bytes."""
+        """Return the frame (h,w,3) by the composite stage, from the network's picture in bytes."""
         if not self._cells():
             return self.own
         painted = np.asarray(np.rint(self._painted(causes) * 255), np.uint8)
@@ -326,7 +334,7 @@ class Moment:
         return made
 
     def _once(self, key: Hashable, make: Callable[[], Any]) -> Any:
-        """What `make` gives, made once for each `key`: a cause that changes nothing costs nothing."""
+        """Return what `make` gives, made once for each `key`, so that a cause that changes nothing costs nothing."""
         if key not in self._made:
             self._made[key] = make()
         return self._made[key]
@@ -334,10 +342,11 @@ class Moment:
 
 @dataclass(frozen=True)
 class _Avatar:
-    """One distinct avatar. `area`: of the tensor that its network is for, in pixels. `network`: `paint`, for people.
+    """One distinct avatar.
 
-    `encoding`: of the tensor's bytes. `paint`, `as_written`, `by_runtime`: networks in FP32, in integers as the file
-    says, and on the run's runtime, which take real numbers.
+    `encoding`: encoding of the tensor's bytes. `area`: pixels of the tensor that its network is for. `paint`,
+    `as_written`, `by_runtime`: the network in FP32, in integers as its file says, and on the run's runtime; all take
+    real numbers. `network`: name of `paint`.
     """
 
     body: RunBody
@@ -351,13 +360,13 @@ class _Avatar:
     by_runtime: Paint
 
     def packed(self, tensor: F64, causes: Causes) -> F64:
-        """`tensor` as its bytes say it when the causes have packing; else itself."""
+        """Return what the bytes of `tensor` stand for if the causes have packing; else `tensor` itself."""
         if Cause.PACKING not in causes:
             return tensor
         return self.real(quantise(tensor, self.encoding.scale, self.encoding.zero_point))
 
     def real(self, tensor: U8) -> F64:
-        """What the bytes of a tensor stand for."""
+        """Return what the bytes of a tensor stand for."""
         return (tensor.astype(np.float64) - self.encoding.zero_point) * self.encoding.scale
 
 
@@ -379,7 +388,7 @@ def _avatar(data: AvatarData, runtime: str, on_cpu: bool) -> _Avatar:
 
 
 def _by_runtime(network: NetworkFile, name: str) -> Paint:
-    """`network` on runtime `name`, of tensors whose real numbers are those of bytes."""
+    """Return `network` on runtime `name`; it takes tensors whose real numbers bytes can stand for."""
     bound: dict[Shape, tuple[U8, U8, Binding]] = {}
 
     def paint(tensor: F64) -> F32:
@@ -397,7 +406,7 @@ def _by_runtime(network: NetworkFile, name: str) -> Paint:
 
 
 def _rounded(causes: Causes, *matrices: F64) -> list[F64]:
-    """`matrices` in float32 when the causes say so."""
+    """Return `matrices`, rounded to float32 if the causes say so."""
     if Cause.FLOAT32 not in causes:
         return list(matrices)
     return [matrix.astype(np.float32).astype(np.float64) for matrix in matrices]

@@ -1,7 +1,7 @@
 """The pictures of a scene's frames by one configuration, what each stage took, and what they are compared with.
 
-Rule: pictures are made by the run's own stages in this process, one after the other. They are compared with ground
-truth, the clothed body itself, where a scene has it, else with the plan `full`; whoever compares says which.
+Rule: the run's own stages make the pictures in this process, one after the other. Their reference is ground truth, the
+clothed body itself, where a scene has it, else the plan `full`; a caller that compares says which.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import Any
 
 from trilane import machine
-from trilane.apps.experiments.error_by_cause import region
+from trilane.apps.experiments.picture_errors import LEAST_MS_SSIM_PX
 from trilane.arrays import U8
 from trilane.bench.lib.cast import Cast
 from trilane.bench.lib.full_picture import FullPictures
@@ -32,13 +32,13 @@ from trilane.transport.packets import Packet
 MAX_FRAMES = 10_000
 TRUTH = "ground truth: the clothed body that the avatar was trained on"
 FULL = "the plan full: float64 body, supersampled raster, FP32 network"
-MS = 1e-6  # of a nanosecond
-#: (h,w,3) uint8: frame `number` over its background.
+MS = 1e-6  # milliseconds of a nanosecond
+#: Gives frame `number` over its background, both (h,w,3) uint8.
 Wanted = Callable[[int, U8], U8]
 
 
 class ScenePictures:
-    """The frames of the scene in `checked`. `gpu`: of other pictures in this process; all share its context."""
+    """The frames of the scene in `checked`. `gpu`: context of other pictures in this process, which all share."""
 
     def __init__(self, checked: Checked, gpu: UnitContext | None = None) -> None:
         """Raises BadInputError, MissingPartError."""
@@ -55,7 +55,7 @@ class ScenePictures:
         return self.gpu.shared(CONTEXT, open_context)
 
     def frame(self, number: int) -> tuple[U8, Mapping[str, float]]:
-        """(h,w,3) uint8, sRGB: frame `number`, and milliseconds by stage; those that it skips take none.
+        """Return frame `number`, (h,w,3) uint8 sRGB, and milliseconds by stage; stages that it skips take none.
 
         Time in which a thread that was ready had no core does not count.
         """
@@ -71,7 +71,7 @@ class ScenePictures:
         return self._picture(packet), times
 
     def background(self, number: int) -> U8:
-        """(h,w,3) uint8: what is under the avatars of the frame, their shadows too."""
+        """Return what is under the avatars of the frame, their shadows too, (h,w,3) uint8."""
         self._chain.run(number, len(self._names) - 2).payload[:] = 0
         return self._picture(self._chain.go_on(number))
 
@@ -82,7 +82,7 @@ class ScenePictures:
 
 
 def wanted_pictures(cast: Cast, ctx: Any) -> tuple[Wanted, str]:
-    """What pictures of `cast` are compared with, and which of both it is. `ctx`: the OpenGL context in use."""
+    """Return the reference of pictures of `cast`, and which one it is. `ctx`: OpenGL context in use."""
     from trilane.bench.lib.full_picture import true_pictures
 
     true = true_pictures(cast, ctx)
@@ -90,7 +90,7 @@ def wanted_pictures(cast: Cast, ctx: Any) -> tuple[Wanted, str]:
 
 
 def spread(total: int, frames: int) -> list[int]:
-    """The numbers of at most `frames` of `total` frames, evenly spread. Raises BadInputError."""
+    """Return the numbers of at most `frames` of `total` frames, evenly spread. Raises BadInputError."""
     if not 1 <= frames <= MAX_FRAMES:
         raise BadInputError("--frames", str(frames), f"1 to {MAX_FRAMES}")
     count = min(frames, total)
@@ -98,6 +98,20 @@ def spread(total: int, frames: int) -> list[int]:
 
 
 def around(boxes: Sequence[Box], output: Shape) -> tuple[slice, slice]:
-    """Rows and columns of the `region` of a picture of `output` that holds all `boxes`, of which there is one."""
+    """Return rows and columns of the `region` of a picture of `output` that holds all `boxes`, at least one."""
     box = region(boxes, output)
     return slice(box.top, box.bottom), slice(box.left, box.right)
+
+
+def region(boxes: Sequence[Box], output: Shape) -> Box:
+    """Return the smallest rectangle of a picture of `output` that holds `boxes`, with room for MS-SSIM if it fits."""
+    top, left = min(box.top for box in boxes), min(box.left for box in boxes)
+    bottom, right = max(box.bottom for box in boxes), max(box.right for box in boxes)
+    rows, columns = _with_room(top, bottom, output[0]), _with_room(left, right, output[1])
+    return Box(rows[0], columns[0], rows[1], columns[1])
+
+
+def _with_room(first: int, last: int, side: int) -> tuple[int, int]:
+    length = min(max(last - first, LEAST_MS_SSIM_PX), side)
+    begin = min(max((first + last - length) // 2, 0), side - length)
+    return begin, begin + length

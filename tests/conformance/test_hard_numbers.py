@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from trilane.apps.experiments.hard_numbers.all_rows import COUNT, hard_numbers
+from trilane.apps.experiments.hard_numbers import COUNT, hard_numbers
 
 pytestmark = pytest.mark.slow
 

@@ -11,7 +11,7 @@ import pytest
 
 from support.second_accounts import drawn_run, largest_difference, second_accounts
 from support.trace_reading import ReadTrace, read_trace
-from trilane.apps.tracing.writer import write_trace
+from trilane.apps.explain.trace import write_trace
 from trilane.pipeline.journal import journal_of, records_of
 from trilane.pipeline.timeline import ExplainedJob, Timeline
 from trilane.scheduler.core import Core

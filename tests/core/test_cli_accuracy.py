@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from trilane.apps.cli import accuracy as cli
-from trilane.apps.experiments import accuracy, hard_cases
+from trilane.apps.experiments import accuracy, hard_cases, hard_numbers
 from trilane.apps.experiments.accuracy import runtime_differences
-from trilane.apps.experiments.hard_numbers import all_rows
 from trilane.errors import BadInputError
 from trilane.stages import configure
 from trilane.stages.dsp import runtime
@@ -52,7 +51,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     monkeypatch.setattr(configure, "required_machine", lambda: {"cpu": "a processor"})
     monkeypatch.setattr(accuracy, "runtime_differences", differences)
     monkeypatch.setattr(hard_cases, "hard_cases", cases)
-    monkeypatch.setattr(all_rows, "hard_numbers", lambda: iter([]))
+    monkeypatch.setattr(hard_numbers, "hard_numbers", lambda: iter([]))
     monkeypatch.setattr(runtime, "installed", lambda: ("ort", "qnn"))
     return found
 
@@ -107,7 +106,7 @@ def test_a_hard_case_that_fails_is_named(passed: bool, monkeypatch: pytest.Monke
     row = {**figures, "name": "batch, [odd], ort", "verdict": "above", "passed": passed}
     good = {**row, "name": "good", "passed": True}
     number = {"name": "a [number]", "error": 2.0, "bound": 1.0, "verdict": "over", "passed": passed}
-    monkeypatch.setattr(all_rows, "hard_numbers", lambda: iter([number]))
+    monkeypatch.setattr(hard_numbers, "hard_numbers", lambda: iter([number]))
     monkeypatch.setattr(hard_cases, "hard_cases", lambda _: iter([good, row]))
     out, err = command("accuracy", "--hard-cases", "--json", code=0 if passed else 1)
     assert json.loads(out) == {"schema": 1, "hard_cases": [number, good, row]}
@@ -119,7 +118,7 @@ def test_each_hard_number_says_where_its_bound_comes_from(monkeypatch: pytest.Mo
     row = {"bound": 1.0, "unit": "m", "verdict": "holds", "passed": True}
     found = [("first", 0.5, "[proof]"), ("second", None, "analysis"), ("third", 0.25, "[proof]")]
     numbers = [{**row, "name": name, "error": error, "source": source} for name, error, source in found]
-    monkeypatch.setattr(all_rows, "hard_numbers", lambda: iter(numbers))
+    monkeypatch.setattr(hard_numbers, "hard_numbers", lambda: iter(numbers))
     monkeypatch.setattr(hard_cases, "hard_cases", lambda _: iter([]))
     lines = command("accuracy", "--hard-cases")[0].splitlines()
     cells = [[cell.strip() for cell in line.split("│")[1:-1]] for line in lines if line.startswith("│")]

@@ -16,14 +16,12 @@ import pytest
 from support.compared_runs import STAGES, on_a_machine, simulated
 from support.run_report import make_report
 from trilane.apps.cli.compare_table import comparison_lines
-from trilane.apps.comparison.compared import Bounds, Comparison, compare
-from trilane.apps.comparison.difference import Outcome
-from trilane.apps.comparison.page import page
-from trilane.apps.comparison.rows import Figure
-from trilane.apps.comparison.run_frames import frames_of
-from trilane.apps.comparison.sides import Kind, Side, Told
-from trilane.apps.comparison.verdict import NO_DIFFERENCE
-from trilane.apps.comparison.words import bounds_text
+from trilane.apps.compare.comparison import NO_DIFFERENCE, Bounds, Comparison, bounds_text, compare
+from trilane.apps.compare.difference import Finding
+from trilane.apps.compare.page import page
+from trilane.apps.compare.rows import Figure
+from trilane.apps.compare.run_frames import frames_of
+from trilane.apps.compare.sides import ComparedRun, RunKind, Side
 from trilane.pipeline.journal import Worked, journal_of
 from trilane.pipeline.reckoning import reckoned
 
@@ -36,7 +34,7 @@ def side(*seeds: int, factors: Mapping[str, float] | None = None, counted: bool 
         if not counted:
             records = [each._replace(figures={}) if isinstance(each, Worked) else each for each in records]
         report = make_report(**{**run.report, "clock": "host", "other_programs": 0.0, "baseline": None})
-        runs.append(Told(f"run {seed}", Kind.RUN, report, frames_of(records)))
+        runs.append(ComparedRun(f"run {seed}", RunKind.RUN, report, frames_of(records)))
     return Side("runs", tuple(runs))
 
 
@@ -56,7 +54,7 @@ def test_with_instructions_3_percent_of_one_stage_is_named_and_the_machine_is_to
     assert named(found.verdict) == ["raster"]
     assert "raster takes" not in found.verdict  # said once
     figure = Figure("time of an instruction", "raster", "", "typical", "ns")
-    assert found.outcome(figure) is Outcome.UNKNOWN
+    assert found.outcome(figure) is Finding.UNKNOWN
     assert found.rows[figure].base == pytest.approx(0.25, rel=0.4)  # 1 / INSTRUCTIONS_PER_NS, three deviations of a run
     back = one(other, base)
     assert "raster executes " in back.verdict and " % fewer instructions (" in back.verdict
@@ -64,8 +62,8 @@ def test_with_instructions_3_percent_of_one_stage_is_named_and_the_machine_is_to
 
 def test_runs_of_one_kind_are_alike_with_instructions_and_cannot_be_told_without() -> None:
     assert one(side(1), side(2)).verdict == NO_DIFFERENCE
-    assert one(side(1, counted=False), side(2, counted=False)).whole is Outcome.UNKNOWN
-    assert one(side(1), side(2, counted=False)).whole is Outcome.UNKNOWN
+    assert one(side(1, counted=False), side(2, counted=False)).whole is Finding.UNKNOWN
+    assert one(side(1), side(2, counted=False)).whole is Finding.UNKNOWN
 
 
 @pytest.mark.parametrize("counted", [True, False])
@@ -84,7 +82,7 @@ def test_several_runs_a_side_tell_without_instructions_what_one_cannot() -> None
     ))  # fmt: skip
     assert named(one(base, other).verdict) == ["composite"]
     few = one(Side("a", base.runs[:1]), Side("b", other.runs[:1]))
-    assert few.whole is Outcome.UNKNOWN
+    assert few.whole is Finding.UNKNOWN
     uneven = one(base, Side("b", other.runs[:3]))
     figure = Figure("work", "composite", "", "typical", "ms")
     deviations = [found.rows[figure].deviation or 0.0 for found in (one(base, other), uneven, few)]
@@ -124,13 +122,15 @@ def test_how_often_it_is_right(counted: bool, capsys: pytest.CaptureFixture[str]
         assert found[1.0]["no difference"] >= 19
 
 
-def bounded(seed: int, **factors: float) -> Told:
+def bounded(seed: int, **factors: float) -> ComparedRun:
     """A run whose report names what bounded it. infer takes 9 ms of the dsp, raster 4 and composite 3 of the gpu."""
     run = simulated(seed, factors=factors)
     assert run.recording is not None
     begun, *records = journal_of(run.recording, run.jobs, {}, run.report)
     found = reckoned(run.recording.graph, run.recording.settings, {}, records)
-    return Told(f"run {seed}", Kind.RUN, make_report(**run.report, **found.figures), frames_of([begun, *records]))
+    return ComparedRun(
+        f"run {seed}", RunKind.RUN, make_report(**run.report, **found.figures), frames_of([begun, *records])
+    )
 
 
 def test_what_bounded_either_run_is_named_and_that_it_changed() -> None:
@@ -138,7 +138,7 @@ def test_what_bounded_either_run_is_named_and_that_it_changed() -> None:
     base, alike, slow = bounded(1), bounded(2, raster=1.2), bounded(3, raster=3.0)
     same = one(Side("base", (base,)), Side("other", (alike,)))
     changed = one(Side("base", (base,)), Side("other", (slow,)))
-    assert (same.bounds.outcome, changed.bounds.outcome) == (Outcome.SAME, Outcome.DIFFERS)
+    assert (same.bounds.outcome, changed.bounds.outcome) == (Finding.SAME, Finding.DIFFERS)
     line = re.compile(r"bound( changed)?: (\w+) (\d+)% .*, and of stages most (\w+) .*; was (\w+) .* most (\w+) ")
     for found, said in (
         (same, (None, "dsp", "infer", "dsp", "infer")),

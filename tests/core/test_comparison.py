@@ -17,16 +17,13 @@ from support.compared_runs import STAGES, simulated, write_run
 from support.run_report import make_report
 from trilane.apps.cli import main as cli
 from trilane.apps.cli.compare_table import comparison_lines
-from trilane.apps.comparison import run_frames
-from trilane.apps.comparison.compared import Comparison, compare, document
-from trilane.apps.comparison.configuration import Change, changes
-from trilane.apps.comparison.difference import Chance, Outcome
-from trilane.apps.comparison.noise import noise_between, remarks
-from trilane.apps.comparison.page import page
-from trilane.apps.comparison.rows import Figure
-from trilane.apps.comparison.run_frames import Key, frames_of
-from trilane.apps.comparison.sides import Kind, Side, Told, read_side, read_told
-from trilane.apps.comparison.verdict import NO_DIFFERENCE, TOO_FEW
+from trilane.apps.compare import run_frames
+from trilane.apps.compare.comparison import NO_DIFFERENCE, TOO_FEW, Comparison, compare, document
+from trilane.apps.compare.difference import Chance, Finding
+from trilane.apps.compare.page import page
+from trilane.apps.compare.rows import Figure, noise_between, remarks
+from trilane.apps.compare.run_frames import Key, frames_of
+from trilane.apps.compare.sides import Change, ComparedRun, RunKind, Side, changes, read_side, read_told
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import NAME, JournalWriter, Worked, journal_of
 from trilane.scheduler.virtual import Simulation
@@ -34,14 +31,14 @@ from trilane.scheduler.virtual import Simulation
 Make = Callable[..., Path]
 
 
-def told(run: Simulation, name: str = "run", **changes: Any) -> Told:
+def told(run: Simulation, name: str = "run", **changes: Any) -> ComparedRun:
     assert run.recording is not None
     frames = frames_of(journal_of(run.recording, run.jobs, {}, run.report))
     report = make_report(**{**run.report, "policy": run.recording.settings.policy, **changes})
-    return Told(name, Kind.RUN, report, frames)
+    return ComparedRun(name, RunKind.RUN, report, frames)
 
 
-def pair(base: Told, other: Told) -> Comparison:
+def pair(base: ComparedRun, other: ComparedRun) -> Comparison:
     return compare(Side(base.name, (base,)), [Side(other.name, (other,))])[0]
 
 
@@ -101,7 +98,7 @@ def test_a_stage_that_takes_5_percent_longer_is_named_and_no_other(stage: str) -
     figure = Figure("work", stage, "", "typical", "ms")
     row = found.rows[figure]
     assert row.low is not None and row.high is not None and row.low < 0.05 < row.high
-    assert found.outcome(figure) is Outcome.DIFFERS
+    assert found.outcome(figure) is Finding.DIFFERS
     assert found.verdict.startswith("frame time +") == (stage == "infer")
 
 
@@ -110,9 +107,9 @@ def test_one_run_of_each_kind_on_the_host_cannot_tell_5_percent_and_says_so(long
     found = pair(told(simulated(1), clock="host"), told(simulated(2, factors={"infer": longer}), clock="host"))
     assert found.verdict.startswith("cannot tell: frame time +") and "runs of one kind may differ" in found.verdict
     assert not found.differing
-    assert found.outcome(Figure("work", "infer", "", "typical", "ms")) is Outcome.UNKNOWN
-    assert found.slower_than(0.05) is Outcome.UNKNOWN
-    assert found.slower_than(1.0) is Outcome.SAME
+    assert found.outcome(Figure("work", "infer", "", "typical", "ms")) is Finding.UNKNOWN
+    assert found.slower_than(0.05) is Finding.UNKNOWN
+    assert found.slower_than(1.0) is Finding.SAME
     said = {row["outcome"] for row in found.as_json()["rows"] if row["measure"] == "frame time"}
     assert said == {"cannot tell"}
 
@@ -127,7 +124,7 @@ def test_a_frame_time_that_doubles_is_named_whatever_else_runs(others: tuple[flo
     )
     found = pair(base, other)
     assert re.match(r"frame time \+(9\d|10\d) % \(", found.verdict)
-    assert found.slower_than(0.05) is Outcome.DIFFERS
+    assert found.slower_than(0.05) is Finding.DIFFERS
 
 
 def test_what_other_programs_may_have_done_to_the_frame_time_is_not_the_programs() -> None:
@@ -253,7 +250,7 @@ def test_only_the_keys_that_differ_are_named() -> None:
 
 
 def test_bytes_that_a_stage_moves_are_named() -> None:
-    def moved(run: Simulation, ratio: float) -> Told:
+    def moved(run: Simulation, ratio: float) -> ComparedRun:
         assert run.recording is not None
         records = [
             record._replace(figures={"bytes_read": 1000.0 * ratio, "visible": record.job.frame * ratio})
@@ -261,7 +258,7 @@ def test_bytes_that_a_stage_moves_are_named() -> None:
             else record
             for record in journal_of(run.recording, run.jobs, {}, run.report)
         ]
-        return Told("run", Kind.RUN, make_report(**run.report), frames_of(records))
+        return ComparedRun("run", RunKind.RUN, make_report(**run.report), frames_of(records))
 
     run = simulated(1, frames=60)
     assert pair(moved(run, 1.0), moved(run, 1.5)).verdict == "raster bytes read +50 %"
@@ -292,7 +289,7 @@ def test_a_stage_that_only_waits_longer_for_its_core_takes_no_longer() -> None:
         else record
         for record in journal_of(run.recording, run.jobs, {}, run.report)
     ]
-    waits = Told("waits", Kind.RUN, make_report(**run.report), frames_of(records))
+    waits = ComparedRun("waits", RunKind.RUN, make_report(**run.report), frames_of(records))
     found = pair(told(simulated(1)), waits)
     assert found.verdict.startswith("frame time +2") and "unit dsp (infer) has no core" in found.verdict
     assert "takes" not in found.verdict
@@ -327,7 +324,7 @@ def test_a_report_without_a_journal_has_summaries(make: Make) -> None:
 
 
 def test_predictions_of_one_chip_share_the_models_error(tmp_path: Path) -> None:
-    def prediction(name: str, mean: float, chip: str) -> Told:
+    def prediction(name: str, mean: float, chip: str) -> ComparedRun:
         times = {"mean": mean, "p50": mean, "p90": mean, "p99": mean, "low": mean * 0.9, "high": mean * 1.1}
         idle = {"starved": 0.5, "blocked": 0.0, "throttled": 0.0, "preempted": 0.0, "overhead": 0.0}
         answer = {
@@ -389,7 +386,7 @@ def test_the_page_asks_for_nothing_and_escapes_what_it_is_given() -> None:
     assert not any(word in text for word in ("http:", "https:", "src=", "url(", "@import"))
     assert text.count("<svg") == len(found.rows)
     outcomes = [found.outcome(figure) for figure in found.rows]
-    assert all(text.count(f"<td>{each}</td>") == outcomes.count(each) for each in Outcome)
+    assert all(text.count(f"<td>{each}</td>") == outcomes.count(each) for each in Finding)
     assert "prefers-color-scheme: dark" in text
 
 
@@ -542,7 +539,7 @@ def test_what_a_journal_says_of_a_run_is_what_its_report_says(tmp_path: Path) ->
 def test_what_is_too_short_is_not_called_alike(make: Make, tmp_path: Path) -> None:
     short = str(write_run(tmp_path / "short", simulated(2, frames=20)))
     found = compare(read_side(str(make("a"))), [read_side(short)])[0]
-    unknown = [found.outcome(figure) for figure in found.rows].count(Outcome.UNKNOWN)
+    unknown = [found.outcome(figure) for figure in found.rows].count(Finding.UNKNOWN)
     alike = len(found.rows) - unknown
     lines = [*comparison_lines(found, False)]
     said = " ".join(line for line in lines if isinstance(line, str))

@@ -7,22 +7,22 @@ from math import erfc, gamma, inf, log, pi, sqrt
 import numpy as np
 import pytest
 
-from trilane.apps.comparison.difference import (
+from trilane.apps.compare.difference import (
     LEAST_FRAMES,
     STRETCHES,
     Chance,
     Difference,
-    Outcome,
+    Finding,
     Series,
     combined,
     difference,
     judged,
+    rejected,
     settled,
     student_quantile,
     student_tails,
     unsure,
 )
-from trilane.apps.comparison.family import rejected
 from trilane.arrays import F64
 
 RUNS = 100
@@ -116,12 +116,12 @@ def test_what_is_explained_is_no_chance() -> None:
 
 def test_a_figure_has_one_of_three_outcomes() -> None:
     """Within 5 % at both ends; beyond at one; not known; and what differs does so whatever its interval."""
-    assert judged(1.0, 1.01, 0.01, is_ratio=True).outcome(differs=False) is Outcome.SAME
-    assert judged(1.0, 1.04, 0.01, is_ratio=True).outcome(differs=False) is Outcome.UNKNOWN
-    assert judged(1.0, 0.96, 0.01, is_ratio=True).outcome(differs=False) is Outcome.UNKNOWN
-    assert judged(1.0, 1.04, 0.01, is_ratio=True).outcome(differs=False, margin=0.1) is Outcome.SAME
-    assert unsure(1.0, 1.0, is_ratio=True).outcome(differs=False) is Outcome.UNKNOWN
-    assert judged(1.0, 1.01, 0.001, is_ratio=True).outcome(differs=True) is Outcome.DIFFERS
+    assert judged(1.0, 1.01, 0.01, is_ratio=True).outcome(differs=False) is Finding.SAME
+    assert judged(1.0, 1.04, 0.01, is_ratio=True).outcome(differs=False) is Finding.UNKNOWN
+    assert judged(1.0, 0.96, 0.01, is_ratio=True).outcome(differs=False) is Finding.UNKNOWN
+    assert judged(1.0, 1.04, 0.01, is_ratio=True).outcome(differs=False, margin=0.1) is Finding.SAME
+    assert unsure(1.0, 1.0, is_ratio=True).outcome(differs=False) is Finding.UNKNOWN
+    assert judged(1.0, 1.01, 0.001, is_ratio=True).outcome(differs=True) is Finding.DIFFERS
 
 
 def test_holms_steps() -> None:

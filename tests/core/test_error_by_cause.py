@@ -14,7 +14,6 @@ from PIL import Image
 
 from support.small_inputs import net
 from trilane.apps.experiments import error_by_cause
-from trilane.apps.experiments.error_by_cause import region
 from trilane.apps.experiments.picture_errors import ErrorFigures
 from trilane.apps.experiments.reference_path import (
     BODY,
@@ -29,6 +28,7 @@ from trilane.apps.experiments.reference_path import (
     require_complete,
     up_to,
 )
+from trilane.apps.experiments.scene_pictures import region
 from trilane.arrays import F64
 from trilane.avatars.bundle import bundle_folder, load_bundle
 from trilane.avatars.network_file import check_network, reshaped

@@ -15,10 +15,8 @@ import pytest
 
 from support.run_folders import write_run
 from trilane.apps.cli import explain_run as explain_command
-from trilane.apps.explained.advice import advice
-from trilane.apps.explained.job_table import COLUMNS, write_jobs
-from trilane.apps.explained.run import explain_run
-from trilane.apps.explained.slow_frames import MOST_SAMPLES, Sample, Shown, notes
+from trilane.apps.explain.explained_run import COLUMNS, explain_run, write_jobs
+from trilane.apps.explain.reasons import MOST_SAMPLES, EvenSample, Shown, advice, notes
 from trilane.apps.live.followed_run import CUT_OFF
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.application import application_graph
@@ -303,7 +301,7 @@ def test_a_run_of_one_frame_has_no_frame_time(tmp_path: Path, command: Command) 
 
 
 def test_a_sample_is_evenly_spaced() -> None:
-    sample: Sample[int] = Sample()
+    sample: EvenSample[int] = EvenSample()
     for value in range(3 * MOST_SAMPLES):
         sample.add(value)
     assert sample.values == list(range(0, 3 * MOST_SAMPLES, 4))

@@ -36,7 +36,7 @@ def test_an_error_that_comes_and_goes_flickers_by_its_size() -> None:
 
 def test_a_row_has_the_mean_and_the_worst_pair() -> None:
     """Errors of 0, 1, 3 and 3 steps: changes of 1, 2 and 0."""
-    row = bench.Row("ort", "minmax", "linear", PICTURES)
+    row = bench.FlickerRow("ort", "minmax", "linear", PICTURES)
     for steps in (0, 1, 3, 3):
         row.add(np.full((2, 2, 3), steps / 255), WHOLE)
     assert row.as_json() == {
@@ -51,7 +51,7 @@ def test_a_row_has_the_mean_and_the_worst_pair() -> None:
 
 
 def test_only_where_the_avatars_are_counts() -> None:
-    row = bench.Row("ort", "minmax", "linear", PICTURES)
+    row = bench.FlickerRow("ort", "minmax", "linear", PICTURES)
     for error in (0.0, 1.0):
         picture = np.zeros((2, 2, 3))
         picture[0] = error
@@ -61,7 +61,7 @@ def test_only_where_the_avatars_are_counts() -> None:
 
 def test_a_size_has_its_median_time_and_its_mean_error() -> None:
     errors = [ErrorFigures(1.0, 30.0, 0.9, None, 0.1), ErrorFigures(3.0, 20.0, None, None, 0.3)]
-    row = error_by_size.Row("128", "ort", PICTURES, 1, [1.0, 9.0, 2.0], [4.0, 12.0, 8.0], errors)
+    row = error_by_size.SizeRow("128", "ort", PICTURES, 1, [1.0, 9.0, 2.0], [4.0, 12.0, 8.0], errors)
     found = row.as_json()
     assert (found["infer_ms"], found["frame_ms"]) == (2.0, 8.0)
     assert (found["infer_low_ms"], found["infer_high_ms"]) == (None, None)
@@ -73,7 +73,7 @@ def test_a_size_has_its_median_time_and_its_mean_error() -> None:
 def test_an_interval_of_95_percent_needs_six_jobs(jobs: int, interval: Any) -> None:
     """All of n lie on one side of the median with 2 / 2^n: 6 % for 5, 3 % for 6. All but one of 9: 20 / 512, 4 %."""
     times = [float(job + 1) for job in range(jobs)]
-    row = error_by_size.Row("128", "ort", PICTURES, 1, times, times, [ErrorFigures(1.0, 30.0, 0.9, None, 0.1)])
+    row = error_by_size.SizeRow("128", "ort", PICTURES, 1, times, times, [ErrorFigures(1.0, 30.0, 0.9, None, 0.1)])
     found = row.as_json()
     assert (found["infer_low_ms"], found["infer_high_ms"]) == interval
 

@@ -79,7 +79,7 @@ def test_rows_that_fail_are_named_and_fail_the_command(monkeypatch, verdict, cod
     row = {"name": "batch, usual, ort", **figures, "verdict": verdict, "passed": verdict == HOLDS}
     monkeypatch.setattr("trilane.apps.experiments.hard_cases.hard_cases", lambda _: iter([row]))
     if code:  # the numbers, which all hold, are computed once
-        monkeypatch.setattr("trilane.apps.experiments.hard_numbers.all_rows.hard_numbers", lambda: iter([]))
+        monkeypatch.setattr("trilane.apps.experiments.hard_numbers.hard_numbers", lambda: iter([]))
     result = CliRunner().invoke(app, ["--hard-cases", "--runtime", "ort"])
     assert result.exit_code == code
     assert (f"batch, usual, ort: {verdict}" in result.stderr) == (code == 1)
@@ -107,7 +107,7 @@ def test_a_case_has_the_smaller_bound_of_two(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(hard_cases, "float_picture", lambda *_: wanted)
     monkeypatch.setattr(hard_cases, "ideal_noise_model", lambda *_: "ideal")
     monkeypatch.setattr(hard_cases, "predicted_bound", lambda model, *_: bounds[model])
-    pair = hard_cases.Pair("net", quantised, "own")  # type: ignore[arg-type]
+    pair = hard_cases.NetworkPair("net", quantised, "own")  # type: ignore[arg-type]
     case = hard_cases.make_case(pair, "odd")
     assert case.tensor.tolist() == [[[[103, 0], [255, 100]]]]
     assert (case.tensor.dtype, case.tensor.flags.c_contiguous) == (np.uint8, True)
@@ -136,7 +136,7 @@ def test_the_error_of_a_runtime_is_the_mean_difference(monkeypatch: pytest.Monke
     monkeypatch.setattr(hard_cases, "load_runtime", lambda name: asked.append(name) or Runtime())
     quantised: Any = SimpleNamespace(network="the network")
     wanted = np.array([[[[10.5, 9.0, 4.0, 8.0]]]], np.float32)
-    pair = hard_cases.Pair("net", quantised, "own")  # type: ignore[arg-type]
+    pair = hard_cases.NetworkPair("net", quantised, "own")  # type: ignore[arg-type]
     case = hard_cases.Case(pair, np.full((1, 1), 8, np.uint8), wanted, 0.0, 0.0, "", 0.0, {})
     assert hard_cases.error_of(case, "ort") == (2.5 + 1 + 4 + 0) / 4
     assert asked == ["ort", ("the network", RuntimeOptions())]
@@ -183,4 +183,4 @@ def test_a_pair_is_quantised_on_the_calibration(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(hard_cases, "quantise", lambda *given: given)
     monkeypatch.setattr(hard_cases, "noise_model", lambda given: ("noise", given))
     both = ("network x", "frames")
-    assert hard_cases.make_pair("x") == hard_cases.Pair("network x", both, ("noise", both))  # type: ignore[arg-type]
+    assert hard_cases.make_pair("x") == hard_cases.NetworkPair("network x", both, ("noise", both))  # type: ignore[arg-type]

@@ -11,11 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.apps.experiments.hard_numbers import all_rows, bodies, rotations
-from trilane.apps.experiments.hard_numbers.all_rows import COUNT
-from trilane.apps.experiments.hard_numbers.cameras import time_cases
-from trilane.apps.experiments.hard_numbers.hard_number import U32, HardNumber, U, gamma, worst
-from trilane.apps.experiments.hard_numbers.rotations import PI, exact_turn, turn_error
+from trilane.apps.experiments import hard_numbers, hard_rotations
+from trilane.apps.experiments.hard_numbers import COUNT, time_cases
+from trilane.apps.experiments.hard_rotations import PI, U32, HardNumber, U, exact_turn, gamma, turn_error, worst
 from trilane.avatars.bundle import bundle_folder
 from trilane.body import kinematics, skinning
 from trilane.body.body import ShapedBody, load_body, weights_of_one
@@ -32,8 +30,8 @@ def shaped() -> ShapedBody:
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fewer random rotations than the command draws."""
-    monkeypatch.setattr(rotations, "RANDOM", 2000)
-    monkeypatch.setattr(rotations, "CHUNK", 1000)
+    monkeypatch.setattr(hard_rotations, "RANDOM", 2000)
+    monkeypatch.setattr(hard_rotations, "CHUNK", 1000)
 
 
 def failing(cases: Iterable[HardNumber]) -> list[str]:
@@ -92,7 +90,7 @@ def test_a_turn_that_is_no_number_is_an_error() -> None:
 
 def test_the_bound_of_a_turn_at_three_angles() -> None:
     """At 2: s = h = 1, e = 10 U, f = 4.5 U: 60 + 9 + 6 = 75 U. Near 0: 2 e = 10 U t, s f and s U add 2 and 3 U t."""
-    bounds = rotations.turn_bound(np.array([0.0, 1e-8, 2.0]))
+    bounds = hard_rotations.turn_bound(np.array([0.0, 1e-8, 2.0]))
     assert bounds[0] == 0.0
     assert bounds[1] == pytest.approx(1.01 * 15e-8 * U, rel=1e-6)
     assert bounds[2] == pytest.approx(1.01 * 75 * U, rel=1e-12)
@@ -100,9 +98,9 @@ def test_the_bound_of_a_turn_at_three_angles() -> None:
 
 @pytest.mark.usefixtures("few")
 def test_rotations_keep_their_bounds() -> None:
-    cases = list(rotations.rotation_cases())
+    cases = list(hard_rotations.rotation_cases())
     assert failing(cases) == []
-    assert len(cases) == len(rotations.ANGLES) + 2 + len(rotations.RETURNED)
+    assert len(cases) == len(hard_rotations.ANGLES) + 2 + len(hard_rotations.RETURNED)
 
 
 def _without_a_series(rotvec: Any) -> Any:
@@ -117,15 +115,15 @@ def _without_a_series(rotvec: Any) -> Any:
 
 @pytest.mark.usefixtures("few")
 def test_a_formula_without_care_at_zero_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rotations, "turn", _without_a_series)
-    failed = failing(rotations.rotation_cases())
+    monkeypatch.setattr(hard_rotations, "turn", _without_a_series)
+    failed = failing(hard_rotations.rotation_cases())
     assert {f"rotation by {name}, 26 axes" for name in ("1e-12", "1e-3", "pi")} <= set(failed)
 
 
 def test_chains_keep_their_bounds(shaped: ShapedBody) -> None:
-    cases = list(rotations.chain_cases(shaped))
+    cases = list(hard_rotations.chain_cases(shaped))
     assert failing(cases) == []
-    assert len(cases) == len(rotations.TURNS) + 1 + len(rotations.PLACES)
+    assert len(cases) == len(hard_rotations.TURNS) + 1 + len(hard_rotations.PLACES)
 
 
 def test_places_in_half_precision_fail(shaped: ShapedBody, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -137,8 +135,8 @@ def test_places_in_half_precision_fail(shaped: ShapedBody, monkeypatch: pytest.M
         return posed
 
     monkeypatch.setattr(Skeleton, "pose", rounded)
-    failed = failing(rotations.chain_cases(shaped))
-    assert failed == [f"places of the skinning matrices, {place}" for place in rotations.PLACES]
+    failed = failing(hard_rotations.chain_cases(shaped))
+    assert failed == [f"places of the skinning matrices, {place}" for place in hard_rotations.PLACES]
 
 
 def test_a_day_of_media_time_keeps_its_bounds() -> None:
@@ -156,7 +154,7 @@ def test_weights_are_made_to_sum_to_one() -> None:
 
 
 def test_fewer_weights_keep_the_bound_that_is_proved(shaped: ShapedBody) -> None:
-    cases = list(bodies._left_out(shaped))
+    cases = list(hard_numbers._left_out(shaped))
     assert failing(cases) == []
     assert [case.name.split(" skin")[0] for case in cases] == [
         "the 4 largest",
@@ -174,7 +172,7 @@ def test_weights_that_are_not_scaled_fail(shaped: ShapedBody, monkeypatch: pytes
 
     monkeypatch.setattr(skinning, "largest_weights", unscaled)
     monkeypatch.setattr(skinning, "largest_weights", unscaled)
-    assert len(failing(bodies._left_out(shaped))) == 4
+    assert len(failing(hard_numbers._left_out(shaped))) == 4
 
 
 def test_a_kind_of_case_that_an_error_ends_is_a_row_that_fails() -> None:
@@ -182,7 +180,7 @@ def test_a_kind_of_case_that_an_error_ends_is_a_row_that_fails() -> None:
         yield HardNumber("first", 0.0, 1.0, "m", "")
         raise BadInputError("place", "NaN", "a number")
 
-    kept = list(all_rows.kept_going("bodies", cases()))
+    kept = list(hard_numbers.kept_going("bodies", cases()))
     assert [(case.name, case.holds) for case in kept] == [
         ("first", True),
         ("bodies, ended by an error: place: found NaN, expected a number", False),
@@ -192,12 +190,14 @@ def test_a_kind_of_case_that_an_error_ends_is_a_row_that_fails() -> None:
 def test_a_fault_that_gives_no_number_is_told_row_by_row(monkeypatch: pytest.MonkeyPatch) -> None:
     """As JSON has it, which knows no NaN."""
     monkeypatch.setattr(kinematics, "_TINY", 0.0)
-    monkeypatch.setattr(rotations, "ANGLES", {"0": 0.0, "1e-3": 1e-3})
-    monkeypatch.setattr(all_rows, "_cases", lambda: all_rows.kept_going("rotations", rotations.rotation_cases()))
-    monkeypatch.setattr(rotations, "_random_cases", lambda: iter(()))
-    monkeypatch.setattr(rotations, "RETURNED", ())
+    monkeypatch.setattr(hard_rotations, "ANGLES", {"0": 0.0, "1e-3": 1e-3})
+    monkeypatch.setattr(
+        hard_numbers, "_cases", lambda: hard_numbers.kept_going("rotations", hard_rotations.rotation_cases())
+    )
+    monkeypatch.setattr(hard_rotations, "_random_cases", lambda: iter(()))
+    monkeypatch.setattr(hard_rotations, "RETURNED", ())
     with np.errstate(invalid="ignore"):
-        rows = list(all_rows.hard_numbers())
+        rows = list(hard_numbers.hard_numbers())
     assert [(row["error"] is None, row["passed"]) for row in rows] == [(True, False), (False, True)]
     json.dumps(rows, allow_nan=False)
 

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from support.run_folders import write_run
-from trilane.apps.explained.run import explain_run
+from trilane.apps.explain.explained_run import explain_run
 from trilane.apps.scene_plan import ScenePlan
 from trilane.hw_profiles.application import Plan
 from trilane.hw_profiles.governor import Governor

@@ -17,10 +17,9 @@ from PIL import Image
 from support.run_report import make_report
 from support.small_inputs import WRITERS, bvh_text, nerf_text, picture, write_small_inputs
 from trilane.apps.cli.inspect import lines
-from trilane.apps.inspection import drawn_paths
-from trilane.apps.inspection.inspect_file import READERS, inspect_file
-from trilane.apps.inspection.inspection import Inspection, Length
-from trilane.apps.inspection.recognise import kind_of
+from trilane.apps.inspect import inspection
+from trilane.apps.inspect.inspect_file import READERS, inspect_file, kind_of
+from trilane.apps.inspect.inspection import Inspection, Length, drawn_cameras, drawn_skeletons
 from trilane.body.joints import JOINT_NAMES
 from trilane.errors import BadInputError
 
@@ -229,29 +228,29 @@ def test_the_left_of_a_person_who_faces_us_is_on_our_right() -> None:
         side = 1.0 if name.startswith("left") else -1.0 if name.startswith("right") else 0.0
         joints[0, number] = side * 0.4, 0.03 * number, 0.0
     joints[0, [JOINT_NAMES.index(name) for name in ("left_foot", "right_foot")], 2] = 0.3
-    sheet = drawn_paths.skeletons(joints, np.zeros(1), np.zeros((1, 3)))
-    tile = drawn_paths.TILE
+    sheet = drawn_skeletons(joints, np.zeros(1), np.zeros((1, 3)))
+    tile = inspection.TILE
     assert sheet.size == (2 * tile, 3 * tile)
     front = sheet.crop((0, 30, tile, tile))
-    assert shown(front, drawn_paths.LEFT)[:, 0].mean() > tile / 2 > shown(front, drawn_paths.RIGHT)[:, 0].mean()
+    assert shown(front, inspection.LEFT)[:, 0].mean() > tile / 2 > shown(front, inspection.RIGHT)[:, 0].mean()
     right = sheet.crop((0, tile + 20, tile, 2 * tile))
-    assert shown(right, drawn_paths.RIGHT)[:, 0].max() > tile / 2 + 10
+    assert shown(right, inspection.RIGHT)[:, 0].max() > tile / 2 + 10
     above = sheet.crop((0, 2 * tile + 20, tile, 3 * tile))
-    feet = shown(above, drawn_paths.LEFT)
+    feet = shown(above, inspection.LEFT)
     assert feet[feet[:, 1].argmax(), 1] > tile / 2
 
 
 def test_a_path_begins_green_and_ends_red() -> None:
     """One metre to the right and half a metre up; the frustum opens towards -Z, which from above is up."""
     places = np.array([[0.0, 0.0, 0.0], [1.0, 0.5, 0.0]])
-    sheet = drawn_paths.cameras(np.tile(np.eye(3), (2, 1, 1)), places)
-    side = drawn_paths.PATH_TILE
+    sheet = drawn_cameras(np.tile(np.eye(3), (2, 1, 1)), places)
+    side = inspection.PATH_TILE
     front = sheet.crop((0, 40, side, side))
-    begin, end = (shown(front, colour).mean(axis=0) for colour in (drawn_paths.BEGIN, drawn_paths.END))
+    begin, end = (shown(front, colour).mean(axis=0) for colour in (inspection.BEGIN, inspection.END))
     assert end[0] > begin[0] and end[1] < begin[1]
     assert (end - begin)[0] == pytest.approx(-2 * (end - begin)[1], rel=0.05)
     above = sheet.crop((2 * side, 40, 3 * side, side))
-    assert shown(above, drawn_paths.LEFT)[:, 1].mean() < shown(above, drawn_paths.BEGIN)[:, 1].mean()
+    assert shown(above, inspection.LEFT)[:, 1].mean() < shown(above, inspection.BEGIN)[:, 1].mean()
 
 
 def test_the_command(
@@ -270,7 +269,7 @@ def test_the_command(
     assert any(line.startswith("joints mapped: 16: pelvis = Hips") for line in said)
     assert err == ""
     with Image.open("sheet.png") as sheet:
-        assert sheet.size == (7 * drawn_paths.TILE, 3 * drawn_paths.TILE)
+        assert sheet.size == (7 * inspection.TILE, 3 * inspection.TILE)
     assert "nothing to draw" in command("inspect", folder / "network.onnx", "--out", "none.png")[1]
     assert not Path("none.png").exists()
     (folder / "man.fbx").write_bytes(b"Kaydara FBX Binary  \0")

@@ -17,7 +17,7 @@ from support.run_folders import write_run
 from support.run_report import make_report
 from support.second_accounts import idle_slices
 from trilane.apps import interface
-from trilane.apps.explained.job_table import COLUMNS
+from trilane.apps.explain.explained_run import COLUMNS
 from trilane.apps.report import Report, read_report
 from trilane.apps.run_html import run_html
 from trilane.apps.run_job import Outcome

@@ -51,9 +51,12 @@ def written_value(module: str, constant: str) -> Any:
 
 
 def test_a_literal_is_read_as_it_is_imported() -> None:
-    assert written_value("apps.overview.pictures", "MOST") == import_module("trilane.apps.overview.pictures").MOST
+    assert (
+        written_value("apps.compare.overview_page", "MOST_STILLS")
+        == import_module("trilane.apps.compare.overview_page").MOST_STILLS
+    )
     with pytest.raises(AssertionError, match="NONE"):
-        written_value("apps.overview.pictures", "NONE")
+        written_value("apps.compare.overview_page", "NONE")
 
 
 def test_what_follows_from_one_another() -> None:

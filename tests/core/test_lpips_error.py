@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.apps.experiments.lpips_error import LAYERS, LEAST_PX, Lpips, _shapes
+from trilane.apps.experiments.picture_errors import LEAST_LPIPS_PX, LPIPS_LAYERS, Lpips, _shapes
 from trilane.arrays import F64
 from trilane.errors import BadInputError
 
@@ -43,7 +43,7 @@ def _second(state: dict[str, Any], picture: F64, reference: F64) -> float:
         [((2 * one - 1 - [-0.03, -0.088, -0.188]) / [0.458, 0.448, 0.45]) for one in (picture, reference)],
     )
     both = [one.transpose(2, 0, 1) for one in both]
-    for number, (name, *_, stride, padding, pooled) in enumerate(LAYERS):
+    for number, (name, *_, stride, padding, pooled) in enumerate(LPIPS_LAYERS):
         kernel, bias = (state[f"net.{name}.{part}"].numpy().astype(float) for part in ("weight", "bias"))
         unit = []
         for index, x in enumerate(both):
@@ -58,7 +58,7 @@ def _second(state: dict[str, Any], picture: F64, reference: F64) -> float:
 
 def test_it_is_the_published_formula(state: dict[str, Any], weights: Path) -> None:
     rng = np.random.default_rng(0)
-    picture, reference = (rng.uniform(0, 1, (LEAST_PX, 80, 3)) for _ in range(2))
+    picture, reference = (rng.uniform(0, 1, (LEAST_LPIPS_PX, 80, 3)) for _ in range(2))
     found, wanted = Lpips(weights), _second(state, picture, reference)
     assert abs(wanted) > 1e-3
     assert found(picture, reference) == pytest.approx(wanted, rel=1e-4)

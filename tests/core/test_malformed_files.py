@@ -33,7 +33,7 @@ from support.small_inputs import (
     tum_text,
     write_small_inputs,
 )
-from trilane.apps.inspection.inspect_file import inspect_file
+from trilane.apps.inspect.inspect_file import inspect_file
 from trilane.errors import BadInputError
 
 Content = bytes | str | Callable[[Path], Any]

@@ -13,12 +13,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilane.apps.overview.entry import Entry, entry_of, varied
-from trilane.apps.overview.frontier import frontier
-from trilane.apps.overview.page import page
-from trilane.apps.overview.scatter import MARKERS, Dot, marker_name, scatter
-from trilane.apps.overview.sources import read_entries
-from trilane.apps.overview.table_rows import columns, table_rows, write_csv, write_parquet
+from trilane.apps.compare.overview import (
+    Entry,
+    columns,
+    entry_of,
+    frontier,
+    read_entries,
+    table_rows,
+    varied,
+    write_csv,
+    write_parquet,
+)
+from trilane.apps.compare.overview_page import MARKERS, Dot, marker_name, page, scatter
 from trilane.errors import BadInputError
 
 CPU = {"cpu": {"model": "<Chip>", "cores_allowed": [0, 1]}, "gl": {"renderer": "soft"}}

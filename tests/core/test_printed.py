@@ -13,8 +13,7 @@ from typing import Any
 import pytest
 
 from trilane.apps.cli import bench
-from trilane.apps.experiments import accuracy, error_by_cause, hard_cases
-from trilane.apps.experiments.hard_numbers import all_rows
+from trilane.apps.experiments import accuracy, error_by_cause, hard_cases, hard_numbers
 from trilane.stages import configure, machine_facts
 from trilane.stages.run_options import RunOptions
 
@@ -126,7 +125,7 @@ def test_hard_cases(printed: Printed, check_printed: Check, monkeypatch: pytest.
     bad = row | {"name": "batch, odd, ort", "verdict": "above its bound", "passed": False}
     number = {key: row[key] for key in ("error", "bound", "unit", "source", "verdict", "passed")}
     numbers = [number | {"name": "rotation by 0"}, number | {"name": "rotation by pi", "source": "another"}]
-    monkeypatch.setattr(all_rows, "hard_numbers", lambda: iter(numbers))
+    monkeypatch.setattr(hard_numbers, "hard_numbers", lambda: iter(numbers))
     monkeypatch.setattr(hard_cases, "hard_cases", lambda _: iter([row, bad]))
     check_printed("hard-cases", printed("accuracy", "--hard-cases", "--runtime", "ort", code=1))
 

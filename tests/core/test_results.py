@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from trilane.apps.cli.sweep import _of_file
-from trilane.apps.sweeps.definition import trials_of
+from trilane.apps.sweep.definition import trials_of
 from trilane.bench.lib.cast import Cast
 from trilane.stages.configure import configure
 from trilane.stages.run_options import RunOptions

@@ -15,11 +15,18 @@ from hypothesis import strategies as st
 from trilane.apps.cli.sweep import sweep as sweep_command
 from trilane.apps.cli.sweep_options import SweptCommand
 from trilane.apps.cli.sweep_output import print_summary, seconds_left
-from trilane.apps.sweeps import definition as module
-from trilane.apps.sweeps import ray_engine
-from trilane.apps.sweeps.definition import Definition, Kind, trials_of
-from trilane.apps.sweeps.toml_file import read_sweep
-from trilane.apps.sweeps.trial import Clock, Options, Trial, canonical
+from trilane.apps.sweep import definition as module
+from trilane.apps.sweep import engines
+from trilane.apps.sweep.definition import (
+    Definition,
+    Options,
+    SweepKind,
+    Trial,
+    TrialClock,
+    canonical,
+    read_sweep,
+    trials_of,
+)
 from trilane.errors import BadInputError
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "chip-sweep.toml"
@@ -56,7 +63,7 @@ def test_a_grid_a_list_and_repeats_by_hand() -> None:
     whole = [("128", "ort"), ("128", "openvino"), ("128", "qnn"), ("256", "ort"), ("256", "openvino"), ("256", "qnn")]
     assert rows(Definition(RUN, {}, AXES)) == whole
     side_by_side = {"size": ["128", "256"], "runtime": ["ort", "qnn"]}
-    assert rows(Definition(RUN, {"frames": 8}, side_by_side, Kind.LIST)) == [(8, "128", "ort"), (8, "256", "qnn")]
+    assert rows(Definition(RUN, {"frames": 8}, side_by_side, SweepKind.LIST)) == [(8, "128", "ort"), (8, "256", "qnn")]
     twice = trials_of(Definition(RUN, {"frames": 8}, repeats=2), typed)
     assert [trial.repeat for trial in twice] == [1, 2]
     assert twice[0].id == trials_of(Definition(RUN, {"frames": 8}), typed)[0].id != twice[1].id
@@ -70,15 +77,15 @@ def test_grids_are_products_and_draws_are_among_them(lengths: list[int], data: A
     whole = list(product(*axes.values()))
     assert rows(Definition(RUN, {}, axes)) == whole
     count, seed = data.draw(st.integers(1, len(whole))), data.draw(st.integers(0, 9))
-    drawn = rows(Definition(RUN, {}, axes, Kind.RANDOM, count, seed))
+    drawn = rows(Definition(RUN, {}, axes, SweepKind.RANDOM, count, seed))
     assert len(set(drawn)) == count
     assert drawn == [row for row in whole if row in drawn]
-    assert drawn == rows(Definition(RUN, {}, axes, Kind.RANDOM, count, seed))
+    assert drawn == rows(Definition(RUN, {}, axes, SweepKind.RANDOM, count, seed))
 
 
 def test_another_seed_draws_others() -> None:
     axes = {"size": [str(side) for side in range(100)]}
-    assert len({tuple(rows(Definition(RUN, {}, axes, Kind.RANDOM, 5, seed))) for seed in range(10)}) == 10
+    assert len({tuple(rows(Definition(RUN, {}, axes, SweepKind.RANDOM, 5, seed))) for seed in range(10)}) == 10
 
 
 @pytest.mark.parametrize(
@@ -86,9 +93,9 @@ def test_another_seed_draws_others() -> None:
     [
         (Definition(RUN, {}, {"size": []}), "axes.size: found no value"),
         (Definition(RUN, {"size": "1"}, {"size": ["1"]}), "an axis that is a fixed option too"),
-        (Definition(RUN, {}, AXES, Kind.LIST), "2 of size, 3 of runtime"),
+        (Definition(RUN, {}, AXES, SweepKind.LIST), "2 of size, 3 of runtime"),
         (Definition(RUN, {}, {"size": ["1", "1"]}), "trilane run --size=1 --json twice"),
-        (Definition(RUN, {}, AXES, Kind.RANDOM, 7), "found 7, expected 1 to 6"),
+        (Definition(RUN, {}, AXES, SweepKind.RANDOM, 7), "found 7, expected 1 to 6"),
     ],
 )
 def test_axes_that_do_not_fit(definition: Definition, found: str) -> None:
@@ -100,7 +107,7 @@ def test_too_many_trials_are_refused_before_they_are_made(monkeypatch: pytest.Mo
     huge = {f"axis{place}": list(range(1000)) for place in range(6)}
     with pytest.raises(BadInputError, match="1000000000000000000 trials, expected at most 100000"):
         trials_of(Definition(RUN, {}, huge), typed)
-    assert len(rows(Definition(RUN, {}, huge, Kind.RANDOM, 3))) == 3
+    assert len(rows(Definition(RUN, {}, huge, SweepKind.RANDOM, 3))) == 3
     monkeypatch.setattr(module, "MOST_TRIALS", 5)
     with pytest.raises(BadInputError, match="6 trials"):
         trials_of(Definition(RUN, {}, AXES), typed)
@@ -163,7 +170,7 @@ def test_a_file_by_hand(tmp_path: Path) -> None:
     file = tmp_path / "chips.toml"
     file.write_text('command = "bench raster"\nrepeats = 3\n[options]\nsize = 64\n[axes]\nchannels = [4, 8]\n')
     found = read_sweep(file)
-    assert (found.command, found.kind, found.repeats) == (("bench", "raster"), Kind.GRID, 3)
+    assert (found.command, found.kind, found.repeats) == (("bench", "raster"), SweepKind.GRID, 3)
     assert (found.options, found.axes) == ({"size": 64}, {"channels": [4, 8]})
 
 
@@ -210,26 +217,26 @@ class TwoMachines:
 
 
 def test_machines_that_are_to_measure_have_the_resource_for_it() -> None:
-    assert ray_engine._resources(TwoMachines(), Clock.VIRTUAL) == {}
-    assert ray_engine._resources(TwoMachines(trilane_host_clock=2.0), Clock.HOST) == {"trilane_host_clock": 1}
+    assert engines._resources(TwoMachines(), TrialClock.VIRTUAL) == {}
+    assert engines._resources(TwoMachines(trilane_host_clock=2.0), TrialClock.HOST) == {"trilane_host_clock": 1}
     with pytest.raises(BadInputError, match="no machine with the resource trilane_host_clock"):
-        ray_engine._resources(TwoMachines(), Clock.HOST)
+        engines._resources(TwoMachines(), TrialClock.HOST)
 
 
 def test_a_worker_of_ray_measures_as_its_machine_would() -> None:
     machine = {"PATH": "/bin", "CUDA_VISIBLE_DEVICES": "1", "LD_PRELOAD": "x"}
     worker = {"PATH": "/bin", "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1", "RAY_JOB_ID": "f"}
-    assert ray_engine.restored(worker, machine) == {"PATH": "/bin", "CUDA_VISIBLE_DEVICES": "1", "RAY_JOB_ID": "f"}
+    assert engines.restored(worker, machine) == {"PATH": "/bin", "CUDA_VISIBLE_DEVICES": "1", "RAY_JOB_ID": "f"}
 
 
 def test_an_address_where_nobody_listens_is_found_at_once() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"127.0.0.1:{server.getsockname()[1]}"
-        ray_engine._try_address(address)
+        engines._try_address(address)
     with pytest.raises(ConnectionRefusedError):
-        ray_engine._try_address(address)
+        engines._try_address(address)
     for known_to_ray_alone in ("", "auto", "local", "ray://127.0.0.1:1"):
-        ray_engine._try_address(known_to_ray_alone)
+        engines._try_address(known_to_ray_alone)
 
 
 def test_time_left() -> None:

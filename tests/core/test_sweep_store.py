@@ -10,11 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trilane.apps.sweeps import store as module
-from trilane.apps.sweeps.perform import ended_as
-from trilane.apps.sweeps.store import SWEEP, TRIALS, Store, latest, read_trials, whole_lines
-from trilane.apps.sweeps.sweep import run_sweep, summary
-from trilane.apps.sweeps.trial import Trial
+from trilane.apps.sweep import store as module
+from trilane.apps.sweep.definition import Trial
+from trilane.apps.sweep.engines import ended_as
+from trilane.apps.sweep.store import SWEEP, TRIALS, Store, latest, read_trials, run_sweep, summary, whole_lines
 from trilane.errors import BadInputError
 
 TRIALS_3 = [Trial(("predict",), {"size": size}, ("--size", size)) for size in ("1", "2", "3")]

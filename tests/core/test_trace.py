@@ -18,9 +18,16 @@ import pytest
 from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace
 
 from support.trace_reading import ReadTrace, read_trace
-from trilane.apps.tracing.packets import PLAIN_BYTES, PacketSink, packets_in
-from trilane.apps.tracing.tiles import MOST_WAITING, Lanes, Tiles
-from trilane.apps.tracing.writer import TraceWriter, write_chrome_trace, write_trace, write_tracks
+from trilane.apps.explain.trace import (
+    MOST_WAITING,
+    Lanes,
+    Tiles,
+    TraceWriter,
+    write_chrome_trace,
+    write_trace,
+    write_tracks,
+)
+from trilane.apps.explain.trace_sinks import PLAIN_BYTES, PacketSink, packets_in
 from trilane.hw_profiles.application import application_graph
 from trilane.pipeline.journal import (
     SCHEMA,

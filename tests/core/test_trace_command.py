@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from support.trace_reading import read_trace
-from trilane.apps.tracing.files import write_predicted
+from trilane.apps.explain.trace import write_predicted
 from trilane.hw_profiles.application import application_graph
 from trilane.pipeline.journal import NAME, JournalWriter, journal_of
 from trilane.scheduler.events import Settings

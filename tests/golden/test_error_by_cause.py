@@ -14,7 +14,7 @@ import pytest
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from trilane.apps.experiments.error_by_cause import error_by_cause
-from trilane.apps.experiments.reference_path import BODY, NOTHING, Cause, Moment, ReferencePath, needs, up_to
+from trilane.apps.experiments.reference_path import BODY, NOTHING, Cause, ReferenceMoment, ReferencePath, needs, up_to
 from trilane.arrays import F32, F64
 from trilane.bench.lib.cast import Cast
 from trilane.bench.lib.full_picture import FullPictures
@@ -61,12 +61,12 @@ def own_context(current: None, path: ReferencePath) -> None:  # noqa: ARG001
 
 
 @pytest.fixture(scope="module")
-def moment(path: ReferencePath) -> Moment:
+def moment(path: ReferencePath) -> ReferenceMoment:
     return path.moment(FRAME)
 
 
 @pytest.fixture(scope="module")
-def grey(path: ReferencePath) -> Moment:
+def grey(path: ReferencePath) -> ReferenceMoment:
     """The frame of a body whose texture is GREY, painted opaque in the tensor's own colours."""
 
     def paint(tensor: F64) -> F32:
@@ -81,7 +81,7 @@ def grey(path: ReferencePath) -> Moment:
     return plain.moment(FRAME)
 
 
-def test_without_a_cause_it_is_the_plan_full(checked: Checked, moment: Moment) -> None:
+def test_without_a_cause_it_is_the_plan_full(checked: Checked, moment: ReferenceMoment) -> None:
     """Which is rounded to bytes: half a step."""
     cast = Cast(checked)
     full = FullPictures(cast).frame(FRAME, moment.background)
@@ -104,7 +104,7 @@ def test_with_all_causes_it_is_the_run_to_the_bit(checked: Checked, path: Refere
     assert (of_weights == 0).mean() > 0.3  # and the rest of the body has the weights that it has
 
 
-def test_float64_makes_the_run_s_tensor_but_for_single_steps(moment: Moment) -> None:
+def test_float64_makes_the_run_s_tensor_but_for_single_steps(moment: ReferenceMoment) -> None:
     """The driver rounds, and snaps vertices to parts of a pixel: of the values on the mesh few are a step off."""
     avatar = next(iter(moment._path.avatars.values()))
     own, driver = (
@@ -116,18 +116,18 @@ def test_float64_makes_the_run_s_tensor_but_for_single_steps(moment: Moment) -> 
     assert (np.abs(own - driver)[both] <= 1.001).mean() > 0.98
 
 
-def test_what_a_cause_needs_has_to_be_there(moment: Moment) -> None:
+def test_what_a_cause_needs_has_to_be_there(moment: ReferenceMoment) -> None:
     with pytest.raises(ValueError, match=r"runtime needs INT8 packing, quantisation"):
         moment.frame(frozenset({Cause.RUNTIME}))
     with pytest.raises(ValueError, match=r"composite needs crop and size"):
         moment.frame(frozenset({Cause.COMPOSITE}))
 
 
-def test_a_body_without_blend_shapes_loses_nothing_by_leaving_them_out(moment: Moment) -> None:
+def test_a_body_without_blend_shapes_loses_nothing_by_leaving_them_out(moment: ReferenceMoment) -> None:
     assert np.array_equal(moment.frame(alone(Cause.BLEND)).picture, moment.frame(NOTHING).picture)
 
 
-def painted_grey(grey: Moment, causes: frozenset[Cause]) -> float:
+def painted_grey(grey: ReferenceMoment, causes: frozenset[Cause]) -> float:
     """The picture's grey in the middle of the chest, where the body covers all."""
     frame = grey.frame(causes)
     (box,) = grey.boxes
@@ -137,7 +137,7 @@ def painted_grey(grey: Moment, causes: frozenset[Cause]) -> float:
     return float(around.mean())
 
 
-def test_the_texture_s_grey_in_float16_and_in_bytes(grey: Moment) -> None:
+def test_the_texture_s_grey_in_float16_and_in_bytes(grey: ReferenceMoment) -> None:
     """The error is that of the number itself: 0.3 in float16 is 0.300048828125; in bytes at most half a step off."""
     encoding = next(iter(grey._path.avatars.values())).encoding
     assert painted_grey(grey, NOTHING) == pytest.approx(GREY, abs=1e-6)
@@ -147,14 +147,14 @@ def test_the_texture_s_grey_in_float16_and_in_bytes(grey: Moment) -> None:
     assert abs(packed - GREY) <= encoding.scale / 2 + 1e-6
 
 
-def test_the_composite_alone_is_off_by_two_roundings(grey: Moment) -> None:
+def test_the_composite_alone_is_off_by_two_roundings(grey: ReferenceMoment) -> None:
     """The network's picture in bytes, then the screen's: a step at most, in the middle of the body."""
     exact, rounded = (painted_grey(grey, one) for one in (alone(Cause.CROP), alone(Cause.COMPOSITE)))
     assert abs(rounded - exact) * 255 <= 1.0 + 1e-6
     assert rounded * 255 == pytest.approx(round(rounded * 255), abs=1e-9)
 
 
-def test_one_read_a_pixel_changes_the_outline_alone(grey: Moment) -> None:
+def test_one_read_a_pixel_changes_the_outline_alone(grey: ReferenceMoment) -> None:
     before, after = grey.frame(NOTHING), grey.frame(alone(Cause.READS))
     changed = np.abs(before.picture - after.picture).max(axis=2) > 1e-6
     opaque = (np.abs(before.picture - GREY) < 1e-6).all(axis=2)

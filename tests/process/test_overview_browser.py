@@ -8,9 +8,8 @@ from typing import Any
 import pytest
 
 from trilane import machine
-from trilane.apps.overview import page as page_module
-from trilane.apps.overview.entry import Entry
-from trilane.apps.overview.frontier import frontier
+from trilane.apps.compare import overview_page as page_module
+from trilane.apps.compare.overview import Entry, frontier
 
 playwright = pytest.importorskip("playwright.sync_api")
 pytestmark = pytest.mark.slow

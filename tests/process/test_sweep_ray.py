@@ -19,8 +19,8 @@ from typing import Any
 import psutil
 import pytest
 
-from trilane.apps.sweeps.ray_engine import cluster
-from trilane.apps.sweeps.store import TRIALS
+from trilane.apps.sweep.engines import cluster
+from trilane.apps.sweep.store import TRIALS
 from trilane.errors import BadInputError
 
 FAKE = "support.sweep_trial"
@@ -28,7 +28,7 @@ FAKE = "support.sweep_trial"
 #: SIGINT is heard even where the tests run in a background in which it is ignored.
 PROGRAM = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    f"import trilane.apps.sweeps.perform as p; p.PROGRAM = {FAKE!r}; from trilane.apps.cli.main import entry; entry()"
+    f"import trilane.apps.sweep.engines as p; p.PROGRAM = {FAKE!r}; from trilane.apps.cli.main import entry; entry()"
 )
 LIMIT_S = 100.0
 FRAMES = range(1, 6)

@@ -19,18 +19,16 @@ import psutil
 import pytest
 
 from trilane import machine
-from trilane.apps.sweeps.local_engine import at_once, run_here
-from trilane.apps.sweeps.perform import Place
-from trilane.apps.sweeps.store import TRIALS, Store, read_trials
-from trilane.apps.sweeps.sweep import run_sweep
-from trilane.apps.sweeps.trial import Clock, Trial
+from trilane.apps.sweep.definition import Trial, TrialClock
+from trilane.apps.sweep.engines import TrialPlace, at_once, run_here
+from trilane.apps.sweep.store import TRIALS, Store, read_trials, run_sweep
 
 FAKE = "support.sweep_trial"
 #: `trilane` that tries the module in place of Trilane.
 #: SIGINT is heard even where the tests run in a background in which it is ignored.
 PROGRAM = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    f"import trilane.apps.sweeps.perform as p; p.PROGRAM = {FAKE!r}; from trilane.apps.cli.main import entry; entry()"
+    f"import trilane.apps.sweep.engines as p; p.PROGRAM = {FAKE!r}; from trilane.apps.cli.main import entry; entry()"
 )
 LIMIT_S = 60.0
 COUNT = 4
@@ -51,7 +49,7 @@ def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def swept(folder: Path, trials: list[Trial]) -> dict[str, dict[str, Any]]:
     """The records after a sweep of `trials`."""
     with Store(folder, trials, {}, resume=False) as store:
-        place = Place(store.folder, program=FAKE)
+        place = TrialPlace(store.folder, program=FAKE)
         run_sweep(trials, store, lambda left: run_here(left, place), lambda _record: None)
     return read_trials(folder)
 
@@ -76,7 +74,7 @@ def test_trials_of_the_host_clock_one_after_the_other_with_their_folders(tmp_pat
     records = swept(tmp_path / "s", trials)
     (_, first_end), (second_begin, _) = spans(log)
     assert first_end <= second_begin
-    assert at_once(Clock.HOST) == 1
+    assert at_once(TrialClock.HOST) == 1
     for trial in trials:
         record = records[trial.id]
         assert record["result"] == {"schema": 1, "words": ["run", *trial.words, "--json"], "threads": "7"}

@@ -29,8 +29,8 @@ from support.mutations import mutated
 from support.small_inputs import write_small_inputs
 from trilane.apps.cli.console import without_controls
 from trilane.apps.cli.inspect import lines
-from trilane.apps.inspection.inspect_file import inspect_file
-from trilane.apps.inspection.inspection import Inspection
+from trilane.apps.inspect.inspect_file import inspect_file
+from trilane.apps.inspect.inspection import Inspection
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import read_network
 from trilane.body.body import load_body

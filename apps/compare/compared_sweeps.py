@@ -1,0 +1,227 @@
+"""Two sweeps beside each other: trials of one configuration in pairs, and what holds for all pairs together.
+
+Rule: a configuration is paired with itself and nothing else. A trial that did not end well, or that the other sweep
+lacks, is counted and named. A trial is compared by its run folder if there is one, else by the result in its line.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from pydantic import ValidationError
+
+from trilane.apps.compare.comparison import SCHEMA, change_of, exceeds, interval_of
+from trilane.apps.compare.difference import ALPHA, LEAST_FRAMES, Difference, Finding, combined, rejected
+from trilane.apps.compare.rows import BUSY_MACHINE, FRAME_TIME, MS, Figure, rows_of
+from trilane.apps.compare.sides import Change, ComparedRun, RunKind, Side, changes, read_told
+from trilane.apps.report import Report
+from trilane.apps.sweep.store import TRIALS, read_trials
+from trilane.errors import BadInputError
+
+MEAN: Final = Figure(FRAME_TIME, "", "", "mean", MS)
+METHOD: Final = (
+    "trials of one configuration are compared with each other, repeats as several runs; intervals hold 95 %; that any "
+    f"of the trials that are said to differ does so by chance has a probability of at most {100 * ALPHA:.0f} % (Holm); "
+    "over all: the geometric mean of the ratios"
+)
+#: A pair: the name of its first trial in the base, both sides, and its options.
+_Found = tuple[str, Side, Side, Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class TrialPair:
+    """One configuration in both sweeps.
+
+    `name`: name of its first trial in the base. `runs`: number of runs a side. `frame_time`: mean frame time of both.
+    `differs`: whether the test of all pairs together calls it different. `changes`: changes of machine and settings.
+    """
+
+    name: str
+    options: Mapping[str, Any]
+    runs: int
+    frame_time: Difference
+    differs: bool
+    changes: tuple[Change, ...]
+
+    @property
+    def outcome(self) -> Finding:
+        """What holds for the frame time."""
+        return self.frame_time.outcome(differs=self.differs)
+
+
+@dataclass(frozen=True)
+class SweepComparison:
+    """`other` beside `base`.
+
+    `over_all`: mean frame time of all pairs. `left_out`: configurations without a partner, by reason. `changes`:
+    changes that every pair has. `notes`: what makes the comparison less sure.
+    """
+
+    base: str
+    other: str
+    pairs: tuple[TrialPair, ...]
+    over_all: Difference
+    left_out: Mapping[str, tuple[str, ...]]
+    changes: tuple[Change, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def verdict(self) -> str:
+        """What differs, as a sentence."""
+        differing = [pair for pair in self.pairs if pair.differs]
+        of = f"{len(self.pairs)} trial{'s' * (len(self.pairs) > 1)}"
+        whole = f"over all {change_of(self.over_all, MS)} ({interval_of(self.over_all, MS)})"
+        if not differing:
+            unsure = sum(pair.outcome is Finding.UNKNOWN for pair in self.pairs)
+            if unsure == len(self.pairs):
+                return f"it cannot be told whether any of {of} differs; {whole}"
+            told = f"; of {unsure} it cannot be told" if unsure else ""
+            return f"no difference in any of {of}{told}; {whole}"
+        slower = sum(pair.frame_time.effect > 0 for pair in differing)
+        return f"frame time differs in {len(differing)} of {of}, {slower} of them slower; {whole}"
+
+    def slower_than(self, limit: float) -> list[Finding]:
+        """Return whether each pair's frame time is longer by more than the share `limit`: DIFFERS if it surely is."""
+        return [exceeds(pair.frame_time, limit, differs=pair.differs) for pair in self.pairs]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return what `trilane compare --json` prints for two sweeps."""
+        return {
+            "schema": SCHEMA,
+            "base": self.base,
+            "other": self.other,
+            "verdict": self.verdict,
+            "changes": [change._asdict() for change in self.changes],
+            "over_all": _told(self.over_all),
+            "trials": [
+                {"id": pair.name, "options": dict(pair.options), "runs": pair.runs}
+                | {**_told(pair.frame_time), "differs": pair.differs, "outcome": str(pair.outcome)}
+                for pair in self.pairs
+            ],
+            "left_out": {reason: list(names) for reason, names in self.left_out.items()},
+            "notes": list(self.notes),
+            "method": METHOD,
+        }
+
+
+def is_sweep(name: str) -> bool:
+    try:
+        return bool(name.strip()) and (Path(name) / TRIALS).is_file()
+    except OSError:  # too long a name
+        return False
+
+
+def compare_sweeps(base: str, other: str) -> SweepComparison:
+    """Compare the folders of two sweeps. Raises BadInputError where there is no pair, or no runs in them."""
+    first, second = (_configurations(Path(name)) for name in (base, other))
+    found: list[_Found] = []
+    left: dict[str, list[str]] = {"not_done": [], "base_alone": [], "other_alone": []}
+    for key, of_base in first.items():
+        name, of_other = _name(of_base), second.get(key, {})
+        repeats = [each for each, record in of_base.items() if _is_done(record) and _is_done(of_other.get(each))]
+        if repeats:
+            sides = (_side(where, of, repeats) for where, of in ((base, of_base), (other, of_other)))
+            found.append((name, *sides, of_base[repeats[0]]["options"]))
+        else:
+            left["not_done" if of_other else "base_alone"].append(name)
+    left["other_alone"] += [_name(of_other) for key, of_other in second.items() if key not in first]
+    if not found:
+        missing = f"no trial that {base} has too, done in both"
+        remedy = "both are of one command, with the same options in the same words"
+        raise BadInputError(other, missing, "trials of equal configuration", remedy)
+    return _compared(base, other, found, {reason: tuple(names) for reason, names in left.items()})
+
+
+def _name(repeats: Mapping[int, Mapping[str, Any]]) -> str:
+    return str(next(iter(repeats.values()))["id"])
+
+
+def _side(where: str, of: Mapping[int, Mapping[str, Any]], repeats: Sequence[int]) -> Side:
+    return Side(where, tuple(_trial(where, of[each]) for each in repeats))
+
+
+def _compared(
+    base: str,
+    other: str,
+    found: Sequence[_Found],
+    left: Mapping[str, tuple[str, ...]],
+) -> SweepComparison:
+    rows = [_frame_time(first, second) for _, first, second, _ in found]
+    fallen = iter(rejected([row.probability for row in rows if row.probability is not None]))
+    pairs = tuple(
+        TrialPair(
+            name,
+            options,
+            len(first.runs),
+            row,
+            row.probability is not None and next(fallen),
+            tuple(changes(first.runs[0].document, second.runs[0].document)),
+        )
+        for (name, first, second, options), row in zip(found, rows, strict=True)
+    )
+    shared = tuple(each for each in pairs[0].changes if all(each in pair.changes for pair in pairs))
+    documents = [told.document for _, *sides, _ in found for side in sides for told in side.runs]
+    return SweepComparison(base, other, pairs, combined(rows), left, shared, tuple(_notes(documents)))
+
+
+def _frame_time(base: Side, other: Side) -> Difference:
+    """Return the difference of the mean frame times. Raises BadInputError for trials that have none."""
+    row = rows_of(base, other).get(MEAN)
+    if row is None:
+        raise BadInputError(base.name, "trials without a frame time", "a sweep of `run` or `predict`")
+    return row
+
+
+def _configurations(folder: Path) -> dict[str, dict[int, Mapping[str, Any]]]:
+    """Return the trials by configuration and repeat, in the order in which they ended."""
+    found: dict[str, dict[int, Mapping[str, Any]]] = {}
+    for record in read_trials(folder).values():
+        words, options = record.get("command"), record.get("options")
+        if not isinstance(words, list) or len(words) < 2 or not isinstance(options, dict):
+            raise BadInputError(folder / TRIALS, f"trial {record['id']} without command or options", "a sweep's trials")
+        key = json.dumps([words[1:3] if words[1] == "bench" else words[1:2], options], sort_keys=True)
+        found.setdefault(key, {})[int(record.get("repeat", 1))] = record
+    return found
+
+
+def _is_done(record: Mapping[str, Any] | None) -> bool:
+    return record is not None and record["status"] == "done"
+
+
+def _trial(sweep: str, record: Mapping[str, Any]) -> ComparedRun:
+    """Read a trial, with every frame if its run folder is there. Raises BadInputError for one that is no run."""
+    name, folder = str(record["id"]), record.get("folder")
+    place = Path(sweep, str(folder)) if isinstance(folder, str) and Path(folder).name == folder else None
+    if place is not None and (place / "report.json").is_file():
+        return read_told(str(place))
+    result = record.get("result")
+    document = result if isinstance(result, dict) else {}
+    if "expected_error" in document and "frame_time_ms" in document:
+        return ComparedRun(name, RunKind.PREDICTION, document)
+    try:
+        return ComparedRun(name, RunKind.REPORT, Report.model_validate(document).as_json())
+    except ValidationError:
+        raise BadInputError(f"{sweep}: trial {name}", "no run", "a sweep of `run` or `predict`") from None
+
+
+def _told(row: Difference) -> dict[str, Any]:
+    names = ("base", "other", "change", "low", "high", "is_ratio", "probability")
+    return {name: getattr(row, name) for name in names}
+
+
+def _notes(documents: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Yield what a person should know of the machine while the trials ran."""
+    shares = [share for document in documents if (share := document.get("other_programs") or 0.0) > BUSY_MACHINE]
+    if shares:
+        runs = f"{len(shares)} of {len(documents)} runs"
+        yield (
+            f"other programs had more than {100 * BUSY_MACHINE:.0f} % of the cores in {runs}, "
+            f"{100 * max(shares):.0f} % at most, which makes their intervals wider"
+        )
+    presented = [document["frames"]["presented"] for document in documents if "frames" in document]
+    if presented and min(presented) <= LEAST_FRAMES:
+        yield f"{min(presented)} frames at the least; to tell what differs, more than {LEAST_FRAMES} are needed"

@@ -1,0 +1,454 @@
+"""A base and the sides compared with it, as data and in words. Rule: table, JSON and page show this and nothing else.
+
+The verdict is a sentence. It names the frame time, then what explains it, the most telling first: stages that take
+longer or shorter, units that wait more or less, and settings with a known effect. It names what no rule explains too.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+from trilane.apps.compare.difference import ALPHA, LEAST_FRAMES, MATTERS, MOST_FRAMES, Difference, Finding, rejected
+from trilane.apps.compare.rows import (
+    BUSY,
+    BYTES,
+    DROPPED,
+    ERROR,
+    FRAME_TIME,
+    IDLE,
+    LATENCY,
+    LOST,
+    SERVICE,
+    SHARE,
+    WORK,
+    Figure,
+    Rows,
+    margin_of,
+    named,
+    remarks,
+    rows_of,
+)
+from trilane.apps.compare.run_frames import INSTRUCTION_TIME, INSTRUCTIONS
+from trilane.apps.compare.sides import Change, ComparedRun, RunKind, Side, changes
+from trilane.apps.explain.reasons import bound_text
+
+SCHEMA: Final = 1
+METHOD: Final = (
+    "intervals hold 95 %; that the verdict names a difference by chance has a probability of at most "
+    f"{100 * ALPHA:.0f} % (Holm); no difference: surely less than {100 * MATTERS:.0f} %; cannot tell: neither"
+)
+SEVERAL: Final = (
+    "of several runs a side: base and other are the arithmetic means of the runs' values; the change of a ratio is "
+    "that of their geometric means, so it need not be the ratio of these means"
+)
+NO_DIFFERENCE: Final = str(Finding.SAME)
+TOO_FEW: Final = f"{Finding.UNKNOWN}: too short"
+#: The least change of a share of idle time for its cause to be named.
+TELLING_SHARE: Final = 0.05
+MOST_NAMED: Final = 4
+NOT_EXPLAINED: Final = "no stage, unit or setting alone explains it; the cores may have another speed"
+WITHOUT_FRACTION: Final = 999.5
+#: A setting and its value -> what is said of it.
+REASONS: Final = {
+    ("policy", "sequential"): "one frame at a time under sequential",
+    ("policy", "pipelined"): "several frames at a time under pipelined",
+    ("policy", "latest"): "the newest pose wins under latest",
+    ("policy", "deadline"): "late frames are dropped under deadline",
+}
+WAITS: Final = {
+    "starved": "is starved",
+    "blocked": "is blocked",
+    "throttled": "is held by its cap",
+    "preempted": "has no core",
+    "overhead": "waits for messages or its process",
+}
+DASH: Final = "–"
+IN_THOUSANDS: Final = 10_000
+
+
+class Bounds(NamedTuple):
+    """What bounded each run of either side, as in report.json; None where nobody knows.
+
+    `outcome` says whether the bounding unit changed. Only that unit's share of the path is known, so another unit's
+    share may be as large unless this one is surely more than a half.
+    """
+
+    base: tuple[Mapping[str, Any] | None, ...]
+    other: tuple[Mapping[str, Any] | None, ...]
+
+    @property
+    def outcome(self) -> Finding:
+        every = [bound["unit"] if bound else None for bound in (*self.base, *self.other)]
+        units = [unit for unit in every if unit is not None]
+        if len(units) < len(every):
+            return Finding.UNKNOWN
+        base, other = ({unit["name"] for unit in side} for side in (units[: len(self.base)], units[len(self.base) :]))
+        if len(base | other) == 1:
+            return Finding.SAME
+        is_sure = all((unit["share_low"] or 0.0) > 0.5 for unit in units)
+        return Finding.DIFFERS if len(base) == len(other) == 1 and is_sure else Finding.UNKNOWN
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A side beside the base. `differing`: figures that differ in the test of all figures together."""
+
+    base: Side
+    other: Side
+    rows: Rows
+    differing: tuple[Figure, ...]
+    changes: tuple[Change, ...]
+    verdict: str
+    bounds: Bounds
+    notes: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return one entry of `comparisons`."""
+        return {
+            "run": self.other.name,
+            "verdict": self.verdict,
+            "outcome": str(self.whole),
+            "bound": {**self.bounds._asdict(), "outcome": str(self.bounds.outcome)},
+            "changes": [change._asdict() for change in self.changes],
+            "rows": [_row_document(figure, self) for figure in self.rows],
+            "notes": list(self.notes),
+        }
+
+    @property
+    def whole(self) -> Finding:
+        """What holds for the comparison as a whole, as the verdict says it."""
+        if self.differing:
+            return Finding.DIFFERS
+        return Finding.SAME if self.verdict == NO_DIFFERENCE else Finding.UNKNOWN
+
+    def outcome(self, figure: Figure) -> Finding:
+        """Return what holds for one of the `rows`."""
+        row = self.rows[figure]
+        return row.outcome(differs=figure in self.differing, margin=margin_of(figure, row))
+
+    def slower_than(self, limit: float) -> Finding:
+        """Return whether the mean frame time is longer by more than the share `limit`: DIFFERS where it surely is."""
+        figure = next(each for each in self.rows if each[:4] == (FRAME_TIME, "", "", "mean"))
+        return exceeds(self.rows[figure], limit, differs=figure in self.differing)
+
+
+def exceeds(row: Difference, limit: float, *, differs: bool) -> Finding:
+    """Return whether a change is surely above `limit`, surely not, or neither."""
+    if row.low is None or row.high is None:
+        return Finding.UNKNOWN
+    if differs and row.low > limit:
+        return Finding.DIFFERS
+    return Finding.SAME if row.high <= limit else Finding.UNKNOWN
+
+
+def compare(base: Side, others: Sequence[Side]) -> list[Comparison]:
+    """Compare each of `others` with `base`."""
+    return [_compared(base, other) for other in others]
+
+
+def document(comparisons: Sequence[Comparison]) -> dict[str, Any]:
+    """Return what `trilane compare --json` prints.
+
+    With several others `verdict` names each of them, and `changes` say whose they are.
+    """
+    several = len(comparisons) > 1
+    return {
+        "schema": SCHEMA,
+        "base": comparisons[0].base.name,
+        "verdict": "; ".join(f"{each.other.name}: {each.verdict}" if several else each.verdict for each in comparisons),
+        "changes": [{"run": each.other.name, **change._asdict()} for each in comparisons for change in each.changes],
+        "comparisons": [each.as_json() for each in comparisons],
+        "method": METHOD,
+    }
+
+
+def _compared(base: Side, other: Side) -> Comparison:
+    rows = rows_of(base, other)
+    first = named(rows)
+    differing = _differing(rows, first)
+    if differing:
+        differing += _differing(rows, [figure for figure in rows if figure not in first])
+    changed = tuple(changes(base.runs[0].document, other.runs[0].document))
+    said = verdict(rows, first, differing, changed, _stages(base.runs[0].document))
+    bounds = Bounds(*(tuple(told.document.get("bound") for told in side.runs) for side in (base, other)))
+    return Comparison(base, other, rows, differing, changed, said, bounds, tuple(_notes(base, other)))
+
+
+def _differing(rows: Rows, figures: Sequence[Figure]) -> tuple[Figure, ...]:
+    """Return those of `figures` that differ, all tested together; figures without chance do not weaken the test."""
+    tested = {figure: rows[figure].probability or 0.0 for figure in figures if rows[figure].probability is not None}
+    uncertain = [figure for figure in tested if rows[figure].deviation]
+    fallen = dict(zip(uncertain, rejected([tested[figure] for figure in uncertain]), strict=True))
+    return tuple(figure for figure, probability in tested.items() if fallen.get(figure, probability < ALPHA))
+
+
+def _stages(report: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Return the names of each unit's stages."""
+    found: dict[str, list[str]] = {}
+    for name, row in report["stages"].items():
+        found.setdefault(row["unit"], []).append(name)
+    return found
+
+
+def _notes(base: Side, other: Side) -> list[str]:
+    runs = {told.name: told for told in (*base.runs, *other.runs)}
+    notes = remarks({name: told.document for name, told in runs.items()})
+    if len(base.runs) > 1:
+        notes.append(SEVERAL)
+    return notes + [f"{name}: {text}" for name, told in runs.items() for text in _about(told)]
+
+
+def _about(told: ComparedRun) -> Iterator[str]:
+    """Yield what a person should know of the data of a run."""
+    if told.kind is RunKind.REPORT:
+        yield "a report without a journal, so only summaries are compared, each as uncertain as the mean frame time"
+    if told.kind is RunKind.PREDICTION:
+        yield "computed by a model, with the error that it expects of itself"
+    if told.frames is None:
+        return
+    presented = told.document["frames"]["presented"]
+    if told.remark:
+        yield told.remark
+    elif not told.frames.is_whole:
+        yield "its journal ends before the run did: compared by the frames until then"
+    if presented > MOST_FRAMES:
+        yield f"compared by its last {MOST_FRAMES} frames"
+    if presented <= LEAST_FRAMES:
+        yield f"{presented} frames; to tell what differs, more than {LEAST_FRAMES} are needed"
+
+
+def _row_document(figure: Figure, comparison: Comparison) -> dict[str, Any]:
+    row = comparison.rows[figure]
+    return {
+        **figure._asdict(),
+        "base": row.base,
+        "other": row.other,
+        "change": row.change,
+        "low": row.low,
+        "high": row.high,
+        "is_ratio": row.is_ratio,
+        "probability": row.probability,
+        "differs": figure in comparison.differing,
+        "outcome": str(comparison.outcome(figure)),
+    }
+
+
+def verdict(
+    rows: Rows,
+    named: Sequence[Figure],
+    differing: Sequence[Figure],
+    changes: Sequence[Change],
+    stages: Mapping[str, Sequence[str]],
+) -> str:
+    """Return `no difference`, or a sentence, which begins with `cannot tell` where nothing is sure.
+
+    `named`: figures of `rows` that the verdict rests on. `differing`: figures that differ, tested together. `changes`:
+    changes of configuration and machine. `stages`: names of each unit's stages.
+    """
+    if not differing:
+        return _not_told(rows, named, changes, stages)
+    found = {figure: rows[figure] for figure in differing}
+    heads = list(_heads(found))
+    causes = [*_programs(found), *_works(found, rows, changes), *_waits(found, rows, stages), *_others(found)]
+    settings = ((change.key.rpartition(".")[2], str(change.other)) for change in changes)
+    reasons = [REASONS[setting] for setting in settings if setting in REASONS]
+    if not causes:
+        causes = [NOT_EXPLAINED] if not reasons and any(figure.measure == WORK for figure in rows) else []
+        if not heads:
+            causes = [_plain(figure, row) for figure, row in [*found.items()][:MOST_NAMED]]
+    parts = ["; ".join(heads), "; ".join(causes), "; ".join(reasons) if heads or causes else ""]
+    return ": ".join(part for part in parts if part)
+
+
+def _not_told(
+    rows: Rows, named: Sequence[Figure], changes: Sequence[Change], stages: Mapping[str, Sequence[str]]
+) -> str:
+    """Return the verdict where nothing surely differs: no difference that matters, or figures of which nobody can tell.
+
+    Counted instructions alone stand for the program if every stage has them and no setting changed.
+    """
+    counted = [figure for figure in named if figure.measure == INSTRUCTIONS]
+    is_counted = len(counted) == sum(map(len, stages.values())) and not changes
+    rested_on = counted if is_counted else [figure for figure in named if figure.measure in (FRAME_TIME, WORK, SERVICE)]
+    if all(rows[figure].probability is None for figure in rested_on):
+        return TOO_FEW
+    unknown = {
+        figure: rows[figure]
+        for figure in rested_on
+        if rows[figure].outcome(differs=False, margin=margin_of(figure, rows[figure])) is Finding.UNKNOWN
+    }
+    if not unknown:
+        return NO_DIFFERENCE
+    ordered = sorted(
+        unknown.items(), key=lambda each: (each[0].measure != FRAME_TIME, -abs(each[1].other - each[1].base))
+    )
+    said = (f"{figure.of or figure.measure} {signed(row, figure.unit)}" for figure, row in ordered[:MOST_NAMED])
+    return f"{Finding.UNKNOWN}: {', '.join(said)}: runs of one kind may differ by as much"
+
+
+def _programs(found: Rows) -> Iterator[str]:
+    """Yield stages that execute more or fewer instructions, and those whose instructions take longer or shorter."""
+    for figure, row in found.items():
+        if figure.measure == INSTRUCTIONS:
+            sign = 1 if row.change > 0 else -1
+            more = f"{_amount(sign * row.change, row, figure.unit)} {'more' if sign > 0 else 'fewer'} instructions"
+            yield f"{figure.of} executes {more}{_between(row, sign)}"
+    for figure, row in found.items():
+        if figure.measure == INSTRUCTION_TIME:
+            yield f"an instruction of {figure.of} takes {longer(row, figure.unit)}, as the machine lets it"
+
+
+def _heads(found: Rows) -> Iterator[str]:
+    """Yield the frame time; where its mean is unchanged its first percentile that differs, or else the latency."""
+    for measure in (FRAME_TIME, LATENCY):
+        mine = {figure: row for figure, row in found.items() if figure.measure == measure}
+        of_mean = [figure for figure in mine if figure.statistic == "mean"] or [*mine][:1]
+        for figure in of_mean:
+            name = measure if figure.statistic == "mean" else f"{figure.statistic} of the {measure}"
+            yield f"{name} {signed(mine[figure], figure.unit)}"
+        if of_mean:
+            return
+
+
+def _works(found: Rows, rows: Rows, changes: Sequence[Change]) -> Iterator[str]:
+    """Yield stages without counted instructions, those whose work changed by the most milliseconds first."""
+    by_stage: dict[str, tuple[Figure, Difference]] = {}
+    counted = {figure.of for figure in found if figure.measure in (INSTRUCTIONS, INSTRUCTION_TIME)}
+    measure = WORK if any(figure.measure == WORK for figure in rows) else SERVICE
+    for figure, row in found.items():
+        if figure.measure == measure and figure.of not in counted:
+            by_stage.setdefault(figure.of, (figure, row))
+    held = {
+        change.key.removeprefix("config.pace_ns.") for change in changes if change.key.startswith("config.pace_ns.")
+    }
+    ordered = sorted(by_stage.values(), key=lambda each: -abs(each[1].other - each[1].base))
+    for figure, row in ordered[:MOST_NAMED]:
+        at = "" if figure.statistic in ("typical", "mean") else f" at {figure.statistic}"
+        why = ", as it is told to (pace_ns)" if figure.of in held else ""
+        yield f"{figure.of} takes {longer(row, figure.unit)}{at}{why}"
+
+
+def _waits(found: Rows, rows: Rows, stages: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    """Yield units that wait more where frames take longer, or less where shorter.
+
+    Longer waits come first, and among them the units that were the busiest.
+    """
+    frame_time = next((row.change for figure, row in found.items() if figure.measure == FRAME_TIME), 0.0)
+    telling = [
+        (figure, row)
+        for figure, row in found.items()
+        if figure.measure == IDLE and abs(row.change) >= TELLING_SHARE and row.change * frame_time >= 0
+    ]
+    busy = {figure.of: row.base for figure, row in rows.items() if figure.measure == BUSY}
+    for figure, row in sorted(telling, key=lambda each: (each[1].change < 0, -busy.get(each[0].of, 0.0)))[:MOST_NAMED]:
+        what = WAITS.get(figure.cause, f"is {figure.cause}")
+        names = ", ".join(stages.get(figure.of, ()))
+        yield f"unit {figure.of} ({names}) {what} {100 * row.other:.0f} % of the time, was {100 * row.base:.0f} %"
+
+
+def _others(found: Rows) -> Iterator[str]:
+    for figure, row in found.items():
+        if figure.measure in (LOST, DROPPED):
+            yield f"{figure.measure} ({figure.of}) {100 * row.other:.1f} % of the frames, was {100 * row.base:.1f} %"
+        elif figure.measure == ERROR:
+            yield f"error of {figure.of} {row.other:.4g} {figure.unit}".rstrip() + f", was {row.base:.4g}"
+        elif figure.unit == BYTES:
+            yield f"{figure.of} {figure.measure} {signed(row, figure.unit)}"
+
+
+def _plain(figure: Figure, row: Difference) -> str:
+    name = " ".join(part for part in (figure.measure, figure.cause, "of" if figure.of else "", figure.of) if part)
+    return f"{name} ({figure.statistic}) {signed(row, figure.unit)}"
+
+
+def longer(row: Difference, unit: str) -> str:
+    """Return a change in words, such as `5 % longer (4.2 to 5.8)`."""
+    word = "longer" if row.change > 0 else "shorter"
+    sign = 1 if row.change > 0 else -1
+    return f"{_amount(sign * row.change, row, unit)} {word}{_between(row, sign)}"
+
+
+def signed(row: Difference, unit: str) -> str:
+    """Return a change with its sign, such as `+48 % (44 to 52)`."""
+    return f"{_amount(row.change, row, unit, '+')}{_between(row, 1)}"
+
+
+def _between(row: Difference, sign: int) -> str:
+    """Return the interval; nothing where both ends have the same written digits."""
+    if row.low is None or row.high is None:
+        return ""
+    scale = 100 if row.is_ratio else 1
+    low, high = map(_number, sorted((sign * row.low * scale, sign * row.high * scale)))
+    return f" ({low} to {high})" if low != high else ""
+
+
+def _amount(value: float, row: Difference, unit: str, sign: str = "") -> str:
+    """Return a change in its unit; a change of a share is in points of percent."""
+    if row.is_ratio or unit == SHARE:
+        return f"{_number(100 * value, sign)} {'%' if row.is_ratio else 'points'}"
+    return f"{_number(value, sign)} {unit}".rstrip()
+
+
+def _number(value: float, sign: str = "") -> str:
+    """Return three digits, without powers of ten."""
+    return f"{value:{sign}.3g}" if abs(value) < WITHOUT_FRACTION else f"{value:{sign}.0f}"
+
+
+def name_of(figure: Figure) -> str:
+    """Return the name of a figure, such as `idle of dsp: starved`."""
+    of = f" of {figure.of}" if figure.of else ""
+    cause = f": {figure.cause}" if figure.cause else ""
+    return f"{figure.measure}{of}{cause}"
+
+
+def value_of(value: float, unit: str) -> str:
+    """Return a value in its unit; a share is in percent."""
+    if unit == BYTES:
+        return f"{value:,.0f} {unit}"
+    if unit == "" and abs(value) >= IN_THOUSANDS:
+        return f"{value:,.0f}"
+    return f"{100 * value:.1f} %" if unit == SHARE else f"{value:.4g} {unit}".rstrip()
+
+
+def change_of(row: Difference, unit: str) -> str:
+    """Return the change: a ratio in percent, a share in points, anything else in its unit."""
+    return _scaled(row.change, row, unit)
+
+
+def interval_of(row: Difference, unit: str) -> str:
+    """Return the 95 % interval of the change; a dash where nobody knows it."""
+    if row.low is None or row.high is None:
+        return DASH
+    return f"{_scaled(row.low, row, unit, with_unit=False)} to {_scaled(row.high, row, unit, with_unit=False)}"
+
+
+def _scaled(value: float, row: Difference, unit: str, *, with_unit: bool = True) -> str:
+    if row.is_ratio or unit == SHARE:
+        name = "%" if row.is_ratio else "points"
+        return f"{100 * value:+.1f} {name}" if with_unit else f"{100 * value:+.1f}"
+    return f"{value:+.4g} {unit}".rstrip() if with_unit else f"{value:+.4g}"
+
+
+def bounds_text(bounds: Bounds) -> str:
+    """Return what bounded the other side and the base; empty where neither is known, as in predictions."""
+    if not any((*bounds.base, *bounds.other)):
+        return ""
+    changed = " changed" if bounds.outcome is Finding.DIFFERS else ""
+    unsure = ": whether it changed cannot be told" if bounds.outcome is Finding.UNKNOWN else ""
+    return f"bound{changed}: {_side(bounds.other)}; was {_side(bounds.base)}{unsure}"
+
+
+def _side(bounds: Sequence[Mapping[str, Any] | None]) -> str:
+    """Return the bound of one run with its shares; of several runs, how many each unit bounded."""
+    if len(bounds) == 1:
+        return bound_text(bounds[0]) if bounds[0] else "not known"
+    names = Counter(bound["unit"]["name"] if bound else "not known" for bound in bounds)
+    return ", ".join(f"{name} in {count} of {len(bounds)} runs" for name, count in names.most_common())
+
+
+def setting(value: Any) -> str:
+    """Return the value of a setting; a dash where the key is missing."""
+    return DASH if value is None else str(value)

@@ -1,0 +1,330 @@
+"""How much a statistic differs between runs, and how sure that is. Rule: what is not known widens the interval.
+
+Two things make runs of one kind differ by chance. Frames scatter and drift within a run; a jackknife over stretches of
+frames measures that (Künsch, Annals of Statistics 17 (1989)). Each run also meets another machine: several runs a side
+show it, and the deviations in `rows.py` count as so many more runs. A normal prior's conjugate joins both, so Student's
+t applies (Gelman et al., Bayesian Data Analysis, section 3.2; Smyth, Statistical Applications in Genetics and Molecular
+Biology 3 (2004)). A change that has a known cause is no chance: up to that much counts as nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import lru_cache
+from itertools import pairwise
+from math import atan, ceil, cos, erfc, expm1, inf, log, log1p, pi, sin, sqrt
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from trilane.arrays import F64, I64, Ints
+
+LEAST_FRAMES: Final = 50
+MOST_FRAMES: Final = 20_000
+#: Stretches of a run's frames; the jackknife leaves out one at a time.
+STRETCHES: Final = 16
+#: Runs show the same frames if at least this share of each run's frames is in the other runs too.
+ALIKE: Final = 0.8
+NEGLIGIBLE: Final = 1e-9
+#: The least change that matters: as a share of the base, or, for shares of the time, as a share of the time.
+MATTERS: Final = 0.05
+CONFIDENCE: Final = 0.95
+Reduce = Callable[[F64, F64], float]
+ALPHA = 0.01
+
+
+class Finding(StrEnum):
+    """What holds for a figure. SAME: its change is surely below `MATTERS`. UNKNOWN: it may be more, or nothing."""
+
+    DIFFERS = "differs"
+    SAME = "no difference"
+    UNKNOWN = "cannot tell"
+
+
+@dataclass(frozen=True)
+class Series:
+    """One figure of every frame of a run, in order.
+
+    `frames`: numbers of the frames, (n,). `values`: the figure of each, (n,) float64. `weights`: for a share its whole,
+    (n,), in the unit of `values`; else ones.
+    """
+
+    frames: I64
+    values: F64
+    weights: F64
+
+    def at(self, places: Ints | slice) -> Series:
+        """Return the frames at `places`."""
+        return Series(self.frames[places], self.values[places], self.weights[places])
+
+
+class Chance(NamedTuple):
+    """How much a figure differs between runs of one kind beyond what their frames show; nothing in virtual time.
+
+    `relative`, `absolute`: standard deviations of one run's figure, as a share of it and in its unit. `freedom`: number
+    of runs that this knowledge is worth. `explained`: part of a change that has another cause, as a logarithm of the
+    ratio, or in the figure's unit where the change is no ratio.
+    """
+
+    relative: float = 0.0
+    absolute: float = 0.0
+    freedom: int = STRETCHES - 1
+    explained: float = 0.0
+
+
+class Difference(NamedTuple):
+    """How far a statistic has changed.
+
+    `base`, `other`: value of each side, over all frames of its run; the arithmetic mean of several runs. `change`:
+    change from base to other, with its 95 % interval from `low` to `high`, as a share of the base where `is_ratio`,
+    else in the statistic's unit. It is taken over the frames that all runs have, and of several runs a side between
+    their geometric means, so it need not be the ratio of the values. `probability`: chance of a change as large as this
+    between runs of one kind. `low`, `high` and `probability` are None where nobody can tell. `deviation`: standard
+    deviation of the change, or of its logarithm where `is_ratio`. `freedom`: degrees of freedom of the deviation.
+    `explained`: as in `Chance`.
+    """
+
+    base: float
+    other: float
+    change: float
+    low: float | None
+    high: float | None
+    probability: float | None
+    is_ratio: bool
+    deviation: float | None = None
+    freedom: float = inf
+    explained: float = 0.0
+
+    @property
+    def effect(self) -> float:
+        """The change on the scale of the deviations: the logarithm of the ratio where `is_ratio`, else the change."""
+        return log1p(self.change) if self.is_ratio else self.change
+
+    def outcome(self, *, differs: bool, margin: float = MATTERS) -> Finding:
+        """Return what holds for this difference.
+
+        `differs`: whether the test of all figures together calls it different. `margin`: the least change that matters,
+        in the unit of `change`.
+        """
+        if differs:
+            return Finding.DIFFERS
+        if self.low is None or self.high is None or max(-self.low, self.high) > margin:
+            return Finding.UNKNOWN
+        return Finding.SAME
+
+
+def _mean(values: F64, weights: F64) -> float:
+    return float(values.sum() / weights.sum())
+
+
+def _typical(values: F64, _: F64) -> float:
+    """Return the mean of the middle half."""
+    count = len(values)
+    return float(np.sort(values)[count // 4 : count - count // 4].mean())
+
+
+def _quantile(share: float) -> Reduce:
+    """Return a quantile that is linear between ranks, as in the report."""
+    return lambda values, _: float(np.quantile(values, share))
+
+
+#: Statistic -> how it is computed. `typical` is the mean of the middle half of the values.
+STATISTICS: Final[dict[str, Reduce]] = {
+    "mean": _mean,
+    "share": _mean,
+    "typical": _typical,
+    "p50": _quantile(0.5),
+    "p90": _quantile(0.9),
+    "p99": _quantile(0.99),
+}
+
+
+def difference(
+    base: Sequence[Series], other: Sequence[Series], statistic: str, *, is_ratio: bool, chance: Chance
+) -> Difference:
+    """Return the change of `statistic` from the runs `base` to the runs `other`, over each one's last `MOST_FRAMES`.
+
+    `is_ratio`: whether the change is a share of the base; where a value is zero it is not. Frames that all runs have
+    are compared frame with frame, so the different work in the scene's frames does not count as scatter.
+    """
+    reduce = STATISTICS[statistic]
+    sides = [[each.at(slice(-MOST_FRAMES, None)) for each in side] for side in (base, other)]
+    values = [[_value(each, reduce) for each in side] for side in sides]
+    runs = [each for side in sides for each in side]
+    common = _common(runs)
+    if common is not None:
+        sides = [[each.at(np.isin(each.frames, common).nonzero()[0]) for each in side] for side in sides]
+        runs = [each for side in sides for each in side]
+    is_ratio = is_ratio and all(len(each.values) > 0 and float(each.values.min()) > 0 for each in runs)
+    if min(len(each.values) for each in runs) < _least_frames(statistic):
+        return unsure(*map(_average, values), is_ratio=is_ratio)
+    scaled = [np.array([_left_out(each, reduce, is_ratio) for each in side]) for side in sides]
+    if common is not None:
+        within = _jackknife(scaled[1].mean(axis=0)[1:] - scaled[0].mean(axis=0)[1:])
+    else:
+        within = sum(_jackknife(row[1:]) / len(side) ** 2 for side in scaled for row in side)
+    effects = [side[:, 0] for side in scaled]
+    return settled(values, effects, within, chance, is_ratio=is_ratio)
+
+
+def settled(
+    values: Sequence[Sequence[float]], effects: Sequence[F64], within: float, chance: Chance, *, is_ratio: bool
+) -> Difference:
+    """Return the difference of two sides.
+
+    `values`: figures of each side's runs. `effects`: the same on the scale of the deviations. `within`: variance of the
+    change by what scatters within the runs.
+    """
+    first, second = (float(side.mean()) for side in effects)
+    scale = 1.0 if is_ratio else max(abs(first), abs(second))
+    share = sum(1 / len(side) for side in effects)
+    known = share * ((chance.relative * scale) ** 2 + chance.absolute**2) + within
+    seen = share * sum(float(((side - side.mean()) ** 2).sum()) for side in effects)
+    freedom = chance.freedom + sum(len(side) - 1 for side in effects)
+    deviation = sqrt((chance.freedom * known + seen) / freedom)
+    return _told(tuple(map(_average, values)), second - first, deviation, freedom, chance.explained, is_ratio=is_ratio)
+
+
+def combined(pairs: Sequence[Difference]) -> Difference:
+    """Return one difference for several pairs, which may scatter by more than each one's interval says.
+
+    `base` and `other` are the arithmetic means of the values. The change is the mean of the effects, so for ratios the
+    geometric mean. Its deviation is that of the mean of independent pairs, or, where the pairs scatter more (Birge's
+    ratio above 1), that of their scatter. Where some pairs are ratios and others are not, nobody knows how sure the
+    change of the means is. `pairs`: at least one.
+    """
+    base, other = (sum(getattr(pair, side) for pair in pairs) / len(pairs) for side in ("base", "other"))
+    is_ratio = all(pair.is_ratio for pair in pairs)
+    if any(pair.is_ratio != is_ratio for pair in pairs):
+        return unsure(base, other, is_ratio=False)
+    effects = np.array([pair.effect for pair in pairs])
+    mean = float(effects.mean())
+    deviations = [pair.deviation for pair in pairs if pair.deviation is not None]
+    if len(deviations) < len(pairs):
+        return _told((base, other), mean, None, is_ratio=is_ratio)
+    within = sqrt(sum(value**2 for value in deviations)) / len(pairs)
+    between = float(effects.std(ddof=1)) / sqrt(len(pairs)) if len(pairs) > 1 else 0.0
+    freedom = min(pair.freedom for pair in pairs) + len(pairs) - 1
+    explained = sum(pair.explained for pair in pairs) / len(pairs)
+    return _told((base, other), mean, max(within, between), freedom, explained, is_ratio=is_ratio)
+
+
+def unsure(base: float, other: float, *, is_ratio: bool) -> Difference:
+    """Return a difference whose uncertainty is unknown."""
+    is_ratio = is_ratio and min(base, other) > 0
+    return _told((base, other), log(other / base) if is_ratio else other - base, None, is_ratio=is_ratio)
+
+
+def judged(base: float, other: float, deviation: float, *, is_ratio: bool) -> Difference:
+    """Return a difference with a known deviation; where `is_ratio`, that of the logarithm, and values are above 0."""
+    return _told((base, other), log(other / base) if is_ratio else other - base, deviation, is_ratio=is_ratio)
+
+
+def _told(
+    values: tuple[float, ...],
+    effect: float,
+    deviation: float | None,
+    freedom: float = inf,
+    explained: float = 0.0,
+    *,
+    is_ratio: bool,
+) -> Difference:
+    """Return the difference with this `effect` and deviation; None stands for a deviation that is unknown."""
+    base, other = values
+    if deviation is None:
+        return Difference(base, other, _change(effect, is_ratio), None, None, None, is_ratio)
+    reach = student_quantile(freedom) * deviation + explained
+    change, low, high = (_change(effect + sign * reach, is_ratio) for sign in (0, -1, 1))
+    left = max(abs(effect) - explained, 0.0)
+    probability = 1.0 if left < NEGLIGIBLE else student_tails(left / deviation if deviation else inf, freedom)
+    return Difference(base, other, change, low, high, probability, is_ratio, deviation, freedom, explained)
+
+
+def _change(effect: float, is_ratio: bool) -> float:
+    return expm1(effect) if is_ratio else effect
+
+
+def _least_frames(statistic: str) -> int:
+    """Return the frames that a statistic needs.
+
+    For a percentile each stretch has, in the mean, a frame beyond it: without one the jackknife sees no scatter.
+    """
+    share = int(statistic[1:]) / 100 if statistic in ("p50", "p90", "p99") else 0.5
+    return max(LEAST_FRAMES, ceil(STRETCHES / (1 - share)))
+
+
+def _average(values: Sequence[float]) -> float:
+    return sum(values) / len(values)
+
+
+def _value(series: Series, reduce: Reduce) -> float:
+    return reduce(series.values, series.weights) if len(series.values) else 0.0
+
+
+def _common(runs: Sequence[Series]) -> I64 | None:
+    """Return the frames that all `runs` have; None where they are less than the share `ALIKE` of a run's frames."""
+    common = runs[0].frames
+    for each in runs[1:]:
+        common = np.intersect1d(common, each.frames)
+    return common if len(common) >= ALIKE * max(len(each.frames) for each in runs) else None
+
+
+def _left_out(series: Series, reduce: Reduce, is_ratio: bool) -> F64:
+    """Return the statistic of all frames, then without each stretch, (1 + `STRETCHES`,); for a ratio its logarithm."""
+    edges = np.linspace(0, len(series.values), STRETCHES + 1).astype(int)
+    places = np.arange(len(series.values))
+    kept = [places, *(np.delete(places, slice(low, high)) for low, high in pairwise(edges))]
+    values = np.array([reduce(series.values[these], series.weights[these]) for these in kept])
+    return np.log(values) if is_ratio else values
+
+
+def _jackknife(values: F64) -> float:
+    """Return the variance of a statistic, from its `values` without each stretch."""
+    return float((len(values) - 1) / len(values) * ((values - values.mean()) ** 2).sum())
+
+
+@lru_cache(maxsize=4096)
+def student_tails(t: float, freedom: float) -> float:
+    """Return the probability that Student's t is beyond ±`t`.
+
+    `freedom`: degrees of freedom, a whole number or inf.
+    Abramowitz and Stegun, Handbook of Mathematical Functions, 26.7.3 and 26.7.4.
+    """
+    if freedom == inf or t == inf:
+        return erfc(t / sqrt(2))
+    angle, odd = atan(t / sqrt(freedom)), int(freedom) % 2
+    term = cos(angle) if odd else 1.0
+    total = term if freedom > 1 else 0.0
+    for count in range(2 + odd, int(freedom) - 1, 2):
+        term *= cos(angle) ** 2 * (count - 1) / count
+        total += term
+    inside = 2 / pi * (angle + sin(angle) * total) if odd else sin(angle) * total
+    return max(1 - inside, 0.0)
+
+
+@lru_cache(maxsize=256)
+def student_quantile(freedom: float) -> float:
+    """Return what Student's t exceeds, above or below, with probability 1 - `CONFIDENCE`; found by bisection."""
+    low, high = 0.0, 1e3
+    for _ in range(80):
+        middle = (low + high) / 2
+        low, high = (middle, high) if student_tails(middle, freedom) > 1 - CONFIDENCE else (low, middle)
+    return low
+
+
+def rejected(probabilities: Sequence[float], alpha: float = ALPHA) -> list[bool]:
+    """Return which of the hypotheses "no difference" fall.
+
+    `probabilities`: for each hypothesis the probability of what was seen under it. The chance that any of them falls
+    wrongly is at most `alpha`, also where they depend on each other: Holm, "A simple sequentially rejective multiple
+    test procedure", Scandinavian Journal of Statistics 6 (1979).
+    """
+    order = sorted(range(len(probabilities)), key=probabilities.__getitem__)
+    fallen = [False] * len(probabilities)
+    for rank, place in enumerate(order):
+        if probabilities[place] > alpha / (len(order) - rank):
+            break
+        fallen[place] = True
+    return fallen

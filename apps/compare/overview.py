@@ -1,0 +1,404 @@
+"""Many runs, predictions and trials as one table: what was asked, speed, error, and where each comes from.
+
+Rule: a figure is taken from a document as it stands there; nothing is measured or guessed, and no speed stands without
+its error or the word that there is none. Page, CSV and Parquet have the same columns and numbers. Each file is opened
+with its size checked; one that cannot be read is refused by name before anything is written.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import re
+import shlex
+from collections import Counter
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+from trilane.apps.report import MAX_REPORT_BYTES
+from trilane.apps.sweep.store import TRIALS, read_trials
+from trilane.errors import BadInputError, MissingPartError
+from trilane.figure_sources import COMPUTED, MEASURED, NO_FIGURES
+from trilane.files import instead_of_file, require_file
+from trilane.scene.schema import Scene
+from trilane.writing import write_atomically
+
+HOST = "host"
+#: What an error belongs to, and what an interval of the frame time holds.
+OF_RUN, OF_AVATAR = "errors of the runs themselves", "errors of the avatars' validations"
+BY_SCATTER, BY_MODEL = "95 %, scatter of the run's frames", "80 %, of the model"
+#: Keys of a scene that say how it is drawn, not what; another bundle may be another network of the same person.
+HOW_DRAWN = (
+    *("size", "plan", "texture_filter", "error_budget_px", "error_budget_db", "most_side", "memory_mb"),
+    *("avatars[0].bundle", "avatars[0].name"),
+)
+#: Keys of a scene whose values stand without the key. Every avatar has the keys of the first.
+WITHOUT_KEY = ("name", "background", "output.width", "output.height", "camera.source", "avatars[0].motion")
+#: Keys of a document's `config` that are no settings, or that the row has under other names.
+NOT_SETTINGS = (
+    "avatar_dirs",
+    "shapes",
+    "changes",
+    "own_pixels",
+    "works",
+    "posed_vertices",
+    "pace_ns",
+    "units",
+    "cuts",
+    "record",
+)
+REPORT, VIDEO = "report.json", "video.mp4"
+EXPECTED = "a run folder, a sweep's folder, a prediction that was saved with --json, or a folder of these"
+MOST = 10_000
+FIGURES = (
+    *("frame_ms", "low_ms", "high_ms", "frames_per_s", "latency_ms"),
+    *("psnr_db", "worst_psnr_db", "p1_psnr_db", "on_frontier"),
+)
+SOURCES = ("speed_source", "interval", "error_source", "shows", "clock", "machine", "failure", "command")
+
+
+def read_entries(places: Sequence[Path]) -> list[Entry]:
+    """Read the entries of all `places`, in their order; entries of the same name get their folder's name in front.
+
+    In a folder of runs and sweeps, one that cannot be read becomes an entry with a `failure`.
+    Raises BadInputError for a place that cannot be read or has no entries.
+    """
+    entries: list[Entry] = []
+    for place in places:
+        before = len(entries)
+        for entry in _entries(place):
+            entries.append(entry)
+            if len(entries) > MOST:
+                raise BadInputError(place, f"more than {MOST} runs and trials", f"at most {MOST} for a page")
+        if len(entries) == before:
+            raise BadInputError(place, "no run and no trial", EXPECTED)
+    names = Counter(entry.name for entry in entries)
+    return [replace(each, name=f"{each.within}/{each.name}") if names[each.name] > 1 else each for each in entries]
+
+
+def _entries(place: Path) -> Iterator[Entry]:
+    within = place.absolute().parent.name
+    if place.is_file():
+        yield replace(entry_of(place.stem, _document(place)), within=within)
+    elif not place.is_dir():
+        raise BadInputError(place, instead_of_file(place), EXPECTED)
+    elif (place / REPORT).is_file():
+        yield replace(entry_of(place.name, _document(place / REPORT), place / VIDEO), within=within)
+    elif (place / TRIALS).is_file():
+        trials = [_trial(place, trial) for trial in read_trials(place).values()]
+        yield from (replace(trial, within=place.absolute().name) for trial in trials)
+    else:
+        for folder in sorted(path for path in place.iterdir() if path.is_dir() and path.suffix != ".partial"):
+            if (folder / REPORT).is_file() or (folder / TRIALS).is_file():
+                yield from _one_of_many(folder)
+
+
+def _one_of_many(folder: Path) -> list[Entry]:
+    try:
+        return list(_entries(folder))
+    except BadInputError as error:
+        damaged = entry_of(folder.name, {"failure": f"cannot be read: {error}"})
+        return [replace(damaged, within=folder.absolute().parent.name)]
+
+
+def _document(path: Path) -> Mapping[str, Any]:
+    size = require_file(path, EXPECTED)
+    if size > MAX_REPORT_BYTES:
+        raise BadInputError(path, f"{size} bytes", f"at most {MAX_REPORT_BYTES}")
+    try:
+        document = json.loads(path.read_text(encoding="utf-8", errors="replace"))
+    except (ValueError, RecursionError) as error:
+        raise BadInputError(path, str(error), EXPECTED) from None
+    if not isinstance(document, dict):
+        raise BadInputError(path, f"a {type(document).__name__}", EXPECTED)
+    return document
+
+
+def _trial(folder: Path, trial: Mapping[str, Any]) -> Entry:
+    result = trial.get("result")
+    document = dict(result) if isinstance(result, dict) else {}
+    document["made"] = {**_dict(document.get("made")), "command": trial.get("command")}
+    document.setdefault("clock", trial.get("clock", "host"))
+    document.setdefault("machine", trial.get("host"))
+    if trial.get("status") != "done":
+        error = trial.get("error")
+        ended = f"{trial.get('status')}, exit code {trial.get('exit_code')}"
+        document["failure"] = f"{ended}: {error}" if error else ended
+    video = _video(folder, trial.get("folder"))
+    return entry_of(str(trial.get("id")), document, video, _dict(trial.get("options")))
+
+
+def _dict(value: Any) -> dict[str, Any]:
+    return dict(value) if isinstance(value, dict) else {}
+
+
+def _video(folder: Path, name: Any) -> Path | None:
+    """Return the video of a trial's run folder, which has to lie inside the sweep's folder."""
+    if not isinstance(name, str):
+        return None
+    place = (folder / name).resolve()
+    return place / VIDEO if place.is_relative_to(folder.resolve()) else None
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One run, prediction or trial as a row.
+
+    `name`: name of its folder or trial. `clock`: host or virtual. `machine`: the machine in one line. `settings`:
+    settings by dotted key. `command`: words of the command; empty where none is known. `frame_ms`, `low_ms`, `high_ms`:
+    mean frame time and its interval, None where there is none. `psnr_db`: error, a mean over the frames.
+    `worst_psnr_db`, `p1_psnr_db`: worst frame and 1st percentile of a run's own frames. `error_source`: origin of the
+    error, or why there is none. `facts`: facts of the machine. `video`: video of a run. `failure`: why there are no
+    figures. `interval`: what the interval holds. `error_of`: `OF_RUN` and its reference, `OF_AVATAR`, or empty.
+    `shows`: what the pictures show. `within`: name of the folder that holds the run, or of its sweep.
+    """
+
+    name: str
+    clock: str
+    machine: str
+    settings: Mapping[str, str]
+    command: tuple[str, ...] = ()
+    frame_ms: float | None = None
+    low_ms: float | None = None
+    high_ms: float | None = None
+    frames_per_s: float | None = None
+    latency_ms: float | None = None
+    psnr_db: float | None = None
+    worst_psnr_db: float | None = None
+    p1_psnr_db: float | None = None
+    error_source: str = NO_FIGURES
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    video: Path | None = None
+    failure: str = ""
+    interval: str = ""
+    error_of: str = ""
+    shows: str = ""
+    within: str = ""
+
+    @property
+    def speed_source(self) -> str:
+        """Origin of the speed; empty without a speed."""
+        return "" if self.frame_ms is None else MEASURED if self.clock == HOST else COMPUTED
+
+    @property
+    def group(self) -> tuple[str, str, str, str]:
+        """The group of entries that are compared with each other: their times and errors mean the same."""
+        return self.clock, self.machine, self.shows, self.error_of
+
+
+def entry_of(
+    name: str, document: Mapping[str, Any], video: Path | None = None, options: Mapping[str, Any] | None = None
+) -> Entry:
+    """Return the row of a report.json, of a prediction, or of a failed trial, which has only a `failure`.
+
+    `options`: options of a trial, which are settings beside those of its document.
+    """
+    times, made = _mapping(document, "frame_time_ms"), _mapping(document, "made")
+    machine, config = _mapping(document, "machine"), _mapping(document, "config")
+    psnr_db, source, error_of = _error(document)
+    check = _mapping(document, "check")
+    low, high = _interval(times)
+    return Entry(
+        _text(name),
+        str(document.get("clock", HOST)),
+        _machine_line(machine),
+        dict(_settings(config)) | dict(_settings(options or {})),
+        tuple(map(_text, _sequence(made.get("command")))),
+        _time(times.get("mean")),
+        low,
+        high,
+        _time(document.get("fps")),
+        _time(_mapping(document, "latency_ms").get("mean")),
+        psnr_db,
+        _number(check.get("worst_psnr_db")),
+        _number(check.get("p1_psnr_db")),
+        error_source=_text(source),
+        facts=machine,
+        video=video if video is not None and video.is_file() else None,
+        failure=_text(document.get("failure") or ""),
+        interval="" if low is None else BY_SCATTER if "mean_low" in times else BY_MODEL,
+        error_of=error_of,
+        shows=_shows(_mapping(config, "scene")),
+    )
+
+
+def _interval(times: Mapping[str, Any]) -> tuple[float | None, float | None]:
+    """Return the interval of the mean from a run's own frames, else that of a model."""
+    names = ("mean_low", "mean_high") if "mean_low" in times else ("low", "high")
+    low, high = (_time(times.get(name)) for name in names)
+    return (None, None) if low is None or high is None else (low, high)
+
+
+def _shows(scene: Mapping[str, Any]) -> str:
+    """Return what the frames of `scene` show, in words; a smaller tensor or another network shows the same.
+
+    Whatever is unusual is named by its key, so two scenes with the same words show the same pictures.
+    """
+    output, camera = _mapping(scene, "output"), _mapping(scene, "camera")
+    bodies = [body for body in _sequence(scene.get("avatars")) if isinstance(body, Mapping)]
+    picture = f"{output.get('width')}x{output.get('height')}" if output else None
+    parts = [scene.get("name"), picture, camera.get("source"), *(body.get("motion") for body in bodies)]
+    return _text(", ".join(str(part) for part in [*parts, scene.get("background"), *_unusual(scene)] if part))
+
+
+def _unusual(scene: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the keys of `scene` with values that differ from the defaults, such as `frames 60`."""
+    usual = dict(_settings(Scene().model_dump(mode="json")))
+    for key, value in _settings(scene):
+        plain = re.sub(r"^avatars\[\d+\]", "avatars[0]", key)
+        if plain not in (*HOW_DRAWN, *WITHOUT_KEY) and usual.get(plain) != value:
+            yield f"{key} {value}"
+
+
+def _error(document: Mapping[str, Any]) -> tuple[float | None, str, str]:
+    """Return a PSNR, its origin and what it belongs to: the run itself if it was compared, else its worst avatar."""
+    check = _mapping(document, "check")
+    if (own := _number(check.get("psnr_db"))) is not None:
+        against = f"against {str(check.get('against')).partition(':')[0]}"
+        return own, f"{MEASURED}, {check.get('frames')} frames {against}", _text(f"{OF_RUN} {against}")
+    avatars = [facts for facts in _mapping(document, "accuracy").values() if isinstance(facts, Mapping)]
+    if not avatars:
+        return None, NO_FIGURES, ""
+    known = [(_number(facts.get("psnr_db")), str(facts.get("source", ""))) for facts in avatars]
+    if any(value is None for value, _ in known):
+        why = next((str(facts["why"]) for facts in avatars if facts.get("why")), "")
+        return None, f"{NO_FIGURES}: {why}" if why else NO_FIGURES, ""
+    least, source = min((value, source) for value, source in known if value is not None)
+    return least, source, OF_AVATAR
+
+
+def _settings(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the leaves of `config` by dotted key."""
+    for key, value in config.items():
+        if not prefix and key in NOT_SETTINGS:
+            continue
+        if isinstance(value, Mapping):
+            yield from _settings(value, f"{prefix}{key}.")
+        elif isinstance(value, list) and all(isinstance(each, Mapping) for each in value):
+            for number, each in enumerate(value):
+                yield from _settings(each, f"{prefix}{key}[{number}].")
+        elif value is not None:
+            yield _text(f"{prefix}{key}"), f"{value:g}" if isinstance(value, float) else _text(value)
+
+
+def _machine_line(machine: Mapping[str, Any]) -> str:
+    cpu, gl = _mapping(machine, "cpu"), _mapping(machine, "gl")
+    if cpu:
+        cores = len(_sequence(cpu.get("cores_allowed")))
+        return _text(f"{cpu.get('model')}, {cores} cores, {gl.get('renderer', 'no OpenGL')}")
+    return _text(machine.get("title") or machine.get("profile") or "a machine that is not named")
+
+
+def _mapping(document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    found = document.get(key)
+    return found if isinstance(found, Mapping) else {}
+
+
+def _sequence(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else []
+
+
+def _text(value: Any) -> str:
+    """Return `value` as text that any file can hold. A lone surrogate, as from a file name without UTF-8, is a `?`."""
+    return str(value).encode("utf-8", "replace").decode("utf-8")
+
+
+def _number(value: Any) -> float | None:
+    """Return a number; None for NaN, infinities, integers beyond a float, which JSON may hold, and anything else."""
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _time(value: Any) -> float | None:
+    """Return a number above 0, else None."""
+    number = _number(value)
+    return number if number is not None and number > 0 else None
+
+
+def varied(entries: list[Entry]) -> list[str]:
+    """Return the settings in which entries differ, in the order of their first appearance."""
+    keys = dict.fromkeys(key for entry in entries for key in entry.settings)
+    return [key for key in keys if len({entry.settings[key] for entry in entries if key in entry.settings}) > 1]
+
+
+class Scored(Protocol):
+    """What can be on a frontier. Less `frame_ms` and more `psnr_db` are better, within one `group`."""
+
+    @property
+    def frame_ms(self) -> float | None: ...
+    @property
+    def psnr_db(self) -> float | None: ...
+    @property
+    def group(self) -> Hashable: ...
+
+
+def frontier(entries: Sequence[Scored]) -> list[bool]:
+    """Return for each entry whether it is on the frontier of frame time against error: no other entry beats it.
+
+    An entry beats another if it is at least as quick and at least as near to the truth, and better in one of both.
+    Equal ones do not beat each other. One without a speed or an error is on no frontier.
+    """
+    on = [False] * len(entries)
+    for group in {entry.group for entry in entries}:
+        rows = [
+            (entry.frame_ms, -entry.psnr_db, number)
+            for number, entry in enumerate(entries)
+            if entry.group == group and entry.frame_ms is not None and entry.psnr_db is not None
+        ]
+        least = (float("inf"), float("inf"))  # the smallest error so far, and its frame time
+        for frame_ms, error, number in sorted(rows):
+            if error < least[0]:
+                least = error, frame_ms
+            on[number] = (error, frame_ms) == least
+    return on
+
+
+def columns(entries: Sequence[Entry]) -> list[str]:
+    """Return the table's columns: `name`, the settings that vary, `FIGURES`, `SOURCES`."""
+    return ["name", *varied(list(entries)), *FIGURES, *SOURCES]
+
+
+def table_rows(entries: Sequence[Entry]) -> list[dict[str, Any]]:
+    """Return a row for each entry; a cell without a value is None."""
+    settings = varied(list(entries))
+    return [
+        {
+            "name": entry.name,
+            **{key: entry.settings.get(key) for key in settings},
+            **{key: getattr(entry, key) for key in FIGURES[:-1]},
+            "on_frontier": on,
+            **{key: getattr(entry, key) for key in SOURCES[:-1]},
+            "command": shlex.join(entry.command),
+        }
+        for entry, on in zip(entries, frontier(entries), strict=True)
+    ]
+
+
+def write_csv(target: Path, entries: Sequence[Entry]) -> None:
+    """Write the table as CSV. Raises BadInputError where nothing can be written."""
+    with write_atomically(target) as draft, draft.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, columns(entries))
+        writer.writeheader()
+        writer.writerows(table_rows(entries))
+
+
+def write_parquet(target: Path, entries: Sequence[Entry]) -> None:
+    """Write the table as Parquet.
+
+    Raises MissingPartError without pyarrow, BadInputError where nothing can be written.
+    """
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError as error:
+        raise MissingPartError(f"a table as Parquet needs {error.name or 'pyarrow'}", extra="table") from None
+    with write_atomically(target) as draft:
+        parquet.write_table(pyarrow.Table.from_pylist(table_rows(entries)), draft)

@@ -1,0 +1,289 @@
+"""The overview as one HTML file that asks nothing of any other place: a drawing, the table, and stills of the videos.
+
+Rule: all text is escaped; the one script is of this folder and named by its digest in the page's policy. A video that
+cannot be read gives no still. The drawing shows numbers of the table, and never tells two things apart by colour alone.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import av
+
+from trilane.apps.compare.overview import Entry, columns, frontier, table_rows
+
+UNITS = {"frame_ms": "frame, ms", "low_ms": "from, ms", "high_ms": "to, ms", "latency_ms": "latency, ms"}
+UNITS |= {"psnr_db": "PSNR, dB", "worst_psnr_db": "worst frame, dB", "p1_psnr_db": "1st percentile, dB"}
+UNITS |= {"frames_per_s": "frames/s", "on_frontier": "frontier"}
+NO_ERROR = "No entry has both a speed and a known error. `trilane run --check N` measures the error of a run."
+LONG = 40  # letters of a cell that is given room
+MEANING = (
+    "Frame time is the mean between presented frames, from and to its interval: of a run 95 %, by the scatter of its "
+    "own frames; of a prediction 80 %, by the model. PSNR is the error of the picture, larger is better, a mean "
+    "over frames, beside the worst one and the 1st percentile, which tell what the mean hides. The frontier "
+    "holds what nobody beats in both on the same clock and machine, with the same scene and the same kind of error. An "
+    "entry without a known error is in the table and on no frontier."
+)
+WIDTH, HEIGHT = 720, 400
+LEFT, RIGHT, TOP, BOTTOM = 64, 16, 16, 48
+TICKS = 5
+MOST_STILLS = 24
+STILL_QUALITY = 85
+STILL_WIDTH = 640
+
+
+def page(title: str, entries: Sequence[Entry]) -> str:
+    """Return a whole HTML document of at least one entry."""
+    script = (files("trilane.apps.compare") / "overview_page.js").read_text(encoding="utf-8")
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
+    style = (files("trilane.apps.compare") / "overview_page.css").read_text(encoding="utf-8")
+    body = "\n".join(_sections(title, entries))
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{escape(policy)}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{escape(title)}</title><style>{style}</style></head>\n"
+        f"<body><h1>{escape(title)}</h1>\n{body}\n<script>{script}</script></body></html>\n"
+    )
+
+
+def _sections(title: str, entries: Sequence[Entry]) -> Iterator[str]:
+    yield f'<p class="note">{escape(MEANING)}</p>'
+    yield f"<h2>Frame time against error</h2>{_drawing(entries)}"
+    yield f"<h2>All {len(entries)} entries</h2>{_table(title, entries)}"
+    yield from _stills(entries)
+    yield f"<h2>Machines</h2>{_machines(entries)}"
+
+
+def _drawing(entries: Sequence[Entry]) -> str:
+    drawable = [entry for entry in entries if entry.frame_ms is not None and entry.psnr_db is not None]
+    groups = list(dict.fromkeys(entry.group for entry in drawable))
+    dots = [
+        Dot(entry.name, entry.frame_ms, entry.low_ms, entry.high_ms, entry.psnr_db, on, groups.index(entry.group))
+        for entry, on in zip(entries, frontier(entries), strict=True)
+        if entry.frame_ms is not None and entry.psnr_db is not None
+    ]
+    left_out = len(entries) - len(dots)
+    note = f"{left_out} of {len(entries)} have no speed or no known error and are not drawn. " if left_out else ""
+    words = "Filled: on the frontier. A marker's shape is what it is compared with: "
+    legend = "; ".join(f"{marker_name(number)}: {_told(group)}" for number, group in enumerate(groups))
+    drawn = scatter(dots, "frame time, ms", "PSNR, dB")
+    if not drawn:
+        return f"<p>{escape(NO_ERROR)}</p>"
+    return f'<div class="wide">{drawn}</div><p class="note">{escape(note + words + legend)}.</p>'
+
+
+def _told(group: tuple[str, ...]) -> str:
+    clock, *rest = group
+    return ", ".join(filter(None, [f"{clock} clock", *rest]))
+
+
+def _table(title: str, entries: Sequence[Entry]) -> str:
+    names = columns(entries)
+    head = "".join(
+        f'<th scope="col"><button type="button">{escape(UNITS.get(name, name))}</button></th>' for name in names
+    )
+    rows = "\n".join(
+        f"<tr{' class=on' if row['on_frontier'] else ''}>{''.join(_cell(name, row[name]) for name in names)}</tr>"
+        for row in table_rows(entries)
+    )
+    return (
+        '<p><label>Filter <input id="filter" type="search" placeholder="words, all of which a row has"></label> '
+        '<label><input id="only" type="checkbox"> frontier only</label> <span id="count" role="status"></span></p>'
+        f'<div class="wide"><table class="entries"><caption>{escape(title)}; click a heading to sort</caption>'
+        f"<thead><tr>{head}</tr></thead><tbody>\n{rows}\n</tbody></table></div>"
+    )
+
+
+def _cell(name: str, value: Any) -> str:
+    if isinstance(value, bool):
+        return f"<td>{'yes' if value else ''}</td>"
+    if isinstance(value, float):
+        return f'<td class="number" data-value="{value!r}">{value:.2f}</td>'
+    text = "" if value is None else escape(str(value))
+    if name == "command":
+        return f'<td class="long"><code>{text}</code></td>'
+    return f'<td class="long">{text}</td>' if len(text) > LONG else f"<td>{text}</td>"
+
+
+def _stills(entries: Sequence[Entry]) -> Iterator[str]:
+    """Yield the pictures, and two of them over each other."""
+    filmed = [entry for entry in entries if entry.video is not None]
+    pictures = [(entry, still(entry.video)) for entry in filmed[:MOST_STILLS] if entry.video is not None]
+    found = [(entry, base64.b64encode(data).decode()) for entry, data in pictures if data is not None]
+    if not found:
+        return
+    yield "<h2>Pictures</h2>"
+    if len(found) > 1:
+        yield _pair([entry.name for entry, _ in found])
+    figures = "".join(
+        f'<figure class="still"><img src="data:image/jpeg;base64,{data}" alt="middle frame of {escape(entry.name)}">'
+        f"<figcaption>{escape(entry.name)}: {escape(_caption(entry))}</figcaption></figure>"
+        for entry, data in found
+    )
+    yield f'<div class="stills">{figures}</div>'
+    if len(filmed) > MOST_STILLS:
+        yield f'<p class="note">The first {MOST_STILLS} of {len(filmed)} videos.</p>'
+
+
+def _pair(names: Sequence[str]) -> str:
+    options = [f'<option value="{n}">{escape(name)}</option>' for n, name in enumerate(names)]
+    second = [option.replace(" value", " selected value", 1) if n == 1 else option for n, option in enumerate(options)]
+    return (
+        f'<p><label>Left <select class="picture">{"".join(options)}</select></label> '
+        f'<label>Right <select class="picture">{"".join(second)}</select></label></p>'
+        '<div class="pair"><img alt=""><img alt=""></div>'
+        '<label>Divide <input id="divide" type="range" min="0" max="100" value="50"></label>'
+    )
+
+
+def _caption(entry: Entry) -> str:
+    speed = "no speed" if entry.frame_ms is None else f"{entry.frame_ms:.1f} ms a frame, {entry.speed_source}"
+    error = entry.error_source if entry.psnr_db is None else f"{entry.psnr_db:.1f} dB, {entry.error_source}"
+    return f"{speed}; {error}"
+
+
+def _machines(entries: Sequence[Entry]) -> str:
+    facts = {entry.machine: entry.facts for entry in entries}
+    parts: Iterable[str] = (
+        f"<details><summary>{escape(name)}</summary>{_facts(machine)}</details>" for name, machine in facts.items()
+    )
+    return "".join(parts)
+
+
+def _facts(machine: Any) -> str:
+    rows = "".join(f"<tr><th>{escape(key)}</th><td>{escape(str(value))}</td></tr>" for key, value in machine.items())
+    return f'<div class="wide"><table>{rows}</table></div>'
+
+
+class Dot(NamedTuple):
+    """A dot at `x` and `y`.
+
+    `low`, `high`: interval of `x`. `on`: whether it is on the frontier. `group`: number of its marker.
+    """
+
+    label: str
+    x: float
+    low: float | None
+    high: float | None
+    y: float
+    on: bool
+    group: int
+
+
+#: Name -> marker. Groups beyond the last marker begin again at the first.
+MARKERS = {
+    "circle": '<circle class="g0" cx="{x}" cy="{y}" r="5"/>',
+    "square": '<rect class="g1" x="{x0}" y="{y0}" width="9" height="9"/>',
+    "triangle": '<path class="g2" d="M{x} {y0} l6 10 h-12 z"/>',
+    "diamond": '<path class="g3" d="M{x} {y0} l5 5 l-5 5 l-5 -5 z"/>',
+    "triangle on its tip": '<path class="g4" d="M{x} {y0} m-6 0 h12 l-6 10 z"/>',
+    "hexagon": '<path class="g5" d="M{x} {y0} m-3 0 h6 l3 5 l-3 5 h-6 l-3 -5 z"/>',
+    "plus": '<path class="g6" d="M{x} {y0} m-2 0 h4 v3 h3 v4 h-3 v3 h-4 v-3 h-3 v-4 h3 z"/>',
+    "bar": '<path class="g7" d="M{x} {y0} m-2 0 h4 v10 h-4 z"/>',
+}
+
+
+def marker_name(group: int) -> str:
+    return list(MARKERS)[group % len(MARKERS)]
+
+
+def scatter(dots: Sequence[Dot], x_title: str, y_title: str) -> str:
+    """Return an SVG drawing of the dots, with intervals as lines and frontiers as steps; empty without dots."""
+    if not dots:
+        return ""
+    xs = [value for dot in dots for value in (dot.x, dot.low, dot.high) if value is not None]
+    across, up = _Axis(min(xs), max(xs), LEFT, WIDTH - RIGHT), _Axis(*_reach(dots), HEIGHT - BOTTOM, TOP)
+    parts = [*_grid(across, up), *_steps(dots, across, up), *(_dot(dot, across, up) for dot in dots)]
+    turned = f"translate(14 {(TOP + HEIGHT - BOTTOM) / 2}) rotate(-90)"
+    titles = (
+        f'<text class="title" x="{(LEFT + WIDTH - RIGHT) / 2}" y="{HEIGHT - 8}">{escape(x_title)}</text>'
+        f'<text class="title" transform="{turned}">{escape(y_title)}</text>'
+    )
+    return (
+        f'<svg class="scatter" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" '
+        f'aria-label="{escape(y_title)} against {escape(x_title)}">{"".join(parts)}{titles}</svg>'
+    )
+
+
+class _Axis:
+    """An axis from values to pixels, with a margin of a twentieth and ticks at round numbers."""
+
+    def __init__(self, low: float, high: float, first: float, last: float) -> None:
+        margin = (high - low) / 20 or max(abs(high) / 20, 0.5)
+        self._low, self._high = low - margin, high + margin
+        self._first, self._last = first, last
+
+    def place(self, value: float) -> float:
+        share = (value - self._low) / (self._high - self._low)
+        return round(self._first + share * (self._last - self._first), 1)
+
+    def ticks(self) -> list[float]:
+        step = 10.0 ** math.floor(math.log10((self._high - self._low) / TICKS))
+        step *= next(factor for factor in (1, 2, 5, 10) if (self._high - self._low) / (factor * step) <= TICKS)
+        first = math.ceil(self._low / step)
+        return [number * step for number in range(first, math.floor(self._high / step) + 1)]
+
+
+def _reach(dots: Sequence[Dot]) -> tuple[float, float]:
+    return min(dot.y for dot in dots), max(dot.y for dot in dots)
+
+
+def _grid(across: _Axis, up: _Axis) -> Iterator[str]:
+    for value in across.ticks():
+        x = across.place(value)
+        yield f'<line class="grid" x1="{x}" x2="{x}" y1="{TOP}" y2="{HEIGHT - BOTTOM}"/>'
+        yield f'<text class="tick" x="{x}" y="{HEIGHT - BOTTOM + 18}">{value:g}</text>'
+    for value in up.ticks():
+        y = up.place(value)
+        yield f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y}" y2="{y}"/>'
+        yield f'<text class="tick left" x="{LEFT - 8}" y="{y + 4}">{value:g}</text>'
+
+
+def _steps(dots: Sequence[Dot], across: _Axis, up: _Axis) -> Iterator[str]:
+    """Yield the frontier of each group as steps: the best error at each frame time."""
+    for group in sorted({dot.group for dot in dots}):
+        edge = sorted((dot.x, dot.y) for dot in dots if dot.on and dot.group == group)
+        if len(edge) > 1:
+            path = f"M{across.place(edge[0][0])} {up.place(edge[0][1])}"
+            path += "".join(f" H{across.place(x)} V{up.place(y)}" for x, y in edge[1:])
+            yield f'<path class="frontier g{group % len(MARKERS)}" d="{path}"/>'
+
+
+def _dot(dot: Dot, across: _Axis, up: _Axis) -> str:
+    x, y = across.place(dot.x), up.place(dot.y)
+    interval = (
+        f'<line class="interval" x1="{across.place(dot.low)}" x2="{across.place(dot.high)}" y1="{y}" y2="{y}"/>'
+        if dot.low is not None and dot.high is not None
+        else ""
+    )
+    marker = MARKERS[marker_name(dot.group)].format(x=x, y=y, x0=x - 4.5, y0=y - 5)
+    title = f"<title>{escape(dot.label)}: {dot.x:.2f} ms, {dot.y:.2f} dB</title>"
+    return f'<g class="{"on" if dot.on else "off"}" tabindex="0">{title}{interval}{marker}</g>'
+
+
+def still(video: Path) -> bytes | None:
+    """Return the frame nearest before the middle of `video` as JPEG, at most `STILL_WIDTH` wide; None if unreadable."""
+    try:
+        with av.open(str(video)) as container:
+            stream = container.streams.video[0]
+            if stream.duration:
+                container.seek(stream.duration // 2, stream=stream)
+            frame = next(container.decode(stream))
+            image = frame.to_image()
+    except (av.error.FFmpegError, OSError, StopIteration, IndexError):
+        return None
+    if image.width > STILL_WIDTH:
+        image = image.resize((STILL_WIDTH, round(image.height * STILL_WIDTH / image.width)))
+    file = io.BytesIO()
+    image.save(file, "JPEG", quality=STILL_QUALITY)
+    return file.getvalue()

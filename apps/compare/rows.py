@@ -1,0 +1,390 @@
+"""The figures of two sides as rows, each with the chance that alters it. Rule: a table names each measure's statistics.
+
+Of runs with a journal every figure comes from their frames. A report alone or a prediction has summaries; each is as
+uncertain as the mean frame time, because nothing else is known.
+
+`Noise` says how much a figure differs between runs of one kind beyond what their frames show. Each number has its
+source beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from math import inf, log, log1p
+from statistics import fmean
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from trilane.apps.compare.difference import (
+    MATTERS,
+    Chance,
+    Difference,
+    difference,
+    judged,
+    settled,
+    student_quantile,
+    unsure,
+)
+from trilane.apps.compare.run_frames import INSTRUCTION_TIME, INSTRUCTIONS, Key
+from trilane.apps.compare.sides import ComparedRun, RunKind, Side, changes
+
+Z_80: Final = 1.281552
+FRAME_TIME, LATENCY, WORK, SERVICE, WAIT, BUSY, IDLE = (
+    "frame time", "latency", "work", "service", "wait", "busy", "idle",
+)  # fmt: skip
+LOST, DROPPED, ERROR = "lost", "dropped", "error"
+MS, NS, SHARE, BYTES = "ms", "ns", "share", "bytes"
+#: Measure -> its statistics, for runs with a journal.
+MEASURES: Final = {
+    FRAME_TIME: ("mean", "p50", "p90", "p99"),
+    LATENCY: ("mean", "p50", "p90", "p99"),
+    INSTRUCTIONS: ("mean",),
+    INSTRUCTION_TIME: ("typical",),
+    WORK: ("typical", "p90", "p99"),
+    SERVICE: ("mean", "typical"),
+    WAIT: ("mean", "p90"),
+    BUSY: ("share",),
+    IDLE: ("share",),
+}
+UNITS: Final = {
+    **dict.fromkeys((FRAME_TIME, LATENCY, WORK, SERVICE, WAIT), MS),
+    **dict.fromkeys((BUSY, IDLE), SHARE),
+    INSTRUCTIONS: "",
+    INSTRUCTION_TIME: NS,
+}
+#: Statistics of a summary whose uncertainty is about that of a mean.
+LIKE_THE_MEAN: Final = ("mean", "p50")
+_HOST: Final = "host"
+#: Standard deviations of one run's figure, of its logarithm or of a share of the time, and how many runs these numbers
+#: are worth (docs/decisions/comparing-runs.md has the measurements): of a stage's typical time on its core, of other
+#: times on the clock, of shares, and of counted instructions.
+WORK_DEVIATION, WALL_DEVIATION, SHARE_DEVIATION, COUNT_DEVIATION = 0.042, 0.03, 0.015, 0.001
+FREEDOM = 5
+#: Standard deviation of the logarithm of a held stage's time, assumed: a sleep may end a little late.
+HELD_DEVIATION = 0.002
+#: How much a larger share of the cores for other programs explains, per share of the cores: of a stage's time on its
+#: core, and of a share of the time.
+WORK_BESIDE_OTHERS, SHARE_BESIDE_OTHERS = 0.3, 0.5
+#: The least share of the cores that is left to a run.
+LEAST_LEFT = 0.01
+#: How many times as much a percentile differs as the mean, because rare events make it.
+TAILS: Final = {"p90": 1.5, "p99": 4.0}
+WAIT_FLOOR_MS: Final = 0.05  # deviation of any wait: a message takes so long more or less
+#: Share of the cores for other programs above which a person is told.
+BUSY_MACHINE = 0.05
+#: Settings that leave the speed of a core as it is.
+SAME_CORES: Final = ("policy", "edge", "made.", "config.pace_ns", "config.scene", "idle_cores")
+Documents = Sequence[Mapping[str, Any]]
+
+
+class Figure(NamedTuple):
+    """The subject of a row.
+
+    `measure`: what is measured. `of`: stage, unit or avatar, or empty. `cause`: cause of idle time, or empty.
+    `statistic`: as in `MEASURES`. `unit`: unit of the value, such as ms or share.
+    """
+
+    measure: str
+    of: str
+    cause: str
+    statistic: str
+    unit: str
+
+
+Rows = dict[Figure, Difference]
+
+
+def rows_of(base: Side, other: Side) -> Rows:
+    """Return every figure that all runs of both sides have."""
+    noise = _noise(base, other)
+    is_known = all(told.frames is not None for told in (*base.runs, *other.runs))
+    rows = dict(_of_frames(base, other, noise) if is_known else _of_summaries(base, other, noise))
+    rows.update(_of_counts(base, other, noise))
+    rows.update(_of_errors(base, other))
+    return rows
+
+
+def named(rows: Rows) -> list[Figure]:
+    """Return the figures that a verdict rests on; all others are there to explain them.
+
+    Counted instructions stand for a stage's program, and the time of one instruction for the machine. Without counts
+    its time on the core stands for the program, or its service time where nobody knows that.
+    """
+    counted, worked = ({figure.of for figure in rows if figure.measure == each} for each in (INSTRUCTION_TIME, WORK))
+
+    def is_named(figure: Figure) -> bool:
+        if figure.measure in (FRAME_TIME, LATENCY):
+            return figure.statistic == "mean"
+        if figure.measure == WORK:
+            return figure.statistic == "typical" and figure.of not in counted
+        if figure.measure == SERVICE:
+            return figure.statistic == "mean" and figure.of not in worked
+        return figure.measure not in (WAIT, BUSY, IDLE)
+
+    return [figure for figure in rows if is_named(figure)]
+
+
+def margin_of(figure: Figure, row: Difference) -> float:
+    """Return the least change that matters, in the unit of the row's `change`."""
+    if row.is_ratio or figure.unit == SHARE:
+        return MATTERS
+    return max(MATTERS * max(abs(row.base), abs(row.other)), WAIT_FLOOR_MS if figure.unit == MS else 0.0)
+
+
+def _noise(base: Side, other: Side) -> Noise:
+    effects = {}
+    for key in _shared(base, other):
+        if key.measure == WORK:
+            change = _difference(base, other, key, "typical", Chance())
+            if change.is_ratio:
+                effects[key.of] = change.effect
+    return noise_between([told.document for told in base.runs], [told.document for told in other.runs], effects)
+
+
+def _shared(base: Side, other: Side) -> list[Key]:
+    """Return the series that all runs have; none where a run has no frames."""
+    first, *rest = [told.frames.series if told.frames else {} for side in (base, other) for told in side.runs]
+    return [key for key in first if all(key in each for each in rest)]
+
+
+def _difference(base: Side, other: Side, key: Key, statistic: str, chance: Chance) -> Difference:
+    first, second = ([told.frames.series[key] for told in side.runs if told.frames] for side in (base, other))
+    is_ratio = statistic != SHARE and key.measure != WAIT
+    return difference(first, second, statistic, is_ratio=is_ratio, chance=chance)
+
+
+def _of_frames(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figure, Difference]]:
+    for key in _shared(base, other):
+        if key.measure == INSTRUCTION_TIME and key.of in noise.held:
+            continue  # the stage sleeps until its time is over, so the time says nothing of its instructions
+        for statistic in MEASURES.get(key.measure, ("mean",)):
+            change = _difference(base, other, key, statistic, _chance(key.measure, key.of, statistic, noise))
+            yield Figure(*key, statistic, UNITS.get(key.measure, BYTES)), change
+
+
+def _chance(measure: str, of: str, statistic: str, noise: Noise) -> Chance:
+    if measure in (BUSY, IDLE):
+        return noise.of_share()
+    if measure == WAIT:
+        return noise.of_wait(statistic)
+    if measure in (WORK, INSTRUCTION_TIME) or (measure == SERVICE and of in noise.held):
+        return noise.of_work(of, statistic)
+    if measure == INSTRUCTIONS:
+        return noise.of_count()
+    return noise.of_time(statistic) if measure in MEASURES else Chance()
+
+
+def _of_summaries(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figure, Difference]]:
+    """Yield the figures of reports or predictions, each as sure as the document's mean frame time."""
+    sides = [[_summaries(told.document) for told in side.runs] for side in (base, other)]
+    within = _relative_variance(base, other)
+    for figure in sides[0][0]:
+        if any(figure not in run for side in sides for run in side):
+            continue
+        values = [[run[figure] for run in side] for side in sides]
+        is_ratio = figure.unit == MS and figure.measure != WAIT
+        if within is None or figure.statistic not in (*LIKE_THE_MEAN, SHARE):
+            yield figure, unsure(fmean(values[0]), fmean(values[1]), is_ratio=is_ratio)
+            continue
+        is_ratio = is_ratio and min(map(min, values)) > 0
+        effects = [np.array([log(value) if is_ratio else value for value in side]) for side in values]
+        scale = 1.0 if is_ratio or figure.unit == SHARE else max(map(max, values))
+        chance = _chance(figure.measure, figure.of, figure.statistic, noise)
+        yield figure, settled(values, effects, within * scale**2, chance, is_ratio=is_ratio)
+
+
+def _relative_variance(base: Side, other: Side) -> float | None:
+    """Return the relative variance of the ratio of mean frame times, from the documents' own intervals.
+
+    None where a document has no interval. It is 0 for predictions of one chip, which share the model's error.
+    """
+    runs = [*base.runs, *other.runs]
+    if all(
+        told.kind == RunKind.PREDICTION and told.document["machine"] == runs[0].document["machine"] for told in runs
+    ):
+        return 0.0
+    found = [[_deviation_of(told) for told in side.runs] for side in (base, other)]
+    if any(value is None for side in found for value in side):
+        return None
+    return sum((value or 0.0) ** 2 / len(side) ** 2 for side in found for value in side)
+
+
+def _deviation_of(told: ComparedRun) -> float | None:
+    times = told.document["frame_time_ms"]
+    low, high, quantile = (
+        (times["low"], times["high"], Z_80)
+        if told.kind is RunKind.PREDICTION
+        else (times.get("mean_low"), times.get("mean_high"), student_quantile(inf))
+    )
+    if low is None or high is None or not times["mean"]:
+        return 0.0 if told.document["clock"] == "virtual" else None
+    return float((high - low) / (2 * quantile * times["mean"]))
+
+
+def _summaries(document: Mapping[str, Any]) -> dict[Figure, float]:
+    found: dict[Figure, float] = {}
+    for measure, times in ((FRAME_TIME, document["frame_time_ms"]), (LATENCY, document["latency_ms"])):
+        found.update(_statistics(measure, "", times, MEASURES[measure]))
+    for stage, row in document["stages"].items():
+        found.update(_statistics(SERVICE, stage, row.get("service_ms", {}), MEASURES[SERVICE]))
+        found.update(_statistics(WAIT, stage, row.get("wait_ms", {}), MEASURES[WAIT]))
+    for unit, row in document["units"].items():
+        found[Figure(BUSY, unit, "", SHARE, SHARE)] = row["busy"]
+        for cause, share in row["idle"].items():
+            if share is not None:
+                found[Figure(IDLE, unit, cause, SHARE, SHARE)] = share
+    return found
+
+
+def _statistics(measure: str, of: str, times: Mapping[str, Any], names: Sequence[str]) -> dict[Figure, float]:
+    return {Figure(measure, of, "", name, MS): float(times[name]) for name in names if name in times}
+
+
+def _of_counts(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figure, Difference]]:
+    """Yield the lost and dropped frames, as shares of those asked for."""
+    if any("frames" not in told.document for told in (*base.runs, *other.runs)):
+        return
+    sides = [[told.document["frames"] for told in side.runs] for side in (base, other)]
+    for measure, causes in ((LOST, "lost_by_cause"), (DROPPED, DROPPED)):
+        for cause in dict.fromkeys(cause for side in sides for frames in side for cause in frames.get(causes, {})):
+            counts = [[frames.get(causes, {}).get(cause, 0) for frames in side] for side in sides]
+            asked = [[frames["requested"] or 1 for frames in side] for side in sides]
+            values = [np.divide(*both) for both in zip(counts, asked, strict=True)]
+            pooled = sum(map(sum, counts)) / sum(map(sum, asked))
+            within = pooled * max(1 - pooled, 0.0) * sum(1 / sum(each) for each in asked)
+            row = settled([side.tolist() for side in values], values, within, noise.of_share(), is_ratio=False)
+            yield Figure(measure, cause, "", SHARE, SHARE), row
+
+
+def _of_errors(base: Side, other: Side) -> Iterator[tuple[Figure, Difference]]:
+    """Yield the avatars' figures of accuracy. They were measured once and do not scatter, so every change counts."""
+    first, second = (dict(_numbers("", side.runs[0].document.get("accuracy", {}))) for side in (base, other))
+    for name, value in first.items():
+        if name in second:
+            unit = "dB" if "psnr" in name else ""
+            yield Figure(ERROR, name, "", "", unit), judged(value, second[name], 0.0, is_ratio=False)
+
+
+def _numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            if key not in ("by_seed", "worst", "samples"):
+                yield from _numbers(f"{name} {key}".strip(), inner)
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield name, float(value)
+
+
+class Noise(NamedTuple):
+    """What makes runs of one kind differ, beside what their frames show.
+
+    Times on the host clock depend on what a process cannot see of itself. Its memory lies elsewhere, caches are warmer,
+    other programs use the cores, and other machines use what these cores share. (Mytkowicz et al., "Producing wrong
+    data without doing anything obviously wrong!", ASPLOS 2009; Kalibera & Jones, "Rigorous benchmarking in reasonable
+    time", ISMM 2013.) In virtual time there is no such thing. A held job is timed by the
+    clock alone. Counted instructions are the program's, whatever the machine does.
+
+    `is_real`: whether a run was on the host clock. `others`: what a larger share of the cores for other programs
+    explains of times on the clock, of a stage's time on its core, and of shares of the time. `slower`: per stage, what
+    its cores' own speed explains. `held`: stages whose jobs last as long as they were told to, in all runs.
+    """
+
+    is_real: bool
+    others: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    slower: Mapping[str, float] = {}
+    held: frozenset[str] = frozenset()
+
+    def of_time(self, statistic: str = "mean") -> Chance:
+        """Return the chance of times on the clock. The cores' own speed excuses none of it; only stages show that."""
+        return self._chance(TAILS.get(statistic, 1.0) * WALL_DEVIATION, explained=self.others[0])
+
+    def of_wait(self, statistic: str) -> Chance:
+        """Return the chance of a wait in ms, which may be almost 0; nobody knows what explains its growth."""
+        return self._chance(TAILS.get(statistic, 1.0) * (WALL_DEVIATION + self.others[0]), WAIT_FLOOR_MS)
+
+    def of_share(self) -> Chance:
+        """Return the chance of shares of the time."""
+        return self._chance(0.0, SHARE_DEVIATION, explained=self.others[2])
+
+    def of_work(self, stage: str, statistic: str) -> Chance:
+        """Return the chance of a stage's time on its core."""
+        tail = TAILS.get(statistic, 1.0)
+        if stage in self.held:
+            return self._chance(tail * HELD_DEVIATION)
+        return self._chance(tail * WORK_DEVIATION, explained=max(self.others[1], self.slower.get(stage, 0.0)))
+
+    def of_count(self) -> Chance:
+        """Return the chance of counted instructions."""
+        return self._chance(COUNT_DEVIATION)
+
+    def _chance(self, relative: float, absolute: float = 0.0, explained: float = 0.0) -> Chance:
+        return Chance(relative, absolute, FREEDOM, explained) if self.is_real else Chance()
+
+
+def noise_between(base: Documents, other: Documents, effects: Mapping[str, float]) -> Noise:
+    """Return the noise between the runs of two sides.
+
+    `base`, `other`: reports of their runs, as JSON. `effects`: per stage, the logarithm of the ratio of its typical
+    times on its core.
+    """
+    runs = [*base, *other]
+    if all(run["clock"] != _HOST for run in runs):
+        return Noise(is_real=False)
+    first, second = ([run.get("other_programs") or 0.0 for run in side] for side in (base, other))
+    more = abs(fmean(second) - fmean(first))
+    wall = abs(fmean(map(_left, second)) - fmean(map(_left, first)))
+    held = frozenset.intersection(*map(_held, runs))
+    free = {stage: ratio for stage, ratio in effects.items() if stage not in held}
+    slower = _slower_cores(base[0], other[0], free)
+    return Noise(True, (wall, WORK_BESIDE_OTHERS * more, SHARE_BESIDE_OTHERS * more), slower, held)
+
+
+def _left(others: float) -> float:
+    """Return the logarithm of the share of the cores that other programs left.
+
+    On full cores frames take longer by as much.
+    """
+    return log1p(-min(others, 1 - LEAST_LEFT))
+
+
+def _held(report: Mapping[str, Any]) -> frozenset[str]:
+    return frozenset(stage for stage, ns in report["config"].get("pace_ns", {}).items() if ns)
+
+
+def _slower_cores(base: Mapping[str, Any], other: Mapping[str, Any], effects: Mapping[str, float]) -> dict[str, float]:
+    """Return for each stage the least change, as a logarithm, of all stages on its cores if all went in one direction.
+
+    On one machine with one placement the cores' own speed explains that much: another machine beside this one, its
+    clock, its temperature. A single stage on its cores says nothing of them.
+    """
+    if any(not change.key.startswith(SAME_CORES) for change in changes(base, other)):
+        return {}
+    found = {}
+    for stages in _stages_by_cores(base):
+        ratios = [effects[stage] for stage in stages if stage in effects]
+        alike = len(ratios) > 1 and (min(ratios) > 0 or max(ratios) < 0)
+        found.update(dict.fromkeys(stages, min(map(abs, ratios)) if alike else 0.0))
+    return found
+
+
+def _stages_by_cores(report: Mapping[str, Any]) -> Iterable[list[str]]:
+    found: dict[tuple[int, ...], list[str]] = {}
+    for stage, row in report["stages"].items():
+        found.setdefault(tuple(report["units"][row["unit"]].get("cores", ())), []).append(stage)
+    return found.values()
+
+
+def remarks(reports: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return what a person should know of the machine. `reports`: reports by the names of their runs."""
+    said = []
+    for name, report in reports.items():
+        others = report.get("other_programs")
+        if report["clock"] == _HOST and others is None:
+            said.append(f"{name}: what other programs had of its cores is not known; they are taken to have had none")
+        elif others is not None and others > BUSY_MACHINE:
+            longer = 1 / max(1 - others, LEAST_LEFT) - 1
+            said.append(
+                f"{name}: other programs had {100 * others:.0f} % of its cores, by which frames may take up to "
+                f"{100 * longer:.0f} % longer; only what the other run did not have of that counts"
+            )
+    return said

@@ -1,0 +1,216 @@
+"""The frames of a run as series, from its journal. Rule: every figure here is a frame's, in the order of presentation.
+
+A frame's own time begins when the frame before it is presented and ends when the frame itself is. What units do in that
+time is the frame's share of them.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from trilane.apps.compare.difference import MOST_FRAMES, Series
+from trilane.arrays import F64, I64
+from trilane.errors import BadInputError
+from trilane.pipeline.journal import Begun, Counted, Ended, Record, Worked, read_journal
+from trilane.pipeline.timeline import Presented, Timeline
+from trilane.pipeline.unit_history import BUSY, IDLE_CAUSES, OVERHEAD, PREEMPTED, IdleSlice
+from trilane.scheduler.ledger import JobRecord
+
+NS_PER_MS = 1e6
+STATES = (BUSY, *IDLE_CAUSES)
+INSTRUCTIONS, INSTRUCTION_TIME = "instructions", "time of an instruction"
+#: Figures of jobs that stages report or the processor counts -> their measures here.
+REPORTED = {f"bytes_{name}": f"bytes {name.replace('_', ' ')}" for name in ("read", "written", "uploaded", "read_back")}
+REPORTED["instructions"] = INSTRUCTIONS
+#: Frames that may still be in flight when the first kept one begins.
+IN_FLIGHT = 100
+
+
+class Key(NamedTuple):
+    """The subject of a series. `of`: stage or unit, or empty. `cause`: cause of idle time, or empty."""
+
+    measure: str
+    of: str = ""
+    cause: str = ""
+
+
+@dataclass(frozen=True)
+class RunFrames:
+    """The frames of a run as series.
+
+    `begun`: first record of the journal. `series`: series by subject, times in ms. `ended`: last record; None where the
+    run did not end by itself. `presented`: presented frames of the whole run. `counted`: lost and dropped frames; None
+    where there are none.
+    """
+
+    begun: Begun
+    series: Mapping[Key, Series]
+    ended: Ended | None
+    presented: int
+    counted: Counted | None
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the journal has the whole run."""
+        return self.ended is not None
+
+
+def read_frames(path: Path) -> RunFrames:
+    """Read the frames of the journal at `path`. Raises BadInputError for a file that is none or ends too early."""
+    frames = frames_of(read_journal(path))
+    if frames is None:
+        raise BadInputError(path, "fewer than two presented frames", "two or more", "run more frames")
+    return frames
+
+
+def frames_of(records: Iterable[Record]) -> RunFrames | None:
+    """Return the frames of a journal's `records`; None where fewer than two were presented."""
+    story = _Story()
+    for record in records:
+        story.add(record)
+    graph, jobs, idle = story.graph, story.jobs, story.idle()
+    if len(story.shown) < 2:
+        return None
+    shown = [(one.frame, one.end_ns, one.latency_ns) for one in story.shown]
+    numbers, end_ns, latency_ns = (np.array(column, np.int64) for column in zip(*shown, strict=True))
+    series = {Key("frame time"): _plain(numbers[1:], np.diff(end_ns)), Key("latency"): _plain(numbers, latency_ns)}
+    for stage in graph.stages:
+        series |= _stage(stage.name, [job for job in jobs if job.stage == stage.name])
+    for unit in graph.units:
+        series |= _unit(unit, [job for job in jobs if job.unit == unit], idle, numbers, end_ns)
+    series |= _figures(story.figures)
+    series |= _instruction_times(series)
+    return RunFrames(story.begun, series, story.ended, story.presented, story.counted)
+
+
+class _Story:
+    """What the records of a journal tell, gathered."""
+
+    def __init__(self) -> None:
+        self.jobs: list[JobRecord] = []
+        self.shown: list[Presented] = []
+        self.figures: dict[Key, list[tuple[int, float]]] = defaultdict(list)
+        self.ended: Ended | None = None
+        self.counted: Counted | None = None
+        self.presented = 0
+        self._idle: list[IdleSlice] = []
+
+    def idle(self) -> list[IdleSlice]:
+        """Return every idle slice of the run. Call it once, after the last record."""
+        return [*self._idle, *self._timeline.end()]
+
+    def add(self, record: Record) -> None:
+        if isinstance(record, Begun):
+            self.begun, self.graph = record, record.graph
+            self._timeline = Timeline(record.graph, record.settings, idle=True)
+            return
+        for fact in self._timeline.add(record):
+            if isinstance(fact, IdleSlice):
+                self._idle.append(fact)
+            elif isinstance(fact, Presented):
+                self.shown.append(fact)
+                self.presented += 1
+        if isinstance(record, Worked):
+            self._work(record)
+        elif isinstance(record, Counted):
+            self.counted = record
+        elif isinstance(record, Ended):
+            self.ended = record
+
+    def _work(self, record: Worked) -> None:
+        self.jobs.append(record.job)
+        most = (MOST_FRAMES + IN_FLIGHT) * len(self.graph.stages)
+        if len(self.jobs) >= 2 * most:
+            self._forget(self.jobs[-most])
+        for name, value in record.figures.items():
+            if name in REPORTED:
+                self.figures[Key(REPORTED[name], record.job.stage)].append((record.job.frame, value))
+
+    def _forget(self, first: JobRecord) -> None:
+        """Forget what was before the job `first`, so that a run of days keeps no more than its last frames."""
+        self.jobs = self.jobs[self.jobs.index(first) :]
+        oldest = min(job.frame for job in self.jobs)
+        self._idle = [piece for piece in self._idle if piece.end_ns >= first.begin_ns]
+        self.shown = [one for one in self.shown if one.frame >= oldest]
+        for key, rows in self.figures.items():
+            self.figures[key] = [row for row in rows if row[0] >= oldest]
+
+
+def _plain(frames: I64, ns: I64) -> Series:
+    return Series(frames, ns / NS_PER_MS, np.ones(len(frames)))
+
+
+def _stage(name: str, jobs: Sequence[JobRecord]) -> dict[Key, Series]:
+    """Return the times of a stage's jobs: `work` on the core, `service` with time off it, `wait` for the unit."""
+    frames = np.array([job.frame for job in jobs], np.int64)
+    service = np.array([job.end_ns - job.begin_ns for job in jobs], np.int64)
+    preempted = np.array([job.preempted_ns for job in jobs], np.int64)
+    wait = np.array([job.begin_ns - job.ready_ns for job in jobs], np.int64)
+    return {
+        Key("work", name): _plain(frames, service - preempted),
+        Key("service", name): _plain(frames, service),
+        Key("wait", name): _plain(frames, wait),
+    }
+
+
+def _unit(
+    unit: str, jobs: Sequence[JobRecord], idle: Sequence[IdleSlice], frames: I64, end_ns: I64
+) -> dict[Key, Series]:
+    """Return busy and idle time of a unit within each frame's own time, by cause, as shares of that time."""
+    pieces: list[tuple[int, int, dict[str, int]]] = []
+    for job in jobs:
+        busy = job.end_ns - job.begin_ns - job.preempted_ns - job.asleep_ns
+        pieces.append((job.begin_ns, job.end_ns, {BUSY: busy, PREEMPTED: job.preempted_ns, OVERHEAD: job.asleep_ns}))
+    for piece in idle:
+        if piece.unit == unit:
+            rest = piece.end_ns - piece.begin_ns - piece.preempted_ns
+            states = {piece.cause: rest}
+            states[PREEMPTED] = states.get(PREEMPTED, 0) + piece.preempted_ns
+            pieces.append((piece.begin_ns, piece.end_ns, states))
+    pieces.sort(key=lambda piece: piece[:2])
+    weights = np.diff(end_ns) / NS_PER_MS
+    return {
+        Key("busy" if state == BUSY else "idle", unit, "" if state == BUSY else state): Series(
+            frames[1:], _within(pieces, state, end_ns), weights
+        )
+        for state in STATES
+    }
+
+
+def _within(pieces: Sequence[tuple[int, int, Mapping[str, int]]], state: str, edges_ns: I64) -> F64:
+    """Return the ms of `state` between neighbouring edges, (edges - 1,), spread evenly over each piece that has it."""
+    places, totals, total = [0.0], [0.0], 0
+    for begin_ns, end_ns, states in pieces:
+        places += [begin_ns, end_ns]
+        totals.append(total)
+        total += states.get(state, 0)
+        totals.append(total)
+    return np.asarray(np.diff(np.interp(edges_ns, places, totals)) / NS_PER_MS)
+
+
+def _figures(figures: Mapping[Key, Sequence[tuple[int, float]]]) -> dict[Key, Series]:
+    """Return the figures that stages gave of their jobs."""
+    return {
+        key: Series(
+            np.array([frame for frame, _ in rows], np.int64), np.array([v for _, v in rows]), np.ones(len(rows))
+        )
+        for key, rows in figures.items()
+    }
+
+
+def _instruction_times(series: Mapping[Key, Series]) -> dict[Key, Series]:
+    """Return the time on the core per instruction, ns, for each stage whose instructions were counted."""
+    found = {}
+    for key, counted in series.items():
+        if key.measure == INSTRUCTIONS:
+            work = series[Key("work", key.of)]
+            frames, ours, theirs = np.intersect1d(work.frames, counted.frames, return_indices=True)
+            ns = work.values[ours] * NS_PER_MS / np.maximum(counted.values[theirs], 1.0)
+            found[Key(INSTRUCTION_TIME, key.of)] = Series(frames, ns, np.ones(len(frames)))
+    return found

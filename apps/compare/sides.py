@@ -1,0 +1,282 @@
+"""The runs to compare, read from disk: run folders, reports and predictions, with their settings.
+
+Rule: what cannot be compared is refused by name. A run folder with a journal has every frame; a report alone, or a
+prediction, has summaries. A run that was killed has no report: its journal gives the keys that a comparison reads, and
+`NOT_KNOWN` names those that the journal lacks.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from pydantic import ValidationError
+from pydantic_core import from_json, to_json
+
+from trilane.apps.compare.difference import STATISTICS
+from trilane.apps.compare.run_frames import Key, RunFrames, read_frames
+from trilane.apps.live.followed_run import FollowedRun, RunState, folder_of
+from trilane.apps.report import MAX_REPORT_BYTES, read_report
+from trilane.errors import BadInputError
+from trilane.files import require_file
+from trilane.pipeline.journal import NAME as JOURNAL
+from trilane.pipeline.journal import read_journal
+from trilane.pipeline.reckoning import places_of, reckoned
+from trilane.pipeline.run_metrics import RunMetrics
+
+EXPECTED: Final = "a run folder, its report.json, or what `trilane predict --json` printed"
+#: Keys that a prediction of the application has and a report lacks.
+OF_A_PREDICTION: Final = ("expected_error", "network", "frame_time_ms", "units", "stages")
+#: Facts of the first record that a report has too.
+FACTS: Final = ("config", "machine", "made", "accuracy")
+#: Parts of a report that say how the run was made.
+PARTS: Final = (
+    "clock",
+    "policy",
+    "edge",
+    "config",
+    "stages",
+    "caps.performance_profile",
+    "machine",
+    "made",
+    "idle_cores",
+)
+#: Keys that a report has both at its top and in `config`, and a prediction in `config` alone.
+TWICE: Final = ("policy", "edge")
+#: Key of a document that lists the parts nobody knows; whether these have changed cannot be told.
+NOT_KNOWN: Final = "not_known"
+#: Keys that differ between any two runs.
+ALWAYS_DIFFERENT: Final = ("made.at", "made.command")
+
+
+class RunKind(StrEnum):
+    """What is known of a run. RUN: every frame; REPORT: summaries; PREDICTION: summaries that a model computed."""
+
+    RUN = "run"
+    REPORT = "report"
+    PREDICTION = "prediction"
+
+
+@dataclass(frozen=True)
+class ComparedRun:
+    """One run of a side.
+
+    `name`: name as the user gave it. `document`: JSON with the keys of a report. `frames`: frames of a run with a
+    journal. `remark`: what a person should know of a run without a report.
+    """
+
+    name: str
+    kind: RunKind
+    document: Mapping[str, Any]
+    frames: RunFrames | None = None
+    remark: str = ""
+
+
+@dataclass(frozen=True)
+class Side:
+    """One run, or several runs of one configuration, on one side of a comparison."""
+
+    name: str
+    runs: tuple[ComparedRun, ...]
+
+
+def read_side(text: str) -> Side:
+    """Read the runs of a side. `text`: a path, or several joined by commas.
+
+    Raises BadInputError, also for a run that is named twice.
+    """
+    names = [text] if text.strip() and _is_there(text) else text.split(",")
+    for name in names:
+        if not name.strip():
+            raise BadInputError(repr(text), "an empty name", EXPECTED, "leave no comma over")
+    seen: set[str] = set()
+    for name in names:
+        place = os.path.realpath(name)
+        if place in seen:
+            remedy = "twice the same run is no surer than once"
+            raise BadInputError(repr(text), f"{name} twice", "each run once", remedy)
+        seen.add(place)
+    return Side(text, tuple(read_told(name) for name in names))
+
+
+def read_told(name: str) -> ComparedRun:
+    """Read the run at the path `name`, or the run of this name that `trilane top` finds.
+
+    Raises BadInputError naming what is missing, cut off or of another schema.
+    """
+    try:
+        path = folder_of(Path(name)) or Path(name)
+        if path.is_dir():
+            return _of_folder(name, path)
+    except OSError as error:
+        raise BadInputError.of_os_error(name, error, EXPECTED) from None
+    found = _document(path)
+    if all(key in found for key in OF_A_PREDICTION):
+        return ComparedRun(name, RunKind.PREDICTION, found)
+    if "networks" in found or "rows" in found:
+        remedy = "the application with a network is predicted with --application"
+        raise BadInputError(path, "predictions of bare networks or of a table", EXPECTED, remedy)
+    return ComparedRun(name, RunKind.REPORT, read_report(path).as_json())
+
+
+def _is_there(text: str) -> bool:
+    try:
+        return Path(text).exists()
+    except OSError:  # several names together may be longer than one path may be
+        return False
+
+
+def _of_folder(name: str, path: Path) -> ComparedRun:
+    journal = path / JOURNAL
+    if not os.path.lexists(journal):
+        return ComparedRun(name, RunKind.REPORT, read_report(path).as_json())
+    if os.path.lexists(path / "report.json"):
+        return ComparedRun(name, RunKind.RUN, read_report(path).as_json(), read_frames(journal))
+    frames = read_frames(journal)
+    return ComparedRun(name, RunKind.RUN, _journal_document(frames, journal), frames, _without_report(path, frames))
+
+
+def _without_report(path: Path, frames: RunFrames) -> str:
+    if frames.is_whole:
+        return "it has no report: compared by its journal"
+    if FollowedRun(path).state is RunState.GOES_ON:
+        return "it still goes on and has no report: compared by the frames until now"
+    return "it did not end by itself and has no report: compared by the frames of its journal until then"
+
+
+def _document(path: Path) -> Mapping[str, Any]:
+    try:
+        if (size := require_file(path, EXPECTED)) > MAX_REPORT_BYTES:
+            raise BadInputError(path, f"{size} bytes", f"at most {MAX_REPORT_BYTES}")
+        document = from_json(path.read_bytes())
+    except OSError as error:
+        raise BadInputError.of_os_error(path, error, EXPECTED) from None
+    except ValueError as error:
+        raise BadInputError(path, str(error), EXPECTED) from None
+    if not isinstance(document, dict):
+        raise BadInputError(path, f"a JSON {type(document).__name__}", EXPECTED)
+    return {str(key): value for key, value in document.items()}
+
+
+def _journal_document(frames: RunFrames, path: Path) -> dict[str, Any]:
+    """Return what a journal alone tells of its run, with the keys of a report that a comparison reads.
+
+    Settings come from the first record, and figures from the frames. For a run that ended the rest comes from its last
+    record; else it is what bounded the run until then.
+
+    `frames`: frames of the journal at `path`. Raises BadInputError for facts that no run has.
+    """
+    facts = from_json(to_json(dict(frames.begun.facts)))
+    for name in FACTS:
+        if not isinstance(facts.get(name, {}), dict):
+            raise BadInputError(f"{path}: {name}", repr(facts[name])[:80], "names and their values, as in report.json")
+    found = {
+        "clock": facts.get("clock", "host"),
+        "policy": frames.begun.settings.policy,
+        "config": facts.get("config", {}),
+        "machine": facts.get("machine", {}),
+        "accuracy": facts.get("accuracy", {}),
+        "frames": _counts(frames),
+        "frame_time_ms": _times(frames, Key("frame time")),
+        "latency_ms": _times(frames, Key("latency")),
+        "stages": {
+            stage.name: {
+                "unit": stage.unit,
+                "service_ms": _times(frames, Key("service", stage.name)),
+                "wait_ms": _times(frames, Key("wait", stage.name)),
+            }
+            for stage in frames.begun.graph.stages
+        },
+        "units": {unit: _unit(frames, unit, facts.get("config", {})) for unit in frames.begun.graph.units},
+        **{name: facts[name] for name in ("made",) if name in facts},
+        **_at_the_end(frames, path),
+    }
+    if "edge" in found["config"]:
+        found.setdefault("edge", found["config"]["edge"])
+    return {**found, NOT_KNOWN: tuple(part for part in PARTS if part not in (facts if part in FACTS else found))}
+
+
+def _at_the_end(frames: RunFrames, path: Path) -> dict[str, Any]:
+    """Return what the last record says of the whole run; without one, what bounded it and how full its cores were."""
+    if frames.ended is None:
+        begun, records = frames.begun, read_journal(path)
+        return dict(reckoned(begun.graph, begun.settings, places_of(begun), records).figures)
+    try:
+        return RunMetrics.model_validate(from_json(to_json(dict(frames.ended.report)))).as_json()
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise BadInputError(f"{path}, last record: {key}", first["msg"].lower(), "the figures of a run") from None
+
+
+def _counts(frames: RunFrames) -> dict[str, Any]:
+    """Return the numbers of frames; `requested` are those asked for until now, without the frames in flight."""
+    lost = dict(frames.counted.lost) if frames.counted else {}
+    dropped = dict(frames.counted.dropped) if frames.counted else {}
+    asked = frames.presented + sum(lost.values()) + sum(dropped.values())
+    return {"requested": asked, "presented": frames.presented, "lost_by_cause": lost, "dropped": dropped}
+
+
+def _times(frames: RunFrames, key: Key) -> dict[str, float]:
+    series = frames.series[key]
+    if not len(series.values):
+        return {}
+    return {name: float(STATISTICS[name](series.values, series.weights)) for name in ("mean", "p50", "p90", "p99")}
+
+
+def _unit(frames: RunFrames, unit: str, config: Mapping[str, Any]) -> dict[str, Any]:
+    series = {key: each for key, each in frames.series.items() if key.of == unit and key.measure in ("busy", "idle")}
+    shares = {key: float(each.values.sum() / each.weights.sum()) for key, each in series.items()}
+    cores = config.get("units", {}).get(unit, {}).get("cores", ())
+    return {
+        "busy": shares[Key("busy", unit)],
+        "idle": {key.cause: share for key, share in shares.items() if key.cause},
+        "cores": tuple(cores),
+    }
+
+
+class Change(NamedTuple):
+    """A dotted key with its value in the base and in the other run; None where a run lacks the key."""
+
+    key: str
+    base: Any
+    other: Any
+
+
+def changes(base: Mapping[str, Any], other: Mapping[str, Any]) -> list[Change]:
+    """Return every key in which two runs were not made alike, and no other. `base`, `other`: reports as JSON."""
+    first, second = _settings(base), _settings(other)
+    found = dict.fromkeys([*first, *second])
+    known = [part for part in PARTS if part not in (*base.get(NOT_KNOWN, ()), *other.get(NOT_KNOWN, ()))]
+    keys = [key for part in known for key in found if key == part or key.startswith(f"{part}.")]
+    return [Change(key, first.get(key), second.get(key)) for key in keys if first.get(key) != second.get(key)]
+
+
+def _settings(document: Mapping[str, Any]) -> dict[str, Any]:
+    units = {name: {"unit": stage["unit"]} for name, stage in document["stages"].items()}
+    found: dict[str, Any] = {}
+    for part in PARTS:
+        value: Any = {**document, "stages": units}
+        for key in part.split("."):
+            value = value.get(key) if isinstance(value, Mapping) else None
+        if value is not None:
+            found.update(_flat(part, value))
+    for key in TWICE:
+        if f"config.{key}" in found:
+            found.setdefault(key, found.pop(f"config.{key}"))
+    return {key: value for key, value in found.items() if key not in ALWAYS_DIFFERENT}
+
+
+def _flat(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, Mapping) and value:
+        for key, inner in value.items():
+            yield from _flat(f"{name}.{key}", inner)
+    elif isinstance(value, list) and any(isinstance(each, Mapping) for each in value):
+        for place, inner in enumerate(value):
+            yield from _flat(f"{name}.{place}", inner)
+    else:
+        yield name, value

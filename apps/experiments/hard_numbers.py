@@ -1,0 +1,358 @@
+"""Numbers that are hard to get right, each with a bound: all rows, and here those of bodies, cameras and times.
+
+Rule: the body is the default avatar's, so that the rows are the same everywhere. A reference sums in extended precision
+or float64; a bound counts the roundings of what is computed, and never follows from a result.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from trilane.apps.experiments.hard_rotations import EXACT, HIGHAM, U32, HardNumber, U, gamma, in_mm, random_pose, worst
+from trilane.arrays import F64
+from trilane.body.body import Body, ShapedBody, weights_of_one
+from trilane.body.joints import JOINTS, POSE_FEATURES
+from trilane.body.kinematics import Posed, Skeleton, rodrigues
+from trilane.body.skinning import WEIGHT_COUNTS, CpuSkinner, FrameSkinner, weight_error_bound
+from trilane.errors import BadInputError
+from trilane.scene.camera.path import load_builtin, look_at, projection_matrix
+from trilane.scene.crop import Rect, crop_projection
+from trilane.scene.motion.builtin import walk_wave_turn
+from trilane.scene.motion.motion import Wrap
+from trilane.scene.schema import CameraSpec
+from trilane.stages.cpu.mesh_bounds import MeshBounds
+
+HOLDS, EXCEEDED = "holds", "FAILS: error above the bound"
+#: Number of rows of `hard_numbers`.
+COUNT = 92
+SIGMAS = 5.0
+#: Drawn shape directions: how many, and how far one sigma of each moves a vertex, metres.
+DRAWN_DIRECTIONS, DRAWN_M = 10, 0.01
+#: Distances of the root joint from the origin, metres.
+PLACES = {"0.2 m": 0.2, "20 m": 20.0, "200 m": 200.0}
+#: Sums of a vertex's skin weights in files that are just accepted.
+SUMS = (0.9991, 1.0009)
+POSES = 8
+#: Number of drawn skin weights of a vertex, on joints from all over the body.
+DRAWN_WEIGHTS = 16
+WEIGHTS_PROOF = "the bound that body/skinning.py proves"
+NEAR_M, FAR_M = 0.05, 1000.0
+#: Camera -> its field of view in degrees, and its distance from a joint in metres.
+VIEWS = {
+    "a lens of 1 degree at 60 m": (1.0, 60.0),
+    "a lens of 10 degrees at 8 m": (10.0, 8.0),
+    "a lens of 120 degrees at 0.8 m": (120.0, 0.8),
+    "a lens of 170 degrees at 0.5 m": (170.0, 0.5),
+    "0.2 m away": (60.0, 0.2),
+    "1 m away": (60.0, 1.0),
+    "20 m away": (60.0, 20.0),
+    "200 m away": (60.0, 200.0),
+    "inside the body": (90.0, 0.02),
+    "the near plane through the body": (90.0, 0.12),
+}
+DRAWN_POSES = 6
+SIDE = 512
+#: Crops as parts of the screen's width.
+CROPS = {"a whole screen": 2.0, "a tenth": 0.2, "a 4096th": 2 / 4096}
+BOX_PROOF = "no vertex on the screen may be outside: 0, by the proof in stages/cpu/mesh_bounds.py"
+FRAME = 5_000_000
+RATES = (24.0, 30.0, 59.94)
+SOURCE = "rounding of the frame's time, times the fastest that is shown"
+Shown = Callable[[float], F64]
+
+
+def hard_numbers() -> Iterator[dict[str, Any]]:
+    """Yield rows with `name`, `error`, `bound`, `unit`, `source` (of the bound), `verdict`, `passed`.
+
+    `error` is None where it is not a number, which counts as above every bound.
+    Raises MissingPartError where no OpenGL context can be made.
+    """
+    for case in _cases():
+        error = case.error if math.isfinite(case.error) else None
+        yield {**case._asdict(), "error": error, "verdict": HOLDS if case.holds else EXCEEDED, "passed": case.holds}
+
+
+def kept_going(kind: str, cases: Iterable[HardNumber]) -> Iterator[HardNumber]:
+    """Yield `cases` of one kind; when tested code refuses its input, the last row says so and fails."""
+    try:
+        yield from cases
+    except (BadInputError, ArithmeticError, ValueError) as error:
+        yield HardNumber(f"{kind}, ended by an error: {error}", math.inf, 0.0, "errors", EXACT)
+
+
+def _cases() -> Iterator[HardNumber]:
+    from trilane.apps.experiments.hard_rotations import chain_cases, rotation_cases
+    from trilane.apps.experiments.hard_tensors import scene_cases, tensor_cases
+    from trilane.avatars.bundle import load_bundle
+    from trilane.stages.avatar_assets import load_avatar
+    from trilane.stages.gpu.opengl import open_context
+
+    context = open_context(2)
+    shaped = load_avatar(load_bundle("default")).shaped
+    yield from kept_going("rotations", rotation_cases())
+    yield from kept_going("chains of joints", chain_cases(shaped))
+    yield from kept_going("bodies", _body_cases(shaped))
+    yield from kept_going("cameras", _camera_cases(shaped))
+    yield from kept_going("times", time_cases())
+    with context:
+        yield from kept_going("tensors", tensor_cases(shaped, context))
+    yield from kept_going("scenes", scene_cases())
+
+
+def _body_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
+    """Yield rows of shapes, skinning and weights of the body `shaped`."""
+    yield from _shapes(shaped.body)
+    yield from _skinning(shaped)
+    yield from _left_out(shaped)
+    yield from _sums(shaped)
+
+
+def _shapes(body: Body) -> Iterator[HardNumber]:
+    """Yield rows of extreme shapes, whose shape directions are drawn.
+
+    The rest vertices are a sum in float64 of S + 1 numbers and an offset, rounded to float32.
+    """
+    rng = np.random.default_rng(9)
+    drawn = rng.normal(0, DRAWN_M, (2, *body.v_template.shape, DRAWN_DIRECTIONS)).astype(np.float32)
+    body = replace(body, shape_dirs=drawn[0], expression_dirs=drawn[1])
+    offsets = np.zeros_like(body.v_template) if body.offsets is None else body.offsets
+    for name, dirs in (("betas", body.shape_dirs), ("expression", body.expression_dirs)):
+        count = dirs.shape[2]
+        signs = {"+5 sigma": np.ones(count), "-5 sigma": -np.ones(count), "+-5 sigma": (-1.0) ** np.arange(count)}
+        for word, sign in signs.items():
+            values = SIGMAS * sign
+            found = body.shape(**{name: values}).vertices
+            terms = dirs.astype(np.longdouble) * values
+            wanted = body.v_template + terms.sum(axis=2) + offsets
+            size = np.abs(body.v_template) + np.abs(terms).sum(axis=2) + np.abs(offsets)
+            bounds = U32 * np.abs(wanted) + 2 * gamma(count + 3) * size
+            errors = np.abs(found - wanted)
+            yield HardNumber(f"all {count} {name} at {word}", *in_mm(worst(errors, bounds)), "mm", HIGHAM)
+
+
+def _skinning(shaped: ShapedBody) -> Iterator[HardNumber]:
+    skeleton, skinner = Skeleton(shaped.joints, shaped.body.parents), FrameSkinner(shaped)
+    pose, found = random_pose(JOINTS), np.empty(shaped.vertices.shape, np.float32)
+    for name, metres in PLACES.items():
+        posed = skeleton.pose(pose, metres * np.array([1.0, 2.0, 3.0]) / np.sqrt(14.0))
+        skinner.skin_into(posed, found)
+        wanted, bounds = _skinned(shaped, posed.matrices.astype(np.float64), posed.feature.astype(np.float64))
+        errors = np.abs(found - wanted)
+        name = f"vertices skinned in float32, a pose never trained, {name} away"
+        yield HardNumber(name, *in_mm(worst(errors, bounds)), "mm", HIGHAM)
+
+
+def _skinned(shaped: ShapedBody, matrices: F64, feature: F64) -> tuple[F64, F64]:
+    """Return vertices (V, 3) in float64, and how far float32 may be off them.
+
+    With n weights of a vertex that are not 0, the blended matrix M is off by gamma_(n+1) of sum w |matrix| in float32:
+    one rounding is for the float32 matrices. M [p, 1] is off by four roundings more. Pose blend shapes move p by a sum
+    of 486 products, which is off by gamma_488 of their absolute values.
+    """
+    body = shaped.body
+    rest = shaped.vertices.astype(np.float64)
+    moved, unsure = np.zeros(rest.shape), np.zeros(rest.shape)
+    if body.posedirs is not None:
+        dirs = body.posedirs.astype(np.float64)
+        moved = dirs @ feature
+        unsure = gamma(POSE_FEATURES + 2, U32) * (np.abs(dirs) @ np.abs(feature))
+    rest = np.concatenate([rest + moved, np.ones((len(rest), 1))], axis=1)
+    weights = body.weights.astype(np.float64)
+    blended = (weights @ matrices.reshape(JOINTS, 12)).reshape(-1, 3, 4)
+    sizes = (np.abs(weights) @ np.abs(matrices).reshape(JOINTS, 12)).reshape(-1, 3, 4)
+    many = np.count_nonzero(weights, axis=1)[:, None]
+    places = np.einsum("vab,vb->va", blended, rest)
+    bounds = gamma(many + 6, U32) * np.einsum("vab,vb->va", sizes, np.abs(rest))
+    return places, bounds + np.einsum("vab,vb->va", sizes[:, :, :3], unsure)
+
+
+def _left_out(shaped: ShapedBody) -> Iterator[HardNumber]:
+    """Yield rows of skinning with fewer weights: the four largest of the body, and every offered count of drawn ones.
+
+    The body's vertices have seven weights at most. The drawn weights skin a body 200 m away, where remaining weights
+    that do not sum to 1 would show.
+    """
+    rng = np.random.default_rng(5)
+    poses = [rng.normal(0, 1.0, (JOINTS, 3)) for _ in range(POSES)]
+    yield _fewer(shaped, 4, poses, 0.0, "skin weights alone")
+    weights = np.zeros((len(shaped.vertices), JOINTS))
+    joints = np.argsort(rng.random(weights.shape), axis=1)[:, :DRAWN_WEIGHTS]
+    np.put_along_axis(weights, joints, rng.dirichlet(np.ones(DRAWN_WEIGHTS), len(weights)), axis=1)
+    drawn = replace(shaped, body=replace(shaped.body, weights=weights_of_one(weights.astype(np.float32))))
+    for count in WEIGHT_COUNTS:
+        yield _fewer(drawn, count, poses, 200.0, f"of {DRAWN_WEIGHTS} drawn skin weights, 200 m away")
+
+
+def _fewer(shaped: ShapedBody, count: int, poses: Sequence[F64], metres: float, what: str) -> HardNumber:
+    """Return the row of skinning by the `count` largest weights.
+
+    Beside the proof's bound each of the two sums of weights is off by gamma_n, times the reach of the body.
+    """
+    skeleton = Skeleton(shaped.joints, shaped.body.parents)
+    few, whole = CpuSkinner(shaped, count, pose_blend=False), CpuSkinner(shaped, pose_blend=False)
+    reach = metres + 1.0 + np.abs(shaped.vertices).max()
+    rounding = 2 * gamma(int(np.count_nonzero(shaped.body.weights, axis=1).max()) + 4, U32) * reach
+    posed = (skeleton.pose(pose, np.array([0.0, 0.0, metres])) for pose in poses)
+    moved = [np.linalg.norm(few.vertices(one) - whole.vertices(one), axis=1) for one in posed]
+    found = in_mm(worst(np.max(moved, axis=0), weight_error_bound(shaped, count) + rounding))
+    return HardNumber(f"the {count} largest {what}, {POSES} poses never trained", *found, "mm", WEIGHTS_PROOF)
+
+
+def _sums(shaped: ShapedBody) -> Iterator[HardNumber]:
+    """Yield rows of weights that do not sum to 1. At 200 m, weights that sum to 1 + d move a body by 200 d metres."""
+    skeleton = Skeleton(shaped.joints, shaped.body.parents)
+    posed = skeleton.pose(np.zeros((JOINTS, 3)), np.array([200.0, 0.0, 0.0]))
+    wanted = CpuSkinner(shaped, pose_blend=False).vertices(posed)
+    for total in SUMS:
+        weights = weights_of_one(shaped.body.weights * np.float32(total))
+        scaled = replace(shaped, body=replace(shaped.body, weights=weights))
+        errors = np.abs(CpuSkinner(scaled, pose_blend=False).vertices(posed) - wanted).max(axis=1)
+        many = np.count_nonzero(shaped.body.weights, axis=1)
+        bounds = (gamma(many + 4, U32) + gamma(many, U)) * (201.0 + np.abs(shaped.vertices).max())
+        found = in_mm(worst(errors, bounds))
+        yield HardNumber(f"skin weights of a file that sum to {total}, 200 m away", *found, "mm", HIGHAM)
+    sums = [np.abs(weights_of_one(shaped.body.weights * np.float32(t)).sum(axis=1, dtype=np.float64) - 1) for t in SUMS]
+    many = np.count_nonzero(shaped.body.weights, axis=1)
+    yield HardNumber("their sums after loading", *worst(np.max(sums, axis=0), gamma(many + 2, U32)), "of 1", HIGHAM)
+    negative = weights_of_one(np.array([[1.0005, -0.0005], [0.0, 1.0]], np.float32))
+    error = float(np.abs(negative - np.eye(2)).max())
+    yield HardNumber("a weight just below 0 after loading", error, 0.0, "of 1", EXACT)
+
+
+def _camera_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
+    """Yield rows of rectangles, of crops and of vertices on the screen.
+
+    The rectangle of a body is right when no vertex on the screen lies outside it.
+    """
+    bounds, skinner = MeshBounds(shaped), CpuSkinner(shaped)
+    skeleton = Skeleton(shaped.joints, shaped.body.parents)
+    for name, (fov_deg, metres) in VIEWS.items():
+        outside = [
+            _outside(bounds, posed, skinner.vertices(posed), clip) for posed, clip in _drawn(skeleton, fov_deg, metres)
+        ]
+        found = float(np.max(outside))
+        yield HardNumber(f"vertices outside the rectangle, {name}, {DRAWN_POSES} poses", found, 0.0, "NDC", BOX_PROOF)
+    yield from _behind(bounds, skeleton)
+    yield from _crops()
+    yield from _on_screen(skinner, skeleton)
+
+
+def _drawn(skeleton: Skeleton, fov_deg: float, metres: float) -> Iterator[tuple[Posed, F64]]:
+    """Yield poses never trained, and a camera for each, (4, 4) to clip space."""
+    rng = np.random.default_rng(round(1e3 * metres + fov_deg))
+    for _ in range(DRAWN_POSES):
+        posed = skeleton.pose(rng.normal(0, 0.6, (JOINTS, 3)))
+        target = posed.joints[rng.integers(JOINTS)].copy()
+        towards = rng.normal(size=3)
+        eye = target + metres * towards / np.linalg.norm(towards)
+        yield posed, projection_matrix(fov_deg, 1.0, min(NEAR_M, metres / 2), FAR_M) @ look_at(eye, target)
+
+
+def _outside(bounds: MeshBounds, posed: Posed, vertices: F64, clip: F64) -> float:
+    """Return how far vertices in front of the near plane and on the screen leave the rectangle; inf without one."""
+    found = bounds.rect(posed, clip)
+    x, y, z, w = clip @ np.concatenate([vertices, np.ones((len(vertices), 1))], axis=1).T
+    seen = (w > 0) & (z > -w) & (np.abs(x) <= w) & (np.abs(y) <= w)
+    if not seen.any():
+        return 0.0
+    if found is None:
+        return float("inf")
+    x, y = x[seen] / w[seen], y[seen] / w[seen]
+    return float(max(0.0, found.x0 - x.min(), x.max() - found.x1, found.y0 - y.min(), y.max() - found.y1))
+
+
+def _behind(bounds: MeshBounds, skeleton: Skeleton) -> Iterator[HardNumber]:
+    posed = skeleton.pose(np.zeros((JOINTS, 3)))
+    eye = posed.joints[0] + np.array([0.0, 0.0, 4.0])
+    clip = projection_matrix(60.0, 1.0, NEAR_M, FAR_M) @ look_at(eye, eye + np.array([0.0, 0.0, 4.0]))
+    found = 0.0 if bounds.rect(posed, clip) is None else 1.0
+    yield HardNumber("rectangles of a body behind the camera", found, 0.0, "rectangles", EXACT)
+
+
+def _crops() -> Iterator[HardNumber]:
+    """Yield rows of the cropped projection beside the map of the rectangle after projection, in extended precision.
+
+    X' = (2 X - (x0 + x1) W) / (x1 - x0) and W are sums of at most 8 products in float64, each of a size of at most
+    2 (|X| + 2 |W|) / (x1 - x0) in sum.
+    """
+    rng = np.random.default_rng(3)
+    points = np.concatenate([rng.uniform(-2, 2, (4000, 2)), rng.uniform(-9, -1, (4000, 1)), np.ones((4000, 1))], axis=1)
+    whole = projection_matrix(50.0, 1.5, NEAR_M, FAR_M)
+    for name, width in CROPS.items():
+        rect = Rect(0.3 - width / 2, -0.1 - width / 2, 0.3 + width / 2, -0.1 + width / 2)
+        cropped = points @ crop_projection(whole, rect).T
+        x, w = (points.astype(np.longdouble) @ whole.astype(np.longdouble).T).T[[0, 3]]
+        wanted = (2 * x / w - (np.longdouble(rect.x0) + np.longdouble(rect.x1))) / np.longdouble(rect.width)
+        sizes = 2 * (np.abs(points) @ np.abs(whole).T)[:, [0, 3]] @ np.array([1.0, 2.0]) / width / w
+        bounds = (gamma(12) * sizes + gamma(6) * np.abs(wanted)) * SIDE / 2
+        errors = np.abs(cropped[:, 0] / cropped[:, 3] - wanted) * SIDE / 2
+        yield HardNumber(f"a crop of {name} of the screen", *worst(errors, bounds), "pixels of 512", HIGHAM)
+
+
+def _on_screen(skinner: CpuSkinner, skeleton: Skeleton) -> Iterator[HardNumber]:
+    """Yield rows of where vertices land in float32, beside float64, with the roundings of the shader counted.
+
+    With clip coordinates C = M [x, 1], M and x in float32, each coordinate is off by gamma_6 of |M| |x| in float32:
+    four products, two roundings of the inputs. X / W is off by that of X, plus X / W times that of W, over W, and by a
+    rounding of the quotient. A pixel is half a tensor's side for each 1 of X / W.
+    """
+    posed = skeleton.pose(random_pose(JOINTS))
+    vertices = skinner.vertices(posed)
+    for metres in (0.2, 2.0, 20.0, 200.0):
+        target = vertices.mean(axis=0)
+        eye = target + metres * np.array([0.6, 0.0, 0.8])
+        fov_deg = float(np.degrees(2 * np.arctan(1.0 / max(metres, 0.5))))
+        clip = projection_matrix(fov_deg, 1.0, NEAR_M, FAR_M) @ look_at(eye, target)
+        points = np.concatenate([vertices, np.ones((len(vertices), 1))], axis=1)
+        seen = points @ clip.T
+        points = points[seen[:, 3] > NEAR_M]
+        exact = points @ clip.T
+        found = points.astype(np.float32) @ clip.astype(np.float32).T
+        off = gamma(7, U32) * (np.abs(points) @ np.abs(clip).T)
+        place = exact[:, :2] / exact[:, 3:]
+        bounds = (off[:, :2] + np.abs(place) * off[:, 3:]) / (np.abs(exact[:, 3:]) - off[:, 3:]) + U32 * np.abs(place)
+        errors = np.abs(found[:, :2] / found[:, 3:] - place) * SIDE / 2
+        name = f"vertices on the screen in float32, {metres:g} m away"
+        yield HardNumber(name, *worst(errors, bounds * SIDE / 2), "pixels of 512", HIGHAM)
+
+
+def time_cases() -> Iterator[HardNumber]:
+    """Yield rows of the built-in walk and camera at each rate, after a day of media time.
+
+    Frame 5,000,000 shows what the same moment of the motion's period shows. The reference reduces the frame's time by
+    the period in fractions, which are exact. frame / fps rounds by U of itself and the remainder is exact, so the time
+    is off by at most U t. What is shown is off by that times its greatest change in a second, and by a few roundings.
+    """
+    motion, camera = walk_wave_turn(), load_builtin("orbit", CameraSpec())
+    assert camera is not None
+    shown: dict[str, tuple[Shown, F64, Wrap, str]] = {
+        "turns of the walk": (lambda t: rodrigues(motion.sample(t)[0]), motion.times_s, motion.wrap, "entry of R"),
+        "place of the walk": (lambda t: motion.sample(t)[1], motion.times_s, motion.wrap, "m"),
+        "the orbiting camera": (camera.sample, camera.times_s, camera.wrap, "entry of the view"),
+    }
+    for name, (at, times_s, wrap, unit) in shown.items():
+        speed = _fastest(at, times_s)
+        for fps in RATES:
+            reached = FRAME / fps
+            error = float(np.abs(at(reached) - at(_moment(fps, times_s, wrap))).max())
+            bound = 2 * U * reached * speed + 64 * U * (1 + np.pi)
+            yield HardNumber(f"{name}, frame {FRAME:,} at {fps:g} a second", error, bound, unit, SOURCE)
+
+
+def _moment(fps: float, times_s: F64, wrap: Wrap) -> float:
+    """Return the time of frame `FRAME` within one period."""
+    length = Fraction(float(times_s[-1])) * (1 if wrap is Wrap.LOOP else 2)
+    phase = (Fraction(FRAME) / Fraction(fps)) % length
+    return float(phase if wrap is Wrap.LOOP or phase <= length / 2 else length - phase)
+
+
+def _fastest(at: Shown, times_s: F64) -> float:
+    """Return the greatest change per second of any number, between neighbouring samples."""
+    values = np.array([at(float(t)).ravel() for t in times_s])
+    return float(np.abs(np.diff(values, axis=0) / np.diff(times_s)[:, None]).max())

@@ -1,0 +1,307 @@
+"""Where the time of a run went, as a document and as a table of its jobs.
+
+Rule: the figures come from the run's journal in one reading, in memory that does not grow with the run, whether or not
+it still goes on; the report of one that has ended says how it ended. The table is written as it is read. It needs two
+readings: the first finds the names of the figures that stages report, which are the last columns.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final
+
+from trilane.apps.explain.reasons import MOST_SAMPLES, Shown, SlowFrames, Usual, advice, notes, reasons
+from trilane.apps.live.followed_run import CUT_OFF, FollowedRun, RunState
+from trilane.apps.report import Report, read_report
+from trilane.errors import BadInputError, MissingPartError
+from trilane.figure_sources import COMPUTED, MEASURED
+from trilane.pipeline.critical_path import WHATS, Part
+from trilane.pipeline.journal import NAME, Begun, Ended, Record, Worked, config_of, journal_in, read_journal
+from trilane.pipeline.reckoning import Reckoning, places_of
+from trilane.pipeline.sharing import Taken
+from trilane.pipeline.timeline import ExplainedJob, Timeline
+from trilane.pipeline.unit_history import PREEMPTED
+from trilane.scheduler.stats import NS_PER_MS
+from trilane.writing import write_atomically
+
+SCHEMA = 1
+HOST = "host"
+GOES_ON = "the run still goes on: what follows is of its frames so far"
+#: Column -> its type, and its value for a job. Times are ns of the run's clock, durations ns; docs/explain.md explains
+#: each column.
+COLUMNS: dict[str, tuple[type, Callable[[ExplainedJob], Any]]] = {
+    "frame": (int, lambda one: one.job.frame),
+    "stage": (str, lambda one: one.job.stage),
+    "unit": (str, lambda one: one.job.unit),
+    "ready_ns": (int, lambda one: one.job.ready_ns),
+    "dispatch_ns": (int, lambda one: one.job.dispatch_ns),
+    "begin_ns": (int, lambda one: one.job.begin_ns),
+    "end_ns": (int, lambda one: one.job.end_ns),
+    "preempted_ns": (int, lambda one: one.job.preempted_ns),
+    "asleep_ns": (int, lambda one: one.job.asleep_ns),
+    "preempted_before_ns": (int, lambda one: one.job.preempted_before_ns),
+    "wait_ns": (int, lambda one: one.job.begin_ns - one.job.ready_ns),
+    "wait_cause": (str, lambda one: one.cause),
+    "wait_cause_ns": (int, lambda one: one.waits_ns.get(one.cause, 0)),
+    "behind_stage": (str, lambda one: one.behind.stage if one.behind is not None else ""),
+    "behind_frame": (int, lambda one: one.behind.frame if one.behind is not None else -1),
+    "rung": (int, lambda one: one.rung),
+    "skips": (bool, lambda one: one.skips),
+}
+ROWS_AT_ONCE: Final = 8192
+ENDINGS = (".csv", ".parquet")
+
+
+def _explained_jobs(begun: Begun, records: Iterable[Record]) -> Iterator[ExplainedJob]:
+    """Yield every job of a journal with its wait explained. `records`: the records that follow `begun`."""
+    timeline = Timeline(begun.graph, begun.settings, waits=True)
+    for record in records:
+        yield from (fact for fact in timeline.add(record) if isinstance(fact, ExplainedJob))
+
+
+def open_journal(folder: Path) -> tuple[Begun, Iterator[Record]]:
+    """Return the first record of a run folder's journal, and the records that follow it.
+
+    Raises BadInputError for a folder without a journal and, also while it is read, for a file that is no journal.
+    """
+    path = journal_in(folder)
+    if path is None:
+        raise BadInputError(
+            folder, f"no {NAME}", "the folder of a run", "a run of an older Trilane has none: run again"
+        )
+    records = read_journal(path)
+    begun = next(records)
+    assert isinstance(begun, Begun)  # the journal's reader makes sure of it
+    return begun, records
+
+
+class RunExplanation:
+    """Takes the records of a journal after the first; `document` says what follows from them.
+
+    `begun`: first record of the journal. `report`: report of the run, None while it goes on. `slowest`: number of
+    frames to name.
+    """
+
+    def __init__(self, begun: Begun, report: Report | None, slowest: int) -> None:
+        self._begun, self._report, self._places = begun, report, places_of(begun)
+        self._timeline = Timeline(begun.graph, begun.settings, waits=True)
+        self._reckoning = Reckoning(begun.graph, begun.settings, self._places, self._timeline.downs)
+        self._slow = SlowFrames(begun.graph, self._reckoning.paths, self._reckoning.sharing, slowest)
+        self._waits: dict[str, dict[str, int]] = {stage.name: {} for stage in begun.graph.stages}
+        self._jobs = dict.fromkeys(self._waits, 0)
+        self._frames, self._first_ns, self._last_ns = 0, 0, 0
+
+    def add(self, record: Record) -> None:
+        """Take the next record."""
+        for fact in self._timeline.add(record):
+            if isinstance(fact, ExplainedJob):
+                self._count(fact)
+
+    def _count(self, explained: ExplainedJob) -> None:
+        job = explained.job
+        self._reckoning.add(explained)
+        self._slow.add(explained)
+        self._jobs[job.stage] += 1
+        sums = self._waits[job.stage]
+        for cause, ns in explained.waits_ns.items():
+            sums[cause] = sums.get(cause, 0) + ns
+        if explained.presented is not None:
+            self._frames += 1
+            self._first_ns, self._last_ns = self._first_ns or job.end_ns, job.end_ns
+
+    def document(self) -> dict[str, Any]:
+        """Return the document of `trilane explain RUN --json`. Call it after the last record."""
+        budget, taken, figures = self._reckoning.close()
+        slowest, usual = self._slow.close()
+        unit_of = {stage.name: stage.unit for stage in self._begun.graph.stages}
+        intervals = max(self._frames - 1, 1)
+        clock = str(self._begun.facts.get("clock", HOST))
+        frame_ms = (self._last_ns - self._first_ns) / intervals / NS_PER_MS if self._frames > 1 else None
+        rows = _budget_rows(budget, unit_of, intervals)
+        shared = [self._shared(stage, row) for stage, row in taken.items() if row.preempted_ns]
+        return {
+            "schema": SCHEMA,
+            "clock": clock,
+            **self._of_run(),
+            "frames": self._frames,
+            "frame_ms": frame_ms,
+            **figures,
+            "cores": self._of_cores(frame_ms, figures["machine_efficiency"]),
+            "nobodys_ms": sum(row["ms"] for row in rows if row["what"] == PREEMPTED),
+            "budget": rows,
+            "shared_cores": shared,
+            "waits": [_wait_row(name, unit_of[name], self._jobs[name], self._waits[name]) for name in self._waits],
+            "usual": {
+                "frame_ms": usual.frame_ns / NS_PER_MS,
+                "service_ms": {name: ns / NS_PER_MS for name, ns in usual.service_ns.items()},
+            },
+            "slowest": [_slow_row(shown, usual) for shown in slowest],
+            "advice": advice(rows, self._begun.settings.policy, self._spare_cores(unit_of)),
+            "sources": {
+                "frames, waits_ms, service_ms, preempted_ms": MEASURED if clock == HOST else COMPUTED,
+                "efficiency, core_efficiency, machine_efficiency, cores": "CPU time of the run's own jobs",
+                "budget, bound": "the same times along the path that ends with the last frame",
+                "taken_ms": "computed: whose jobs ran then on the same cores",
+                "usual": f"medians of all frames, of at most {MOST_SAMPLES} evenly spaced ones in a long run",
+            },
+        }
+
+    def _of_run(self) -> dict[str, Any]:
+        """Return what the run said of itself before its first frame, and how it ended."""
+        facts, report = self._begun.facts, self._report
+        return {
+            "scene": config_of(self._begun).get("scene", {}).get("name"),
+            "policy": self._begun.settings.policy,
+            "edges": list(self._begun.graph.edges),
+            "accuracy": facts.get("accuracy", {}),
+            "interrupted": None if report is None else report.interrupted,
+            "failure": None if report is None else report.failure,
+        }
+
+    def _shared(self, stage: str, taken: Taken) -> dict[str, Any]:
+        per_job = taken.jobs * NS_PER_MS
+        unit_of = {each.name: each.unit for each in self._begun.graph.stages}
+        cores = self._places[taken.unit].cores if taken.unit in self._places else ()
+        return {
+            "stage": stage,
+            "unit": taken.unit,
+            "cores": list(cores),
+            "service_ms": taken.service_ns / per_job,
+            "preempted_ms": taken.preempted_ns / per_job,
+            "taken_ms": {other: ns / per_job for other, ns in taken.of.items()},
+            "shared": {other: sorted(set(cores) & set(self._places[unit_of[other]].cores)) for other in taken.of},
+            "others_ms": taken.other_ns / per_job,
+        }
+
+    def _of_cores(self, frame_ms: float | None, efficiency: float | None) -> dict[str, Any] | None:
+        """Return the CPU time of all jobs per frame beside what the run's cores had; None where either is unknown."""
+        cores = sorted({core for place in self._places.values() for core in place.cores})
+        if frame_ms is None or efficiency is None or not cores or len(self._places) < len(self._begun.graph.units):
+            return None
+        had_ms = len(cores) * frame_ms
+        return {"numbers": cores, "cpu_ms": efficiency * had_ms, "had_ms": had_ms}
+
+    def _spare_cores(self, unit_of: Mapping[str, str]) -> int:
+        """Return how many cores the run might have used beyond one for each unit; below 0 units must share."""
+        cpu = self._begun.facts.get("machine", {}).get("cpu", {})
+        return len(cpu.get("cores_allowed", ())) - len(set(unit_of.values()))
+
+
+def explain_run(folder: Path, slowest: int = 10) -> dict[str, Any]:
+    """Return where the time of the run in `folder` went, as plain data. `slowest`: number of frames to name.
+
+    Raises BadInputError for a folder that is no run's, or whose journal or report cannot be read.
+    """
+    report = read_report(folder) if (folder / "report.json").exists() else None  # there is none while a run goes on
+    begun, records = open_journal(folder)
+    explanation, is_whole = RunExplanation(begun, report, slowest), False
+    for record in records:
+        explanation.add(record)
+        is_whole = isinstance(record, Ended)
+    goes_on = not is_whole and FollowedRun(folder).state is RunState.GOES_ON
+    remark = "" if is_whole else GOES_ON if goes_on else CUT_OFF
+    return {"run": str(folder), "remark": remark, **explanation.document()}
+
+
+def _budget_rows(budget: Mapping[Part, int], unit_of: Mapping[str, str], intervals: int) -> list[dict[str, Any]]:
+    total_ns = max(sum(budget.values()), 1)
+    return [
+        {
+            "stage": stage,
+            "unit": unit_of[stage],
+            "what": what,
+            "why": WHATS[what],
+            "ms": ns / intervals / NS_PER_MS,
+            "share": ns / total_ns,
+        }
+        for (what, stage), ns in sorted(budget.items(), key=lambda row: -row[1])
+    ]
+
+
+def _wait_row(stage: str, unit: str, jobs: int, waits_ns: Mapping[str, int]) -> dict[str, Any]:
+    per_job = max(jobs, 1) * NS_PER_MS
+    causes = sorted(waits_ns.items(), key=lambda row: -row[1])
+    return {
+        "stage": stage,
+        "unit": unit,
+        "jobs": jobs,
+        "wait_ms": sum(waits_ns.values()) / per_job,
+        "causes_ms": {cause: ns / per_job for cause, ns in causes},
+    }
+
+
+def _slow_row(shown: Shown, usual: Usual) -> dict[str, Any]:
+    return {
+        "frame": shown.now.frame,
+        "presented_ns": shown.now.end_ns,
+        "frame_ms": shown.frame_ns / NS_PER_MS,
+        "longer_ms": (shown.frame_ns - usual.frame_ns) / NS_PER_MS,
+        "latency_ms": shown.now.latency_ns / NS_PER_MS,
+        "why": [reason._asdict() for reason in reasons(shown, usual)],
+        "notes": notes(shown),
+    }
+
+
+def figure_names(folder: Path) -> list[str]:
+    """Return the names of the figures that the stages of a run report, sorted. Raises BadInputError."""
+    _, records = open_journal(folder)
+    return sorted({name for record in records if isinstance(record, Worked) for name in record.figures})
+
+
+def job_rows(folder: Path, figures: Sequence[str]) -> Iterator[tuple[Any, ...]]:
+    """Yield a row for each job, in the order of their ends: COLUMNS, then `figures`, None where a stage has none."""
+    values = [value for _, value in COLUMNS.values()]
+    for one in _explained_jobs(*open_journal(folder)):
+        yield (*(value(one) for value in values), *(one.figures.get(name) for name in figures))
+
+
+def check_ending(target: Path) -> None:
+    """Raise BadInputError for a name that ends in none of ENDINGS."""
+    if target.suffix.lower() not in ENDINGS:
+        raise BadInputError("--jobs", f"'{target}'", f"a name that ends in {' or '.join(ENDINGS)}")
+
+
+def write_jobs(folder: Path, target: Path) -> int:
+    """Write every job of the run in `folder` to `target`, a .csv or .parquet file, and return their number.
+
+    Raises BadInputError for another ending, a folder that is no run's and a place that cannot be written;
+    MissingPartError where .parquet lacks its library.
+    """
+    check_ending(target)
+    figures = figure_names(folder)
+    write = _write_parquet if target.suffix.lower() == ".parquet" else _write_csv
+    with write_atomically(target) as draft:
+        return write(draft, figures, job_rows(folder, figures))
+
+
+def _write_csv(target: Path, figures: Sequence[str], rows: Iterator[tuple[Any, ...]]) -> int:
+    count = 0
+    with target.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([*COLUMNS, *figures])
+        for count, row in enumerate(rows, start=1):  # noqa: B007 - handed back
+            writer.writerow([int(value) if isinstance(value, bool) else value for value in row])
+    return count
+
+
+def _write_parquet(target: Path, figures: Sequence[str], rows: Iterator[tuple[Any, ...]]) -> int:
+    try:
+        import pyarrow as arrow
+        from pyarrow.parquet import ParquetWriter
+    except ImportError as error:
+        raise MissingPartError(f"a table as Parquet needs {error.name or 'pyarrow'}", extra="table") from None
+    words = arrow.dictionary(arrow.int32(), arrow.string())
+    kinds = {int: arrow.int64(), str: words, bool: arrow.bool_()}
+    fields = [(name, kinds[kind]) for name, (kind, _) in COLUMNS.items()]
+    schema = arrow.schema(fields + [(name, arrow.float64()) for name in figures])
+    count = 0
+    with ParquetWriter(target, schema) as writer:
+        while some := list(islice(rows, ROWS_AT_ONCE)):
+            count += len(some)
+            by_column = zip(*some, strict=True)
+            columns = [arrow.array(column, field.type) for column, field in zip(by_column, schema, strict=True)]
+            writer.write_batch(arrow.record_batch(columns, schema=schema))
+    return count

@@ -1,0 +1,296 @@
+"""Why a run takes its time, in words: its slowest frames with their reasons, what bounded it, and what to try.
+
+Rule: each cause names what it rests on. A frame's time is the path that ends with it, cut at the presentation of the
+frame before and at its own. The usual length of a part is its median over the run's frames; a frame was slow because of
+the parts that were longer.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from heapq import heappush, heappushpop
+from statistics import median
+from typing import Any, Final, Generic, NamedTuple, TypeVar
+
+from trilane.pipeline.critical_path import (
+    ASLEEP,
+    RELEASE,
+    TAKEN,
+    WORK,
+    Part,
+    Paths,
+    parts,
+)
+from trilane.pipeline.sharing import Sharing
+from trilane.pipeline.timeline import ExplainedJob, Presented
+from trilane.pipeline.unit_history import DOWN, HELD, LOST, OVERHEAD, PREEMPTED, THROTTLED
+from trilane.scheduler.events import Graph
+from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.stats import NS_PER_MS
+
+DELAY: Final = 16  # presented frames; by then all jobs beside those of a frame have ended
+MOST_SAMPLES: Final = 4096
+LEAST_LONGER: Final = 0.05  # share of the median; a frame that took hardly longer than usual has no reason
+LEAST_SHARE: Final = 0.1  # share of a frame's extra time that a reason needs to be named
+MOST_REASONS: Final = 3
+#: Least share of the frame time for advice; what bounds less is not worth an attempt.
+LEAST_ADVISED_SHARE: Final = 0.1
+MOST_ADVICE: Final = 4
+
+T = TypeVar("T")
+
+
+class Shown(NamedTuple):
+    """A presented frame and the one that was presented before it.
+
+    `frame_ns`: time from the one to the other, ns. `parts_ns`: parts of that time, ns. `longest`: for each part the job
+    with the largest piece of it.
+    """
+
+    now: Presented
+    before: Presented
+    frame_ns: int
+    parts_ns: Mapping[Part, int]
+    longest: Mapping[Part, JobRecord]
+
+
+class Usual(NamedTuple):
+    """Medians over a run: frame time, its parts and each stage's service time, ns. `unit_of`: unit of each stage."""
+
+    frame_ns: float
+    parts_ns: Mapping[Part, float]
+    service_ns: Mapping[str, float]
+    unit_of: Mapping[str, str]
+
+
+class Reason(NamedTuple):
+    """Why a frame was slow. `stage`: where. `longer_ms`: extra time for this reason. `text`: the reason in words."""
+
+    cause: str
+    stage: str
+    longer_ms: float
+    text: str
+
+
+class EvenSample(Generic[T]):
+    """A sample of at most MOST_SAMPLES of the added values, evenly spaced; of fewer values it has all."""
+
+    def __init__(self) -> None:
+        self.values: list[T] = []
+        self._stride = 1
+        self._count = 0
+
+    def add(self, value: T) -> None:
+        if self._count % self._stride == 0:
+            if len(self.values) == MOST_SAMPLES:
+                del self.values[1::2]
+                self._stride *= 2
+            if self._count % self._stride == 0:
+                self.values.append(value)
+        self._count += 1
+
+
+class SlowFrames:
+    """Takes the jobs of a run in order, each after `paths` and `sharing` have taken it.
+
+    `most`: number of slowest frames to keep.
+    """
+
+    def __init__(self, graph: Graph, paths: Paths, sharing: Sharing, most: int) -> None:
+        self._paths, self._sharing, self._most = paths, sharing, most
+        self._unit_of = {stage.name: stage.unit for stage in graph.stages}
+        self._waiting: deque[ExplainedJob] = deque()
+        self._before: Presented | None = None
+        self._slowest: list[tuple[int, int, Shown]] = []
+        self._frames: EvenSample[tuple[int, Mapping[Part, int]]] = EvenSample()
+        self._services: dict[str, EvenSample[int]] = {stage.name: EvenSample() for stage in graph.stages}
+
+    def add(self, explained: ExplainedJob) -> None:
+        """Take the next job that has ended."""
+        job = explained.job
+        self._services[job.stage].add(job.end_ns - job.begin_ns)
+        if explained.presented is not None:
+            self._waiting.append(explained)
+        if len(self._waiting) > DELAY:
+            self._look(self._waiting.popleft())
+
+    def close(self) -> tuple[list[Shown], Usual]:
+        """Return the slowest frames, the slowest first, and what is usual. Call it after the last job."""
+        while self._waiting:
+            self._look(self._waiting.popleft())
+        slowest = [shown for _, _, shown in sorted(self._slowest, reverse=True)]
+        return slowest, self._usual()
+
+    def _usual(self) -> Usual:
+        frames = self._frames.values
+        kinds = {part for _, parts_ns in frames for part in parts_ns}
+        return Usual(
+            _median([frame_ns for frame_ns, _ in frames]),
+            {part: _median([parts_ns.get(part, 0) for _, parts_ns in frames]) for part in kinds},
+            {stage: _median(sample.values) for stage, sample in self._services.items()},
+            self._unit_of,
+        )
+
+    def _look(self, shown: ExplainedJob) -> None:
+        now = shown.presented
+        assert now is not None
+        before, self._before = self._before, now
+        if before is None:
+            return
+        begin_ns, end_ns = before.end_ns, now.end_ns
+        sums: dict[Part, int] = {}
+        longest: dict[Part, tuple[int, JobRecord]] = {}
+        for piece in self._paths.walk(shown, begin_ns):
+            for part, ns in parts(piece, begin_ns, end_ns, self._sharing).items():
+                sums[part] = sums.get(part, 0) + ns
+                if ns > longest.get(part, (0, piece.job))[0]:
+                    longest[part] = (ns, piece.job)
+        self._frames.add((end_ns - begin_ns, sums))
+        if len(self._slowest) == self._most and self._slowest[0][0] >= end_ns - begin_ns:
+            return
+        jobs = {part: job for part, (_, job) in longest.items()}
+        self._keep(Shown(now, before, end_ns - begin_ns, sums, jobs))
+
+    def _keep(self, shown: Shown) -> None:
+        entry = (shown.frame_ns, -shown.now.frame, shown)
+        if len(self._slowest) < self._most:
+            heappush(self._slowest, entry)
+        else:
+            heappushpop(self._slowest, entry)
+
+
+def _median(values: Sequence[int]) -> float:
+    return float(median(values)) if values else 0.0
+
+
+def reasons(shown: Shown, usual: Usual) -> list[Reason]:
+    """Return why a frame took longer than the median, the most important reason first; empty if it hardly did."""
+    longer_ns = shown.frame_ns - usual.frame_ns
+    found = [
+        (ns - usual.parts_ns.get(part, 0.0), part)
+        for part, ns in shown.parts_ns.items()
+        if ns - usual.parts_ns.get(part, 0.0) > max(LEAST_SHARE * longer_ns, 0)
+    ]
+    if longer_ns <= LEAST_LONGER * usual.frame_ns:
+        return []
+    return [
+        Reason(part[0], part[1], ns / NS_PER_MS, _text(shown, usual, part, ns))
+        for ns, part in sorted(found, reverse=True)[:MOST_REASONS]
+    ]
+
+
+def notes(shown: Shown) -> list[str]:
+    """Return what else was unlike the frame before."""
+    said = []
+    now, before = shown.now, shown.before
+    missing = now.frame - before.frame - 1
+    if missing > 0:
+        which = f"frame {before.frame + 1}" if missing == 1 else f"frames {before.frame + 1} to {now.frame - 1}"
+        said.append(f"{which} before it {'was' if missing == 1 else 'were'} dropped or lost")
+    if now.rung != before.rung:
+        said.append(f"its work changed from rung {before.rung} to {now.rung}")
+    if now.skips != before.skips:
+        said.append("it took the bypass" if now.skips else "the frame before took the bypass, it did not")
+    return said
+
+
+def _text(shown: Shown, usual: Usual, part: Part, longer_ns: float) -> str:
+    what, stage = part
+    job, unit = shown.longest[part], usual.unit_of[stage]
+    whose = "" if job.frame == shown.now.frame else f" of frame {job.frame}"
+    if what == WORK:
+        return _work(shown, usual, job, longer_ns)
+    if what == PREEMPTED:
+        return f"{stage}{whose}: {unit} had no core, and no job of this run had it"
+    if what == TAKEN:
+        return f"{job.stage}{whose}: {stage} had its core"
+    words = {
+        ASLEEP: f"{stage}{whose} slept in its job",
+        OVERHEAD: f"{stage}{whose} was handed over late",
+        THROTTLED: f"the cap of {unit} held {stage}{whose}",
+        LOST: f"a job of {unit} was lost with its process",
+        DOWN: f"{unit} was restarted",
+        HELD: f"the policy or the order of frames held {stage}{whose}",
+        RELEASE: "its input was late: no frame was released yet",
+    }
+    return words.get(what, "before what is known")
+
+
+def _work(shown: Shown, usual: Usual, job: JobRecord, longer_ns: float) -> str:
+    """Return why a stage had a larger part: its job was long, or more of the job lay between the two frames."""
+    service_ns, usual_ns = job.end_ns - job.begin_ns, usual.service_ns.get(job.stage, 0.0)
+    times = f"{service_ns / NS_PER_MS:.1f} ms, median {usual_ns / NS_PER_MS:.1f}"
+    whose = "" if job.frame == shown.now.frame else f" of frame {job.frame}"
+    if service_ns - usual_ns >= longer_ns / 2:
+        return f"{job.stage}{whose} was slow: {times}"
+    if whose:
+        return f"it waited for {job.stage}{whose} ({times})"
+    return f"less of its {job.stage} overlapped with the frame before ({times})"
+
+
+def bound_text(bound: Mapping[str, Any]) -> str:
+    """Return a report's `bound` in words: the unit and the stage with most of the path, their shares and intervals."""
+    named = [f"{part['name']} {_share(part)}" for part in (bound["unit"], bound["stage"]) if part]
+    return ", and of stages most ".join(named)
+
+
+def _share(part: Mapping[str, Any]) -> str:
+    if part["share_low"] is None:
+        return f"{part['share']:.0%} of the path"
+    rivals = f", not surely more than {' or '.join(part['rivals'])}" if part.get("rivals") else ""
+    return f"{part['share']:.0%} of the path ({part['share_low']:.0%} to {part['share_high']:.0%}){rivals}"
+
+
+#: Stage of the avatar's pipeline -> what makes its work shorter.
+SHORTER = {
+    "pose": "`--skinning gpu` takes the vertices off the CPU; `trilane explain SCENE` says what a scene models",
+    "raster": "a smaller `--size` draws fewer texels",
+    "infer": "a smaller `--size`, or another `--runtime`",
+    "composite": "a smaller `--output`",
+    "present": "a smaller `--output`: the picture is encoded there",
+}
+
+OF_CAUSES = {
+    THROTTLED: "a performance profile with more power, such as `--performance-profile burst`, caps {unit} less",
+    DOWN: "{unit} was restarted: the run's messages say why",
+    LOST: "{unit} was restarted: the run's messages say why",
+    HELD: "another `--policy`, `--edge` or `--latch` lets {stage} begin sooner (docs/policies-and-edges.md)",
+    ASLEEP: "{stage} sleeps in its jobs: what it waits for is outside of Trilane",
+    OVERHEAD: "{stage} is handed over late: fewer, longer jobs, or fewer programs beside the run on this machine",
+    RELEASE: "nothing: frames come as often as was asked for, and there is time to spare",
+}
+
+
+def advice(budget: Sequence[Mapping[str, Any]], policy: str, spare_cores: int) -> list[str]:
+    """Return what a person could try, as sentences that name their reason.
+
+    First comes the policy, then what other programs took, then the largest rows. `budget`: rows of the document, the
+    largest first. `policy`: policy of the run. `spare_cores`: cores of the machine beyond one for each unit.
+    """
+    found = []
+    works = [row for row in budget if row["what"] == WORK]
+    if policy == "sequential" and len(works) > 1:
+        found.append("one frame is worked on at a time: `--policy pipelined` lets the units work at once")
+    nobodys = [row for row in budget if row["what"] == PREEMPTED]
+    if sum(row["share"] for row in nobodys) >= LEAST_ADVISED_SHARE:
+        found.append(
+            f"{sum(row['ms'] for row in nobodys):.1f} ms a frame, {', '.join(row['stage'] for row in nobodys)} "
+            f"({PREEMPTED}): no job of this run had the core: end other programs; threads that spin take it too"
+        )
+    found += [
+        f"{row['ms']:.1f} ms a frame, {row['stage']} ({row['what']}): {_try(row, spare_cores)}"
+        for row in budget
+        if row["share"] >= LEAST_ADVISED_SHARE and row["what"] != PREEMPTED
+    ]
+    return found[:MOST_ADVICE]
+
+
+def _try(row: Mapping[str, Any], spare_cores: int) -> str:
+    stage, unit = row["stage"], row["unit"]
+    if row["what"] == TAKEN and spare_cores >= 0:
+        return f"this machine has a core for every unit: `--cores` gives {unit} one of its own"
+    if row["what"] in (WORK, TAKEN):
+        more_cores = ", or more cores for it (`--cores dsp=...`)" if stage == "infer" and spare_cores > 0 else ""
+        return SHORTER.get(stage, f"shorter work of {stage}, or a unit of its own for it") + more_cores
+    return OF_CAUSES.get(row["what"], "nothing: it is before what is known").format(stage=stage, unit=unit)

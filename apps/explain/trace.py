@@ -1,0 +1,403 @@
+"""The trace of a run from the records of its journal: tracks of units, stages and frames, on either clock.
+
+Rule: bounded memory: what is held is what the run has in flight, however long it lasts. A slice is a job as it was
+recorded, or the time between two jobs under its cause; nothing is drawn that was not measured. The slices of a unit do
+not overlap, so its accounts can be added up from them. A frame is late as in the report: past its deadline, or, without
+one, longer after the frame before than the scene's rate allows. A file is whole or absent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
+from heapq import heappop, heappush
+from pathlib import Path
+from typing import IO, Any, Final, Generic, TypeVar
+
+from trilane.apps.explain.trace_sinks import ChromeSink, FlowArrow, PacketSink, Sink
+from trilane.pipeline.journal import Begun, Ended, Record, Said, Sampled, Stepped, Worked, journal_of
+from trilane.pipeline.timeline import UNKNOWN, Gone, Presented, Timeline
+from trilane.pipeline.unit_history import IDLE_CAUSES, UNEXPLAINED, IdleSlice
+from trilane.scheduler.events import NEVER, Graph
+from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.virtual import Simulation
+from trilane.writing import write_atomically
+
+NAME: Final = "trace.pftrace"
+CHROME_NAME: Final = "trace.json"
+#: Ranks of the tracks of a process.
+RUN_RANK, MESSAGE_RANK, FRAME_RANK, UNIT_RANK, SAMPLE_RANK = 0, 1, 2, 10, 1000
+#: Numbers of arrows that each pipeline of a trace has for its frames.
+FLOWS_PER_PIPELINE: Final = 1 << 40
+#: First part of a sampled value's name -> what people call it, unit.
+SAMPLED: Final = {"temperature_c": ("temperature", "°C"), "duty": ("duty", ""), "memory_bytes": ("memory", "B")}
+NS_PER_US: Final = 1000
+MOST_LANES: Final = 32
+EXPECTED, ACTUAL, LEFT_OUT, IN_FLIGHT = "Expected frames", "Actual frames", "Lost and dropped", "Frames in flight"
+#: Figures of jobs that become counters of their stage: name -> title, unit.
+FIGURE_COUNTERS: Final = {
+    "bytes_read": ("bytes read", "B"),
+    "bytes_written": ("bytes written", "B"),
+    "bytes_uploaded": ("bytes uploaded", "B"),
+    "bytes_read_back": ("bytes read back", "B"),
+    "bytes_least": ("bytes needed", "B"),
+    "instructions": ("instructions", ""),
+    "cache_misses": ("cache misses", ""),
+}
+WAITING: Final = "frames that wait"
+#: Slices that may wait for an earlier one; where a piece of time never gets one, the wait ends after so many.
+MOST_WAITING: Final = 256
+Item = TypeVar("Item")
+
+
+class RunTracks:
+    """One run as a group of tracks of `sink`. `name`: name of the group. `number`: number of the run in the trace."""
+
+    def __init__(self, sink: Sink, begun: Begun, name: str = "trilane", number: int = 0) -> None:
+        self._sink, self._begun = sink, begun
+        clock = str(begun.facts.get("clock", "unknown"))
+        process = sink.process(f"{name}, {clock} clock")
+        self._run = sink.track("run", process, RUN_RANK)
+        self._messages = sink.track("messages", process, MESSAGE_RANK)
+        self._frames = _FrameTracks(sink, begun, process, FRAME_RANK)
+        self._units = _UnitTracks(sink, begun.graph, process, UNIT_RANK, number * FLOWS_PER_PIPELINE + 1)
+        self._timeline = Timeline(begun.graph, begun.settings, idle=True)
+        self._process, self._samples = process, dict[str, int]()
+        self._now_ns: int | None = None
+        self._end_ns = 0
+
+    def add(self, record: Record) -> None:
+        """Take the next record of the journal."""
+        if isinstance(record, Stepped):
+            self._end_step(record.now_ns)
+        had_started = self._timeline.start_ns is not None
+        facts = self._timeline.add(record)
+        for fact in facts:
+            if isinstance(fact, IdleSlice):
+                self._units.idle(fact)
+            elif isinstance(fact, Presented | Gone):
+                self._frames.add(fact)
+        match record:
+            case Stepped() if not had_started and self._timeline.start_ns is not None:
+                self._units.start(record.now_ns)
+            case Worked():
+                self._units.work(record)
+            case Sampled():
+                self._sample(record)
+            case Said():
+                self._sink.instant(self._messages, record.now_ns, record.text)
+            case Ended():
+                self._end_ns = record.now_ns
+
+    def close(self) -> None:
+        """Write what is still held: the run has ended, or nothing more of it is known."""
+        for piece in self._timeline.end():
+            self._units.idle(piece)
+        self._units.close()
+        self._count()
+        if self._now_ns is not None:
+            self._sink.end(self._run, max(self._now_ns, self._end_ns))
+
+    def _end_step(self, now_ns: int) -> None:
+        """End the step before the one at `now_ns`; before the first step the run's slice begins."""
+        if self._now_ns is None:
+            self._sink.begin(self._run, now_ns, "run", _facts_of(self._begun))
+        self._count()
+        self._now_ns = now_ns
+
+    def _count(self) -> None:
+        """Write the counters of the last step, whose records are all known now."""
+        if self._now_ns is not None:
+            line, stages = self._timeline, self._begun.graph.stages
+            self._frames.count(self._now_ns, len(line.frames))
+            self._units.count(self._now_ns, {stage.name: len(line.waiting(stage.name)) for stage in stages})
+
+    def _sample(self, sampled: Sampled) -> None:
+        for name, value in sampled.values.items():
+            if name not in self._samples:
+                kind, _, of = name.partition(".")
+                title, unit = SAMPLED.get(kind, (kind, ""))
+                rank = SAMPLE_RANK + len(self._samples)
+                self._samples[name] = self._sink.counter_track(f"{of} {title}".strip(), self._process, rank, unit)
+            self._sink.count(self._samples[name], sampled.now_ns, value)
+
+
+class TraceWriter:
+    """The trace of a run as Perfetto's packets. `file`: opened for bytes; its opener closes it after `close`."""
+
+    def __init__(self, file: IO[bytes], begun: Begun) -> None:
+        self._sink = PacketSink(file)
+        self._tracks = RunTracks(self._sink, begun)
+
+    def add(self, record: Record) -> None:
+        """Take the next record of the journal."""
+        self._tracks.add(record)
+
+    def close(self) -> None:
+        """Complete the trace."""
+        self._tracks.close()
+        self._sink.close()
+
+
+def write_trace(records: Iterable[Record], file: IO[bytes]) -> None:
+    """Write the trace of a journal's `records` as Perfetto's packets."""
+    write_tracks(PacketSink(file), {"trilane": records})
+
+
+def write_chrome_trace(records: Iterable[Record], file: IO[str]) -> None:
+    """Write the trace of a journal's `records` as Chrome's JSON."""
+    write_tracks(ChromeSink(file), {"trilane": records})
+
+
+def write_tracks(sink: Sink, runs: Mapping[str, Iterable[Record]]) -> None:
+    """Write several runs to one trace, one after the other, each as a group of tracks by its name; close the sink."""
+    for number, (name, records) in enumerate(runs.items()):
+        tracks: RunTracks | None = None
+        for record in records:
+            if isinstance(record, Begun):
+                tracks = RunTracks(sink, record, name, number)
+            elif tracks is not None:
+                tracks.add(record)
+        if tracks is not None:
+            tracks.close()
+    sink.close()
+
+
+def _facts_of(begun: Begun) -> dict[str, Any]:
+    """Return what is known of a run before its first frame, and which clock its times are of."""
+    clocks = {"host": "CLOCK_MONOTONIC", "virtual": "simulated time from 0 on"}
+    times = f"ns of {clocks.get(str(begun.facts.get('clock')), 'an unknown clock')}"
+    settings = {key: value for key, value in asdict(begun.settings).items() if not isinstance(value, Sequence) or value}
+    return {"times": times, **begun.facts, "scheduler": settings, "edges": list(begun.graph.edges)}
+
+
+def write_run(records: Iterable[Record], target: Path, *, chrome: bool = False) -> None:
+    """Write the trace of a run's journal to `target`. `chrome`: whether as Chrome's JSON. Raises BadInputError."""
+    with write_atomically(target) as draft:
+        if chrome:
+            with draft.open("w", encoding="utf-8") as text:
+                write_chrome_trace(records, text)
+        else:
+            with draft.open("wb") as file:
+                write_trace(records, file)
+
+
+def write_predicted(runs: Mapping[str, Simulation], facts: Mapping[str, Any], target: Path) -> None:
+    """Write the trace of recorded runs in virtual time, each as a group of tracks by its name. Raises BadInputError.
+
+    `facts`: facts of all the runs, as in `Begun`.
+    """
+    records: dict[str, Iterable[Record]] = {}
+    for name, run in runs.items():
+        assert run.recording is not None
+        records[name] = journal_of(run.recording, run.jobs, {"clock": "virtual", **facts}, run.report)
+    with write_atomically(target) as draft, draft.open("wb") as file:
+        write_tracks(PacketSink(file), records)
+
+
+class _FrameTracks:
+    """The frames of a run as tracks below `parent`, from `rank` on: expected, presented, and lost or dropped ones."""
+
+    def __init__(self, sink: Sink, begun: Begun, parent: int, rank: int) -> None:
+        self._sink, self._parent = sink, parent
+        self._deadline_ns = begun.settings.deadline_ns
+        self._target_ns = 0 if self._deadline_ns else target_period_ns(begun)
+        self._ranks = {EXPECTED: rank, ACTUAL: rank + 1}
+        self._lanes = {name: Lanes(MOST_LANES) for name in self._ranks}
+        self._tracks: dict[tuple[str, int], int] = {}
+        self._left_out = sink.track(LEFT_OUT, parent, rank + 2)
+        self._in_flight = sink.counter_track(IN_FLIGHT, parent, rank + 3)
+        self._flying = -1
+        self._before_ns: int | None = None
+
+    def add(self, frame: Presented | Gone) -> None:
+        """Take a frame that has left the pipeline: presented, lost or dropped."""
+        if isinstance(frame, Gone):
+            if frame.frame != UNKNOWN:
+                self._expect(frame.frame, frame.release_ns)
+            notes = {"frame": frame.frame} if frame.frame != UNKNOWN else {}
+            self._sink.instant(self._left_out, frame.at_ns, f"{frame.kind} {frame.cause}", notes)
+            return
+        due_ns = self._expect(frame.frame, frame.release_ns)
+        late_ns = frame.end_ns - due_ns
+        name = f"late {frame.frame}" if late_ns > 0 else f"{frame.frame}"
+        notes = {"late_us": late_ns // NS_PER_US} if late_ns > 0 else {}
+        self._slice(ACTUAL, frame.release_ns, frame.end_ns, name, notes)
+        self._before_ns = frame.end_ns
+
+    def count(self, at_ns: int, in_flight: int) -> None:
+        """Write how many frames are in flight, if that has changed."""
+        if in_flight != self._flying:
+            self._flying = in_flight
+            self._sink.count(self._in_flight, at_ns, self._flying)
+
+    def _expect(self, frame: int, release_ns: int) -> int:
+        """Write when the frame was to be presented, and return its due time; NEVER where none is expected."""
+        if self._deadline_ns:
+            begin_ns, due_ns = release_ns, release_ns + self._deadline_ns
+        elif self._target_ns and self._before_ns is not None:
+            begin_ns, due_ns = self._before_ns, self._before_ns + self._target_ns
+        else:
+            return NEVER
+        self._slice(EXPECTED, begin_ns, due_ns, f"{frame}", {})
+        return due_ns
+
+    def _slice(self, name: str, begin_ns: int, end_ns: int, text: str, notes: dict[str, int]) -> None:
+        lane, begin_ns = self._lanes[name].place(begin_ns, end_ns)
+        if (name, lane) not in self._tracks:
+            self._tracks[name, lane] = self._sink.track(name, self._parent, self._ranks[name])
+        self._sink.slice(self._tracks[name, lane], begin_ns, end_ns, text, notes)
+
+
+def target_period_ns(begun: Begun) -> int:
+    """Return the frame time that the scene of a run is meant for, ns; 0 where the journal says none."""
+    scene = begun.facts.get("config", {}).get("scene", {})
+    fps = scene.get("fps") if isinstance(scene, dict) else None
+    return round(1e9 / fps) if isinstance(fps, int | float) and fps > 0 else 0
+
+
+class _UnitTracks:
+    """The units of a run as tracks below `parent`, from `rank` on: jobs, idle time by cause, and the stages.
+
+    A job that its unit held while the unit did another one is shown from its begin on; its notes say how long it had no
+    core. `flows_from`: number of frame 0's arrow; frame n is part of arrow `flows_from` + n.
+    """
+
+    def __init__(self, sink: Sink, graph: Graph, parent: int, rank: int, flows_from: int = 1) -> None:
+        self._sink, self._flows_from = sink, flows_from
+        sink.recurring([*IDLE_CAUSES, UNEXPLAINED, *(stage.name for stage in graph.stages)])
+        self._units = {unit: sink.track(unit, parent, rank + place) for place, unit in enumerate(graph.units)}
+        self._tiles: dict[str, Tiles[JobRecord | IdleSlice]] = {unit: Tiles() for unit in graph.units}
+        self._first, self._last = graph.stages[0].name, graph.stages[-1].name
+        self._stages = {
+            stage.name: sink.track(stage.name, self._units[stage.unit], place)
+            for place, stage in enumerate(graph.stages)
+        }
+        self._depths: dict[str, tuple[int, int]] = {}
+        self._counters: dict[tuple[str, str], int] = {}
+        self._figures: dict[tuple[str, str], float] = {}
+
+    def start(self, at_ns: int) -> None:
+        """Begin the time of the accounts."""
+        for tiles in self._tiles.values():
+            tiles.start(at_ns)
+
+    def work(self, worked: Worked) -> None:
+        """Take a job that has ended."""
+        job = worked.job
+        self._tiles[job.unit].add(job.begin_ns, job.end_ns, job)
+        self._sink.slice(self._stages[job.stage], job.begin_ns, job.end_ns, f"{job.frame}")
+        self._count_figures(job, worked.figures)
+        self._write(job.unit)
+
+    def idle(self, piece: IdleSlice) -> None:
+        """Take a slice of a unit's idle time."""
+        self._tiles[piece.unit].add(piece.begin_ns, piece.end_ns, piece)
+        self._write(piece.unit)
+
+    def count(self, at_ns: int, waiting: Mapping[str, int]) -> None:
+        """Write how many frames wait before each stage, where that has changed."""
+        for stage, frames in waiting.items():
+            counter, depth = self._depths.get(stage, (0, 0))
+            if frames == depth:
+                continue
+            if not counter:
+                counter = self._sink.counter_track(WAITING, self._stages[stage], 0)
+            self._depths[stage] = counter, frames
+            self._sink.count(counter, at_ns, frames)
+
+    def close(self) -> None:
+        """Write what still waits."""
+        for unit in self._units:
+            self._write(unit, rest=True)
+
+    def _write(self, unit: str, *, rest: bool = False) -> None:
+        track = self._units[unit]
+        for begin_ns, end_ns, piece in self._tiles[unit].take(rest=rest):
+            if isinstance(piece, IdleSlice):
+                notes = _if_any(preempted_ns=piece.preempted_ns)
+                self._sink.slice(track, begin_ns, end_ns, piece.cause, notes)
+            else:
+                flow = FlowArrow(self._flows_from + piece.frame, piece.stage == self._first, piece.stage == self._last)
+                self._sink.slice(track, begin_ns, end_ns, piece.stage, _notes_of(piece), flow)
+
+    def _count_figures(self, job: JobRecord, figures: Mapping[str, float]) -> None:
+        """Write the counters that changed since the stage's last job, at the job's begin. A counter begins above 0."""
+        for rank, (name, (title, unit)) in enumerate(FIGURE_COUNTERS.items(), start=1):
+            key, value = (job.stage, name), figures.get(name)
+            if value is None or self._figures.get(key, 0) == value:
+                continue
+            if key not in self._counters:
+                self._counters[key] = self._sink.counter_track(title, self._stages[job.stage], rank, unit)
+            self._figures[key] = value
+            self._sink.count(self._counters[key], job.begin_ns, value)
+
+
+def _notes_of(job: JobRecord) -> dict[str, int]:
+    lost = _if_any(preempted_ns=job.preempted_ns, asleep_ns=job.asleep_ns)
+    return {"frame": job.frame, "wait_us": (job.begin_ns - job.ready_ns) // NS_PER_US, **lost}
+
+
+def _if_any(**times_ns: int) -> dict[str, int]:
+    """Return those that are not 0."""
+    return {name: ns for name, ns in times_ns.items() if ns}
+
+
+class Tiles(Generic[Item]):
+    """The slices of one track, which come in any order and leave in order, without overlap.
+
+    At any moment a unit has a job or is idle, so a slice can be written once those before it reach up to it. A slice
+    that begins within the written time is cut.
+    """
+
+    def __init__(self) -> None:
+        self._until_ns: int | None = None
+        self._waiting: list[tuple[int, int, int, Item]] = []
+        self._count = 0
+
+    def add(self, begin_ns: int, end_ns: int, item: Item) -> None:
+        """Add a slice of the track."""
+        self._count += 1
+        heappush(self._waiting, (begin_ns, end_ns, self._count, item))
+
+    def start(self, at_ns: int) -> None:
+        """Begin the track's time."""
+        self._until_ns = at_ns
+
+    def take(self, *, rest: bool = False) -> Iterator[tuple[int, int, Item]]:
+        """Yield (begin, end, item) of the slices that can be written now; with `rest`, of all."""
+        waiting = self._waiting
+        while waiting and (rest or len(waiting) > MOST_WAITING or self._reaches(waiting[0][0])):
+            begin_ns, end_ns, _, item = heappop(waiting)
+            begin_ns = max(begin_ns, self._until_ns or begin_ns)
+            if end_ns >= begin_ns:
+                self._until_ns = end_ns
+                yield begin_ns, end_ns, item
+
+    def _reaches(self, at_ns: int) -> bool:
+        return self._until_ns is not None and self._until_ns >= at_ns
+
+
+class Lanes:
+    """Puts overlapping slices into lanes in which they do not overlap; lanes are numbered from 0.
+
+    `most`: largest number of lanes; where more slices overlap, the begin of one is cut.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._until_ns: list[int] = []
+
+    def place(self, begin_ns: int, end_ns: int) -> tuple[int, int]:
+        """Return the lane of a slice, and where the slice begins in it."""
+        for lane, until_ns in enumerate(self._until_ns):
+            if until_ns <= begin_ns:
+                self._until_ns[lane] = end_ns
+                return lane, begin_ns
+        if len(self._until_ns) < self._most:
+            self._until_ns.append(end_ns)
+            return len(self._until_ns) - 1, begin_ns
+        lane = min(range(self._most), key=self._until_ns.__getitem__)
+        begin_ns = min(self._until_ns[lane], end_ns)
+        self._until_ns[lane] = max(end_ns, self._until_ns[lane])
+        return lane, begin_ns

@@ -1,0 +1,325 @@
+"""What a trace is written into: Perfetto's packets (ui.perfetto.dev) or Chrome's JSON (chrome://tracing).
+
+Rule: tracks, slices, instants, counters and flows, whatever the file's format. Times are ns of the run's clock. The
+slices of one track come in the order of their begins and do not overlap. Memory is bounded: packets are written in
+blocks, JSON event by event. A file that ends early is whole up to its last block.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
+from typing import IO, Any, Final, NamedTuple, Protocol
+
+from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TracePacket, TrackDescriptor, TrackEvent
+
+#: Notes of a slice: numbers, texts, and mappings and sequences of them.
+Notes = Mapping[str, Any]
+NO_NOTES: Notes = {}
+SEQUENCE: Final = 1
+BLOCK_BYTES: Final = 1 << 18
+PLAIN_BYTES: Final = 16 << 20
+LONGEST_INT: Final = 1 << 63
+#: Tag of `Trace.packet`: a trace is its packets one after the other, each behind this and its length.
+PACKET_FIELD: Final = b"\x0a"
+NS_PER_US: Final = 1000
+CATEGORY: Final = "frame"
+
+
+class FlowArrow(NamedTuple):
+    """The arrow that a slice is part of.
+
+    `number`: number of the arrow, above 0. `begins`, `ends`: whether the arrow begins or ends at the slice.
+    """
+
+    number: int
+    begins: bool = False
+    ends: bool = False
+
+
+class Sink(Protocol):
+    """A trace file that is being written."""
+
+    def recurring(self, names: Iterable[str]) -> None:
+        """Announce names of slices and instants that come again and again."""
+
+    def process(self, name: str) -> int:
+        """Begin a group of tracks of its own; return the number of its track."""
+
+    def track(self, name: str, parent: int, rank: int = 0) -> int:
+        """Begin a track below another one, in the order of `rank`; return its number. Viewers join equal names."""
+
+    def counter_track(self, name: str, parent: int, rank: int = 0, unit: str = "") -> int:
+        """Begin a track of numbers; return its number. `unit`: unit of the numbers, as people write it."""
+
+    def slice(
+        self, track: int, begin_ns: int, end_ns: int, name: str, notes: Notes = NO_NOTES, flow: FlowArrow | None = None
+    ) -> None:
+        """Write a piece of time on a track."""
+
+    def begin(self, track: int, at_ns: int, name: str, notes: Notes = NO_NOTES) -> None:
+        """Begin a slice whose end is not known yet."""
+
+    def end(self, track: int, at_ns: int) -> None:
+        """End the slice that has begun on the track."""
+
+    def instant(self, track: int, at_ns: int, name: str, notes: Notes = NO_NOTES) -> None:
+        """Write something that took no time."""
+
+    def count(self, track: int, at_ns: int, value: float) -> None:
+        """Give the counter this value from now on."""
+
+    def close(self) -> None:
+        """Write everything to the file."""
+
+
+class PacketSink:
+    """A `Sink` that writes Perfetto's packets.
+
+    The first `plain_bytes` are packets as they are, so any protobuf reader can read a trace of some minutes. What
+    follows is compressed, a block at a time (`TracePacket.compressed_packets`, zlib), as Perfetto's own recorder does.
+    Recurring names are interned: the first packet that uses one brings it along. `file`: opened for writing bytes; its
+    opener closes it after `close`.
+    """
+
+    def __init__(self, file: IO[bytes], plain_bytes: int = PLAIN_BYTES) -> None:
+        self._file, self._block, self._plain_bytes = file, bytearray(), plain_bytes
+        self._tracks = self._processes = 0
+        self._recurring: set[str] = set()
+        self._event_names: dict[str, int] = {}
+        self._note_names: dict[str, int] = {}
+        self._ended, self._counted = (
+            _packet(0, 0, kind) for kind in (TrackEvent.TYPE_SLICE_END, TrackEvent.TYPE_COUNTER)
+        )
+        first = TracePacket(trusted_packet_sequence_id=SEQUENCE)
+        first.sequence_flags = TracePacket.SEQ_INCREMENTAL_STATE_CLEARED
+        self._add(first)
+
+    def recurring(self, names: Iterable[str]) -> None:
+        self._recurring.update(names)
+
+    def process(self, name: str) -> int:
+        self._processes += 1
+        return self._describe(name, sibling_order_rank=self._processes, child_ordering=TrackDescriptor.EXPLICIT)
+
+    def track(self, name: str, parent: int, rank: int = 0) -> int:
+        ordering = TrackDescriptor.EXPLICIT
+        return self._describe(name, parent_uuid=parent, sibling_order_rank=rank, child_ordering=ordering)
+
+    def counter_track(self, name: str, parent: int, rank: int = 0, unit: str = "") -> int:
+        return self._describe(name, parent_uuid=parent, sibling_order_rank=rank, counter={"unit_name": unit})
+
+    def slice(
+        self, track: int, begin_ns: int, end_ns: int, name: str, notes: Notes = NO_NOTES, flow: FlowArrow | None = None
+    ) -> None:
+        packet = self._named(track, begin_ns, TrackEvent.TYPE_SLICE_BEGIN, name, notes)
+        if flow is not None:
+            packet.track_event.flow_ids.append(flow.number)
+        self._add(packet)
+        self.end(track, end_ns)
+
+    def begin(self, track: int, at_ns: int, name: str, notes: Notes = NO_NOTES) -> None:
+        packet = _packet(track, at_ns, TrackEvent.TYPE_SLICE_BEGIN)
+        packet.track_event.name = name
+        for key, value in notes.items():
+            _fill(packet.track_event.debug_annotations.add(name=key), value)
+        self._add(packet)
+
+    def end(self, track: int, at_ns: int) -> None:
+        packet = self._ended  # one packet serves all ends, because it holds numbers alone
+        packet.timestamp, packet.track_event.track_uuid = at_ns, track
+        self._add(packet)
+
+    def instant(self, track: int, at_ns: int, name: str, notes: Notes = NO_NOTES) -> None:
+        self._add(self._named(track, at_ns, TrackEvent.TYPE_INSTANT, name, notes))
+
+    def count(self, track: int, at_ns: int, value: float) -> None:
+        packet = self._counted
+        event = packet.track_event
+        packet.timestamp, event.track_uuid = at_ns, track
+        if value == int(value):
+            event.counter_value = int(value)
+        else:
+            event.double_counter_value = value  # setting one of the two fields unsets the other
+        self._add(packet)
+
+    def close(self) -> None:
+        self._write_block()
+        self._file.flush()
+
+    def _describe(self, name: str, **fields: Any) -> int:
+        self._tracks += 1
+        self._add(TracePacket(track_descriptor=TrackDescriptor(uuid=self._tracks, name=name, **fields)))
+        return self._tracks
+
+    def _named(self, track: int, at_ns: int, kind: int, name: str, notes: Notes) -> Any:
+        """Return an event; a recurring name is interned, and so are the names of notes."""
+        packet = _packet(track, at_ns, kind)
+        event = packet.track_event
+        if name in self._recurring:
+            event.name_iid = self._event_names.get(name) or _intern(self._event_names, name, packet, "event_names")
+            packet.sequence_flags = TracePacket.SEQ_NEEDS_INCREMENTAL_STATE
+        else:
+            event.name = name
+        for key, value in notes.items():
+            number = self._note_names.get(key) or _intern(self._note_names, key, packet, "debug_annotation_names")
+            _fill(event.debug_annotations.add(name_iid=number), value)
+            packet.sequence_flags = TracePacket.SEQ_NEEDS_INCREMENTAL_STATE
+        return packet
+
+    def _add(self, packet: Any) -> None:
+        content = packet.SerializeToString()
+        self._block += PACKET_FIELD + _varint(len(content)) + content
+        if len(self._block) >= BLOCK_BYTES:
+            self._write_block()
+
+    def _write_block(self) -> None:
+        content = bytes(self._block)
+        self._block.clear()
+        self._plain_bytes -= len(content)
+        if self._plain_bytes < 0:
+            content = Trace(packet=[TracePacket(compressed_packets=zlib.compress(content))]).SerializeToString()
+        self._file.write(content)
+
+
+def packets_in(content: bytes) -> Iterator[TracePacket]:
+    """Yield the packets of a trace in order, compressed or not.
+
+    Raises google.protobuf.message.DecodeError for bytes that are no trace.
+    """
+    for packet in Trace.FromString(content).packet:
+        if packet.HasField("compressed_packets"):
+            yield from Trace.FromString(zlib.decompress(packet.compressed_packets)).packet
+        else:
+            yield packet
+
+
+@lru_cache(maxsize=1024)
+def _varint(number: int) -> bytes:
+    """Return a length as protobuf writes it: seven bits a byte, lowest first, the top bit set except in the last."""
+    groups = bytearray()
+    while number > 0x7F:
+        groups.append(number & 0x7F | 0x80)
+        number >>= 7
+    return bytes((*groups, number))
+
+
+def _packet(track: int, at_ns: int, kind: int) -> Any:
+    """Return an event of a track."""
+    packet = TracePacket(timestamp=at_ns, trusted_packet_sequence_id=SEQUENCE)
+    event = packet.track_event
+    event.type, event.track_uuid = kind, track
+    return packet
+
+
+def _intern(numbers: dict[str, int], name: str, packet: Any, table: str) -> int:
+    """Return the number of a name that no packet before this one has."""
+    numbers[name] = number = len(numbers) + 1
+    getattr(packet.interned_data, table).add(iid=number, name=name)
+    return number
+
+
+def _fill(note: Any, value: Any) -> None:
+    """Give an annotation its value."""
+    if isinstance(value, bool):
+        note.bool_value = value
+    elif isinstance(value, int) and -LONGEST_INT <= value < LONGEST_INT:
+        note.int_value = value
+    elif isinstance(value, float):
+        note.double_value = value
+    elif value is None or (isinstance(value, Mapping | Sequence) and not value):
+        note.string_value = "none"
+    elif isinstance(value, Mapping):
+        for key, below in value.items():
+            _fill(note.dict_entries.add(name=str(key)), below)
+    elif isinstance(value, Sequence) and not isinstance(value, str):
+        for below in value:
+            _fill(note.array_values.add(), below)
+    else:
+        note.string_value = str(value)
+
+
+class ChromeSink:
+    """A `Sink` that writes Chrome's JSON, event by event.
+
+    The format is the Trace Event Format, docs.google.com/document/d/1CvAClvFfyA5R-PhYUmn5OOQtYMH4h6I0nSsKchNAySU. A
+    process is a process, a track one of its threads; times are in us. `file`: opened for writing text; its opener
+    closes it after `close`.
+    """
+
+    def __init__(self, file: IO[str]) -> None:
+        self._file, self._is_first, self._tracks = file, True, 0
+        self._names: dict[int, str] = {}
+        self._process_of: dict[int, int] = {}
+        file.write('{"displayTimeUnit": "ms", "traceEvents": [')
+
+    def recurring(self, names: Iterable[str]) -> None:
+        """Do nothing: Chrome's JSON has every name in full."""
+
+    def process(self, name: str) -> int:
+        number = self._new(name)
+        self._process_of[number] = number
+        self._write(ph="M", pid=number, name="process_name", args={"name": name})
+        return number
+
+    def track(self, name: str, parent: int, rank: int = 0) -> int:  # noqa: ARG002 - the order is that of the calls
+        number = self._child(name, parent)
+        pid = self._process_of[number]
+        self._write(ph="M", pid=pid, tid=number, name="thread_name", args={"name": self._names[number]})
+        self._write(ph="M", pid=pid, tid=number, name="thread_sort_index", args={"sort_index": number})
+        return number
+
+    def counter_track(self, name: str, parent: int, rank: int = 0, unit: str = "") -> int:  # noqa: ARG002
+        return self._child(f"{name}, {unit}" if unit else name, parent)
+
+    def slice(
+        self, track: int, begin_ns: int, end_ns: int, name: str, notes: Notes = NO_NOTES, flow: FlowArrow | None = None
+    ) -> None:
+        times = {"ts": begin_ns / NS_PER_US, "dur": (end_ns - begin_ns) / NS_PER_US}
+        self._write(ph="X", **self._at(track), **times, name=name, args=notes)
+        if flow is not None:
+            phase = "s" if flow.begins else "f" if flow.ends else "t"
+            where = {**self._at(track), "ts": begin_ns / NS_PER_US, "bp": "e"}
+            self._write(ph=phase, **where, id=flow.number, cat=CATEGORY, name=CATEGORY)
+
+    def begin(self, track: int, at_ns: int, name: str, notes: Notes = NO_NOTES) -> None:
+        self._write(ph="B", **self._at(track), ts=at_ns / NS_PER_US, name=name, args=notes)
+
+    def end(self, track: int, at_ns: int) -> None:
+        self._write(ph="E", **self._at(track), ts=at_ns / NS_PER_US)
+
+    def instant(self, track: int, at_ns: int, name: str, notes: Notes = NO_NOTES) -> None:
+        self._write(ph="i", s="t", **self._at(track), ts=at_ns / NS_PER_US, name=name, args=notes)
+
+    def count(self, track: int, at_ns: int, value: float) -> None:
+        where = {"pid": self._process_of[track], "ts": at_ns / NS_PER_US}
+        self._write(ph="C", **where, name=self._names[track], args={"value": value})
+
+    def close(self) -> None:
+        self._file.write("\n]}\n")
+        self._file.flush()
+
+    def _new(self, name: str) -> int:
+        self._tracks += 1
+        self._names[self._tracks] = name
+        return self._tracks
+
+    def _child(self, name: str, parent: int) -> int:
+        """Begin a track below `parent`; its name has the parent's in front unless that is a process.
+
+        Chrome's threads have no hierarchy of their own.
+        """
+        pid = self._process_of[parent]
+        number = self._new(name if parent == pid else f"{self._names[parent]}: {name}")
+        self._process_of[number] = pid
+        return number
+
+    def _at(self, track: int) -> dict[str, int]:
+        return {"pid": self._process_of[track], "tid": track}
+
+    def _write(self, **event: Any) -> None:
+        self._file.write("\n" if self._is_first else ",\n")
+        self._is_first = False
+        self._file.write(json.dumps(event, separators=(",", ":"), allow_nan=False))

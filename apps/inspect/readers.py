@@ -1,0 +1,313 @@
+"""What motions, cameras, bodies, avatars, networks, scenes, traces and runs are, each by a command's own reader.
+
+Rule: a fact is one that the reader found; what this file adds is words. Nothing is placed in a scene, so everything
+said is of the file alone.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from trilane.apps.avatar_facts import bundle_facts
+from trilane.apps.compare.overview import read_entries
+from trilane.apps.explain.trace import NAME as TRACE_NAME
+from trilane.apps.inspect.inspection import Inspection, Length, drawn_cameras, drawn_points, drawn_skeletons, used
+from trilane.apps.report import read_report
+from trilane.apps.sweep.definition import read_sweep
+from trilane.arrays import F32
+from trilane.avatars.bundle import DEFAULT, MANIFEST, bundle_folder, load_bundle
+from trilane.avatars.network_file import read_network
+from trilane.body.body import ShapedBody, load_body
+from trilane.body.kinematics import Skeleton
+from trilane.errors import BadInputError
+from trilane.files import MAX_TEXT_BYTES, read_npz, read_text
+from trilane.hw_profiles.graph_file import read_graph
+from trilane.hw_profiles.load import load_profile
+from trilane.pipeline.journal import NAME as JOURNAL
+from trilane.pipeline.journal import read_journal
+from trilane.scene.camera.files import load_camera
+from trilane.scene.camera.path import CameraPath
+from trilane.scene.motion.files import load_motion
+from trilane.scene.motion.motion import Motion
+from trilane.scene.recordings import Detected
+from trilane.scene.rotations import matrix_from_quat
+from trilane.scene.schema import AvatarSpec, CameraSpec, load_scene
+
+SHEET = "contact.png"
+MOMENTS = 6
+MOST_PATH_POINTS = 2000
+
+
+def inspect_body(path: Path) -> Inspection:
+    """Read a body. Raises BadInputError when it is not usable."""
+    shaped = load_body(path).shape()
+    height = float(np.ptp(shaped.vertices[:, 1]))
+    facts = {
+        "vertices": len(shaped.vertices),
+        "triangles": len(shaped.body.faces),
+        "joints": len(shaped.joints),
+        "height_m": round(height, 4),
+        "pose_blend_shapes": shaped.body.has_pose_blend_shapes,
+    }
+    return Inspection(
+        "body",
+        f"a body of {len(shaped.vertices)} vertices, {height:.2f} m tall",
+        "",
+        f"trilane body inspect {path}",
+        Detected("body in the SMPL-X layout", "an array `v_template`", "Y up, as the layout has it", "m"),
+        facts=facts,
+        draw=partial(_drawn_body, shaped.vertices),
+    )
+
+
+def _drawn_body(vertices: F32) -> Image.Image:
+    return drawn_points(vertices.astype(np.float64))
+
+
+def inspect_avatar(path: Path) -> Inspection:
+    """Read an avatar. `path`: its folder or manifest. Raises BadInputError when the bundle is not usable."""
+    folder = path if path.is_dir() else path.parent
+    bundle = load_bundle(folder)
+    found = bundle_facts(bundle)
+    manifest = bundle.manifest
+    vertices = bundle.shaped_body().vertices
+    facts = {
+        "name": found["name"],
+        "vertices": found["body"]["vertices"],
+        "texture": found["texture"]["shape"],
+        "network": {key: found["network"][key] for key in ("file", "encoder", "width", "shape", "parameters", "gmac")},
+        "validated": found["validation"] is not None,
+    }
+    return Inspection(
+        "avatar",
+        f"the avatar {manifest.name!r}",
+        "",
+        used("--avatar", folder),
+        Detected("avatar bundle", f"a file {MANIFEST}"),
+        facts=facts,
+        draw=partial(_drawn_body, vertices),
+    )
+
+
+def inspect_texture(path: Path) -> Inspection:
+    """Read a neural texture. Raises BadInputError when that fails."""
+    shape = list(read_npz(path, ("texture",), "a neural texture")["texture"].shape)
+    what = f"a neural texture of shape {tuple(shape)}, a part of an avatar"
+    found = Detected("neural texture", "an array `texture`")
+    return Inspection("texture", what, "", f"trilane inspect {path.parent}", found, facts={"shape": shape})
+
+
+def inspect_network(path: Path) -> Inspection:
+    """Read an ONNX network; one that no avatar can use is usable for predictions.
+
+    Raises BadInputError when it is none.
+    """
+    graph = read_graph(path)
+    facts: dict[str, Any] = {"parameters": graph.work.weights, "gmac": graph.work.macs / 1e9, "numbers": graph.numbers}
+    notes: tuple[str, ...] = ()
+    try:
+        shape = read_network(path).shape
+        facts, what = {"avatars": True, "shape": list(shape), **facts}, "an avatar's integer network"
+    except BadInputError as error:
+        facts, what = {"avatars": False, **facts}, "an ONNX network, which is no avatar's"
+        notes = (f"no avatar's network: found {error.found}, expected {error.expected}",)
+    detected = Detected("ONNX network", "a protobuf message with nodes and operator sets")
+    advice = f"trilane predict --network {path}"
+    return Inspection("network", what, "", advice, detected, facts=facts, notes=notes)
+
+
+def inspect_scene(path: Path) -> Inspection:
+    """Read a scene, without the files that it names. Raises BadInputError when the scene is refused."""
+    values = load_scene(path)
+    avatars = values["avatars"]
+    named = [values["background"], values["camera"]["source"], *(raw[key] for raw in avatars for key in ("motion",))]
+    facts = {"name": values["name"], "avatars": len(avatars), "sources": [str(source) for source in named]}
+    missing = [source for source in facts["sources"] if "/" in source and not Path(source).exists()]
+    notes = tuple(f"{source}: no such file, which the scene names" for source in missing)
+    what = f"the scene {values['name']!r} with {len(avatars)} avatar{'s' if len(avatars) != 1 else ''}"
+    advice = "give the files that it names" if missing else used("", path)
+    found = Detected("scene", "TOML with keys of the scene schema")
+    return Inspection("scene", what, notes[0] if missing else "", advice, found, facts=facts, notes=notes)
+
+
+def inspect_profile(path: Path) -> Inspection:
+    """Read a hardware profile. Raises BadInputError when it is refused."""
+    profile = load_profile(path)
+    found = Detected("hardware profile", "TOML with a title and units")
+    return Inspection(
+        "hardware profile",
+        f"the hardware profile of {profile.title}",
+        "",
+        f"trilane predict --profile {path}",
+        found,
+        facts={"name": profile.name},
+    )
+
+
+def inspect_run(path: Path) -> Inspection:
+    """Read a run folder, or the journal of one. Raises BadInputError when neither report nor journal is readable."""
+    folder = path if path.is_dir() else path.parent
+    sheet = folder / SHEET
+    detected = Detected("run folder", "a report or a journal in it")
+    draw = partial(_copied, sheet) if sheet.is_file() else None
+    if (folder / "report.json").is_file():
+        found = inspect_report(folder)
+        return Inspection("run", f"a run folder with {found.what}", "", found.advice, detected, found.length,
+                          found.facts, draw=draw)  # fmt: skip
+    records = sum(1 for _ in read_journal(folder / JOURNAL))
+    what = f"a run folder without a report: a journal of {records} records of a run that goes on or was killed"
+    return Inspection("run", what, "", f"trilane explain {folder}", detected, facts={"records": records}, draw=draw)
+
+
+def _copied(sheet: Path) -> Image.Image:
+    try:
+        with Image.open(sheet) as image:
+            return image.convert("RGB")
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise BadInputError(sheet, f"no readable picture ({error})", "the contact sheet of a run") from error
+
+
+def inspect_report(path: Path) -> Inspection:
+    """Read the report of a run. Raises BadInputError when it is none."""
+    report = read_report(path)
+    presented = report.frames.presented
+    seconds = report.duration_s
+    facts = {"clock": report.clock, "fps": report.fps, "presented": presented, "failure": report.failure}
+    what = f"the report of {presented} frames at {report.fps:.4g}/s on the {report.clock} clock"
+    advice = f"trilane explain {path if path.is_dir() else path.parent}"
+    length = Length(presented, float(seconds), float(report.fps))
+    return Inspection("report", what, "", advice, Detected("report of a run", "its key `clock`"), length, facts)
+
+
+def inspect_sweep(path: Path) -> Inspection:
+    """Read the folder of a sweep. Raises BadInputError when its trials are not readable."""
+    entries = read_entries([path])
+    what = f"a folder of {len(entries)} trials of a sweep"
+    found = Detected("sweep", "a file trials.jsonl")
+    return Inspection("sweep", what, "", f"trilane report {path}", found, facts={"trials": len(entries)})
+
+
+def inspect_sweep_file(path: Path) -> Inspection:
+    """Read the file of a sweep. Raises BadInputError when it is no sweep."""
+    sweep = read_sweep(path)
+    command = " ".join(sweep.command)
+    facts = {"command": command, "axes": list(sweep.axes)}
+    found = Detected("sweep file", "TOML with a `command`")
+    return Inspection("sweep file", f"a sweep of `trilane {command}`", "", f"trilane sweep {path}", found, facts=facts)
+
+
+def inspect_trace(path: Path) -> Inspection:
+    """Read a trace, of Perfetto or in Chrome's format. Raises BadInputError when it is none."""
+    events = _trace_events(path)
+    found, advice = Detected("trace", "its events"), "open it at https://ui.perfetto.dev"
+    return Inspection("trace", f"a trace of {events} events", "", advice, found, facts={"events": events})
+
+
+def _trace_events(path: Path) -> int:
+    if path.suffix == Path(TRACE_NAME).suffix:
+        return _packets(path)
+    document: Any = json.loads(read_text(path, "a trace in Chrome's format"))
+    events = document.get("traceEvents") if isinstance(document, dict) else None
+    if not isinstance(events, list):
+        raise BadInputError(f"{path}: traceEvents", type(events).__name__, "a list of events")
+    return len(events)
+
+
+def _packets(path: Path) -> int:
+    from google.protobuf.message import DecodeError
+    from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace
+
+    size = path.stat().st_size
+    if size > MAX_TEXT_BYTES:
+        raise BadInputError(path, f"{size} bytes", f"a trace of at most {MAX_TEXT_BYTES}")
+    trace = Trace()
+    try:
+        trace.ParseFromString(path.read_bytes())
+    except DecodeError as error:
+        raise BadInputError(path, "bytes that do not parse", "a trace of Perfetto") from error
+    if not trace.packet:
+        raise BadInputError(path, "no packets", "a trace of Perfetto")
+    return len(trace.packet)
+
+
+def inspect_motion(path: Path) -> Inspection:
+    """Read a motion. Raises BadInputError when it is not usable."""
+    motion = load_motion(AvatarSpec(motion=str(path.absolute())), Path(), _body().joints)
+    places = motion.translation
+    facts = {
+        "travels": motion.travels,
+        "ground_m": [round(float(side), 3) for side in np.ptp(places, axis=0)[[0, 2]]],
+        "leg_m": None if motion.leg_m is None else round(motion.leg_m, 3),
+        "betas": 0 if motion.betas is None else len(motion.betas),
+    }
+    return Inspection(
+        "motion",
+        f"a motion: {motion.detected.format or 'a recording'}",
+        "",
+        used("--motion", path),
+        motion.detected,
+        Length.of(motion.times_s),
+        facts,
+        motion.notes,
+        partial(_drawn_motion, motion),
+    )
+
+
+def inspect_camera(path: Path) -> Inspection:
+    """Read a camera. Raises BadInputError when it is not usable."""
+    camera = load_camera(CameraSpec(source=str(path.absolute())), Path())
+    low, high = camera.places.min(axis=0), camera.places.max(axis=0)
+    steps = np.linalg.norm(np.diff(camera.places, axis=0), axis=1)
+    angles = [lens.fov_y_deg for lens in camera.optics.lenses]
+    facts = {
+        "fov_y_deg": [round(min(angles), 3), round(max(angles), 3)],
+        "lenses": len(angles),
+        "pictures": len(camera.pictures),
+        "extent_m": [round(float(side), 3) for side in high - low],
+        "path_m": round(float(steps.sum()), 3),
+    }
+    return Inspection(
+        "camera",
+        f"a camera path: {camera.detected.format or 'a recording'}",
+        "",
+        used("--camera", path),
+        camera.detected,
+        Length.of(camera.times_s),
+        facts,
+        camera.notes,
+        partial(_drawn_camera, camera),
+    )
+
+
+@cache
+def _body() -> ShapedBody:
+    """Return the body that shows motions, which is the default avatar's."""
+    return load_body(bundle_folder(DEFAULT) / "body.npz").shape()
+
+
+def _drawn_motion(motion: Motion) -> Image.Image:
+    body = _body()
+    skeleton = Skeleton(body.joints, body.body.parents)
+    times = np.linspace(0.0, motion.duration_s, MOMENTS if motion.duration_s else 1)
+    joints = []
+    for time_s in times:
+        pose, place = motion.sample(float(time_s))
+        joints.append(skeleton.pose(pose, place - body.joints[0]).joints.copy())
+    return drawn_skeletons(np.stack(joints), times, _thinned(motion.translation))
+
+
+def _drawn_camera(camera: CameraPath) -> Image.Image:
+    return drawn_cameras(_thinned(matrix_from_quat(camera.quats)), _thinned(camera.places))
+
+
+def _thinned(samples: np.ndarray) -> np.ndarray:
+    """Return `samples` (N, ...), or MOST_PATH_POINTS of them, evenly spread with the first and the last."""
+    if len(samples) <= MOST_PATH_POINTS:
+        return samples
+    return np.asarray(samples[np.linspace(0, len(samples) - 1, MOST_PATH_POINTS).round().astype(int)])

@@ -1,0 +1,261 @@
+"""What a sweep tries: a command with fixed options and axes, its trials by name, and the TOML file that says so.
+
+Rule: the same definition gives the same trials in the same order on every machine. A trial's name is a hash of what is
+asked and of nothing else: not of the machine, the folder or the moment. The first defect of a file is named with its
+key; whether its options are those of the command is not known here.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import random
+import shlex
+import tomllib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from trilane.errors import BadInputError, did_you_mean
+from trilane.files import read_text
+
+#: Value of an option, as its command converts it; a list for an option that collects several.
+Value = str | int | float | bool | list[Any]
+Options = Mapping[str, Value]
+ID_DIGITS = 16
+MOST_TRIALS = 100_000
+EXPECTED = "a sweep (docs/sweeps.md)"
+#: Key -> the type of its value, and what that is called.
+KEYS: dict[str, tuple[type, str]] = {
+    "command": (str, "a command in quotes, such as 'run' or 'bench raster'"),
+    "kind": (str, "grid, list or random"),
+    "count": (int, "a whole number"),
+    "seed": (int, "a whole number"),
+    "repeats": (int, "a whole number"),
+    "options": (dict, "a table of options"),
+    "axes": (dict, "a table of lists"),
+}
+
+
+class SweepKind(StrEnum):
+    """How axes are combined. GRID: every combination; LIST: side by side, first with first; RANDOM: drawn by a seed."""
+
+    GRID = "grid"
+    LIST = "list"
+    RANDOM = "random"
+
+
+@dataclass(frozen=True)
+class Definition:
+    """A sweep to be done.
+
+    `command`: its words. `options`: fixed options. `axes`: option -> its values, at least one. `count`: number of
+    configurations that RANDOM draws. `seed`: seed of RANDOM. `repeats`: trials of every configuration.
+    """
+
+    command: tuple[str, ...]
+    options: Options = field(default_factory=dict)
+    axes: Mapping[str, Sequence[Value]] = field(default_factory=dict)
+    kind: SweepKind = SweepKind.GRID
+    count: int | None = None
+    seed: int = 0
+    repeats: int = 1
+
+
+def _kind_named(where: str, word: str) -> SweepKind:
+    """Return the kind that `word` names. Raises BadInputError, which names `where`, for any other word."""
+    if word not in [*SweepKind]:
+        raise BadInputError(where, repr(word), f"one of {', '.join(SweepKind)}", did_you_mean(word, SweepKind))
+    return SweepKind(word)
+
+
+def trials_of(definition: Definition, words: Callable[[Options], Sequence[str]]) -> list[Trial]:
+    """Return the trials. The last axis changes fastest, and repeats of a configuration follow each other.
+
+    `words`: gives the options of a configuration as a command line has them.
+    Raises BadInputError for axes that do not fit each other, for more than `MOST_TRIALS`, and for a trial given twice.
+    """
+    made = [
+        Trial(definition.command, options, tuple(words(options)), repeat)
+        for options in _configurations(definition)
+        for repeat in range(1, definition.repeats + 1)
+    ]
+    seen: set[str] = set()
+    for trial in made:
+        if trial.id in seen:
+            raise BadInputError("axes", f"{trial.line} twice", "each trial once", "repeats = 2 measures it again")
+        seen.add(trial.id)
+    return made
+
+
+def _configurations(definition: Definition) -> Iterator[Options]:
+    _check(definition)
+    names = list(definition.axes)
+    if definition.kind is SweepKind.LIST and names:
+        combinations: Iterator[Sequence[Value]] = zip(*definition.axes.values(), strict=True)
+    else:
+        combinations = (_combination(definition, number) for number in _numbers(definition))
+    for values in combinations:
+        yield {**definition.options, **dict(zip(names, values, strict=True))}
+
+
+def _check(definition: Definition) -> None:
+    for name in definition.axes:
+        if not definition.axes[name]:
+            raise BadInputError(f"axes.{name}", "no value", "at least one")
+        if name in definition.options:
+            raise BadInputError(f"axes.{name}", "an axis that is a fixed option too", "one of them")
+    lengths = {name: len(values) for name, values in definition.axes.items()}
+    if definition.kind is SweepKind.LIST and len(set(lengths.values())) > 1:
+        found = ", ".join(f"{count} of {name}" for name, count in lengths.items())
+        raise BadInputError("axes", found, "as many values of each", "a list takes the axes side by side")
+    if _count(definition) * definition.repeats > MOST_TRIALS:
+        found = f"{_count(definition) * definition.repeats} trials"
+        raise BadInputError("axes", found, f"at most {MOST_TRIALS}", "draw some of them: kind = 'random' with a count")
+
+
+def _count(definition: Definition) -> int:
+    """Return the number of configurations. Raises BadInputError where more are drawn than there are."""
+    if definition.kind is SweepKind.LIST:
+        return max((len(values) for values in definition.axes.values()), default=1)
+    whole = math.prod(len(values) for values in definition.axes.values())
+    if definition.kind is SweepKind.GRID:
+        return whole
+    if definition.count is None or not 1 <= definition.count <= whole:
+        found = "none" if definition.count is None else str(definition.count)
+        raise BadInputError("count", found, f"1 to {whole}", "so many combinations the axes have")
+    return definition.count
+
+
+def _numbers(definition: Definition) -> Sequence[int]:
+    """Return the numbers of the combinations, as a grid numbers them; drawn ones are in the grid's order."""
+    whole = math.prod(len(values) for values in definition.axes.values())
+    if definition.kind is SweepKind.RANDOM:
+        return sorted(random.Random(definition.seed).sample(range(whole), _count(definition)))
+    return range(whole)
+
+
+def _combination(definition: Definition, number: int) -> list[Value]:
+    """Return combination `number`: it is written with one digit per axis, in the base of that axis's length."""
+    digits: list[Value] = []
+    for values in reversed(list(definition.axes.values())):
+        number, place = divmod(number, len(values))
+        digits.append(values[place])
+    return digits[::-1]
+
+
+class TrialClock(StrEnum):
+    """The clock of a trial. HOST: it takes time and needs its machine for itself. VIRTUAL: it computes its times."""
+
+    HOST = "host"
+    VIRTUAL = "virtual"
+
+
+@dataclass(frozen=True)
+class TriedCommand:
+    """A command that a sweep can try. `clock`: clock of its result. `has_folder`: whether it writes a run folder."""
+
+    clock: TrialClock
+    has_folder: bool = False
+
+
+#: Commands that a sweep can try, by their first word.
+COMMANDS = {
+    "run": TriedCommand(TrialClock.HOST, has_folder=True),
+    "predict": TriedCommand(TrialClock.VIRTUAL),
+    "accuracy": TriedCommand(TrialClock.HOST),
+    "bench": TriedCommand(TrialClock.HOST),
+}
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One configuration of a command, to be run once.
+
+    `command`: its words, such as `bench raster`. `options`: options by name, without dashes. `words`: the options as
+    typed. `repeat`: number of the repeat, from 1.
+    """
+
+    command: tuple[str, ...]
+    options: Options
+    words: tuple[str, ...]
+    repeat: int = 1
+
+    @cached_property
+    def id(self) -> str:
+        """The first 16 digits of the SHA-256 of the canonical configuration."""
+        return hashlib.sha256(canonical(self.command, self.options, self.repeat).encode()).hexdigest()[:ID_DIGITS]
+
+    @property
+    def arguments(self) -> list[str]:
+        """The words after `trilane` on its command line."""
+        return [*self.command, *self.words, "--json"]
+
+    @property
+    def line(self) -> str:
+        """The command line that does the trial once more, without its run folder."""
+        return shlex.join(["trilane", *self.arguments])
+
+    @property
+    def kind(self) -> TriedCommand:
+        return COMMANDS[self.command[0]]
+
+
+def canonical(command: tuple[str, ...], options: Options, repeat: int = 1) -> str:
+    """Return a configuration as JSON without spaces, keys sorted.
+
+    The first repeat is not named, so that more repeats leave its name as it is. Raises ValueError for NaN and
+    infinities.
+    """
+    named: dict[str, Any] = {"command": list(command), "options": dict(options)}
+    if repeat > 1:
+        named["repeat"] = repeat
+    return json.dumps(named, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+
+
+@dataclass(frozen=True)
+class SweepFile:
+    """What a file says. Values of options are as the file has them."""
+
+    command: tuple[str, ...]
+    kind: SweepKind = SweepKind.GRID
+    count: int | None = None
+    seed: int = 0
+    repeats: int = 1
+    options: dict[str, Any] = field(default_factory=dict)
+    axes: dict[str, list[Any]] = field(default_factory=dict)
+
+
+def read_sweep(path: Path) -> SweepFile:
+    """Read the file of a sweep. Raises BadInputError when it cannot be read or is no sweep."""
+    try:
+        data = tomllib.loads(read_text(path, EXPECTED))
+    except (ValueError, RecursionError) as error:  # also for numbers and lists that are too long
+        raise BadInputError(path, f"no TOML ({error})", EXPECTED) from error
+    for key, value in data.items():
+        _check_key(path, key, value)
+    if not data.get("command", "").split():
+        raise BadInputError(f"{path}: command", "nothing", KEYS["command"][1])
+    if data.get("repeats", 1) < 1:
+        raise BadInputError(f"{path}: repeats", str(data["repeats"]), "1 or more")
+    for name, values in data.get("axes", {}).items():
+        if not isinstance(values, list):
+            raise BadInputError(f"{path}: axes.{name}", repr(values), "a list", "a single value goes under [options]")
+    kind = _kind_named(f"{path}: kind", data.get("kind", SweepKind.GRID))
+    for key in ("count", "seed"):
+        if key in data and kind is not SweepKind.RANDOM:
+            raise BadInputError(f"{path}: {key}", f"{key} of a {kind}", "kind = 'random' beside it")
+    return SweepFile(**{**data, "kind": kind, "command": tuple(data["command"].split())})
+
+
+def _check_key(path: Path, key: str, value: object) -> None:
+    if key not in KEYS:
+        remedy = did_you_mean(key, KEYS) or "options go under [options] or [axes]"
+        raise BadInputError(f"{path}: {key}", "an unknown key", f"one of {', '.join(KEYS)}", remedy)
+    kind, expected = KEYS[key]
+    if not isinstance(value, kind) or isinstance(value, bool):
+        raise BadInputError(f"{path}: {key}", repr(value), expected)

@@ -1,0 +1,325 @@
+"""How trials are done: one in a process, many on this machine, and many on the machines of a Ray cluster.
+
+Rule: a process that was ended from outside is lost and may be tried again; what ends by itself has said its last word.
+Trials of the host clock run one at a time on a machine, virtual ones on all its cores, and no process is left. On Ray a
+task does one trial as this machine would, and the driver alone writes the sweep's folder. Ray retries nothing by
+itself; a driver that leaves takes its workers with it, and they their trials.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from trilane import machine
+from trilane.apps.sweep.definition import Trial, TrialClock
+from trilane.apps.sweep.store import SWEEP, Engine, Record
+from trilane.errors import BadInputError, MissingPartError
+from trilane.stages.machine_facts import machine_facts
+
+#: The module that a trial runs; tests replace it.
+PROGRAM = "trilane"
+#: Seconds for a trial to end when asked, before it is killed.
+END_S = 10.0
+#: Exit codes of a process that somebody ended: by a signal that its own defects do not cause, or by an interrupt.
+ENDED_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT, -signal.SIGHUP, 130)
+host_facts = cache(machine_facts)
+#: Ray's resource that each machine has one of; a trial of the host clock takes it.
+RESOURCE = "trilane_host_clock"
+#: Seconds for the head of a cluster to answer.
+ANSWER_S = 5.0
+START_LINE = (
+    f"""RAY_worker_niceness=0 ray start --head --resources='{{"{RESOURCE}": 1}}', """
+    "on the others with --address=HEAD:6379 in place of --head"
+)
+#: Variables that Ray sets in its workers. A trial gets them as its machine has them.
+SET_BY_RAY = ("OMP_NUM_THREADS", "CUDA_VISIBLE_DEVICES", "PYTHONBREAKPOINT")
+
+
+@dataclass(frozen=True)
+class TrialPlace:
+    """Where trials are done.
+
+    `folder`: folder of the sweep, which takes their run folders; None for none. `working_folder`, `environment`: those
+    of the trials; None for this process's own. `program`: the module that a trial runs.
+    """
+
+    folder: Path | None
+    working_folder: Path | None = None
+    environment: dict[str, str] | None = None
+    program: str = field(default_factory=lambda: PROGRAM)
+
+
+class Children:
+    """The running processes of trials. Several threads start them, and one may end them all."""
+
+    def __init__(self, inherited: tuple[int, ...] = ()) -> None:
+        """`inherited`: file descriptors that every process gets."""
+        self._inherited = inherited
+        self._lock = threading.Lock()
+        self._going: set[subprocess.Popen[bytes]] = set()
+        self._over = False
+
+    def run(self, command: list[str], stdout: Any, stderr: Any, place: TrialPlace) -> int:
+        """Run `command` and return its exit code; after `end` no process starts and the code is that of SIGTERM."""
+        with self._lock:
+            if self._over:
+                return -signal.SIGTERM
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=stdout,
+                stderr=stderr,
+                cwd=place.working_folder,
+                env=place.environment,
+                process_group=0,  # Ctrl-C reaches the sweep alone, which ends its trials itself
+                pass_fds=self._inherited,
+            )
+            self._going.add(process)
+        try:
+            return process.wait()
+        finally:
+            _end([process])
+            with self._lock:
+                self._going.discard(process)
+
+    def end(self) -> None:
+        """End every process, and start no further one."""
+        with self._lock:
+            self._over = True
+            going = list(self._going)
+        _end(going)
+
+
+def _end(processes: list[subprocess.Popen[bytes]]) -> None:
+    for process in processes:
+        process.terminate()  # it does nothing to a process that has ended
+    give_up_at = time.monotonic() + END_S
+    for process in processes:
+        try:
+            process.wait(max(0.0, give_up_at - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def perform(trial: Trial, place: TrialPlace, children: Children) -> Record:
+    """Do `trial` and return its line of `trials.jsonl` (docs/sweeps.md has the keys).
+
+    What a lost trial left in the folder is removed. `children`: starts the trial's process.
+    """
+    began_at, start = machine.here.now().isoformat(timespec="milliseconds"), time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="trilane-trial-") as scratch:
+        own = (place.folder or Path(scratch)) / trial.id
+        _remove(own)
+        with tempfile.TemporaryFile() as stdout, tempfile.TemporaryFile() as stderr:
+            code = children.run(_command(trial, own, place.program), stdout, stderr, place)
+            out, messages = (_text(file) for file in (stdout, stderr))
+        ended = ended_as(code, out, messages)
+        if ended["status"] == "lost":
+            _remove(own)
+        has_folder = place.folder is not None and own.is_dir()
+    return {
+        **about(trial),
+        **ended,
+        "began_at": began_at,
+        "seconds": round(time.monotonic() - start, 3),
+        "host": host_facts(),
+        "folder": trial.id if has_folder else None,
+    }
+
+
+def about(trial: Trial) -> Record:
+    """Return what is known of a trial before it is done."""
+    return {
+        "schema": 1,
+        "id": trial.id,
+        "command": ["trilane", *trial.arguments],
+        "options": dict(trial.options),
+        "repeat": trial.repeat,
+        "clock": str(trial.kind.clock),
+    }
+
+
+def ended_as(code: int, out: str, messages: str) -> Record:
+    """Return how a process ended: status, exit code, its JSON document and, unless it is done, its last message.
+
+    `code`: exit code, negative for a signal, as `subprocess` has it. `out`, `messages`: text of its stdout and stderr.
+    """
+    result = _document(out)
+    lines = [line for line in messages.splitlines() if line.strip()]
+    error: str | None = lines[-1].strip() if lines else f"exit code {code}, no message"
+    if code in ENDED_FROM_OUTSIDE:
+        return {"status": "lost", "exit_code": code, "error": error, "result": None}
+    if code == 0 and result is None:
+        error = "exit code 0, but no JSON document on stdout"
+    done = code == 0 and result is not None
+    return {
+        "status": "done" if done else "failed",
+        "exit_code": code,
+        "error": None if done else error,
+        "result": result,
+    }
+
+
+def lost(trial: Trial, why: str) -> Record:
+    """Return the record of a trial whose worker ended before it could give one."""
+    return {
+        **about(trial),
+        **{"status": "lost", "exit_code": None, "error": why, "result": None},
+        **{"began_at": None, "seconds": None, "host": None, "folder": None},
+    }
+
+
+def _command(trial: Trial, own: Path, program: str) -> list[str]:
+    words = [*trial.arguments, *(("--out", str(own)) if trial.kind.has_folder else ())]
+    return [sys.executable, "-m", "trilane.apps.sweep.child", str(os.getpid()), program, *words]
+
+
+def _document(text: str) -> dict[str, Any] | None:
+    try:
+        found = json.loads(text)
+    except ValueError:
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def _text(file: Any) -> str:
+    file.seek(0)
+    return str(file.read().decode(errors="replace"))
+
+
+def _remove(own: Path) -> None:
+    """Remove the run folder of a trial, whole or partial."""
+    shutil.rmtree(own, ignore_errors=True)
+    for draft in own.parent.glob(f"{own.name}.*.partial"):
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def at_once(clock: TrialClock) -> int:
+    """Return how many trials run together: one that measures has the machine for itself."""
+    return 1 if clock is TrialClock.HOST else len(machine.here.cores())
+
+
+def run_here(trials: Sequence[Trial], place: TrialPlace, inherited: tuple[int, ...] = ()) -> Generator[Record]:
+    """Do `trials`, all of one command, on this machine and yield their records as they end.
+
+    Closing the generator ends the trials that still run. `inherited`: file descriptors that every trial gets.
+    """
+    children = Children(inherited)
+    with ThreadPoolExecutor(at_once(trials[0].kind.clock)) as pool:
+        waiting = [pool.submit(perform, trial, place, children) for trial in trials]
+        try:
+            for ended in as_completed(waiting):
+                yield ended.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+            children.end()
+
+
+@contextmanager
+def cluster(folder: Path) -> Iterator[Engine]:
+    """Give the engine of a Ray cluster while connected to it; RAY_ADDRESS or this machine says which cluster.
+
+    `folder`: folder of the sweep; machines of the cluster that see it keep their run folders there.
+    Raises MissingPartError without Ray, BadInputError without a cluster.
+    """
+    ray = required_ray()
+    try:
+        _try_address(os.environ.get("RAY_ADDRESS", ""))
+        ray.init(address="auto", log_to_driver=False, logging_level="ERROR")
+    except OSError as error:
+        raise BadInputError("--engine ray", "no cluster", "one that runs", f"start it: {START_LINE}") from error
+    try:
+        yield partial(_run_on, ray, TrialPlace(folder, Path.cwd()))
+    finally:
+        ray.shutdown()
+
+
+def _try_address(address: str) -> None:
+    """Raise OSError for HOST:PORT where nobody listens; Ray alone would try it for many minutes."""
+    host, _, port = address.rpartition(":")
+    if host and port.isdecimal() and "/" not in host:
+        socket.create_connection((host, int(port)), ANSWER_S).close()
+
+
+def required_ray() -> Any:
+    """Return the package `ray`. Raises MissingPartError without it."""
+    try:
+        import ray
+    except ImportError as error:
+        raise MissingPartError("the engine ray needs the package ray", extra="ray") from error
+    return ray
+
+
+def _run_on(ray: Any, place: TrialPlace, trials: Sequence[Trial]) -> Generator[Record]:
+    resources = _resources(ray, trials[0].kind.clock)
+    task = ray.remote(num_cpus=1, resources=resources, max_retries=0)(perform_there)
+    going = {task.remote(trial, str(place.folder), str(place.working_folder), place.program): trial for trial in trials}
+    while going:
+        (ended,), _ = ray.wait(list(going), num_returns=1)
+        yield _record(ray, ended, going.pop(ended))
+
+
+def _resources(ray: Any, clock: TrialClock) -> dict[str, int]:
+    """Return what a trial takes besides a core. Raises BadInputError when no machine has it."""
+    if clock is TrialClock.VIRTUAL:
+        return {}
+    if RESOURCE not in ray.cluster_resources():
+        remedy = f"it keeps trials from disturbing each other; start them so: {START_LINE}"
+        raise BadInputError("--engine ray", f"no machine with the resource {RESOURCE}", "1 on each", remedy)
+    return {RESOURCE: 1}
+
+
+def _record(ray: Any, reference: Any, trial: Trial) -> Record:
+    try:
+        found: Record = ray.get(reference)
+    except ray.exceptions.RayTaskError as error:
+        raise error.cause from None
+    except ray.exceptions.RayError as error:
+        return lost(trial, str(error).partition("\n")[0])
+    return found
+
+
+def perform_there(trial: Trial, folder: str, working_folder: str, program: str) -> Record:
+    """Do `trial` on the machine where Ray has put it.
+
+    `folder`: folder of the sweep on the driver's machine, used if this machine sees it. `working_folder`: the driver's
+    folder, used if it is here. `program`: the module that the trial runs.
+    Raises BadInputError when the trial measures but has a lower priority than other programs.
+    """
+    worker = psutil.Process()
+    parent = worker.parent() or worker
+    if trial.kind.clock is TrialClock.HOST and worker.nice() > parent.nice():
+        found = f"workers on {machine.here.host_name()} that give way to other programs (niceness {worker.nice()})"
+        raise BadInputError("--engine ray", found, f"niceness {parent.nice()}", f"start Ray so: {START_LINE}")
+    shared = Path(folder) if (Path(folder) / SWEEP).is_file() else None
+    here = Path(working_folder) if Path(working_folder).is_dir() else None
+    environment = restored(os.environ, parent.environ())
+    return perform(trial, TrialPlace(shared, here, environment, program), Children())
+
+
+def restored(worker: Mapping[str, str], parent: Mapping[str, str]) -> dict[str, str]:
+    """Return a Ray worker's environment in which variables that change a measurement are as on its machine.
+
+    `worker`: environment of the worker. `parent`: environment of its parent process.
+    """
+    kept = {name: value for name, value in worker.items() if name not in SET_BY_RAY}
+    return kept | {name: parent[name] for name in SET_BY_RAY if name in parent}

@@ -1,0 +1,234 @@
+"""The folder of a sweep, and the loop that does the trials it lacks: `sweep.json`, `trials.jsonl`, run folders.
+
+Rule: one process at a time adds whole lines, one for every trial that ended. A torn last line is cut off, and its trial
+is done again. Only a lost trial is tried again, `TRIES` times in all.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import time
+from collections import Counter
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from trilane.apps.sweep.definition import Trial
+from trilane.errors import BadInputError, reason
+from trilane.writing import WRITABLE, write_bytes
+
+SWEEP, TRIALS, LOCK = "sweep.json", "trials.jsonl", ".lock"
+#: Seconds for the trials of a killed sweep to end; they hold its lock until then.
+LOCK_S = 15.0
+Record = dict[str, Any]
+TRIES = 3
+#: Does trials and yields their records as they end; closing it ends the trials that still run.
+Engine = Callable[[Sequence[Trial]], Generator[Record]]
+
+
+def whole_lines(text: bytes, where: str | Path) -> tuple[list[Record], int]:
+    """Return the records of a `trials.jsonl`, and how many bytes of it they take.
+
+    Text after the last line feed is no record, and neither is a last line that is no JSON.
+    Raises BadInputError, which names the line, for an earlier line that is no record.
+    """
+    records: list[Record] = []
+    size, lines = 0, text.split(b"\n")[:-1]
+    for number, line in enumerate(lines, start=1):
+        record = _record(line)
+        if record is None and number < len(lines):
+            expected = "a JSON object with id and status"
+            raise BadInputError(
+                f"{where}, line {number}", "no trial", expected, "without this line its trial is done again"
+            )
+        if record is not None:
+            records.append(record)
+            size += len(line) + 1
+    return records, size
+
+
+def _record(line: bytes) -> Record | None:
+    try:
+        found = json.loads(line)
+    except ValueError:
+        return None
+    return found if isinstance(found, dict) and {"id", "status"} <= found.keys() else None
+
+
+def latest(records: Sequence[Record]) -> dict[str, Record]:
+    """Return the last record of each trial by its name, in the order in which the trials first ended."""
+    return {str(record["id"]): record for record in records}
+
+
+def read_trials(folder: Path) -> dict[str, Record]:
+    """Return the `latest` records of a sweep's folder. Raises BadInputError when it is none."""
+    path = folder / TRIALS
+    try:
+        return latest(whole_lines(path.read_bytes(), path)[0])
+    except OSError as error:
+        raise BadInputError.of_os_error(path, error, "the trials of a sweep") from error
+
+
+class Store:
+    """The folder of a sweep, open for the one process that runs it; a context manager.
+
+    `done`: records by trial, those found and those added since. On entry a new folder is made, or one with the same
+    trials is taken up. Entering raises BadInputError when the folder has other trials, when another process works in
+    it, and when trials are left and `resume` is false.
+    """
+
+    def __init__(self, folder: Path, trials: Sequence[Trial], about: Mapping[str, Any], *, resume: bool) -> None:
+        """`about`: content of `sweep.json` besides the trials. `resume`: whether to go on with trials that are left."""
+        self.folder = folder.absolute()
+        self.done: dict[str, Record] = {}
+        self._trials, self._about, self._resume = trials, about, resume
+        self._lock = self._file = -1
+
+    def __enter__(self) -> Self:
+        if self._resume and not (self.folder / SWEEP).is_file():
+            raise BadInputError(self.folder, "no sweep", "one to go on with", "leave --resume out to begin it")
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._take_lock()
+            self._file = os.open(self.folder / TRIALS, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        except OSError as error:
+            self._close()
+            raise BadInputError.of_os_error(self.folder, error, WRITABLE, "choose another --out") from error
+        try:
+            self._take_up()
+        except BaseException:
+            self._close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._close()
+
+    @property
+    def lock(self) -> int:
+        """The descriptor of the lock. A child that inherits it keeps others out of the folder until it has ended."""
+        return self._lock
+
+    def add(self, record: Mapping[str, Any]) -> None:
+        """Write a trial's record, and wait until it is on the disk."""
+        line = json.dumps(record, separators=(",", ":"), allow_nan=False).encode() + b"\n"
+        try:
+            while line:
+                line = line[os.write(self._file, line) :]
+            os.fsync(self._file)
+        except OSError as error:
+            raise BadInputError.of_os_error(self.folder / TRIALS, error, WRITABLE, "--resume goes on") from error
+        self.done[str(record["id"])] = dict(record)
+
+    def _take_lock(self) -> None:
+        self._lock = os.open(self.folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        give_up_at = time.monotonic() + LOCK_S
+        while True:
+            try:
+                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return
+            except BlockingIOError:
+                if time.monotonic() > give_up_at:
+                    self._close()
+                    remedy = "wait for it, or choose another --out"
+                    raise BadInputError(self.folder, "a sweep that goes on", "one that nobody runs", remedy) from None
+                time.sleep(0.05)
+
+    def _take_up(self) -> None:
+        path, ids = self.folder / SWEEP, [trial.id for trial in self._trials]
+        if path.exists():
+            self._check_same(path, ids)
+        else:
+            listed = [
+                {"id": trial.id, "options": dict(trial.options), "repeat": trial.repeat} for trial in self._trials
+            ]
+            document = {"schema": 1, **self._about, "trials": listed}
+            write_bytes(path, json.dumps(document, indent=1).encode() + b"\n")
+        records, size = whole_lines(os.pread(self._file, os.fstat(self._file).st_size, 0), self.folder / TRIALS)
+        os.ftruncate(self._file, size)
+        os.lseek(self._file, 0, os.SEEK_END)
+        self.done = latest(records)
+        ended = sum(is_ended(self.done.get(name)) for name in ids)
+        if self.done and ended < len(ids) and not self._resume:
+            found = f"a sweep of which {ended} of {len(ids)} trials are done"
+            raise BadInputError(self.folder, found, "a new folder, or one that is complete", "--resume goes on with it")
+
+    def _check_same(self, path: Path, ids: list[str]) -> None:
+        try:
+            there = {trial["id"] for trial in json.loads(path.read_bytes())["trials"]}
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            raise BadInputError(path, f"no description of a sweep ({reason(error)})", "one") from error
+        if there != set(ids):
+            found = f"a sweep of {len(there)} trials, {len(there & set(ids))} of which are among these {len(ids)}"
+            raise BadInputError(self.folder, found, "the same trials", "choose another --out")
+
+    def _close(self) -> None:
+        for descriptor in (self._file, self._lock):
+            if descriptor >= 0:
+                os.close(descriptor)
+        self._file = self._lock = -1
+
+
+def is_ended(record: Mapping[str, Any] | None) -> bool:
+    """Return whether a trial is done, or failed by itself, as it would again; a lost trial is neither."""
+    return record is not None and record["status"] in ("done", "failed")
+
+
+def run_sweep(trials: Sequence[Trial], store: Store, engine: Engine, told: Callable[[Record], None]) -> None:
+    """Do those of `trials` that have not ended.
+
+    `store`: the open folder; trials that ended there are not done again.
+    `told`: called with the record of each trial that ended for good.
+    """
+    left = [trial for trial in trials if not is_ended(store.done.get(trial.id))]
+    for attempt in range(1, TRIES + 1):
+        lost_now: list[Trial] = []
+        for record in _records(engine, left):
+            if record["status"] == "lost" and attempt < TRIES:
+                lost_now += [trial for trial in left if trial.id == record["id"]]
+                continue
+            store.add({**record, "tries": attempt})
+            told(record)
+        left = lost_now
+
+
+def _records(engine: Engine, trials: list[Trial]) -> Iterator[Record]:
+    if trials:
+        with closing(engine(trials)) as records:
+            yield from records
+
+
+def summary(trials: Sequence[Trial], store: Store, before: set[str]) -> dict[str, Any]:
+    """Return how the trials of a sweep ended, with a row for each.
+
+    `before`: names of the trials that were done when it began.
+    """
+    rows = [row_of(trial, store.done.get(trial.id)) for trial in trials]
+    counts = Counter(row["status"] for row in rows)
+    return {
+        "folder": str(store.folder),
+        "counts": {
+            "trials": len(rows),
+            **{status: counts[status] for status in ("done", "failed", "lost", "planned")},
+            "skipped": sum(trial.id in before for trial in trials),
+        },
+        "trials": rows,
+    }
+
+
+def row_of(trial: Trial, record: Record | None) -> dict[str, Any]:
+    """Return a trial as a row of a summary: what it is and, unless it is planned, how it ended."""
+    ended = record or {"status": "planned", "exit_code": None, "error": None, "seconds": None}
+    return {
+        "id": trial.id,
+        "command": ["trilane", *trial.arguments],
+        "options": dict(trial.options),
+        "repeat": trial.repeat,
+        **{key: ended[key] for key in ("status", "exit_code", "error", "seconds")},
+    }
