@@ -1,4 +1,5 @@
-"""Who uses the pipeline: the command line, experiments, what a run writes into its folder.
+"""Who uses the pipeline, a folder for each thing that a user does with it.
 
-It may use every other folder; nothing imports it.
+`interface` is for programs and notebooks, `cli` for the command line; both stand on the other folders. apps/ may use
+every other folder; nothing imports it.
 """

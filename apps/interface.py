@@ -1,27 +1,29 @@
 """Trilane for programs and notebooks: `run`, `predict`, `load_run`, and what they hand back (docs/python.md).
 
 Rule: the same functions work here and below the command line. Nothing is printed and nothing ends the program: what
-goes wrong is a TrilaneError, what a person might want to read is in the report or comes through a callback.
+goes wrong is a TrilaneError, what a person might want to read is in the report or comes through a callback. A notebook
+shows a run and a prediction as a table of HTML, in which every value is escaped.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.apps.asked_run import run_asked
 from trilane.apps.explain.explained_run import COLUMNS, explain_run, figure_names, job_rows, open_journal
-from trilane.apps.report import Report, read_report
-from trilane.apps.run_html import prediction_html, run_html
+from trilane.apps.run.asked_run import run_asked
+from trilane.apps.run.report import Report, read_report
 from trilane.errors import BadInputError, MissingPartError, TrilaneError, did_you_mean
+from trilane.figure_sources import COMPUTED, MEASURED, NO_FIGURES
 from trilane.pipeline.journal import Record, Stepped
 from trilane.pipeline.timeline import Presented, Timeline
 from trilane.pipeline.unit_history import IdleSlice
@@ -32,18 +34,23 @@ from trilane.units import PERFORMANCE_PROFILES
 if TYPE_CHECKING:
     import pandas
 
+    from trilane.pipeline.run_metrics import PathShare
+
 INTERRUPTED = 130
 #: Defaults of a program's run that are not those of the command line.
 DEFAULTS = {"baseline_frames": 0}
 FRAME_TYPE = np.dtype(
     [("frame", np.int64), ("presented_ns", np.int64), ("frame_ns", np.int64), ("latency_ns", np.int64)]
 )
+#: Name of a row, its value, and where that comes from.
+Row = tuple[str, str, str]
+TOO_SHORT = "too short to tell"
 
 
 class Run:
-    """A run that has ended. What it reads of its journal it keeps; `records` reads without keeping.
+    """A run that has ended. It keeps what it reads of its journal; `records` reads without keeping.
 
-    `folder`: the run folder. `report`: report.json (docs/report.md), with the machine and the avatars' error.
+    `folder`: run folder. `report`: report.json (docs/report.md), with the machine and the avatars' error.
     """
 
     def __init__(self, folder: Path, report: Report) -> None:
@@ -56,12 +63,12 @@ class Run:
         return run_html(self.report, str(self.folder))
 
     def records(self) -> Iterator[Record]:
-        """The records of the journal after the first, one by one. Raises BadInputError."""
+        """Yield the records of the journal after the first. Raises BadInputError."""
         return open_journal(self.folder)[1]
 
     @cached_property
     def jobs(self) -> NDArray[Any]:
-        """Every job, in the order of their ends: a structured array of shape (jobs,), its fields docs/explain.md's.
+        """Every job, by their ends: a structured array of shape (jobs,) with the fields of docs/explain.md.
 
         Times are int64, ns; words `str_`; figures of the stages float64, NaN where a stage has none. Raises
         BadInputError.
@@ -82,17 +89,18 @@ class Run:
 
     @cached_property
     def idle(self) -> list[IdleSlice]:
-        """The time in which units did no job, in the order of the ends; how long of it they had no core."""
+        """The times in which units did no job, in the order of their ends, and how long of each they had no core."""
         begun, records = open_journal(self.folder)
         timeline = Timeline(begun.graph, begun.settings, idle=True)
         facts = [fact for record in records for fact in timeline.add(record)]
         return [fact for fact in facts if isinstance(fact, IdleSlice)] + timeline.end()
 
     def frames(self) -> NDArray[Any]:
-        """The presented frames, in order: a structured array of shape (frames,), all int64.
+        """Return the presented frames, in order: a structured array of shape (frames,), all int64.
 
-        `frame`; `presented_ns`; `frame_ns` since the frame before, -1 for the first; `latency_ns` from its sampled pose
-        to the end of the stage that the pipeline names. Raises BadInputError.
+        `frame`: number; `presented_ns`: time of presentation; `frame_ns`: time since the frame before, -1 for the
+        first; `latency_ns`: time from its sampled pose to the end of the stage that the pipeline names.
+        Raises BadInputError.
         """
         begun, records = open_journal(self.folder)
         timeline = Timeline(begun.graph, begun.settings)
@@ -103,7 +111,7 @@ class Run:
         return np.array(rows, FRAME_TYPE)
 
     def to_pandas(self) -> pandas.DataFrame:
-        """`jobs` as a data frame. Raises MissingPartError without pandas, which the extra `table` brings."""
+        """Return `jobs` as a data frame. Raises MissingPartError without pandas, which the extra `table` brings."""
         try:
             import pandas
         except ImportError:
@@ -111,12 +119,12 @@ class Run:
         return pandas.DataFrame({name: self.jobs[name] for name in self.jobs.dtype.names or ()})
 
     def explain(self, slowest: int = 10) -> dict[str, Any]:
-        """Where the time went, as `trilane explain RUN --json` says it (docs/explain.md). Raises BadInputError."""
+        """Say where the time went, as `trilane explain RUN --json` does (docs/explain.md). Raises BadInputError."""
         return explain_run(self.folder, slowest)
 
 
 class RunFailedError(TrilaneError):
-    """A run that ended before it was done. `run`: what was done until then."""
+    """A run ended before it was done. `run`: what was done until then."""
 
     def __init__(self, message: str, run: Run, exit_code: int) -> None:
         super().__init__(message)
@@ -124,7 +132,7 @@ class RunFailedError(TrilaneError):
 
 
 def load_run(folder: str | Path) -> Run:
-    """The run whose folder is `folder`. Raises BadInputError for a folder that is none, or that is not whole yet."""
+    """Load the run in `folder`. Raises BadInputError for a folder that is none, or that is not whole yet."""
     place = _place("load_run", folder)
     if not place.is_dir():
         raise BadInputError(place, "no folder", "the folder of a run")
@@ -149,7 +157,7 @@ def run(
     keeps its folder, TrilaneError for one that presented no frame, KeyboardInterrupt after an interrupted one was
     written.
     """
-    from trilane.apps.run_job import Hooks
+    from trilane.apps.run.run_job import Hooks
 
     parameters = inspect.signature(run).parameters
     given = inspect.signature(run).bind(scene, **options).arguments
@@ -167,7 +175,7 @@ def run(
 
 
 def _signature() -> inspect.Signature:
-    """The parameters of `run`, with one for each option."""
+    """Return the parameters of `run`, with one for each option."""
     scene, *told, _ = inspect.signature(run, eval_str=True).parameters.values()
     options = [
         inspect.Parameter(
@@ -186,11 +194,11 @@ run.__signature__ = _signature()  # type: ignore[attr-defined]
 class Prediction:
     """What a hardware profile says of an application or a network; every figure is computed.
 
-    `document`: the keys of `trilane predict --json`.
-    `frame_ms`: time of a frame; `low_ms`, `high_ms`: where it is with a probability of 80 %, None where
-    nothing was measured of this machine.
-    `latency_ms`: None of a network by itself.
-    `power_w`: of the whole device.
+    `document`: keys of `trilane predict --json`.
+    `frame_ms`: frame time; `low_ms`, `high_ms`: interval that holds it with a probability of 80 %, None where nothing
+    was measured.
+    `latency_ms`: None for a network by itself.
+    `power_w`: power of the whole device.
     """
 
     document: Mapping[str, Any]
@@ -204,17 +212,17 @@ class Prediction:
 
     @property
     def fps(self) -> float:
-        """Frames a second."""
+        """Return the frames a second."""
         return 1e3 / self.frame_ms
 
     @property
     def is_display_capped(self) -> bool:
-        """Whether frames would come faster if the display showed them."""
+        """Say whether frames would come faster if the display showed them."""
         return bool(self.document.get("display_capped", False))
 
     @property
     def units(self) -> Mapping[str, Any]:
-        """Of each unit the busy share and the idle shares by cause; empty of a network by itself."""
+        """Return by unit its busy share and its idle shares by cause; empty for a network by itself."""
         found: Mapping[str, Any] = self.document.get("units", {})
         return found
 
@@ -260,7 +268,7 @@ def predict(
     `on_message(text)`: is told before the profile `host`, this machine, is measured, which may take half a minute.
     Raises BadInputError.
     """
-    from trilane.apps import asked_prediction as asked
+    from trilane.apps.predict import asked_prediction as asked
     from trilane.hw_profiles.application import Plan
     from trilane.hw_profiles.load import load_runnable
 
@@ -289,7 +297,7 @@ def predict(
 
 
 def _place(where: str, given: str | Path) -> Path:
-    """`given`; of an empty name Path would make the working directory."""
+    """Return `given` as a path; an empty name is refused, because Path makes the working directory of it."""
     if isinstance(given, str) and not given.strip():
         raise BadInputError(where, repr(given), "the name of a folder")
     return Path(given)
@@ -298,3 +306,63 @@ def _place(where: str, given: str | Path) -> Path:
 def _check_name(where: str, name: str, names: Sequence[str] | Mapping[str, Any]) -> None:
     if name not in names:
         raise BadInputError(where, repr(name), f"one of {', '.join(names)}", did_you_mean(str(name), list(names)))
+
+
+def table(title: str, rows: Iterable[Row]) -> str:
+    """Write a table with a caption and a row for each figure."""
+    body = "".join(
+        f"<tr><th style='text-align:left'>{escape(name)}</th><td style='text-align:left'>{escape(value)}</td>"
+        f"<td style='text-align:left'><small>{escape(source)}</small></td></tr>"
+        for name, value, source in rows
+    )
+    caption = f"<caption style='text-align:left'><b>{escape(title)}</b></caption>"
+    return f"<table>{caption}<tbody>{body}</tbody></table>"
+
+
+def run_html(report: Report, folder: str) -> str:
+    """Write the figures of a run that people ask for first, its speed with the machine and the avatar's error."""
+    return table(f"Run {folder}", _run_rows(report))
+
+
+def _run_rows(report: Report) -> Iterable[Row]:
+    measured = MEASURED if report.clock == "host" else COMPUTED
+    times, latency, frames = report.frame_time_ms, report.latency_ms, report.frames
+    if report.failure:
+        yield "failed", report.failure, ""
+    if frames.presented > 1:
+        yield "frame time", f"{times.mean:.2f} ms ({_between(times.mean_low, times.mean_high)})", measured
+        yield "rate", f"{report.fps:.1f} frames a second ({_between(report.fps_low, report.fps_high)})", measured
+    for name, facts in report.accuracy.items():
+        yield (f"error of {name}", *_error(facts))
+    yield "latency", f"p50 {latency.p50:.1f} ms, p95 {latency.p95:.1f} ms", measured
+    counts = f"{frames.presented} presented, {frames.lost} lost, {sum(frames.dropped.values())} dropped"
+    yield "frames", counts + (f", {frames.not_begun} not begun" if frames.not_begun else ""), measured
+    if report.bound is not None:
+        yield "bound", ", ".join(_of_path(part) for part in (report.bound.unit, report.bound.stage) if part), measured
+    for unit, shares in report.units.items():
+        idle = ", ".join(f"{cause} {share:.0%}" for cause, share in shares.idle if share)
+        yield unit, f"busy {shares.busy:.0%}; {idle}", measured
+    scene = report.config["scene"]
+    yield "scene", f"{scene['name']}, tensor size {scene['size']}, {report.policy}, {report.edge}", ""
+    yield "machine", report.machine.cpu.model, ""
+
+
+def _between(low: float | None, high: float | None) -> str:
+    return TOO_SHORT if low is None or high is None else f"95 %: {low:.2f} to {high:.2f}"
+
+
+def _of_path(part: PathShare) -> str:
+    return f"{part.names} {part.share:.0%} of the path"
+
+
+def _error(facts: Mapping[str, Any]) -> tuple[str, str]:
+    """Return PSNR by band and its source; else why there is none."""
+    if "psnr_db_by_band" not in facts:
+        return NO_FIGURES, str(facts.get("why", ""))
+    bands = ", ".join(f"{band} {value:.1f}" for band, value in facts["psnr_db_by_band"].items())
+    return f"PSNR {bands} dB", str(facts.get("source", ""))
+
+
+def prediction_html(title: str, rows: Mapping[str, str]) -> str:
+    """Write the figures of a prediction; all are computed."""
+    return table(title, ((name, value, COMPUTED) for name, value in rows.items()))

@@ -5,20 +5,18 @@ Rule: this module reads options and shows results; every figure comes from `tril
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from trilane.apps.cli.accuracy_by_cause import Files, show_by_cause
-from trilane.apps.cli.commands import Commands
+from trilane.apps.cli.commands import Commands, JsonOption, SceneArgument, SceneAvatarOption, SceneSizeOption
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console, stdout_kept
-from trilane.apps.cli.options import JsonOption, SceneArgument, SceneAvatarOption, SceneSizeOption
 from trilane.errors import BadInputError
 
 app = Commands()
-
 EPILOG = """\b
 Examples:
   trilane accuracy
@@ -30,6 +28,15 @@ OUT_OF_BOUNDS = 1
 SCENE, FRAMES, BY_CAUSE_FRAMES = "default", 8, 2
 NUMBER_COLUMNS = ("name", "error", "bound", "unit", "from", "verdict")
 HARD_COLUMNS = ("name", "error", "bound", "constant_error", "shifted_error", "swapped_error", "source", "verdict")
+HEADS = {
+    "mae": "MAE",
+    "psnr_db": "PSNR dB",
+    "ssim": "SSIM",
+    "ms_ssim": "MS-SSIM",
+    "flip": "FLIP",
+    "iou": "mask IoU",
+    "lpips": "LPIPS",
+}
 
 
 @app.command(epilog=EPILOG)
@@ -84,7 +91,9 @@ def accuracy(
     if by_cause:
         _refuse_other_comparisons(hard_cases, runtime or [])
         asked = {"avatar": avatar, "size": size, "runtime": runtime[0] if runtime else "auto"}
-        show_by_cause(scene, asked, BY_CAUSE_FRAMES if frames is None else frames, Files(out, lpips_weights), as_json)
+        _show_by_cause(
+            scene, asked, BY_CAUSE_FRAMES if frames is None else frames, _CauseFiles(out, lpips_weights), as_json
+        )
         return
     if hard_cases:
         _refuse_a_scene(scene, {"--avatar": avatar, "--size": size, "--frames": frames})
@@ -103,7 +112,7 @@ def _refuse_without_by_cause(options: dict[str, Path | None]) -> None:
 
 
 def _refuse_other_comparisons(hard_cases: bool, runtimes: list[str]) -> None:
-    """Raises BadInputError for what cannot stand beside --by-cause: it looks at one run."""
+    """Raises BadInputError for options that cannot stand beside --by-cause, which looks at one run."""
     if hard_cases:
         raise BadInputError("--by-cause", "--hard-cases beside it", "one of them")
     if len(runtimes) > 1:
@@ -112,7 +121,7 @@ def _refuse_other_comparisons(hard_cases: bool, runtimes: list[str]) -> None:
 
 
 def _refuse_a_scene(scene: str, options: dict[str, object]) -> None:
-    """Hard cases bring their own inputs. Raises BadInputError for what they would leave aside."""
+    """Raises BadInputError for options that hard cases would leave aside, because they bring their own inputs."""
     asked = [name for name, value in options.items() if value is not None]
     if scene != SCENE or asked:
         found = ", ".join(asked) or scene
@@ -135,10 +144,10 @@ def _hard_cases(names: list[str], as_json: bool) -> bool:
         print_json({"schema": 1, "hard_cases": rows})
     else:
         marks = {source: f"[{number}]" for number, source in enumerate(dict.fromkeys(_sources(numbers)), start=1)}
-        _print([{**row, "from": marks[row["source"]]} for row in numbers], NUMBER_COLUMNS)
+        _print_rows([{**row, "from": marks[row["source"]]} for row in numbers], NUMBER_COLUMNS)
         for source, mark in marks.items():
             stdout_console().print(f"{mark} bound: {source}", soft_wrap=True, markup=False)
-        _print(networks, HARD_COLUMNS)
+        _print_rows(networks, HARD_COLUMNS)
         stdout_console().print(f"{UNIT}; bound: {SOURCE}", soft_wrap=True, markup=False)
     failed = [row for row in rows if not row["passed"]]
     for row in failed:
@@ -162,7 +171,7 @@ def _scene(scene: str, avatar: str | None, size: str | None, frames: int, names:
     if as_json:
         print_json({"schema": 1, **result, "machine": machine})
     else:
-        _print(result["rows"], ("first", "second", "mean", "largest", "worst_frame"))
+        _print_rows(result["rows"], ("first", "second", "mean", "largest", "worst_frame"))
         bounds = result["bounds"]
         stdout_console().print(
             f"of 255, over {len(result['frames'])} frames, {result['sources']['rows']}; "
@@ -180,7 +189,7 @@ def _out_of_bounds(row: dict[str, Any], bounds: dict[str, float]) -> Iterator[st
             yield f"out of bounds: {row['first']} and {row['second']}, {figure} {row[figure]:.3g}, expected {bound:g}"
 
 
-def _print(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> None:
+def _print_rows(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> None:
     from rich.table import Table
     from rich.text import Text
 
@@ -194,3 +203,98 @@ def _shown(value: Any) -> str:
     if value is None:
         return "no number"
     return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+@dataclass(frozen=True)
+class _CauseFiles:
+    """Files of --by-cause. `out`: folder for heat maps; `lpips_weights`: file of LPIPS' weights; None for none."""
+
+    out: Path | None = None
+    lpips_weights: Path | None = None
+
+
+def _show_by_cause(scene: str, request: dict[str, Any], frames: int, files: _CauseFiles, as_json: bool) -> None:
+    """Measure and print. `request`: options of the run. Raises BadInputError, MissingPartError."""
+    from trilane.apps.experiments.error_by_cause import error_by_cause
+    from trilane.apps.experiments.picture_errors import Lpips
+    from trilane.stages.configure import configure, required_machine
+    from trilane.stages.run_options import RunOptions
+    from trilane.writing import write_folder
+
+    out, lpips = files.out, None if files.lpips_weights is None else Lpips(files.lpips_weights)
+    checked = configure(RunOptions(scene=scene, **request), Path.cwd())
+    machine = required_machine()
+    if out is not None:
+        with write_folder(out):
+            pass  # that it can be written is found out before the work
+    with stdout_kept():
+        result = error_by_cause(checked, frames, out, _tracked, lpips)
+    if as_json:
+        print_json({"schema": 1, **result, "machine": machine})
+    else:
+        _print_causes(result)
+    if out is not None:
+        stderr_console().print(f"heat maps: {out}", soft_wrap=True, markup=False)
+
+
+def _tracked(numbers: Sequence[int]) -> Iterable[int]:
+    from rich.progress import track
+
+    console = stderr_console()
+    return track(numbers, "frames", console=console, disable=not console.is_terminal)
+
+
+def _print_causes(result: dict[str, Any]) -> None:
+    from rich.table import Table
+
+    console = stdout_console()
+    config, sums, whole = result["config"], result["sums"], result["whole"]
+    console.print(
+        f"{config['scene']}, plan {config['plan']}, size {config['size']}, {config['runtime']}: "
+        f"frames {', '.join(map(str, result['frames']))}; measured in this run",
+        soft_wrap=True,
+    )
+    shown = [name for name in HEADS if name != "lpips" or whole["lpips"] is not None]
+    heads = (HEADS[name] for name in shown)
+    alone = Table("each cause alone", *heads, "moved mm (px)", title="against the reference")
+    for row in result["causes"]:
+        moved = row["moved"]
+        said = "" if moved is None else f"{moved['largest_mm']:.3g} ({moved['largest_px']:.3g})"
+        alone.add_row(row["cause"], *_cells(row["alone"], shown), said)
+    alone.add_row("the run", *_cells(whole, shown), "", style="bold")
+    for name, figures in (result["truth"] or {}).items():
+        alone.add_row(f"{name} against truth", *_cells(figures, shown), "")
+    console.print(alone)
+    if result["empty_frames"]:
+        console.print(f"nobody is in view in frames {', '.join(map(str, result['empty_frames']))}", soft_wrap=True)
+    order = Table("in order", "MAE adds", "mean square adds", "share", "so far: MAE", "PSNR dB", "SSIM", "FLIP")
+    for row in result["causes"]:
+        adds, far = row["adds"], row["so_far"]
+        share = adds["product"] / whole["square"] if whole["square"] else 0.0
+        so_far = [_number(far[name]) for name in ("mae", "psnr_db", "ssim", "flip")]
+        order.add_row(row["cause"], _number(adds["mae"]), _number(adds["square"]), f"{share:.1%}", *so_far)
+    console.print(order)
+    for line in _sums(sums, whole, result):
+        console.print(line, soft_wrap=True, markup=False)
+
+
+def _sums(sums: dict[str, Any], whole: dict[str, Any], result: dict[str, Any]) -> list[str]:
+    left, alone = sums["left_in_order"], sums["left_alone"]
+    return [
+        f"in order, exact by construction: MAE {sums['in_order']['mae']:.4g} of {whole['mae']:.4g} (left "
+        f"{left['mae']:.1e}), mean square {sums['in_order']['square']:.4g} of {whole['square']:.4g} "
+        f"(left {left['square']:.1e})",
+        f"alone, not exact: MAE {sums['alone']['mae']:.4g} (left {alone['mae']:.2g}), mean square "
+        f"{sums['alone']['square']:.4g} (left {alone['square']:.2g})",
+        f"the run's own frames differ from the sequence's end by {result['remainder']['mae']:.2g} (MAE); "
+        "MAE in steps of 1/255, mean square in their squares",
+        f"reference network: {result['network']}",
+    ]
+
+
+def _cells(figures: dict[str, float | None], shown: Sequence[str]) -> list[str]:
+    return [_number(figures.get(name)) for name in shown]
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4g}"

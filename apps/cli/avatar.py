@@ -1,41 +1,221 @@
 """`trilane avatar`: look into avatars and what they are trained on, train and validate them, quantise their networks.
 
-Rule: this file lists the commands of the group; `avatar_create.py`, `avatar_data.py`, `avatar_train.py`,
-`avatar_validate.py`, `avatar_network.py` and `avatar_quantise.py` hold the larger ones.
+Rule: this file lists the commands of the group and talks to the person. It holds `inspect`, `create`, `create-data` and
+`check-data`; `avatar_train.py` and `avatar_network.py` hold the others.
 """
 
 from __future__ import annotations
 
-from trilane.apps.cli import avatar_create, avatar_data, avatar_network, avatar_quantise, avatar_train, avatar_validate
-from trilane.apps.cli.commands import Commands
-from trilane.apps.cli.console import print_facts
-from trilane.apps.cli.options import AvatarArgument, JsonOption
+import re
+from collections.abc import Iterable, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from trilane.apps.cli import avatar_network, avatar_train
+from trilane.apps.cli.commands import AvatarArgument, Commands, JsonOption
+from trilane.apps.cli.console import print_facts, spinner, stderr_console
+from trilane.errors import BadInputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from trilane.shapes import Shape
+    from trilane.training.capture.capture import Capture
+    from trilane.training.capture.synthetic import Recipe, SyntheticCapture
 
 app = Commands(
     no_args_is_help=True,
     help="Look into avatars and captures, train and validate avatars, export and quantise their networks.",
 )
-
 EPILOG_INSPECT = "\b\nExamples:\n  trilane avatar inspect default\n  trilane avatar inspect my-avatar --json"
+EPILOG_CREATE = """\b
+Examples:
+  trilane avatar create --network mine.onnx --out mine
+  trilane avatar create my-avatar --network entropy.onnx --out my-avatar-entropy
+  trilane avatar create --network mine.onnx --texture texture.npz --body body.npz --out mine
+"""
+EPILOG_CREATE_DATA = """\b
+Examples:
+  trilane avatar create-data my-capture
+  trilane avatar create-data noisy --frames 400 --output 1920x1080 --fit-deg 1 --fit-mm 5 --mask-px 3
+"""
+EPILOG_CHECK_DATA = """\b
+Examples:
+  trilane avatar check-data my-capture
+  trilane avatar check-data my-capture --sheet fits.png --json
+"""
+MOST_FRAMES = 100_000
+LEAST_SIDE, MOST_SIDE = 64, 4096
+SHEET = "check-data.png"
 
 
 @app.command(epilog=EPILOG_INSPECT)
 def inspect(name: AvatarArgument, json: JsonOption = False) -> None:
     """Say what an avatar holds and how good it is, after every check that a run makes."""
-    from trilane.apps.avatar_facts import bundle_facts
+    from trilane.apps.avatar.assembled_avatar import bundle_facts
     from trilane.avatars.bundle import load_bundle
 
     print_facts(bundle_facts(load_bundle(name)), json)
 
 
-app.command(epilog=avatar_create.EPILOG_CREATE)(avatar_create.create)
-app.command("create-data", epilog=avatar_data.EPILOG_CREATE)(avatar_data.create_data)
-app.command("check-data", epilog=avatar_data.EPILOG_CHECK)(avatar_data.check_data)
+@app.command(epilog=EPILOG_CREATE)
+def create(
+    out: Annotated[Path, typer.Option("--out", help="Folder of the avatar to write.")],
+    name: Annotated[str, typer.Argument(help="The avatar whose other parts stay: its name or folder.")] = "default",
+    network: Annotated[
+        Path | None, typer.Option(help="Integer network (.onnx), as `trilane avatar quantise` writes it.")
+    ] = None,
+    texture: Annotated[
+        Path | None, typer.Option(help="Neural texture (.npz): `texture` (H, W, C), with `scale` if it is int8.")
+    ] = None,
+    body: Annotated[Path | None, typer.Option(help="Body (.npz) in the SMPL-X layout, at its mean shape.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """Put another network, texture or body into an avatar, as a new one.
+
+    To train an avatar of a person: docs/own-avatar.md.
+    """
+    from trilane.apps.avatar.assembled_avatar import Parts, assemble
+    from trilane.avatars.bundle import load_bundle
+
+    print_facts(assemble(load_bundle(name), Parts(network, texture, body), out), json)
+
+
+@app.command("create-data", epilog=EPILOG_CREATE_DATA)
+def create_data(
+    folder: Annotated[Path, typer.Argument(help="Folder to write; it must not be there yet, or be empty.")],
+    frames: Annotated[int, typer.Option(min=4, max=MOST_FRAMES, help="Number of frames, from all sides.")] = 120,
+    output: Annotated[str, typer.Option(help="Size of a frame in pixels: WIDTHxHEIGHT.")] = "1280x720",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of poses, views and noise.")] = 1,
+    fit_deg: Annotated[
+        float, typer.Option(min=0, max=45, help="Turn joints of the fits by up to so many degrees.")
+    ] = 0.0,
+    fit_mm: Annotated[float, typer.Option(min=0, max=1000, help="Move the fits by up to so many millimetres.")] = 0.0,
+    mask_px: Annotated[
+        float, typer.Option(min=0, max=50, help="Move the outline of masks by up to so many pixels.")
+    ] = 0.0,
+    look: Annotated[
+        str, typer.Option(help="Who is drawn: default, or hiker, of another build in other clothes.")
+    ] = "default",
+    json: JsonOption = False,
+) -> None:
+    """Draw frames of a synthetic person with masks, fits and the camera: a capture to try the training on.
+
+    With noise the exact masks and fits are kept as a capture of their own, in `truth`.
+    """
+    from trilane.avatars.bundle import bundle_folder
+    from trilane.body.body import load_body
+    from trilane.training.capture.capture import BODY
+    from trilane.training.capture.synthetic import Recipe, SyntheticCapture, write_capture
+    from trilane.training.clothing.looks import look_named
+    from trilane.writing import write_folder
+
+    recipe = Recipe(frames, _shape(output), seed, fit_deg, fit_mm, mask_px, look)
+    betas = look_named(look).betas
+    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+        raise BadInputError(folder, "files" if folder.is_dir() else "a file", "a folder that is not there yet")
+    with spinner("putting clothes on the body"):
+        capture = SyntheticCapture(load_body(bundle_folder("default") / BODY).shape(betas), recipe)
+    _state_cost(capture, recipe)
+    with write_folder(folder) as draft, _tracked("drawing frames") as track:
+        for _ in track(range(frames), write_capture(draft, capture, recipe)):
+            pass
+    noise = {"fit_deg": fit_deg, "fit_mm": fit_mm, "mask_px": mask_px}
+    facts = {"capture": str(folder), "frames": frames, "size": [*recipe.shape[::-1]], "seed": seed}
+    print_facts(
+        {**facts, "look": look, "noise": noise, "truth": str(folder / "truth") if recipe.is_noisy else None}, json
+    )
+
+
+@app.command("check-data", epilog=EPILOG_CHECK_DATA)
+def check_data(
+    folder: Annotated[Path, typer.Argument(help="Folder of a capture; docs/captures.md says what is in it.")],
+    sheet: Annotated[
+        Path | None, typer.Option(help=f"Picture to write: the fits over the frames. {SHEET} in the folder if none.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Say what is wrong with a capture, which frames have bad fits, and which sides and texels no frame shows."""
+    from trilane.training.capture.capture import open_capture
+    from trilane.writing import require_writable
+
+    picture = folder / SHEET if sheet is None else sheet
+    with _tracked("reading pictures") as track:
+        capture = open_capture(folder, lambda numbers: track(numbers, numbers))
+    require_writable(picture)
+    print_facts(_checked(capture, picture), json)
+
+
 app.command(epilog=avatar_train.EPILOG_TRAIN)(avatar_train.train)
-app.command(epilog=avatar_validate.EPILOG_VALIDATE)(avatar_validate.validate)
+app.command(epilog=avatar_train.EPILOG_VALIDATE)(avatar_train.validate)
 app.command(epilog=avatar_network.EPILOG_NETWORK)(avatar_network.network)
-app.command(epilog=avatar_quantise.EPILOG_QUANTISE)(avatar_quantise.quantise)
-app.command("quantize", hidden=True)(avatar_quantise.quantise)  # the name that the command had first
-app.command(epilog=avatar_quantise.EPILOG_CALIBRATIONS)(avatar_quantise.calibrations)
+app.command(epilog=avatar_network.EPILOG_QUANTISE)(avatar_network.quantise)
+app.command("quantize", hidden=True)(avatar_network.quantise)  # the name that the command had first
+app.command(epilog=avatar_network.EPILOG_CALIBRATIONS)(avatar_network.calibrations)
 app.command(epilog=avatar_network.EPILOG_SPLIT)(avatar_network.split)
 app.command(epilog=avatar_network.EPILOG_EXPORT)(avatar_network.export)
+
+
+def _checked(capture: Capture, picture: Path) -> dict[str, Any]:
+    """Write the sheet of `capture` to `picture`; returns what is said of the capture."""
+    from trilane.training.capture.capture_samples import BodyRaster
+    from trilane.training.capture.check import (
+        bad_frames,
+        capture_facts,
+        check_frames,
+        chosen,
+        coverage_of,
+        overlaid,
+        require_fits,
+        sheet,
+    )
+    from trilane.writing import write_atomically
+
+    raster, coverage = BodyRaster(capture.shaped), coverage_of(capture)
+    with _tracked("drawing fits") as track:
+        checks = check_frames(capture, raster, coverage)
+        frames = list(track(range(len(capture)), checks))
+    bad = bad_frames(frames)
+    cells = []
+    for frame in sorted(chosen(frames, bad), key=lambda each: each.number):
+        uv = raster.uv_of(capture, frame.number)
+        text = f"{capture.names[frame.number]}  IoU {frame.iou:.3f}" + ("  BAD" if frame in bad else "")
+        cells.append((text, overlaid(capture.picture(frame.number), uv)))
+    with write_atomically(picture) as draft:
+        sheet(cells).save(draft, format="png")
+    require_fits(capture, frames, picture)
+    return capture_facts(capture, frames, bad, coverage) | {"sheet": str(picture)}
+
+
+def _state_cost(capture: SyntheticCapture, recipe: Recipe) -> None:
+    """Say on stderr what all frames will take, as measured by drawing one."""
+    import psutil
+
+    from trilane.training.capture.synthetic import measured_cost
+
+    cost = measured_cost(capture, recipe)
+    memory_mb = psutil.Process().memory_info().rss / 1e6
+    took = f"about {cost.seconds * recipe.frames:.0f} s, {cost.disk_bytes * recipe.frames / 1e6:.0f} MB on the disk"
+    stderr_console().print(f"{took} and {memory_mb:.0f} MB of memory, by one frame that was measured")
+
+
+def _shape(text: str) -> Shape:
+    """Return (height, width) of `--output`. Raises BadInputError."""
+    match = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", text)
+    if match is None or not all(LEAST_SIDE <= int(side) <= MOST_SIDE for side in match.groups()):
+        expected = f"WIDTHxHEIGHT in pixels, each from {LEAST_SIDE} to {MOST_SIDE}, such as 1280x720"
+        raise BadInputError("--output", repr(text), expected)
+    return int(match[2]), int(match[1])
+
+
+@contextmanager
+def _tracked(text: str) -> Iterator[Callable[[Sequence[int], Iterable[Any]], Iterable[Any]]]:
+    """Yield a function that shows work as a progress bar, when stderr is a terminal."""
+    from rich.progress import Progress
+
+    console = stderr_console()
+    with Progress(console=console, disable=not console.is_terminal) as progress:
+        yield lambda numbers, work: progress.track(work, total=len(numbers), description=text)

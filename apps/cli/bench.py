@@ -1,7 +1,8 @@
 """`trilane bench`: the questions about speed and exactness that this machine can answer, by name.
 
 Rule: a bench is one module of `trilane.bench` with a `measure`, and one line of `BENCHES`. The parameters of `measure`
-are the command's options, with types from their defaults; its docstring and the module's question are the help.
+are the command's options, with types from their defaults; its docstring and the module's question are the help. An
+option means the same in every bench, or has a line of its own in `MEANINGS` for the bench where it does not.
 """
 
 from __future__ import annotations
@@ -15,10 +16,9 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from trilane.apps.cli.bench_options import meaning
-from trilane.apps.cli.commands import Commands
+from trilane.apps.cli.commands import ENCODER_HELP, NORM_HELP, POLICY_HELP, Commands, JsonOption
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console, stdout_kept
-from trilane.apps.cli.options import JsonOption
+from trilane.stages.run_options import RUNTIME_HELP, SIZE_HELP, WIDTH_HELP
 
 #: Bench: its module, and the line that `trilane bench --help` shows for it.
 BENCHES = {
@@ -48,11 +48,9 @@ BENCHES = {
         "How restless the error is, by runtime, calibration and texture filter.",
     ),
 }
-
 METAVARS: dict[type, str] = {int: "N", float: "X", str: "TEXT"}
 #: A table with more columns is printed with a row for each column.
 MOST_COLUMNS = 9
-
 EPILOG = """\b
 Examples:
   trilane bench raster --size 512 --channels 16 --json
@@ -60,6 +58,77 @@ Examples:
   trilane bench pipeline --avatar default --avatar resnet18 --size 512x512
   trilane bench handoff
 """
+FIXED_SIZE = "Tensor size in pixels: HEIGHTxWIDTH."
+SQUARE_SIZE = "Side of the square tensor in pixels."
+NAMED_RUNTIME = "ort, openvino, qnn or cuda."
+DRIVER_THREADS = "Threads of the software OpenGL driver."
+#: Option, or bench and option: its line in `--help`.
+MEANINGS = {
+    "avatar": "`default`, `hiker`, the folder of an avatar, or `resnet18`: the full-width network, untrained.",
+    "avatars": "How many avatars share the tensor.",
+    "beside": "A second avatar, run at the same time and set beside the virtual clock.",
+    "beside_size": "Tensor size of the second avatar in pixels: HEIGHTxWIDTH, or a side.",
+    "batch": "Frames inferred at once.",
+    "calibration": "as-it-is, or the network quantised anew: minmax, percentile or entropy.",
+    "channels": "Channels of the neural texture: 4, 8, 12 or 16.",
+    "cores": "Cores of the three units together; 0: all that this process may use.",
+    "edge": "Buffers between stages: single, double, triple, fifo:N, orphan or orphan:N.",
+    "encoder": ENCODER_HELP,
+    "events": "Folder of a run, or its events.jsonl, to be replayed.",
+    "frames": "Frames of each run.",
+    "predict avatar": "`default`, `hiker`, or the folder of an avatar.",
+    "predict frames": "Frames of each run, at least 100.",
+    "predict seconds": "How long each network is called by itself.",
+    "predict width": "Width of a further network, untrained; 64 is full.",
+    "handoff frames": "Hand-overs in each round, of each variant and size.",
+    "judge": "Who evaluates the run: trilane or loadgen.",
+    "kib": "Size of the slot in KiB: 256, 1024, 4096 or 16384.",
+    "limit_ms": "Longest latency of the server scenario that counts as in time.",
+    "finalists": "How many placements are measured again, beside the chosen one and that of the rule.",
+    "further": "Rounds of the finalists, after those of all placements.",
+    "placement frames": "Frames of each whole run, at least 20.",
+    "placement runs": "Whole runs of the chosen placement and of the rule's.",
+    "margins": "Pixels of the tensor between two avatars.",
+    "minutes": "Virtual minutes.",
+    "network": "An .onnx file or an avatar, at its own size; if none, one of --encoder, --norm, --width and --size.",
+    "norm": NORM_HELP,
+    "period": "Seconds that one runtime runs before the next one does.",
+    "policy": POLICY_HELP,
+    "rate": "Queries a second of the server scenario.",
+    "repeats": "How often each variant runs.",
+    "runtime": RUNTIME_HELP,
+    "infer runtime": NAMED_RUNTIME,
+    "samples": "Frames of a multi-stream query.",
+    "out": "Folder for sheets of the pictures: full, fixed, planned; below: the truth, and differences times 8.",
+    "pictures": "Frames whose image error is measured, evenly spread over the scene.",
+    "planner frames": "Frames of each run, at least 20, evenly spread over the scene; all of a shorter one.",
+    "sizes frames": "Frames whose error is measured, evenly spread over the scene.",
+    "sizes rounds": "How often each frame is timed, by every size on every runtime in turn.",
+    "sizes runtime": NAMED_RUNTIME,
+    "flicker frames": "Frames that follow each other, from the first on.",
+    "flicker runtime": NAMED_RUNTIME,
+    "scene": "A scene that comes with Trilane, or a scene file.",
+    "scenario": "single-stream, multi-stream, server or offline.",
+    "seconds": "How long each run lasts.",
+    "infer seconds": "How long each network runs on each runtime.",
+    "peers seconds": "How long each variant runs in a round.",
+    "seed": "Seed of the random moments.",
+    "seeds": "How many seeds are compared.",
+    "size": SIZE_HELP,
+    "sizes": "Sides of square tensors in pixels.",
+    "spin": "Let the runtime's threads spin between jobs.",
+    "texture_filter": "Of the neural texture: linear, mipmap or anisotropic.",
+    "threads": "Threads of the runtime; 0: one for each core that this process may use.",
+    "raster threads": DRIVER_THREADS,
+    "readback threads": DRIVER_THREADS,
+    "rounds": "Rounds: each runs every variant once.",
+    "video": "Encode the video, as a run does.",
+    "views": "How many moments of the motion.",
+    "width": WIDTH_HELP,
+    "infer size": FIXED_SIZE,
+    "peers size": FIXED_SIZE,
+    "raster size": SQUARE_SIZE,
+}
 
 
 class BenchGroup(TyperGroup):
@@ -69,7 +138,7 @@ class BenchGroup(TyperGroup):
         return list(BENCHES)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
-        """A stand-in with the help line: enough for `--help` and completion of the name."""
+        """Return a stand-in with the help line: enough for `--help` and completion of the name."""
         return TyperCommand(cmd_name, help=BENCHES[cmd_name][1]) if cmd_name in BENCHES else None
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
@@ -93,7 +162,7 @@ def bench() -> None:
 
 
 def bench_command(name: str) -> Any:
-    """The command of bench `name`, with an option for every parameter of its `measure`."""
+    """Return the command of bench `name`, with an option for every parameter of its `measure`."""
     module = importlib.import_module(BENCHES[name][0])
     measure = module.measure
 
@@ -115,14 +184,14 @@ def bench_command(name: str) -> Any:
 
 
 def _help(name: str, module: ModuleType) -> str:
-    """The bench's line, its module's question, and what `measure` says of its answer."""
+    """Return the bench's line, its module's question, and what `measure` says of its answer."""
     question = (inspect.getdoc(module) or "").split("\n\n")[0]
     answer = (inspect.getdoc(module.measure) or "").partition("Raises ")[0].rstrip()
     return f"{BENCHES[name][1]}\n\n{question}\n\n{answer}"
 
 
 def _option(bench: str, parameter: inspect.Parameter) -> Any:
-    """An option with the type of its default; where that is a tuple, the option is given once for each value."""
+    """Return an option with the type of its default; for a tuple, one that is given once for each value."""
     default = parameter.default
     several = isinstance(default, tuple)
     kind = type(default[0] if several else default)
@@ -134,10 +203,9 @@ def _option(bench: str, parameter: inspect.Parameter) -> Any:
 def show(name: str, measure: Callable[..., Mapping[str, Any]], asked: Mapping[str, Any], as_json: bool) -> None:
     """Measure and print the result with the machine's facts.
 
-    `name`: of the bench.
-    `measure`: of its module.
+    `name`: name of the bench. `measure`: function of its module.
     `asked`: value of each option.
-    `as_json`: one JSON document, or a table for people.
+    `as_json`: whether to print one JSON document, or a table for people.
     """
     from trilane.bench.lib.limits import check_limits
     from trilane.stages.machine_facts import machine_facts
@@ -163,7 +231,7 @@ def show(name: str, measure: Callable[..., Mapping[str, Any]], asked: Mapping[st
 
 
 def flat(data: Mapping[str, Any]) -> dict[str, Any]:
-    """`data` with the keys of mappings in it joined by dots."""
+    """Return `data` with the keys of mappings in it joined by dots."""
     joined: dict[str, Any] = {}
     for key, value in data.items():
         inner = flat(value) if isinstance(value, Mapping) else None
@@ -190,3 +258,8 @@ def _text(value: Any) -> str:
     from rich.markup import escape
 
     return f"{value:.4g}" if isinstance(value, float) else escape(str(value))
+
+
+def meaning(bench: str, option: str) -> str:
+    """Return the line for `option` of `bench`. Raises KeyError for an option without one."""
+    return MEANINGS.get(f"{bench} {option}") or MEANINGS[option]

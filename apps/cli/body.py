@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from trilane.apps.cli.commands import Commands
+from trilane.apps.cli.commands import BodyFileArgument, BodyFileOption, Commands, JsonOption
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console
-from trilane.apps.cli.options import BodyFileArgument, BodyFileOption, JsonOption
 from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -55,7 +54,7 @@ def inspect(path: BodyFileArgument, json: JsonOption = False) -> None:
 
 
 def body_facts(path: Path) -> dict[str, Any]:
-    """Counts, size and skinning of a body file. Raises BadInputError."""
+    """Return counts, size and skinning of a body file. Raises BadInputError."""
     from trilane.body.body import load_body
     from trilane.body.skinning import WEIGHT_COUNTS, weight_error_bound
 
@@ -119,7 +118,7 @@ def _check_poses(path: Path, frames: NDArray[np.float64], expected: str) -> NDAr
 
 
 def _write_vertices(out: Path, shaped: ShapedBody, frames: NDArray[np.float64]) -> tuple[int, int, int]:
-    """The vertices of every pose as the file `out`; the shape of their array. Raises BadInputError."""
+    """Write the vertices of every pose as the file `out`; returns the shape of their array. Raises BadInputError."""
     import numpy as np
 
     from trilane.body.skinning import posed_vertices

@@ -1,28 +1,42 @@
-"""The Typer application that every module of commands makes, and what all its commands refuse.
+"""What modules of commands are made of: the Typer application, and the options that several commands share.
 
 Rule: an option that takes one value is given at most once; a second value would silently replace the first. What is
-wrong with a value is said as everywhere: what was found, what was expected.
+wrong with a value is said as everywhere: what was found, what was expected. An option of a run is a field of
+`RunOptions`; another one that two commands have stands here. Each is spelt and explained alike in all commands.
 """
 
 from __future__ import annotations
 
+import inspect
 from collections import Counter
 from collections.abc import Callable
 from enum import Enum
-from typing import Any, Literal, get_args, get_origin
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import typer
 from pydantic import ValidationError
 from typer.core import TyperCommand, TyperOption
 
 from trilane.errors import BadInputError, did_you_mean
+from trilane.stages.run_options import AVATARS_HELP, PROFILE_HELP, WIDTH_HELP, RunOptions, kind_of, limits_of, option_of
+from trilane.units import PerformanceProfile
+
+ENCODER_HELP = "resnet18, mobilenetv2, mobilenetv3 or efficientnet-lite0."
+NORM_HELP = "batch, instance or group."
+POLICY_HELP = "sequential, pipelined, latest or deadline."
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")]
+OutFileOption = Annotated[Path, typer.Option("--out", help="File to write.")]
+PortOption = Annotated[
+    int | None, typer.Option(min=1024, max=65535, help="Port of this machine to listen on; a free one if none.")
+]
 
 
 class OnceCommand(TyperCommand):
-    """A command whose options have one value each, but for those that collect several."""
+    """A command whose options take one value each, but for those that collect several."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Raises BadInputError naming an option that was given again or has a value of another kind or range.
+        """Raises BadInputError naming an option that is given twice or has a value of another kind or range.
 
         Its other spelling (`--no-hud`) is the same option.
         """
@@ -40,7 +54,7 @@ class OnceCommand(TyperCommand):
 
 
 def _wrong_value(parameter: Any, error: ValidationError) -> BadInputError:
-    """What pydantic found wrong with the value of an option or argument."""
+    """Say what pydantic found wrong with the value of an option or argument."""
     first, kind = error.errors()[0], parameter.type_descriptor.annotation
     where = parameter.opts[0]
     found = first["input"]
@@ -53,12 +67,12 @@ def _wrong_value(parameter: Any, error: ValidationError) -> BadInputError:
 
 
 def _may_be_repeated(option: TyperOption) -> bool:
-    """Options that collect values, and flags that can only say the same thing again."""
+    """Say whether the option collects values, or is a flag that can only say the same thing again."""
     return option.multiple or option.count or (option.is_flag and not option.secondary_opts)
 
 
 def given(ctx: typer.Context) -> set[str]:
-    """The parameters that the command line gives."""
+    """Return the names of the parameters that the command line gives."""
     sources = {name: ctx.get_parameter_source(name) for name in ctx.params}
     return {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
 
@@ -70,5 +84,102 @@ class Commands(typer.Typer):
         super().__init__(rich_markup_mode=None, add_completion=False, **settings)
 
     def command(self, name: str | None = None, **settings: Any) -> Callable[[Any], Any]:
-        """As `typer.Typer.command`."""
+        """Register a command as `typer.Typer.command` does."""
         return super().command(name, cls=OnceCommand, **settings)
+
+
+def _run_parameter(name: str) -> Any:
+    """Describe field `name` of `RunOptions` to Typer as an option or argument, whose value the field checks."""
+    field = RunOptions.model_fields[name]
+    option = option_of(field)
+
+    def checked(value: Any) -> Any:
+        if value is not None:
+            RunOptions.checked({name: value}, as_typed=True)
+        return value
+
+    least, most = limits_of(field)
+    settings: dict[str, Any] = {"help": field.description, "callback": checked, "min": least, "max": most}
+    if option.is_argument:
+        return typer.Argument(**settings)
+    is_pair = kind_of(field) is bool and not option.spelling  # which Typer spells --NAME/--no-NAME
+    return typer.Option(*() if is_pair else (RunOptions.spelling(name),), **settings)
+
+
+def with_run_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Return `command` with an option for every field of `RunOptions` in place of its first parameter, a `RunOptions`.
+
+    Typer reads the options of a command from its signature, which is put together here.
+    """
+
+    def called(**values: Any) -> None:
+        given = {name: values.pop(name) for name in RunOptions.model_fields}
+        asked = {name: value for name, value in given.items() if value is not None}
+        command(RunOptions.checked(asked, as_typed=True), **values)
+
+    _, *own = inspect.signature(command, eval_str=True).parameters.values()
+    called.__signature__ = inspect.Signature([*map(_parameter, RunOptions.model_fields), *own])  # type: ignore[attr-defined]
+    called.__name__, called.__doc__ = command.__name__, command.__doc__
+    return called
+
+
+def _parameter(name: str) -> inspect.Parameter:
+    field = RunOptions.model_fields[name]
+    words, kind = option_of(field).words, kind_of(field)
+    typed: Any = Literal[words] if words else list[str] if kind is tuple else kind
+    default = None if field.default == () else field.default
+    annotation: Any = Annotated[typed if default is not None else typed | None, _run_parameter(name)]
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+# Options of a run that other commands have too.
+SceneArgument = Annotated[str, _run_parameter("scene")]
+
+SceneAvatarOption = Annotated[str | None, _run_parameter("avatar")]
+
+SceneSizeOption = Annotated[str | None, _run_parameter("size")]
+
+MotionOption = Annotated[str | None, _run_parameter("motion")]
+
+CameraOption = Annotated[str | None, _run_parameter("camera")]
+
+FpsOption = Annotated[float | None, _run_parameter("fps")]
+
+OutputOption = Annotated[str | None, _run_parameter("output")]
+
+SkinningOption = Annotated[str, _run_parameter("skinning")]
+
+CoresOption = Annotated[list[str] | None, _run_parameter("cores")]
+
+PerformanceProfileOption = typer.Option(help=RunOptions.model_fields["performance_profile"].description)
+
+PerformanceProfileChoice = Annotated[PerformanceProfile, PerformanceProfileOption]
+
+# An avatar and its network.
+AvatarArgument = Annotated[str, typer.Argument(help=AVATARS_HELP)]
+
+EncoderOption = Annotated[str, typer.Option(help=ENCODER_HELP)]
+
+NormOption = Annotated[str, typer.Option(help=NORM_HELP)]
+
+WidthOption = Annotated[int, typer.Option(help=WIDTH_HELP)]
+
+FixedSizeOption = Annotated[str, typer.Option("--size", help="Tensor size in pixels: one side, or HEIGHTxWIDTH.")]
+
+ChannelsOption = Annotated[int, typer.Option(help="Channels of the neural texture, 1 to 16.")]
+
+FloatNetworkArgument = Annotated[Path, typer.Argument(help="Float network (.onnx) with the input N x C x H x W.")]
+
+FramesFileOption = Annotated[Path, typer.Option("--frames", help="Real inputs: .npy (N, H, W, C) of floats.")]
+
+METHOD_HELP = "minmax, percentile or entropy."
+
+# A body.
+BODY_HELP = "Body file in the SMPL-X layout (.npz)."
+
+BodyFileArgument = Annotated[Path, typer.Argument(help=BODY_HELP)]
+
+BodyFileOption = Annotated[Path, typer.Option(help=BODY_HELP)]
+
+# A hardware profile.
+ProfileOption = Annotated[str, typer.Option("--profile", help=PROFILE_HELP)]

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trilane.apps.cli.commands import Commands
+from trilane.apps.cli.commands import Commands, JsonOption
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console
-from trilane.apps.cli.options import JsonOption
 from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -91,7 +90,7 @@ def compare(
 
 
 def _leave(limit: float | None, outcomes: Sequence[Finding]) -> None:
-    """With the exit code that --fail-if-slower asks for."""
+    """Leave with the exit code that --fail-if-slower asks for."""
     from trilane.apps.compare.difference import Finding
 
     if Finding.DIFFERS in outcomes:
@@ -103,7 +102,7 @@ def _leave(limit: float | None, outcomes: Sequence[Finding]) -> None:
 
 
 def _are_sweeps(names: list[str]) -> bool:
-    """Raises BadInputError for sweeps beside something else."""
+    """Say whether all names are sweeps. Raises BadInputError for sweeps beside something else."""
     from trilane.apps.compare.compared_sweeps import is_sweep
 
     sweeps = [name for name in names if is_sweep(name)]
@@ -134,7 +133,7 @@ def _compare_sweeps(
 
 
 def _share(text: str | None) -> float | None:
-    """0.05 for `5%` and for `5 %`."""
+    """Return 0.05 for `5%` and for `5 %`."""
     if text is None:
         return None
     found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*%", text)

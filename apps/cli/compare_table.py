@@ -27,7 +27,7 @@ MOST_CHANGES = 12
 
 
 def comparison_lines(comparison: Comparison, show_all: bool) -> Iterator[str | Table]:
-    """Texts and tables of one comparison. `show_all`: figures too that do not differ and are seldom asked for."""
+    """Yield texts and tables of one comparison. `show_all`: also show figures that do not differ."""
     yield f"{comparison.other.name} beside {comparison.base.name}"
     yield f"verdict: {comparison.verdict}"
     if said := bounds_text(comparison.bounds):
@@ -53,7 +53,7 @@ LEFT_OUT = {
 
 
 def sweep_lines(comparison: SweepComparison, show_all: bool) -> Iterator[str | Table]:
-    """Texts and tables of two sweeps. `show_all`: trials too that do not differ."""
+    """Yield texts and tables of two sweeps. `show_all`: also show trials that do not differ."""
     yield f"{comparison.other} beside {comparison.base}: {len(comparison.pairs)} trials of equal configuration"
     yield f"verdict: {comparison.verdict}"
     if comparison.changes:
@@ -72,7 +72,7 @@ def sweep_lines(comparison: SweepComparison, show_all: bool) -> Iterator[str | T
 
 
 def _trial_table(pairs: Sequence[TrialPair]) -> Table:
-    """The options that vary, the mean frame time in both sweeps, the change and its interval."""
+    """Return a table of the options that vary, the mean frame times, their change and its interval."""
     from rich.table import Table
 
     names = [
@@ -91,7 +91,7 @@ def _trial_table(pairs: Sequence[TrialPair]) -> Table:
 
 
 def _left_out(comparison: Comparison, shown: Sequence[Figure]) -> Iterator[str]:
-    """How many figures are not in the table; those of which nobody knows whether they differ apart."""
+    """Say how many figures the table leaves out, apart for those of which nobody knows whether they differ."""
     left = [comparison.outcome(figure) for figure in comparison.rows if figure not in shown]
     unknown = left.count(Finding.UNKNOWN)
     if alike := len(left) - unknown:

@@ -21,7 +21,7 @@ _WRITTEN_OUT = {code: repr(chr(code))[1:-1] for code in (*range(0x20), *range(0x
 
 
 class _Kept:
-    """The stream; what is written to a terminal that is gone is lost, and ends nothing."""
+    """Wraps a stream: what is written to a terminal that is gone is lost, and is no error."""
 
     def __init__(self, stream: IO[str]) -> None:
         self._stream = stream
@@ -49,14 +49,14 @@ def _hung_up() -> Iterator[None]:
 
 
 def stderr_console() -> Console:
-    """Console for messages and progress. Rich obeys NO_COLOR and plain pipes by itself."""
+    """Return the console for messages and progress. Rich obeys NO_COLOR and plain pipes by itself."""
     from rich.console import Console
 
     return Console(stderr=True, file=cast("IO[str]", _Kept(sys.stderr)), highlight=False)
 
 
 def stdout_console() -> Console:
-    """Console for results that a person reads. A pipe gets 120 columns, so that tables are not cut."""
+    """Return the console for results that a person reads. A pipe gets 120 columns, so that tables are not cut."""
     from rich.console import Console
 
     file = cast("IO[str]", _Kept(sys.stdout))
@@ -70,7 +70,7 @@ def say(text: str) -> None:
 
 @contextmanager
 def stdout_kept() -> Iterator[None]:
-    """Inside the block, what libraries write to file descriptor 1 goes to stderr: it is not a result."""
+    """Send what libraries write to file descriptor 1 inside the block to stderr: it is not a result."""
     sys.stdout.flush()
     stdout_copy = os.dup(1)
     os.dup2(2, 1)
@@ -84,7 +84,7 @@ def stdout_kept() -> Iterator[None]:
 
 @contextmanager
 def spinner(text: str) -> Iterator[None]:
-    """`text` beside a moving sign while the block runs, when stderr is a terminal."""
+    """Show `text` beside a moving sign while the block runs, when stderr is a terminal."""
     console = stderr_console()
     if not console.is_terminal:
         yield
@@ -94,9 +94,9 @@ def spinner(text: str) -> Iterator[None]:
 
 
 def without_controls(value: Any) -> Any:
-    """A text, or every text in a document, with control characters written out: a terminal would obey those of a file.
+    """Write out the control characters of a file's texts, because a terminal would obey them.
 
-    `value`: mappings and lists of texts and numbers; all but texts stays as it is.
+    `value`: text, or mappings and lists of texts and numbers; everything but texts stays as it is.
     """
     if isinstance(value, str):
         return value.translate(_WRITTEN_OUT)
@@ -125,7 +125,7 @@ def print_facts(facts: Mapping[str, Any], as_json: bool) -> None:
 
 
 def _written(value: Any) -> str:
-    """`value` as it stands in a table: floats with four digits, also in a list of numbers."""
+    """Return `value` as it stands in a table: floats with four digits, also in a list of numbers."""
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, list) and all(isinstance(each, int | float) for each in value):
@@ -134,7 +134,7 @@ def _written(value: Any) -> str:
 
 
 def _flat(facts: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Keys of mappings inside joined by dots; entries of a list of mappings under their names."""
+    """Yield rows of a table: keys of inner mappings joined by dots, entries of a list of mappings under their names."""
     for key, value in facts.items():
         if isinstance(value, dict):
             yield from _flat(value, f"{prefix}{key}.")

@@ -15,9 +15,8 @@ from typing import Any
 import typer
 
 from trilane import machine
-from trilane.apps.cli.commands import Commands
+from trilane.apps.cli.commands import Commands, JsonOption
 from trilane.apps.cli.console import print_json, stdout_console
-from trilane.apps.cli.options import JsonOption
 from trilane.errors import EGL_LINE, install_line, package_line, reason
 
 app = Commands()
@@ -28,14 +27,12 @@ EPILOG = "\b\nExamples:\n  trilane doctor\n  trilane doctor --json"
 
 
 @dataclass(frozen=True)
-class Check:
-    """One part of what a run uses.
+class PartCheck:
+    """The check of one part that a run uses.
 
-    `name`: of the part.
-    `found`: what is here of it.
-    `works`: whether it was tried and works.
-    `needed`: whether a run needs it.
-    `install`: the line that mends it.
+    `name`: name of the part. `found`: what is here of it.
+    `works`: whether it was tried and works. `needed`: whether a run needs it.
+    `install`: line that mends it.
     """
 
     name: str
@@ -45,110 +42,112 @@ class Check:
     install: str = ""
 
 
-def _python() -> Check:
+def _python() -> PartCheck:
     works = sys.version_info >= (3, 11)
-    return Check("Python", machine.here.python(), works, install="apt-get install python3.11 python3.11-venv")
+    return PartCheck("Python", machine.here.python(), works, install="apt-get install python3.11 python3.11-venv")
 
 
-def _packages() -> list[Check]:
+def _packages() -> list[PartCheck]:
     from trilane.stages.machine_facts import OPTIONAL_PACKAGES, PACKAGES, package_version
 
     checks = []
     for name in PACKAGES:
         version = package_version(name)
-        checks.append(Check(name, version or "missing", version is not None, install=package_line(name)))
+        checks.append(PartCheck(name, version or "missing", version is not None, install=package_line(name)))
     for name, extra in OPTIONAL_PACKAGES.items():
         version = package_version(name)
         line = install_line(extra)
-        checks.append(Check(name, version or "missing", version is not None, needed=False, install=line))
+        checks.append(PartCheck(name, version or "missing", version is not None, needed=False, install=line))
     return checks
 
 
-def _gl(facts: dict[str, Any] | None) -> Check:
+def _gl(facts: dict[str, Any] | None) -> PartCheck:
     if facts is None:
-        return Check("EGL and OpenGL", "no OpenGL 3.3 context can be made", works=False, install=EGL_LINE)
+        return PartCheck("EGL and OpenGL", "no OpenGL 3.3 context can be made", works=False, install=EGL_LINE)
     kind = "hardware" if facts["hardware"] else "software, on the CPU"
-    return Check("EGL and OpenGL", f"{facts['renderer']}, {facts['version']} ({kind})", works=True)
+    return PartCheck("EGL and OpenGL", f"{facts['renderer']}, {facts['version']} ({kind})", works=True)
 
 
-def _runtimes() -> Check:
+def _runtimes() -> PartCheck:
     from trilane.stages.machine_facts import runtime_facts
 
     try:
         facts = runtime_facts()
     except Exception as error:  # a broken wheel raises whatever its loader raises
         found = f"{type(error).__name__}: {error}"
-        return Check("inference runtimes", found, works=False, install=package_line("onnxruntime"))
+        return PartCheck("inference runtimes", found, works=False, install=package_line("onnxruntime"))
     found = "; ".join(f"{runtime}: {', '.join(places)}" for runtime, places in facts.items())
-    return Check("inference runtimes", found, works=bool(facts["onnxruntime"]))
+    return PartCheck("inference runtimes", found, works=bool(facts["onnxruntime"]))
 
 
-def _cpu() -> Check:
+def _cpu() -> PartCheck:
     from trilane.stages.machine_facts import cpu_facts
 
     cpu = cpu_facts()
     flags = " ".join(cpu["flags"]) or "none of those that matter"
     found = f"{cpu['model']}, {len(cpu['cores_allowed'])} of {cpu['cores']} cores allowed, {flags}"
-    return Check("CPU", found, works=True)
+    return PartCheck("CPU", found, works=True)
 
 
-def _int8() -> Check:
+def _int8() -> PartCheck:
     from trilane.stages.machine_facts import cpu_facts
 
     present = {"avx512_vnni", "avx_vnni", "amx_int8", "asimddp", "i8mm"} & set(cpu_facts()["flags"])
     found = " ".join(sorted(present)) or "no; INT8 networks run on AVX2 or NEON alone"
-    return Check("INT8 dot product", found, works=bool(present), needed=False, install="needs another CPU")
+    return PartCheck("INT8 dot product", found, works=bool(present), needed=False, install="needs another CPU")
 
 
-def _memfd() -> Check:
+def _memfd() -> PartCheck:
     try:
         handle = os.memfd_create("trilane-doctor", os.MFD_CLOEXEC)
         os.ftruncate(handle, 4096)
         os.close(handle)
     except (AttributeError, OSError) as error:
-        return Check("memfd", reason(error), works=False, install="needs Linux 3.17 or newer with memfd_create allowed")
-    return Check("memfd", "anonymous shared memory works", works=True)
+        return PartCheck(
+            "memfd", reason(error), works=False, install="needs Linux 3.17 or newer with memfd_create allowed"
+        )
+    return PartCheck("memfd", "anonymous shared memory works", works=True)
 
 
-def _dev_shm() -> Check:
-    """Not needed: slots are memfds. What other programs left there does not matter."""
+def _dev_shm() -> PartCheck:
+    """Check /dev/shm, which is not needed: slots are memfds. What other programs left there does not matter."""
     if not SHM.is_dir():
-        return Check(str(SHM), "absent", works=False, needed=False, install="mount -t tmpfs tmpfs /dev/shm")
+        return PartCheck(str(SHM), "absent", works=False, needed=False, install="mount -t tmpfs tmpfs /dev/shm")
     free = shutil.disk_usage(SHM).free
-    return Check(str(SHM), f"{free / 2**20:.0f} MiB free; Trilane leaves nothing there", works=True, needed=False)
+    return PartCheck(str(SHM), f"{free / 2**20:.0f} MiB free; Trilane leaves nothing there", works=True, needed=False)
 
 
-def _wakeup() -> Check:
-    """Not needed: without it a message to a sleeping core takes some 50 us longer."""
+def _wakeup() -> PartCheck:
+    """Check whether cores stay awake; not needed: without it a message to a sleeping core takes some 50 us longer."""
     from trilane.transport.wakeup import AWAKE, LATENCY_FILE, awake
 
     install = f'apt-get install acl; setfacl -m "u:$USER:w" {LATENCY_FILE}'
     with awake() as idle_cores:
-        return Check("idle cores", idle_cores, works=idle_cores == AWAKE, needed=False, install=install)
+        return PartCheck("idle cores", idle_cores, works=idle_cores == AWAKE, needed=False, install=install)
 
 
-def _counters() -> Check:
-    """Not needed: without them a trace has no instructions and cache misses."""
+def _counters() -> PartCheck:
+    """Check the hardware counters, which are not needed: without them a trace has no instructions and cache misses."""
     from trilane.pipeline.hardware_counters import absence, availability, remedy
 
     why = absence()
     install = "" if why is None else remedy(why)
-    return Check("hardware counters", why or availability(), works=why is None, needed=False, install=install)
+    return PartCheck("hardware counters", why or availability(), works=why is None, needed=False, install=install)
 
 
-def checks(gl: dict[str, Any] | None) -> list[Check]:
-    """Every check, in the order in which they are shown; `gl` is what `gl_facts` said."""
+def checks(gl: dict[str, Any] | None) -> list[PartCheck]:
+    """Return every check, in the order in which they are shown. `gl`: what `gl_facts` said."""
     machine = [_python(), _cpu(), _int8(), _counters(), _memfd(), _dev_shm(), _wakeup(), _gl(gl)]
     return [*machine, _runtimes(), *_packages()]
 
 
-def _state(check: Check) -> str:
+def _state(check: PartCheck) -> str:
     if check.works:
         return "[green]works[/green]"
     return "[red]missing[/red]" if check.needed else "[yellow]absent[/yellow]"
 
 
-def _print_table(rows: list[Check]) -> None:
+def _print_table(rows: list[PartCheck]) -> None:
     from rich.markup import escape
     from rich.table import Table
 

@@ -11,9 +11,8 @@ from typing import Annotated, Any
 
 import typer
 
-from trilane.apps.cli.commands import Commands
+from trilane.apps.cli.commands import Commands, JsonOption
 from trilane.apps.cli.console import print_json, spinner, stderr_console, stdout_console, without_controls
-from trilane.apps.cli.options import JsonOption
 
 app = Commands()
 
@@ -66,7 +65,7 @@ def inspect(file: FileArgument, out: SheetOption = None, json: JsonOption = Fals
 
 
 def _draw(found: Any, out: Path | None) -> Path | None:
-    """Write the sheet; where it is, None where there is nothing to draw or nowhere to draw it."""
+    """Write the sheet and return its place; None where there is nothing to draw or nowhere to draw it."""
     from trilane.writing import write_atomically
 
     if out is None or found.draw is None:
@@ -78,7 +77,7 @@ def _draw(found: Any, out: Path | None) -> Path | None:
 
 
 def lines(document: Mapping[str, Any]) -> Iterator[str]:
-    """What a person reads of the document."""
+    """Yield what a person reads of the document."""
     yield f"{document['file']}: {document['what']}"
     rows = {
         "not usable": document["problem"],

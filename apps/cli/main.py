@@ -1,6 +1,6 @@
 """Entry point of the `trilane` command: the table of commands, the global options and the exit codes.
 
-Rule: a command is one module with a Typer `app`, named by one line of `COMMANDS` and imported when it is called;
+Rule: a command is in a module with a Typer `app`, named by one line of `COMMANDS` and imported when it is called;
 an error that a person can cause ends here as one sentence on stderr and an exit code, never as a traceback.
 """
 
@@ -22,9 +22,9 @@ from trilane.errors import TrilaneError, install_line, reason
 #: Command: its module, and the line that `trilane --help` shows for it.
 COMMANDS = {
     "run": ("trilane.apps.cli.run", "Run a scene on the three units and write a run folder."),
-    "dashboard": ("trilane.apps.cli.dashboard", "Show a finished run in a browser."),
-    "top": ("trilane.apps.cli.top", "Show the live figures of a run in a terminal."),
-    "trace": ("trilane.apps.cli.trace", "Write the timeline of a run for Perfetto or Chrome."),
+    "dashboard": ("trilane.apps.cli.watch", "Show a finished run in a browser."),
+    "top": ("trilane.apps.cli.watch", "Show the live figures of a run in a terminal."),
+    "trace": ("trilane.apps.cli.watch", "Write the timeline of a run for Perfetto or Chrome."),
     "report": ("trilane.apps.cli.report", "One page of many runs: what each speed costs in image error."),
     "compare": ("trilane.apps.cli.compare", "Say what differs between runs, by how much and why."),
     "explain": ("trilane.apps.cli.explain", "Explain the plan of a scene, or where the time of a run went."),
@@ -54,6 +54,15 @@ Exit codes:
 """
 
 
+def command_of(name: str) -> Any:
+    """Import the module of command `name` and return the command.
+
+    The `app` of a module holds one command, a group, or several small commands of which one has the name.
+    """
+    command = typer.main.get_command(importlib.import_module(COMMANDS[name][0]).app)
+    return getattr(command, "commands", {}).get(name, command)  # small commands share a module
+
+
 class LazyGroup(TyperGroup):
     """Lists the commands from the table and imports a command's module when it is called."""
 
@@ -61,7 +70,7 @@ class LazyGroup(TyperGroup):
         return list(COMMANDS)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
-        """A stand-in with the help line: enough for `--help` and completion of the name."""
+        """Return a stand-in with the help line: enough for `--help` and completion of the name."""
         if cmd_name not in COMMANDS:
             return None
         return TyperCommand(cmd_name, help=COMMANDS[cmd_name][1])
@@ -70,7 +79,7 @@ class LazyGroup(TyperGroup):
         name, stand_in, rest = super().resolve_command(ctx, args)
         if name is None or stand_in is None:
             return name, stand_in, rest
-        command = typer.main.get_command(importlib.import_module(COMMANDS[name][0]).app)
+        command = command_of(name)
         command.name = name
         return name, command, rest
 
@@ -115,7 +124,7 @@ def _fail(message: str, code: int, details: tuple[str, ...] = ()) -> NoReturn:
 
 
 def _describe(error: Exception) -> tuple[str, int]:
-    """The sentence and the exit code of an error that no command handled."""
+    """Return the sentence and the exit code of an error that no command handled."""
     if isinstance(error, TrilaneError):
         return str(error), error.exit_code
     if isinstance(error, ModuleNotFoundError):
@@ -128,7 +137,7 @@ def _describe(error: Exception) -> tuple[str, int]:
 
 
 def _is_of_stdout(error: OSError) -> bool:
-    """Where stdout takes no more, one byte more fails the same way; of another error nothing is tried."""
+    """Say whether stdout takes no more, which writing one more byte shows; for another error nothing is tried."""
     if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
         return False
     try:
@@ -139,7 +148,7 @@ def _is_of_stdout(error: OSError) -> bool:
 
 
 def _call(arguments: list[str]) -> None:
-    """Of a command that is done, the output is out: who reads none of it any more is no error, a full disk is."""
+    """Call the command and flush its output. A reader that has left is no error; a full disk is."""
     try:
         app(args=arguments, prog_name="trilane")
     except SystemExit:
@@ -163,7 +172,7 @@ def main() -> None:
 
 
 def entry() -> NoReturn:
-    """`main` for the command line; the process ends without taking every module down, which would take 0.1 s."""
+    """Call `main` and end the process without taking every module down, which would take 0.1 s."""
     code: object = 0
     try:
         main()

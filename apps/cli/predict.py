@@ -11,7 +11,28 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from trilane.apps.asked_prediction import (
+from trilane.apps.cli.commands import (
+    ChannelsOption,
+    Commands,
+    EncoderOption,
+    FixedSizeOption,
+    JsonOption,
+    NormOption,
+    PerformanceProfileChoice,
+    ProfileOption,
+    given,
+)
+from trilane.apps.cli.console import say, stderr_console
+from trilane.apps.cli.predict_output import draw, show_answer, show_networks, show_table
+from trilane.apps.cli.predict_pipelines import (
+    BesideOption,
+    ChipOptions,
+    SceneToPredict,
+    SchedulerOptions,
+    TurnsOption,
+    predict_pipelines,
+)
+from trilane.apps.predict.asked_prediction import (
     answer_of,
     check_governor,
     engine_runtime_of,
@@ -25,19 +46,6 @@ from trilane.apps.asked_prediction import (
     variant_of,
     wanted_of,
 )
-from trilane.apps.cli.beside import BesideOption, Joined, OnChip, SceneToPredict, TurnsOption, predict_pipelines
-from trilane.apps.cli.commands import Commands, given
-from trilane.apps.cli.console import say, stderr_console
-from trilane.apps.cli.options import (
-    ChannelsOption,
-    EncoderOption,
-    FixedSizeOption,
-    JsonOption,
-    NormOption,
-    PerformanceProfileChoice,
-    ProfileOption,
-)
-from trilane.apps.cli.predict_output import draw, show_answer, show_networks, show_table
 from trilane.errors import BadInputError
 from trilane.units import PerformanceProfile
 
@@ -192,8 +200,10 @@ def predict(
         performance_profile = PerformanceProfile(usual_cap(profile, bare=bare))
     check_governor(governor)
     if scene is not None or beside:
-        chip_at = OnChip(profile, performance_profile, minutes, governor)
-        predict_pipelines(scene, beside or [], given(ctx), chip_at, Joined(policy or "", edge, turns), trace, json)
+        chip_at = ChipOptions(profile, performance_profile, minutes, governor)
+        predict_pipelines(
+            scene, beside or [], given(ctx), chip_at, SchedulerOptions(policy or "", edge, turns), trace, json
+        )
         return
     wanted, shapes = wanted_of(fps, power_limit_w), _shapes(input_shape or [], len(networks))
     chip, variant = load_runnable(profile), variant_of(policy or usual_policy(profile), edge, batch, fps)
@@ -217,7 +227,7 @@ def predict(
 
 
 def _refuse_ignored(ctx: typer.Context, *, bare: bool) -> None:
-    """Raises BadInputError for options that another one leaves without effect. `bare`: a network by itself is asked."""
+    """Raises BadInputError for options that another one leaves without effect. `bare`: whether networks are alone."""
     typed = given(ctx)
     for option, others in IGNORED.items():
         if option in typed and (useless := typed & others):
@@ -239,7 +249,7 @@ def _check_application(application: bool, networks: int) -> None:
 
 
 def _shapes(texts: list[str], networks: int) -> dict[str, tuple[int, ...]]:
-    """Shapes of inputs by name."""
+    """Read the shapes of inputs, by name."""
     if texts and not networks:
         raise BadInputError("options", "--input-shape without --network", "a network whose input it is")
     shapes = {}
@@ -256,7 +266,7 @@ def _shapes(texts: list[str], networks: int) -> dict[str, tuple[int, ...]]:
 def _write_trace(
     chip: Profile, plan: Plan, performance_profile: str, wanted: Wanted, answer: dict[str, Any], target: Path
 ) -> None:
-    """The simulated run that the prediction has its shares of time from, as a trace."""
+    """Write the simulated run, from which the prediction has its shares of time, as a trace."""
     from trilane.apps.explain.trace import write_predicted
     from trilane.hw_profiles.predict import predicted_run
 
@@ -265,7 +275,7 @@ def _write_trace(
 
 
 def _predict_table(chip: Profile, path: Path, performance_profile: str, variant: Variant) -> list[dict[str, Any]]:
-    """An answer for each row of the table."""
+    """Return an answer for each row of the table."""
     from rich.progress import Progress
 
     from trilane.hw_profiles.configuration_table import read_table

@@ -29,10 +29,9 @@ SHOWN = ("bench_gpu_ms", "bench_dsp_ms", "app_gpu_ms", "app_dsp_ms", "confidence
 def show_table(profile: str, performance_profile: str, answers: list[dict[str, Any]], as_json: bool) -> None:
     """Print an answer for each row of a table.
 
-    `profile`: hardware profile of the chip.
-    `performance_profile`: under which the chip runs.
-    `answers`: of `predict_table`.
-    `as_json`: one JSON document, or a table for people.
+    `profile`: hardware profile of the chip. `performance_profile`: performance profile of the chip.
+    `answers`: answers of `predict_table`.
+    `as_json`: whether to print one JSON document, or a table for people.
     """
     from rich.table import Table
 
@@ -53,11 +52,10 @@ def show_table(profile: str, performance_profile: str, answers: list[dict[str, A
 def draw(chip: Profile, plan: Plan, asked: str, minutes: float, governor: str | None, path: Path) -> None:
     """Draw frame rate and temperature over time to `path`.
 
-    `chip`: its hardware profile.
-    `plan`: what runs on it.
+    `chip`: hardware profile of the chip. `plan`: application that runs on it.
     `asked`: performance profile to draw beside `burst` and `sustained_high_performance`.
-    `minutes`: of virtual time.
-    `governor`: that lowers the clocks; None for the profile's own.
+    `minutes`: virtual time, minutes.
+    `governor`: name of the governor that lowers the clocks; None for the profile's own.
     `path`: file to write.
     """
     from trilane.hw_profiles.over_time import over_time
@@ -76,10 +74,10 @@ def show_networks(
 ) -> None:
     """Print what is predicted of networks by themselves.
 
-    `chip`: its hardware profile.
+    `chip`: hardware profile of the chip.
     `over`: performance profile, minutes, governor, and what is wanted.
-    `answers`: of `predict_network`.
-    `as_json`: one JSON document, or text and tables for people.
+    `answers`: answers of `predict_network`.
+    `as_json`: whether to print one JSON document, or text and tables for people.
     """
     performance_profile, minutes, governor, wanted = over
     if as_json:
@@ -158,7 +156,7 @@ def _reserve(rate: dict[str, Any]) -> str:
 
 
 def _span(low: float | None, high: float | None, form: str, unit: str = "") -> str:
-    """An interval in brackets; nothing where there is none."""
+    """Return an interval in brackets; nothing where there is none."""
     return "" if low is None or high is None else f" ({low:{form}} to {high:{form}}{unit})"
 
 

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from trilane.apps.cli.commands import Commands
+from trilane.apps.cli.commands import Commands, JsonOption
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console
-from trilane.apps.cli.options import JsonOption
 from trilane.errors import BadInputError
 from trilane.files import read_text
 from trilane.writing import WRITABLE, write_bytes

@@ -1,6 +1,6 @@
 """`trilane run`: a scene through the three units, to a run folder and a table.
 
-Rule: this file talks to the person; what is done is in `trilane.apps.asked_run`.
+Rule: this file talks to the person; what is done is in `trilane.apps.run.asked_run`.
 """
 
 from __future__ import annotations
@@ -12,16 +12,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trilane.apps.cli.commands import Commands
+from trilane.apps.cli.commands import Commands, JsonOption, PortOption, with_run_options
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console
-from trilane.apps.cli.options import JsonOption, PortOption, with_run_options
 from trilane.errors import BadInputError
 from trilane.stages.run_options import RunOptions
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
-    from trilane.apps.run_job import Hooks, Outcome
+    from trilane.apps.run.run_job import Hooks, RunOutcome
 
 app = Commands()
 
@@ -51,11 +50,11 @@ DashboardOption = Annotated[
 
 @contextmanager
 def _hooks() -> Iterator[Hooks]:
-    """Messages, and a progress bar when stderr is a terminal."""
+    """Show messages, and a progress bar when stderr is a terminal."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
     from rich.text import Text
 
-    from trilane.apps.run_job import Hooks
+    from trilane.apps.run.run_job import Hooks
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     bar = Progress(*columns, console=stderr_console(), disable=not sys.stderr.isatty())
@@ -83,7 +82,7 @@ def run(
     journal.msgpack, which is written while the run goes on.
     docs/report.md explains every key, the policies and the edges.
     """
-    from trilane.apps.asked_run import run_asked
+    from trilane.apps.run.asked_run import run_asked
 
     if port is not None and not dashboard:
         raise BadInputError("options", "--port without --dashboard", "both or neither")
@@ -97,8 +96,8 @@ def run(
     raise typer.Exit(outcome.exit_code)
 
 
-def _run_live(options: RunOptions, command: tuple[str, ...], port: int | None) -> Outcome:
-    from trilane.apps.dashboard.serve import require_server
+def _run_live(options: RunOptions, command: tuple[str, ...], port: int | None) -> RunOutcome:
+    from trilane.apps.dashboard.access import require_server
 
     require_server()
     from trilane.apps.dashboard.live_run import run_live
@@ -108,8 +107,8 @@ def _run_live(options: RunOptions, command: tuple[str, ...], port: int | None) -
     )
 
 
-def _print_outcome(outcome: Outcome, as_json: bool) -> None:
-    """The report or its table on stdout; the folder, and why a run failed, on stderr."""
+def _print_outcome(outcome: RunOutcome, as_json: bool) -> None:
+    """Print the report or its table on stdout; the folder, and why a run failed, on stderr."""
     from trilane.apps.cli.run_table import run_table
 
     report = outcome.report

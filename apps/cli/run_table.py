@@ -17,7 +17,7 @@ from trilane.scheduler.stats import samples_needed
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from trilane.apps.report import Baseline, Check, FrameErrors, Made, PaceComparison, Report
+    from trilane.apps.run.report import Baseline, Check, FrameErrors, Made, PaceComparison, Report
     from trilane.pipeline.run_metrics import (
         Caps,
         FrameCounts,
@@ -42,7 +42,7 @@ NEEDED = {name: samples_needed(int(name[1:]) / 100) for name in ("p90", "p95", "
 
 
 def run_table(report: Report) -> Table:
-    """Rows of stages, units, times and rates; a column for the run and one for its baseline."""
+    """Return rows of stages, units, times and rates; a column for the run and one for its baseline."""
     from rich.table import Table
 
     runs: list[Report | Baseline] = [report, report.baseline] if report.baseline else [report]
@@ -105,7 +105,7 @@ def _pace(pace: PaceComparison) -> str:
 
 
 def _check(check: Check) -> list[str]:
-    """A line for each thing that the frames were compared with."""
+    """Return a line for each thing that the frames were compared with."""
     errors = [check, *([check.float_path] if check.float_path else [])]
     return [f"of this run, {check.frames} frames against {_errors(each)} ({MEASURED})" for each in errors]
 
@@ -128,9 +128,9 @@ def _caps(caps: Caps, temperature: Temperature) -> str:
 
 
 def accuracy_line(name: str, facts: Mapping[str, Any]) -> str:
-    """The error of an avatar's pictures, and where its figures come from; else why there are none.
+    """Say how wrong an avatar's pictures are and where the figures come from; else why there are none.
 
-    A report that an older Trilane wrote does not say where its figures come from, so they are not shown.
+    A report of an older Trilane does not say where its figures come from, so they are not shown.
     """
     source = facts.get("source", NO_FIGURES)
     if source == NO_FIGURES:
@@ -161,7 +161,7 @@ def _service_and_wait(times: StageTimes | None) -> str:
 
 
 def _byte_rows(runs: Sequence[Report | Baseline]) -> Rows:
-    """What every stage moved for a frame, and beside all of it the least; none where no run counted it."""
+    """Yield what every stage moved for a frame, and all of it beside the least; nothing where no run counted it."""
     if not any(run.bytes for run in runs):
         return
     counting = [stage for stage, times in runs[0].stages.items() if times.bytes]
@@ -196,7 +196,7 @@ def _shares(unit: UnitShares | None) -> str:
 
 
 def _core_rows(runs: Sequence[Report | Baseline]) -> Rows:
-    """CPU time of the units of each set of cores; none for a report that has no such figures."""
+    """Yield the CPU time of the units of each set of cores; nothing for a report without such figures."""
     for index, first in enumerate(runs[0].core_shares):
         shares = [run.core_shares[index] if index < len(run.core_shares) else None for run in runs]
         name = f"core{'s' if len(first.cores) > 1 else ''} {','.join(map(str, first.cores))}"
@@ -223,17 +223,17 @@ def _time(run: Report | Baseline, times: TimeSummary, statistic: str) -> str:
 
 
 def _too_few(times: TimeSummary, statistic: str) -> bool:
-    """Whether a percentile rests on too few samples; a report of before they were counted does not say."""
+    """Say whether a percentile rests on too few samples; an older report does not count them."""
     return times.samples is not None and times.samples < NEEDED.get(statistic, 0)
 
 
 def _between(low: float | None, high: float | None) -> str:
-    """A 95 % interval."""
+    """Return a 95 % interval."""
     return TOO_SHORT if low is None or high is None else f"{_number(low)} to {_number(high)}"
 
 
 def _skipped(report: Report) -> str:
-    """Which of the presented frames needed no new picture of the avatars, and why."""
+    """Say which of the presented frames needed no new picture of the avatars, and why."""
     frames, composite = report.frames, report.stages["composite"]
     means = report.stage_metrics.get("composite", {})
     why = {"reused": "reused", "nobody on the screen": "nobody", "without their picture": "stale"}
@@ -243,7 +243,7 @@ def _skipped(report: Report) -> str:
 
 
 def _of_several(run: Report | Baseline, value: float) -> float | None:
-    """A time between frames, or a latency, needs two frames to be a statistic."""
+    """Return a time between frames, or a latency; None with one frame, which is no statistic."""
     return value if run.frames.presented > 1 else None
 
 

@@ -1,6 +1,7 @@
 """`trilane sweep`: many configurations of one command, each tried once, in a folder that remembers what is done.
 
-Rule: this file talks to the person; what a sweep is, and how it is run, is in `trilane.apps.sweep`.
+Rule: this file talks to the person; `trilane.apps.sweep` says what a sweep is, and runs it. While it goes on, a
+terminal has one bar with the time left, anything else a line for each trial that ended; both on stderr.
 """
 
 from __future__ import annotations
@@ -8,8 +9,11 @@ from __future__ import annotations
 import hashlib
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from datetime import timedelta
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
@@ -17,9 +21,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from trilane.apps.cli.commands import Commands
-from trilane.apps.cli.console import print_json, stderr_console, stdout_kept
-from trilane.apps.cli.options import JsonOption
+from trilane.apps.cli.commands import Commands, JsonOption
+from trilane.apps.cli.console import print_json, stderr_console, stdout_console, stdout_kept
 from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -28,7 +31,6 @@ if TYPE_CHECKING:
     from trilane.apps.sweep.store import Engine, Store
 
 app = Commands()
-
 EPILOG = """\b
 Examples:
   trilane sweep run --size 128 --size 256 --runtime ort --runtime openvino --check 4
@@ -40,6 +42,10 @@ Examples:
 """
 ENDING = ".toml"
 SOME_FAILED, INTERRUPTED = 1, 130
+#: Of a trial's result, where it has them: what the table shows beside how it ended.
+FIGURES = {"fps": ("fps",), "frame ms": ("frame_time_ms", "mean")}
+#: Of trials with `--check`: of the single frames, as in the overview.
+ERRORS = {"PSNR, dB": ("check", "psnr_db"), "worst": ("check", "worst_psnr_db"), "1st pct.": ("check", "p1_psnr_db")}
 
 
 class EngineName(StrEnum):
@@ -57,12 +63,19 @@ WordsArgument = Annotated[
         "of which one that is given several times is an axis.",
     ),
 ]
+
 EngineOption = Annotated[EngineName, typer.Option(help="local: this machine; ray: those of the Ray cluster.")]
+
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on with a sweep that was interrupted or killed.")]
+
 FolderOption = Annotated[Path | None, typer.Option("--out", help="Folder of the sweep; sweeps/NAME-HASH if none.")]
+
 ListOption = Annotated[bool, typer.Option("--list", help="Take the axes side by side, first with first.")]
+
 RandomOption = Annotated[int | None, typer.Option("--random", min=1, help="Draw so many of the combinations.")]
+
 SeedOption = Annotated[int | None, typer.Option(help="Of --random; 0 if none.")]
+
 DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Print the trials and run none.")]
 
 
@@ -145,7 +158,7 @@ def _of_words(
 
 
 def _trials(first: str, definition: Definition, command: SweptCommand) -> list[Trial]:
-    """Errors of a definition that came from a file, the `first` word, name it."""
+    """Return the trials of a definition; an error in a file, the `first` word, names that file."""
     from trilane.apps.sweep.definition import trials_of
 
     try:
@@ -157,11 +170,11 @@ def _trials(first: str, definition: Definition, command: SweptCommand) -> list[T
 
 
 def _require_checks(trials: Sequence[Trial]) -> None:
-    """Raises MissingPartError where runs are to be checked and cannot be: found out before the first trial.
+    """Raises MissingPartError, before the first trial, where runs are to be checked and cannot be.
 
-    What else is wrong with a trial, it says itself.
+    A trial says by itself what else is wrong with it.
     """
-    from trilane.apps.run_check import require_parts
+    from trilane.apps.run.run_job import require_parts
     from trilane.avatars.bundle import load_bundle
     from trilane.stages.configure import requested_scene
     from trilane.stages.run_options import RunOptions
@@ -174,7 +187,7 @@ def _require_checks(trials: Sequence[Trial]) -> None:
 
 
 def _default_folder(name: str, trials: Sequence[Trial]) -> Path:
-    """The same for the same trials, so that a rerun finds what is done."""
+    """Return the same folder for the same trials, so that a rerun finds what is done."""
     digest = hashlib.sha256("".join(sorted(trial.id for trial in trials)).encode()).hexdigest()
     return Path("sweeps") / f"{name}-{digest[:8]}"
 
@@ -182,9 +195,8 @@ def _default_folder(name: str, trials: Sequence[Trial]) -> Path:
 def _run(
     trials: Sequence[Trial], folder: Path, definition: Definition, engine: EngineName, resume: bool, as_json: bool
 ) -> bool:
-    """Run what is left and print how it ended. Returns: is there a trial that is not done?"""
-    from trilane.apps.cli.sweep_output import print_summary, progress
-    from trilane.apps.made import made_facts
+    """Run what is left and print how it ended; returns whether a trial is not done."""
+    from trilane.apps.run.asked_run import made_facts
     from trilane.apps.sweep.store import Store, is_ended, run_sweep, summary
 
     about = {"made": made_facts(("trilane", *sys.argv[1:])), "definition": _described(definition)}
@@ -192,7 +204,7 @@ def _run(
         before = {name for name, record in store.done.items() if is_ended(record)}
         left = len(trials) - len(before)
         try:
-            with progress(left, len(trials)) as told, _engine(engine, store) as engine_of:
+            with _progress(left, len(trials)) as told, _engine(engine, store) as engine_of:
                 run_sweep(trials, store, engine_of, told)
         except KeyboardInterrupt:
             _say_interrupted(trials, store)
@@ -249,3 +261,101 @@ def _print_planned(trials: Sequence[Trial], as_json: bool) -> None:
         return
     for trial in trials:
         sys.stdout.write(f"{trial.id}  {trial.line}\n")
+
+
+def seconds_left(elapsed_s: float, ended: int, left: int) -> float:
+    """Return the time left if these trials take as long as those that ended, at least one of them."""
+    return elapsed_s / ended * left
+
+
+@contextmanager
+def _progress(left: int, whole: int) -> Iterator[Callable[[Mapping[str, Any]], None]]:
+    """Yield a function that is told of each trial that ended. `left`: number of the `whole` that are not done yet."""
+    console = stderr_console()
+    if not console.is_terminal:
+        yield _plain(console, left, whole)
+        return
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[left]}"))
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("trials", total=whole, completed=whole - left, left="")
+        begin, ended = time.monotonic(), 0
+
+        def told(record: Mapping[str, Any]) -> None:
+            nonlocal ended
+            ended += 1
+            if record["status"] != "done":
+                console.print(_line(record), soft_wrap=True, markup=False)
+            text = f"{_time(seconds_left(time.monotonic() - begin, ended, left - ended))} left"
+            bar.update(task, completed=whole - left + ended, left=text)
+
+        yield told
+
+
+def _plain(console: Any, left: int, whole: int) -> Callable[[Mapping[str, Any]], None]:
+    begin, ended = time.monotonic(), 0
+
+    def told(record: Mapping[str, Any]) -> None:
+        nonlocal ended
+        ended += 1
+        remaining = _time(seconds_left(time.monotonic() - begin, ended, left - ended))
+        place = f"{whole - left + ended}/{whole}"
+        console.print(f"{place} {_line(record)}; {remaining} left", soft_wrap=True, markup=False)
+
+    return told
+
+
+def _line(record: Mapping[str, Any]) -> str:
+    took = "" if record["seconds"] is None else f" in {record['seconds']:.1f} s"
+    why = f": {record['error']}" if record["error"] else ""
+    return f"{record['status']} {_words(record['options'])}{took}{why}"
+
+
+def _words(options: Mapping[str, Any]) -> str:
+    return " ".join(f"{name}={value}" for name, value in options.items())
+
+
+def _time(seconds: float) -> str:
+    return str(timedelta(seconds=round(seconds)))
+
+
+def print_summary(document: Mapping[str, Any], definition: Definition, records: Mapping[str, Any]) -> None:
+    """Print a row for each trial, a line of counts, and a line for each error that trials ended with.
+
+    `document`: as `--json` prints it.
+    `records`: by name, as in `trials.jsonl`.
+    """
+    from rich.table import Table
+
+    axes = list(definition.axes)
+    repeats = ["repeat"] if definition.repeats > 1 else []
+    results = {row["id"]: (records.get(row["id"]) or {}).get("result") or {} for row in document["trials"]}
+    shown = FIGURES | (ERRORS if any(result.get("check") for result in results.values()) else {})
+    table = Table(*axes, *repeats, "status", "seconds", *shown)
+    for row in document["trials"]:
+        cells = [row["options"][name] for name in axes] + [row[name] for name in repeats]
+        figures = [_figure(results[row["id"]], path) for path in shown.values()]
+        table.add_row(*(_text(each) for each in [*cells, row["status"], row["seconds"], *figures]))
+    stdout_console().print(table)
+    counts = document["counts"]
+    text = ", ".join(f"{counts[key]} {key}" for key in ("trials", "done", "failed", "lost", "skipped"))
+    stdout_console().print(f"{text}; {document['clock']} clock", markup=False)
+    errors = Counter((row["status"], row["error"]) for row in document["trials"] if row["error"])
+    for (status, error), count in errors.items():
+        stdout_console().print(f"{count} {status}: {error}", soft_wrap=True, markup=False)
+
+
+def _figure(result: Mapping[str, Any], path: tuple[str, ...]) -> Any:
+    found: Any = result
+    for key in path:
+        found = found.get(key) if isinstance(found, dict) else None
+    return found
+
+
+def _text(value: Any) -> str:
+    from rich.markup import escape
+
+    if value is None:
+        return ""
+    return f"{value:.4g}" if isinstance(value, float) else escape(str(value))

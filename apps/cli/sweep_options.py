@@ -5,7 +5,6 @@ Rule: no second list of options. What a name, a spelling or a value is, the comm
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterable, Iterator, Sequence
 from enum import Enum
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any
 import typer
 
 from trilane.apps.cli.bench import BENCHES, bench_command
-from trilane.apps.cli.main import COMMANDS as ALL_COMMANDS
+from trilane.apps.cli.main import command_of
 from trilane.apps.sweep.definition import COMMANDS, Options, Value
 from trilane.errors import BadInputError, did_you_mean
 
@@ -30,7 +29,7 @@ NOT_SWEPT = {
 
 
 class SweptCommand:
-    """A command by its words. Raises BadInputError for words that are none of those that a sweep can try."""
+    """A command by its words. Raises BadInputError for a command that a sweep cannot try."""
 
     def __init__(self, words: Sequence[str]) -> None:
         self.words = tuple(words)
@@ -38,9 +37,9 @@ class SweptCommand:
         self._parameters = {_name(each): each for each in self._command.params if _name(each) not in NOT_SWEPT}
 
     def values_of(self, tokens: Sequence[str]) -> dict[str, list[Value]]:
-        """Name: the values given to it, one after the other. `tokens`: what a person typed after the command.
+        """Return by name the values that were given, one after the other. Raises BadInputError.
 
-        Raises BadInputError.
+        `tokens`: what a person typed after the command.
         """
         found: dict[str, list[Value]] = {}
         arguments = [name for name, each in self._parameters.items() if each.param_type_name == "argument"]
@@ -53,7 +52,7 @@ class SweptCommand:
         return found
 
     def converted(self, name: str, value: Any, where: str = "") -> Value:
-        """`value` as the command converts it, as plain data. Raises BadInputError for one that it refuses."""
+        """Return `value` as the command converts it, as plain data. Raises BadInputError for one that it refuses."""
         parameter = self._named(name, where)
         words = self.words_of({name: value})
         place = f"{where or 'options'}: {name}"
@@ -71,7 +70,7 @@ class SweptCommand:
             raise BadInputError(place, repr(value), f"a value that {' '.join(self.words)} takes", str(error)) from None
 
     def words_of(self, options: Options) -> tuple[str, ...]:
-        """`options`, by name, as they are typed."""
+        """Return `options`, by name, as they are typed."""
         words: list[str] = []
         for name, value in options.items():
             words += self._typed(self._named(name), value)
@@ -86,7 +85,7 @@ class SweptCommand:
         return self._parameters[name]
 
     def _option(self, token: str, left: Iterator[str]) -> tuple[str, Value]:
-        """Name and value of the option that begins with `token`; its value may be the next one of `left`."""
+        """Return name and value of the option that `token` begins; its value may be the next one of `left`."""
         spelling, has_value, value = token.partition("=")
         for name, parameter in self._parameters.items():
             if spelling in (*parameter.opts, *parameter.secondary_opts) and parameter.param_type_name == "option":
@@ -121,7 +120,7 @@ def _command(words: tuple[str, ...]) -> Any:
         raise BadInputError("command", repr(text), expected, did_you_mean(text, known))
     if words[0] == "bench":
         return bench_command(words[1])
-    return typer.main.get_command(importlib.import_module(ALL_COMMANDS[words[0]][0]).app)
+    return command_of(words[0])
 
 
 def _next(spelling: str, left: Iterator[str]) -> str:

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from trilane.apps.cli.run_table import DASH, NEEDED, TOO_FEW, accuracy_line
 from trilane.apps.explain.reasons import bound_text
-from trilane.apps.live.figures import Figures, Moved, UnitFigures
-from trilane.apps.live.followed_run import RunState
-from trilane.apps.live.live_figures import LEAST
-from trilane.apps.live.run_looks import Look
+from trilane.apps.watch.figures import Figures, Moved, UnitFigures
+from trilane.apps.watch.followed_run import RunState
+from trilane.apps.watch.live_figures import LEAST, RunLook
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -34,8 +33,8 @@ PERCENTILES = ("p50", "p90", "p95", "p99")
 MIB = 1 << 20
 
 
-def screen(look: Look) -> Group:
-    """Everything, for a terminal."""
+def screen(look: RunLook) -> Group:
+    """Return everything, for a terminal."""
     from rich.console import Group
     from rich.text import Text
 
@@ -47,8 +46,8 @@ def screen(look: Look) -> Group:
     )
 
 
-def line(look: Look) -> str:
-    """The most important figures in one line."""
+def line(look: RunLook) -> str:
+    """Return the most important figures in one line."""
     figures = look.figures
     busy = ", ".join(f"{name} {unit.window.busy:.0%}" for name, unit in figures.units.items())
     waiting = ", ".join(f"{name} {stage.waiting}" for name, stage in figures.stages.items() if stage.waiting)
@@ -69,29 +68,29 @@ def line(look: Look) -> str:
     return "; ".join(part for part in parts if part)
 
 
-def heading(look: Look) -> str:
-    """What stands above the lines."""
+def heading(look: RunLook) -> str:
+    """Return what stands above the lines."""
     of_fps = "between the first frame and the last" if look.state is RunState.FINISHED else "of the last 5 s"
     how = f"fps {of_fps}, p50 / p95 / p99 of the last 5 s;{FEW}"
     return "\n".join([f"run {look.name}: {look.state}; {how}", *errors(look.figures), _sources(look.figures)])
 
 
-def ending(look: Look) -> str:
-    """What is said when a run that went on has another state."""
+def ending(look: RunLook) -> str:
+    """Say that a run that went on has another state."""
     return f"run {look.name}: {ENDINGS[look.state]}"
 
 
 def errors(figures: Figures) -> list[str]:
-    """A line for each avatar: how wrong its pictures are, or why that is not known."""
+    """Return a line for each avatar: how wrong its pictures are, or why that is not known."""
     return [accuracy_line(name, facts) for name, facts in figures.accuracy.items()] or [NO_ERROR]
 
 
 def dropped(figures: Figures) -> int:
-    """Frames dropped on all edges."""
+    """Return the number of frames dropped on all edges."""
     return sum(drop.frames for drop in figures.frames.dropped)
 
 
-def _title(look: Look) -> str:
+def _title(look: RunLook) -> str:
     figures = look.figures
     over = "over" if figures.is_over else f"for {figures.run_s:.1f} s"
     rate = f"{_rate(look)} between the first frame and the last"
@@ -103,15 +102,15 @@ def _title(look: Look) -> str:
     return f"run {look.name}: {look.state}, {over}; {rate}\navatars: {_short_error(figures)}\n{_bound(look)}"
 
 
-def _bound(look: Look) -> str:
-    """What bounds the run, or bounded it."""
+def _bound(look: RunLook) -> str:
+    """Say what bounds the run, or bounded it."""
     so_far = " so far" if look.state is RunState.GOES_ON else ""
     bound = look.figures.bound
     return f"bound{so_far}: {'not known' if bound is None else bound_text(bound)}"
 
 
-def _rate(look: Look) -> str:
-    """Of a finished run as its report has it, of any other in the window."""
+def _rate(look: RunLook) -> str:
+    """Return the rate of a finished run as its report has it, of any other in the window."""
     figures = look.figures
     return f"{figures.run_fps if look.state is RunState.FINISHED else figures.fps:.1f} fps"
 
@@ -133,7 +132,7 @@ def _table(*names: str) -> Table:
 
 
 def _add_row(table: Table, *cells: str) -> None:
-    """Stages and units have the names that their pipeline gave them: they are no markup."""
+    """Add a row whose cells are no markup: a pipeline gives its stages and units any names."""
     from rich.text import Text
 
     table.add_row(*map(Text, cells))
@@ -166,7 +165,7 @@ def _three(times: Mapping[str, float]) -> str:
 
 
 def _time(times: Mapping[str, float], key: str) -> str:
-    """A dash of no samples at all; a percentile of too few says so."""
+    """Return a dash without samples; a percentile of too few says so."""
     if not times["samples"]:
         return DASH
     return f"{times[key]:.1f}{TOO_FEW if times['samples'] < NEEDED.get(key, 0) else ''}"
@@ -181,7 +180,7 @@ def _stages(figures: Figures) -> Table:
 
 
 def _moved(kinds: Mapping[str, Moved]) -> tuple[str, str]:
-    """MiB of a job in all and by kind, and the least that would do; dashes where the stage counts none."""
+    """Return MiB of a job in all and by kind, and the least that would do; dashes where the stage counts none."""
     shown = {kind: moved.per_job / MIB for kind, moved in kinds.items() if kind != LEAST and moved.total}
     least = f"{kinds[LEAST].per_job / MIB:.2f}" if LEAST in kinds else "–"
     if not shown:
@@ -218,13 +217,13 @@ def _percent(share: float) -> str:
 
 
 def _short_bound(figures: Figures) -> str:
-    """The unit, and its share of the path; empty where it is not known."""
+    """Return the unit, and its share of the path; empty where it is not known."""
     unit = (figures.bound or {}).get("unit")
     return f"bound {unit['name']} {unit['share']:.0%}" if unit else ""
 
 
 def _short_error(figures: Figures) -> str:
-    """The least PSNR of each avatar, which is that of the band in which it is worst."""
+    """Return the PSNR of each avatar in the band of zoom in which it is worst."""
     known = {
         name: min(facts["psnr_db_by_band"].values())
         for name, facts in figures.accuracy.items()
@@ -234,7 +233,7 @@ def _short_error(figures: Figures) -> str:
 
 
 def _sources(figures: Figures) -> str:
-    """Where the figures come from; of the temperatures only where there are any."""
+    """Say where the figures come from; only a run that has temperatures has a source of them."""
     said = [f"figures: {figures.sources['fps']}"]
     for place in figures.temperature_c:
         source = figures.sources.get(f"temperature_c.{place}", figures.sources["temperature_c"])

@@ -18,7 +18,7 @@ from trilane.apps.compare.comparison import SCHEMA, change_of, exceeds, interval
 from trilane.apps.compare.difference import ALPHA, LEAST_FRAMES, Difference, Finding, combined, rejected
 from trilane.apps.compare.rows import BUSY_MACHINE, FRAME_TIME, MS, Figure, rows_of
 from trilane.apps.compare.sides import Change, ComparedRun, RunKind, Side, changes, read_told
-from trilane.apps.report import Report
+from trilane.apps.run.report import Report
 from trilane.apps.sweep.store import TRIALS, read_trials
 from trilane.errors import BadInputError
 

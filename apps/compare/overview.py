@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from trilane.apps.report import MAX_REPORT_BYTES
+from trilane.apps.run.report import MAX_REPORT_BYTES
 from trilane.apps.sweep.store import TRIALS, read_trials
 from trilane.errors import BadInputError, MissingPartError
 from trilane.figure_sources import COMPUTED, MEASURED, NO_FIGURES

@@ -19,8 +19,8 @@ from pydantic_core import from_json, to_json
 
 from trilane.apps.compare.difference import STATISTICS
 from trilane.apps.compare.run_frames import Key, RunFrames, read_frames
-from trilane.apps.live.followed_run import FollowedRun, RunState, folder_of
-from trilane.apps.report import MAX_REPORT_BYTES, read_report
+from trilane.apps.run.report import MAX_REPORT_BYTES, read_report
+from trilane.apps.watch.followed_run import FollowedRun, RunState, folder_of
 from trilane.errors import BadInputError
 from trilane.files import require_file
 from trilane.pipeline.journal import NAME as JOURNAL

@@ -1,7 +1,7 @@
-"""The server's answers: the page's files, one WebSocket, metrics and the trace. Rule: it decides nothing of the run.
+"""The server's answers: the page's files, one WebSocket, metrics and the trace. Rule: it decides nothing about the run.
 
-Pictures are pulled: a client that asked gets the newest one when there is one that it has not had, and none before it
-asks again. Everything else is told to all clients as it happens.
+Pictures are pulled: a client that asked gets the newest picture that it has not had, and none before it asks again.
+Everything else is told to all clients as it happens. The system gives up what a client does not take or say in time.
 """
 
 from __future__ import annotations
@@ -19,11 +19,19 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from trilane.apps.dashboard.clients import Client, Clients
-from trilane.apps.dashboard.guard import Asgi, Guard
-from trilane.apps.dashboard.refusals import Refusal, Refusals
-from trilane.apps.dashboard.view import View
-from trilane.apps.dashboard.wire import ControlSaid, MalformedError, PictureAsked, Seek, heard, said
+from trilane.apps.dashboard.access import Asgi, Guard, Refusal, Refusals
+from trilane.apps.dashboard.pages import (
+    MOST_BYTES,
+    Client,
+    Clients,
+    ControlSaid,
+    MalformedError,
+    PictureAsked,
+    Seek,
+    heard,
+    said,
+)
+from trilane.apps.dashboard.view import RunView
 
 PAGE: Final = Path(__file__).with_name("page")
 NEWS_S: Final = 0.1
@@ -37,12 +45,14 @@ REFUSED_HELP: Final = (
     "# HELP trilane_dashboard_refused Requests, messages and clients that the dashboard refused or dropped.\n"
     "# TYPE trilane_dashboard_refused counter\n"
 )
+PING_S: Final = 10.0
+SWITCHING: Final = 101  # status of a WebSocket that begins
 
 
 class DashboardApp:
-    """The ASGI application `asgi` for `view` on `port`, for those who know `token`. `refusals`: all of its server."""
+    """The ASGI application `asgi` for `view` on `port`, for those who know `token`. `refusals`: its server's counts."""
 
-    def __init__(self, view: View, port: int, token: str) -> None:
+    def __init__(self, view: RunView, port: int, token: str) -> None:
         self._view = view
         self.refusals = Refusals()
         self._clients = Clients()
@@ -58,7 +68,7 @@ class DashboardApp:
         self.asgi: Asgi = Guard(app, port, token, self.refusals)
 
     async def finish(self) -> None:
-        """Tell all clients what is still to be told; they have a moment to take it."""
+        """Tell all clients what is still untold, and give them a moment to take it."""
         await self._tell_newest()
         await asyncio.sleep(LAST_S)
 
@@ -107,7 +117,7 @@ class DashboardApp:
             await socket.close(1008)
 
     async def _listen(self, socket: WebSocket, client: Client) -> None:
-        """Do what the client says until it leaves, or has said too much that it may not."""
+        """Do what the client says until it leaves or has said too much that is malformed."""
         while client.faults < MOST_FAULTS:
             event = await socket.receive()
             if event["type"] == "websocket.disconnect":
@@ -163,3 +173,46 @@ class DashboardApp:
                     client.asks_picture = False
                     client.put(picture)
             await asyncio.sleep(PICTURE_S)
+
+
+def server(app: DashboardApp) -> Any:
+    """Return a uvicorn server of `app`; its `serve(sockets=[...])` returns when its `should_exit` is set.
+
+    The app counts what uvicorn refuses before the app hears of it.
+    """
+    import uvicorn
+    from uvicorn.protocols.http.h11_impl import H11Protocol
+    from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+
+    class Http(H11Protocol):  # type: ignore[misc]
+        def send_400_response(self, msg: str) -> None:
+            app.refusals.add(Refusal.MALFORMED)
+            super().send_400_response(msg)
+
+    class WebSockets(WebSocketsSansIOProtocol):  # type: ignore[misc]
+        def handle_connect(self, event: Any) -> None:
+            super().handle_connect(event)
+            if self.response.status_code != SWITCHING:
+                app.refusals.add(Refusal.MALFORMED)
+
+        def handle_text(self, event: Any) -> None:
+            self.handle_bytes(event)  # uvicorn prints a traceback where a text is not UTF-8
+
+    config = uvicorn.Config(
+        app.asgi,
+        log_config=None,
+        access_log=False,
+        lifespan="on",
+        ws=WebSockets,
+        ws_max_size=MOST_BYTES,
+        ws_ping_interval=PING_S,
+        ws_ping_timeout=PING_S,
+        ws_per_message_deflate=False,
+        timeout_keep_alive=5,
+        timeout_graceful_shutdown=1,
+        h11_max_incomplete_event_size=16384,
+        server_header=False,
+        date_header=False,
+        http=Http,
+    )
+    return uvicorn.Server(config)

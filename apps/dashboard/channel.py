@@ -1,25 +1,36 @@
 """What passes between a run and the server that shows it, two processes. Rule: msgpack, and nothing but this table.
 
 A message is an array of its place in MESSAGES and its fields. It goes as one packet over a pair of sockets that only
-these two processes have. Neither waits for the other: what cannot be sent at once is left out, and said so.
+these two processes have. Neither process waits for the other: what cannot be sent at once is left out. `ServerLink`
+starts the server's process and ends it; when that process ends by itself, the run goes on without it.
 """
 
 from __future__ import annotations
 
 import contextlib
+import os
+import select
 import socket
-from collections.abc import Mapping, Sequence
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import msgpack
 
+from trilane.apps.dashboard.access import ServerAddress
+from trilane.transport.live_window import create_window, path_of
 from trilane.unexpected_value import UnexpectedValue
 
 MOST_BYTES: Final = 1 << 17
+CLOSE_S: Final = 3.0
+SERVER_ENDED: Final = "the dashboard's server has ended; the run goes on without it"
 
 
 class Opened(NamedTuple):
-    """To the server, first: the `token` of who may ask, and the size of the window's pictures."""
+    """To the server, first: the `token` that clients need, and the size of the window's pictures."""
 
     token: str
     height: int
@@ -48,32 +59,34 @@ class Refused(NamedTuple):
     why: str
 
 
-class Asked(NamedTuple):
+class ControlAsked(NamedTuple):
     """To the run: somebody wants the control to have the value."""
 
     control: str
     value: str | float | None
 
 
-Message = Opened | RunBegins | StateIs | Refused | Asked
-MESSAGES: Final[tuple[type[Any], ...]] = (Opened, RunBegins, StateIs, Refused, Asked)
+Message = Opened | RunBegins | StateIs | Refused | ControlAsked
+
+MESSAGES: Final[tuple[type[Any], ...]] = (Opened, RunBegins, StateIs, Refused, ControlAsked)
+
 _FIELDS: Final[dict[type[Any], tuple[type | tuple[type, ...], ...]]] = {
     Opened: (str, int, int),
     RunBegins: (str, dict, list),
     StateIs: (str, str),
     Refused: (str, str),
-    Asked: (str, (str, float, int, type(None))),
+    ControlAsked: (str, (str, float, int, type(None))),
 }
 
 
 def packed(message: Message) -> bytes:
-    """The packet of `message`."""
+    """Return the packet of `message`."""
     data: bytes = msgpack.packb([MESSAGES.index(type(message)), *message])
     return data
 
 
 def unpacked(data: bytes) -> Message:
-    """The message of a packet. Raises UnexpectedValue for bytes that are none."""
+    """Return the message of a packet. Raises UnexpectedValue for bytes that are none."""
     try:
         place, *fields = msgpack.unpackb(data)
         kind = MESSAGES[place]
@@ -86,8 +99,8 @@ def unpacked(data: bytes) -> Message:
     return message
 
 
-class Channel:
-    """One end of the pair. `fd` becomes readable when a message or the end of the other side has come."""
+class ChannelEnd:
+    """One end of the pair. `fd` becomes readable when a message has come or the other end is gone."""
 
     def __init__(self, end: socket.socket) -> None:
         self._end = end
@@ -98,7 +111,7 @@ class Channel:
         return self._end.fileno()
 
     def send(self, message: Message) -> bool:
-        """Whether it was sent: not to an end that is gone, or that has left too much unread."""
+        """Send `message`; returns whether it was sent. An end that is gone, or left too much unread, gets nothing."""
         try:
             self._end.send(packed(message))
         except OSError:
@@ -106,7 +119,7 @@ class Channel:
         return True
 
     def receive(self) -> Message | None:
-        """The next message; None when there is none yet. Raises EOFError when the other end is gone."""
+        """Return the next message, None when there is none yet. Raises EOFError when the other end is gone."""
         try:
             data = self._end.recv(MOST_BYTES)
         except BlockingIOError:
@@ -122,7 +135,70 @@ class Channel:
             self._end.close()
 
 
-def channel_pair() -> tuple[Channel, socket.socket]:
-    """This process's end, and the other's, to be handed on."""
+def channel_pair() -> tuple[ChannelEnd, socket.socket]:
+    """Return this process's end, and the socket that the other process gets."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    return Channel(ours), theirs
+    return ChannelEnd(ours), theirs
+
+
+class ServerLink:
+    """The run's end of a server at `place` for pictures of `height` x `width`.
+
+    `hear`: function that a thread of its own calls with what the page asks for. `tell`: function that is told a
+    sentence for a person.
+    """
+
+    def __init__(
+        self,
+        place: ServerAddress,
+        height: int,
+        width: int,
+        hear: Callable[[ControlAsked], None],
+        tell: Callable[[str], None],
+    ) -> None:
+        self._hear, self._tell = hear, tell
+        self._window_fd = create_window(height, width)
+        self.window: Path = path_of(self._window_fd)
+        self._channel, theirs = channel_pair()
+        self._end_fd = os.eventfd(0, os.EFD_CLOEXEC)
+        with theirs:
+            fds = (place.listener.fileno(), theirs.fileno(), self._window_fd)
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-m", "trilane.apps.dashboard.live_server", *map(str, fds)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                pass_fds=fds,
+                process_group=0,  # an interrupt of the terminal is the run's to hear; the server ends after it
+            )
+        self.send(Opened(place.token, height, width))
+        self._thread = threading.Thread(target=self._listen, name="dashboard", daemon=True)
+        self._thread.start()
+
+    def send(self, message: Message) -> None:
+        """Send `message` to the server, if it is there and listens."""
+        self._channel.send(message)
+
+    def close(self) -> None:
+        """End the server; its process is gone when this returns."""
+        os.eventfd_write(self._end_fd, 1)
+        self._thread.join()
+        self._channel.close()
+        try:
+            self._process.wait(CLOSE_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        os.close(self._end_fd)
+        os.close(self._window_fd)
+
+    def _listen(self) -> None:
+        poller = select.poll()
+        poller.register(self._channel.fd, select.POLLIN)
+        poller.register(self._end_fd, select.POLLIN)
+        with contextlib.suppress(EOFError):
+            while self._end_fd not in [fd for fd, _ in poller.poll()]:
+                message = self._channel.receive()
+                if isinstance(message, ControlAsked):
+                    self._hear(message)
+            return
+        self._tell(SERVER_ENDED)

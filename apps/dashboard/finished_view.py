@@ -1,32 +1,30 @@
 """A run that is over, as a server shows it: any moment of it, from its journal and its video.
 
-Rule: the journal is read once; what is kept of it lies in temporary files, so a run may have lasted for days.
+Rule: the journal is read once; what is kept of it lies in temporary files without a name, so a run may have lasted for
+days. A picture is decoded when it is asked for, and none is kept.
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
+import os
+import tempfile
 import threading
 from collections.abc import Iterable, Mapping
+from fractions import Fraction
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final, NamedTuple
 from weakref import WeakKeyDictionary
 
 import av
 import numpy as np
+from numpy.typing import NDArray
 
-from trilane.apps.dashboard.clients import Client
-from trilane.apps.dashboard.known_runs import facts_of_folder
-from trilane.apps.dashboard.meter import Meter
-from trilane.apps.dashboard.run_facts import RunFacts
-from trilane.apps.dashboard.text_store import TextStore
-from trilane.apps.dashboard.time_table import TimeTable
-from trilane.apps.dashboard.timeline import TimelineRows, described, note, slices
-from trilane.apps.dashboard.video_frames import VideoFrames
-from trilane.apps.dashboard.view import Message
-from trilane.apps.dashboard.wire import ControlSaid, Seek, shown
-from trilane.apps.live.followed_run import CUT_OFF, FollowedRun, RunState
+from trilane.apps.dashboard.pages import Client, ControlSaid, Seek, shown
+from trilane.apps.dashboard.run_facts import RunFacts, facts_of_folder
+from trilane.apps.dashboard.view import Message, RunMeter, TimelineRows, described, jpeg_of, note, slices
+from trilane.apps.watch.followed_run import CUT_OFF, FollowedRun, RunState
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import NAME, Begun, Ended, Record, Stepped, journal_in, read_journal
 from trilane.pipeline.unit_history import IDLE_CAUSES, UNEXPLAINED
@@ -38,121 +36,21 @@ MOST_IDLE: Final = 6000
 MOST_NOTES: Final = 100
 OVER: Final = "the run is over"
 NO_VIDEO: Final = "there are no pictures: video.mp4 is missing or cannot be read"
-
 CAUSE_NAMES: Final = (*IDLE_CAUSES, UNEXPLAINED)
 TIMES: Final = [("begin", "<f8"), ("end", "<f8")]
 JOB: Final = np.dtype([("unit", "u1"), ("stage", "u1"), ("frame", "<u4"), *TIMES, ("wait", "<f8")])
 IDLE: Final = np.dtype([("unit", "u1"), ("cause", "u1"), *TIMES])
 PRESENTED: Final = np.dtype([("frame", "<u4"), *TIMES])
 FIGURES: Final = np.dtype([("offset", "<u8"), ("size", "<u4"), *TIMES])
-
-
-class FinishedRun:
-    """What is known of a finished run, and where; `read_run` makes it.
-
-    `end_ms`: of its last step.
-    """
-
-    def __init__(self, begun: Begun, facts: RunFacts) -> None:
-        self.begun, self.facts = begun, facts
-        self.end_ms = 0.0
-        self.jobs, self.idle, self.presented, self.figures = map(TimeTable, (JOB, IDLE, PRESENTED, FIGURES))
-        self._written = TextStore()
-        self._timeline, self._meter = TimelineRows(begun), Meter(begun, finds_bound=facts.bound is None)
-        self._last_stage = len(begun.graph.stages) - 1
-        self._due_ms = 0.0
-        self.metrics = ""
-        self._is_whole = False
-        self.notes: list[tuple[float, str]] = []
-
-    def add(self, record: Record) -> None:
-        """The next record."""
-        self._timeline.add(record)
-        self._meter.add(record)
-        self._is_whole = isinstance(record, Ended)
-        if isinstance(record, Stepped):
-            self._keep()
-            if self._timeline.now_ms >= self._due_ms:
-                self._keep_figures()
-
-    def end(self, state: RunState) -> None:
-        """After the last record. `state`: of the run."""
-        self._timeline.end()
-        self._keep()
-        self._keep_figures()
-        self.end_ms, self.metrics = self._timeline.now_ms, self._meter.metrics(state=state)
-        if not self._is_whole:
-            self.notes.append((self.end_ms, CUT_OFF))
-        for table in (self.jobs, self.idle, self.presented, self.figures):
-            table.complete()
-
-    def figures_at(self, t_ms: float) -> Mapping[str, Any]:
-        """The figures that were kept last before `t_ms`, or the first."""
-        row = self.figures.last_before(t_ms)
-        row = self.figures.near(t_ms, FIGURES_EVERY_MS, 1)[0] if row is None else row
-        figures: Mapping[str, Any] = json.loads(self._written.read(int(row["offset"]), int(row["size"])))
-        return figures
-
-    def slices_near(self, t_ms: float, span_ms: float) -> Message:
-        """Jobs and idle slices from `span_ms` before to as long after."""
-        jobs = [
-            (int(r["unit"]), int(r["stage"]), int(r["frame"]), float(r["begin"]), float(r["end"]), float(r["wait"]))
-            for r in self.jobs.near(t_ms, span_ms, MOST_JOBS)
-        ]
-        idle = [
-            (int(r["unit"]), CAUSE_NAMES[int(r["cause"])], float(r["begin"]), float(r["end"]))
-            for r in self.idle.near(t_ms, span_ms, MOST_IDLE)
-        ]
-        return slices(jobs, idle)
-
-    def frame_at(self, t_ms: float) -> int | None:
-        """The frame that was presented last at `t_ms`, None before the first."""
-        row = self.presented.last_before(t_ms)
-        return None if row is None else int(row["frame"])
-
-    def close(self) -> None:
-        """The temporary files are gone."""
-        for table in (self.jobs, self.idle, self.presented, self.figures, self._written):
-            table.close()
-
-    def _keep(self) -> None:
-        jobs, idle, notes = self._timeline.take()
-        for unit, stage, frame, begin, end, wait in jobs:
-            self.jobs.add((unit, stage, frame, begin, end, wait))
-            if stage == self._last_stage:
-                self.presented.add((frame, end, end))
-        for unit, cause, begin, end in idle:
-            self.idle.add((unit, CAUSE_NAMES.index(cause), begin, end))
-        self.notes = [*self.notes, *notes][-MOST_NOTES:]
-
-    def _keep_figures(self) -> None:
-        offset, size = self._written.add(json.dumps(self._meter.message()).encode())
-        self.figures.add((offset, size, self._timeline.now_ms, self._timeline.now_ms))
-        self._due_ms = self._timeline.now_ms + FIGURES_EVERY_MS
-
-
-def read_run(folder: Path) -> FinishedRun:
-    """The run in `folder`. Raises BadInputError for a folder that has none, or whose journal cannot be read."""
-    journal = journal_in(folder)
-    if journal is None:
-        raise BadInputError(folder, f"no {NAME}", "the folder of a run", "`trilane run` writes one into runs/")
-    run: FinishedRun | None = None
-    for record in read_journal(journal):
-        if isinstance(record, Begun):
-            run = FinishedRun(record, facts_of_folder(folder, record))
-        elif run is not None:
-            run.add(record)
-    assert run is not None, "a journal begins with its header"
-    run.end(FollowedRun(folder).state)
-    return run
+PIECE_ROWS = 4096
 
 
 class FinishedView:
-    """`trilane.apps.dashboard.view.View` of the run in `folder`. Raises as `read_run`."""
+    """The `RunView` of the run in `folder`. Raises what `_read_run` raises."""
 
     def __init__(self, folder: Path) -> None:
-        self._run = read_run(folder)
-        self._video = Pictures(folder / "video.mp4", self._run.facts.fps)
+        self._run = _read_run(folder)
+        self._video = _RunPictures(folder / "video.mp4", self._run.facts.fps)
         self.trace: Path | None = folder / "trace.pftrace"
         self._at_ms: WeakKeyDictionary[Client, float] = WeakKeyDictionary()
 
@@ -199,13 +97,113 @@ class FinishedView:
         yield self._run.figures_at(t_ms)
 
 
-class Pictures:
-    """Pictures of a video that may be missing, for one thread at a time."""
+def _read_run(folder: Path) -> _FinishedRun:
+    """Read the run in `folder`. Raises BadInputError for a folder that has none, or whose journal cannot be read."""
+    journal = journal_in(folder)
+    if journal is None:
+        raise BadInputError(folder, f"no {NAME}", "the folder of a run", "`trilane run` writes one into runs/")
+    run: _FinishedRun | None = None
+    for record in read_journal(journal):
+        if isinstance(record, Begun):
+            run = _FinishedRun(record, facts_of_folder(folder, record))
+        elif run is not None:
+            run.add(record)
+    assert run is not None, "a journal begins with its header"
+    run.end(FollowedRun(folder).state)
+    return run
+
+
+class _FinishedRun:
+    """What is known of a finished run, and where it lies; `_read_run` makes it.
+
+    `end_ms`: time of its last step.
+    """
+
+    def __init__(self, begun: Begun, facts: RunFacts) -> None:
+        self.begun, self.facts = begun, facts
+        self.end_ms = 0.0
+        self.jobs, self.idle, self.presented, self.figures = map(TimeTable, (JOB, IDLE, PRESENTED, FIGURES))
+        self._written = _TextStore()
+        self._timeline, self._meter = TimelineRows(begun), RunMeter(begun, finds_bound=facts.bound is None)
+        self._last_stage = len(begun.graph.stages) - 1
+        self._due_ms = 0.0
+        self.metrics = ""
+        self._is_whole = False
+        self.notes: list[tuple[float, str]] = []
+
+    def add(self, record: Record) -> None:
+        """Take the next record."""
+        self._timeline.add(record)
+        self._meter.add(record)
+        self._is_whole = isinstance(record, Ended)
+        if isinstance(record, Stepped):
+            self._keep()
+            if self._timeline.now_ms >= self._due_ms:
+                self._keep_figures()
+
+    def end(self, state: RunState) -> None:
+        """Complete the tables after the last record. `state`: what has become of the run."""
+        self._timeline.end()
+        self._keep()
+        self._keep_figures()
+        self.end_ms, self.metrics = self._timeline.now_ms, self._meter.metrics(state=state)
+        if not self._is_whole:
+            self.notes.append((self.end_ms, CUT_OFF))
+        for table in (self.jobs, self.idle, self.presented, self.figures):
+            table.complete()
+
+    def figures_at(self, t_ms: float) -> Mapping[str, Any]:
+        """Return the figures that were kept last before `t_ms`, or the first."""
+        row = self.figures.last_before(t_ms)
+        row = self.figures.near(t_ms, FIGURES_EVERY_MS, 1)[0] if row is None else row
+        figures: Mapping[str, Any] = json.loads(self._written.read(int(row["offset"]), int(row["size"])))
+        return figures
+
+    def slices_near(self, t_ms: float, span_ms: float) -> Message:
+        """Return jobs and idle slices from `span_ms` before `t_ms` until as long after."""
+        jobs = [
+            (int(r["unit"]), int(r["stage"]), int(r["frame"]), float(r["begin"]), float(r["end"]), float(r["wait"]))
+            for r in self.jobs.near(t_ms, span_ms, MOST_JOBS)
+        ]
+        idle = [
+            (int(r["unit"]), CAUSE_NAMES[int(r["cause"])], float(r["begin"]), float(r["end"]))
+            for r in self.idle.near(t_ms, span_ms, MOST_IDLE)
+        ]
+        return slices(jobs, idle)
+
+    def frame_at(self, t_ms: float) -> int | None:
+        """Return the frame that was presented last at `t_ms`, None before the first."""
+        row = self.presented.last_before(t_ms)
+        return None if row is None else int(row["frame"])
+
+    def close(self) -> None:
+        """Remove the temporary files."""
+        for table in (self.jobs, self.idle, self.presented, self.figures, self._written):
+            table.close()
+
+    def _keep(self) -> None:
+        jobs, idle, notes = self._timeline.take()
+        for unit, stage, frame, begin, end, wait in jobs:
+            self.jobs.add((unit, stage, frame, begin, end, wait))
+            if stage == self._last_stage:
+                self.presented.add((frame, end, end))
+        for unit, cause, begin, end in idle:
+            self.idle.add((unit, CAUSE_NAMES.index(cause), begin, end))
+        self.notes = [*self.notes, *notes][-MOST_NOTES:]
+
+    def _keep_figures(self) -> None:
+        offset, size = self._written.add(json.dumps(self._meter.message()).encode())
+        self.figures.add((offset, size, self._timeline.now_ms, self._timeline.now_ms))
+        self._due_ms = self._timeline.now_ms + FIGURES_EVERY_MS
+
+
+class _RunPictures:
+    """The pictures of a video that may be missing, for one thread at a time."""
 
     def __init__(self, path: Path, fps: float) -> None:
         self._lock = threading.Lock()
         try:
-            self._frames: VideoFrames | None = VideoFrames(path, fps)
+            self._frames: _VideoFrames | None = _VideoFrames(path, fps)
         except (OSError, av.error.FFmpegError):
             self._frames = None  # the run was not recorded
 
@@ -214,11 +212,134 @@ class Pictures:
         return self._frames is None
 
     def jpeg(self, frame: int) -> bytes | None:
-        """What was shown with frame `frame`; None where there is no picture."""
+        """Return what was shown with frame `frame`; None where there is no picture."""
         with self._lock:
             return None if self._frames is None else self._frames.jpeg(frame)
 
     def close(self) -> None:
-        """No picture is asked for any more."""
+        """Let go of the video."""
         if self._frames is not None:
             self._frames.close()
+
+
+class _Piece(NamedTuple):
+    offset: int
+    rows: int
+    begin: float
+    end: float
+
+
+class TimeTable:
+    """Rows with a begin and an end, many more than memory should hold, found by their time.
+
+    `dtype`: type of a row, with the fields `begin` and `end` in any unit of time. Rows lie in a temporary file, in
+    pieces; memory holds the place, earliest begin and latest end of each piece. Rows need not be in order, but those of
+    about one time should be added together.
+    """
+
+    def __init__(self, dtype: np.dtype[Any]) -> None:
+        self._dtype = dtype
+        self._file: IO[bytes] = tempfile.TemporaryFile(prefix="trilane-")  # noqa: SIM115 - `close` closes it
+        self._fresh: list[tuple[Any, ...]] = []
+        self._pieces: list[_Piece] = []
+
+    def add(self, row: tuple[Any, ...]) -> None:
+        self._fresh.append(row)
+        if len(self._fresh) == PIECE_ROWS:
+            self.complete()
+
+    def complete(self) -> None:
+        """Write the rows that were added; from now on they are found."""
+        if self._fresh:
+            rows = np.array(self._fresh, self._dtype)
+            offset = self._file.seek(0, os.SEEK_END)
+            self._file.write(rows.tobytes())
+            self._file.flush()
+            self._pieces.append(_Piece(offset, len(rows), float(rows["begin"].min()), float(rows["end"].max())))
+            self._fresh = []
+
+    def near(self, time: float, reach: float, most: int) -> NDArray[Any]:
+        """Return rows that touch `time - reach` to `time + reach`, by their begins; of too many, the nearest `most`."""
+        low, high = time - reach, time + reach
+        touching = [piece for piece in self._pieces if piece.begin <= high and piece.end >= low]
+        touching.sort(key=lambda piece: _away(time, piece.begin, piece.end))
+        found = [np.empty(0, self._dtype)]
+        for piece in touching:
+            if sum(map(len, found)) >= most:
+                break
+            rows = self._read(piece)
+            found.append(rows[(rows["begin"] <= high) & (rows["end"] >= low)])
+        rows = np.concatenate(found)
+        away = np.maximum(np.maximum(rows["begin"] - time, time - rows["end"]), 0)
+        rows = rows[np.argsort(away, kind="stable")[:most]]
+        return rows[np.argsort(rows["begin"], kind="stable")]
+
+    def last_before(self, time: float) -> np.void | None:
+        """Return the row that ended last of those that have ended at `time`; None when there is none."""
+        for piece in reversed(self._pieces):
+            rows = self._read(piece)
+            ended = rows[rows["end"] <= time]
+            if len(ended):
+                last: np.void = ended[int(ended["end"].argmax())]
+                return last
+        return None
+
+    def close(self) -> None:
+        """Remove the file; nothing is found any more."""
+        self._file.close()
+
+    def _read(self, piece: _Piece) -> NDArray[Any]:
+        return np.frombuffer(
+            os.pread(self._file.fileno(), piece.rows * self._dtype.itemsize, piece.offset), self._dtype
+        )
+
+
+def _away(time: float, begin: float, end: float) -> float:
+    return max(begin - time, time - end, 0.0)
+
+
+class _TextStore:
+    """Texts in a temporary file; `add` returns the place and length by which `read` finds one again."""
+
+    def __init__(self) -> None:
+        self._file: IO[bytes] = tempfile.TemporaryFile(prefix="trilane-", buffering=0)  # noqa: SIM115 - `close` closes it
+
+    def add(self, text: bytes) -> tuple[int, int]:
+        offset = self._file.seek(0, os.SEEK_END)
+        self._file.write(text)
+        return offset, len(text)
+
+    def read(self, offset: int, size: int) -> bytes:
+        return os.pread(self._file.fileno(), size, offset)
+
+    def close(self) -> None:
+        """Remove the file."""
+        self._file.close()
+
+
+class _VideoFrames:
+    """The pictures of `path`, a video of `trilane run`, in which frame n is shown from n / `fps` on.
+
+    Raises OSError and av.error.FFmpegError.
+    """
+
+    def __init__(self, path: Path, fps: float) -> None:
+        self._container: Any = av.open(str(path))
+        self._stream: Any = self._container.streams.video[0]
+        self._fps = fps
+
+    def jpeg(self, frame: int) -> bytes | None:
+        """Return what was shown when frame `frame` was; None when the video does not reach so far."""
+        at = Fraction(frame) / Fraction(self._fps).limit_denominator(1001)
+        pts = int(at / self._stream.time_base)
+        self._container.seek(pts, stream=self._stream, backward=True)
+        newest = None
+        half = Fraction(1, 2) / Fraction(self._fps).limit_denominator(1001) / self._stream.time_base
+        for picture in self._container.decode(self._stream):
+            if newest is not None and picture.pts > pts + half:
+                break
+            newest = picture
+        return None if newest is None else jpeg_of(newest.to_image())
+
+    def close(self) -> None:
+        self._container.close()

@@ -1,44 +1,52 @@
 """A run under a dashboard: `trilane run`'s own code, again whenever the page asks for another configuration.
 
 Rule: this process runs the pipeline and answers the page's server, which is a process of its own; neither waits for the
-other. What can be changed while the run goes on is. For the rest the run is ended cleanly and begins anew; each of
-these runs leaves a folder of its own.
+other. What can be changed while the run goes on is. For the rest the run is ended cleanly and begins anew, once the
+change was checked as a command line is; each of these runs leaves a folder of its own.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from trilane.apps.asked_run import early_processes, prepare, run_prepared
-from trilane.apps.dashboard.channel import Refused, StateIs
-from trilane.apps.dashboard.director import ENDED, FAILED, Director
-from trilane.apps.dashboard.serve import listen
-from trilane.apps.dashboard.server_link import ServerLink
-from trilane.apps.run_job import Hooks, Outcome, Prepared, Watched
+from trilane.apps.dashboard.access import listen
+from trilane.apps.dashboard.channel import ControlAsked, Message, Refused, RunBegins, ServerLink, StateIs
+from trilane.apps.dashboard.run_facts import OF_A_NEW_RUN, controls_of_run, facts_of_checked
+from trilane.apps.run.asked_run import early_processes, prepare, run_prepared
+from trilane.apps.run.run_job import Hooks, Prepared, RunOutcome, Watched
+from trilane.apps.watch.followed_run import run_name
+from trilane.avatars.bundle import BUILT_IN, MANIFEST
 from trilane.errors import TrilaneError
-from trilane.stages.configure import GlFacts, required_machine
-from trilane.stages.run_options import RunOptions
+from trilane.pipeline.controls import ALL, RunControls
+from trilane.stages.configure import Checked, GlFacts, required_machine
+from trilane.stages.dsp.runtime import installed
+from trilane.stages.run_options import NOTHING, RunOptions, kind_of, option_of
+from trilane.units import UNITS
 
 ENDLESS: Final = 1_000_000_000  # frames: a year at 30 a second
-
 OpenHooks = Callable[[], AbstractContextManager[Hooks]]
+RUNNING, PAUSED, RESTARTING, ENDED, FAILED = "running", "paused", "restarting", "ended", "failed"
+#: Controls that hold the run or let it go: how many frames it may release, and what it does then.
+HOLDS: Final = {"play": (ALL, RUNNING), "pause": (0, PAUSED), "step": (1, PAUSED)}
+MOST_AVATARS: Final = 20
 
 
 def run_live(
     options: RunOptions, hooks: OpenHooks, command: tuple[str, ...], port: int | None, tell: Callable[[str], None]
-) -> Outcome:
-    """Run what the options ask for, and then what the page asks for, until it is interrupted; the last run's outcome.
+) -> RunOutcome:
+    """Run what the options ask for, then what the page asks for, until an interrupt; returns the last run's outcome.
 
-    `options`: with a number of frames each run ends after so many.
+    `options`: options of the first run; with a number of frames, each run ends after so many.
     `hooks`, `command`: as `run_asked` takes them. `port`: as `listen` takes it.
-    `tell`: is given the page's address, and sentences for a person.
-    Raises as `run_asked`.
+    `tell`: function that is given the page's address, and sentences for a person.
+    Raises what `run_asked` raises.
     """
     with early_processes() as (starter, gl):
         first = prepare(options.changed(baseline_frames=0), gl, command)
@@ -57,7 +65,7 @@ def run_live(
 
 
 class _Runs:
-    """One run after the other. `link`: to the server, set before the first."""
+    """Runs one run after the other. `link`: link to the server, set before the first run."""
 
     link: ServerLink
 
@@ -65,15 +73,15 @@ class _Runs:
         self,
         prepare: Callable[[RunOptions], Prepared],
         gl: GlFacts,
-        run: Callable[..., Outcome],
+        run: Callable[..., RunOutcome],
         tell: Callable[[str], None],
     ) -> None:
         self._gl, self._run, self._tell = gl, run, tell
         self._count = 0
         self.director = Director(prepare, lambda message: self.link.send(message))
 
-    def run_all(self, first: Prepared) -> Outcome:
-        """Until no other is asked for, or one fails. Raises TrilaneError when the first has presented no frame."""
+    def run_all(self, first: Prepared) -> RunOutcome:
+        """Run until no other run is asked for, or one fails. Raises TrilaneError when the first presented no frame."""
         now, before = first, None
         while True:
             try:
@@ -94,7 +102,7 @@ class _Runs:
             self._tell(f"run folder: {outcome.folder}")
             now, before = following, now
 
-    def _run_one(self, prepared: Prepared) -> Outcome:
+    def _run_one(self, prepared: Prepared) -> RunOutcome:
         options = prepared.options
         controls = self.director.begin(prepared)
         show = partial(self.director.show, required_machine(self._gl))
@@ -106,5 +114,95 @@ class _Runs:
 
 
 def _numbered(folder: Path, number: int) -> Path:
-    """The folder of run `number` of those under one page: the first has the name that was asked for."""
+    """Return the folder of run `number` under one page: the first has the name that was asked for."""
     return folder if number == 1 else folder.with_name(f"{folder.name}-{number}")
+
+
+class Director:
+    """Directs the runs under one page, one after the other. Another thread than the rest calls `do`.
+
+    `prepare`: function that checks a run. `send`: function that hands a message to the server.
+    """
+
+    def __init__(self, prepare: Callable[[RunOptions], Prepared], send: Callable[[Message], None]) -> None:
+        self._prepare, self._send = prepare, send
+        self._lock = threading.Lock()
+        self._now: Prepared | None = None
+        self._next: Prepared | None = None
+        self._controls: RunControls | None = None
+
+    def begin(self, prepared: Prepared) -> RunControls:
+        """Begin the run of `prepared`; returns the controls of it."""
+        with self._lock:
+            self._now, self._next, self._controls = prepared, None, RunControls()
+            return self._controls
+
+    def show(self, machine: Mapping[str, Any], folder: Path, checked: Checked) -> None:
+        """Tell the server that the run of `checked` writes into `folder`."""
+        assert self._now is not None
+        options = self._now.options
+        facts = facts_of_checked(run_name(folder), checked, options, machine)
+        choices = choices_of(facts.config)
+        controls = controls_of_run(UNITS, choices, reasons_against(options))
+        self._send(RunBegins(str(folder), asdict(facts), [asdict(control) for control in controls]))
+        self._send(StateIs(RUNNING, ""))
+
+    def take_next(self) -> Prepared | None:
+        """Return, once, the run that was asked for in place of the one that has ended."""
+        with self._lock:
+            taken, self._next = self._next, None
+            return taken
+
+    def do(self, asked: ControlAsked) -> None:
+        """Do what the page asks for; its server has looked at name and value."""
+        with self._lock:
+            controls = self._controls
+        if controls is None:
+            return
+        if asked.control in HOLDS:
+            frames, state = HOLDS[asked.control]
+            controls.hold(frames)
+            self._send(StateIs(state, ""))
+        elif asked.control == "kill" and asked.value in UNITS:
+            controls.kill(str(asked.value))
+        elif asked.control in OF_A_NEW_RUN and isinstance(asked.value, str):
+            self._change(controls, asked.control, asked.value)
+
+    def _change(self, controls: RunControls, name: str, value: str) -> None:
+        with self._lock:
+            current = self._next or self._now
+        assert current is not None
+        try:
+            asked = None if value == NOTHING else kind_of(RunOptions.model_fields[name])(value)
+            prepared = self._prepare(current.options.changed(**{name: asked}))
+        except TrilaneError as error:
+            self._send(Refused(name, str(error)))
+            return
+        with self._lock:
+            self._next = prepared
+        self._send(StateIs(RESTARTING, f"{name.replace('_', ' ')} {value}: the run begins anew"))
+        controls.stop()
+
+
+def choices_of(config: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
+    """Return what each control of a new run may be set to; `config` is in force and always among it."""
+    found = {"runtime": installed(), "avatar": (*BUILT_IN, *_neighbours(str(config["avatar"])))}
+    choices = {}
+    for name in OF_A_NEW_RUN:
+        offered = option_of(RunOptions.model_fields[name]).offered or ()
+        choices[name] = tuple(dict.fromkeys([*offered, *found.get(name, ()), str(config[name])]))
+    return choices
+
+
+def reasons_against(options: RunOptions) -> dict[str, str]:
+    """Return by name why a control of a new run cannot be used beside `options`."""
+    if options.pace:
+        return {"performance_profile": "the run is held to a chip's pace, which is capped already"}
+    return {}
+
+
+def _neighbours(avatar: str) -> Iterator[str]:
+    """Yield the folders of avatars beside that of `avatar`, where it is a folder."""
+    folder = Path(avatar)
+    if avatar not in BUILT_IN and folder.is_dir():
+        yield from [str(manifest.parent) for manifest in sorted(folder.parent.glob(f"*/{MANIFEST}"))[:MOST_AVATARS]]

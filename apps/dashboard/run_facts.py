@@ -1,22 +1,43 @@
-"""What the page is told of a run besides its course: configuration, plan, placement, error, machine.
+"""What the page is told of a run besides its course, and what somebody may do to it from there.
 
-Rule: what is not known is null; the words are those of report.json.
+Rule: what is not known is null, nothing is guessed, and the words are those of report.json. What a value of a control
+must be stands in its row alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from trilane.pipeline.journal import Begun
+from trilane.stages.run_options import NOTHING, RunOptions, option_of
+
+if TYPE_CHECKING:
+    from trilane.apps.run.report import Report
+    from trilane.stages.configure import Checked
+
+ACTION, CHOICE, NUMBER, DRAG = "action", "choice", "number", "drag"
+LEAST_ZOOM, MOST_ZOOM = 0.25, 4.0
+MOST_DRAG_DEG: Final = 360.0
+#: Controls that the server itself answers, by the window.
+OF_THE_CAMERA: Final = ("orbit", "zoom", "recentre")
+#: Controls for which a run begins anew.
+OF_A_NEW_RUN: Final = tuple(
+    name for name, field in RunOptions.model_fields.items() if option_of(field).offered is not None
+)
+Value = str | float | list[float] | None
 
 
 @dataclass(frozen=True)
 class RunFacts:
-    """`name` of the run folder; `scene`; `clock`: host or virtual; `machine`: a line for people.
+    """What the page is told of a run besides its course.
 
-    `fps`, `output` (width, height): of the scene. `config`: the value in force of each control.
-    `plan`, `placement`, `accuracy`: as in report.json, and `notes` beside the plan. `bound`: of a run that is over, as
-    there, with its efficiencies.
+    `name`: name of the run folder. `clock`: host or virtual. `machine`: line for people.
+    `fps`, `output` (width, height): rate and size of the scene. `config`: value in force of each control.
+    `plan`, `placement`, `accuracy`: as in report.json, with `notes` beside the plan. `bound`: as there, with the
+    efficiencies, for a run that is over.
     """
 
     name: str
@@ -33,12 +54,12 @@ class RunFacts:
 
     @classmethod
     def of_row(cls, row: Mapping[str, Any]) -> RunFacts:
-        """The facts that were sent as `asdict` has them."""
+        """Return the facts that were sent as `asdict` has them."""
         width, height = row["output"]
         return cls(**{**row, "output": (width, height)})
 
     def hello(self) -> dict[str, Any]:
-        """Its part of the hello."""
+        """Return the facts that are part of the hello."""
         return {
             "name": self.name,
             "scene": self.scene,
@@ -49,6 +70,163 @@ class RunFacts:
         }
 
     def state(self, state: str, why: str = "") -> dict[str, Any]:
-        """The message that says what the run does, and under what configuration."""
+        """Return the message that says what the run does, and under what configuration."""
         facts = {"plan": self.plan, "placement": self.placement, "accuracy": self.accuracy, "bound": self.bound}
         return {"type": "state", "is": state, "why": why, "config": self.config, **facts}
+
+
+def config_in_force(config: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the value of each control that is set before a run.
+
+    `config`: block of report.json, which says what an option left open. `options`: by name, as they were asked for.
+    """
+    scene = config["scene"]
+    chosen = {**config, "size": scene["size"], "avatar": scene["avatars"][0]["bundle"]}
+    return {name: chosen.get(name) or options.get(name) or NOTHING for name in OF_A_NEW_RUN}
+
+
+def _machine_line(machine: Mapping[str, Any]) -> str:
+    """Return processor and OpenGL driver in one line."""
+    cpu, driver = machine["cpu"], machine.get("gl")
+    cores = f"{len(cpu['cores_allowed'])} of {cpu['cores']} cores"
+    drawn = f", {driver['renderer']}" if driver else ""
+    return f"{cpu['model']}, {cores}{drawn}"
+
+
+#: Of a report: how well a run used its cores, and what bounded it.
+BOUND: Final = ("bottleneck", "bound", "efficiency", "core_efficiency", "machine_efficiency")
+
+
+def facts_of_checked(name: str, checked: Checked, options: RunOptions, machine: Mapping[str, Any]) -> RunFacts:
+    """Return the facts of a run that begins."""
+    # here and below: the process that shows a live run asks for neither, and starts sooner without
+    from trilane.apps.run.report_facts import config_facts
+
+    config = checked.config
+    scene = config.scene
+    said = config_facts(config, options.policy, options.edge)
+    return RunFacts(
+        name,
+        scene.name,
+        "host",
+        _machine_line(machine),
+        scene.fps,
+        (scene.output.width, scene.output.height),
+        config_in_force(said, dict(options)),
+        {"tensor_shapes": [list(shape) for shape in config.buckets], "notes": list(checked.notes)},
+        checked.placement,
+        checked.accuracy,
+    )
+
+
+def facts_of_report(name: str, report: Report) -> RunFacts:
+    """Return what the report of a finished run says."""
+    document = report.as_json()
+    scene = document["config"]["scene"]
+    caps = document["caps"]
+    return RunFacts(
+        name,
+        scene["name"],
+        report.clock,
+        _machine_line(document["machine"]),
+        scene["fps"],
+        (scene["output"]["width"], scene["output"]["height"]),
+        config_in_force(document["config"], {**(document.get("options") or {}), **caps}),
+        {**document["plan"], "notes": document["notes"]},
+        document.get("placement"),
+        document["accuracy"],
+        {key: document.get(key) for key in BOUND} if report.bound is not None else None,
+    )
+
+
+def facts_of_folder(folder: Path, begun: Begun) -> RunFacts:
+    """Return the facts of the run in `folder`, from its report or, without one, from the first record of its journal.
+
+    Raises BadInputError for a report that cannot be read.
+    """
+    if (folder / "report.json").is_file():
+        from trilane.apps.run.report import read_report
+
+        return facts_of_report(folder.name, read_report(folder))
+    facts = begun.facts
+    scene = (facts.get("config") or {}).get("scene") or {}
+    output = scene.get("output") or {}
+    machine = facts.get("machine")
+    return RunFacts(
+        folder.name,
+        scene.get("name", folder.name),
+        str(facts.get("clock", "host")),
+        _machine_line(machine) if machine else "",
+        scene.get("fps", 30.0),
+        (output.get("width", 640), output.get("height", 480)),
+        {"policy": begun.settings.policy},
+        {},
+        None,
+        facts.get("accuracy") or {},
+    )
+
+
+@dataclass(frozen=True)
+class Control:
+    """One control.
+
+    `kind`: action, choice, number or drag. `live`: whether the run goes on when it is used, or begins anew.
+    `choices`: values of a choice. `min`, `max`: range of a number, and of both numbers of a drag. `why_not`: reason why
+    it cannot be used now, "" when it can.
+    """
+
+    name: str
+    kind: str
+    live: bool
+    choices: tuple[str, ...] = ()
+    min: float | None = None
+    max: float | None = None
+    why_not: str = ""
+
+    def refusal(self, value: Value) -> str:
+        """Return why it cannot have `value`, "" when it can."""
+        if self.why_not:
+            return self.why_not
+        if self.kind == ACTION:
+            return "" if value is None else "found a value, expected none"
+        if self.kind == CHOICE:
+            return "" if value in self.choices else f"found {value!r}, expected one of {', '.join(self.choices)}"
+        numbers = value if self.kind == DRAG else [value]
+        if isinstance(numbers, list) and all(self._has_room_for(number) for number in numbers):
+            return ""
+        found = "two numbers" if self.kind == DRAG else "a number"
+        return f"found {value!r}, expected {found} from {self.min:g} to {self.max:g}"
+
+    def _has_room_for(self, number: Any) -> bool:
+        assert self.min is not None and self.max is not None
+        is_number = isinstance(number, int | float) and not isinstance(number, bool)
+        return is_number and self.min <= number <= self.max
+
+    def as_json(self, value: Any) -> dict[str, Any]:
+        """Return its row in the hello, with the value in force."""
+        return {**asdict(self), "value": value}
+
+
+def control_of(row: Mapping[str, Any]) -> Control:
+    """Return the control that was sent as `asdict` has it."""
+    return Control(**{**row, "choices": tuple(row["choices"])})
+
+
+def controls_of_run(
+    units: Sequence[str], choices: Mapping[str, Sequence[str]], why_not: Mapping[str, str]
+) -> tuple[Control, ...]:
+    """Return the controls of a run with these `units`. `choices`, `why_not`: by name, for those of OF_A_NEW_RUN."""
+    live = (
+        Control("play", ACTION, True),
+        Control("pause", ACTION, True),
+        Control("step", ACTION, True),
+        Control("orbit", DRAG, True, min=-MOST_DRAG_DEG, max=MOST_DRAG_DEG),
+        Control("zoom", NUMBER, True, min=LEAST_ZOOM, max=MOST_ZOOM),
+        Control("recentre", ACTION, True),
+        Control("kill", CHOICE, True, choices=tuple(units)),
+    )
+    anew = (
+        Control(name, CHOICE, False, choices=tuple(choices[name]), why_not=why_not.get(name, ""))
+        for name in OF_A_NEW_RUN
+    )
+    return (*live, *anew)

@@ -14,10 +14,10 @@ from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from trilane.apps.asked_prediction import answer_of, network_of, predict_networks, usual_policy, variant_of
-from trilane.apps.asked_run import run_asked
-from trilane.apps.remade_avatar import remade_avatar
-from trilane.apps.run_job import Hooks
+from trilane.apps.avatar.remade_avatar import remade_avatar
+from trilane.apps.predict.asked_prediction import answer_of, network_of, predict_networks, usual_policy, variant_of
+from trilane.apps.run.asked_run import run_asked
+from trilane.apps.run.run_job import Hooks
 from trilane.avatars.bundle import load_bundle
 from trilane.bench.lib.interleaved_processes import Variant, runners
 from trilane.errors import BadInputError

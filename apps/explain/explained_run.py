@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from trilane.apps.explain.reasons import MOST_SAMPLES, Shown, SlowFrames, Usual, advice, notes, reasons
-from trilane.apps.live.followed_run import CUT_OFF, FollowedRun, RunState
-from trilane.apps.report import Report, read_report
+from trilane.apps.run.report import Report, read_report
+from trilane.apps.watch.followed_run import CUT_OFF, FollowedRun, RunState
 from trilane.errors import BadInputError, MissingPartError
 from trilane.figure_sources import COMPUTED, MEASURED
 from trilane.pipeline.critical_path import WHATS, Part

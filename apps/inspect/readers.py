@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from trilane.apps.avatar_facts import bundle_facts
+from trilane.apps.avatar.assembled_avatar import bundle_facts
 from trilane.apps.compare.overview import read_entries
 from trilane.apps.explain.trace import NAME as TRACE_NAME
 from trilane.apps.inspect.inspection import Inspection, Length, drawn_cameras, drawn_points, drawn_skeletons, used
-from trilane.apps.report import read_report
+from trilane.apps.run.report import read_report
 from trilane.apps.sweep.definition import read_sweep
 from trilane.arrays import F32
 from trilane.avatars.bundle import DEFAULT, MANIFEST, bundle_folder, load_bundle

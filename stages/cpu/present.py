@@ -1,9 +1,9 @@
 """The present stage: turns frames into a segment of video, and writes a line with a digest of every frame beside it.
 
 The stage presents the bytes of the slot and digests them before anything else is done to them. Each process writes one
-segment, named so that none replaces another; the parent joins them (`trilane.apps.video`). A segment is fragmented MP4:
-when its writer is killed it is readable, short of the last frame at most. Frames that are to be compared after the run
-are kept as arrays beside it.
+segment, named so that none replaces another; the parent joins them (`apps/run/run_files.py`). A segment is fragmented
+MP4: when its writer is killed it is readable, short of the last frame at most. Frames that are to be compared after the
+run are kept as arrays beside it.
 """
 
 from __future__ import annotations

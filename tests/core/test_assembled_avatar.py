@@ -14,7 +14,7 @@ import onnx
 import pytest
 from onnx import numpy_helper
 
-from trilane.apps.assembled_avatar import Parts, assemble
+from trilane.apps.avatar.assembled_avatar import Parts, assemble
 from trilane.avatars.bundle import OFFSETS, bundle_folder, load_bundle, save_offsets
 from trilane.avatars.manifest import CAPTURED, UNTRAINED, Validation, digests_of, with_figures_digest
 from trilane.errors import BadInputError

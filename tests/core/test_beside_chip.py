@@ -16,7 +16,7 @@ import pytest
 from onnx import TensorProto, helper
 
 from support.trace_reading import read_trace
-from trilane.apps import beside as sources
+from trilane.apps.predict import asked_pipelines as sources
 from trilane.errors import BadInputError
 from trilane.hw_profiles import beside_answer
 from trilane.hw_profiles.application import REFERENCE, Plan, Variant, stage_times_ms, steady

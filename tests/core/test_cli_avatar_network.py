@@ -12,7 +12,7 @@ from typing import Any
 import onnx
 import pytest
 
-from trilane.apps.avatar_facts import bundle_facts
+from trilane.apps.avatar.assembled_avatar import bundle_facts
 from trilane.apps.cli import avatar_network
 from trilane.avatars import network_split
 from trilane.avatars.bundle import load_bundle

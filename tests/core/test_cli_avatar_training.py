@@ -20,9 +20,9 @@ from PIL import Image
 
 import trilane.training
 from support.small_inputs import validated
-from trilane.apps import made
-from trilane.apps.cli import avatar_quantise, avatar_validate
+from trilane.apps.cli import avatar_network, avatar_train
 from trilane.apps.experiments import calibrated_network
+from trilane.apps.run import asked_run
 from trilane.avatars.bundle import load_bundle, write_manifest
 from trilane.avatars.manifest import Validation, sha256_of
 from trilane.stages.dsp import runtime
@@ -105,7 +105,7 @@ def test_quantise_refuses_word_by_word(files: Path, command: Command) -> None:
 
 def test_no_more_frames_than_a_thousand_are_read(tmp_path: Path) -> None:
     np.save(tmp_path / "f.npy", np.arange(1002.0).reshape(-1, 1, 1, 1))
-    frames = avatar_quantise._frames(tmp_path / "f.npy")
+    frames = avatar_network._frames(tmp_path / "f.npy")
     assert (len(frames), frames[-1].dtype, frames[-1].item()) == (1000, np.float32, 999.0)
 
 
@@ -176,7 +176,7 @@ class Work:
         painter = ModuleType("trainable_avatar")
         painter.__dict__["float_painter_of"] = lambda bundle, weights: ("painter", bundle.manifest.name, weights.name)
         monkeypatch.setitem(sys.modules, "trilane.training.trainable_avatar", painter)
-        monkeypatch.setattr(made, "made_facts", lambda words: {"revision": f"r{len(words)}", "modified": True})
+        monkeypatch.setattr(asked_run, "made_facts", lambda words: {"revision": f"r{len(words)}", "modified": True})
 
     def _make_plan(self, **values: Any) -> Any:
         self.plan = SimpleNamespace(threads=7, **values)
@@ -336,7 +336,7 @@ def test_a_bar_counts_the_views_on_a_terminal(
 
     screen = io.StringIO()
     console = Console(file=screen, force_terminal=True, width=100)
-    monkeypatch.setattr(avatar_validate, "stderr_console", lambda: console)
+    monkeypatch.setattr(avatar_train, "stderr_console", lambda: console)
     command("avatar", "validate", tiny_bundle, "--per-band", 1)
     share = 6 / (2 * 1 * len(BANDS))
     assert "validating" in screen.getvalue() and f"{100 * share:.0f}%" in screen.getvalue()

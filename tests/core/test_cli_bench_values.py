@@ -1,4 +1,7 @@
-"""`trilane bench`: the options of every bench, word for word, and what a bench that a test makes up prints."""
+"""`trilane bench`: the options of every bench, word for word, and what a bench that a test makes up prints.
+
+A number out of range is refused by its name before anything is measured.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,9 @@ import typer
 from rich.console import Console
 
 from trilane.apps.cli import bench
-from trilane.apps.cli.bench import BENCHES, bench_command
+from trilane.apps.cli.bench import BENCHES, MEANINGS, bench_command, show
+from trilane.bench.lib.limits import LIMITS, check_limits
+from trilane.errors import BadInputError
 from trilane.stages import machine_facts
 
 Command = Callable[..., tuple[str, str]]
@@ -97,3 +102,21 @@ def test_a_table_of_few_columns_has_their_names() -> None:
     console.print(bench._table([{"a": 1, "b": 2.0}, {"a": 3}]))
     words = console.file.getvalue().translate(str.maketrans(dict.fromkeys("┏┓┗┛┃┡┩━┳╇└┘│─┴", " "))).split()  # type: ignore[attr-defined]
     assert words == ["a", "b", "1", "2", "3"]
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [{"width": -3}, {"batch": 0}, {"repeats": 0}, {"threads": -1}, {"minutes": float("nan")}, {"sizes": (64, 0)}],
+)
+def test_a_number_out_of_range_is_refused_by_name(asked: dict[str, object]) -> None:
+    def never(**_: object) -> dict[str, object]:
+        raise AssertionError("measured")
+
+    with pytest.raises(BadInputError, match=f"--{next(iter(asked))}: found .* expected .* to "):
+        show("raster", never, asked, as_json=True)
+
+
+def test_what_has_no_range_is_left_to_the_bench() -> None:
+    check_limits({"network": "x.onnx", "spin": True, "size": ("256x256",), "repeats": 5})
+    assert all(low < high for low, high in LIMITS.values())
+    assert set(LIMITS) <= {name.split(" ")[-1] for name in MEANINGS}

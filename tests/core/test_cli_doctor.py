@@ -16,7 +16,7 @@ import pytest
 
 from trilane import machine
 from trilane.apps.cli import doctor
-from trilane.apps.cli.doctor import Check
+from trilane.apps.cli.doctor import PartCheck
 from trilane.pipeline import hardware_counters
 from trilane.stages import machine_facts
 from trilane.transport import wakeup
@@ -63,19 +63,19 @@ MEMFD = "needs Linux 3.17 or newer with memfd_create allowed"
 @pytest.mark.usefixtures("well_equipped")
 def test_a_machine_that_has_everything(tmp_path: Path) -> None:
     assert doctor.checks(GL) == [
-        Check("Python", "3.11.9", True, True, PYTHON),
-        Check("CPU", "a processor, 3 of 8 cores allowed, avx2 avx512_vnni amx_int8", True, True, ""),
-        Check("INT8 dot product", "amx_int8 avx512_vnni", True, False, "needs another CPU"),
-        Check("hardware counters", "instructions, cache_misses", True, False, ""),
-        Check("memfd", "anonymous shared memory works", True, True, ""),
-        Check(str(tmp_path), "3 MiB free; Trilane leaves nothing there", True, False, ""),
-        Check("idle cores", wakeup.AWAKE, True, False, ACL),
-        Check("EGL and OpenGL", "a [driver], 4.5 (hardware)", True, True, ""),
-        Check("inference runtimes", "onnxruntime: CPU, QNN; openvino: GPU", True, True, ""),
-        Check("numpy", "numpy-1.2", True, True, "pip install numpy"),
-        Check("av", "av-1.2", True, True, "pip install av"),
-        Check("openvino", "openvino-1.2", True, False, "pip install trilane[openvino]"),
-        Check("torch", "torch-1.2", True, False, "pip install trilane[train]"),
+        PartCheck("Python", "3.11.9", True, True, PYTHON),
+        PartCheck("CPU", "a processor, 3 of 8 cores allowed, avx2 avx512_vnni amx_int8", True, True, ""),
+        PartCheck("INT8 dot product", "amx_int8 avx512_vnni", True, False, "needs another CPU"),
+        PartCheck("hardware counters", "instructions, cache_misses", True, False, ""),
+        PartCheck("memfd", "anonymous shared memory works", True, True, ""),
+        PartCheck(str(tmp_path), "3 MiB free; Trilane leaves nothing there", True, False, ""),
+        PartCheck("idle cores", wakeup.AWAKE, True, False, ACL),
+        PartCheck("EGL and OpenGL", "a [driver], 4.5 (hardware)", True, True, ""),
+        PartCheck("inference runtimes", "onnxruntime: CPU, QNN; openvino: GPU", True, True, ""),
+        PartCheck("numpy", "numpy-1.2", True, True, "pip install numpy"),
+        PartCheck("av", "av-1.2", True, True, "pip install av"),
+        PartCheck("openvino", "openvino-1.2", True, False, "pip install trilane[openvino]"),
+        PartCheck("torch", "torch-1.2", True, False, "pip install trilane[train]"),
     ]
 
 
@@ -100,26 +100,26 @@ def test_a_machine_that_has_nothing(well_equipped: pytest.MonkeyPatch, tmp_path:
     well_equipped.setattr(os, "memfd_create", refused)
     no_mesa = "apt-get install libegl1 libgl1-mesa-dri"
     assert doctor.checks(None) == [
-        Check("Python", "3.11.9", False, True, PYTHON),
-        Check("CPU", "a processor, 3 of 8 cores allowed, none of those that matter", True, True, ""),
-        Check("INT8 dot product", "no; INT8 networks run on AVX2 or NEON alone", False, False, "needs another CPU"),
-        Check("hardware counters", "kernel.perf_event_paranoid is 3", False, False, PARANOID),
-        Check("memfd", "operation not permitted", False, True, MEMFD),
-        Check(str(tmp_path / "none"), "absent", False, False, "mount -t tmpfs tmpfs /dev/shm"),
-        Check("idle cores", "may sleep", False, False, ACL),
-        Check("EGL and OpenGL", "no OpenGL 3.3 context can be made", False, True, no_mesa),
-        Check("inference runtimes", "ImportError: no libonnxruntime.so", False, True, "pip install onnxruntime"),
-        Check("numpy", "missing", False, True, "pip install numpy"),
-        Check("av", "missing", False, True, "pip install av"),
-        Check("openvino", "missing", False, False, "pip install trilane[openvino]"),
-        Check("torch", "missing", False, False, "pip install trilane[train]"),
+        PartCheck("Python", "3.11.9", False, True, PYTHON),
+        PartCheck("CPU", "a processor, 3 of 8 cores allowed, none of those that matter", True, True, ""),
+        PartCheck("INT8 dot product", "no; INT8 networks run on AVX2 or NEON alone", False, False, "needs another CPU"),
+        PartCheck("hardware counters", "kernel.perf_event_paranoid is 3", False, False, PARANOID),
+        PartCheck("memfd", "operation not permitted", False, True, MEMFD),
+        PartCheck(str(tmp_path / "none"), "absent", False, False, "mount -t tmpfs tmpfs /dev/shm"),
+        PartCheck("idle cores", "may sleep", False, False, ACL),
+        PartCheck("EGL and OpenGL", "no OpenGL 3.3 context can be made", False, True, no_mesa),
+        PartCheck("inference runtimes", "ImportError: no libonnxruntime.so", False, True, "pip install onnxruntime"),
+        PartCheck("numpy", "missing", False, True, "pip install numpy"),
+        PartCheck("av", "missing", False, True, "pip install av"),
+        PartCheck("openvino", "missing", False, False, "pip install trilane[openvino]"),
+        PartCheck("torch", "missing", False, False, "pip install trilane[train]"),
     ]
 
 
 @pytest.mark.parametrize("flag", ["avx512_vnni", "avx_vnni", "amx_int8", "asimddp", "i8mm"])
 def test_any_instruction_for_dot_products_is_enough(flag: str, well_equipped: pytest.MonkeyPatch) -> None:
     well_equipped.setattr(machine_facts, "cpu_facts", lambda: {**CPU, "flags": ["avx2", flag]})
-    assert doctor._int8() == Check("INT8 dot product", flag, True, False, "needs another CPU")
+    assert doctor._int8() == PartCheck("INT8 dot product", flag, True, False, "needs another CPU")
 
 
 def test_a_runtime_without_a_place_to_run_does_not_work(well_equipped: pytest.MonkeyPatch) -> None:
@@ -134,7 +134,7 @@ def test_a_driver_on_the_cpu_is_named() -> None:
 
 def test_memory_is_tried_and_given_back() -> None:
     before = len(list(Path("/proc/self/fd").iterdir()))
-    assert doctor._memfd() == Check("memfd", "anonymous shared memory works", True)
+    assert doctor._memfd() == PartCheck("memfd", "anonymous shared memory works", True)
     assert len(list(Path("/proc/self/fd").iterdir())) == before
 
 
@@ -150,15 +150,15 @@ def test_memory_that_cannot_grow_does_not_work(monkeypatch: pytest.MonkeyPatch) 
 
 
 ROWS = [
-    Check("first", "1.2 [x]", True, True, "never shown"),
-    Check("second", "missing", False, True, "pip install x[y]"),
-    Check("third", "absent", False, False, "mount it"),
+    PartCheck("first", "1.2 [x]", True, True, "never shown"),
+    PartCheck("second", "missing", False, True, "pip install x[y]"),
+    PartCheck("third", "absent", False, False, "mount it"),
 ]
 
 
 @pytest.mark.parametrize(("rows", "code"), [(ROWS, 3), ([ROWS[0], ROWS[2]], 0)])
 def test_the_table_and_the_exit_code(
-    rows: list[Check],
+    rows: list[PartCheck],
     code: int,
     well_equipped: pytest.MonkeyPatch,
     command: Command,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from enum import Enum
-from importlib import import_module
 from typing import Annotated, Any
 
 import pytest
@@ -17,8 +16,8 @@ from trilane.errors import BadInputError
 
 def commands() -> Iterator[tuple[str, Any]]:
     """Every command of the command line, by the words that call it."""
-    for name, (module, _) in main.COMMANDS.items():
-        command = typer.main.get_command(import_module(module).app)
+    for name in main.COMMANDS:
+        command = main.command_of(name)
         if name == "bench":
             yield from ((f"bench {one}", bench.bench_command(one)) for one in bench.BENCHES)
         elif hasattr(command, "commands"):

@@ -12,9 +12,9 @@ from typing import Any
 import onnx
 import pytest
 
-from trilane.apps import asked_prediction
 from trilane.apps.cli import predict as cli
 from trilane.apps.cli import predict_output
+from trilane.apps.predict import asked_prediction
 from trilane.avatars.bundle import load_bundle
 from trilane.errors import BadInputError
 from trilane.hw_profiles import configuration_table, load, over_time, plot

@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 
 from support.run_report import make_report
-from trilane.apps import asked_run, made, pace, run_check, run_job
 from trilane.apps.cli import run as cli_run
-from trilane.apps.report import Report
-from trilane.apps.run_job import Outcome, Prepared
+from trilane.apps.run import asked_run, pace, run_job
+from trilane.apps.run.report import Report
+from trilane.apps.run.run_job import Prepared, RunOutcome
 from trilane.errors import BadInputError
 from trilane.pipeline import unit_starter
 from trilane.stages import PRELOAD, configure
@@ -86,7 +86,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Asked:
         found.others |= {"out_dir": out_dir, "gl": (gl(), gl())}
         return checked
 
-    def run_to_folder(given: Prepared, target: Path, hooks: Any, **others: Any) -> Outcome:
+    def run_to_folder(given: Prepared, target: Path, hooks: Any, **others: Any) -> RunOutcome:
         assert given.options == found.options
         found.pace, found.target = given.pace, target
         found.others |= others | {
@@ -97,7 +97,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Asked:
         hooks.message("[red] is no markup")
         if found.raises is not None:
             raise found.raises
-        return Outcome(Report.model_validate(found.report), target, found.exit_code)
+        return RunOutcome(Report.model_validate(found.report), target, found.exit_code)
 
     def pace_of(given: Any, profile: str, slow_motion: float) -> Any:
         assert given is config
@@ -108,7 +108,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Asked:
     monkeypatch.setattr(configure, "required_machine", lambda gl: ("machine", gl()))
     monkeypatch.setattr(run_job, "run_to_folder", run_to_folder)
     monkeypatch.setattr(pace, "pace_of", pace_of)
-    monkeypatch.setattr(made, "made_facts", lambda words: {"command": [*words]})
+    monkeypatch.setattr(asked_run, "made_facts", lambda words: {"command": [*words]})
     return found
 
 
@@ -136,7 +136,7 @@ def test_a_run_that_is_steered_is_not_compared(asked: Asked, command: Command) -
 
 
 def test_a_picture_with_a_hud_is_not_compared(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_check, "require_parts", lambda _: None)
+    monkeypatch.setattr(run_job, "require_parts", lambda _: None)
 
     def checked(hud: bool) -> Any:
         return SimpleNamespace(config=SimpleNamespace(scene=SimpleNamespace(hud=hud), avatar_dirs=()))

@@ -17,11 +17,10 @@ from rich.console import Console
 
 from support.run_report import make_report
 from support.told_journal import told_journal
-from trilane.apps.cli import top as cli_top
+from trilane.apps.cli import watch as cli_top
 from trilane.apps.cli.top_view import line, screen
-from trilane.apps.live.followed_run import RunState
-from trilane.apps.live.live_figures import LiveFigures
-from trilane.apps.live.run_looks import Look
+from trilane.apps.watch.followed_run import RunState
+from trilane.apps.watch.live_figures import LiveFigures, RunLook
 from trilane.pipeline.journal import NAME, Counted, Ended, JournalWriter, Record, Stepped
 from trilane.scheduler.events import JobDone, Start, UnitDied
 
@@ -60,7 +59,7 @@ def test_a_finished_run_is_a_line_where_stdout_is_no_terminal(command: Command, 
 
 def test_the_screen(check_printed: Check) -> None:
     console = Console(file=io.StringIO(), width=120)
-    console.print(screen(Look("walk", RunState.FINISHED, FIGURES.now())))
+    console.print(screen(RunLook("walk", RunState.FINISHED, FIGURES.now())))
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert text.count("█") == round(20 * 40 / 90) + round(20 * 20 / 90)  # of 20, by the busy shares of u and v
     check_printed("top-screen", text)
@@ -70,11 +69,11 @@ def test_what_bounds_the_run_is_named() -> None:
     figures = replace(FIGURES.now(), bound=make_report()["bound"])
     named = "dsp 82% of the path (78% to 86%), and of stages most infer 44% of the path"
     for state, said in ((RunState.GOES_ON, f"bound so far: {named}"), (RunState.KILLED, f"bound: {named}")):
-        console, look = Console(file=io.StringIO(), width=120), Look("walk", state, figures)
+        console, look = Console(file=io.StringIO(), width=120), RunLook("walk", state, figures)
         console.print(screen(look))
         assert console.file.getvalue().splitlines()[2].rstrip() == said  # type: ignore[attr-defined]
         assert "; bound dsp 82%; " in line(look)
-    assert "bound" not in line(Look("walk", RunState.KILLED, FIGURES.now()))
+    assert "bound" not in line(RunLook("walk", RunState.KILLED, FIGURES.now()))
 
 
 def test_a_terminal_is_drawn_anew(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -166,7 +165,7 @@ def test_openmetrics(command: Command) -> None:
 
 def test_openmetrics_without_its_library(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     written("runs/walk", BEGUN)
-    monkeypatch.setitem(__import__("sys").modules, "trilane.apps.live.openmetrics", None)
+    monkeypatch.setitem(__import__("sys").modules, "trilane.apps.watch.metrics", None)
     _, err = command("top", "walk", "--openmetrics", code=3)
     assert "[dashboard]" in err
 

@@ -6,11 +6,9 @@ from typing import Any
 
 import pytest
 
-from trilane.apps.dashboard.channel import Asked, Message, Refused, StateIs
-from trilane.apps.dashboard.choices import choices_of, reasons_against
-from trilane.apps.dashboard.director import Director
-from trilane.apps.dashboard.live_run import _numbered
-from trilane.apps.run_job import Prepared
+from trilane.apps.dashboard.channel import ControlAsked, Message, Refused, StateIs
+from trilane.apps.dashboard.live_run import Director, _numbered, choices_of, reasons_against
+from trilane.apps.run.run_job import Prepared
 from trilane.errors import BadInputError
 from trilane.pipeline.controls import RunControls
 from trilane.scheduler.events import Hold, Stop
@@ -38,14 +36,14 @@ def run(told: list[Message]) -> tuple[Director, RunControls]:
 
 
 def test_before_a_run_nothing_can_be_asked(told: list[Message]) -> None:
-    Director(prepared, told.append).do(Asked("pause", None))
+    Director(prepared, told.append).do(ControlAsked("pause", None))
     assert told == []
 
 
 def test_the_run_is_held_stepped_and_let_go(run: tuple[Director, RunControls], told: list[Message]) -> None:
     director, controls = run
     for control in ("pause", "step", "play"):
-        director.do(Asked(control, None))
+        director.do(ControlAsked(control, None))
     assert controls.taken() == ([Hold(0), Hold(1), Hold(-1)], [])
     assert told == [StateIs("paused", ""), StateIs("paused", ""), StateIs("running", "")]
 
@@ -53,7 +51,7 @@ def test_the_run_is_held_stepped_and_let_go(run: tuple[Director, RunControls], t
 def test_a_unit_is_killed_and_nothing_else(run: tuple[Director, RunControls]) -> None:
     director, controls = run
     for value in ("gpu", "npu", None, 1.0):
-        director.do(Asked("kill", value))
+        director.do(ControlAsked("kill", value))
     assert controls.taken() == ([], ["gpu"])
 
 
@@ -61,8 +59,8 @@ def test_a_new_configuration_is_checked_and_then_the_run_stops(
     run: tuple[Director, RunControls], told: list[Message]
 ) -> None:
     director, controls = run
-    director.do(Asked("policy", "latest"))
-    director.do(Asked("edge", "triple"))  # before the next run has begun: both hold
+    director.do(ControlAsked("policy", "latest"))
+    director.do(ControlAsked("edge", "triple"))  # before the next run has begun: both hold
     assert controls.taken() == ([Stop(), Stop()], [])
     assert [type(message) for message in told] == [StateIs, StateIs]
     assert isinstance(told[0], StateIs) and told[0].state == "restarting" and "policy latest" in told[0].why
@@ -73,14 +71,17 @@ def test_a_new_configuration_is_checked_and_then_the_run_stops(
 
 def test_one_that_cannot_be_run_changes_nothing(run: tuple[Director, RunControls], told: list[Message]) -> None:
     director, controls = run
-    director.do(Asked("size", "17"))
+    director.do(ControlAsked("size", "17"))
     assert controls.taken() == ([], []) and director.take_next() is None
     assert told == [Refused("size", "size: found 17, expected multiples of 32")]
 
 
-@pytest.mark.parametrize("asked", [Asked("reboot", "x"), Asked("policy", None), Asked("size", 96.0), Asked("out", "/")])
+@pytest.mark.parametrize(
+    "asked",
+    [ControlAsked("reboot", "x"), ControlAsked("policy", None), ControlAsked("size", 96.0), ControlAsked("out", "/")],
+)
 def test_what_is_no_control_of_a_run_does_nothing(
-    run: tuple[Director, RunControls], told: list[Message], asked: Asked
+    run: tuple[Director, RunControls], told: list[Message], asked: ControlAsked
 ) -> None:
     director, controls = run
     director.do(asked)
@@ -94,7 +95,7 @@ def test_a_control_changes_its_own_option_alone(run: tuple[Director, RunControls
         ("performance_profile", "burst", RunOptions(avatar="a/b", performance_profile="burst")),
         ("performance_profile", "none", RunOptions(avatar="a/b")),
     ):
-        director.do(Asked(control, value))
+        director.do(ControlAsked(control, value))
         following = director.take_next()
         assert following is not None and following.options == expected
         director.begin(following)

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from trilane import machine
-from trilane.apps.dashboard import live_run, serve
-from trilane.apps.dashboard.channel import Asked, Message, Refused, StateIs
+from trilane.apps.dashboard import access, live_run
+from trilane.apps.dashboard.channel import ControlAsked, Message, Refused, StateIs
 from trilane.apps.dashboard.live_run import ENDLESS, _Runs
-from trilane.apps.run_job import Prepared, Watched
+from trilane.apps.run.run_job import Prepared, Watched
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
 from trilane.stages.run_options import RunOptions
 
@@ -40,7 +40,7 @@ class World:
         return SimpleNamespace(exit_code=exit_code, folder=str(out), report=SimpleNamespace(failure=failure))
 
     def ask(self, policy: str) -> None:
-        self.runs.director.do(Asked("policy", policy))
+        self.runs.director.do(ControlAsked("policy", policy))
 
     def run_all(self, **options: Any) -> Any:
         return self.runs.run_all(prepared(RunOptions(**options)))
@@ -110,13 +110,13 @@ def test_a_first_run_that_cannot_begin_is_an_error_and_one_that_fails_says_so(mo
 def test_what_is_not_installed_is_named_with_its_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine.here, "has_package", lambda name: name != "uvicorn")
     with pytest.raises(MissingPartError, match=r"needs the package uvicorn.*\[dashboard\]") as missing:
-        serve.require_server()
+        access.require_server()
     assert missing.value.exit_code == 3
 
 
 def test_a_port_in_use_is_an_error_of_the_option() -> None:
-    place = serve.listen(None)
+    place = access.listen(None)
     assert place.url == f"http://127.0.0.1:{place.port}/?token={place.token}" and len(place.token) >= 32
     with pytest.raises(BadInputError, match=f"--port: found {place.port}, which is in use"):
-        serve.listen(place.port)
+        access.listen(place.port)
     place.close()

@@ -9,9 +9,18 @@ from typing import Any
 import msgpack
 import pytest
 
-from trilane.apps.dashboard.channel import Asked, Opened, Refused, RunBegins, StateIs, channel_pair, packed, unpacked
-from trilane.apps.dashboard.controls import Control, control_of, controls_of_run
-from trilane.apps.dashboard.wire import ControlSaid, MalformedError, PictureAsked, Seek, heard, said, shown
+from trilane.apps.dashboard.channel import (
+    ControlAsked,
+    Opened,
+    Refused,
+    RunBegins,
+    StateIs,
+    channel_pair,
+    packed,
+    unpacked,
+)
+from trilane.apps.dashboard.pages import ControlSaid, MalformedError, PictureAsked, Seek, heard, said, shown
+from trilane.apps.dashboard.run_facts import Control, control_of, controls_of_run
 from trilane.unexpected_value import UnexpectedValue
 
 
@@ -60,7 +69,8 @@ def test_the_page_is_told_in_bytes_that_are_written_down() -> None:
 
 MESSAGES = [
     Opened("token", 480, 640), RunBegins("/runs/a", {"name": "a"}, [{"name": "play"}]), StateIs("paused", ""),
-    Refused("size", "found 17"), Asked("zoom", 2.5), Asked("pause", None), Asked("policy", "latest"),
+    Refused("size", "found 17"),
+    ControlAsked("zoom", 2.5), ControlAsked("pause", None), ControlAsked("policy", "latest"),
 ]  # fmt: skip
 
 
@@ -82,8 +92,8 @@ def test_a_channel_carries_messages_and_the_end_and_waits_for_nobody() -> None:
     assert ours.receive() is None
     assert ours.send(StateIs("running", ""))
     assert theirs.recv(1 << 16) == packed(StateIs("running", ""))
-    theirs.send(packed(Asked("pause", None)))
-    assert ours.receive() == Asked("pause", None)
+    theirs.send(packed(ControlAsked("pause", None)))
+    assert ours.receive() == ControlAsked("pause", None)
     sent = [ours.send(Refused("x", "y" * 10_000)) for _ in range(1000)]  # nobody reads
     assert sent[0] and not sent[-1]
     theirs.close()

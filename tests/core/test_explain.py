@@ -16,10 +16,18 @@ from typer.testing import CliRunner
 
 from trilane.apps.cli.explain import app
 from trilane.apps.cli.run import app as run_app
-from trilane.apps.explanation import _why
-from trilane.apps.plan_cost import ALWAYS, PIPELINED, CostModel, least_frame_ms
-from trilane.apps.plan_picture import BODY, GROUND, MESH, TENSOR, _tile, draw_plan
-from trilane.apps.scene_plan import PlannedFrame, ScenePlan, phases
+from trilane.apps.explain.explanation import ALWAYS, PIPELINED, CostModel, _why, least_frame_ms
+from trilane.apps.explain.scene_plan import (
+    BODY,
+    GROUND,
+    MESH,
+    TENSOR,
+    PlannedFrame,
+    ScenePlan,
+    _tile,
+    draw_plan,
+    phases,
+)
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import reshaped
 from trilane.body.kinematics import Skeleton
@@ -242,7 +250,7 @@ def test_phases_and_the_fixed_square_count_the_avatars_in_view(tiny_bundle: Path
 
 def test_a_crowds_units_are_placed_by_the_crowds_times(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Five avatars on one core: 4 poses and 4 meshes more than one, whatever the placement."""
-    for module in ("hw_profiles.host_profile", "hw_profiles.predict", "apps.plan_cost"):
+    for module in ("hw_profiles.host_profile", "hw_profiles.predict", "apps.explain.explanation"):
         monkeypatch.setattr(f"trilane.{module}.usable_cores", lambda: (0,))
     costs = CostModel(load_bundle(tiny_bundle).read_network(), "host", CAP)
     chip = load_profile("host")
@@ -291,7 +299,7 @@ def test_on_this_machine_units_are_placed_as_in_a_prediction(
     """For the shape of most frames, on two cores."""
     for module in ("host_profile", "predict"):
         monkeypatch.setattr(f"trilane.hw_profiles.{module}.usable_cores", lambda: (0, 1))
-    monkeypatch.setattr("trilane.apps.plan_cost.usable_cores", lambda: (0, 1))
+    monkeypatch.setattr("trilane.apps.explain.explanation.usable_cores", lambda: (0, 1))
     document = json.loads(explained(tmp_path, "--json", "--profile", "host").stdout)
     frames = {tuple(row["tensor"]): 0 for row in document["phases"]}
     for row in document["phases"]:
@@ -341,7 +349,7 @@ def test_both_commands_explain_an_option_alike() -> None:
 
 def test_cores_that_are_asked_for_are_kept(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of two cores: the other units go where frames are shortest; a network on both cores may share them."""
-    for module in ("hw_profiles.host_profile", "hw_profiles.predict", "apps.plan_cost"):
+    for module in ("hw_profiles.host_profile", "hw_profiles.predict", "apps.explain.explanation"):
         monkeypatch.setattr(f"trilane.{module}.usable_cores", lambda: (0, 1))
     costs = CostModel(load_bundle(tiny_bundle).read_network(), "host", CAP)
     free = costs.placement((96, 64))
@@ -420,8 +428,8 @@ def test_the_name_of_a_picture_stays_in_one_line(
 ) -> None:
     told = SimpleNamespace(plan="plan", first_frames=[1, 2], document={"a": 1})
     drawn: list[Any] = []
-    monkeypatch.setattr("trilane.apps.explanation.explain", lambda *_: told)
-    monkeypatch.setattr("trilane.apps.plan_picture.draw_plan", lambda *what: drawn.append(what))
+    monkeypatch.setattr("trilane.apps.explain.explanation.explain", lambda *_: told)
+    monkeypatch.setattr("trilane.apps.explain.scene_plan.draw_plan", lambda *what: drawn.append(what))
     file = tmp_path / f"{'wide' * 40}.png"
     result = explained(tmp_path, "--json", "--picture", str(file))
     assert drawn == [("plan", [1, 2], file)]

@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 
 from support.run_folders import write_run
-from trilane.apps.cli import explain_run as explain_command
+from trilane.apps.cli import explain as explain_command
 from trilane.apps.explain.explained_run import COLUMNS, explain_run, write_jobs
 from trilane.apps.explain.reasons import MOST_SAMPLES, EvenSample, Shown, advice, notes
-from trilane.apps.live.followed_run import CUT_OFF
+from trilane.apps.watch.followed_run import CUT_OFF
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.application import application_graph
 from trilane.pipeline.journal import NAME, Accounted, Begun, JournalWriter, Record, Stepped, Worked

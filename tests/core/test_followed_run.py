@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from trilane.apps.live import followed_run
-from trilane.apps.live.followed_run import RunState, follow
-from trilane.apps.run_folder import RunFolder
+from trilane.apps.run.run_folder import RunFolder
+from trilane.apps.watch import followed_run
+from trilane.apps.watch.followed_run import RunState, follow
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import NAME, SCHEMA, Begun, JournalWriter, Said
 from trilane.scheduler.events import Settings, chain

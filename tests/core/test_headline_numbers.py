@@ -19,7 +19,7 @@ import pytest
 
 from support.run_folders import write_run
 from trilane.apps.explain.explained_run import explain_run
-from trilane.apps.scene_plan import ScenePlan
+from trilane.apps.explain.scene_plan import ScenePlan
 from trilane.hw_profiles.application import Plan
 from trilane.hw_profiles.governor import Governor
 from trilane.hw_profiles.load import load_profile

@@ -18,9 +18,9 @@ from support.run_report import make_report
 from support.second_accounts import idle_slices
 from trilane.apps import interface
 from trilane.apps.explain.explained_run import COLUMNS
-from trilane.apps.report import Report, read_report
-from trilane.apps.run_html import run_html
-from trilane.apps.run_job import Outcome
+from trilane.apps.interface import run_html
+from trilane.apps.run.report import Report, read_report
+from trilane.apps.run.run_job import RunOutcome
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
 from trilane.hw_profiles.application import application_graph
 from trilane.pipeline.journal import Stepped
@@ -48,13 +48,13 @@ def asked(monkeypatch: pytest.MonkeyPatch, folder: Path) -> list[Any]:
     """What `run` asked for; the run ends with the exit code that is put in front."""
     found: list[Any] = [0]
 
-    def run_asked(options: RunOptions, hooks: Any, command: tuple[str, ...]) -> Outcome:
+    def run_asked(options: RunOptions, hooks: Any, command: tuple[str, ...]) -> RunOutcome:
         found.extend([options, command])
         with hooks() as told:
             told.progress("pipelined", 1, 2)
             told.message("a note")
         failure = {"failure": "infer broke"} if found[0] == 1 else {}
-        return Outcome(Report.model_validate(make_report(**failure)), folder, found[0])
+        return RunOutcome(Report.model_validate(make_report(**failure)), folder, found[0])
 
     monkeypatch.setattr(interface, "run_asked", run_asked)
     return found
@@ -304,7 +304,7 @@ def test_an_empty_name_is_not_the_working_directory(name: str) -> None:
 def test_numbers_outside_of_what_holds_are_refused_before_a_process_starts(
     argument: str, value: Any, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("trilane.apps.asked_run.early_processes", pytest.fail)
+    monkeypatch.setattr("trilane.apps.run.asked_run.early_processes", pytest.fail)
     with pytest.raises(BadInputError, match=f"^{said}"):
         trilane.run(**{argument: value})
 

@@ -125,7 +125,7 @@ def test_no_files_import_each_other_in_a_circle(graph: Imports) -> None:
     [
         "from trilane.scene.schema import Scene",
         "import trilane.stages.config",
-        "from trilane.apps import report",
+        "from trilane.apps import interface",
         "def late():\n    from trilane.pipeline.run import run_pipeline",
         "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from trilane.body.joints import JOINTS",
     ],

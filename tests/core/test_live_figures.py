@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from support.told_journal import told_journal
-from trilane.apps.live.figures import DropCount, Figures, Moved, Shares
-from trilane.apps.live.live_figures import LiveFigures
+from trilane.apps.watch.figures import DropCount, Figures, Moved, Shares
+from trilane.apps.watch.live_figures import LiveFigures
 from trilane.pipeline.journal import SCHEMA, Accounted, Begun, Counted, Ended, Record, Stepped, Worked, journal_of
 from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.core import Core

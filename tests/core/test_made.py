@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 from trilane import machine
-from trilane.apps import made
-from trilane.apps.made import made_facts
+from trilane.apps.run.asked_run import made_facts
 
 
 def git(folder: Path, *words: str) -> str:
@@ -47,7 +46,7 @@ def test_what_is_no_checkout_has_no_revision_though_a_folder_above_is_one(checko
 
 def test_every_key_of_what_was_made(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine.here, "now", lambda: datetime(2026, 11, 22, 3, 4, 5, 678, tzinfo=UTC))
-    monkeypatch.setattr(made, "package_version", lambda name: f"{name} 9.9")
+    monkeypatch.setattr("trilane.stages.machine_facts.package_version", lambda name: f"{name} 9.9")
     assert made_facts(("trilane", "run"), checkout) == {
         "at": "2026-11-22T03:04:05+00:00",
         "command": ["trilane", "run"],

@@ -9,7 +9,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from trilane.apps.live.metrics_table import COUNTERS, GAUGES, HISTOGRAMS, SOURCE
+from trilane.apps.watch.metrics import COUNTERS, GAUGES, HISTOGRAMS, SOURCE
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = (DOCS / "metrics.md").read_text(encoding="utf-8")

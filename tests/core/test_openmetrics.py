@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from trilane.apps.live.followed_run import RunState
-from trilane.apps.live.live_figures import LiveFigures
-from trilane.apps.live.metrics_table import COUNTERS, GAUGES, HISTOGRAMS, SOURCE
+from trilane.apps.watch.followed_run import RunState
+from trilane.apps.watch.live_figures import LiveFigures
+from trilane.apps.watch.metrics import COUNTERS, GAUGES, HISTOGRAMS, SOURCE
 from trilane.pipeline.journal import SCHEMA, Accounted, Begun, Counted, Ended, Sampled, Stepped, Worked
 from trilane.scheduler.events import Dispatch, Job, JobDone, Settings, UnitReady, chain
 from trilane.scheduler.ledger import ASSIGNED, STARVED, JobRecord
@@ -55,7 +55,7 @@ def run(frames: int, frame_ms: int = 20) -> LiveFigures:
 def parsed(figures: LiveFigures, state: RunState | None = None) -> dict[str, Any]:
     from prometheus_client.openmetrics.parser import text_string_to_metric_families
 
-    from trilane.apps.live.openmetrics import openmetrics
+    from trilane.apps.watch.metrics import openmetrics
 
     text = openmetrics(figures.now(state=state)).decode()
     return {family.name: family for family in text_string_to_metric_families(text)}
@@ -166,7 +166,7 @@ def test_without_a_beginning_there_are_no_creation_times() -> None:
 
 
 def test_the_document_ends_as_the_format_asks() -> None:
-    from trilane.apps.live.openmetrics import CONTENT_TYPE, openmetrics
+    from trilane.apps.watch.metrics import CONTENT_TYPE, openmetrics
 
     assert openmetrics(run(1).now()).endswith(b"\n# EOF\n")
     assert CONTENT_TYPE.startswith("application/openmetrics-text; version=1.0.0")

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from trilane.apps import pace as module
-from trilane.apps.pace import SLACK_NS, Pace, compare, pace_of, release_fps
+from trilane.apps.run import pace as module
+from trilane.apps.run.pace import SLACK_NS, Pace, compare, pace_of, release_fps
 from trilane.avatars.bundle import bundle_folder, load_bundle
 from trilane.avatars.network_file import reshaped
 from trilane.errors import BadInputError

@@ -84,7 +84,7 @@ def test_plain_data_is_frozen_and_closed() -> None:
 
 def test_the_schema_of_a_report_is_held(check_printed: Callable[[str, str], None]) -> None:
     """Every key of report.json with its type and its default, and what lies inside: programs read them."""
-    from trilane.apps.report import Report
+    from trilane.apps.run.report import Report
 
     schema = Report.model_json_schema()
     kinds = {"Report": schema, **schema["$defs"]}

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.apps import remade_avatar
-from trilane.apps.asked_run import prepare
+from trilane.apps.avatar import remade_avatar
 from trilane.apps.cli.sweep_options import SweptCommand
+from trilane.apps.run.asked_run import prepare
 from trilane.avatars.bundle import MANIFEST, load_bundle
 from trilane.avatars.manifest import sha256_of
 from trilane.avatars.validation import DrawnAs, accuracy_of

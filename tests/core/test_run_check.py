@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from trilane import machine
-from trilane.apps import asked_run, run_job
 from trilane.apps.cli import main as cli
 from trilane.apps.cli import sweep as cli_sweep
 from trilane.apps.experiments.picture_errors import ErrorFigures
 from trilane.apps.experiments.scene_pictures import region
-from trilane.apps.run_check import FLOAT_PATH, TRUTH, asked_frames, check_run, differs, require_parts, summed_up
+from trilane.apps.run import asked_run, run_job
+from trilane.apps.run.run_job import FLOAT_PATH, TRUTH, asked_frames, check_run, differs, require_parts, summed_up
 from trilane.arrays import U8
 from trilane.bench.lib.layers import Box
 from trilane.errors import MissingPartError, TrilaneError

@@ -16,10 +16,10 @@ import pytest
 
 from support.run_report import SHARE, SHOWN, make_report
 from trilane import machine
-from trilane.apps import report as report_module
-from trilane.apps.report import Report, read_report, write_report
-from trilane.apps.report_sources import NO_FIGURES_UNDER, sources_of
-from trilane.apps.run_folder import RunFolder, default_place
+from trilane.apps.run import report as report_module
+from trilane.apps.run.report import Report, read_report, write_report
+from trilane.apps.run.report_facts import NO_FIGURES_UNDER, sources_of
+from trilane.apps.run.run_folder import RunFolder, default_place
 from trilane.errors import BadInputError, TrilaneError, UnwrittenError
 from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
 from trilane.writing import WRITABLE, write_atomically
@@ -39,7 +39,7 @@ def test_a_folder_has_its_name_once_it_is_complete(tmp_path: Path) -> None:
 OTHER_RUN = """
 import sys
 from pathlib import Path
-from trilane.apps.run_folder import RunFolder
+from trilane.apps.run.run_folder import RunFolder
 with RunFolder(Path(sys.argv[1])):
     print("begun", flush=True)
     sys.stdin.read()

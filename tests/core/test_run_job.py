@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.apps import run_job
-from trilane.apps.pace import Pace
-from trilane.apps.report import read_report
-from trilane.apps.run_check import asked_frames
-from trilane.apps.run_job import Hooks, Outcome, Prepared, run_to_folder
+from trilane.apps.run import run_job
+from trilane.apps.run.pace import Pace
+from trilane.apps.run.report import read_report
+from trilane.apps.run.run_job import Hooks, Prepared, RunOutcome, asked_frames, run_to_folder
 from trilane.errors import BadInputError, TrilaneError
 from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
 from trilane.hw_profiles.application import application_graph
@@ -147,7 +146,7 @@ def with_a_place(given: Checked, _policy: str, _starter: Any, _driver: str, _say
 
 def go(
     runs: Runs, target: Path, made: Mapping[str, Any] | None = None, pace: Pace | None = None, **options: Any
-) -> Outcome:
+) -> RunOutcome:
     starter: Any = "the starter"
     prepared = Prepared(RunOptions(**options), checked(), pace)
     return run_to_folder(prepared, target, runs.hooks, machine=MACHINE, made=made, starter=starter)

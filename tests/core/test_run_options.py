@@ -33,10 +33,10 @@ import trilane
 from trilane.apps import interface
 from trilane.apps.cli.run import app
 from trilane.apps.cli.sweep_options import SweptCommand
-from trilane.apps.dashboard.choices import choices_of
-from trilane.apps.dashboard.known_runs import config_in_force
+from trilane.apps.dashboard.live_run import choices_of
+from trilane.apps.dashboard.run_facts import config_in_force
 from support.run_report import make_report
-from trilane.apps.report import Report
+from trilane.apps.run.report import Report
 from trilane.errors import TrilaneError
 from typer.testing import CliRunner
 

@@ -10,7 +10,7 @@ import pytest
 
 from support.run_report import SHARE, SHOWN, TIMES, make_report
 from trilane.apps.cli.run_table import run_table
-from trilane.apps.report import Report
+from trilane.apps.run.report import Report
 from trilane.figure_sources import NO_FIGURES
 
 

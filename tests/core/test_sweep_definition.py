@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from trilane.apps.cli.sweep import print_summary, seconds_left
 from trilane.apps.cli.sweep import sweep as sweep_command
 from trilane.apps.cli.sweep_options import SweptCommand
-from trilane.apps.cli.sweep_output import print_summary, seconds_left
 from trilane.apps.sweep import definition as module
 from trilane.apps.sweep import engines
 from trilane.apps.sweep.definition import (

@@ -13,7 +13,7 @@ import pytest
 from onnx import TensorProto, helper
 
 from trilane import machine
-from trilane.apps import asked_prediction, this_machine
+from trilane.apps.predict import asked_prediction, this_machine
 from trilane.avatars.bundle import load_bundle
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.graph_file import read_graph

@@ -21,7 +21,7 @@ pytest.importorskip("torch")
 
 from trilane.apps.experiments import reference_path
 from trilane.apps.experiments.scene_pictures import around
-from trilane.apps.run_check import FLOAT_PATH, TRUTH, check_run
+from trilane.apps.run.run_job import FLOAT_PATH, TRUTH, check_run
 from trilane.arrays import U8
 from trilane.bench.lib.full_picture import TruePictures, true_pictures
 from trilane.bench.lib.layers import blended

@@ -22,7 +22,7 @@ import pytest
 import trilane
 from support.machines import lowest_versions
 from trilane import machine
-from trilane.apps.run_folder import RunFolder
+from trilane.apps.run.run_folder import RunFolder
 from trilane.cache import cache_dir
 from trilane.hw_profiles.load import load_profile
 from trilane.pipeline.hardware_counters import availability

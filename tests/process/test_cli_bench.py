@@ -10,8 +10,7 @@ import sys
 import pytest
 
 from trilane.apps.cli import main as cli
-from trilane.apps.cli.bench import BENCHES, bench_command, flat
-from trilane.apps.cli.bench_options import MEANINGS, meaning
+from trilane.apps.cli.bench import BENCHES, MEANINGS, bench_command, flat, meaning
 
 #: A bench that is over in seconds.
 SHORT = ("scheduler", "--minutes", "0.02", "--rounds", "1", "--seeds", "1")

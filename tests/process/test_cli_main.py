@@ -6,7 +6,6 @@ import json
 import os
 import subprocess
 import sys
-from importlib import import_module
 
 import pytest
 
@@ -62,7 +61,7 @@ except SystemExit:
 def test_every_command_is_there_and_has_help_with_examples(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert import_module(cli.COMMANDS[name][0]).app is not None
+    assert cli.command_of(name) is not None
     assert run_here(monkeypatch, name, "--help") == 0
     assert f"Usage: trilane {name}" in capsys.readouterr().out
 

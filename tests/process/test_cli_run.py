@@ -21,7 +21,7 @@ import pytest
 from PIL import Image
 
 from trilane import machine
-from trilane.apps.report import read_report
+from trilane.apps.run.report import read_report
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_split import cuts
 from trilane.figure_sources import COMPUTED, NO_FIGURES

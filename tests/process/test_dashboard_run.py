@@ -33,8 +33,8 @@ websockets = pytest.importorskip("websockets.sync.client", reason="the extra das
 
 from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
 
-from trilane.apps.dashboard.clients import MOST_CLIENTS  # noqa: E402
-from trilane.apps.report import read_report  # noqa: E402
+from trilane.apps.dashboard.pages import MOST_CLIENTS  # noqa: E402
+from trilane.apps.run.report import read_report  # noqa: E402
 
 pytestmark = pytest.mark.slow
 

@@ -22,7 +22,7 @@ from support.doubles import HANG, LOSING_FACTORY
 from support.doubles import pipeline_of_doubles as doubles
 from support.faults import unit_process
 from trilane import machine
-from trilane.apps.pace import Pace, compare
+from trilane.apps.run.pace import Pace, compare
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.application import Variant, application_graph, settings_of
 from trilane.hw_profiles.governor import Governor

@@ -13,8 +13,8 @@ import pytest
 
 from support.doubles import pipeline_of_doubles
 from support.trace_reading import Slice, read_trace
-from trilane.apps.report import read_report
-from trilane.apps.run_job import Hooks, Outcome, Prepared, run_to_folder
+from trilane.apps.run.report import read_report
+from trilane.apps.run.run_job import Hooks, Prepared, RunOutcome, run_to_folder
 from trilane.errors import TrilaneError
 from trilane.hw_profiles.host import host_units
 from trilane.pipeline.result import RunResult
@@ -56,11 +56,11 @@ def behaviour(starter: UnitStarter, monkeypatch: pytest.MonkeyPatch) -> dict[str
         count, fps = frames or config.scene.frames, config.scene.fps
         return run_pipeline(pipeline, count, fps=fps, assets=assets, **{**options, "starter": starter})
 
-    monkeypatch.setattr("trilane.apps.run_job.run_avatar", run_doubles)
+    monkeypatch.setattr("trilane.apps.run.run_job.run_avatar", run_doubles)
     return asked
 
 
-def run_mocks(target: Path, listener: Listener, frames: int = FRAMES, **options: Any) -> Outcome:
+def run_mocks(target: Path, listener: Listener, frames: int = FRAMES, **options: Any) -> RunOutcome:
     config = RunConfig(
         scene=Scene(frames=frames, output=OutputSpec(width=64, height=64)),
         out_dir=target,

@@ -18,10 +18,9 @@ from typing import Any, Self
 
 from PIL import Image, ImageDraw
 
-from trilane.apps.dashboard.app import DashboardApp
-from trilane.apps.dashboard.clients import Client
-from trilane.apps.dashboard.serve import listen, server
-from trilane.apps.dashboard.wire import ControlSaid, Seek, shown
+from trilane.apps.dashboard.access import listen
+from trilane.apps.dashboard.app import DashboardApp, server
+from trilane.apps.dashboard.pages import Client, ControlSaid, Seek, shown
 
 PERIOD_MS = 1000 / 60
 STAGES = (("pose", "cpu"), ("raster", "gpu"), ("infer", "dsp"), ("composite", "gpu"), ("present", "cpu"))
@@ -83,7 +82,7 @@ SO_FAR = {"name": "gpu", "share": 0.82, "share_low": 0.78, "share_high": 0.86}
 
 
 def figures(t_ms: float, restarts: int = 0) -> dict[str, Any]:
-    """`trilane.apps.live.figures.Figures` at a moment, as JSON."""
+    """`trilane.apps.watch.figures.Figures` at a moment, as JSON."""
     wave = (t_ms / 1000 % 10) / 10
     times = {"mean": 16.7, "p50": 16.6 + wave, "p90": 17.9 + wave, "p95": 18.8 + wave, "p99": 21.4, "max": 25.0}
     idle = dict.fromkeys(CAUSES, 0.01)

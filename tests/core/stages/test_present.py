@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 
 from support.small_pipeline import without_bytes
-from trilane.apps import video
-from trilane.apps.video import contact_sheet, join_segments, run_checksum
+from trilane.apps.run import run_files
+from trilane.apps.run.run_files import contact_sheet, join_segments, run_checksum
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.moved_bytes import BYTES
 from trilane.scene.schema import OutputSpec, Scene
@@ -154,9 +154,9 @@ def test_both_ways_to_decode_give_the_frames_that_are_wanted(
 ) -> None:
     """Seeking to each is used where more than 30 frames lie between them: here it is said to be fewer or more."""
     used = []
-    chosen = getattr(video, decode)
-    monkeypatch.setattr(video, decode, lambda *given: used.append(len(given[1])) or chosen(*given))
-    monkeypatch.setattr(video, "KEYFRAME_EVERY", 2 if decode == "_decode_all" else 1.9)
+    chosen = getattr(run_files, decode)
+    monkeypatch.setattr(run_files, decode, lambda *given: used.append(len(given[1])) or chosen(*given))
+    monkeypatch.setattr(run_files, "KEYFRAME_EVERY", 2 if decode == "_decode_all" else 1.9)
     _, greys_of = sheet_of(tmp_path, range(40))
     assert used == [20]
     assert greys_of.ravel() == pytest.approx([grey_of(round(k * 39 / 19)) for k in range(20)], abs=4)
@@ -171,8 +171,8 @@ def test_each_frame_is_sought_in_the_time_of_its_stream(monkeypatch: pytest.Monk
         seek=lambda pts, **settings: sought.append((pts, settings)),
         decode=lambda stream: iter(frames) if stream == "the stream" else iter(()),
     )
-    monkeypatch.setattr(video, "_thumbnail", lambda frame: f"of {frame.pts}")
-    assert list(video._decode_each(container, [512, 1000])) == [(512, "of 512"), (1000, "of 1024")]
+    monkeypatch.setattr(run_files, "_thumbnail", lambda frame: f"of {frame.pts}")
+    assert list(run_files._decode_each(container, [512, 1000])) == [(512, "of 512"), (1000, "of 1024")]
     assert sought == [(512, {"stream": "the stream"}), (1000, {"stream": "the stream"})]
 
 
@@ -185,7 +185,9 @@ def test_a_sheet_is_compressed(tmp_path: Path) -> None:
 def test_frames_are_labelled_with_their_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames 2, 3 and 7 of a run: the time of a frame tells its number."""
     said: list[Any] = []
-    monkeypatch.setattr(video.ImageDraw, "Draw", lambda _: SimpleNamespace(text=lambda *a, **k: said.append((a, k))))
+    monkeypatch.setattr(
+        run_files.ImageDraw, "Draw", lambda _: SimpleNamespace(text=lambda *a, **k: said.append((a, k)))
+    )
     present(tmp_path, range(2, 4))
     sheet_of(tmp_path, range(7, 8))
     style = {"fill": "white", "stroke_width": 2, "stroke_fill": "black", "font_size": 14}

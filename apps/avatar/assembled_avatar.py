@@ -1,0 +1,222 @@
+"""What an avatar's files hold, and an avatar put together of another one's files and some that a person brings.
+
+Rule: what is said of an avatar is of its own parts, read from the files or from the manifest, which says how it was
+measured. Figures and words about a part that was replaced stay behind, and a validation stays only where nothing that
+it is of has changed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.avatars.bundle import TEXTURE_KEYS, Bundle, load_bundle, read_texture, write_bundle
+from trilane.avatars.manifest import CAPTURED, UNTRAINED, Manifest, network_entry
+from trilane.avatars.network_file import STRIDE, NetworkFile, check_integer_layers, read_network, reshaped
+from trilane.avatars.validation import refused, validation_facts
+from trilane.body.body import Body, load_body
+from trilane.errors import BadInputError
+from trilane.files import read_npz
+from trilane.hw_profiles.network_work import graph_facts
+from trilane.training.clothing.looks import KEY as LOOK
+
+if TYPE_CHECKING:
+    import onnx
+
+#: Of a network that is not the replaced one's: what the manifest says of its encoder and norm, which nobody stated.
+OTHER = "other"
+#: A network's picture is its bytes as they are: alpha and colour in 0..1 have this scale, and zero point 0.
+PICTURE_SCALE = 1 / 255
+MAX_WIDTH = 256
+NAME_LENGTH = 100
+
+
+def bundle_facts(bundle: Bundle) -> dict[str, Any]:
+    """Return the manifest's entries, sizes in bytes, and what the network's file holds. Raises BadInputError.
+
+    Keys: `name`, `folder`, `files`, `body`, `texture`, `network`, `quantisation`, `provenance`, `training_command`,
+    `validation`.
+    """
+    manifest = bundle.manifest
+    shaped = bundle.shaped_body()
+    files = {"body": bundle.body_path, "texture": bundle.texture_path, "network": bundle.network_path}
+    files |= {"offsets": bundle.offsets_path} if bundle.offsets_path is not None else {}
+    return {
+        "name": manifest.name,
+        "folder": str(bundle.folder),
+        "files": {key: {"name": path.name, "bytes": path.stat().st_size} for key, path in files.items()},
+        "body": {"vertices": len(shaped.vertices)},
+        "texture": {"shape": list(bundle.read_texture().shape)},
+        "network": {**manifest.network.model_dump(), **network_facts(bundle.read_network())},
+        "quantisation": manifest.quantisation,
+        "provenance": manifest.provenance,
+        "training_command": manifest.training_command,
+        "validation": validation_facts(bundle),
+    }
+
+
+def network_facts(network: NetworkFile) -> dict[str, Any]:
+    """Return `shape` (N, H, W, C), `sha256`, and the work of one pass (`graph_facts`). Raises BadInputError."""
+    try:
+        work = graph_facts(network.model)
+    except BadInputError as error:
+        raise BadInputError(f"{network.where}, {error.where}", error.found, error.expected, error.remedy) from None
+    return {"shape": list(network.shape), "sha256": network.digest, **work}
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Files that replace those of an avatar; None where its own stays."""
+
+    network: Path | None = None
+    texture: Path | None = None
+    body: Path | None = None
+
+    def files(self) -> dict[str, Path]:
+        """Return the files that replace one, by key."""
+        return {key: file for key, file in vars(self).items() if file is not None}
+
+
+def assemble(base: Bundle, parts: Parts, out: Path) -> dict[str, Any]:
+    """Write to the folder `out` an avatar that has `parts` and all else of `base`; returns facts about it.
+
+    Raises BadInputError when a part is wrong in itself or does not fit the others; then nothing is written.
+    """
+    if not parts.files():
+        raise BadInputError("avatar create", "no part", "--network, --texture or --body, at least one of them")
+    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
+        raise BadInputError(out, "files" if out.is_dir() else "a file", "a folder that is not there yet")
+    network = base.read_network() if parts.network is None else _drawable(read_network(parts.network))
+    source = parts.texture or base.texture_path
+    texture = _texture(source, network, parts)
+    body = parts.body or base.body_path
+    if parts.body is not None:
+        _check_body(base, load_body(parts.body), parts)
+    offsets = base.read_body().offsets if parts.body is None else None
+    arrays = read_npz(source, TEXTURE_KEYS, "a neural texture")
+    manifest, scale = _manifest(base, parts, network, out.name), arrays.get("scale")
+    write_bundle(out, manifest, body, arrays["texture"], network, scale, offsets, arrays.get("levels"))
+    made = load_bundle(out)
+    return {
+        "avatar": str(out),
+        "made_from": base.manifest.name,
+        "replaced": {key: str(file) for key, file in parts.files().items()},
+        "network": made.manifest.network.model_dump() | {"shapes": _shapes(network)},
+        "texture": {"shape": list(texture.shape), "clipped": _clipped(texture, network)},
+        "accuracy": refused(made).get("why", "validated, and unchanged since"),
+    }
+
+
+def _drawable(network: NetworkFile) -> NetworkFile:
+    """Return `network` if the units can feed it and show its picture. Raises BadInputError."""
+    from trilane.stages.gpu.packed_pass import CHANNELS
+
+    check_integer_layers(network)
+    if network.channels not in CHANNELS:
+        expected = f"{', '.join(map(str, CHANNELS[:-1]))} or {CHANNELS[-1]}, which the GPU packs"
+        raise BadInputError(network.where, f"an input of {network.channels} channels", expected, "pad with zeros")
+    output = network.output
+    if output.zero_point != 0 or not np.isclose(output.scale, PICTURE_SCALE, rtol=1e-5):
+        found = f"an output with scale {output.scale:g}, zero point {output.zero_point}"
+        expected = "scale 1/255, zero point 0: the bytes are shown as they are"
+        raise BadInputError(network.where, found, expected, "end it with a Sigmoid: trilane avatar quantise")
+    return network
+
+
+def _texture(source: Path, network: NetworkFile, parts: Parts) -> NDArray[np.float32]:
+    """Read the neural texture `source`. Raises BadInputError, also for one that `network` cannot read."""
+    arrays = read_npz(source, TEXTURE_KEYS, "a neural texture")
+    shape = arrays["texture"].shape if "texture" in arrays else ()
+    if len(shape) == 3 and shape[2] != network.channels:
+        ends = [(network.where, network.channels, "network"), (str(source), shape[2], "texture")]
+        (where, found, what), (beside, expected, other) = ends if parts.network is not None else ends[::-1]
+        remedy = f"give a --{other} of {found} channels as well, or another --{what}"
+        raise BadInputError(where, f"{found} channels", f"{expected}, as {beside} has", remedy)
+    return read_texture(source, network.channels)
+
+
+def _check_body(base: Bundle, body: Body, parts: Parts) -> None:
+    """Raises BadInputError where the texture is laid out for another body than `body`."""
+    own = load_body(base.body_path)
+    pairs = ((own.uv, body.uv), (own.uv_faces, body.uv_faces))
+    same = all(one.shape == other.shape and np.allclose(one, other, atol=1e-6) for one, other in pairs)
+    if not same and parts.texture is None:
+        expected = f"that of {base.body_path}, which the texture is laid out for"
+        raise BadInputError(str(parts.body), "another UV layout", expected, "give its --texture as well")
+
+
+def _manifest(base: Bundle, parts: Parts, network: NetworkFile, name: str) -> Manifest:
+    own = base.manifest
+    entry, quantisation = own.network.model_copy(update={"file": "network.onnx"}), own.quantisation
+    if parts.network is not None and network.digest != base.read_network().digest:
+        entry, quantisation = network_entry(network, *_kind(base, network)), {}
+    coefficients = {} if parts.body is None else {"betas": (), "expression": ()}
+    changed = {
+        "name": name[:NAME_LENGTH],
+        "body": "body.npz",
+        "texture": "texture.npz",
+        "network": entry,
+        "provenance": _provenance(own, parts),
+        "training_command": "",
+        "quantisation": quantisation,
+        **coefficients,
+    }
+    return own.model_copy(update=changed)
+
+
+def _provenance(own: Manifest, parts: Parts) -> dict[str, Any]:
+    """Say where the parts come from. Words about the person or the weights stay where these parts stay."""
+    stays = {"body": (parts.body, CAPTURED), "weights": (parts.network, UNTRAINED)}
+    kept = {key: word for key, (part, word) in stays.items() if part is None and own.provenance.get(key) == word}
+    kept |= {LOOK: own.provenance[LOOK]} if parts.body is None and LOOK in own.provenance else {}
+    files = {key: file.name for key, file in parts.files().items()}
+    return kept | {"made_from": own.name, "replaced": files, "base": own.provenance}
+
+
+def _kind(base: Bundle, network: NetworkFile) -> tuple[str, str, int]:
+    """Return encoder, norm and width of the network; encoder and norm are `OTHER` unless its operators are the base's.
+
+    The width is the number of channels of the first convolution.
+    """
+    own, operators = base.manifest.network, [_operators(each.model) for each in (base.read_network(), network)]
+    names = (own.encoder, own.norm) if operators[0] == operators[1] else (OTHER, OTHER)
+    return *names, _width(network.model)
+
+
+def _operators(model: onnx.ModelProto) -> Sequence[str]:
+    return [node.op_type for node in model.graph.node]
+
+
+def _width(model: onnx.ModelProto) -> int:
+    """Return the channels of the first convolution of `model`; 1 where none has known weights."""
+    weights = {tensor.name: tensor.dims[0] for tensor in model.graph.initializer if len(tensor.dims) == 4}
+    makers = {name: node for node in model.graph.node for name in node.output}
+    for node in model.graph.node:
+        if node.op_type == "Conv":
+            source = node.input[1]
+            while source not in weights and source in makers:
+                source = makers[source].input[0]
+            return int(min(weights.get(source, 1), MAX_WIDTH))
+    return 1
+
+
+def _shapes(network: NetworkFile) -> str:
+    """Say at which tensor shapes the network can run."""
+    _, height, width, _ = network.shape
+    try:
+        reshaped(network, STRIDE * 3, STRIDE * 5)
+    except BadInputError:
+        return f"{height}x{width} alone: trilane run --size {height}x{width}"
+    return f"any with sides in multiples of {STRIDE}"
+
+
+def _clipped(texture: NDArray[np.float32], network: NetworkFile) -> float:
+    """Return the share of the texture's values beyond the range of the network's input bytes."""
+    scale, zero = network.input.scale, network.input.zero_point
+    low, high = (-zero - 0.5) * scale, (255 - zero + 0.5) * scale
+    return float(((texture < low) | (texture > high)).mean())

@@ -1,0 +1,210 @@
+"""`trilane predict SCENE --beside …`: several pipelines on one chip, as options and as tables.
+
+Rule: nothing is computed here; `apps/predict/asked_pipelines.py` reads what the pipelines are, and
+`hw_profiles/beside_answer.py` answers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence, Set
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import typer
+
+from trilane.apps.cli.console import print_json, say, spinner, stdout_console
+from trilane.apps.cli.predict_output import IDLE
+from trilane.errors import BadInputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from trilane.hw_profiles.application import Variant
+    from trilane.hw_profiles.beside import Tenant
+    from trilane.hw_profiles.schema import Profile
+
+SceneToPredict = Annotated[
+    str | None,
+    typer.Argument(help="A scene, priced frame by frame, instead of one network: a name, a file, or SCENE@RATE."),
+]
+BesideOption = Annotated[
+    list[str] | None,
+    typer.Option(help="What else the chip does: SCENE, SCENE@RATE, NETWORK.onnx@RATE or @RATE:gpu. Once for each."),
+]
+TurnsOption = Annotated[
+    str, typer.Option(help="Whose job a unit takes that several pipelines wait for: round-robin or deadline.")
+]
+#: Options that mean something beside a scene.
+USED = {
+    "scene",
+    "beside",
+    "turns",
+    "profile",
+    "minutes",
+    "policy",
+    "edge",
+    "performance_profile",
+    "governor",
+    "trace",
+    "json",
+}
+
+
+class ChipOptions(NamedTuple):
+    """Options of the chip: its profile and performance profile, minutes with heat, and its governor."""
+
+    profile: str
+    performance_profile: str
+    minutes: float
+    governor: str | None
+
+
+class SchedulerOptions(NamedTuple):
+    """Options of the scheduler: policy and edge of the avatars, and the rule for turns on a unit."""
+
+    policy: str
+    edge: str | None
+    turns: str
+
+
+def predict_pipelines(
+    scene: str | None,
+    beside: Sequence[str],
+    typed: Set[str],
+    on: ChipOptions,
+    joined: SchedulerOptions,
+    trace: Path | None,
+    as_json: bool,
+) -> None:
+    """Print how `scene` and the pipelines `beside` it do on one chip.
+
+    `typed`: names of the options that the command line has. `trace`: file to write the simulated runs to.
+    Raises BadInputError for options that do not go with a scene and for what is wrong in one of them.
+    """
+    from trilane.apps.predict.asked_pipelines import tenants
+    from trilane.hw_profiles.beside_answer import predict_beside
+    from trilane.hw_profiles.load import HOST, load_runnable
+    from trilane.scheduler.turns import TURNS
+
+    if scene is None:
+        raise BadInputError("options", "--beside without a scene", "a scene, such as `trilane predict default`")
+    if useless := typed - USED:
+        names = ", ".join(sorted(f"--{name.replace('_', '-')}" for name in useless))
+        raise BadInputError("options", f"{names} beside a scene", "none of them", "the scene says so itself")
+    if joined.turns not in TURNS:
+        raise BadInputError("--turns", repr(joined.turns), " or ".join(TURNS))
+    chip, variant = load_runnable(on.profile), _variant(joined.policy, joined.edge)
+    if chip.name == HOST:
+        from trilane.apps.predict.this_machine import with_first
+
+        chip = with_first(chip, scene, say)
+    with spinner("predicting"):
+        found = tenants([scene, *beside], variant)
+        answer = predict_beside(chip, found, on.performance_profile, on.minutes, on.governor, joined.turns)
+        if trace is not None:
+            _write_trace(chip, found, on.performance_profile, joined.turns, answer, trace)
+    if as_json:
+        print_json(answer)
+        return
+    _show(answer)
+
+
+def _write_trace(
+    chip: Profile,
+    found: Sequence[Tenant],
+    performance_profile: str,
+    turns: str,
+    answer: Mapping[str, Any],
+    target: Path,
+) -> None:
+    """Write the simulated runs of the pipelines as one trace."""
+    from trilane.apps.explain.trace import write_predicted
+    from trilane.hw_profiles.beside import together
+    from trilane.hw_profiles.performance_profiles import corners_of
+
+    runs = together(chip, found, corners_of(chip, performance_profile), turns, keep=True).runs
+    named = {tenant.name: run for tenant, run in zip(found, runs, strict=True)}
+    write_predicted(named, {key: answer[key] for key in ("machine", "config")}, target)
+
+
+def _variant(policy: str, edge: str | None) -> Variant:
+    """Return how the avatars' stages are joined. `policy`: "" where none was asked for."""
+    from trilane.hw_profiles.application import REFERENCE
+    from trilane.hw_profiles.beside import NEWEST
+    from trilane.scheduler.policy import POLICIES
+    from trilane.transport.slots import edge_rule
+    from trilane.unexpected_value import UnexpectedValue
+
+    if policy == "reference":
+        return REFERENCE
+    if policy and policy not in POLICIES:
+        raise BadInputError("--policy", repr(policy), "reference or one of " + ", ".join(POLICIES))
+    try:
+        edge_rule(edge or NEWEST.edge)
+    except UnexpectedValue as error:
+        raise BadInputError.at("--edge", error) from None
+    return NEWEST._replace(policy=policy or NEWEST.policy, edge=edge or NEWEST.edge)
+
+
+def _show(answer: dict[str, Any]) -> None:
+    console, config = stdout_console(), answer["config"]
+    console.print(f"{answer['machine']['title']} (virtual clock), {config['performance_profile']}")
+    console.print(_pipelines(answer))
+    console.print(_idle(answer))
+    _show_chip(console, answer)
+    for note in answer["notes"]:
+        console.print(f"note            {note}", soft_wrap=True)
+
+
+def _pipelines(answer: dict[str, Any]) -> Table:
+    from rich.table import Table
+
+    minutes = answer["config"]["minutes"]
+    settled = [f"after {minutes:g} min, ms"] if minutes else []
+    table = Table(
+        "pipeline", "asked fps", "frame, ms", *settled, "alone, ms", "response, ms", "in time", "late", "dropped"
+    )
+    for row in answer["pipelines"]:
+        after = [f"{row['frame_ms_settled']:.1f}"] if minutes else []
+        table.add_row(
+            row["name"],
+            f"{row['rate_fps']:g}",
+            _mean(row["frame_time_ms"]),
+            *after,
+            _mean(row["alone"]["frame_time_ms"]),
+            _mean(row["response_ms"]),
+            f"{row['in_time']:.1%}",
+            f"{row['deadline_misses']}",
+            f"{sum(row['frames']['dropped'].values())}",
+        )
+    return table
+
+
+def _mean(times: Mapping[str, float]) -> str:
+    """Return the mean of some times in ms, a dash where there are none."""
+    return f"{times['mean']:.1f}" if times["samples"] else "-"
+
+
+def _idle(answer: dict[str, Any]) -> Table:
+    """Return a table of each unit: the busy time of all, then each pipeline's own and why the unit was idle for it."""
+    from rich.table import Table
+
+    table = Table("unit", "pipeline", "busy", *IDLE)
+    for unit, row in answer["units"].items():
+        table.add_row(unit, "all", f"{row['busy']:.1%}")
+        for one in answer["pipelines"]:
+            own = one["units"].get(unit)
+            if own is not None:
+                table.add_row("", one["name"], f"{own['busy']:.1%}", *(f"{own['idle'][cause]:.1%}" for cause in IDLE))
+    return table
+
+
+def _show_chip(console: Console, answer: dict[str, Any]) -> None:
+    base = f"{answer['base_power_w']:.1f} W of it {answer['base_power_kind']} for all but the units"
+    console.print(f"power           {answer['power_w']:.1f} W ({base})")
+    if heat := answer["temperature_c"]:
+        console.print(
+            f"temperature     device {heat['device_max']:.1f} °C, junction {heat['junction_max']:.1f} °C; "
+            f"lowered for heat {answer['caps']['throttled_share']:.0%} of the time"
+        )

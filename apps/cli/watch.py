@@ -1,0 +1,178 @@
+"""`trilane top`, `trilane dashboard` and `trilane trace`: one run, looked at while it goes on or when it is over.
+
+Rule: this file reads options and shows; the figures come from `trilane.apps.watch`, the page from
+`trilane.apps.dashboard`, the trace from `trilane.apps.tracing`.
+"""
+
+from __future__ import annotations
+
+import json as json_text
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from functools import partial
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from trilane.apps.cli.commands import Commands, PortOption
+from trilane.apps.cli.console import print_json, spinner, stderr_console, stdout_console
+from trilane.errors import BadInputError, MissingPartError
+
+if TYPE_CHECKING:
+    from trilane.apps.watch.live_figures import RunLook
+
+app = Commands()
+EPILOG_TOP = """\b
+Examples:
+  trilane top
+  trilane top runs/walk
+  trilane top walk --wait
+  trilane top --json --interval 5 >> figures.jsonl
+  trilane top runs/walk --once --json
+  trilane top runs/walk --openmetrics
+"""
+NewestRunArgument = Annotated[
+    Path | None,
+    typer.Argument(help="Run folder, its journal, or its name below runs/; the newest below runs/ if none is given."),
+]
+OnceOption = Annotated[bool, typer.Option("--once", help="Look once, whether the run goes on or not.")]
+LooksOption = Annotated[
+    bool, typer.Option("--json", help="Print a JSON document in a line for each look; with --once, one document.")
+]
+OpenMetricsOption = Annotated[
+    bool, typer.Option("--openmetrics", help="Look once and print the figures as `/metrics` of the dashboard has them.")
+]
+WaitOption = Annotated[bool, typer.Option("--wait", help="Wait for a run that has not begun.")]
+IntervalOption = Annotated[float, typer.Option(min=0.1, max=3600, help="Seconds between two looks.")]
+EPILOG_DASHBOARD = """\b
+Examples:
+  trilane dashboard runs/20261122T101500Z-default
+  trilane dashboard runs/walk --port 8080
+"""
+FolderArgument = Annotated[Path, typer.Argument(help="Folder of a run, or its name below runs/.")]
+EPILOG_TRACE = """\b
+Examples:
+  trilane trace runs/20261122T101500Z-default
+  trilane trace walk --chrome-json --out walk.json
+"""
+RunArgument = Annotated[Path, typer.Argument(help="Run folder, or its name below runs/.")]
+ChromeOption = Annotated[bool, typer.Option("--chrome-json", help="Chrome's JSON instead of Perfetto's packets.")]
+OutOption = Annotated[Path | None, typer.Option("--out", help="File to write; trace.pftrace or trace.json in RUN.")]
+
+
+@app.command(epilog=EPILOG_TOP)
+def top(
+    run: NewestRunArgument = None,
+    once: OnceOption = False,
+    json: LooksOption = False,
+    openmetrics: OpenMetricsOption = False,
+    wait: WaitOption = False,
+    interval: IntervalOption = 1.0,
+) -> None:
+    """Show how busy the units of a run are, its frame time and latency, queues, drops, heat and error.
+
+    It ends with the run; Ctrl-C ends it before. A finished run is shown as it ended. Where stdout is no terminal, each
+    look is a line.
+    """
+    from trilane.apps.watch.followed_run import follow
+    from trilane.apps.watch.live_figures import looks
+
+    if json and openmetrics:
+        raise BadInputError("options", "--json and --openmetrics", "one of them")
+    followed = follow(run, wait=wait)
+    with closing(looks(followed, partial(time.sleep, interval))) as seen:
+        with spinner("reading the journal"):
+            first = next(seen)
+        if openmetrics:
+            _print_openmetrics(first)
+        elif once and json:
+            print_json(first.as_json())
+        elif json:
+            _print_lines(first, seen)
+        else:
+            _show(first, iter(()) if once else seen)
+
+
+def _print_openmetrics(look: RunLook) -> None:
+    try:
+        from trilane.apps.watch.metrics import openmetrics
+    except ModuleNotFoundError as error:
+        raise MissingPartError(f"--openmetrics needs {error.name}", extra="dashboard") from None
+    sys.stdout.write(openmetrics(look.figures).decode())
+
+
+def _print_lines(first: RunLook, rest: Iterator[RunLook]) -> None:
+    for look in chain([first], rest):
+        sys.stdout.write(json_text.dumps(look.as_json(), allow_nan=False) + "\n")
+        sys.stdout.flush()
+
+
+def _show(first: RunLook, rest: Iterator[RunLook]) -> None:
+    """Show looks on a screen that is drawn anew, or line by line where stdout is no terminal."""
+    from rich.live import Live
+
+    from trilane.apps.cli.top_view import ending, heading, line, screen
+
+    console = stdout_console()
+    if not console.is_terminal:
+        sys.stdout.write(heading(first) + "\n")
+        written = ""
+        for look in chain([first], rest):
+            if (said := line(look)) != written:
+                sys.stdout.write(said + "\n")
+            if look.state is not first.state:
+                sys.stdout.write(ending(look) + "\n")
+            sys.stdout.flush()
+            written = said
+        return
+    with Live(screen(first), console=console, auto_refresh=False) as live:
+        for look in rest:
+            live.update(screen(look), refresh=True)
+
+
+@app.command(epilog=EPILOG_DASHBOARD)
+def dashboard(run: FolderArgument, port: PortOption = None) -> None:
+    """Show a finished run in a browser: its pictures, timeline and figures at any moment.
+
+    The page is at the address that is printed, on this machine alone, until the command is interrupted. A run that
+    goes on is shown by `trilane run --dashboard`.
+    """
+    import asyncio
+
+    from trilane.apps.dashboard.access import listen, require_server
+
+    require_server()
+    from trilane.apps.dashboard.app import DashboardApp, server
+    from trilane.apps.dashboard.finished_view import FinishedView
+    from trilane.apps.watch.followed_run import RunState, follow
+
+    followed = follow(run)
+    if followed.state is RunState.GOES_ON:
+        remedy = "`trilane top` shows it; start it with `trilane run --dashboard` to see it in a browser"
+        raise BadInputError(run, "a run that goes on", "one that is over", remedy)
+    with closing(FinishedView(followed.folder)) as view, closing(listen(port)) as place:
+        answers = DashboardApp(view, place.port, place.token)
+        stderr_console().print(f"dashboard: {place.url}", soft_wrap=True, markup=False)
+        asyncio.run(server(answers).serve(sockets=[place.listener]))
+
+
+@app.command(epilog=EPILOG_TRACE)
+def trace(run: RunArgument, chrome_json: ChromeOption = False, out: OutOption = None) -> None:
+    """Write the timeline of a run, from its journal, for ui.perfetto.dev or chrome://tracing.
+
+    docs/trace.md says what every track is.
+    """
+    from trilane.apps.explain.trace import CHROME_NAME, NAME, write_run
+    from trilane.apps.watch.followed_run import RunState, follow
+
+    followed = follow(run)
+    if out is None and followed.state is RunState.GOES_ON:
+        raise BadInputError(run, "a run that goes on", "--out FILE for its trace so far", "its folder is its own")
+    target = out or followed.folder / (CHROME_NAME if chrome_json else NAME)
+    with spinner("writing the trace"):
+        write_run(followed.whole(), target, chrome=chrome_json)
+    stderr_console().print(f"trace: {target}", soft_wrap=True, markup=False)

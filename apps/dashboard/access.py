@@ -1,0 +1,202 @@
+"""Where a server listens, and who may ask it for anything. Rule: nothing is refused in silence.
+
+This machine alone may ask, under this address, with the token of this run. A page of another site that knows the port
+gets nothing: its Origin is not ours, and a name that it lets point here is not in the Host header that is expected. The
+page's own files hold nothing secret and need no token. The socket listens before the server starts, so the address that
+is printed can be asked at once.
+"""
+
+from __future__ import annotations
+
+import errno
+import secrets
+import socket
+from collections import Counter
+from collections.abc import Awaitable, Callable, Mapping, MutableMapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, Final
+from urllib.parse import parse_qs
+
+from trilane import machine
+from trilane.errors import BadInputError, MissingPartError, install_line, reason
+
+SEND_BYTES: Final = 1 << 18  # that the system keeps of what a client does not take
+PATIENCE_MS: Final = 10_000
+BACKLOG: Final = 256
+TOKEN_BYTES: Final = 24
+PACKAGES: Final = ("starlette", "uvicorn", "websockets", "prometheus_client")
+ADDRESS: Final = "127.0.0.1"
+#: Paths that need the token; all others are files of the page.
+SECRET_PATHS: Final = frozenset({"/", "/live", "/metrics", "/trace.pftrace"})
+#: Of a page that is not there: who asks for one asks for nothing that may not be asked.
+NOT_FOUND: Final = 404
+MOST_FIELDS: Final = 16
+Scope = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
+Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
+Asgi = Callable[[Scope, Receive, Send], Awaitable[None]]
+
+
+class Refusal(StrEnum):
+    """Why the server did not do what it was asked to; the values are labels of a metric."""
+
+    WRONG_TOKEN = "wrong_token"  # noqa: S105 - the name of a count
+    FOREIGN_HOST = "foreign_host"
+    FOREIGN_ORIGIN = "foreign_origin"
+    TOO_MANY_CLIENTS = "too_many_clients"
+    OVERSIZED = "oversized"
+    MALFORMED = "malformed"
+    CONTROL = "control"
+    SLOW_CLIENT = "slow_client"
+
+
+#: Status of an answer that refuses.
+STATUS: Final = {
+    Refusal.FOREIGN_HOST: 421,
+    Refusal.FOREIGN_ORIGIN: 403,
+    Refusal.WRONG_TOKEN: 403,
+    Refusal.MALFORMED: 400,
+}
+
+
+@dataclass(frozen=True)
+class ServerAddress:
+    """Where a server listens, and the token that a client has to know."""
+
+    listener: socket.socket
+    token: str
+
+    @property
+    def port(self) -> int:
+        return int(self.listener.getsockname()[1])
+
+    @property
+    def url(self) -> str:
+        return f"http://{ADDRESS}:{self.port}/?token={self.token}"
+
+    def close(self) -> None:
+        self.listener.close()
+
+
+def require_server() -> None:
+    """Raises MissingPartError when a package of the extra is missing."""
+    for package in PACKAGES:
+        if not machine.here.has_package(package):
+            raise MissingPartError(f"the dashboard needs the package {package}", install_line("dashboard"))
+
+
+def listen(port: int | None) -> ServerAddress:
+    """Listen on `port` of this machine alone, on any free one when None. Raises BadInputError."""
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BYTES)
+        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, PATIENCE_MS)
+        listener.bind((ADDRESS, port or 0))
+        listener.listen(BACKLOG)
+    except OSError as error:
+        listener.close()
+        found = f"{port}, which is in use" if error.errno == errno.EADDRINUSE else f"{port}: {reason(error)}"
+        raise BadInputError("--port", found, "a port that is free", "without it a free one is taken") from None
+    return ServerAddress(listener, secrets.token_urlsafe(TOKEN_BYTES))
+
+
+class Refusals:
+    """Counts all refusals of a server; one that never happened counts 0."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[Refusal] = Counter(dict.fromkeys(Refusal, 0))
+
+    def add(self, why: Refusal) -> None:
+        self._counts[why] += 1
+
+    def as_json(self) -> dict[str, int]:
+        """Return the count by name."""
+        return {why.value: count for why, count in self._counts.items()}
+
+
+def hosts(port: int) -> tuple[str, str]:
+    """Return what the Host header may say."""
+    return f"{ADDRESS}:{port}", f"localhost:{port}"
+
+
+def headers(port: int) -> dict[str, str]:
+    """Return the headers of every answer: nothing from elsewhere, nothing inline, nothing kept, nothing told on."""
+    sockets = " ".join(f"ws://{host}" for host in hosts(port))
+    policy = (
+        "default-src 'none'; script-src 'self'; style-src 'self'; font-src 'self'; img-src 'self' blob:; "
+        f"connect-src 'self' {sockets}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    )
+    return {
+        "content-security-policy": policy,
+        "x-content-type-options": "nosniff",
+        "x-frame-options": "DENY",
+        "referrer-policy": "no-referrer",
+        "cross-origin-resource-policy": "same-origin",
+        "cross-origin-opener-policy": "same-origin-allow-popups",  # the trace is handed to a window of its own
+        "permissions-policy": "camera=(), microphone=(), geolocation=()",
+        "cache-control": "no-store",
+    }
+
+
+class Guard:
+    """ASGI middleware that refuses what `refusal_of` names, counts all refusals and gives every answer `headers`."""
+
+    def __init__(self, app: Asgi, port: int, token: str, refusals: Refusals) -> None:
+        self._app, self._hosts, self._token, self._refusals = app, hosts(port), token, refusals
+        self._headers = [(name.encode(), value.encode()) for name, value in headers(port).items()]
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        why = self.refusal_of(scope)
+        if why is None:
+            await self._app(scope, receive, self._with_headers(send, is_refused=False))
+            return
+        self._refusals.add(why)
+        await self._refuse(scope, receive, self._with_headers(send, is_refused=True), why)
+
+    def refusal_of(self, scope: Mapping[str, Any]) -> Refusal | None:
+        """Return why the request is refused, None when it is not."""
+        given = [(name.lower(), value.decode("latin-1")) for name, value in scope["headers"]]
+        if [value for name, value in given if name == b"host"] not in [[host] for host in self._hosts]:
+            return Refusal.FOREIGN_HOST
+        origins = [value for name, value in given if name == b"origin"]
+        ours = [[f"http://{host}"] for host in self._hosts]
+        if origins not in ours and (origins or scope["type"] == "websocket"):
+            return Refusal.FOREIGN_ORIGIN
+        if scope["path"] in SECRET_PATHS:
+            return self._refusal_of_token(scope["query_string"])
+        return None
+
+    def _refusal_of_token(self, query: bytes) -> Refusal | None:
+        try:
+            tokens = parse_qs(query.decode("latin-1"), max_num_fields=MOST_FIELDS).get("token", [])
+        except ValueError:
+            return Refusal.MALFORMED
+        is_known = len(tokens) == 1 and secrets.compare_digest(tokens[0].encode(), self._token.encode())
+        return None if is_known else Refusal.WRONG_TOKEN
+
+    async def _refuse(self, scope: Scope, receive: Receive, send: Send, why: Refusal) -> None:
+        if scope["type"] == "websocket":
+            await receive()
+            await send({"type": "websocket.close", "code": 1008, "reason": why.value})
+            return
+        body = f"refused: {why.value.replace('_', ' ')}\n".encode()
+        plain = [(b"content-type", b"text/plain; charset=utf-8"), (b"content-length", str(len(body)).encode())]
+        await send({"type": "http.response.start", "status": STATUS[why], "headers": plain})
+        await send({"type": "http.response.body", "body": body})
+
+    def _with_headers(self, send: Send, *, is_refused: bool) -> Send:
+        async def sent(message: MutableMapping[str, Any]) -> None:
+            if message["type"] == "http.response.start":
+                if not is_refused and 400 <= message["status"] < 500 and message["status"] != NOT_FOUND:
+                    self._refusals.add(Refusal.MALFORMED)
+                ours = {name for name, _ in self._headers}
+                theirs = [pair for pair in message.get("headers", []) if pair[0].lower() not in ours]
+                message = {**message, "headers": [*theirs, *self._headers]}
+            await send(message)
+
+        return sent

@@ -1,0 +1,301 @@
+"""The process that shows a run that goes on: its journal as it grows, its newest picture, its controls.
+
+Rule: nothing here makes the run wait. The journal is read behind it, pictures are pulled through the window, requests
+are handed over to the run, and its answers are told to all pages. The process yields to whoever has work, and ends with
+the run's. It starts with three descriptors: the listening socket, its end of the channel and the window.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final
+
+from PIL import Image
+
+from trilane.apps.dashboard.app import DashboardApp, server
+from trilane.apps.dashboard.channel import ChannelEnd, ControlAsked, Opened, Refused, RunBegins, StateIs
+from trilane.apps.dashboard.channel import Message as FromRun
+from trilane.apps.dashboard.pages import Client, ControlSaid, Seek, shown
+from trilane.apps.dashboard.run_facts import OF_THE_CAMERA, Control, RunFacts, Value, control_of
+from trilane.apps.dashboard.view import (
+    IdleRow,
+    JobRow,
+    Message,
+    RunMeter,
+    TimelineRows,
+    described,
+    jpeg_of,
+    note,
+    slices,
+)
+from trilane.apps.watch.followed_run import FollowedRun
+from trilane.pipeline.journal import NAME, Begun, Record
+from trilane.transport.live_window import LiveWindow, ShownPicture, Steering
+from trilane.unexpected_value import UnexpectedValue
+
+NICE: Final = 10
+FIGURES_S: Final = 0.25
+PICTURE_S: Final = 0.05  # between two that are encoded
+MOST_RAISED_DEG: Final = 90.0
+MOST_JOBS: Final = 4000
+MOST_IDLE: Final = 4000
+MOST_NOTES: Final = 100
+RECORDS_AT_ONCE: Final = 200
+READ_S: Final = 0.05  # of each look at the journal
+ASKED_A_SECOND: Final = 10
+ACCEPTED: Final = ""
+GOES_ON: Final = "a run that goes on has no other time than now"
+MS: Final = 1e-6  # of a nanosecond
+
+
+async def serve(listener: socket.socket, channel: ChannelEnd, window_fd: int) -> None:
+    """Show runs until the other end of `channel` is gone."""
+    opened = await _first(channel)
+    window = LiveWindow(window_fd, opened.height, opened.width)
+    os.close(window_fd)
+    view = _LiveView(window, channel.send)
+    app = DashboardApp(view, listener.getsockname()[1], opened.token)
+    answers = server(app)
+    run_is_over = asyncio.Event()
+    asyncio.get_running_loop().add_reader(channel.fd, _hear, channel, view, run_is_over)
+    leaving = asyncio.create_task(_leave(run_is_over, app, answers))
+    os.setpriority(os.PRIO_PROCESS, 0, NICE)  # what was imported until now had to be there at once
+    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # it takes no core from a unit by waking up
+    await answers.serve(sockets=[listener])
+    leaving.cancel()
+
+
+async def _first(channel: ChannelEnd) -> Opened:
+    while (message := channel.receive()) is None:
+        await asyncio.sleep(0.01)
+    if not isinstance(message, Opened):
+        raise UnexpectedValue(type(message).__name__, Opened.__name__)
+    return message
+
+
+async def _leave(run_is_over: asyncio.Event, app: DashboardApp, answers: Any) -> None:
+    await run_is_over.wait()
+    await app.finish()
+    answers.should_exit = True
+
+
+def _hear(channel: ChannelEnd, view: _LiveView, run_is_over: asyncio.Event) -> None:
+    try:
+        message = channel.receive()
+    except EOFError:
+        asyncio.get_running_loop().remove_reader(channel.fd)
+        run_is_over.set()
+        return
+    if message is not None:
+        view.hear(message)
+
+
+def main() -> None:
+    """Serve for `python -m trilane.apps.dashboard.live_server LISTENER CHANNEL WINDOW`."""
+    listener_fd, channel_fd, window_fd = map(int, sys.argv[1:])
+    channel = ChannelEnd(socket.socket(fileno=channel_fd))
+    with socket.socket(fileno=listener_fd) as listener:
+        try:
+            asyncio.run(serve(listener, channel, window_fd))
+        except EOFError:  # the run ended before it began
+            return
+
+
+class _Course:
+    """What is known of one run since its journal began."""
+
+    def __init__(self, begun: Begun) -> None:
+        self.begun = begun
+        self.timeline, self.meter = TimelineRows(begun), RunMeter(begun)
+        self.jobs: deque[JobRow] = deque(maxlen=MOST_JOBS)
+        self.idle: deque[IdleRow] = deque(maxlen=MOST_IDLE)
+        self.notes: deque[Message] = deque(maxlen=MOST_NOTES)
+
+    def add(self, record: Record) -> None:
+        self.timeline.add(record)
+        self.meter.add(record)
+
+    def fresh(self) -> Iterable[Message]:
+        """Return what came since the last call, and keep it for clients that join later."""
+        jobs, idle, said = self.timeline.take()
+        notes = [note(t_ms, text) for t_ms, text in said]
+        self.jobs.extend(jobs)
+        self.idle.extend(idle)
+        self.notes.extend(notes)
+        return [*([slices(jobs, idle)] if jobs or idle else []), *notes]
+
+
+class _LiveView:
+    """The `RunView` of the runs that `hear` tells of, one after the other.
+
+    `window`: window into them. `ask`: function that hands a request to the run and says whether it could.
+    """
+
+    def __init__(self, window: LiveWindow, ask: Callable[[ControlAsked], bool]) -> None:
+        self._window, self._ask = window, ask
+        self._steering = Steering()
+        self._facts: RunFacts | None = None
+        self._controls: dict[str, Control] = {}
+        self._folder: Path | None = None
+        self._followed: FollowedRun | None = None
+        self._course: _Course | None = None
+        self._state, self._why = "restarting", ""
+        self._told: list[Message] = []
+        self._unread: Iterator[Record] = iter(())
+        self._is_news = self._is_behind = False
+        self._figures_s = self._picture_s = 0.0
+        self._jpeg: tuple[int, bytes] = (-1, b"")
+        self._asked_s: deque[float] = deque(maxlen=ASKED_A_SECOND)
+
+    def hear(self, message: FromRun) -> None:
+        """Take a message from the process of the runs."""
+        if isinstance(message, RunBegins):
+            self._facts = RunFacts.of_row(message.facts)
+            self._controls = {control.name: control for control in map(control_of, message.controls)}
+            self._folder, self._followed, self._course = Path(message.folder), None, None
+            self._unread = iter(())
+        elif isinstance(message, StateIs):
+            self._state, self._why, self._is_news = message.state, message.why, True
+        elif isinstance(message, Refused):
+            self._told.append({"type": "refused", "control": message.control, "why": message.why})
+
+    def greeting(self) -> Iterable[Message]:
+        course = self._course
+        if course is not None and self._facts is not None:
+            yield self._hello(course, self._facts)
+        if self._facts is not None:
+            yield self._stated(self._facts)
+        if course is not None:
+            yield slices(list(course.jobs), list(course.idle))
+            yield from course.notes
+            yield course.meter.message(self._now_ns())
+
+    async def news(self, *, is_watched: bool) -> Iterable[Message]:
+        await self._read_on()
+        told, self._told = self._told, []
+        if not is_watched:
+            if self._course is not None:
+                self._course.fresh()
+            return ()
+        if self._is_news and self._facts is not None:
+            self._is_news = False
+            told.append(self._stated(self._facts))
+        if self._course is not None:
+            told += self._course.fresh()
+            if time.monotonic() >= self._figures_s:
+                self._figures_s = time.monotonic() + FIGURES_S
+                told.append(self._course.meter.message(self._now_ns()))
+        return told
+
+    async def picture(self, client: Client) -> bytes | None:
+        self._window.look()
+        if time.monotonic() < self._picture_s:
+            return None
+        seen = self._window.newest(client.had_frame)
+        if seen is None:
+            return None
+        self._picture_s = time.monotonic() + PICTURE_S
+        if seen.frame != self._jpeg[0]:
+            self._jpeg = seen.frame, await asyncio.to_thread(_jpeg, seen)
+        client.had_frame = seen.frame
+        age_ms = (time.monotonic_ns() - seen.sampled_ns) * MS
+        return shown(seen.frame, 1e3 * seen.media_s, age_ms, self._jpeg[1])
+
+    def control(self, asked: ControlSaid) -> str:
+        control = self._controls.get(asked.name)
+        if control is None:
+            return f"found {asked.name!r}, expected one of {', '.join(self._controls)}"
+        if why := control.refusal(asked.value):
+            return why
+        if asked.name in OF_THE_CAMERA:
+            self._steer(asked.name, asked.value)
+            return ACCEPTED
+        now_s = time.monotonic()
+        if len(self._asked_s) == ASKED_A_SECOND and now_s - self._asked_s[0] < 1.0:
+            return f"more than {ASKED_A_SECOND} things were asked for within a second"
+        self._asked_s.append(now_s)
+        value = asked.value if not isinstance(asked.value, list) else None
+        return ACCEPTED if self._ask(ControlAsked(asked.name, value)) else "the run does not answer"
+
+    async def seek(self, client: Client, to: Seek) -> Iterable[Message]:  # noqa: ARG002 - a view's signature
+        return [{"type": "refused", "control": "seek", "why": GOES_ON}]
+
+    def metrics(self) -> str:
+        return "" if self._course is None else self._course.meter.metrics(self._now_ns())
+
+    @property
+    def trace(self) -> Path | None:
+        folder = self._followed.folder if self._followed is not None else self._folder
+        return None if folder is None else folder / "trace.pftrace"
+
+    async def _read_on(self) -> None:
+        """Read what the run has written since the last call, as far as there is time for it."""
+        if self._followed is None and self._folder is not None and (self._folder / NAME).is_file():
+            self._followed = FollowedRun(self._folder)
+        if self._followed is None:
+            return
+        until_s = time.monotonic() + READ_S
+        while records := list(islice(self._unread, RECORDS_AT_ONCE)):
+            for record in records:
+                self._add(record)
+            self._is_behind = time.monotonic() > until_s
+            if self._is_behind:
+                return
+            await asyncio.sleep(0)
+        self._unread = self._followed.new()
+
+    def _add(self, record: Record) -> None:
+        if isinstance(record, Begun):
+            self._course = _Course(record)
+            if self._facts is not None:
+                self._told.append(self._hello(self._course, self._facts))
+                self._is_news = True
+        elif self._course is not None:
+            self._course.add(record)
+
+    def _hello(self, course: _Course, facts: RunFacts) -> Message:
+        run = {**facts.hello(), **described(course.begun.graph)}
+        values = self._values(facts)
+        rows = [control.as_json(values.get(name)) for name, control in self._controls.items()]
+        span = [0.0, course.timeline.now_ms]
+        return {"type": "hello", "run": run, "controls": rows, "is_live": True, "span_ms": span}
+
+    def _stated(self, facts: RunFacts) -> Message:
+        return {**facts.state(self._state, self._why), "config": self._values(facts)}
+
+    def _values(self, facts: RunFacts) -> dict[str, Any]:
+        """Return the value in force of each control that has one."""
+        camera = self._steering
+        return {**facts.config, "orbit": [camera.azimuth_deg, camera.elevation_deg], "zoom": camera.zoom}
+
+    def _steer(self, name: str, value: Value) -> None:
+        """Move the camera: a drag to the right brings it to the left, as the picture moves; one down lifts it."""
+        azimuth, elevation, zoom = self._steering
+        if isinstance(value, list):
+            azimuth = (azimuth - value[0] + 180.0) % 360.0 - 180.0
+            elevation = min(max(elevation + value[1], -MOST_RAISED_DEG), MOST_RAISED_DEG)
+        elif isinstance(value, float | int):
+            zoom = float(value)
+        self._steering = Steering() if name == "recentre" else Steering(azimuth, elevation, zoom)
+        self._window.steer(self._steering)
+        self._is_news = True
+
+    def _now_ns(self) -> int | None:
+        """Return the time of the figures: now; None, the last record's, when the run is over or not read so far."""
+        return None if self._is_behind or self._state in ("ended", "failed") else time.monotonic_ns()
+
+
+def _jpeg(seen: ShownPicture) -> bytes:
+    return jpeg_of(Image.fromarray(seen.pixels))
+
+
+if __name__ == "__main__":
+    main()

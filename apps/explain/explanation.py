@@ -1,0 +1,320 @@
+"""The plan of a scene in words and figures: what is modelled, what is left out, why, and what it costs and saves.
+
+Rule: decisions come from `scene_plan.py`. Costs are computed, never measured, by the same model as `trilane predict`;
+joints and vertices count for each avatar in view. Every figure says whether it is a bound, measured or computed.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from trilane.apps.explain.scene_plan import PlannedFrame, ScenePlan, phases
+from trilane.apps.run.report_facts import worst_loss
+from trilane.avatars.network_file import NetworkFile, reshaped
+from trilane.body.skinning import DETAILS, left_out
+from trilane.errors import BadInputError
+from trilane.figure_sources import COMPUTED, MEASURED
+from trilane.hw_profiles.application import Plan, Variant, stage_times_ms, steady, workers_of
+from trilane.hw_profiles.host import host_cores, usable_cores
+from trilane.hw_profiles.load import HOST, load_runnable
+from trilane.hw_profiles.network_work import Network, count_work
+from trilane.hw_profiles.performance_profiles import corners_of
+from trilane.hw_profiles.placed_host import place_units
+from trilane.hw_profiles.placement_facts import NS_PER_MS, described
+from trilane.hw_profiles.schema import Profile
+from trilane.scene.planner import ALL_WORK, MOST_DENSITY, FrameWork
+from trilane.scheduler.placement import Ranked
+from trilane.shapes import Shape
+from trilane.stages.avatar_assets import distinct, network_of, shaped_body
+from trilane.stages.configure import Checked
+from trilane.stages.cpu.pose import FramePlan
+from trilane.units import UNITS, UnitName
+
+#: What every plan is compared with: the square that the reference application fills.
+FIXED: Shape = (512, 512)
+BOUND = "proved bound, in pixels of the picture"
+WHY = {
+    FrameWork.NONE: "nobody is on the screen: nothing is drawn, packed or inferred",
+    FrameWork.REUSE: "nothing has changed: the picture that is there is shown again",
+}
+PIPELINED = Variant("pipelined", "double")
+#: Stages that a frame needs even with nobody in view.
+ALWAYS = ("pose", "composite", "present")
+
+
+@dataclass(frozen=True)
+class PlanExplanation:
+    """An explained plan.
+
+    `document`: keys of `trilane explain --json`. `plan`, `first_frames`: plan and first frame of each phase, to be
+    drawn.
+    """
+
+    document: dict[str, Any]
+    plan: ScenePlan
+    first_frames: Sequence[PlannedFrame]
+
+
+def explain(checked: Checked, profile: str, performance_profile: str, most_measured: int = 24) -> PlanExplanation:
+    """Explain the plan of a scene that was checked.
+
+    `profile`, `performance_profile`: hardware profile and performance profile that the costs are computed with.
+    `most_measured`: number of phases whose error is measured, at one frame each.
+    Raises BadInputError for an unknown profile.
+    """
+    scene, plan = checked.config.scene, ScenePlan(checked.config, checked.assets)
+    costs = CostModel(network_of(checked.assets), profile, performance_profile)
+    rows: list[list[float | None]] = []
+    frames: list[PlannedFrame] = []
+    for frame in range(scene.frames):
+        planned = plan.decide(frame)
+        if len(phases([*frames[-1:], planned])) > len(frames[-1:]):
+            measured = len(rows) < most_measured
+            rows.append([plan.measured_px(frame, avatar) if measured else None for avatar in planned.plan.seen])
+        frames.append(planned)
+    groups, bodies = phases(frames), _Bodies(checked)
+    names = [str(spec.name) for spec in scene.avatars]
+    document = {
+        "scene": scene.name,
+        "config": {
+            "frames": scene.frames,
+            "fps": scene.fps,
+            "output": [scene.output.height, scene.output.width],
+            "plan": scene.plan,
+            "size": scene.size,
+            "error_budget_px": scene.error_budget_px,
+            "error_budget_db": scene.error_budget_db,
+            "profile": profile,
+            "performance_profile": performance_profile,
+        },
+        "shapes": [list(shape) for shape in checked.config.buckets],
+        "avatars": [_avatar(checked, number) for number in range(len(scene.avatars))],
+        "phases": [_phase(group, errors, costs, names, bodies) for group, errors in zip(groups, rows, strict=True)],
+        "image": _image(checked),
+        "totals": _totals(frames, costs),
+        "placement": costs.placement(*_usual(frames), checked.asked_cores),
+        "notes": list(checked.notes),
+        "sources": {
+            "bound_px": BOUND,
+            "measured_px": f"{MEASURED}, at a phase's first frame",
+            "pixels, gmac": "counted",
+            "ms": COMPUTED,
+        },
+    }
+    return PlanExplanation(document, plan, [group[0] for group in groups])
+
+
+class _Bodies:
+    """The bodies of the avatars, and what each level of detail leaves out of them."""
+
+    def __init__(self, checked: Checked) -> None:
+        folders = distinct(checked.config)
+        bodies = [shaped_body(checked.assets, number).body for number in range(len(folders))]
+        self._bodies = [bodies[folders.index(folder)] for folder in checked.config.avatar_dirs]
+        self.left_out = cache(self._left_out)
+
+    def _left_out(self, avatar: int, level: int) -> list[str]:
+        return left_out(DETAILS[level], self._bodies[avatar])
+
+
+def _image(checked: Checked) -> dict[str, Any]:
+    """Return the share of its network's own pixels that a planned tensor may have, and the loss that this costs."""
+    if not checked.config.scene.plans_tensor:
+        return {"work": None, "psnr_loss_db": None, "source": "the scene fixes the tensor's size"}
+    work = checked.config.works[0]
+    sources = "; ".join(dict.fromkeys(loss.source for loss in checked.losses))
+    return {"work": work / ALL_WORK, "psnr_loss_db": worst_loss(work, checked.losses), "source": sources}
+
+
+def _avatar(checked: Checked, number: int) -> dict[str, Any]:
+    config = checked.config
+    where = "cpu" if config.posed_vertices else "gpu"
+    return {
+        "avatar": number,
+        "name": config.scene.avatars[number].name,
+        "bundle": config.scene.avatars[number].bundle,
+        "skinned_on": where,
+        "expression": "part of the avatar's shape: it costs nothing per frame",
+        "detail": "by its bound in pixels" if where == "cpu" and config.budget_px else "everything",
+        "texture_filter": config.scene.texture_filter,
+    }
+
+
+def _phase(
+    group: Sequence[PlannedFrame],
+    errors: Sequence[float | None],
+    costs: CostModel,
+    names: Sequence[str],
+    bodies: _Bodies,
+) -> dict[str, Any]:
+    first = group[0].plan
+    cost = _cost(first, costs)
+    return {
+        "first_frame": group[0].frame,
+        "last_frame": group[-1].frame,
+        "frames": len(group),
+        "work": first.work.name.lower(),
+        "tensor": list(first.shape) if first.shape else None,
+        "density": [_least(group), _most(group)] if first.shape and first.density is not None else None,
+        "avatars": [
+            {
+                "avatar": number,
+                "name": names[number],
+                "modelled": DETAILS[one.level].name,
+                "left_out": bodies.left_out(number, one.level),
+                "bound_px": max(planned.plan.seen[number].error_px for planned in group),
+                "measured_px": error,
+            }
+            for (number, one), error in zip(first.seen.items(), errors, strict=True)
+        ],
+        "why": _why(group),
+        "cost": cost.as_json(),
+        "saved": _saved(cost, costs.of(FIXED, len(first.seen))),
+    }
+
+
+def _cost(plan: FramePlan, costs: CostModel) -> FrameCost:
+    return costs.of(plan.shape, len(plan.seen)) if plan.work is FrameWork.FULL else costs.of(None)
+
+
+def _least(group: Sequence[PlannedFrame]) -> float:
+    return min(planned.plan.density or 0.0 for planned in group)
+
+
+def _most(group: Sequence[PlannedFrame]) -> float:
+    return max(planned.plan.density or 0.0 for planned in group)
+
+
+def _why(group: Sequence[PlannedFrame]) -> str:
+    """Say why the tensor of a phase is as it is."""
+    first = group[0].plan
+    if first.work in WHY:
+        return WHY[first.work]
+    if first.density is None:
+        return "the scene fixes the tensor's size"
+    if _most(group) >= MOST_DENSITY:
+        return f"{MOST_DENSITY:g} tensor pixels along a side of a pixel of the picture: more could not be seen"
+    return "the pixels that the network was trained to paint, in the shape that fits best of those that are ready"
+
+
+def _saved(cost: FrameCost, fixed: FrameCost) -> dict[str, float]:
+    return {
+        "pixels": fixed.pixels - cost.pixels,
+        "gmac": fixed.gmac - cost.gmac,
+        "work_ms": fixed.work_ms - cost.work_ms,
+    }
+
+
+def _usual(frames: Sequence[PlannedFrame]) -> tuple[Shape | None, int]:
+    """Return the shape of most full frames and the number of avatars in view there; None and 0 without any."""
+    kinds = Counter((one.plan.shape, len(one.plan.seen)) for one in frames if one.plan.work is FrameWork.FULL)
+    return kinds.most_common(1)[0][0] if kinds else (None, 0)
+
+
+def _totals(frames: Sequence[PlannedFrame], costs: CostModel) -> dict[str, Any]:
+    """Add up all frames, as planned and with the fixed square that shows the same avatars."""
+    planned = [_cost(one.plan, costs) for one in frames]
+    fixed = [costs.of(FIXED, len(one.plan.seen)) for one in frames]
+    return {
+        "pixels": sum(cost.pixels for cost in planned),
+        "fixed_pixels": sum(cost.pixels for cost in fixed),
+        "gmac": sum(cost.gmac for cost in planned),
+        "fixed_gmac": sum(cost.gmac for cost in fixed),
+        "work_ms": sum(cost.work_ms for cost in planned),
+        "fixed_work_ms": sum(cost.work_ms for cost in fixed),
+        "frame_ms": sum(cost.frame_ms for cost in planned) / len(frames),
+        "fixed_frame_ms": sum(cost.frame_ms for cost in fixed) / len(frames),
+    }
+
+
+@dataclass(frozen=True)
+class FrameCost:
+    """The cost of one frame.
+
+    `pixels`: pixels of its tensor. `gmac`: products of the network, 1e9. `work_ms`: time of all stages, one after the
+    other.
+    `frame_ms`: time between frames of its kind when they are pipelined.
+    """
+
+    pixels: int
+    gmac: float
+    work_ms: float
+    frame_ms: float
+
+    def as_json(self) -> dict[str, Any]:
+        return {"pixels": self.pixels, "gmac": self.gmac, "work_ms": self.work_ms, "frame_ms": self.frame_ms}
+
+
+def least_frame_ms(chip: Profile, times: Mapping[tuple[str, UnitName], float]) -> float:
+    """Return the time between frames whose jobs take `times`, ms by stage and unit.
+
+    It is the time of the busiest core, and no less than that of the display.
+    """
+    worker = workers_of(chip)
+    busy = (sum(ms for (_, unit), ms in times.items() if worker[unit] == one) for one in set(worker.values()))
+    return max(*busy, chip.application.display_ms.or_else(0))
+
+
+class CostModel:
+    """The costs of frames on the chip `profile`. Raises BadInputError for an unknown profile."""
+
+    def __init__(self, network: NetworkFile, profile: str, performance_profile: str) -> None:
+        self._network, self._chip = network, load_runnable(profile)
+        self._corners = corners_of(self._chip, performance_profile)
+        self.of = cache(self._of)
+
+    def _of(self, shape: Shape | None, avatars: int = 1) -> FrameCost:
+        """Return the cost of a frame whose tensor has `shape`, None for no tensor, with `avatars` avatars in view.
+
+        A frame with nobody in view still counts one avatar's pose, because the pose stage looks for somebody.
+        """
+        plan = self._plan(shape, avatars)
+        times = stage_times_ms(self._chip, plan, self._corners)
+        if shape is None:
+            kept = {key: ms for key, ms in times.items() if key[0] in ALWAYS}
+            return FrameCost(0, 0.0, sum(kept.values()), least_frame_ms(self._chip, kept))
+        steady_ms = steady(self._chip, plan, self._corners, quick=True).frame_ms
+        return FrameCost(shape[0] * shape[1], plan.network.work.macs / 1e9, sum(times.values()), steady_ms)
+
+    def placement(
+        self, shape: Shape | None, avatars: int = 1, asked: Mapping[str, tuple[int, ...]] | None = None
+    ) -> dict[str, Any]:
+        """Say where the units are best placed for frames of `shape` with `avatars` avatars in view, and why.
+
+        The model of `trilane predict` decides. `asked`: cores of units of this machine. Raises BadInputError when cores
+        of another chip are asked for.
+        """
+        asked = asked or {}
+        if self._chip.name != HOST:
+            if asked:
+                raise BadInputError("--cores", f"cores of {self._chip.name}", f"--profile {HOST}, which has cores")
+            return {
+                "units": None,
+                "predicted_ms": None,
+                "why": f"each unit of {self._chip.name} is hardware of its own",
+            }
+        plan = self._plan(shape, avatars)
+        cores = sorted({*usable_cores(), *(core for own in asked.values() for core in own)})
+        placed = place_units(self._chip, plan, self._corners, host_cores(cores), asked)
+        chosen = {key: placed.facts[key] for key in ("units", "predicted_ms")}
+        return {**chosen, "why": f"{described(placed.best.placement)}: {_why_placed(asked, placed.rule)}"}
+
+    def _plan(self, shape: Shape | None, avatars: int) -> Plan:
+        described = self._described(shape or self._network.shape[1:3])
+        return Plan(described, "dsp", PIPELINED, avatars=max(1, avatars))
+
+    def _described(self, shape: Shape) -> Network:
+        work = count_work(reshaped(self._network, *shape).model)
+        return Network({}, *shape, self._network.channels, "packed", work)
+
+
+def _why_placed(asked: Mapping[str, tuple[int, ...]], rule: Ranked) -> str:
+    if len(asked) == len(UNITS):
+        return "as asked"
+    how = "as asked, the others for the least predicted frame time" if asked else "the least predicted frame time"
+    by_rule = f"{described(rule.placement)}, {rule.frame_ns / NS_PER_MS:.1f} ms"
+    return f"{how}; by the rule for any run, {by_rule}. A run measures and decides anew"

@@ -1,0 +1,122 @@
+"""The pipelines that `trilane predict` sets beside each other, from what was typed: scenes, and networks at a rate.
+
+Rule: the pose stage of a run plans a scene, frame by frame, as for `trilane explain`; a network is its file.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from trilane.apps.explain.scene_plan import ScenePlan
+from trilane.avatars.network_file import reshaped
+from trilane.errors import BadInputError
+from trilane.hw_profiles.application import LEAST_FPS, MOST_FPS, RUNTIMES, Variant
+from trilane.hw_profiles.beside import MOST_TENANTS, NEWEST, SKIPS, Tenant
+from trilane.hw_profiles.graph_file import read_graph
+from trilane.hw_profiles.network_work import Network, count_work
+from trilane.scene.planner import FrameWork
+from trilane.scene.schema import ENDING
+from trilane.shapes import Shape
+from trilane.stages.avatar_assets import network_of
+from trilane.stages.configure import configure
+from trilane.stages.run_options import RunOptions
+from trilane.units import INFER, UnitName
+
+NETWORK_ENDING = ".onnx"
+#: Frames of a scene that are planned, the first ones; they are taken again from the first on.
+MOST_FRAMES = 600
+FORM = "SCENE, SCENE@RATE or NETWORK.onnx@RATE, with :gpu or :dsp behind the rate"
+
+
+class AskedPipeline(NamedTuple):
+    """A pipeline as typed. `what`: scene or file. `fps`: None for the scene's own rate. `unit`: unit of the network."""
+
+    text: str
+    what: str
+    fps: float | None
+    unit: UnitName
+
+
+def asked(text: str) -> AskedPipeline:
+    """Read what was typed. Raises BadInputError.
+
+    An @ belongs to the file's name unless a rate follows it, so that a file may have one in its name.
+    """
+    what, at, rate = text.rpartition("@")
+    if not at or text.endswith((ENDING, NETWORK_ENDING)):
+        what, rate = text, ""
+        if text.endswith(NETWORK_ENDING):
+            remedy = f"such as {text}@30; by itself: --network {text}"
+            raise BadInputError(_where(text), "a network without a rate", FORM, remedy)
+    if not what:
+        raise BadInputError(_where(text), "no scene and no file", FORM)
+    number, colon, unit = rate.partition(":")
+    chosen = _unit(text, unit) if colon else INFER[1]
+    return AskedPipeline(text, what, _rate(text, number) if at and what != text else None, chosen)
+
+
+def _where(text: str) -> str:
+    return f"pipeline {text!r}"
+
+
+def _rate(text: str, number: str) -> float:
+    if not re.fullmatch(r"\d+(\.\d+)?", number) or not LEAST_FPS <= float(number) <= MOST_FPS:
+        expected = f"frames a second, {LEAST_FPS:g} to {MOST_FPS:g}"
+        raise BadInputError(_where(text), f"rate {number!r}", expected, "such as @30")
+    return float(number)
+
+
+def _unit(text: str, asked_for: str) -> UnitName:
+    for unit in RUNTIMES:
+        if unit == asked_for:
+            return unit
+    raise BadInputError(_where(text), f"unit {asked_for!r}", " or ".join(RUNTIMES), "without the colon it is the dsp")
+
+
+def tenants(texts: Sequence[str], variant: Variant = NEWEST) -> list[Tenant]:
+    """Return a pipeline for each text, in order. `variant`: policy and edge of the avatars. Raises BadInputError."""
+    if len(texts) > MOST_TENANTS:
+        raise BadInputError("--beside", f"{len(texts)} pipelines", f"at most {MOST_TENANTS} with the first one")
+    read = [asked(text) for text in texts]
+    names = _names([Path(each.what).stem for each in read])
+    return [
+        _bare(each, name) if each.what.endswith(NETWORK_ENDING) else _avatar(each, name, variant)
+        for each, name in zip(read, names, strict=True)
+    ]
+
+
+def _names(stems: Sequence[str]) -> list[str]:
+    """Give each pipeline a name of its own: those of the same stem are numbered."""
+    return [
+        stem if stems.count(stem) == 1 else f"{stem} ({stems[: place + 1].count(stem)})"
+        for place, stem in enumerate(stems)
+    ]
+
+
+def _bare(each: AskedPipeline, name: str) -> Tenant:
+    path = Path(each.what)
+    network = Network({"network": str(path)}, 1, 1, 1, "packed", read_graph(path).work)
+    return Tenant(name, each.text, (network,), (0,), each.fps or 0.0, each.unit, NEWEST, is_bare=True)
+
+
+def _avatar(each: AskedPipeline, name: str, variant: Variant) -> Tenant:
+    checked = configure(RunOptions(scene=each.what, skinning="gpu"), Path.cwd())
+    scene, file = checked.config.scene, network_of(checked.assets)
+    plan = ScenePlan(checked.config, checked.assets)
+    plans = [plan.decide(frame).plan for frame in range(min(scene.frames, MOST_FRAMES))]
+    seen = [(one.shape, len(one.seen)) if one.shape and one.work is FrameWork.FULL else None for one in plans]
+    distinct = list(dict.fromkeys(one for one in seen if one is not None)) or [(_own(file.shape), 1)]
+    by_shape = {
+        shape: Network({"scene": each.what}, *shape, file.shape[3], "packed", count_work(reshaped(file, *shape).model))
+        for shape in dict.fromkeys(shape for shape, _ in distinct)
+    }
+    networks, avatars = tuple(by_shape[shape] for shape, _ in distinct), tuple(count for _, count in distinct)
+    frames = tuple(SKIPS if one is None else distinct.index(one) for one in seen)
+    return Tenant(name, each.text, networks, frames, each.fps or scene.fps, each.unit, variant, avatars=avatars)
+
+
+def _own(shape: Sequence[int]) -> Shape:
+    return shape[1], shape[2]

@@ -1,0 +1,132 @@
+"""The profile `host` with what was measured of this machine: a network's own calls, and the stages of an avatar's run.
+
+Rule: a measurement takes at most half a minute, which is said before, happens once, and is kept with the machine's
+facts. What cannot be measured is said, and the profile stays as it is: then nothing that it predicts has an interval.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from statistics import median
+
+from trilane.apps.predict.asked_pipelines import NETWORK_ENDING, asked
+from trilane.avatars.network_file import reshaped
+from trilane.errors import TrilaneError
+from trilane.hw_profiles.graph_file import GraphFile, read_graph
+from trilane.hw_profiles.host import usable_cores
+from trilane.hw_profiles.measured_host import error_of, with_network, with_stages
+from trilane.hw_profiles.network_time import price
+from trilane.hw_profiles.network_work import Network, count_work
+from trilane.hw_profiles.performance_profiles import corners_of
+from trilane.hw_profiles.placed_host import NETWORK
+from trilane.hw_profiles.placement_facts import NS_PER_MS
+from trilane.hw_profiles.schema import Profile
+from trilane.pipeline.unit_starter import UnitStarter
+from trilane.stages import PRELOAD
+from trilane.stages.avatar_assets import network_of
+from trilane.stages.avatar_pipeline import one_shape
+from trilane.stages.configure import configure, requested_runtime
+from trilane.stages.dsp.bare_calls import calls_of
+from trilane.stages.machine_facts import gl_facts
+from trilane.stages.placing import rehearsed
+from trilane.stages.run_options import RunOptions
+from trilane.units import BURST
+
+MEASURING = "measuring {} on this machine: at most half a minute, once for this machine and these packages ..."
+#: A call that is expected to take longer is not tried: warm-up and counted calls would take more than was said.
+LONGEST_CALL_MS = 4000.0
+DEFAULT = "default"
+Say = Callable[[str], None]
+
+
+def with_avatar(chip: Profile, avatar: str, say: Say) -> tuple[Profile, Network]:
+    """Return `chip`, this machine, with the times by which a run of `avatar` is placed, and its usual network.
+
+    The network is that of the run's usual tensor. `say`: function that is told what takes time and what cannot be
+    measured. Raises BadInputError for what is no avatar.
+    """
+    measured, network = _with_run(chip, RunOptions(avatar=avatar), say)
+    return measured, network._replace(facts={"avatar": avatar})
+
+
+def _with_run(chip: Profile, request: RunOptions, say: Say) -> tuple[Profile, Network]:
+    """Return `chip`, this machine, with the times by which a run is placed, and the network of its usual tensor.
+
+    The avatars of the run share the tensor; each has an equal part of the time of their poses. `say`: as in
+    `with_avatar`. Raises BadInputError for what cannot be run.
+    """
+    checked = configure(request, Path.cwd())
+    file, (height, width) = network_of(checked.assets), one_shape(checked.config)
+    work = count_work(reshaped(file, height, width).model)
+    network = Network({"scene": request.scene}, height, width, file.channels, "packed", work)
+    try:
+        with UnitStarter(PRELOAD) as starter:
+            found, at = rehearsed(checked, starter, str(gl_facts()), lambda _: say(MEASURING.format("the stages")))
+    except TrilaneError as error:
+        return _unmeasured(chip, error, say), network
+    said = f"measured on this machine at {at}: frames of a run, one at a time, with {checked.config.runtime}"
+    ms = {threads: work.serial_ns / NS_PER_MS for threads, work in found.times[NETWORK].items()}
+    frames = [sum(frame) for frame in zip(*found.took_ns.values(), strict=True)]
+    measured = with_network(chip, network.work, ms, error_of(frames), said)
+    return with_stages(measured, network, found.took_ns, said, len(checked.config.avatar_dirs)), network
+
+
+def with_first(chip: Profile, text: str, say: Say) -> Profile:
+    """Return `chip`, this machine, with what was measured of the first of several pipelines, as it was typed."""
+    what = asked(text).what
+    if what.endswith(NETWORK_ENDING):
+        return with_file(chip, read_graph(Path(what)), {}, say)
+    return _with_run(chip, RunOptions(scene=what), say)[0]
+
+
+def with_file_in_application(chip: Profile, graph: GraphFile, shapes: Mapping[str, Sequence[int]], say: Say) -> Profile:
+    """Return `chip`, this machine, with the times of a run in which a file's network takes the default avatar's place.
+
+    The parameters are those of `with_file`.
+    """
+    usual, _ = with_avatar(chip, DEFAULT, say)
+    placed = usual.units[NETWORK].measured
+    if placed is None:
+        return chip
+    measured = with_file(chip, graph, shapes, say, tuple(placed.slower))
+    if measured.units[NETWORK].measured is None:
+        return chip
+    return measured.model_copy(update={"application": usual.application})
+
+
+def with_file(
+    chip: Profile, graph: GraphFile, shapes: Mapping[str, Sequence[int]], say: Say, counts: Sequence[int] = ()
+) -> Profile:
+    """Return `chip`, this machine, with the measured time of the network of a file.
+
+    `shapes`: shapes of inputs by name, in place of the file's own. `say`: as in `with_avatar`. `counts`: numbers of
+    threads; if empty, that of the unit for networks.
+    """
+    why = _why_not(chip, graph)
+    if why:
+        return _unmeasured(chip, why, say)
+    cores = usable_cores()
+    try:
+        runtime, _ = requested_runtime("auto")
+        threads = counts or (chip.units[NETWORK].threads,)
+        found = calls_of(graph.path, shapes, runtime, threads, cores, lambda: say(MEASURING.format(graph.path.name)))
+    except TrilaneError as error:
+        return _unmeasured(chip, error, say)
+    said = f"measured on this machine at {found.at}: calls of the network by itself, with {found.runtime}"
+    ms = {count: median(took) / NS_PER_MS for count, took in found.took_ns.items()}
+    scatter = max(error_of(took) for took in found.took_ns.values())
+    return with_network(chip, graph.work, ms, scatter, said)
+
+
+def _why_not(chip: Profile, graph: GraphFile) -> str:
+    """Say why a network is not even tried; empty when it is."""
+    if graph.numbers == "not said":
+        return "the file has no weights"
+    ms = price(chip, graph.work, NETWORK, corners_of(chip, BURST)).total_ms
+    return f"a call is expected to take {ms / 1e3:.0f} s, which is too long" if ms > LONGEST_CALL_MS else ""
+
+
+def _unmeasured(chip: Profile, why: TrilaneError | str, say: Say) -> Profile:
+    say(f"not measured on this machine: {why}")
+    return chip

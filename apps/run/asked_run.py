@@ -1,0 +1,183 @@
+"""A run as somebody asked for it, from options to a run folder: the same for a command line and for a program.
+
+Rule: nothing is printed here. The fork server starts first and imports what the units need while this process goes on,
+so functions here import what this process needs.
+"""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, closing, contextmanager
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from trilane import machine
+from trilane.errors import BadInputError
+from trilane.stages.run_options import RunOptions
+
+if TYPE_CHECKING:
+    from trilane.apps.run.run_job import Hooks, Prepared, RunOutcome, Watched
+    from trilane.pipeline.unit_starter import UnitStarter
+    from trilane.stages.configure import Checked, GlFacts
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+GIT_S = 5.0
+
+
+def run_asked(
+    options: RunOptions,
+    hooks: Callable[[], AbstractContextManager[Hooks]],
+    command: tuple[str, ...] = (),
+) -> RunOutcome:
+    """Check the options, run what they ask for and leave its run folder.
+
+    `hooks`: context manager of those who are told; it opens when the input is checked and the units start.
+    `command`: words by which the run was asked for.
+    Raises BadInputError and MissingPartError for what cannot be run, TrilaneError when no frame was presented.
+    """
+    options.check_together()
+    with early_processes() as (starter, gl):
+        return run_prepared(prepare(options, gl, command), hooks=hooks, starter=starter, gl=gl)
+
+
+def prepare(options: RunOptions, gl: GlFacts, command: tuple[str, ...] = ()) -> Prepared:
+    """Check the options. Raises BadInputError and MissingPartError for what cannot be run.
+
+    `command`: words by which the run was asked for.
+    """
+    options.check_together()
+    from trilane.apps.run.run_job import Prepared
+    from trilane.stages.configure import configure
+
+    requested, said = _with_remade_avatar(options) if options.remakes_avatar else (options, ())
+    checked = configure(requested, Path.cwd(), gl)
+    if said:
+        checked = replace(checked, notes=(*said, *checked.notes))
+    if options.check:
+        _require_check(checked)
+    pace = None
+    if options.profile is not None:
+        from trilane.apps.run.pace import pace_of
+
+        pace = pace_of(checked.config, options.profile, options.slow_motion)
+        checked = checked.changed(pace_ns=dict(pace.stage_ns))
+    if not options.video:
+        checked = checked.changed(record=False)
+    return Prepared(options, checked, pace, command)
+
+
+def _with_remade_avatar(options: RunOptions) -> tuple[RunOptions, tuple[str, ...]]:
+    """Return `options` with the folder of the avatar that they ask for, and a sentence on it.
+
+    Raises BadInputError, MissingPartError.
+    """
+    from trilane.apps.avatar.remade_avatar import is_untrained, remade_avatar
+    from trilane.avatars.bundle import load_bundle
+    from trilane.stages.configure import requested_scene
+
+    avatars = requested_scene(options).avatars
+    if len(avatars) > 1:
+        expected = "one avatar, whose network is made anew"
+        raise BadInputError("--width, --channels, --calibration", f"a scene of {len(avatars)} avatars", expected)
+    folder, said = remade_avatar(str(avatars[0].bundle), options)
+    if options.check and is_untrained(load_bundle(folder)):
+        raise BadInputError("--check", "a network that is made untrained", "pictures that mean something")
+    return options.changed(avatar=folder), (f"avatar: {said}",)
+
+
+def _require_check(checked: Checked) -> None:
+    """Find out before the run whether there is something to compare its frames with.
+
+    Raises BadInputError for a scene with a HUD, MissingPartError for a library that is missing.
+    """
+    from trilane.apps.run.run_job import require_parts
+    from trilane.avatars.bundle import load_bundle
+
+    require_parts(load_bundle(folder) for folder in dict.fromkeys(checked.config.avatar_dirs))
+    if checked.config.scene.hud:
+        raise BadInputError("--check", "a scene with a HUD", "pictures without", "--no-hud leaves it out")
+
+
+@contextmanager
+def early_processes() -> Iterator[tuple[UnitStarter, GlFacts]]:
+    """Start the fork server, which imports what the units need while this process goes on, and look for OpenGL.
+
+    Yields the server and a function that waits for the facts of OpenGL. A process of its own looks at the driver,
+    because the driver may crash.
+    """
+    from trilane.pipeline.unit_starter import UnitStarter
+    from trilane.stages import PRELOAD
+
+    with UnitStarter(PRELOAD) as starter, closing(starter.call("trilane.stages.machine_facts:open_gl")) as gl:
+        yield starter, cache(gl.result)
+
+
+def run_prepared(
+    prepared: Prepared,
+    *,
+    hooks: Callable[[], AbstractContextManager[Hooks]],
+    starter: UnitStarter,
+    gl: GlFacts,
+    watched: Watched | None = None,
+) -> RunOutcome:
+    """Run what was checked and leave its run folder.
+
+    `hooks`: as in `run_asked`. `starter`, `gl`: fork server and facts that `early_processes` gives. `watched`: who
+    looks at the run, if anybody.
+    Raises what `run_asked` raises.
+    """
+    from trilane.apps.run.run_folder import default_place
+    from trilane.apps.run.run_job import run_to_folder
+    from trilane.stages.configure import required_machine
+
+    target = prepared.options.out or default_place(prepared.checked.config.scene.name)
+    with hooks() as told:
+        for note in prepared.checked.notes:
+            told.message(note)
+        try:
+            made = made_facts(prepared.command)
+            machine = required_machine(gl)
+            return run_to_folder(prepared, target, told, machine=machine, made=made, starter=starter, watched=watched)
+        except KeyboardInterrupt:
+            told.message("interrupted: nothing was written")
+            raise
+
+
+def made_facts(command: Sequence[str], checkout: Path = CHECKOUT) -> dict[str, Any]:
+    """Return the keys of `trilane.apps.run.report.Made` as of now; what is not known is null, and nothing is an error.
+
+    `command`: command line, word by word. `checkout`: folder above Trilane's own, a checkout of git or not.
+    """
+    from trilane.stages.machine_facts import package_version
+
+    revision, modified = _revision(checkout)
+    return {
+        "at": machine.here.now().isoformat(timespec="seconds"),
+        "command": list(command),
+        "trilane": package_version("trilane"),
+        "revision": revision,
+        "modified": modified,
+    }
+
+
+def _revision(checkout: Path) -> tuple[str | None, bool | None]:
+    """Return git's revision and whether files that git follows were changed; None for a folder that is no checkout."""
+    git = machine.here.program("git")
+    if git is None or not (checkout / ".git").exists():
+        return None, None
+    revision = _git(git, checkout, "rev-parse", "HEAD")
+    changes = _git(git, checkout, "status", "--porcelain", "--untracked-files=no")
+    return revision, None if revision is None or changes is None else bool(changes)
+
+
+def _git(git: str, checkout: Path, *words: str) -> str | None:
+    """Return what git answers, or None when it cannot."""
+    command = [git, "--no-optional-locks", "-C", str(checkout), *words]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=GIT_S)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None

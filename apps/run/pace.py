@@ -1,0 +1,145 @@
+"""A run at the pace of a chip: how long each job is held, and how the run compares with the same run in virtual time.
+
+Rule: the chip's times come from its hardware profile, the order of jobs from the scheduler. A job that the host could
+not do in time is counted, never hidden.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from trilane.avatars.bundle import load_bundle
+from trilane.avatars.network_file import reshaped
+from trilane.errors import BadInputError
+from trilane.hw_profiles.application import Plan, application_graph, stage_times_ms
+from trilane.hw_profiles.load import load_runnable
+from trilane.hw_profiles.network_work import Network, count_work
+from trilane.hw_profiles.performance_profiles import corners_of
+from trilane.scheduler.events import Settings
+from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.release import run_settings
+from trilane.scheduler.virtual import simulate
+from trilane.stages.config import RunConfig
+from trilane.units import BEFORE_INFER, BYPASS, SUSTAINED
+
+MAX_SLOW_MOTION = 1000.0
+#: A job that ends this much after its pace was done in time: waking up takes this long on a quiet machine.
+SLACK_NS = 200_000
+#: Frames round one that came late whose times it may have changed: as many as are in flight, and one.
+WAKE_FRAMES = 8
+
+
+@dataclass(frozen=True)
+class Pace:
+    """The pace of a chip.
+
+    `stage_ns`: time for which a job of each stage is held, ns. `slow_motion`: factor by which the run is slower than
+    the chip.
+    """
+
+    profile: str
+    performance_profile: str
+    slow_motion: float
+    stage_ns: Mapping[str, int]
+
+
+def pace_of(config: RunConfig, profile: str, slow_motion: float = 1.0, performance_profile: str = SUSTAINED) -> Pace:
+    """Return the pace of `config` on a chip. Raises BadInputError.
+
+    The times are those of the largest tensor that the scene's size allows, with all of its avatars in view.
+    `profile`: hardware profile of the chip, by name or TOML file.
+    """
+    if not 0 < slow_motion <= MAX_SLOW_MOTION:
+        raise BadInputError("--slow-motion", f"{slow_motion:g}", f"above 0, at most {MAX_SLOW_MOTION:g}")
+    chip = load_runnable(profile)
+    height, width = max(config.buckets, key=lambda shape: shape[0] * shape[1])
+    file = load_bundle(config.avatar_dirs[0]).read_network()
+    facts = {"avatar": config.avatar_dirs[0].name}
+    network = Network(facts, height, width, file.shape[3], "packed", count_work(reshaped(file, height, width).model))
+    plan = Plan(network, "dsp", avatars=len(config.avatar_dirs))
+    times = stage_times_ms(chip, plan, corners_of(chip, performance_profile))
+    held = {stage: round(ms * slow_motion * 1e6) for (stage, _), ms in times.items()}
+    return Pace(chip.name, performance_profile, slow_motion, held)
+
+
+def release_fps(pace: Pace, scene_fps: float) -> float:
+    """Return the frames released a second under a policy that needs a rate: the scene's, slowed down as the chip is."""
+    return scene_fps / pace.slow_motion
+
+
+def compare(
+    pace: Pace, policy: str, frames: int, jobs: Sequence[JobRecord], *, edge: str = "double", fps: float = 30.0
+) -> dict[str, Any]:
+    """Compare a paced run with the same run in virtual time; returns the block `pace` of report.json.
+
+    `pace`, `policy`, `frames`, `edge`: pace, policy, number of frames and edge of the run. `fps`: rate of its scene.
+    `jobs`: jobs that it did.
+    `host_slower` counts, by stage, the jobs that the host did not do in time; `late_frames` are the numbers of their
+    frames.
+    `virtual_ms` and `measured_ms` are median times between presented frames. The measured one leaves out frames with a
+    late one among the `WAKE_FRAMES` before them. `ratio` is measured over virtual, None when no frame is left.
+    """
+    late = [job for job in jobs if job.end_ns - job.begin_ns > pace.stage_ns[job.stage] + SLACK_NS]
+    late_frames = sorted({job.frame for job in late})
+    settings = run_settings(policy, frames, round(1e9 / release_fps(pace, fps)))
+    virtual = _virtual_ms(pace, settings, edge, _skipping(jobs))
+    measured = _measured_ms(jobs, late_frames)
+    return {
+        "profile": pace.profile,
+        "performance_profile": pace.performance_profile,
+        "slow_motion": pace.slow_motion,
+        "stage_ms": {stage: ns / 1e6 for stage, ns in pace.stage_ns.items()},
+        "host_slower": dict(Counter(job.stage for job in late)),
+        "late_frames": late_frames,
+        "virtual_ms": virtual,
+        "measured_ms": measured,
+        "compared_share": _share(jobs, late_frames),
+        "ratio": None if measured is None else measured / virtual,
+    }
+
+
+def _skipping(jobs: Sequence[JobRecord]) -> set[int]:
+    """Return the numbers of the frames that took the pipeline's bypass."""
+    ends, between = ({job.frame for job in jobs if job.stage == stage} for stage in (BYPASS[1], BEFORE_INFER[-1][0]))
+    return ends - between
+
+
+def _virtual_ms(pace: Pace, settings: Settings, edge: str, skipping: Set[int]) -> float:
+    """Return the median time between presented frames in virtual time; the frames `skipping` take the bypass too."""
+    graph = replace(application_graph(edge), bypass=BYPASS)
+    result = simulate(
+        graph,
+        settings,
+        lambda stage, *_: pace.stage_ns[stage],
+        skips=lambda frame, _fresh: frame in skipping,
+        keep=True,
+    )
+    return float(np.median(np.diff(_presented(result.jobs)[1]))) / 1e6
+
+
+def _presented(jobs: Sequence[JobRecord]) -> tuple[list[int], list[int]]:
+    """Return the numbers of the presented frames and when each was presented, ns."""
+    ends = sorted((job.end_ns, job.frame) for job in jobs if job.stage == "present")
+    return [frame for _, frame in ends], [end for end, _ in ends]
+
+
+def _in_time(jobs: Sequence[JobRecord], late_frames: Sequence[int]) -> list[tuple[int, int]]:
+    """Return (number of a frame, ns since the frame before it) for frames with no late one near."""
+    frames, ends = _presented(jobs)
+    disturbed = {near for frame in late_frames for near in range(frame - 1, frame + WAKE_FRAMES)}
+    pairs = zip(frames[1:], np.diff(ends).tolist(), strict=True)
+    return [(frame, interval) for frame, interval in pairs if frame not in disturbed]
+
+
+def _measured_ms(jobs: Sequence[JobRecord], late_frames: Sequence[int]) -> float | None:
+    kept = _in_time(jobs, late_frames)
+    return float(np.median([interval for _, interval in kept])) / 1e6 if kept else None
+
+
+def _share(jobs: Sequence[JobRecord], late_frames: Sequence[int]) -> float:
+    return len(_in_time(jobs, late_frames)) / max(1, len(_presented(jobs)[0]) - 1)

@@ -1,0 +1,183 @@
+"""What report.json says of a run: made of the run's result, with the source of every figure.
+
+Rule: of all keys of `SOURCES` that a figure stands under, the longest decides; no figure stands under none. Frames of a
+tensor size are counted by the run; the error of that size is the avatars' own, from their validation, or unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from trilane.apps.run.report import SCHEMA, Baseline, Report, Resolution, TensorSize
+from trilane.avatars.validation import SizeLoss
+from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
+from trilane.machine import here
+from trilane.pipeline.result import RunResult
+from trilane.pipeline.run_metrics import RunMetrics
+from trilane.scene.planner import ALL_WORK
+from trilane.stages.config import RunConfig
+
+NO_CAP = "none: every unit works as much as its cores and threads allow"
+#: Key, dotted where it is inside another, to the source of all figures below it.
+SOURCES = {
+    "frames": MEASURED,
+    "duration_s": MEASURED,
+    "frame_time_ms": MEASURED,
+    "latency_ms": MEASURED,
+    "fps": MEASURED,
+    "deadline_misses": MEASURED,
+    "xrbench": MEASURED,
+    "xrbench.energy": COMPUTED,
+    "stages": MEASURED,
+    "bytes": MEASURED,
+    "bytes.least": COMPUTED,
+    "bytes.ratio": COMPARED,
+    "units": MEASURED,
+    "efficiency": MEASURED,
+    "core_efficiency": MEASURED,
+    "machine_efficiency": MEASURED,
+    "bound": COMPUTED,
+    "other_programs": MEASURED,
+    "caps": COMPUTED,
+    "temperature_c": COMPUTED,
+    "temperature_c.sensor": MEASURED,
+    "startup_ms": MEASURED,
+    "figures": MEASURED,
+    "baseline": MEASURED,
+    "placement": COMPUTED,
+    "placement.times": MEASURED,
+    "resolution": MEASURED,
+    "pace": COMPUTED,
+    "pace.host_slower": MEASURED,
+    "pace.late_frames": MEASURED,
+    "pace.measured_ms": MEASURED,
+    "pace.compared_share": MEASURED,
+    "pace.ratio": COMPARED,
+    "video": MEASURED,
+    "check": MEASURED,
+}
+#: Keys whose numbers are settings, names of things or facts of the machine.
+NO_FIGURES_UNDER = ("schema", "machine", "config", "options", "plan", "pids")
+
+
+def build_report(
+    result: RunResult,
+    config: RunConfig,
+    *,
+    machine: Mapping[str, Any],
+    baseline: RunResult | None,
+    facts: Mapping[str, Any],
+) -> Report:
+    """Build the report of a run on the host clock. Raises ValueError naming a wrong or unknown key.
+
+    `result`: result of the run. `config`: its configuration.
+    `machine`: what `machine_facts` said.
+    `baseline`: result of the same scene under another policy, None without one.
+    `facts`: what others know of the run: `video`, `checksum`, and any of `made`, `options`, `placement`, `resolution`,
+    `pace`, `accuracy`, `check`, `notes`.
+    """
+    metrics = result.report
+    sensor = {"sensor": here.sensor_c()}
+    document = {
+        **metrics.as_json(),
+        "schema": SCHEMA,
+        "machine": machine,
+        "config": config_facts(config, metrics.policy, metrics.edge),
+        "plan": {"tensor_shapes": config.buckets},
+        "caps": metrics.caps.as_json() if metrics.caps else {"how": NO_CAP},
+        "temperature_c": (metrics.temperature_c.as_json() if metrics.temperature_c else {}) | sensor,
+        "pids": result.pids,
+        "startup_ms": result.startup_ms,
+        "figures": result.metrics,
+        "messages": result.messages,
+        "interrupted": result.interrupted,
+        "failure": result.failure and result.failure.message,
+        "baseline": baseline and _compared(baseline.report),
+        **facts,
+    }
+    return Report.model_validate(document | {"sources": sources_of(document)})
+
+
+def config_facts(config: RunConfig, policy: str, edge: str) -> dict[str, Any]:
+    """Return the block `config` of the report."""
+    return {**config.model_dump(mode="json", exclude={"out_dir", "window", "kept"}), "policy": policy, "edge": edge}
+
+
+def _compared(metrics: RunMetrics) -> Baseline:
+    return Baseline.model_validate({key: getattr(metrics, key) for key in Baseline.model_fields})
+
+
+def sources_of(document: Mapping[str, Any]) -> dict[str, str]:
+    """Return the source of each figure in `document`, the content of a report; `accuracy` has one for each avatar."""
+    sources = {key: source for key, source in SOURCES.items() if _holds(document, key.split("."))}
+    return sources | _of_bytes(document["stages"]) | dict(_of_accuracy(document.get("accuracy", {})))
+
+
+def _of_bytes(stages: Mapping[str, Any]) -> dict[str, str]:
+    """Return the sources of `least` and `ratio` for the stages that count their bytes: nobody counts these two."""
+    counting = [f"stages.{name}.bytes" for name, row in stages.items() if row.get("bytes")]
+    return {f"{key}.{figure}": SOURCES[f"bytes.{figure}"] for key in counting for figure in ("least", "ratio")}
+
+
+def _of_accuracy(accuracy: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    for name, facts in accuracy.items():
+        yield f"accuracy.{name}", facts["source"]
+
+
+def _holds(document: Any, path: list[str]) -> bool:
+    """Say whether `document` has something at `path`."""
+    for key in path:
+        if not isinstance(document, Mapping) or key not in document:
+            return False
+        document = document[key]
+    return document is not None
+
+
+def resolution_of(
+    rungs: Mapping[int, int], switches: int, config: RunConfig, losses: Sequence[SizeLoss]
+) -> dict[str, Any]:
+    """Return the block `resolution` of the report.
+
+    `rungs`: number of presented frames of each size. `switches`: number of frames of another size than the frame
+    before. `losses`: losses of the scene's avatars by size.
+    """
+    sizes = [
+        {
+            "work": work / ALL_WORK,
+            "most_pixels": budget.most_of(1),
+            "frames": rungs.get(rung, 0),
+            "psnr_loss_db": worst_loss(work, losses),
+        }
+        for rung, (work, budget) in enumerate(zip(config.works, config.tensor_budgets, strict=True))
+    ]
+    return {
+        "sizes": sizes,
+        "switches": switches,
+        "loss_source": "; ".join(dict.fromkeys(loss.source for loss in losses)),
+    }
+
+
+def worst_loss(work: int, losses: Sequence[SizeLoss]) -> float | None:
+    """Return the largest loss of an avatar, in dB; None when one of them is not known."""
+    found = [loss.at(work) for loss in losses]
+    known = [db for db in found if db is not None]
+    return max(known) if known and len(known) == len(found) else None
+
+
+def resolution_note(resolution: Resolution) -> str:
+    """Say to a person how many frames had smaller tensors; empty when every frame had all its pixels."""
+    less = [size for size in resolution.sizes[1:] if size.frames]
+    if not less:
+        return ""
+    total = sum(size.frames for size in resolution.sizes)
+    parts = ", ".join(_said(size) for size in less)
+    return (
+        f"resolution: to be in time {sum(size.frames for size in less)} of {total} presented frames had smaller "
+        f"tensors: {parts}; {resolution.switches} switches (error: {resolution.loss_source})"
+    )
+
+
+def _said(size: TensorSize) -> str:
+    loss = f", {size.psnr_loss_db:.1f} dB worse" if size.psnr_loss_db is not None else ""
+    return f"{size.frames} of at most {size.most_pixels} pixels an avatar{loss}"

@@ -1,0 +1,191 @@
+"""The files of a run folder that are made of others: video, contact sheet, checksum, recording and trace.
+
+Rule: nothing is encoded again: video.mp4 holds the packets of the segments, and the contact sheet is decoded from it.
+The journal is read once, record by record.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import av
+from PIL import Image, ImageDraw
+
+from trilane.apps.explain.trace import NAME as TRACE_NAME
+from trilane.apps.explain.trace import TraceWriter
+from trilane.pipeline.journal import NAME, Begun, Stepped, read_journal
+from trilane.scheduler.recording import header_line, step_line
+from trilane.stages.cpu.present import SEGMENTS
+
+EVENTS = "events.jsonl"
+COLUMNS, ROWS = 4, 5
+THUMB_WIDTH = 320
+KEYFRAME_EVERY = 30  # frames, as the present stage encodes them
+FAST_PNG = 1  # a fifth larger than the best compression, in a quarter of the time
+
+
+def write_files(work: Path, fps: float) -> dict[str, Any]:
+    """Write every file of the run folder `work` but the report; returns what the report says of them.
+
+    `fps`: frames a second of the scene. Raises BadInputError for a broken journal.
+    """
+    segments = work / SEGMENTS
+    facts: dict[str, Any] = {"video": None, "checksum": None}
+    if segments.is_dir():
+        joined = join_segments(sorted(segments.glob("*.mp4")), work / "video.mp4", fps)
+        facts["checksum"] = run_checksum(sorted(segments.glob("*.sha256")))
+        if joined is not None:
+            facts["video"] = {"frames": joined.frames, "seconds": joined.seconds}
+            contact_sheet(work / "video.mp4", work / "contact.png", fps)
+        shutil.rmtree(segments)
+    _write_from_journal(work / NAME, work)
+    return facts
+
+
+def _write_from_journal(journal: Path, folder: Path) -> None:
+    """Write the recording and the trace into `folder`. Raises BadInputError for a file that is no journal."""
+    trace: TraceWriter | None = None
+    with (folder / EVENTS).open("w", encoding="utf-8") as events, (folder / TRACE_NAME).open("wb") as file:
+        for record in read_journal(journal):
+            if isinstance(record, Begun):
+                trace = TraceWriter(file, record)
+                events.write(header_line(record.graph, record.settings))
+            elif trace is not None:
+                trace.add(record)
+                if isinstance(record, Stepped):
+                    events.write(step_line(*record))
+        if trace is not None:
+            trace.close()
+
+
+@dataclass(frozen=True)
+class JoinedVideo:
+    """The file that `join_segments` wrote. `frames`: number of pictures; `seconds`: end of the last one."""
+
+    frames: int
+    seconds: float
+
+
+def join_segments(segments: list[Path], target: Path, fps: float) -> JoinedVideo | None:
+    """Copy the packets of the segments into one MP4 file; returns None when they hold no frame.
+
+    `segments`: files in the order of their frames, each with a digest file beside it.
+    `target`: MP4 file to write.
+    `fps`: frames a second of the scene.
+    A line of the digest file holds a frame's number, which gives the time at which its packet is shown. A packet whose
+    time has passed follows the packet before it. A segment that was cut off counts up to its cut.
+    """
+    readable = [path for path in segments if _has_packets(path)]
+    if not readable:
+        return None
+    frames, end = 0, 0
+    with av.open(str(target), "w", format="mp4", options={"movflags": "faststart"}) as output:
+        stream: Any = None
+        for path in readable:
+            with av.open(str(path)) as segment:
+                source = segment.streams.video[0]
+                stream = stream or output.add_stream_from_template(source)
+                length = round(1 / (fps * source.time_base))
+                for packet, number in zip(_packets(segment), _frame_numbers(path), strict=False):
+                    packet.pts = packet.dts = max(end, number * length)
+                    packet.duration, packet.stream = length, stream
+                    end = packet.pts + length
+                    output.mux(packet)
+                    frames += 1
+    return JoinedVideo(frames, end / (length * fps))
+
+
+def _frame_numbers(segment: Path) -> list[int]:
+    return [int(line.split(" ")[0]) for line in _digest_lines(segment.with_suffix(".sha256"))]
+
+
+def _digest_lines(path: Path) -> list[str]:
+    """Return the whole lines of a digest file; a file that was cut off may end in half a line."""
+    return [line for line in path.read_text(encoding="ascii").splitlines(keepends=True) if line.endswith("\n")]
+
+
+def _packets(container: Any) -> Iterator[Any]:
+    """Yield the whole packets of the video stream; a file that was cut off ends at its cut."""
+    try:
+        for packet in container.demux(video=0):
+            if packet.pts is not None and packet.size:
+                yield packet
+    except av.error.FFmpegError:
+        return
+
+
+def _has_packets(path: Path) -> bool:
+    try:
+        with av.open(str(path)) as segment:
+            return next(_packets(segment), None) is not None
+    except (av.error.FFmpegError, IndexError):
+        return False
+
+
+def run_checksum(digests: list[Path]) -> str | None:
+    """Return the SHA-256 over the lines `frame digest` of all segments, by frame; None when there is no line.
+
+    Two runs that presented the same bytes as the same frames have the same checksum.
+    """
+    lines = [line for path in digests for line in _digest_lines(path)]
+    if not lines:
+        return None
+    ordered = sorted(lines, key=lambda line: int(line.split(" ")[0]))
+    return hashlib.sha256("".join(ordered).encode("ascii")).hexdigest()
+
+
+def contact_sheet(video: Path, target: Path, fps: float) -> int:
+    """Write a PNG sheet of up to COLUMNS x ROWS frames of `video`, evenly spaced, with the first and the last.
+
+    Each picture is labelled with its number. Returns the number of pictures. Raises av.error.FFmpegError when the video
+    cannot be decoded.
+    """
+    with av.open(str(video)) as container:
+        stream = container.streams.video[0]
+        times = sorted(packet.pts for packet in container.demux(stream) if packet.pts is not None)
+        count = min(COLUMNS * ROWS, len(times))
+        chosen = [times[round(k * (len(times) - 1) / max(1, count - 1))] for k in range(count)]
+        decode = _decode_all if len(times) <= KEYFRAME_EVERY * count else _decode_each
+        pictures = [(round(pts * stream.time_base * fps), image) for pts, image in decode(container, chosen)]
+    _paste(pictures).save(target, compress_level=FAST_PNG)
+    return count
+
+
+def _decode_all(container: Any, wanted: list[int]) -> Iterator[tuple[int, Image.Image]]:
+    """Yield the thumbnails at the times `wanted`, in one pass over the video."""
+    container.seek(0)
+    for frame in container.decode(video=0):
+        if frame.pts in wanted:
+            yield frame.pts, _thumbnail(frame)
+
+
+def _decode_each(container: Any, wanted: list[int]) -> Iterator[tuple[int, Image.Image]]:
+    """Yield the same after a seek to each, which is less work where many frames lie between them."""
+    stream = container.streams.video[0]
+    for pts in wanted:
+        container.seek(pts, stream=stream)
+        yield pts, _thumbnail(next(frame for frame in container.decode(stream) if frame.pts >= pts))
+
+
+def _thumbnail(frame: Any) -> Image.Image:
+    height = frame.height * THUMB_WIDTH // frame.width
+    image: Image.Image = frame.to_image(width=THUMB_WIDTH, height=height, interpolation="LANCZOS")
+    return image
+
+
+def _paste(pictures: list[tuple[int, Image.Image]]) -> Image.Image:
+    height = pictures[0][1].height
+    columns = min(COLUMNS, len(pictures))
+    sheet = Image.new("RGB", (columns * THUMB_WIDTH, -(-len(pictures) // columns) * height))
+    draw = ImageDraw.Draw(sheet)
+    for place, (frame, picture) in enumerate(pictures):
+        corner = (place % columns * THUMB_WIDTH, place // columns * height)
+        sheet.paste(picture, corner)
+        text = (corner[0] + 6, corner[1] + 4)
+        draw.text(text, f"frame {frame}", fill="white", stroke_width=2, stroke_fill="black", font_size=14)
+    return sheet

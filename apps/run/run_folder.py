@@ -1,0 +1,143 @@
+"""The folder that a run writes: made under a temporary name beside its place and renamed when it is whole.
+
+Rule: a folder with the run's name is complete; a folder whose name ends in `.partial` is not. Where something in it
+could not be written, such as on a full disk, what was written stays, and the error says where.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import glob
+import os
+import shutil
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from trilane import machine
+from trilane.errors import BadInputError, TrilaneError, UnwrittenError, reason
+from trilane.writing import WRITABLE
+
+#: What the system says of a place that takes no more.
+FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS})
+
+
+def default_place(scene: str) -> Path:
+    """Return `runs/<UTC time>-<scene>` in the working directory, a name that nothing has at this moment."""
+    stamp = machine.here.now().strftime("%Y%m%dT%H%M%SZ")
+    safe = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in scene)
+    place, tries = Path("runs") / f"{stamp}-{safe}", 1
+    while place.exists():
+        tries += 1
+        place = Path("runs") / f"{stamp}-{safe}-{tries}"
+    return place
+
+
+class RunFolder:
+    """Make a run folder under a temporary name, `work`; without `complete()` it and parents that it made are removed.
+
+    A context manager. On entry it raises BadInputError when `target` exists, when another run that goes on has the
+    name, or when nothing can be written there.
+    On leaving by an error about a file that could not be written, it raises TrilaneError; a folder that holds anything
+    then stays.
+    """
+
+    def __init__(self, target: Path) -> None:
+        self.target = target.absolute()
+        self.work = self.target.with_name(f"{self.target.name}.{os.getpid()}.partial")
+        self._made: list[Path] = []
+        self._lock = -1
+        self._keep = False
+
+    def __enter__(self) -> Self:
+        try:
+            if self.target.exists():
+                raise BadInputError(self.target, "a file or folder", "a name that is free", "choose another --out")
+            self._make_parents()
+            self._claim()
+        except OSError as error:
+            self._remove()
+            raise BadInputError.of_os_error(self.target, error, WRITABLE, "choose another --out") from None
+        return self
+
+    def _make_parents(self) -> None:
+        missing = [folder for folder in self.target.parents if not folder.exists()]
+        for folder in reversed(missing):
+            folder.mkdir()
+            self._made.append(folder)
+
+    def _claim(self) -> None:
+        """Make `work` and lock it while this process lives. Only one run at a time looks for folders of other runs."""
+        parent = os.open(self.target.parent, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            fcntl.flock(parent, fcntl.LOCK_EX)
+            for other in self.target.parent.glob(f"{glob.escape(self.target.name)}.*.partial"):
+                if _is_locked(other):
+                    found = f"a run that goes on, in {other.name}"
+                    raise BadInputError(self.target, found, "a name that is free", "choose another --out")
+            self.work.mkdir()
+            self._lock = os.open(self.work, os.O_RDONLY | os.O_DIRECTORY)
+            fcntl.flock(self._lock, fcntl.LOCK_EX)
+        finally:
+            os.close(parent)
+
+    def complete(self) -> Path:
+        """Give the folder its name.
+
+        Raises BadInputError when something else got the name in the meantime; the temporary folder stays then.
+        """
+        self._keep = True
+        try:
+            self.work.rename(self.target)
+        except OSError as error:
+            remedy = f"the run is in {self.work}"
+            raise BadInputError.of_os_error(self.target, error, "a name that is free", remedy) from None
+        return self.target
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        os.close(self._lock)
+        if self._keep:
+            return
+        failed = self._unwritten(error)
+        is_kept = failed and any(file.is_file() and file.stat().st_size for file in self.work.rglob("*"))
+        if not is_kept:
+            self._remove()
+        if failed:
+            left = f"what was written stays in {self.work}" if is_kept else "nothing was written"
+            raise TrilaneError(f"{failed}; free space there or choose another --out; {left}") from error
+
+    def _unwritten(self, error: BaseException | None) -> str:
+        """Say which file could not be written, and why; "" for an error about anything else."""
+        if isinstance(error, UnwrittenError):
+            return str(error)
+        if isinstance(error, BadInputError) and isinstance(error.__cause__, OSError):
+            return f"{error.where}: {error.found}"
+        if isinstance(error, OSError) and error.errno in FULL:
+            return f"{error.filename or self.work}: {reason(error)}"
+        return ""
+
+    def _remove(self) -> None:
+        shutil.rmtree(self.work, ignore_errors=True)
+        for folder in reversed(self._made):
+            try:
+                folder.rmdir()
+            except OSError:
+                return
+
+
+def _is_locked(folder: Path) -> bool:
+    """Say whether a living process holds the lock of the folder; a folder that is gone by now has no lock."""
+    try:
+        fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(fd)
+    return False

@@ -1,0 +1,394 @@
+"""One run from a checked configuration to a complete run folder, and the comparison of its frames with the truth.
+
+Rule: what is in the folder is whole. A run that was interrupted or failed says so in its report and keeps the frames
+that were presented; a run that presented none leaves no folder. `check_run` compares pictures that were presented, kept
+without loss: first with the truth, which a person would see without Trilane, then with the float path, which tells what
+integers, rasters and plans cost.
+"""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import fmean
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from trilane import machine
+from trilane.apps.run.report import Report, write_report
+from trilane.apps.run.report_facts import build_report, config_facts, resolution_note, resolution_of
+from trilane.apps.run.run_folder import RunFolder
+from trilane.arrays import F64, U8, Mask
+from trilane.bench.lib.picture_error import psnr_of_frames, require_metrics
+from trilane.errors import TrilaneError
+from trilane.hw_profiles.governor import Governor
+from trilane.hw_profiles.load import load_runnable
+from trilane.pipeline import journal
+from trilane.pipeline.controls import RunControls
+from trilane.pipeline.result import RunResult
+from trilane.pipeline.run_record import JournalFile
+from trilane.pipeline.signals import Interrupts
+from trilane.pipeline.unit_starter import UnitStarter
+from trilane.scheduler.policy import policy_named
+from trilane.stages.avatar_pipeline import run_avatar
+from trilane.stages.configure import Checked
+from trilane.stages.placing import placed
+from trilane.stages.run_options import RunOptions
+
+if TYPE_CHECKING:
+    from trilane.apps.experiments.picture_errors import ErrorFigures
+    from trilane.apps.run.pace import Pace
+    from trilane.avatars.bundle import Bundle
+
+BASELINE_POLICY = "sequential"
+HOST = "host"
+INTERRUPTED = 130
+NO_VIDEO = "no video, no contact sheet and no checksum: the frames were presented without, as was asked for"
+TRUTH = "the truth: the clothed body that the avatar was trained on"
+FLOAT_PATH = "the float path: float64 body and raster, FP32 network"
+STEPS = 255
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A run whose options were checked.
+
+    `checked`: configuration that follows from `options`.
+    `pace`: pace of a chip at which jobs are held; None for a run as fast as it goes.
+    `command`: words by which the run was asked for.
+    """
+
+    options: RunOptions
+    checked: Checked
+    pace: Pace | None = None
+    command: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Hooks:
+    """Functions that are told of a run: `progress(what, presented, requested)` and `message(text)`."""
+
+    progress: Callable[[str, int, int], None]
+    message: Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A run that somebody looks at and steers while it goes on.
+
+    `frames`: number of frames; None for the scene's. `window`: file to look through (`trilane.transport.live_window`).
+    `controls`: requests to the run. `begins(folder, checked)`: function that is called when the units are placed,
+    before they start.
+    """
+
+    frames: int | None
+    window: Path
+    controls: RunControls
+    begins: Callable[[Path, Checked], None]
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """How a run ended: the `report` as written, the `folder` that holds it, and the exit code that the run asks for."""
+
+    report: Report
+    folder: Path
+    exit_code: int
+
+
+def run_to_folder(
+    prepared: Prepared,
+    target: Path,
+    hooks: Hooks,
+    *,
+    machine: Mapping[str, Any],
+    made: Mapping[str, Any] | None = None,
+    starter: UnitStarter | None = None,
+    watched: Watched | None = None,
+) -> RunOutcome:
+    """Run what was prepared and leave the run folder at `target`.
+
+    `target`: folder that does not exist yet.
+    `hooks`: functions that are told of the run.
+    `machine`: what `machine_facts` said.
+    `made`: what `trilane.apps.run.asked_run.made_facts` said; None for a run without a command line.
+    `starter`: fork server that was started earlier; without one, the units stay where they were prepared.
+    `watched`: who looks at the run, if anybody.
+    Raises BadInputError when `target` cannot be written. Raises TrilaneError when no frame was presented, or when a
+    file could not be written; then the folder stays.
+    """
+    options, checked, pace = prepared.options, prepared.checked, prepared.pace
+    with RunFolder(target) as folder:
+        if starter is not None:
+            checked = placed(checked, options.policy, starter, str(machine.get("gl")), hooks.message)
+            hooks.message(checked.notes[-1])
+        if watched is not None:
+            checked = checked.changed(window=watched.window)
+            watched.begins(folder.work, checked)
+        threading.Thread(target=_import_writers, name="imports", daemon=True).start()
+        job = _Job(replace(prepared, checked=checked), hooks, starter, watched)
+        result = job.run(
+            folder.work,
+            {
+                "config": config_facts(checked.config, options.policy, options.edge),
+                "machine": machine,
+                "made": made,
+                "accuracy": dict(checked.accuracy),
+            },
+        )
+        with Interrupts() as late:  # from here on a signal waits until the folder is whole
+            baseline, stopped = job.run_baseline(folder.work) if _is_complete(result) else (None, False)
+            facts = {
+                "made": made,
+                "options": options.as_json(),
+                "accuracy": dict(checked.accuracy),
+                "notes": _notes(checked),
+            }
+            if checked.placement is not None:
+                facts["placement"] = checked.placement
+            if result.rungs:
+                facts["resolution"] = resolution_of(result.rungs, result.rung_switches, checked.config, checked.losses)
+            if pace is not None:
+                from trilane.apps.run.pace import compare
+
+                scene = checked.config.scene
+                records = journal.read_journal(folder.work / journal.NAME)
+                jobs = [record.job for record in records if isinstance(record, journal.Worked)]
+                facts["pace"] = compare(pace, options.policy, scene.frames, jobs, edge=options.edge, fps=scene.fps)
+            if options.check:
+                ended = lambda: result.interrupted or stopped or late.count > 0  # noqa: E731
+                facts |= _checked_frames(checked, folder.work, hooks, ended)
+            from trilane.apps.run.run_files import write_files
+
+            facts |= write_files(folder.work, checked.config.scene.fps)
+            report = build_report(result, checked.config, machine=machine, baseline=baseline, facts=facts)
+            _tell(report, hooks)
+            write_report(report, folder.work / "report.json")
+            place = folder.complete()
+        return RunOutcome(report, place, INTERRUPTED if stopped or late.count else _exit_code(result))
+
+
+class _Job:
+    """The runs of one job: the one that was asked for, and the sequential one to compare with."""
+
+    def __init__(self, prepared: Prepared, hooks: Hooks, starter: UnitStarter | None, watched: Watched | None) -> None:
+        self._options, self._checked, self._pace = prepared.options, prepared.checked, prepared.pace
+        self._hooks, self._starter, self._watched = hooks, starter, watched
+
+    def run(self, folder: Path, facts: Mapping[str, Any]) -> RunResult:
+        """Run what was asked for and write its journal, which begins with `facts`.
+
+        Raises TrilaneError when the run ended before any frame was presented.
+        """
+        file, watched = JournalFile(folder / journal.NAME, facts, _sensors), self._watched
+        frames, controls = (None, None) if watched is None else (watched.frames, watched.controls)
+        total = frames or self._checked.config.scene.frames
+        kept = asked_frames(total, self._options.check) if self._options.check else ()
+        return self._run(folder, self._options, frames, file, controls, kept)
+
+    def run_baseline(self, folder: Path) -> tuple[RunResult | None, bool]:
+        """Run the first frames of the same scene again, one frame at a time, without keeping pictures.
+
+        Returns the result, None when it was not asked for or did not complete, and whether it was interrupted.
+        """
+        if not self._options.baseline_frames or self._options.policy == BASELINE_POLICY:
+            return None, False
+        place = folder / BASELINE_POLICY
+        place.mkdir()
+        frames = min(self._options.baseline_frames, self._checked.config.scene.frames)
+        try:
+            result = self._run(place, self._options.changed(policy=BASELINE_POLICY, latch_ms=0.0), frames)
+        except KeyboardInterrupt:
+            self._hooks.message(f"interrupted: the {BASELINE_POLICY} run to compare with is left out")
+            return None, True
+        except TrilaneError as error:
+            self._hooks.message(f"the {BASELINE_POLICY} run to compare with failed and is left out: {error}")
+            return None, False
+        finally:
+            shutil.rmtree(place)
+        return (result if _is_complete(result) else None), result.interrupted
+
+    def _run(
+        self,
+        folder: Path,
+        options: RunOptions,
+        frames: int | None,
+        file: JournalFile | None = None,
+        controls: RunControls | None = None,
+        kept: tuple[int, ...] = (),
+    ) -> RunResult:
+        policy, profile = options.policy, options.performance_profile
+        result = run_avatar(
+            self._checked.config.model_copy(update={"out_dir": folder, "kept": kept}),
+            self._checked.assets,
+            policy=policy,
+            edge=options.edge,
+            frames=frames,
+            pace_fps=self._release_fps(policy),
+            latch_ms=options.latch_ms,
+            governor=None if profile is None else Governor(load_runnable(HOST), profile),
+            journal=file,
+            controls=controls,
+            starter=self._starter,
+            on_progress=lambda presented, requested: self._hooks.progress(policy, presented, requested),
+            on_message=self._hooks.message,
+        )
+        if result.presented:
+            return result
+        if result.interrupted:
+            raise KeyboardInterrupt
+        raise _error_of(result)
+
+    def _release_fps(self, policy: str) -> float | None:
+        """Return the rate of a policy that needs one, at a chip's pace; without a pace it has the scene's rate."""
+        if self._pace is None or not policy_named(policy).paced:
+            return None
+        from trilane.apps.run.pace import release_fps
+
+        return release_fps(self._pace, self._checked.config.scene.fps)
+
+
+def _checked_frames(checked: Checked, work: Path, hooks: Hooks, interrupted: Callable[[], bool]) -> dict[str, Any]:
+    """Return `check` of the report, or `notes` that say why there is none. An interrupt ends it at the next frame."""
+
+    def told(done: int, of: int) -> None:
+        hooks.progress("check", done, of)
+        _require(not interrupted())
+
+    try:
+        _require(not interrupted())
+        return {"check": check_run(checked, work, told)}
+    except TrilaneError as error:
+        said = f"the run's frames were not compared: {error}"
+        hooks.message(said)
+        return {"notes": [*_notes(checked), said]}
+    finally:
+        from trilane.stages.cpu.present import KEPT_FOLDER
+
+        shutil.rmtree(work / KEPT_FOLDER, ignore_errors=True)
+
+
+def _require(wanted: bool) -> None:
+    if not wanted:
+        raise TrilaneError("it was interrupted")
+
+
+def _notes(checked: Checked) -> list[str]:
+    return [*checked.notes, *([] if checked.config.record else [NO_VIDEO])]
+
+
+def _sensors() -> dict[str, float]:
+    """Return the figures that the journal samples in passing."""
+    celsius = machine.here.sensor_c()
+    return {} if celsius is None else {"temperature_c.sensor": celsius}
+
+
+def _is_complete(result: RunResult) -> bool:
+    return not result.interrupted and result.failure is None
+
+
+def _error_of(result: RunResult) -> TrilaneError:
+    failure = result.failure
+    error = TrilaneError(failure.message if failure else "no frame was presented: " + "; ".join(result.messages))
+    error.exit_code = failure.exit_code if failure else error.exit_code
+    return error
+
+
+def _exit_code(result: RunResult) -> int:
+    if result.interrupted:
+        return INTERRUPTED
+    return 0 if result.failure is None else result.failure.exit_code
+
+
+def _tell(report: Report, hooks: Hooks) -> None:
+    """Tell a person what should not have to be found in the report."""
+    if report.video is not None and report.video.frames < report.frames.presented:
+        shown = f"{report.video.frames} of {report.frames.presented} frames"
+        hooks.message(f"video.mp4 holds {shown}: a writer was killed before its last")
+    if report.resolution is not None and (stepped := resolution_note(report.resolution)):
+        hooks.message(stepped)
+    if report.stage_metrics.get("pose", {}).get("visible") == 0:
+        hooks.message("no avatar was in the picture in any frame")
+
+
+def _import_writers() -> None:
+    """Import what writes the files while the units start and this process waits for them."""
+    from trilane.apps.run import run_files  # noqa: F401
+
+
+def asked_frames(total: int, count: int) -> tuple[int, ...]:
+    """Return the numbers of at most `count` of `total` frames, evenly spread, each in the middle of its share."""
+    number = min(count, total)
+    return tuple((2 * index + 1) * total // (2 * number) for index in range(number))
+
+
+def require_parts(bundles: Iterable[Bundle]) -> None:
+    """Raises MissingPartError for a missing library that the check of a run with avatars `bundles` needs."""
+    from trilane.bench.lib.full_network import require_float_network
+
+    require_metrics()
+    for bundle in bundles:
+        require_float_network(bundle)
+
+
+def check_run(checked: Checked, folder: Path, told: Callable[[int, int], None] = lambda *_: None) -> dict[str, Any]:
+    """Compare the frames that were kept in `folder` with the truth, where it is known, and with the float path.
+
+    A frame with nobody in view is left out. Figures are of the region that holds the avatars; the IoU is of the pixels
+    that differ from the background.
+    `told(done, total)`: function that is called after each frame. Returns `check` of report.json.
+    Raises TrilaneError when no frame with somebody in view was kept, MissingPartError, BadInputError.
+    """
+    from trilane.apps.experiments.picture_errors import figures
+    from trilane.apps.experiments.reference_path import ReferencePath
+    from trilane.apps.experiments.scene_pictures import around
+    from trilane.bench.lib.full_picture import true_pictures
+    from trilane.stages.cpu.present import kept_frames
+
+    files = kept_frames(folder)
+    numbers: list[int] = []
+    found: dict[str, list[ErrorFigures]] = {}
+    path = ReferencePath(checked) if files else None
+    true = true_pictures(path.cast, path.gl) if path is not None else None
+    for done, (number, file) in enumerate(files.items()):
+        assert path is not None
+        moment = path.moment(number)
+        if moment.boxes:
+            numbers.append(number)
+            picture, part = np.load(file, allow_pickle=False), around(moment.boxes, path.output)
+            wanted = {} if true is None else {TRUTH: true.frame(number, moment.background) / STEPS}
+            for against, other in {**wanted, FLOAT_PATH: moment.frame(frozenset()).picture}.items():
+                masks = [differs(image, moment.background) for image in (picture, _bytes(other))]
+                error = figures(picture[part] / STEPS, other[part], mask=masks[0], reference_mask=masks[1])
+                found.setdefault(against, []).append(error)
+        told(done + 1, len(files))
+    if not found:
+        raise TrilaneError("none of the frames that were kept shows an avatar")
+    first, *rest = (summed_up(against, errors) for against, errors in found.items())
+    return {**first, "frames": len(numbers), "numbers": tuple(numbers), "float_path": rest[0] if rest else None}
+
+
+def summed_up(against: str, errors: Sequence[ErrorFigures]) -> dict[str, Any]:
+    """Return what report.json says of frames `against` other pictures."""
+    ssim = [error.ssim for error in errors if error.ssim is not None]
+    return {
+        "against": against,
+        **psnr_of_frames([error.psnr_db for error in errors]),
+        "mae": fmean(error.mae for error in errors),
+        "ssim": fmean(ssim) if ssim else None,
+        "flip": fmean(error.flip for error in errors),
+        "iou": fmean(error.iou for error in errors if error.iou is not None),
+    }
+
+
+def differs(picture: U8, background: U8) -> Mask:
+    """Return (h,w): where `picture` (h,w,3) differs from its `background`."""
+    return np.asarray((picture != background).any(axis=2))
+
+
+def _bytes(picture: F64) -> U8:
+    return np.asarray(np.rint(picture * STEPS), np.uint8)

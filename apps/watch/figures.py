@@ -1,0 +1,186 @@
+"""The figures of a moment of a run, as the dashboard, `trilane top` and `/metrics` show them. Rule: plain typed data.
+
+"The window" is the last `window_s` seconds before the moment, "the run" all time since every unit was ready. `sources`
+says where a figure comes from, and `accuracy` the avatar's error: no speed is shown without them. The bounds of a
+histogram never change, so that counts of different runs can be added up.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+NS_PER_S = 1e9
+#: Upper bounds in seconds: a few to each halving of the rate between 200 and 10 frames a second, fewer on both sides.
+BOUNDS_S = (
+    *(0.001, 0.002, 0.003, 0.004, 0.005, 0.006, 0.008),
+    *(0.01, 0.0125, 0.015, 0.0175, 0.02, 0.025, 0.03, 0.035, 0.04, 0.05, 0.06, 0.075),
+    *(0.1, 0.15, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0),
+)
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Shares of a unit's time: `busy`, and `idle` by cause. They add up to 1, or all are 0 where there is no time."""
+
+    busy: float
+    idle: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class UnitFigures:
+    """One unit.
+
+    `window`, `run`: shares of its time; a job that still runs counts as busy.
+    `jobs`: number of jobs that it ended in the run.
+    `restarts`: number of restarts of its process in the run.
+    `is_up`: whether its process is there and ready; false once the run is over.
+    `stage`, `frame`: stage and frame of its present job, "" and -1 without one.
+    """
+
+    window: Shares
+    run: Shares
+    jobs: int
+    restarts: int
+    is_up: bool
+    stage: str
+    frame: int
+
+
+@dataclass(frozen=True)
+class Moved:
+    """Bytes of one kind that a stage moved: `total` in the run, `per_job` the mean of the window's jobs."""
+
+    total: float
+    per_job: float
+
+
+@dataclass(frozen=True)
+class StageFigures:
+    """One stage.
+
+    `waiting`: number of frames before it. `service_ms`: mean of the window's jobs, 0 without any. `bytes`: moved bytes
+    by kind.
+    """
+
+    unit: str
+    waiting: int
+    service_ms: float
+    bytes: Mapping[str, Moved]
+
+
+@dataclass(frozen=True)
+class DropCount:
+    """Frames dropped at `edge`, "producer->consumer", for `cause`."""
+
+    edge: str
+    cause: str
+    frames: int
+
+
+@dataclass(frozen=True)
+class FrameFigures:
+    """Frames of the run, counted: each requested frame is presented, lost, dropped, in flight, or not begun.
+
+    `lost`: number of lost frames by cause. `skipped`: number of presented frames that took the bypass.
+    """
+
+    requested: int
+    presented: int
+    skipped: int
+    in_flight: int
+    not_begun: int
+    lost: Mapping[str, int]
+    dropped: tuple[DropCount, ...]
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """Times of the whole run. `counts[i]`: number of times of at most `bounds_s[i]` and above the bound before.
+
+    The last count has no bound: it counts the times above all bounds.
+    """
+
+    bounds_s: tuple[float, ...]
+    counts: tuple[int, ...]
+    sum_s: float
+
+    @property
+    def count(self) -> int:
+        """Return the number of times."""
+        return sum(self.counts)
+
+
+@dataclass(frozen=True)
+class Note:
+    """A message to a person, `t_ms` after the first step."""
+
+    t_ms: float
+    text: str
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Figures at one moment.
+
+    `t_ms`: time since the first step. `window_s`, `run_s`: lengths of the window and of the run.
+    `clock`: "host" or "virtual". `is_over`: whether the journal has the run's end.
+    `state`: "goes on", "finished", "killed" or "removed".
+    `fps`: frames presented a second, in the window. `run_fps`: the same between the first and the last presented frame.
+    `frame_time_ms`, `latency_ms`: exact mean, p50, p90, p95, p99, max and samples, of the window.
+    `units`, `stages`: figures by name, in the order of the pipeline.
+    `temperature_c`, `duty`: last values by place and by unit. `memory_bytes`: memory of the processes, by unit.
+    `notes`: the last few messages.
+    `bound`: what bounds the run so far, as in report.json; null before 63 frames, and where it is not looked for.
+    `frame_times`, `latencies`: times of the whole run.
+    `began_at`: UTC, ISO 8601; "" where the journal does not say.
+    `accuracy`: by avatar, as in report.json; empty where the journal does not say.
+    `sources`: key to the source of the figures below it, as in report.json.
+    """
+
+    t_ms: float
+    window_s: float
+    run_s: float
+    clock: str
+    is_over: bool
+    state: str
+    fps: float
+    run_fps: float
+    frame_time_ms: Mapping[str, float]
+    latency_ms: Mapping[str, float]
+    frames: FrameFigures
+    units: Mapping[str, UnitFigures]
+    stages: Mapping[str, StageFigures]
+    temperature_c: Mapping[str, float]
+    duty: Mapping[str, float]
+    memory_bytes: Mapping[str, float]
+    notes: tuple[Note, ...]
+    bound: Mapping[str, Any] | None
+    frame_times: Histogram
+    latencies: Histogram
+    began_at: str
+    accuracy: Mapping[str, Mapping[str, Any]]
+    sources: Mapping[str, str]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the same names and values as JSON takes them."""
+        return asdict(self)
+
+
+class TimeHistogram:
+    """Counts times, given in ns, by their length."""
+
+    def __init__(self) -> None:
+        self._counts = [0] * (len(BOUNDS_S) + 1)
+        self._sum_ns = 0
+
+    def add(self, time_ns: int) -> None:
+        """Count a time; one that equals a bound counts below it."""
+        self._counts[bisect_left(BOUNDS_S, time_ns / NS_PER_S)] += 1
+        self._sum_ns += time_ns
+
+    def now(self) -> Histogram:
+        """Return the counts so far."""
+        return Histogram(BOUNDS_S, tuple(self._counts), self._sum_ns / NS_PER_S)

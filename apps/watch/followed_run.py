@@ -1,0 +1,176 @@
+"""A run that others look at while it goes on, or after: where its journal is, and what has become of it.
+
+Rule: whoever follows a run touches nothing of it. A run that goes on writes into `NAME.PID.partial` beside its place
+(run_folder.py). Whoever asks for NAME is given that folder, and follows it when it gets its name.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Iterator
+from enum import StrEnum
+from pathlib import Path
+
+import psutil
+
+from trilane.errors import BadInputError, did_you_mean
+from trilane.pipeline.journal import NAME, JournalReader, Record, journal_in
+
+RUNS = Path("runs")
+LOOK_S = 0.2
+SILENCE_NS = 1_000_000_000
+EXPECTED = "a run folder with a journal"
+NO_RECORD = "a journal without a record"
+CUT_OFF = "the journal stops here: the run was killed, or the file is cut off; what came after is not known"
+PARTIAL = re.compile(r"(?P<name>.+)\.(?P<pid>[0-9]{1,9})\.partial")
+
+
+class RunState(StrEnum):
+    """What has become of a run.
+
+    GOES_ON: its process lives. FINISHED: the folder has its name. KILLED: the process left the folder behind.
+    REMOVED: the folder is gone; a run that ends before any frame removes its own.
+    """
+
+    GOES_ON = "goes on"
+    FINISHED = "finished"
+    KILLED = "killed"
+    REMOVED = "removed"
+
+
+def without_journal(folder: Path) -> str:
+    """Say what is where the journal of `folder` should be."""
+    if (folder / NAME).is_symlink():
+        return f"{NAME}, a link to a file that is not there"
+    return f"no {NAME}" if folder.is_dir() else "no such folder"
+
+
+class FollowedRun:
+    """The run whose journal is in `folder`. `name`: name that it has, or will have.
+
+    Raises BadInputError where `folder` has no journal.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        journal = journal_in(folder)
+        if journal is None:
+            remedy = "an older Trilane wrote it; run the scene again" if (folder / "report.json").is_file() else ""
+            raise BadInputError(folder, without_journal(folder), EXPECTED, remedy)
+        self.folder = folder
+        matched = PARTIAL.fullmatch(folder.name)
+        self.name = run_name(folder)
+        self._pid = int(matched["pid"]) if matched else 0
+        self._reader = JournalReader(journal)
+        self._heard_ns = time.monotonic_ns()
+
+    @property
+    def state(self) -> RunState:
+        """Return what has become of the run until now."""
+        self._find_again()
+        if not self.folder.is_dir():
+            return RunState.REMOVED
+        if PARTIAL.fullmatch(self.folder.name) is None:
+            return RunState.FINISHED
+        return RunState.GOES_ON if _is_alive(self._pid) else RunState.KILLED
+
+    @property
+    def silent_ns(self) -> int:
+        """Return for how long the run has written nothing although it goes on; 0 while that is no longer than usual."""
+        silent_ns = time.monotonic_ns() - self._heard_ns
+        return silent_ns if silent_ns > SILENCE_NS and self.state is RunState.GOES_ON else 0
+
+    def new(self) -> Iterator[Record]:
+        """Yield the records since the last call; none of a run that was removed. Raises BadInputError."""
+        self._find_again()
+        if not self.folder.is_dir():
+            return
+        try:
+            for record in self._reader.new():
+                self._heard_ns = time.monotonic_ns()
+                yield record
+        except BadInputError:
+            if self._reader.path.exists():
+                raise  # else it was moved this very moment, and the next call finds it
+
+    def whole(self) -> Iterator[Record]:
+        """Yield all records of a run that was not read yet. Raises BadInputError where the journal has none so far."""
+        is_empty = True
+        for record in self.new():
+            is_empty = False
+            yield record
+        if is_empty:
+            raise BadInputError(self.folder, NO_RECORD, EXPECTED)
+
+    def _find_again(self) -> None:
+        """Follow a run that has become complete to the folder with its own name."""
+        target = self.folder.with_name(self.name)
+        if not self.folder.exists() and target.is_dir():
+            self.folder = target
+            self._reader.path = target / NAME
+
+
+def follow(given: Path | None, *, wait: bool = False, sleep: Callable[[float], None] = time.sleep) -> FollowedRun:
+    """Find the run that is meant. Raises BadInputError.
+
+    `given`: its folder, its journal, or its name below runs/; None for the newest below runs/.
+    `wait`: whether to wait until it has begun; without, one that has not begun is an error. `sleep`: function that
+    waits, s.
+    """
+    while True:
+        found = _newest(RUNS.glob(f"*/{NAME}")) if given is None else folder_of(given)
+        if found is not None:
+            return FollowedRun(found)
+        if not wait:
+            raise _missing(given)
+        sleep(LOOK_S)
+
+
+def _is_alive(pid: int) -> bool:
+    """Say whether the process still writes: one that has ended stays until its parent asks for its exit code."""
+    try:
+        return bool(psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
+    except psutil.NoSuchProcess:
+        return False
+
+
+def folder_of(given: Path) -> Path | None:
+    """Return the folder of the run that has begun and that `given` means (`follow`), or what is there in its place."""
+    if given.name == NAME:
+        return given.parent
+    places = [given] if given.is_absolute() or len(given.parts) > 1 else [given, RUNS / given]
+    for place in places:
+        if place.exists():
+            return place
+        if (found := _newest(place.parent.glob(f"*.partial/{NAME}"), place.name)) is not None:
+            return found
+    return None
+
+
+def _newest(journals: Iterator[Path], name: str = "") -> Path | None:
+    """Return the folder whose journal was written to last; with `name`, only among those of that run."""
+    found = []
+    for journal in journals:
+        matched = PARTIAL.fullmatch(journal.parent.name)
+        if not name or (matched and matched["name"] == name):
+            try:
+                found.append((journal.stat().st_mtime_ns, journal.parent))
+            except OSError:  # it was moved this very moment
+                continue
+    return max(found)[1] if found else None
+
+
+def _missing(given: Path | None) -> BadInputError:
+    if given is None:
+        return BadInputError(
+            RUNS, "no run with a journal", EXPECTED, "start one with `trilane run`, or name its folder"
+        )
+    parent = given.parent if len(given.parts) > 1 else RUNS
+    names = [run_name(each) for each in parent.iterdir() if each.is_dir()] if parent.is_dir() else []
+    return BadInputError(given, "no such run", EXPECTED, did_you_mean(given.name, names))
+
+
+def run_name(folder: Path) -> str:
+    """Return the name that the run in `folder` has, or will have."""
+    matched = PARTIAL.fullmatch(folder.name)
+    return matched["name"] if matched else folder.name

@@ -1,0 +1,392 @@
+"""Figures of a run at any moment, from its journal as it grows. Rule: pure, and of bounded memory.
+
+Every time of the last `WINDOW_NS` is kept, so that percentiles are exact; of the whole run sums and counts alone. A
+unit's time follows the ledger (scheduler/ledger.py): its accounts and jobs are spans, told as they change and end. What
+was assigned but neither ran nor was preempted is overhead. `looks` gives the figures again and again until the run
+ends; it looks once at a run that is over.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Mapping
+from typing import Any, Final, NamedTuple
+
+from trilane.apps.watch.figures import (
+    DropCount,
+    Figures,
+    FrameFigures,
+    Moved,
+    Note,
+    Shares,
+    StageFigures,
+    TimeHistogram,
+    UnitFigures,
+)
+from trilane.apps.watch.followed_run import EXPECTED, NO_RECORD, FollowedRun, RunState
+from trilane.errors import BadInputError
+from trilane.figure_sources import COMPUTED, MEASURED
+from trilane.pipeline.journal import Accounted, Begun, Counted, Ended, Record, Said, Sampled, Stepped, Worked
+from trilane.pipeline.reckoning import Reckoning, places_of
+from trilane.pipeline.timeline import Done, ExplainedJob, Presented, Timeline
+from trilane.pipeline.unit_history import BUSY, IDLE_CAUSES, NAMES, OVERHEAD, PREEMPTED
+from trilane.scheduler.events import NEVER, Finish, JobDone, Start
+from trilane.scheduler.ledger import STARVED
+from trilane.scheduler.stats import NS_PER_MS, summary_ms
+
+WINDOW_NS: Final = 5_000_000_000
+NS_PER_S: Final = 1e9
+MOST_NOTES = 5
+BYTES, LEAST = "bytes_", "least"  # bytes that a stage moved, and those that would have done
+LEAST_KEY = f"stages.*.bytes.{LEAST}"
+TEMPERATURE, DUTY, MEMORY = "temperature_c.", "duty.", "memory_bytes."
+SENSOR = "sensor"  # this machine's own, beside those that are modelled
+OF_THE_RUN = (
+    "fps",
+    "run_fps",
+    "frame_time_ms",
+    "latency_ms",
+    "frames",
+    "units",
+    "stages",
+    "frame_times",
+    "latencies",
+    "bound",
+    "memory_bytes",
+)
+ASSIGNED = "assigned"
+PARTS = (ASSIGNED, *NAMES.values(), BUSY, PREEMPTED)
+
+
+class LiveFigures:
+    """Takes the records that follow `begun`, in order, and gives the figures of a moment that is not before them.
+
+    `finds_bound`: whether to find what bounds the run, which takes three times as long as all else. The end of a
+    journal says it, so it need not be found for a run that is over.
+    """
+
+    def __init__(self, begun: Begun, *, finds_bound: bool = True) -> None:
+        self._graph, self._facts, self._settings = begun.graph, begun.facts, begun.settings
+        self._timeline = line = Timeline(begun.graph, begun.settings, waits=finds_bound)
+        self._reckoning = Reckoning(begun.graph, begun.settings, places_of(begun), line.downs) if finds_bound else None
+        self._bound: Mapping[str, Any] | None = None
+        self._first_ns: int | None = None
+        self._last_ns = 0
+        self._finished_ns = NEVER
+        self._is_over = False
+        self._times: dict[str, _UnitTime] = {}
+        self._jobs, self._restarts = Counter[str](), Counter[str]()
+        self._stages = {stage.name: _StageBook() for stage in begun.graph.stages}
+        self._recent: deque[Presented] = deque()
+        self._first_end_ns = 0
+        self._frame_times, self._latencies = TimeHistogram(), TimeHistogram()
+        self._lost: Mapping[str, int] = {}
+        self._dropped: Mapping[str, int] = {}
+        self._sampled: dict[str, float] = {}
+        self._notes: deque[Note] = deque(maxlen=MOST_NOTES)
+        self._adders: dict[type[Any], Callable[[Any], None]] = {
+            Stepped: self._add_step,
+            Accounted: self._add_account,
+            Worked: self._add_work,
+            Counted: self._add_counts,
+            Sampled: self._add_sample,
+            Said: self._add_note,
+            Ended: self._add_end,
+        }
+
+    @property
+    def last_ns(self) -> int:
+        """Return the time of the last record that has one; 0 before the first."""
+        return self._last_ns
+
+    @property
+    def is_over(self) -> bool:
+        """Say whether the run's last record was added."""
+        return self._is_over
+
+    def add(self, record: Record) -> None:
+        """Take a record of the journal, but for the first."""
+        facts = self._timeline.add(record)
+        self._adders[type(record)](record)
+        for fact in facts:
+            if isinstance(fact, Done):
+                self._jobs[fact.handed.job.unit] += 1
+                self._times[fact.handed.job.unit].add_job(fact.event)
+            elif isinstance(fact, Presented):
+                self._add_presented(fact)
+            elif isinstance(fact, ExplainedJob) and self._reckoning is not None:
+                self._reckoning.add(fact)
+
+    def now(self, now_ns: int | None = None, state: RunState | None = None) -> Figures:
+        """Return the figures at `now_ns`, of the run's clock; at the last record where it is None or earlier.
+
+        `state`: what has become of the run, which the journal of a killed run does not say; None to take it from the
+        journal.
+        After the step that finished the run the moment stays at that step: what follows are no frames.
+        """
+        now_ns = min(max(now_ns or 0, self._last_ns), self._finished_ns)
+        start_ns = now_ns if self._timeline.start_ns is None else self._timeline.start_ns
+        window_s = min(now_ns - start_ns, WINDOW_NS) / NS_PER_S
+        recent = [each for each in self._recent if each.end_ns > now_ns - WINDOW_NS]
+        clock = str(self._facts.get("clock", ""))
+        state = state or (RunState.FINISHED if self._is_over else RunState.GOES_ON)
+        goes_on = state is RunState.GOES_ON and not self._is_over
+        return Figures(
+            t_ms=self._since_first_ms(now_ns),
+            window_s=window_s,
+            run_s=(now_ns - start_ns) / NS_PER_S,
+            clock=clock,
+            is_over=self._is_over,
+            state=state.value,
+            fps=len(recent) / window_s if window_s else 0.0,
+            run_fps=self._run_fps(),
+            frame_time_ms=summary_ms(each.interval_ns for each in recent if each.interval_ns is not None),
+            latency_ms=summary_ms(each.latency_ns for each in recent),
+            frames=self._frame_figures(),
+            units={unit: self._unit_figures(unit, now_ns, goes_on) for unit in self._graph.units},
+            stages=self._stage_figures(now_ns),
+            temperature_c=self._values(TEMPERATURE),
+            duty=self._values(DUTY),
+            memory_bytes=self._values(MEMORY),
+            notes=tuple(self._notes),
+            bound=self._bound or (self._reckoning.bound if self._reckoning is not None else None),
+            frame_times=self._frame_times.now(),
+            latencies=self._latencies.now(),
+            began_at=str(self._facts.get("began_at", "")),
+            accuracy=dict(self._facts.get("accuracy") or {}),
+            sources=self._sources(clock),
+        )
+
+    # records
+
+    def _add_step(self, step: Stepped) -> None:
+        self._last_ns = step.now_ns
+        if self._first_ns is None:
+            self._first_ns = step.now_ns
+        if not self._times and self._timeline.start_ns is not None:
+            units = self._timeline.units.values()
+            self._times = {unit.name: _UnitTime(step.now_ns, WINDOW_NS, unit.account) for unit in units}
+        for action in step.actions:
+            if type(action) is Start:
+                self._restarts[action.unit] += 1
+            elif type(action) is Finish:
+                self._finished_ns = step.now_ns
+
+    def _add_presented(self, presented: Presented) -> None:
+        if presented.interval_ns is None:
+            self._first_end_ns = presented.end_ns
+        else:
+            self._frame_times.add(presented.interval_ns)
+        self._latencies.add(presented.latency_ns)
+        self._recent.append(presented)
+        while self._recent[0].end_ns < presented.end_ns - WINDOW_NS:
+            self._recent.popleft()
+
+    def _add_account(self, entry: Accounted) -> None:
+        if entry.unit in self._times:
+            self._times[entry.unit].enter(entry.now_ns, entry.account)
+
+    def _add_work(self, work: Worked) -> None:
+        job = work.job
+        moved = {name.removeprefix(BYTES): value for name, value in work.figures.items() if name.startswith(BYTES)}
+        self._stages[job.stage].add(_Work(job.end_ns, job.end_ns - job.begin_ns, moved))
+
+    def _add_counts(self, counts: Counted) -> None:
+        self._lost, self._dropped = counts.lost, counts.dropped
+
+    def _add_sample(self, sample: Sampled) -> None:
+        self._sampled.update(sample.values)
+
+    def _add_note(self, said: Said) -> None:
+        self._notes.append(Note(self._since_first_ms(said.now_ns), said.text))
+
+    def _add_end(self, ended: Ended) -> None:
+        self._last_ns = max(self._last_ns, ended.now_ns)
+        self._is_over, self._bound = True, ended.report.get("bound")
+
+    # figures
+
+    def _since_first_ms(self, now_ns: int) -> float:
+        return 0.0 if self._first_ns is None else (now_ns - self._first_ns) / NS_PER_MS
+
+    def _run_fps(self) -> float:
+        span_ns = self._recent[-1].end_ns - self._first_end_ns if self._recent else 0
+        return (self._timeline.presented - 1) * NS_PER_S / span_ns if span_ns else 0.0
+
+    def _frame_figures(self) -> FrameFigures:
+        line = self._timeline
+        dropped = tuple(_drop_count(key, count) for key, count in self._dropped.items())
+        counts = (self._settings.frames, line.presented, line.skipped, len(line.frames), line.not_begun)
+        return FrameFigures(*counts, dict(self._lost), dropped)
+
+    def _unit_figures(self, name: str, now_ns: int, goes_on: bool) -> UnitFigures:
+        unit = self._timeline.units[name]
+        held = unit.held[0] if unit.held else None
+        times = self._times.get(name) or _UnitTime(now_ns, WINDOW_NS)
+        window, run = times.shares(now_ns, held and held.at_ns)
+        stage, frame = (held.job.stage, held.job.frame) if held else ("", -1)
+        return UnitFigures(window, run, self._jobs[name], self._restarts[name], goes_on and unit.is_up, stage, frame)
+
+    def _stage_figures(self, now_ns: int) -> dict[str, StageFigures]:
+        line = self._timeline
+        return {
+            stage.name: self._stages[stage.name].now(
+                stage.unit, 0 if line.is_over else len(line.waiting(stage.name)), now_ns - WINDOW_NS
+            )
+            for stage in self._graph.stages
+        }
+
+    def _values(self, prefix: str) -> dict[str, float]:
+        return {name.removeprefix(prefix): value for name, value in self._sampled.items() if name.startswith(prefix)}
+
+    def _sources(self, clock: str) -> dict[str, str]:
+        """Return the source by key; the longest key decides."""
+        sources = dict.fromkeys(OF_THE_RUN, COMPUTED if clock == "virtual" else MEASURED)
+        sources |= {
+            LEAST_KEY: COMPUTED,
+            "temperature_c": COMPUTED,
+            f"{TEMPERATURE}{SENSOR}": MEASURED,
+            "duty": COMPUTED,
+        }
+        accuracy = self._facts.get("accuracy") or {}
+        return sources | {f"accuracy.{name}": facts["source"] for name, facts in accuracy.items() if "source" in facts}
+
+
+class RunLook(NamedTuple):
+    """One look at a run: its name, its state and its figures. `name`: its folder's at the end."""
+
+    name: str
+    state: RunState
+    figures: Figures
+
+    def as_json(self) -> dict[str, Any]:
+        """Return `run`, and the names of `Figures`."""
+        return {"run": self.name, **self.figures.as_json()}
+
+
+def looks(run: FollowedRun, pause: Callable[[], None]) -> Generator[RunLook]:
+    """Look at `run` now, and after every `pause` until it has ended.
+
+    Raises BadInputError for a journal without a record.
+    """
+    figures: LiveFigures | None = None
+    while True:
+        state = run.state  # asked before the journal is read, which has everything then
+        for record in run.new():
+            if isinstance(record, Begun):
+                figures = LiveFigures(record, finds_bound=state is not RunState.FINISHED)
+            elif figures is not None:
+                figures.add(record)
+        if figures is not None:
+            yield RunLook(run.name, state, figures.now(figures.last_ns + run.silent_ns, state))
+        elif state is not RunState.GOES_ON:
+            raise BadInputError(run.folder, NO_RECORD, EXPECTED)
+        if state is not RunState.GOES_ON or (figures is not None and figures.is_over):
+            return
+        pause()
+
+
+class _Span(NamedTuple):
+    """A piece of time in which `ns` count as `name`; where in it they lie is not known."""
+
+    begin_ns: int
+    end_ns: int
+    name: str
+    ns: int
+
+
+class _UnitTime:
+    """Where the time of one unit goes from `begin_ns` on; spans are kept for `window_ns`."""
+
+    def __init__(self, begin_ns: int, window_ns: int, account: int = STARVED) -> None:
+        self._begin_ns, self._window_ns = begin_ns, window_ns
+        self._state, self._since_ns = NAMES.get(account, ASSIGNED), begin_ns
+        self._last_end_ns = 0
+        self._spans: deque[_Span] = deque()
+        self._totals = dict.fromkeys(PARTS, 0)
+
+    def enter(self, now_ns: int, account: int) -> None:
+        """Charge the unit's time to `account` from `now_ns` on."""
+        self._keep(self._since_ns, now_ns, self._state, now_ns - self._since_ns)
+        self._state, self._since_ns = NAMES.get(account, ASSIGNED), now_ns
+
+    def add_job(self, job: JobDone) -> None:
+        """Take a job that has ended; time before it counts as preempted only while the unit had it and ran no other."""
+        begin_ns, end_ns = job.t_begin_ns, job.t_end_ns
+        held_from_ns = max(self._last_end_ns, self._since_ns)
+        if begin_ns > held_from_ns:
+            self._keep(held_from_ns, begin_ns, PREEMPTED, min(job.preempted_before_ns, begin_ns - held_from_ns))
+        if end_ns > self._last_end_ns:
+            begin_ns = max(begin_ns, self._last_end_ns)
+            ran_ns = end_ns - begin_ns
+            self._last_end_ns = end_ns
+            self._keep(begin_ns, end_ns, BUSY, ran_ns - min(job.preempted_ns + job.asleep_ns, ran_ns))
+            self._keep(begin_ns, end_ns, PREEMPTED, min(job.preempted_ns, ran_ns))
+
+    def shares(self, now_ns: int, running_since_ns: int | None) -> tuple[Shares, Shares]:
+        """Return the shares of the window and of the run. `running_since_ns`: hand-over of the job it holds, if any."""
+        opened = [_Span(self._since_ns, now_ns, self._state, now_ns - self._since_ns)]
+        if running_since_ns is not None:
+            begin_ns = min(max(running_since_ns, self._last_end_ns, self._since_ns), now_ns)
+            opened.append(_Span(begin_ns, now_ns, BUSY, now_ns - begin_ns))
+        from_ns = max(now_ns - self._window_ns, self._begin_ns)
+        run, window = dict(self._totals), dict.fromkeys(PARTS, 0)
+        for span in opened:
+            run[span.name] += span.ns
+        for begin_ns, end_ns, name, ns in (*self._spans, *opened):
+            if begin_ns >= from_ns:
+                window[name] += ns
+            elif end_ns > from_ns:
+                window[name] += ns * (end_ns - from_ns) // (end_ns - begin_ns)
+        return _shares(window, now_ns - from_ns), _shares(run, now_ns - self._begin_ns)
+
+    def _keep(self, begin_ns: int, end_ns: int, name: str, ns: int) -> None:
+        if ns:
+            self._totals[name] += ns
+            self._spans.append(_Span(begin_ns, end_ns, name, ns))
+            while self._spans[0].end_ns < end_ns - self._window_ns:
+                self._spans.popleft()
+
+
+def _shares(sums: Mapping[str, int], total_ns: int) -> Shares:
+    if total_ns <= 0:
+        return Shares(0.0, dict.fromkeys(IDLE_CAUSES, 0.0))
+    overhead_ns = max(sums[ASSIGNED] - sums[BUSY] - sums[PREEMPTED], 0)  # parts that were cut are rounded down
+    idle_ns = {**sums, OVERHEAD: overhead_ns}
+    return Shares(sums[BUSY] / total_ns, {cause: idle_ns[cause] / total_ns for cause in IDLE_CAUSES})
+
+
+class _Work(NamedTuple):
+    """A job of a stage: its end, its duration, and the bytes that it moved by kind."""
+
+    end_ns: int
+    service_ns: int
+    bytes: Mapping[str, float]
+
+
+class _StageBook:
+    """The jobs of a stage in the window, and the bytes of all its jobs."""
+
+    def __init__(self) -> None:
+        self.recent: deque[_Work] = deque()
+        self.bytes: Counter[str] = Counter()
+
+    def add(self, work: _Work) -> None:
+        self.bytes.update(work.bytes)
+        self.recent.append(work)
+        while self.recent[0].end_ns < work.end_ns - WINDOW_NS:
+            self.recent.popleft()
+
+    def now(self, unit: str, waiting: int, from_ns: int) -> StageFigures:
+        works = [work for work in self.recent if work.end_ns > from_ns]
+        count = max(len(works), 1)
+        moved = {
+            kind: Moved(float(total), sum(work.bytes.get(kind, 0.0) for work in works) / count)
+            for kind, total in sorted(self.bytes.items())
+        }
+        return StageFigures(unit, waiting, sum(work.service_ns for work in works) / count / NS_PER_MS, moved)
+
+
+def _drop_count(key: str, frames: int) -> DropCount:
+    edge, _, cause = key.rpartition(":")
+    return DropCount(edge, cause, frames)
