@@ -270,7 +270,7 @@ def predict(
     """
     from trilane.apps.predict import asked_prediction as asked
     from trilane.hw_profiles.application import Plan
-    from trilane.hw_profiles.load import load_runnable
+    from trilane.hw_profiles.profile_files import load_runnable
 
     if network is not None and avatar is not None:
         raise BadInputError("predict", "an avatar and a network", "one of them")

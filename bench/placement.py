@@ -19,19 +19,18 @@ from trilane.avatars.network_file import reshaped
 from trilane.bench.lib import networks
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.application import Plan, Variant, steady
-from trilane.hw_profiles.host import host_cores, rule_placement, settings_of, usable_cores
-from trilane.hw_profiles.load import HOST, load_profile
+from trilane.hw_profiles.host import described, host_cores, rule_placement, settings_of, usable_cores
+from trilane.hw_profiles.host_model import on_cores, place_units
 from trilane.hw_profiles.network_work import Network, count_work
-from trilane.hw_profiles.performance_profiles import corners_of
-from trilane.hw_profiles.placed_host import on_cores, place_units
-from trilane.hw_profiles.placement_facts import NS_PER_MS, described
+from trilane.hw_profiles.profile_files import HOST, load_profile
+from trilane.hw_profiles.schema import corners_of
 from trilane.pipeline.run_metrics import RunMetrics
 from trilane.pipeline.trial import Round
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.placement import Ranked, ranked, worth_trying
 from trilane.scheduler.placement_model import Rules, frame_ns
 from trilane.scheduler.places import Core, Placement
-from trilane.scheduler.stats import median_interval
+from trilane.scheduler.stats import NS_PER_MS, median_interval
 from trilane.stages import PRELOAD
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.avatar_pipeline import measured_times, run_avatar, tried

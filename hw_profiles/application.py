@@ -1,10 +1,8 @@
 """The whole application on a chip: a service time per stage, run through the real scheduler in virtual time.
 
-Rule: this file computes what a frame costs each stage; which stage waits for which is decided by the scheduler alone.
-
-`REFERENCE` is how the reference application works: with one buffer between stages, so that a frame is not drawn before
-the network has released the buffer that it reads. The GPU is busy during read-back, the network's unit during the
-hand-over.
+This file computes what a frame costs each stage; the scheduler alone decides which stage waits for which. `REFERENCE`
+is how the reference application works: with one buffer between stages, so that a frame is not drawn before the network
+has released the buffer that it reads. The GPU is busy during read-back, the network's unit during the hand-over.
 """
 
 from __future__ import annotations
@@ -17,15 +15,13 @@ from typing import Any, NamedTuple
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.network_work import Network, Work
-from trilane.hw_profiles.operator_kinds import CLASSES
-from trilane.hw_profiles.operator_times import JobTime
-from trilane.hw_profiles.performance_profiles import Corners
 from trilane.hw_profiles.reference_networks import CHANNELS_PER_PASS
-from trilane.hw_profiles.schema import Profile, Unit
-from trilane.hw_profiles.unit_times import time_on
+from trilane.hw_profiles.schema import Corners, Profile
+from trilane.hw_profiles.unit_times import JobTime, time_on
 from trilane.scheduler.events import Graph, Settings, chain
 from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.release import run_settings
+from trilane.scheduler.stats import NS_PER_MS
 from trilane.scheduler.virtual import Simulation, simulate
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import AFTER_INFER, BEFORE_INFER, INFER, LATENCY_TO, UNITS, UnitName
@@ -34,17 +30,17 @@ RUNTIMES: tuple[UnitName, ...] = ("gpu", "dsp")
 PACKED_BYTES_PER_PIXEL = 16
 #: Frames of a simulated run: for shares of time, for a frame time alone, and where dropped frames vary the intervals.
 FRAMES, QUICK_FRAMES, FRAMES_WITH_DROPS = 192, 12, 480
-NS_PER_MS = 1_000_000
 #: Stage, unit and nanoseconds of a job, in data-flow order.
 StageTimes = tuple[tuple[str, UnitName, int], ...]
-LEAST_FPS, MOST_FPS = 1e-3, 1000.0  # as of a scene
+LEAST_FPS, MOST_FPS = 1e-3, 1000.0  # a scene has the same limits
 
 
 class Variant(NamedTuple):
     """How the stages are joined.
 
-    `policy`: of the scheduler. `edge`: rule of the edges between stages, the same for all. `batch`: frames per job.
-    `fps`: the scene's rate, at which `latest` and `deadline` release frames, but no faster than the display shows them.
+    `policy`: policy of the scheduler. `edge`: rule of every edge between stages. `batch`: frames per job, 1 to 64.
+    `fps`: rate of the scene, frames a second; `latest` and `deadline` release frames at it, but no faster than the
+    display shows them.
     """
 
     policy: str = "pipelined"
@@ -58,12 +54,13 @@ REFERENCE = Variant()
 
 @dataclass(frozen=True)
 class Plan:
-    """One application on one chip. `runtime`: the unit of the network.
+    """One application on one chip.
 
-    `gpu_share`: the part of the network's products that the GPU does when the rest runs on the DSP. `most_fps`: a rate
-    that the application is held to, as the display would, None for the display's own; policies that release frames at
-    a rate have it in their variant. `stretch`: by which the network's time differs from what is expected. `avatars`:
-    in view, whose tensor is one and the same. Raises BadInputError for a value outside its range.
+    `network`: network that runs. `runtime`: unit that runs it, gpu or dsp. `variant`: how the stages are joined.
+    `gpu_share`: part of the network's products that the GPU does while the DSP does the rest, 0 to below 1. `most_fps`:
+    rate that the application is held to, as by a display; None for the display's own. Policies that release frames at a
+    rate have the rate in their variant. `stretch`: factor on the network's expected time. `avatars`: number of avatars
+    in view; they share one tensor. Raises BadInputError for a value outside its range.
     """
 
     network: Network
@@ -94,10 +91,10 @@ class Plan:
 def isolated_job_time(profile: Profile, network: Network, runtime: UnitName, corners: Corners) -> JobTime:
     """Time of one frame's job when the network runs continuously and nothing else does, as in a benchmark.
 
-    `profile`: of the chip.
-    `network`: that runs.
+    `profile`: hardware profile of the chip.
+    `network`: network that runs.
     `runtime`: the unit that runs it.
-    `corners`: of all units.
+    `corners`: corner of each unit.
     """
     return _job(profile, network.work, runtime, corners, contended=False)
 
@@ -107,12 +104,12 @@ def _job(
 ) -> JobTime:
     """Time of a job with the operators of `work`.
 
-    `profile`: of the chip.
-    `work`: of one frame.
-    `unit`: that does it.
-    `corners`: of all units.
-    `contended`: whether the rest of the application uses the memory too.
-    `batch`: frames of the job.
+    `profile`: hardware profile of the chip.
+    `work`: work of one frame.
+    `unit`: unit that does it.
+    `corners`: corner of each unit.
+    `contended`: whether the rest of the application uses the memory meanwhile.
+    `batch`: number of frames in the job.
     """
     clock = profile.units[unit].clock(corners[UNITS.index(unit)])
     return time_on(profile.units[unit], profile.memory, work, clock, contended=contended, batch=batch)
@@ -176,10 +173,10 @@ def split_work(work: Work, share: float) -> tuple[Work, Work]:
 class Steady:
     """The application once it has settled.
 
-    `capped`: whether it waits for the display, or is held to a rate. `dropped`: share of the
-    frames that are not shown. `unit_of`: unit of each stage. `stages_ms`: time of a job of each stage.
-    `busy`: share of the time in which each unit works; `idle`: shares of the rest by cause. They sum to 1 per unit. Of
-    units that share a core, `preempted` is the share in which another one of them works on it.
+    `capped`: whether the display, or a rate, holds it back. `dropped`: share of the frames that are not shown.
+    `unit_of`: unit of each stage. `stages_ms`: milliseconds of a job of each stage. `busy`: share of the time in which
+    each unit works; `idle`: shares of the rest by cause. Both sum to 1 per unit. Where units share a core, `preempted`
+    is the share in which another one of them works on it.
     """
 
     frame_ms: float
@@ -193,7 +190,7 @@ class Steady:
 
 
 def application_graph(edge: str = "double", infer: Iterable[tuple[str, str]] = (INFER,)) -> Graph:
-    """The avatar's pipeline, every edge with the same rule. `infer`: the network's stages and their units."""
+    """The avatar's pipeline with the same rule on every edge. `infer`: the network's stages and their units."""
     return chain((*BEFORE_INFER, *infer, *AFTER_INFER), edge, LATENCY_TO)
 
 
@@ -215,7 +212,7 @@ def _settled(times: StageTimes, variant: Variant, display_ns: int, quick: bool) 
 
 
 def _frames_of(variant: Variant, quick: bool) -> int:
-    """How many frames are simulated. `quick`: as of `_settled`."""
+    """How many frames are simulated. `quick`: as in `_settled`."""
     if variant.edge not in ("single", "double") or POLICIES[variant.policy].paced:
         return FRAMES_WITH_DROPS
     return QUICK_FRAMES if quick and variant.edge == "single" else FRAMES
@@ -243,9 +240,9 @@ def _simulated(times: StageTimes, variant: Variant, settings: Settings, *, keep:
 
 
 def simulated(profile: Profile, plan: Plan, corners: Corners) -> Simulation:
-    """The run in virtual time from which `steady` has its figures, with its recording and its jobs.
+    """Return the run in virtual time that `steady` takes its figures from, with its recording and its jobs.
 
-    `profile`, `plan`, `corners`: as of `steady`.
+    `profile`, `plan`, `corners`: as in `steady`.
     """
     times, display_ns = _rounded(profile, plan, corners), _display_ns(profile, plan)
     _, held = _settled(times, plan.variant, display_ns, quick=False)
@@ -254,7 +251,7 @@ def simulated(profile: Profile, plan: Plan, corners: Corners) -> Simulation:
 
 
 def _rounded(profile: Profile, plan: Plan, corners: Corners) -> StageTimes:
-    """What a job of each stage takes, of units as the scheduler sees them."""
+    """Nanoseconds of a job of each stage, with the units as the scheduler sees them."""
     worker = workers_of(profile)
     times = stage_times_ms(profile, plan, corners)
     return tuple((name, worker[unit], round(ms * NS_PER_MS)) for (name, unit), ms in times.items())
@@ -273,9 +270,9 @@ def _display_ns(profile: Profile, plan: Plan) -> int:
 def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = False) -> Steady:
     """Frame time, latency and shares of time, by the scheduler in virtual time.
 
-    `profile`: of the chip.
-    `plan`: what runs on it.
-    `corners`: at which the units stay.
+    `profile`: hardware profile of the chip.
+    `plan`: application that runs on it.
+    `corners`: corner of each unit, the same all the time.
     `quick`: whether a short run will do where it can. Its frame time is right to a hundredth; its shares of time
     include filling and draining.
     """
@@ -298,7 +295,10 @@ def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = Fals
 
 
 def workers_of(profile: Profile) -> dict[UnitName, UnitName]:
-    """The unit under whose name the scheduler sees each: of units on one core, the first, since one works at a time."""
+    """Map each unit to the unit under whose name the scheduler sees it.
+
+    Units on one core work in turns, so the first of them stands for all.
+    """
     first: dict[str, UnitName] = {}
     return {unit: first.setdefault(profile.units[unit].core or unit, unit) for unit in UNITS}
 
@@ -311,9 +311,9 @@ def _shares(
 ) -> tuple[float, dict[str, float]]:
     """Busy share of `unit` and shares of its idle time by cause.
 
-    `worker`: of each unit, `workers_of`.
-    `times`: of a job of each stage and unit.
-    `units`: what the simulated run says of each worker. Those behind one worker divide its busy time as their jobs do.
+    `worker`: result of `workers_of`. Units behind one worker divide its busy time in proportion to their jobs.
+    `times`: milliseconds of a job of each stage and unit.
+    `units`: row of each worker in the report of the simulated run.
     """
     own, together = (
         sum(ms for (_, other), ms in times.items() if other in group)
@@ -336,26 +336,3 @@ def reference_frame_ms(profile: Profile, plan: Plan, corners: Corners) -> float:
     times = stage_times_ms(profile, plan, corners)
     chain = sum(ms for (name, _), ms in times.items() if name not in ("pose", "present"))
     return max(profile.application.display_ms.or_else(0), chain)
-
-
-def relative_error(job: JobTime, unit: Unit) -> float:
-    """Expected relative error of the time of `job` on `unit`: as measured, where it was.
-
-    Else it joins the errors of the numbers that the parts of the time are computed from, and the model's own error.
-    """
-    if unit.measured is not None:
-        return unit.measured.error
-    if job.unsure is not None and unit.engine is not None:
-        return math.hypot(job.unsure, unit.engine.error_fraction.or_else(0.5) * job.unlike)
-    computed_from = {
-        "fixed": unit.job_fixed_ms,
-        "input": unit.input_ns_per_element,
-        "weights": unit.efficiency.convolution_traffic,
-        "fallback": unit.fallback_ns_per_element,
-        "depthwise": unit.efficiency.depthwise_traffic,
-        "pointwise": unit.efficiency.pointwise_traffic,
-    }
-    computed_from |= {kind: getattr(unit.efficiency, kind) for kind in CLASSES if kind not in computed_from}
-    shares = {part: ms / job.total_ms for part, ms in job.parts.items()}
-    variance = sum((shares[part] * quantity.relative_error) ** 2 for part, quantity in computed_from.items())
-    return float((variance + unit.model_error_fraction.or_else(0.5) ** 2) ** 0.5)

@@ -1,11 +1,10 @@
-"""The layers of a network as a tensor engine runs them: what its runtime folds, and how much of each term is left.
+"""Turns an ONNX graph into the layers that a tensor engine runs, each with its amounts of work by term.
 
-Rule: a pure function of an ONNX graph's shapes; nothing here knows a chip. A term is a kind of work with a price of its
-own (`TERMS`). Products are counted with the channels rounded up to the blocks in which the Hexagon keeps them: a
-convolution's inputs to 16, its outputs to 32, all other activations to 8. A ReLU and a clip disappear in the layer
-before them, a batch normalisation in the convolution before it, a sum of two tensors in the convolution that makes one
-of them. A permutation between channels first and channels last is none: the engine has channels last, whichever the
-file says.
+A term is a kind of work with a price of its own (`TERMS`); nothing here knows a chip. Channels are rounded up to the
+blocks in which the Hexagon keeps them: a convolution's inputs to 16, its outputs to 32, all other activations to 8.
+The runtime folds a ReLU and a clip into the layer before them, a batch normalisation into the convolution before it,
+and a sum of two tensors into the convolution that makes one of them. A permutation between channels first and
+channels last costs nothing, because the engine always has channels last.
 """
 
 from __future__ import annotations
@@ -20,15 +19,21 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.hw_profiles.operator_kinds import CONVOLUTIONS, DOMAINS, LAYOUT_CHANGES, RECURRENT
-from trilane.hw_profiles.operator_kinds import PRODUCTS as MATRIX_PRODUCTS
-from trilane.hw_profiles.product_counts import product_of
+from trilane.hw_profiles.operator_kinds import (
+    CONVOLUTIONS,
+    DOMAINS,
+    LAYOUT_CHANGES,
+    PRODUCTS,
+    RECURRENT,
+    Shape,
+    product_of,
+)
 
-Rate = Literal["arithmetic", "activation", "spill", "weight", "operator", "job"]
-RATES: tuple[Rate, ...] = ("arithmetic", "activation", "spill", "weight", "operator", "job")
+RateName = Literal["arithmetic", "activation", "spill", "weight", "operator", "job"]
+RATES: tuple[RateName, ...] = ("arithmetic", "activation", "spill", "weight", "operator", "job")
 
 #: Each term -> the rate that its amount is divided by. Amounts are products for the first, elements for the next three.
-TERMS: dict[str, Rate] = {
+TERMS: dict[str, RateName] = {
     "convolution": "arithmetic",
     "grouped": "arithmetic",
     "first": "arithmetic",
@@ -71,15 +76,15 @@ RENAMES = frozenset(
     ("Identity", "Reshape", "Flatten", "Squeeze", "Unsqueeze", "Dropout", "Cast", "QuantizeLinear", "DequantizeLinear")
 )
 #: Activations that disappear in the layer before them.
-FOLDED = frozenset(["Relu", "Clip"])
+FOLDED_ACTIVATIONS = frozenset(["Relu", "Clip"])
 #: Layers that take up such an activation.
 NORMALISATIONS = ("BatchNormalization", "InstanceNormalization", "GroupNormalization", "LayerNormalization")
 TAKES = frozenset(
     ("Conv", "ConvTranspose", "Gemm", "MatMul", "Add", "Mul", "Concat", "MaxPool", "Resize", *NORMALISATIONS)
 )
-PRODUCTS = frozenset(["Conv", "ConvTranspose", "Gemm", "MatMul"])
-WITH_PRODUCTS = frozenset([*CONVOLUTIONS, *MATRIX_PRODUCTS, *RECURRENT])
-#: Operators of integers, or joined with others -> the one of floats whose work they do.
+PLAIN_PRODUCTS = frozenset(["Conv", "ConvTranspose", "Gemm", "MatMul"])
+WITH_PRODUCTS = frozenset([*CONVOLUTIONS, *PRODUCTS, *RECURRENT])
+#: Operators of integers, or with others joined to them -> the operator of floats that does the same work.
 PLAIN = {
     **{"QLinearConv": "Conv", "ConvInteger": "Conv", "FusedConv": "Conv", "DeformConv": "Conv"},
     **{"QLinearMatMul": "MatMul", "MatMulInteger": "MatMul", "FusedMatMul": "MatMul"},
@@ -107,10 +112,10 @@ INPUT_BLOCK, OUTPUT_BLOCK, ACTIVATION_BLOCK = 16, 32, 8
 PICTURE_CHANNELS = 4
 
 
-class Layer(NamedTuple):
-    """One layer. `amounts`: of each term. `reads`, `writes`: names of tensors that are not weights.
+class EngineLayer(NamedTuple):
+    """One layer. `amounts`: amount of each term. `reads`, `writes`: names of tensors that are not weights.
 
-    `more`: its other results, as a split has them, that somebody needs.
+    `more`: further results that somebody needs, such as those of a split.
     """
 
     name: str
@@ -122,7 +127,7 @@ class Layer(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """Its type as that of floats."""
+        """Type of the operator of floats that does the same work."""
         return PLAIN.get(self.op_type, self.op_type)
 
 
@@ -130,10 +135,10 @@ class Layer(NamedTuple):
 class Layers:
     """The layers of a network in order, equal to nothing but themselves.
 
-    `sizes`: elements of each tensor. `input`, `output`: elements of the network's.
+    `sizes`: elements of each tensor. `input`, `output`: elements of the network's input and output.
     """
 
-    layers: tuple[Layer, ...]
+    layers: tuple[EngineLayer, ...]
     sizes: Mapping[str, int]
     input: int
     output: int
@@ -148,19 +153,18 @@ class Layers:
         return table
 
     def since(self, name: str, crossing: int) -> Layers:
-        """The layers from the one called `name` on. `crossing`: elements that the layers before hand over."""
+        """The layers from the one called `name` on. `crossing`: elements that the layers before it hand over."""
         first = next((i for i, layer in enumerate(self.layers) if layer.name == name), len(self.layers))
         return Layers(self.layers[first:], self.sizes, crossing, self.output)
 
 
 NO_LAYERS = Layers((), {}, 0, 0)
 
-Shape = tuple[int, ...]
 Shapes = Mapping[str, Shape]
 
 
 class _Graph:
-    """A graph without what only renames: `name_of` a tensor, how often it is read, and which tensors are given."""
+    """A graph without operators that only rename: the name and the reads of each tensor, and which ones are given."""
 
     def __init__(self, graph: Any, shapes: Shapes, constants: set[str]) -> None:
         self.shapes, self.constants = shapes, constants
@@ -173,11 +177,11 @@ class _Graph:
         self._ends = {self.name_of(output.name) for output in graph.output}
 
     def rename(self, name: str, original: str) -> None:
-        """From now on `name` means `original`."""
+        """Let `name` mean `original` from now on."""
         self._renamed[name] = original
 
     def name_of(self, name: str) -> str:
-        """The tensor that `name` is another name of."""
+        """The original name of the tensor `name`."""
         while name in self._renamed:
             name = self._renamed[name]
         return name
@@ -187,19 +191,19 @@ class _Graph:
         return tuple(self.name_of(name) for name in node.input if name and name not in self.constants)
 
     def more(self, node: Any) -> tuple[str, ...]:
-        """The results of `node` besides the first that somebody needs."""
+        """The results of `node` after the first that somebody needs."""
         others = (name for name in node.output if name and name != first_result(node))
         return tuple(name for name in others if self.reads[name] or name in self._ends)
 
 
 def first_result(node: Any) -> str:
-    """The first result that `node` makes: a recurrent layer may leave out what stands first."""
+    """The first result that `node` makes. A recurrent layer may leave out the one that comes first in the list."""
     name: str = next(name for name in node.output if name)
     return name
 
 
 def _kind(node: Any) -> str:
-    """The type of an operator as that of floats; nothing of a domain whose operators nobody knows."""
+    """Type of the operator of floats that does the same work; empty for a domain whose operators nobody knows."""
     return PLAIN.get(node.op_type, node.op_type) if node.domain in DOMAINS else ""
 
 
@@ -212,19 +216,19 @@ def _renames(node: Any) -> bool:
 def layers_of(graph: Any, shapes: Shapes, constants: set[str]) -> Layers:
     """The layers of an ONNX graph.
 
-    `graph`: of a model.
-    `shapes`: of its tensors.
+    `graph`: ONNX graph of a model.
+    `shapes`: shape of each tensor, by name.
     `constants`: names of tensors that do not depend on the input.
     """
     names = _Graph(graph, shapes, constants)
-    layers: dict[str, Layer] = {}
+    layers: dict[str, EngineLayer] = {}
     for node in names.nodes:
         if _renames(node) or not names.given(node):
             continue
         kind = _kind(node)
         before = [layers[name] for name in names.given(node) if name in layers]
         sigmoid = next((layer for layer in before if _is_swish(node, layer, names)), None)
-        if kind in FOLDED and before and _folds(before[0], names):
+        if kind in FOLDED_ACTIVATIONS and before and _folds(before[0], names):
             layers[before[0].writes] = before[0]._replace(amounts={**before[0].amounts, **_clip(node, shapes)})
             names.rename(node.output[0], before[0].writes)
         elif node.op_type == "BatchNormalization" and before and _takes_up(before[0], names):
@@ -232,8 +236,10 @@ def layers_of(graph: Any, shapes: Shapes, constants: set[str]) -> Layers:
         elif sigmoid is not None:
             del layers[sigmoid.writes]
             layers[first_result(node)] = _layer(node, names, "Swish", sigmoid.reads)
-        elif kind == "Add" and any(layer.kind in PRODUCTS for layer in before):
-            layers[node.output[0]] = Layer(node.name or node.output[0], "Add", {}, names.given(node), node.output[0])
+        elif kind == "Add" and any(layer.kind in PLAIN_PRODUCTS for layer in before):
+            layers[node.output[0]] = EngineLayer(
+                node.name or node.output[0], "Add", {}, names.given(node), node.output[0]
+            )
         else:
             layers[first_result(node)] = _layer(node, names, kind, names.given(node))
     sizes = {name: _padded(shape, ACTIVATION_BLOCK) for name, shape in shapes.items() if name not in constants}
@@ -242,27 +248,27 @@ def layers_of(graph: Any, shapes: Shapes, constants: set[str]) -> Layers:
     return Layers(whole, sizes, *(sum(prod(shapes[name]) for name in end) for end in ends))
 
 
-def _folds(before: Layer, names: _Graph) -> bool:
+def _folds(before: EngineLayer, names: _Graph) -> bool:
     return before.kind in TAKES and names.reads[before.writes] == 1
 
 
-def _takes_up(before: Layer, names: _Graph) -> bool:
+def _takes_up(before: EngineLayer, names: _Graph) -> bool:
     """Whether a batch normalisation behind `before` becomes part of its weights."""
-    return before.kind in PRODUCTS and names.reads[before.writes] == 1
+    return before.kind in PLAIN_PRODUCTS and names.reads[before.writes] == 1
 
 
 def _clip(node: Any, shapes: Shapes) -> dict[str, float]:
     return {"clip": 2.0 * _padded(shapes[node.output[0]], ACTIVATION_BLOCK)} if node.op_type == "Clip" else {}
 
 
-def _is_swish(node: Any, before: Layer, names: _Graph) -> bool:
+def _is_swish(node: Any, before: EngineLayer, names: _Graph) -> bool:
     """Whether `node` multiplies a tensor with its own sigmoid, which is `before`."""
     if _kind(node) != "Mul" or before.kind != "Sigmoid":
         return False
     return set(names.given(node)) == {*before.reads, before.writes} and names.reads[before.writes] == 1
 
 
-def _layer(node: Any, names: _Graph, kind: str, reads: tuple[str, ...]) -> Layer:
+def _layer(node: Any, names: _Graph, kind: str, reads: tuple[str, ...]) -> EngineLayer:
     writes, more = first_result(node), names.more(node)
     amounts: Counter[str] = Counter(dict(_products(node, names.shapes)) if kind else {})
     if amounts:
@@ -273,11 +279,11 @@ def _layer(node: Any, names: _Graph, kind: str, reads: tuple[str, ...]) -> Layer
         amounts.update(dict(_movement(node, kind, sum(_padded(s, ACTIVATION_BLOCK) for s in moved), names)))
     amounts["operator"] = 1
     counted = {t: float(a) for t, a in amounts.items() if a}
-    return Layer(node.name or writes, node.op_type, counted, reads, writes, more)
+    return EngineLayer(node.name or writes, node.op_type, counted, reads, writes, more)
 
 
 def _movement(node: Any, kind: str, moved: int, names: _Graph) -> Iterator[tuple[str, float]]:
-    """The term of a layer without products. `kind`: its type; `moved`: elements that it reads and writes."""
+    """The term of a layer without products. `kind`: its type. `moved`: elements that it reads and writes."""
     if kind == "Resize":
         mode = next((a.s for a in node.attribute if a.name == "mode"), b"nearest")
         yield "nearest" if mode == b"nearest" else "bilinear", moved
@@ -289,7 +295,7 @@ def _movement(node: Any, kind: str, moved: int, names: _Graph) -> Iterator[tuple
 
 
 def _padded(shape: tuple[int, ...], block: int) -> int:
-    """Elements of a tensor whose channels, its second axis, are rounded up to whole blocks."""
+    """Elements of a tensor with its channels, the second axis, rounded up to whole blocks."""
     if len(shape) != 4:
         return prod(shape)
     return shape[0] * _up(shape[1], block) * shape[2] * shape[3]
@@ -300,7 +306,7 @@ def _up(count: int, block: int) -> int:
 
 
 def _products(node: Any, shapes: Shapes) -> Iterator[tuple[str, float]]:
-    """Products, and what is moved for them; nothing of an operator that multiplies no tensors."""
+    """Products, and what is moved for them; nothing for an operator that multiplies no tensors."""
     if node.op_type not in WITH_PRODUCTS:
         return
     source, out = shapes[node.input[0]], shapes[first_result(node)]

@@ -1,13 +1,15 @@
-"""The whole fit of tensor engines: all engines, what cross-validation says of each, and chips known by anchors only.
+"""The whole fit of tensor engines: numbers of every chip, what cross-validation says of them, and how both are shown.
 
-Rule: whatever is said of an error is of a row whose network no number had seen. A chip's numbers for an engine of which
-there is no row of it are those of a relative, times what the two differ by where both are known; they are `assumed`.
+Whatever is said of an error is of a row whose network no number had seen. A chip without a row of an engine has the
+numbers of a relative, times what the two differ by where both are known; they are `assumed`. The head of a chip's
+profile is written by hand and stays; everything from MARK on is written here.
 """
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -15,15 +17,26 @@ from typing import NamedTuple
 import numpy as np
 
 from trilane.arrays import F64
-from trilane.hw_profiles.engine_layers import Layers
-from trilane.hw_profiles.fit_engines import Fitted, LeftOut, cross_validate, fit_anchors, fit_engine
-from trilane.hw_profiles.fit_priors import Prior
-from trilane.hw_profiles.latency_rows import Latency, layers_of_rows, read_latencies
-from trilane.hw_profiles.schema import ENGINES, EngineName
+from trilane.errors import BadInputError
+from trilane.files import read_text
+from trilane.hw_profiles.engine_layers import NAMES, Layers
+from trilane.hw_profiles.fit_engines import (
+    ON_CHIP_MB,
+    UNITS_OF_RATES,
+    Fitted,
+    LeftOut,
+    Prior,
+    cross_validate,
+    fit_anchors,
+    fit_engine,
+)
+from trilane.hw_profiles.plot import figure_for
+from trilane.hw_profiles.published_times import Latency, layers_of_rows, read_latencies
+from trilane.hw_profiles.schema import ENGINES, NORMAL_80, EngineName
+from trilane.writing import write_atomically
 
-#: Of a normal distribution: 80 % lie within so many standard deviations. Intervals of 80 % are drawn so that they cover
-#: COVERED of the left-out rows: a stranger is less like the networks of the fit than these are like each other.
-NORMAL_80 = 1.2816
+#: Share of the left-out rows that intervals of 80 % are drawn to cover. It is larger because a stranger is
+#: less like the networks of the fit than these are like each other.
 COVERED = 0.87
 #: A chip of which no row is of the engine: its usual rows are minutes, or fell off the engine.
 LEFT_ASIDE = ("865",)
@@ -39,9 +52,38 @@ SIBLING: dict[EngineName, tuple[EngineName, ...]] = {
 }
 ASSUMED_SPREAD = 0.25
 
+BEGIN, END = "<!-- errors: written by `trilane profiles fit-chips` -->", "<!-- end of errors -->"
+#: The engine whose errors are told by family and chip: bytes under the phone's usual runtime.
+USUAL: EngineName = "int8_tflite"
+CLOSE = 0.15
 
-class Rate(NamedTuple):
-    """One of a chip's six numbers. `kind`: of a profile's number."""
+#: The profile with the shared factors, and those of chips.
+SHARED = "hexagon"
+PROFILE_OF = {
+    "8gen1": "snapdragon-8-gen-1",
+    "8gen2": "snapdragon-8-gen-2",
+    "8gen3": "snapdragon-8-gen-3",
+    "8elite": "snapdragon-8-elite",
+    "8elite5": "snapdragon-8-elite-gen-5",
+    "qcs6490": "qcs6490",
+    "sa8295p": "sa8295p",
+    "xelite": "snapdragon-x-elite",
+}
+HEXAGON_OF = {"8gen1": "v69", "8gen2": "v73", "8gen3": "v75", "8elite": "v79", "8elite5": "v81"} | {
+    "qcs6490": "v68",
+    "sa8295p": "v68",
+    "xelite": "v73",
+}
+#: Chips of the 888's generation: their mean is where a chip without rows begins.
+V68 = ("qcs6490", "sa8295p")
+MARK = "# From here on written by `trilane profiles fit-chips`."
+VTCM = "VTCM of its generation"
+#: Shares of a network's time below it are not written.
+LEAST_SHARE = 0.001
+
+
+class ChipRate(NamedTuple):
+    """One of a chip's six numbers. `kind`: kind of a profile's number."""
 
     value: float
     spread: float
@@ -50,9 +92,10 @@ class Rate(NamedTuple):
 
 @dataclass(frozen=True)
 class EngineStudy:
-    """One engine. `left_out`: of the cross-validation.
+    """One engine. `left_out`: rows of the cross-validation.
 
-    `error`: the model's own for a network that is wholly unlike those of the fit, so that intervals cover COVERED.
+    `error`: error of the model itself for a network that is wholly unlike those of the fit; with it, intervals cover
+    COVERED of the rows.
     """
 
     fitted: Fitted
@@ -68,10 +111,10 @@ class EngineStudy:
 
 @dataclass(frozen=True)
 class Study:
-    """All engines. `rates`: of each chip and engine, by key."""
+    """All engines. `rates`: numbers of each chip and engine, by key."""
 
     engines: Mapping[EngineName, EngineStudy]
-    rates: Mapping[tuple[str, EngineName], Mapping[str, Rate]]
+    rates: Mapping[tuple[str, EngineName], Mapping[str, ChipRate]]
 
     @property
     def chips(self) -> tuple[str, ...]:
@@ -79,14 +122,15 @@ class Study:
 
 
 def misses_of(rows: Sequence[LeftOut]) -> tuple[F64, F64, F64]:
-    """Absolute logarithms of predicted over published (rows,); what the numbers leave open; how unlike each is."""
+    """Absolute logarithms of predicted over published, what the numbers leave open, and how unlike each is (rows,)."""
     misses = [abs(math.log(row.predicted_ms / row.row.ms)) for row in rows]
     return np.array(misses), np.array([row.unsure for row in rows]), np.array([row.unlike for row in rows])
 
 
 def own_error(rows: Sequence[LeftOut]) -> float:
-    """The least error of the model, grown in proportion to how unlike a network is, with which intervals around `rows`
-    cover COVERED of them.
+    """The least error of the model with which intervals around `rows` cover COVERED of them.
+
+    It grows in proportion to how unlike a network is to those of the fit.
     """
     misses, unsure, unlike = misses_of(rows)
     beyond = np.sqrt(np.maximum((misses / NORMAL_80) ** 2 - unsure**2, 0)) / unlike
@@ -118,14 +162,14 @@ def study_engine(rows: Sequence[Latency], layers: Mapping[str, Layers]) -> Engin
     return EngineStudy(fitted, left_out, own_error(left_out))
 
 
-def _known(fitted: Fitted, chip: str) -> dict[str, Rate]:
-    return {key: Rate(*prior, "fitted") for key, prior in fitted.rates_of(chip).items()}
+def _known(fitted: Fitted, chip: str) -> dict[str, ChipRate]:
+    return {key: ChipRate(*prior, "fitted") for key, prior in fitted.rates_of(chip).items()}
 
 
 def _assumed(
-    rates: Mapping[tuple[str, EngineName], Mapping[str, Rate]], engines: Sequence[EngineName]
-) -> dict[tuple[str, EngineName], dict[str, Rate]]:
-    """The numbers of chips for engines of which there is no row of them."""
+    rates: Mapping[tuple[str, EngineName], Mapping[str, ChipRate]], engines: Sequence[EngineName]
+) -> dict[tuple[str, EngineName], dict[str, ChipRate]]:
+    """The numbers of chips for engines of which they have no row."""
     found = {}
     for chip, relative in RELATIVE.items():
         for engine in engines:
@@ -135,17 +179,156 @@ def _assumed(
                     key: rate.value / rates[relative, other][key].value for key, rate in rates[chip, other].items()
                 }
                 found[chip, engine] = {
-                    key: Rate(rate.value * ratio[key], ASSUMED_SPREAD, "assumed")
+                    key: ChipRate(rate.value * ratio[key], ASSUMED_SPREAD, "assumed")
                     for key, rate in rates[relative, engine].items()
                 }
     return found
 
 
-def middle(chips: Sequence[Mapping[str, Rate]]) -> dict[str, Prior]:
-    """The geometric mean of chips' numbers; its spread is what the chips differ by, and what is open of each."""
+def middle(chips: Sequence[Mapping[str, ChipRate]]) -> dict[str, Prior]:
+    """The geometric mean of chips' numbers. Its spread joins the differences of the chips and the spread of each."""
     result = {}
     for key in chips[0]:
         logs = np.log([chip[key].value for chip in chips])
         open_ = np.mean([chip[key].spread ** 2 for chip in chips])
         result[key] = Prior(math.exp(logs.mean()), float(np.sqrt(logs.var() + open_)))
     return result
+
+
+def errors_of(rows: Sequence[LeftOut]) -> dict[str, float]:
+    """`rows`, `median` and `p90` of the absolute errors, `close`: share within 15 %, `bias`: median of the errors."""
+    errors = np.array([row.error for row in rows])
+    return {
+        "rows": len(rows),
+        "median": float(np.median(np.abs(errors))),
+        "p90": float(np.quantile(np.abs(errors), 0.9)),
+        "close": float(np.mean(np.abs(errors) <= CLOSE)),
+        "bias": float(np.median(errors)),
+    }
+
+
+def as_markdown(study: Study) -> str:
+    """Two tables: errors by engine, and those of USUAL by family and chip."""
+    return "\n".join([*_by_engine(study), "", *_by_family(study.engines[USUAL].left_out)])
+
+
+def _by_engine(study: Study) -> Iterator[str]:
+    yield "| engine | rows | median | p90 | within 15 % | in the 80 % interval |"
+    yield "|---|---|---|---|---|---|"
+    for name, engine in study.engines.items():
+        all_rows = errors_of(engine.left_out)
+        shares = " | ".join(f"{100 * all_rows[key]:.0f} %" for key in ("median", "p90", "close"))
+        yield f"| `{name}` | {all_rows['rows']:.0f} | {shares} | {100 * engine.coverage:.0f} % |"
+
+
+def _by_family(rows: Sequence[LeftOut]) -> Iterator[str]:
+    chips = sorted({row.row.chip for row in rows})
+    yield f"| median error, `{USUAL}` | {' | '.join(chips)} | all |"
+    yield "|---|" + "---|" * (len(chips) + 1)
+    for family in [*sorted({row.row.family for row in rows}), ""]:
+        of_family = [row for row in rows if family in ("", row.row.family)]
+        cells = [_median([row for row in of_family if row.row.chip in of]) for of in (*([c] for c in chips), chips)]
+        yield f"| {family or 'all'} | {' | '.join(cells)} |"
+
+
+def _median(rows: Sequence[LeftOut]) -> str:
+    return f"{100 * errors_of(rows)['median']:.0f} %" if rows else ""
+
+
+def with_table(text: str, table: str, path: Path) -> str:
+    """Return `text`, the content of `path`, with `table` between BEGIN and END. Raises BadInputError without these."""
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not (begin and end):
+        raise BadInputError(path, "no place for the table", f"a line {BEGIN} and a line {END}")
+    return f"{before}{BEGIN}\n{table}\n{END}{after}"
+
+
+def plot_errors(study: Study, path: Path) -> None:
+    """Draw the published against the predicted time of each left-out row, by engine, on logarithmic axes.
+
+    `path`: path of the file; its ending is one of `trilane.hw_profiles.plot.SUFFIXES`.
+    Raises MissingPartError without Matplotlib, BadInputError for another ending or a file that cannot be written.
+    """
+    figure = figure_for(path, (6.4, 6))
+    axes = figure.subplots()
+    for name, engine in study.engines.items():
+        rows = engine.left_out
+        axes.plot([r.row.ms for r in rows], [r.predicted_ms for r in rows], ".", markersize=4, alpha=0.6, label=name)
+    ends = np.array([0.1, 200.0])
+    axes.plot(ends, ends, color="black", linewidth=0.8)
+    for factor in (1 + CLOSE, 1 / (1 + CLOSE)):
+        axes.plot(ends, factor * ends, color="black", linewidth=0.5, linestyle="--")
+    axes.set(xscale="log", yscale="log", xlabel="published, ms", ylabel="predicted by a fit without the network, ms")
+    axes.set_title("Networks that the fit has not seen; dashed: 15 %")
+    axes.grid(alpha=0.3)
+    axes.legend(loc="lower right", fontsize="small")
+    with write_atomically(path) as draft:
+        figure.savefig(draft, dpi=120)
+
+
+def profile_texts(study: Study, folder: Path, command: str) -> dict[Path, str]:
+    """Return the new text of each profile of `folder` that has numbers of `study`.
+
+    `command`: source that each number states.
+    Raises BadInputError for a chip's profile that is not there.
+    """
+    written = {folder / f"{SHARED}.toml": list(_shared(study, command))}
+    for chip in study.chips:
+        if chip in PROFILE_OF:
+            written[folder / f"{PROFILE_OF[chip]}.toml"] = list(_chip(study, chip, command))
+    return {path: head_of(path) + "\n".join([MARK, *lines]) + "\n" for path, lines in written.items()}
+
+
+def head_of(path: Path) -> str:
+    """The part of a profile that is written by hand. Raises BadInputError without one."""
+    return read_text(path, "a chip's profile, its head written by hand").partition(MARK)[0].rstrip() + "\n\n"
+
+
+def _shared(study: Study, command: str) -> Iterator[str]:
+    source = f"{command}, factors shared by all chips"
+    for name, engine in study.engines.items():
+        yield f"\n[units.dsp.engines.{name}]"
+        yield f"element_bytes = {2 if name.startswith('fp16') else 1}"
+        yield _number("on_chip_mb", ChipRate(ON_CHIP_MB["v68"], 0.1, "published"), VTCM)
+        yield _number("error_fraction", ChipRate(engine.error, 0.3, "fitted"), _errors(engine))
+        yield from _rates(name, _middle_of(study, name), f"{command}, mean of the chips of Hexagon v68")
+        yield f"\n[units.dsp.engines.{name}.seen]"
+        for network, shares in engine.fitted.seen.items():
+            stated = [
+                f"{term} = {share:.3f}" for term, share in zip(NAMES, shares, strict=True) if share >= LEAST_SHARE
+            ]
+            yield f"{network} = {{ {', '.join(stated)} }}"
+        yield f"\n[units.dsp.engines.{name}.factors]"
+        numbers, spreads = engine.fitted.numbers.factors, engine.fitted.spreads.factors
+        for term, value, spread in zip(NAMES, numbers, spreads, strict=True):
+            if term not in UNITS_OF_RATES:
+                yield _number(term, ChipRate(math.exp(value), float(spread), "fitted"), source)
+
+
+def _middle_of(study: Study, name: EngineName) -> Mapping[str, ChipRate]:
+    chips = [study.rates[chip, name] for chip in V68 if (chip, name) in study.rates]
+    return {key: ChipRate(*prior, "fitted") for key, prior in middle(chips).items()}
+
+
+def _errors(engine: EngineStudy) -> str:
+    return f"cross-validation over networks, {len(engine.left_out)} rows: 87 % of them lie in their intervals"
+
+
+def _chip(study: Study, chip: str, command: str) -> Iterator[str]:
+    for name in study.engines:
+        if (chip, name) in study.rates:
+            yield f"\n[units.dsp.engines.{name}]"
+            yield _number("on_chip_mb", ChipRate(ON_CHIP_MB[HEXAGON_OF[chip]], 0.1, "published"), VTCM)
+            yield from _rates(name, study.rates[chip, name], command)
+
+
+def _rates(name: EngineName, rates: Mapping[str, ChipRate], source: str) -> Iterator[str]:
+    yield f"\n[units.dsp.engines.{name}.rates]"
+    for key, rate in rates.items():
+        yield _number(key, rate, source)
+
+
+def _number(key: str, rate: ChipRate, source: str) -> str:
+    stated = f'value = {rate.value:.4g}, kind = "{rate.kind}", spread = {rate.spread:.2g}'
+    return f"{key} = {{ {stated}, source = {json.dumps(source)} }}"

@@ -1,9 +1,9 @@
 """Fits a profile's efficiencies to measured rows.
 
-Rule: there are fewer free numbers than measurements, and each has a physical meaning and a prior: the value and the
-`spread` that the profile states before the fit. The fit minimises the sum of squares of log(predicted / measured) /
-noise and of log(number / prior) / spread, which gives the most probable numbers if both are normally distributed. The
-network's numbers are fitted first, for each unit by itself, then those of the application.
+There are fewer free numbers than measurements, and each has a physical meaning and a prior: the value and the `spread`
+that the profile states before the fit. The fit minimises the sum of squares of log(predicted / measured) / noise and
+of log(number / prior) / spread, which gives the most probable numbers if both are normally distributed. Each of
+`STEPS` starts from the numbers of the steps before it: those of the network, unit by unit, then the application's.
 """
 
 from __future__ import annotations
@@ -21,32 +21,32 @@ import numpy as np
 from trilane.arrays import F64
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.application import Plan, isolated_job_time, reference_frame_ms
-from trilane.hw_profiles.configuration_table import Row, read_table
-from trilane.hw_profiles.fit_steps import STEPS, UNIT_OF_COLUMN, Keys, Step
-from trilane.hw_profiles.load import load_tables, parse_profile
-from trilane.hw_profiles.performance_profiles import corners_of
-from trilane.hw_profiles.reference_networks import reference_network
-from trilane.hw_profiles.schema import Profile
-from trilane.units import SUSTAINED
+from trilane.hw_profiles.profile_files import load_tables, parse_profile
+from trilane.hw_profiles.reference_networks import ConfigurationRow, read_table, reference_network
+from trilane.hw_profiles.schema import Profile, corners_of
+from trilane.units import SUSTAINED, UnitName
 
 MEASURED_UNDER = SUSTAINED
 NORMAL_OVER_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+
+#: Keys of a profile that are multiplied by one factor.
+Keys = tuple[str, ...]
 
 
 class Measurement(NamedTuple):
     """One cell of the table: its row, its column, and its value in milliseconds."""
 
-    row: Row
+    row: ConfigurationRow
     column: str
     ms: float
 
 
 @dataclass(frozen=True)
 class Residual:
-    """One measurement beside the fit. `left_out_ms`: predicted by a fit to all other measurements of the step."""
+    """One measurement beside the fit. `left_out_ms`: prediction by a fit to all other measurements of the step."""
 
     step: str
-    row: Row
+    row: ConfigurationRow
     column: str
     measured_ms: float
     fitted_ms: float
@@ -64,11 +64,11 @@ class Residual:
 
 
 @dataclass(frozen=True)
-class Fit:
+class ProfileFit:
     """The result of a fit.
 
-    `data`: the tables of the fitted profile. `numbers`: value and relative spread of each fitted key. `free_count`: how
-    many numbers were free.
+    `data`: tables of the fitted profile. `numbers`: value and relative spread of each fitted key. `residuals`: each
+    measurement beside the fit. `free_count`: how many numbers were free.
     """
 
     data: Mapping[str, Any]
@@ -82,13 +82,13 @@ class Fit:
         return tuple(dict.fromkeys(r.column for r in self.residuals))
 
     def median_error(self, column: str, *, left_out: bool = False) -> float:
-        """Median absolute relative error of `column`; `left_out`: of the fits that did not see the measurement."""
+        """Median absolute relative error of `column`. `left_out`: take the fits that had not seen the measurement."""
         errors = [abs(r.left_out_error if left_out else r.error) for r in self.residuals if r.column == column]
         return median(errors) if errors else 0.0
 
 
-def measurements(rows: Sequence[Row], step: Step) -> list[Measurement]:
-    """The measurements of `step` in `rows`. That of an application is the middle of its range."""
+def measurements(rows: Sequence[ConfigurationRow], step: Step) -> list[Measurement]:
+    """The measurements of `step` in `rows`. The middle of its range stands for an application's frame time."""
     result = []
     for row in rows:
         for column in step.columns:
@@ -111,16 +111,19 @@ def predicted_ms(profile: Profile, measured: Measurement) -> float:
     return reference_frame_ms(profile, Plan(network, unit), corners)
 
 
-def fit_profile(name: str | Path, table: Path) -> Fit:
+def fit_profile(name: str | Path, table: Path) -> ProfileFit:
     """Fit the profile `name` to the measured rows of `table`. Raises BadInputError, MissingPartError."""
     data, path = load_tables(name)
     parse_profile(data, path)
     return fit(data, path, read_table(table))
 
 
-def fit(data: Mapping[str, Any], path: Path, rows: Sequence[Row]) -> Fit:
-    """Fit the profile of the tables `data`, which are those of the file `path`, to `rows`.
+def fit(data: Mapping[str, Any], path: Path, rows: Sequence[ConfigurationRow]) -> ProfileFit:
+    """Fit a profile to measured rows.
 
+    `data`: tables of the profile.
+    `path`: file of these tables, for messages.
+    `rows`: measured rows.
     Raises BadInputError when there are no more measurements than free numbers, MissingPartError without SciPy.
     """
     fitted: Mapping[str, Any] = data
@@ -144,11 +147,11 @@ def fit(data: Mapping[str, Any], path: Path, rows: Sequence[Row]) -> Fit:
         for keys, spread in zip(step.free, spreads, strict=True):
             numbers |= {key: (_at(fitted, key)["value"], float(spread)) for key in keys}
     numbers |= _from_residuals(residuals, rows)
-    return Fit(fitted, numbers, tuple(residuals), sum(len(step.free) for step in STEPS))
+    return ProfileFit(fitted, numbers, tuple(residuals), sum(len(step.free) for step in STEPS))
 
 
-def _from_residuals(residuals: Sequence[Residual], rows: Sequence[Row]) -> dict[str, tuple[float, float]]:
-    """The model's own error, from its errors on measurements left out; the spread of frame times, from their ranges."""
+def _from_residuals(residuals: Sequence[Residual], rows: Sequence[ConfigurationRow]) -> dict[str, tuple[float, float]]:
+    """The model's own error, from errors on measurements left out, and the spread of frame times, from their ranges."""
     numbers = {}
     for unit in ("dsp", "gpu"):
         errors = [abs(r.left_out_error) for r in residuals if r.column == f"bench_{unit}_ms"]
@@ -163,9 +166,9 @@ def _solve(data: Mapping[str, Any], path: Path, step: Step, measured: Sequence[M
     """Factors on the priors of `step.free`, and the spread of each after the fit.
 
     `data`: tables of the profile with the priors.
-    `path`: of its file, for messages.
-    `step`: of the fit.
-    `measured`: what it is fitted to.
+    `path`: file of these tables, for messages.
+    `step`: step of the fit.
+    `measured`: measurements that the step fits.
     """
     priors = np.array([_at(data, keys[0]).get("spread", 0.5) for keys in step.free])
 
@@ -206,14 +209,14 @@ def _at(data: Mapping[str, Any], key: str) -> dict[str, Any]:
     return quantity
 
 
-def as_toml(result: Fit, name: str, title: str, extends: str, command: str) -> str:
+def as_toml(result: ProfileFit, name: str, title: str, extends: str, command: str) -> str:
     """The text of a TOML file with the fitted numbers.
 
-    `result`: of the fit.
-    `name`: of the new profile.
-    `title`: of the new profile.
+    `result`: result of the fit.
+    `name`: name of the new profile.
+    `title`: title of the new profile.
     `extends`: name of the profile that has all other numbers.
-    `command`: that made the file; it becomes the source of every number.
+    `command`: command that made the file; it becomes the source of every number.
     """
     lines = [
         f"# Written by `{command}`: {result.free_count} numbers from {len(result.residuals)} measurements.",
@@ -233,3 +236,71 @@ def as_toml(result: Fit, name: str, title: str, extends: str, command: str) -> s
             f'{last} = {{ value = {value:.4g}, kind = "fitted", spread = {spread:.2g}, source = {json.dumps(source)} }}'
         )
     return "\n".join(lines) + "\n"
+
+
+class Step(NamedTuple):
+    """One step of the fit.
+
+    `columns`: measured columns that it fits. `free`: groups of keys; one factor multiplies all keys of a group.
+    `noise`: relative error of a measurement.
+    """
+
+    name: str
+    columns: tuple[str, ...]
+    free: tuple[Keys, ...]
+    noise: float
+
+
+def _efficiency(unit: str, *names: str) -> Keys:
+    return tuple(f"units.{unit}.efficiency.{name}" for name in names)
+
+
+def _engine(name: str) -> Keys:
+    return (f"units.dsp.engines.int8_tflite.{name}",)
+
+
+STEPS = (
+    Step(
+        "network on the DSP",
+        ("bench_dsp_ms",),
+        (
+            _engine("rates.arithmetic_tmac_s"),
+            _engine("rates.spill_gb_s"),
+            _engine("factors.normalisation"),
+            ("units.dsp.input_ns_per_element",),
+            ("units.dsp.permute_fixed_ms",),
+            ("units.dsp.fallback_ns_per_element",),
+        ),
+        0.04,
+    ),
+    Step(
+        "network on the GPU",
+        ("bench_gpu_ms",),
+        (
+            _efficiency("gpu", "convolution", "pointwise"),
+            _efficiency("gpu", "depthwise_traffic", "pointwise_traffic"),
+            _efficiency("gpu", "normalisation"),
+            _efficiency("gpu", "permute"),
+            ("units.gpu.input_ns_per_element",),
+            ("units.gpu.permute_fixed_ms",),
+        ),
+        0.12,
+    ),
+    Step(
+        "application",
+        ("app_dsp_ms", "app_gpu_ms"),
+        (
+            ("application.readback_ns_per_byte",),
+            ("application.handover_ms",),
+            ("memory.application_use_fraction",),
+        ),
+        0.1,
+    ),
+)
+#: Measured column -> the unit that runs the network.
+UNIT_OF_COLUMN: dict[str, UnitName] = {
+    "bench_dsp_ms": "dsp",
+    "bench_gpu_ms": "gpu",
+    "app_dsp_ms": "dsp",
+    "app_gpu_ms": "gpu",
+}

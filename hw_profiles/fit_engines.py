@@ -1,13 +1,12 @@
 """Fits the shared terms of tensor engines and the six numbers of each chip to published latencies.
 
-Rule: every number has a prior (`fit_priors.py`); the fit minimises, over all logarithms of numbers,
+Every number has a prior, what is believed before any latency is looked at. The fit minimises, over all logarithms,
 
     sum over rows of (NU + 1) log(1 + r^2 / NU) + sum over numbers of (log(number / prior) / spread)^2,
     r = log(predicted / published) / NOISE,
 
-which gives the most probable numbers if errors follow Student's t distribution, so that a row far off counts little.
-Solved by Gauss and Newton's method with Levenberg's damping; the derivatives of `engine_times.join` are exact. Whatever
-is said of errors comes from fits that have seen none of a network's rows.
+by Gauss and Newton's method with Levenberg's damping and the exact derivatives of `engine_times.join`. That gives the
+most probable numbers if errors follow Student's t distribution, so that a row far off counts little.
 """
 
 from __future__ import annotations
@@ -22,8 +21,7 @@ import numpy as np
 from trilane.arrays import F64, I64
 from trilane.hw_profiles.engine_layers import NAMES, RATES, TERMS, Layers
 from trilane.hw_profiles.engine_times import amounts, join
-from trilane.hw_profiles.fit_priors import ON_CHIP_MB, STEP, Prior, factor_prior, rate_prior
-from trilane.hw_profiles.latency_rows import Latency
+from trilane.hw_profiles.published_times import Latency
 from trilane.hw_profiles.schema import KEY_OF_RATE, EngineName
 
 NOISE, NU = 0.08, 3.0
@@ -36,7 +34,7 @@ COSTS = ("operator", "job")
 
 
 class Numbers(NamedTuple):
-    """Logarithms of an engine's numbers. `factors` (terms,); `rates` (chips, 6): seconds per unit of each rate."""
+    """Logarithms of an engine's numbers. `factors`: (terms,). `rates`: (chips, 6), seconds per unit of each rate."""
 
     factors: F64
     rates: F64
@@ -54,7 +52,7 @@ def _from_flat(flat: F64) -> Numbers:
 class Fitted:
     """An engine's numbers for `chips`, and the spread that the fit leaves of each.
 
-    `seen`: each network of the fit with the terms' shares in its time (terms,), the mean of all chips.
+    `seen`: each network of the fit with the terms' shares in its time (terms,), as the mean over all chips.
     """
 
     engine: EngineName
@@ -93,7 +91,7 @@ def _bytes(engine: EngineName, rate: str) -> int:
 
 
 class _Rows:
-    """Rows as arrays: amounts of each row's layers (equal ones once, with their count), and which chip each is of."""
+    """Rows as arrays: amounts of each row's layers (equal layers once, with their count), and the chip of each row."""
 
     def __init__(self, rows: Sequence[Latency], layers: Mapping[str, Layers], chips: Sequence[str]) -> None:
         tables = [_distinct(layers[row.network], _room(row)) for row in rows]
@@ -115,7 +113,7 @@ class _Rows:
         return 1e3 * whole, grown / whole[:, None]
 
     def slopes(self, shares: F64, chips: int) -> F64:
-        """How the logarithm of each row's time grows with each number's (rows, numbers)."""
+        """How the logarithm of each row's time grows with the logarithm of each number (rows, numbers)."""
         by_rate = np.stack([shares[:, rate == RATE_OF_TERM].sum(axis=1) for rate in range(len(RATES))], axis=1)
         of_chips = np.zeros((len(shares), chips, len(RATES)))
         of_chips[np.arange(len(shares)), self.chip] = by_rate
@@ -130,7 +128,7 @@ _tables: dict[tuple[Layers, int], tuple[F64, F64]] = {}
 
 
 def _distinct(layers: Layers, room: int) -> tuple[F64, F64]:
-    """Amounts of layers that differ, and how often each is there."""
+    """Amounts of layers that differ, and how often each of them occurs."""
     if (layers, room) not in _tables:
         table, count = np.unique(amounts(layers, room), axis=0, return_counts=True)
         _tables[layers, room] = table, count.astype(np.float64)
@@ -149,10 +147,10 @@ def priors(engine: EngineName, chips: Sequence[str]) -> tuple[Numbers, Numbers]:
 
 
 def fit_engine(rows: Sequence[Latency], layers: Mapping[str, Layers], start: Numbers | None = None) -> Fitted:
-    """The numbers that `rows`, all of one engine, speak for.
+    """Fit the numbers of one engine to `rows`, all of that engine.
 
-    `layers`: of each network.
-    `start`: where to begin, if not at the priors.
+    `layers`: layers of each network, by name.
+    `start`: numbers to begin at; None for the priors.
     """
     engine, chips = rows[0].engine, tuple(sorted({row.chip for row in rows}))
     return solve(engine, chips, _Rows(rows, layers, chips), priors(engine, chips), start)
@@ -165,7 +163,7 @@ def solve(
     prior: tuple[Numbers, Numbers],
     start: Numbers | None = None,
 ) -> Fitted:
-    """The most probable numbers. `prior`: their values and spreads before."""
+    """Find the most probable numbers. `prior`: their values and spreads before the fit."""
     mean, spread = (numbers.flat for numbers in prior)
     at, damping = (mean if start is None else start.flat), 1e-2
     cost = _cost(at, data, mean, spread)
@@ -204,9 +202,10 @@ def _derivatives(at: F64, data: _Rows, mean: F64, spread: F64, chips: int) -> tu
 
 
 class LeftOut(NamedTuple):
-    """A row beside what a fit without its network predicts.
+    """A row beside the prediction of a fit without its network.
 
-    `unsure`: relative error that the fit's numbers leave. `unlike`: how unlike the network is to those of the fit.
+    `unsure`: relative error that the fit's numbers leave. `unlike`: how unlike the network is to those of the fit, 0 to
+    1.
     """
 
     row: Latency
@@ -220,7 +219,7 @@ class LeftOut(NamedTuple):
 
 
 def folds(networks: Sequence[str], seed: int = 0) -> Iterator[frozenset[str]]:
-    """FOLDS parts of the networks, drawn by `seed`; ALWAYS is in none."""
+    """Yield FOLDS parts of the networks, drawn by `seed`; ALWAYS is in none of them."""
     others = sorted(set(networks) - {ALWAYS})
     drawn = np.random.default_rng(seed).permutation(len(others))
     for fold in range(FOLDS):
@@ -230,12 +229,12 @@ def folds(networks: Sequence[str], seed: int = 0) -> Iterator[frozenset[str]]:
 def cross_validate(
     rows: Sequence[Latency], layers: Mapping[str, Layers], start: Numbers, parts: Sequence[frozenset[str]] | None = None
 ) -> list[LeftOut]:
-    """Every row predicted by a fit that has seen none of its network's rows.
+    """Predict every row by a fit that has seen none of its network's rows.
 
-    `rows`: of one engine.
-    `layers`: of each network.
+    `rows`: rows of one engine.
+    `layers`: layers of each network, by name.
     `start`: numbers to begin each fit at.
-    `parts`: networks that are left out together; those of `folds` if None.
+    `parts`: networks that are left out together; None for those of `folds`.
     """
     result = []
     for out in folds([row.network for row in rows]) if parts is None else parts:
@@ -245,7 +244,7 @@ def cross_validate(
 
 
 def predict_rows(fitted: Fitted, rows: Sequence[Latency], layers: Mapping[str, Layers]) -> list[LeftOut]:
-    """Each of `rows` beside what `fitted` predicts."""
+    """Each of `rows` beside the prediction of `fitted`."""
     known = [row for row in rows if row.chip in fitted.chips]
     data = _Rows(known, layers, fitted.chips)
     ms, shares = data.predict(fitted.numbers)
@@ -256,10 +255,10 @@ def predict_rows(fitted: Fitted, rows: Sequence[Latency], layers: Mapping[str, L
 
 
 def fit_anchors(fitted: Fitted, before: str, rows: Sequence[Latency], layers: Mapping[str, Layers]) -> Fitted:
-    """A chip of which only `rows` are known: its rates are those of the chip `before` it, one STEP on.
+    """Fit a chip of which only `rows` are known: its prior rates are those of the chip `before` it, one STEP on.
 
-    `fitted`: all other chips; its factors stay.
-    `layers`: of each network.
+    `fitted`: numbers of all other chips; its factors stay.
+    `layers`: layers of each network, by name.
     """
     chip = (rows[0].chip,)
     rates = fitted.numbers.rates[[fitted.chips.index(before)]] - math.log(STEP.value)
@@ -268,3 +267,81 @@ def fit_anchors(fitted: Fitted, before: str, rows: Sequence[Latency], layers: Ma
         Numbers(np.full(len(NAMES), 1e-6), np.full((1, len(RATES)), STEP.spread)),
     )
     return solve(fitted.engine, chip, _Rows(rows, layers, chip), prior)
+
+
+class Prior(NamedTuple):
+    """A number and its relative spread."""
+
+    value: float
+    spread: float
+
+
+#: Terms whose factor is 1 by definition: those that the six rates are counted in.
+UNITS_OF_RATES = ("convolution", "moved", "spill", "weights", "operator", "job")
+#: How much dearer a term is than a plain convolution's, in INT8. Depthwise products are the vector unit's; strides
+#: break the blocks in which activations lie; bilinear interpolation reads four elements; bytes cannot be divided.
+FACTORS: dict[str, Prior] = {
+    "grouped": Prior(1, 0.7),
+    "first": Prior(1, 0.7),
+    "depthwise": Prior(10, 1),
+    "stride": Prior(1, 0.7),
+    "depthwise_stride": Prior(100, 1),
+    "dilation": Prior(1, 0.7),
+    "moved_depthwise": Prior(1, 0.7),
+    "pool": Prior(1, 0.7),
+    "reduction": Prior(1, 0.7),
+    "bilinear": Prior(5, 1),
+    "nearest": Prior(1, 0.7),
+    "concat": Prior(0.3, 1),
+    "constant": Prior(1, 0.3),
+    "divide": Prior(40, 1),
+    "elementwise": Prior(1, 0.7),
+    "batch_norm": Prior(10, 0.7),
+    "normalisation": Prior(10, 1),
+    "shuffle": Prior(10, 1),
+    "depth_to_space": Prior(1, 0.7),
+    "activation": Prior(1, 0.7),
+    "leaky": Prior(1, 0.7),
+    "swish": Prior(2, 0.7),
+    "clip": Prior(1, 0.7),
+    "pad": Prior(0.5, 1),
+    "other": Prior(2, 1),
+    "input": Prior(2, 1),
+    "output": Prior(10, 1),
+}
+#: In FP16 a lone batch normalisation is one multiplication and addition, not several passes with new scales.
+FP16_FACTORS = {**FACTORS, "batch_norm": Prior(2, 0.7)}
+#: The six rates of the 8 Gen 2 in INT8: half of the 26 to 35 TOPS that are claimed; a vector unit's 200 GB/s; half and
+#: two thirds of 67 GB/s of memory; and what a call over FastRPC costs.
+RATES_OF_8_GEN_2: dict[str, float] = {
+    "arithmetic_tmac_s": 17,
+    "activation_gb_s": 200,
+    "spill_gb_s": 30,
+    "weight_gb_s": 40,
+    "operator_us": 1,
+    "job_us": 80,
+}
+#: In FP16 a quarter of the products; bytes are counted as bytes, and fixed costs are a little larger.
+FP16_OVER_INT8 = {"arithmetic_tmac_s": 0.25, "operator_us": 1.5, "job_us": 1.5}
+RATE_SPREAD = 0.5
+#: How many times slower than the 8 Gen 2 a chip is thought to be, by claimed TOPS and memory.
+SLOWER = {"qcs6490": 4, "sa8295p": 1.8, "8gen1": 1.7, "8gen2": 1, "8gen3": 0.75, "8elite": 0.6, "xelite": 1}
+#: Activations that the engine holds, in MB: the VTCM of its generation.
+ON_CHIP_MB = {"v66": 4, "v68": 4, "v69": 4, "v73": 8, "v75": 8, "v79": 8, "v81": 8}
+#: Step from one generation to the next among the other chips. A chip with only a few anchors begins at the numbers of
+#: the chip before it, so many times faster in everything, with this spread.
+STEP = Prior(1.25, 0.15)
+
+
+def rate_prior(engine: EngineName, chip: str, key: str) -> Prior:
+    """The prior of the rate `key` of `chip`. A slower chip has lower rates and higher costs."""
+    value = RATES_OF_8_GEN_2[key] * (FP16_OVER_INT8.get(key, 1) if engine.startswith("fp16") else 1)
+    slower = SLOWER.get(chip, 1)
+    return Prior(value * slower if key in ("operator_us", "job_us") else value / slower, RATE_SPREAD)
+
+
+def factor_prior(engine: EngineName, term: str) -> Prior:
+    """The prior of a term's factor."""
+    if term in UNITS_OF_RATES:
+        return Prior(1, 1e-6)
+    return (FP16_FACTORS if engine.startswith("fp16") else FACTORS)[term]

@@ -1,8 +1,8 @@
 """Reads any ONNX graph for its operators and shapes: float, quantised, or without weights.
 
-Rule: a file is a stranger's. Sizes are checked before anything is taken in, weights are forgotten as soon as their
-shape is known, and no other file is ever opened: data that a graph keeps beside it is only its weights' values, which
-nothing here needs.
+The file may come from a stranger. Sizes are checked before anything is taken in, weights are forgotten as soon as
+their shape is known, and no other file is opened: data that a graph keeps beside it is only the values of weights.
+`image_network` makes a graph whose one input is a picture the network of the application.
 """
 
 from __future__ import annotations
@@ -18,11 +18,10 @@ from onnx import AttributeProto, TensorProto
 
 from trilane.errors import BadInputError
 from trilane.files import HEAD_BYTES, require_file, signature_of_head
-from trilane.hw_profiles.graph_shapes import Shape, with_shapes
-from trilane.hw_profiles.graph_structure import check_structure, in_order
-from trilane.hw_profiles.graph_tensors import forget_data
-from trilane.hw_profiles.network_work import Work, constant_tensors, count_work
-from trilane.hw_profiles.operator_kinds import CONVOLUTIONS, PRODUCTS
+from trilane.hw_profiles.graph_checks import CUT_SHORT, check_structure, forget_data, in_order
+from trilane.hw_profiles.graph_shapes import with_shapes
+from trilane.hw_profiles.network_work import Network, Work, constant_tensors, count_work
+from trilane.hw_profiles.operator_kinds import CONVOLUTIONS, PRODUCTS, Shape
 from trilane.unexpected_value import UnexpectedValue
 
 MAX_BYTES = 512 << 20
@@ -33,28 +32,32 @@ REMEMBERED, REMEMBERED_BYTES = 16, 1 << 20
 OLDEST_OPSET = 7
 #: Operators that have a tensor among their attributes.
 WITH_VALUES = frozenset(["Constant", "ConstantOfShape"])
-EXPORT_AGAIN = "copy or export it again: it may be cut short"
 
 #: What a file says of its numbers: 8-bit weights and activations, floats, or nothing, as it has no weights.
-Numbers = Literal["w8a8", "float", "not said"]
+NumberFormat = Literal["w8a8", "float", "not said"]
+
+MOST_CHANNELS = 64
 
 
 class GraphFile(NamedTuple):
-    """A checked graph. `model`: with a static shape for every tensor and without the values of weights; it may be the
-    one of an earlier reading, so nobody changes it. `work`: what it asks of a unit.
+    """A checked graph.
+
+    `model`: the graph with a static shape for every tensor and without the values of weights. An earlier reading may
+    share it, so nobody changes it. `work`: work that it asks of a unit.
     """
 
     path: Path
     model: onnx.ModelProto
-    numbers: Numbers
+    numbers: NumberFormat
     work: Work
 
 
 def read_graph(path: Path, input_shapes: Mapping[str, Shape] | None = None) -> GraphFile:
-    """The graph in the file, with static shapes. A small file of the same bytes as an earlier one is not checked again.
+    """Read the graph in a file, with static shapes.
 
-    `path`: of an ONNX file.
-    `input_shapes`: of inputs by name, in place of what the file says.
+    A small file of the same bytes as an earlier one is not checked again.
+    `path`: path of an ONNX file.
+    `input_shapes`: shapes of inputs by name, which replace those of the file.
     Raises BadInputError that says what is wrong and how to mend it.
     """
     data = _bytes(path)
@@ -65,8 +68,10 @@ def read_graph(path: Path, input_shapes: Mapping[str, Shape] | None = None) -> G
         raise BadInputError.at(path, error) from None
 
 
-def _checked(data: bytes, folder: Path, given: Sequence[tuple[str, Shape]]) -> tuple[onnx.ModelProto, Numbers, Work]:
-    """`data`: of a file in `folder`. `given`: shapes of inputs by name."""
+def _checked(
+    data: bytes, folder: Path, given: Sequence[tuple[str, Shape]]
+) -> tuple[onnx.ModelProto, NumberFormat, Work]:
+    """Check the bytes of a file. `data`: bytes of a file in `folder`. `given`: shapes of inputs by name."""
     model = _parse(data)
     _check_version(model)
     _check_names(model)
@@ -83,7 +88,7 @@ _checked_before = lru_cache(maxsize=REMEMBERED)(_checked)
 
 def _bytes(path: Path) -> bytes:
     try:
-        size = require_file(path, _expected(), EXPORT_AGAIN)
+        size = require_file(path, _expected(), CUT_SHORT)
         if size > MAX_BYTES:
             remedy = "keep its weights beside it: onnx.save(model, path, save_as_external_data=True)"
             raise BadInputError(path, f"{size >> 20} MiB", _expected(), remedy)
@@ -104,16 +109,16 @@ def _parse(data: bytes) -> onnx.ModelProto:
     try:
         return onnx.load_model_from_string(data)
     except DecodeError:
-        raise UnexpectedValue("bytes that do not parse", _expected(), EXPORT_AGAIN) from None
+        raise UnexpectedValue("bytes that do not parse", _expected(), CUT_SHORT) from None
 
 
 def _check_version(model: onnx.ModelProto) -> None:
     newest = onnx.defs.onnx_opset_version()
     versions = [entry.version for entry in model.opset_import if entry.domain in ("", "ai.onnx")]
     if not model.graph.node:
-        raise UnexpectedValue("no operators", "a graph with operators", EXPORT_AGAIN)
+        raise UnexpectedValue("no operators", "a graph with operators", CUT_SHORT)
     if len(versions) != 1:
-        raise UnexpectedValue(f"{len(versions)} operator sets of ONNX", "one in opset_import", EXPORT_AGAIN)
+        raise UnexpectedValue(f"{len(versions)} operator sets of ONNX", "one in opset_import", CUT_SHORT)
     if not OLDEST_OPSET <= versions[0] <= newest:
         remedy = "convert it: onnx.version_converter.convert_version(model, 17)"
         raise UnexpectedValue(f"operator set {versions[0]}", f"{OLDEST_OPSET} to {newest}", remedy)
@@ -126,7 +131,7 @@ def _check_version(model: onnx.ModelProto) -> None:
 
 
 def _check_names(model: onnx.ModelProto) -> None:
-    """A name whose bytes are no UTF-8 is given as bytes."""
+    """Refuse names that are no UTF-8, which protobuf returns as bytes."""
     graph = model.graph
     names = [entry.name for entry in (*graph.input, *graph.output, *graph.initializer)]
     for node in graph.node:
@@ -135,7 +140,7 @@ def _check_names(model: onnx.ModelProto) -> None:
         "".join(names)
     except TypeError:
         wrong = next(name for name in names if not isinstance(name, str))
-        raise UnexpectedValue(f"the name {wrong!r}", "text in UTF-8", EXPORT_AGAIN) from None
+        raise UnexpectedValue(f"the name {wrong!r}", "text in UTF-8", CUT_SHORT) from None
 
 
 def _tensors(model: onnx.ModelProto) -> Iterator[TensorProto]:
@@ -145,8 +150,8 @@ def _tensors(model: onnx.ModelProto) -> Iterator[TensorProto]:
             yield from (attribute.t for attribute in node.attribute if attribute.type == AttributeProto.TENSOR)
 
 
-def _numbers(model: onnx.ModelProto) -> Numbers:
-    """In integers is a graph whose layers get dequantised activations, or one with layers of integers."""
+def _numbers(model: onnx.ModelProto) -> NumberFormat:
+    """Number format of the graph: integers where layers read dequantised activations, or are layers of integers."""
     graph, constants = model.graph, constant_tensors(model.graph)
     dequantised = {
         name
@@ -160,3 +165,26 @@ def _numbers(model: onnx.ModelProto) -> Numbers:
     weights = {name for node in layers for name in node.input[1:] if name in constants}
     given = {value.name for value in graph.input}
     return "not said" if weights & given else "float"
+
+
+def image_network(graph: GraphFile, layout: str) -> Network:
+    """Return the graph as the application's network, with its work and the size of its picture.
+
+    Of the two possible orders of axes, the one with fewer channels is meant.
+    `graph`: graph of a file.
+    `layout`: layout of the raster stage: `packed` or `split`.
+    Raises BadInputError unless the graph has one input, a picture.
+    """
+    weights = constant_tensors(graph.model.graph)
+    shapes = [
+        tuple(dim.dim_value for dim in value.type.tensor_type.shape.dim)
+        for value in graph.model.graph.input
+        if value.name not in weights
+    ]
+    if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][0] != 1 or min(shapes[0][1], shapes[0][3]) > MOST_CHANNELS:
+        found = ", ".join("x".join(map(str, shape)) for shape in shapes)
+        expected = f"one picture for the application: 1xCxHxW or 1xHxWxC, C at most {MOST_CHANNELS}"
+        raise BadInputError(graph.path, f"inputs {found}", expected, "without --application it is predicted by itself")
+    _, first, second, third = shapes[0]
+    height, width, channels = (second, third, first) if first <= third else (first, second, third)
+    return Network({"network": str(graph.path)}, height, width, channels, layout, graph.work)

@@ -1,7 +1,9 @@
-"""Static shapes of all tensors of a graph, by ONNX's own inference.
+"""Gives every tensor of a graph a static shape, by ONNX's own inference and by folding of known values.
 
-Rule: a shape is inferred, or the file states it where ONNX knows no rule; a shape that stays unknown is an error that
-names the first operator behind it.
+A shape is inferred, or the file states it where ONNX knows no rule. A shape that stays unknown is an error that names
+the first operator behind it. Exporters compute sizes and axes by chains of operators, for a flattening, a repeat or an
+attention, and ONNX's inference does not see through them. `fold` replaces such operators by their values; it bounds
+what they would make before it makes it.
 """
 
 from __future__ import annotations
@@ -9,17 +11,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from math import prod
 
+import numpy as np
 import onnx
-from onnx import TensorProto
+from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
+from onnx.reference import ReferenceEvaluator
 
-from trilane.hw_profiles.graph_folding import fold
-from trilane.hw_profiles.graph_structure import EXPORT_AGAIN, called
-from trilane.hw_profiles.graph_tensors import KEPT_ELEMENTS, check_size, is_ordinary
+from trilane.hw_profiles.graph_checks import EXPORT_AGAIN, KEPT_ELEMENTS, called, check_size, is_ordinary
 from trilane.hw_profiles.network_work import constant_tensors
-from trilane.hw_profiles.operator_kinds import CONVOLUTIONS
+from trilane.hw_profiles.operator_kinds import CONVOLUTIONS, OF_SHAPES, Shape
 from trilane.unexpected_value import UnexpectedValue
 
-Shape = tuple[int, ...]
 LONGEST_FOUND = 240
 SIZES_INSIDE = "save it with small tensors inside: onnx.save(..., size_threshold=1024)"
 #: Operators whose result has the shape of their first input, though ONNX does not infer it. They are looked at as
@@ -35,12 +37,26 @@ STAND_INS = {
     ("com.microsoft", "DequantizeLinear"): "DequantizeLinear",
 }
 
+Values = dict[str, NDArray[np.generic]]
+
+#: Operators whose results are no larger than their inputs together, or than the product of two of them.
+_BOUNDED = frozenset(
+    (
+        *("Add", "Sub", "Mul", "Div", "Mod", "Min", "Max", "Neg", "Abs", "Floor", "Ceil", "Round", "Sqrt", "Pow"),
+        *("Equal", "Greater", "GreaterOrEqual", "Less", "LessOrEqual", "And", "Or", "Not", "Where", "Cast"),
+        *("Concat", "Gather", "Slice", "Squeeze", "Unsqueeze", "Reshape", "Transpose", "Identity", "Split"),
+        *("ReduceProd", "ReduceSum", "ReduceMax", "ReduceMin"),
+    )
+)
+#: What a damaged chain makes the evaluator raise.
+_FAILURES = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
+
 
 def with_shapes(model: onnx.ModelProto, given: Mapping[str, Shape]) -> onnx.ModelProto:
-    """`model` with the shape of every tensor among its value_info.
+    """Return `model` with the shape of every tensor in its value_info.
 
-    `model`: is changed.
-    `given`: shapes of inputs by name, instead of those of the file.
+    `model`: model of the graph; it is changed in place.
+    `given`: shapes of inputs by name, which replace those of the file.
     Raises UnexpectedValue where a shape is unknown, contradictory or too large.
     """
     weights = {tensor.name for tensor in model.graph.initializer}
@@ -76,7 +92,7 @@ def _known(
 
 
 def _give(graph: onnx.GraphProto, inputs: Sequence[onnx.ValueInfoProto], given: Mapping[str, Shape]) -> None:
-    """Set the shapes of inputs. What the file says of other shapes may be wrong then, and is forgotten."""
+    """Set the shapes of inputs. The file's other shapes may no longer hold then, so they are forgotten."""
     changed = [value for value in inputs if value.name in given]
     for value in changed:
         kind = value.type.tensor_type
@@ -102,7 +118,7 @@ def _check_input(value: onnx.ValueInfoProto) -> None:
 
 
 def _inferred(model: onnx.ModelProto) -> dict[str, onnx.ValueInfoProto]:
-    """The shape of each tensor that is known, by name."""
+    """The inferred value of each tensor, by name."""
     looked_at = model
     if any((node.domain, node.op_type) in STAND_INS for node in model.graph.node):
         looked_at = onnx.ModelProto()
@@ -127,7 +143,7 @@ def _replace(node: onnx.NodeProto, op_type: str) -> None:
 def _check_all(
     graph: onnx.GraphProto, inferred: Mapping[str, onnx.ValueInfoProto], shapes: Mapping[str, Shape]
 ) -> None:
-    """Every result has a shape, which may be empty only where it follows from constants."""
+    """Check that every result has a shape. It may be empty only where it follows from constants."""
     constants = constant_tensors(graph)
     for node in graph.node:
         for name in node.output:
@@ -180,7 +196,7 @@ def _unknown(
 
 
 def _keeps_sizes_outside(graph: onnx.GraphProto) -> bool:
-    """Whether the data of a small tensor of integers, as sizes and axes are, is in another file."""
+    """Whether another file has the data of a small tensor of integers, such as sizes and axes."""
     return any(
         tensor.data_type == TensorProto.INT64 and 0 < prod(tensor.dims) <= KEPT_ELEMENTS
         for tensor in graph.initializer
@@ -193,7 +209,7 @@ def _has_schema(node: onnx.NodeProto) -> bool:
 
 
 def _sizes(value: onnx.ValueInfoProto, least: int = 1) -> Shape | None:
-    """The static shape of a tensor of sizes from `least` on; None when it has none."""
+    """Static shape of a tensor whose sizes are at least `least`; None when it has none."""
     kind = value.type.tensor_type
     if not kind.HasField("shape"):
         return None
@@ -209,3 +225,95 @@ def _shown(value: onnx.ValueInfoProto) -> str:
         return f"{value.name!r} of unknown shape"
     sizes = (str(d.dim_value) if d.HasField("dim_value") else d.dim_param or "?" for d in kind.shape.dim)
     return f"{value.name!r} of [{', '.join(sizes)}]"
+
+
+def fold(model: onnx.ModelProto, shapes: Mapping[str, tuple[int, ...]]) -> bool:
+    """Replace operators that only compute with known numbers by their values. Return whether there were any.
+
+    `model`: model of the graph; it is changed in place.
+    `shapes`: shape of each tensor that has a known one, by name.
+    """
+    graph = model.graph
+    known: Values = {}
+    for tensor in graph.initializer:
+        if prod(tensor.dims) <= KEPT_ELEMENTS:
+            _keep(known, [tensor.name], _read(tensor))
+    left, folded = list[onnx.NodeProto](), Values()
+    for node in graph.node:
+        found = _results(node, known, shapes, model.opset_import)
+        _keep(known, node.output, found)
+        if found and node.op_type != "Constant":
+            folded.update(zip(node.output, found, strict=False))
+        else:
+            left.append(node)
+    if folded:
+        del graph.node[:]
+        graph.node.extend(left)
+        graph.initializer.extend(numpy_helper.from_array(value, name) for name, value in folded.items())
+    return bool(folded)
+
+
+def _keep(known: Values, names: Sequence[str], values: Sequence[NDArray[np.generic]]) -> None:
+    known.update({name: value for name, value in zip(names, values, strict=False) if value.size <= KEPT_ELEMENTS})
+
+
+def _read(tensor: onnx.TensorProto) -> list[NDArray[np.generic]]:
+    """The values of a small tensor; nothing when they were forgotten or are kept outside the file."""
+    try:
+        return [numpy_helper.to_array(tensor)]
+    except _FAILURES:
+        return []
+
+
+def _results(
+    node: onnx.NodeProto,
+    known: Values,
+    shapes: Mapping[str, tuple[int, ...]],
+    opsets: Sequence[onnx.OperatorSetIdProto],
+) -> list[NDArray[np.generic]]:
+    """The values that `node` makes; nothing where it must not be evaluated."""
+    if node.domain not in ("", "ai.onnx"):
+        return []
+    if node.op_type in OF_SHAPES and node.input and node.input[0] in shapes:
+        return _of_shape(node, shapes[node.input[0]])
+    inputs = [known.get(name) for name in node.input if name]
+    values = [value for value in inputs if value is not None]
+    if len(values) < len(inputs) or not _is_small(node, values):
+        return []
+    feeds = dict(zip((name for name in node.input if name), values, strict=True))
+    graph = helper.make_graph([node], "one", [_info(name, value) for name, value in feeds.items()], _ends(node))
+    try:
+        with np.errstate(all="ignore"):
+            found = ReferenceEvaluator(helper.make_model(graph, opset_imports=opsets)).run(None, feeds)
+    except _FAILURES:
+        return []
+    results = [np.asarray(value) for value in found]
+    return results if all(value.size <= KEPT_ELEMENTS for value in results) else []
+
+
+def _of_shape(node: onnx.NodeProto, shape: tuple[int, ...]) -> list[NDArray[np.generic]]:
+    bounds = {a.name: a.i for a in node.attribute}
+    if node.op_type == "Size":
+        return [np.array(prod(shape), np.int64)]
+    return [np.array(shape[bounds.get("start", 0) : bounds.get("end", len(shape))], np.int64)]
+
+
+def _is_small(node: onnx.NodeProto, values: Sequence[NDArray[np.generic]]) -> bool:
+    """Whether the result of `node` for `values` is bounded, and small."""
+    if node.op_type == "Constant":
+        return all(prod(a.t.dims) <= KEPT_ELEMENTS for a in node.attribute if a.name == "value")
+    if node.op_type == "Range" and len(values) == 3 and all(value.size == 1 for value in values):
+        first, last, step = (float(value.item()) for value in values)
+        return step != 0 and abs(last - first) <= KEPT_ELEMENTS * abs(step)
+    if node.op_type in ("ConstantOfShape", "Expand") and values:
+        sizes = values[-1].astype(np.int64).ravel().tolist()
+        return all(size >= 0 for size in sizes) and prod(sizes) * values[0].size <= KEPT_ELEMENTS
+    return node.op_type in _BOUNDED and bool(values)
+
+
+def _info(name: str, value: NDArray[np.generic]) -> onnx.ValueInfoProto:
+    return helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(value.dtype), value.shape)
+
+
+def _ends(node: onnx.NodeProto) -> list[onnx.ValueInfoProto]:
+    return [helper.make_empty_tensor_value_info(name) for name in node.output]

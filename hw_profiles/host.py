@@ -1,7 +1,9 @@
-"""This machine's cores, and the units on them where nothing was measured. Rule: they share only when there are too few.
+"""This machine: its cores, the units on them, and the numbers of the profile `host` that depend on it.
 
-The cores are those that this process may use; a quota of the control group lowers their number. The threads of a unit
-spin between jobs only when no other unit shares its cores. `trilane.scheduler.placement` places what was measured.
+The cores are those that this process may use; a quota of the control group lowers their number. Units share cores only
+when there are too few. Nothing is measured here: every number of `host_tables` says in its `source` what it was
+computed from, or on which other machine it was measured. `host_model.py` lays over them what was measured of this one,
+and `trilane.scheduler.placement` places units by measured times.
 """
 
 from __future__ import annotations
@@ -10,14 +12,40 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from trilane import machine
-from trilane.errors import BadInputError, did_you_mean
+from trilane.errors import BadInputError, MissingPartError, did_you_mean, package_line
+from trilane.hw_profiles.schema import Profile
 from trilane.pipeline.description import UnitSettings
+from trilane.scheduler.placement import Ranked
 from trilane.scheduler.places import FULL, Core, Place, Placement, has_own_cores
+from trilane.scheduler.stats import NS_PER_MS
 from trilane.units import UNITS
 
 CORES = "UNIT=LIST, such as dsp=0,1 or dsp=2-5"
+
+#: CPU flag -> INT8 and FP32 multiply-accumulates per cycle and core. The first flag that the machine has is used.
+RATES = {
+    "avx512_vnni": (128, 32),
+    "avx_vnni": (64, 16),
+    "avx2": (32, 16),
+    "asimddp": (32, 8),
+    "": (8, 4),
+}
+FALLBACK_GHZ = 2.5
+ZEN_5 = "ResNet18 of width 64 at 512x512 on four Zen 5 cores"
+ZEN_3 = "ResNet18 of width 64 at 512x512 on four Zen 3 cores, docs/networks.md"
+#: CPU flag -> how many times faster each runtime is than ONNX Runtime in FP32, kind of these numbers, their source.
+RUNTIMES: dict[str, tuple[dict[str, float], str, str]] = {
+    "avx512_vnni": ({"openvino": 3.7, "ort": 2.2}, "measured", ZEN_5),
+    "avx_vnni": ({"openvino": 3.7, "ort": 2.2}, "assumed", f"like {ZEN_5}"),
+    "avx2": ({"openvino": 1.97, "ort": 1.28}, "measured", ZEN_3),
+    "asimddp": ({"openvino": 1.0, "ort": 1.5}, "assumed", "OpenVINO has few INT8 kernels for ARM"),
+    "": ({"openvino": 1.0, "ort": 1.0}, "assumed", "nothing is known of such a CPU"),
+}
+
+SHOWN = 8  # placements, beside the one that was taken
 
 
 def usable_cores() -> tuple[int, ...]:
@@ -59,18 +87,18 @@ def split_cores(cores: tuple[int, ...]) -> dict[str, tuple[int, ...]]:
 
 
 def rule_placement(cores: tuple[int, ...], asked: Mapping[str, tuple[int, ...]] | None = None) -> Placement:
-    """`split_cores` with a thread for each core of a unit; `asked`: units whose cores were asked for."""
+    """`split_cores` with a thread for each core of a unit. `asked`: cores of the units that the user chose them for."""
     split = {**split_cores(cores), **(asked or {})}
     return {unit: Place(own, len(own)) for unit, own in split.items()}
 
 
 def host_units(cores: tuple[int, ...] | None = None) -> dict[str, UnitSettings]:
-    """Settings of the three units on `cores` of this machine, None for all usable ones, by `split_cores`."""
+    """Settings of the three units by `split_cores`. `cores`: cores of this machine; None for all usable ones."""
     return settings_of(rule_placement(cores or usable_cores()))
 
 
 def settings_of(placement: Placement) -> dict[str, UnitSettings]:
-    """The settings of units that are placed so."""
+    """Settings of the units of a placement. Threads spin between jobs only on cores that no other unit shares."""
     return {
         unit: UnitSettings(cores=place.cores, threads=place.threads, spin=has_own_cores(unit, placement))
         for unit, place in placement.items()
@@ -113,7 +141,7 @@ def _listed(text: str, listed: str) -> tuple[int, ...]:
 def host_cores(numbers: Sequence[int]) -> tuple[Core, ...]:
     """What the kernel says of the cores with these numbers: which are siblings, and how fast each type is.
 
-    Where it says nothing, a core is a physical one, and as fast as the others.
+    Where it says nothing, a core counts as a physical one that is as fast as the others.
     """
     root = machine.here.sys / "devices/system/cpu"
     siblings = {number: _number(root / f"cpu{number}/topology/thread_siblings_list", number) for number in numbers}
@@ -130,9 +158,103 @@ def host_cores(numbers: Sequence[int]) -> tuple[Core, ...]:
 
 
 def _number(file: Path, otherwise: int) -> int:
-    """The first number in a file."""
+    """The first number in a file; `otherwise` without one."""
     try:
         found = re.match(r"\d+", file.read_text())
     except OSError:
         return otherwise
     return int(found[0]) if found else otherwise
+
+
+def host_tables() -> dict[str, Any]:
+    """Tables that are laid over those of `host.toml`: title, peak rates of the units, speeds of the runtimes."""
+    cores = len(usable_cores())
+    ghz = machine.here.clock_ghz()
+    known_ghz = ghz if ghz > 0 else FALLBACK_GHZ
+    flags = machine.here.cpu_flags()
+    flag = next(name for name in RATES if name in flags or not name)
+    clock = f"{known_ghz:.1f} GHz" + ("" if ghz > 0 else " (not told, assumed)")
+    split = split_cores(usable_cores())
+    core = {unit: f"core {own[0]}" for unit, own in split.items()}
+    return {
+        "title": f"this machine: {cores} cores, {clock}, {flag or 'no vector products'}",
+        "units": {
+            "cpu": {**_unit(1, known_ghz, flag, clock), "core": core["cpu"]},
+            "gpu": {**_unit(1, known_ghz, flag, clock), "core": core["gpu"]},
+            "dsp": {
+                **_unit(network_threads(), known_ghz, flag, clock),
+                "core": core["dsp"],
+                "threads": network_threads(),
+                "runtimes": _runtimes(flag),
+            },
+        },
+    }
+
+
+def network_threads() -> int:
+    """Number of cores whose rates the DSP unit of the profile `host` has."""
+    return max(1, len(usable_cores()) - 2)
+
+
+def _runtimes(flag: str) -> dict[str, Any]:
+    speeds, kind, source = RUNTIMES[flag]
+    return {name: {"value": speed, "kind": kind, "source": source} for name, speed in speeds.items()}
+
+
+def _unit(cores: int, ghz: float, flag: str, clock: str) -> dict[str, Any]:
+    int8, fp32 = RATES[flag]
+    source = f"{cores} cores x {clock} x {{}} products a cycle ({flag or 'scalar'})"
+
+    def peak(per_cycle: int) -> dict[str, Any]:
+        value = cores * ghz * per_cycle / 1e3
+        return {"value": value, "kind": "assumed", "spread": 0.3, "source": source.format(per_cycle)}
+
+    return {"peak_int8_tmac_s": peak(int8), "peak_fp16_tmac_s": peak(fp32), "peak_fp32_tmac_s": peak(fp32)}
+
+
+def fastest_runtime(profile: Profile, installed: Sequence[str]) -> tuple[str, str]:
+    """Choose the fastest of the `installed` runtimes by the profile's DSP unit. Return its name and the reason.
+
+    Raises MissingPartError when the profile has a number for none of them.
+    """
+    speeds = {name: profile.units["dsp"].runtimes[name] for name in installed if name in profile.units["dsp"].runtimes}
+    if not speeds:
+        raise MissingPartError("no runtime that the host profile knows is installed", package_line("onnxruntime"))
+    name = max(speeds, key=lambda runtime: speeds[runtime].or_else(0.0))
+    times = ", ".join(f"{runtime} {speed.or_else(0.0):g}" for runtime, speed in speeds.items())
+    return name, f"times the speed of FP32, by the host profile: {times}; {speeds[name].source}"
+
+
+def described(placement: Placement) -> str:
+    """Text of a placement, such as `cpu 0, gpu 1, dsp 0,1 (2 threads)`."""
+    return ", ".join(f"{unit} {_cores(place)}" for unit, place in placement.items())
+
+
+def _cores(place: Place) -> str:
+    listed = ",".join(map(str, place.cores))
+    if len(place.cores) == 1:
+        return listed
+    return f"{listed} ({place.threads} thread{'s' if place.threads > 1 else ''})"
+
+
+def unit_rows(placement: Placement) -> dict[str, Any]:
+    """`cores` and `threads` of each unit, as JSON takes them."""
+    return {unit: {"cores": list(place.cores), "threads": place.threads} for unit, place in placement.items()}
+
+
+def placement_of(rows: Mapping[str, Any]) -> Placement:
+    """The placement that `unit_rows` made `rows` of."""
+    return {unit: Place(tuple(row["cores"]), row["threads"]) for unit, row in rows.items()}
+
+
+def predictions(best: Ranked, rule: Ranked, found: Sequence[Ranked]) -> dict[str, Any]:
+    """Computed keys of a placement in a report: frame times in ms of the best, of the rule's and of the next best."""
+    others = [each for each in found if each.placement != best.placement][:SHOWN]
+    return {
+        "predicted_ms": best.frame_ns / NS_PER_MS,
+        "rule_ms": rule.frame_ns / NS_PER_MS,
+        "rule": unit_rows(rule.placement),
+        "alternatives": [
+            {"units": unit_rows(each.placement), "predicted_ms": each.frame_ns / NS_PER_MS} for each in others
+        ],
+    }

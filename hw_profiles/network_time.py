@@ -1,41 +1,61 @@
-"""The time of one network on one unit, operator by operator, what bounds each, and how far to trust the sum.
-
-Rule: pure functions of a network's counts and of a profile's numbers; `operator_times.py` has the cost of an operator,
-this file says what people ask of it.
+"""The time of one network by itself on one unit: each operator, what bounds it, and how far to trust the sum.
 
     time = price(profile, work, "dsp", corners_of(profile, "burst"))
     time.total_ms, time.operators[0].bound, interval(profile, work, time).why
 
-The parts of the sum are `job_ms`, which belongs to no operator (waking the unit, conversion of the input), and the
-operators, in the order of the file. An operator that the runtime folds into another one is not among them.
+`job_ms` is the part that belongs to no operator: waking the unit, conversion of the input. An operator that the
+runtime folds into another one is not listed. `predict_network` adds power, rates and minutes; other units are idle.
 """
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from trilane.arrays import F64
-from trilane.hw_profiles.application import relative_error
-from trilane.hw_profiles.engine_layers import NAMES, Layer
+from trilane.errors import BadInputError
+from trilane.hw_profiles.engine_layers import NAMES, EngineLayer
 from trilane.hw_profiles.engine_times import BOUNDS, Bound, engine_time, numbers_of
+from trilane.hw_profiles.graph_file import GraphFile, NumberFormat
+from trilane.hw_profiles.host_model import UNMEASURED, with_known_intervals
 from trilane.hw_profiles.network_work import Operator, Work
-from trilane.hw_profiles.operator_times import JobTime, Machine, job_time, machine_of
-from trilane.hw_profiles.performance_profiles import Corners
-from trilane.hw_profiles.schema import Profile, Unit
-from trilane.hw_profiles.unit_times import fallback_ms, layer_times, time_on
-from trilane.units import UNITS, UnitName
+from trilane.hw_profiles.operator_kinds import COMPILED
+from trilane.hw_profiles.over_time import (
+    Moment,
+    caps_of,
+    ends_of,
+    settled_corners,
+    temperatures_of,
+    timeline_of,
+    warm_up,
+)
+from trilane.hw_profiles.profile_files import HOST
+from trilane.hw_profiles.rates import NOTHING, FrameInterval, FrameLoad, Wanted, answers, device_power
+from trilane.hw_profiles.schema import NORMAL_80, Corners, EngineRuntime, Profile, Unit, corners_of
+from trilane.hw_profiles.unit_times import (
+    JobTime,
+    UnitNumbers,
+    fallback_ms,
+    job_time,
+    layer_times,
+    machine_of,
+    relative_error,
+    time_on,
+)
+from trilane.units import BURST, UNITS, UnitName
 
-#: A term is named where it alone makes the time uncertain by so much.
+#: Relative error from which a term is named that alone makes the time so uncertain.
 NAMED_FROM = 0.05
-#: Of a normal distribution: how many standard deviations have 80 % between them and their negative.
-NORMAL_80 = 1.2816
+
+#: Reason that is given where the time is only a lower bound.
+INSIDE = "it holds a compiled network, of which only the ends are seen: price the network that it was made from"
 
 
 class OperatorTime(NamedTuple):
-    """Milliseconds of one operator. `op_type`: of ONNX. `bound`: the largest of its parts."""
+    """Time of one operator. `op_type`: its ONNX type. `bound`: what the largest part of its time is spent on."""
 
     name: str
     op_type: str
@@ -45,7 +65,7 @@ class OperatorTime(NamedTuple):
 
 @dataclass(frozen=True)
 class NetworkTime:
-    """Milliseconds of one job. `job_ms`: what belongs to no operator. `operators`: in the order of the file."""
+    """Time of one job. `job_ms`: the part that belongs to no operator. `operators`: in the order of the file."""
 
     unit: UnitName
     job_ms: float
@@ -57,7 +77,7 @@ class NetworkTime:
 
 
 class Interval(NamedTuple):
-    """Where the time is with a probability of 80 %, in milliseconds, and `why` in plain sentences."""
+    """Interval that holds the time with a probability of 80 %, in milliseconds, and `why` in plain sentences."""
 
     low_ms: float
     high_ms: float
@@ -72,10 +92,10 @@ def spread_of(around: Interval) -> float:
 def price(profile: Profile, work: Work, unit: UnitName, corners: Corners) -> NetworkTime:
     """The time of one job of the network when nothing else runs.
 
-    `profile`: of the chip.
-    `work`: of the network; of several hundred operators, too.
-    `unit`: that runs it.
-    `corners`: of all units.
+    `profile`: hardware profile of the chip.
+    `work`: work of the network, which may have several hundred operators.
+    `unit`: unit that runs it.
+    `corners`: corner of each unit.
     """
     of_unit, clock = profile.units[unit], profile.units[unit].clock(corners[UNITS.index(unit)])
     whole = time_on(of_unit, profile.memory, work, clock)
@@ -92,15 +112,15 @@ def price(profile: Profile, work: Work, unit: UnitName, corners: Corners) -> Net
     return NetworkTime(unit, whole.total_ms - sum(o.ms for o in operators), operators)
 
 
-def _by_engine(layer: Layer, seconds: F64) -> OperatorTime:
+def _by_engine(layer: EngineLayer, seconds: F64) -> OperatorTime:
     return OperatorTime(layer.name, layer.op_type, 1e3 * float(seconds.sum()), BOUNDS[int(seconds.argmax())])
 
 
-def _on_cpu(layer: Layer, on_cpu: Mapping[str, float]) -> OperatorTime:
+def _on_cpu(layer: EngineLayer, on_cpu: Mapping[str, float]) -> OperatorTime:
     return OperatorTime(layer.name, layer.op_type, on_cpu.get(layer.name, 0.0), "activation traffic")
 
 
-def _by_roofline(operator: Operator, machine: Machine) -> OperatorTime:
+def _by_roofline(operator: Operator, machine: UnitNumbers) -> OperatorTime:
     bare = job_time(Work((), 0, 1, 0), machine).total_ms
     parts = dict(job_time(Work((operator,), 0, 1, 0), machine).parts)
     parts["fixed"] -= bare
@@ -115,9 +135,9 @@ def _by_roofline(operator: Operator, machine: Machine) -> OperatorTime:
 def interval(profile: Profile, work: Work, time: NetworkTime) -> Interval:
     """The 80 % interval around `time`: the model's own error, and what its numbers leave open for this network.
 
-    `profile`: of the chip.
-    `work`: of the network.
-    `time`: of `price`.
+    `profile`: hardware profile of the chip.
+    `work`: work of the network.
+    `time`: result of `price`.
     """
     unit = profile.units[time.unit]
     job = time_on(unit, profile.memory, work)
@@ -144,16 +164,173 @@ def interval(profile: Profile, work: Work, time: NetworkTime) -> Interval:
 
 
 def _likeness(job: JobTime) -> str:
-    """How unlike the network is to the nearest of the fit, in words."""
+    """Say in words how unlike the network is to the nearest one of the fit."""
     if not job.like:
         return "its profile names no network that its numbers were fitted to"
     return f"of those {job.like} is most like it; {job.unlike:.0%} of the time goes into other work"
 
 
 def _ill_known(work: Work, unit: Unit) -> list[tuple[str, float, float]]:
-    """The terms that make the time uncertain: name, share of the time, relative spread of what they cost."""
+    """The terms that make the time uncertain: name, share of the time, relative spread of their cost."""
     assert unit.engine is not None
     factors = unit.engine.factors
     shares = engine_time(work.layers, numbers_of(unit.engine)).shares
     all_terms = [(n, float(s), factors[n].relative_error) for n, s in zip(NAMES, shares, strict=True) if n in factors]
     return [term for term in all_terms if term[1] * term[2] >= NAMED_FROM]
+
+
+class _Running(NamedTuple):
+    """A network that runs without pause. `frame_ms`: time between two results. `busy`: share of the time, by unit."""
+
+    frame_ms: float
+    busy: Mapping[str, float]
+
+
+def in_precision(profile: Profile, unit: UnitName, numbers: NumberFormat, asked: str | None = None) -> Profile:
+    """Return `profile` with the unit computing in the network's precision.
+
+    `unit`: unit that runs the network.
+    `numbers`: what the file says of its numbers. A network of floats runs in FP16 on a unit for integers. Any other one
+    runs in the unit's own precision, because a file without weights says nothing.
+    `asked`: int8, fp16 or fp32 instead.
+    """
+    own = profile.units[unit].precision
+    precision = asked or ("fp16" if numbers == "float" and own == "int8" else own)
+    changed = profile.units[unit].model_copy(update={"precision": precision})
+    return profile.model_copy(update={"units": {**profile.units, unit: changed}})
+
+
+def under_runtime(profile: Profile, unit: UnitName, runtime: EngineRuntime | None) -> Profile:
+    """Return `profile` with the unit's tensor engine under `runtime`; None keeps the unit's own.
+
+    `unit`: unit that runs the network, in the network's precision.
+    Raises BadInputError where the profile has no numbers for it.
+    """
+    if runtime is None:
+        return profile
+    changed = profile.units[unit].model_copy(update={"engine_runtime": runtime})
+    if changed.engine is None:
+        found = f"{runtime} for the {unit} of {profile.name} in {changed.precision}"
+        known = [f"{', '.join(each.engines)} of the {name}" for name, each in profile.units.items() if each.engines]
+        expected = " or ".join(known) or "a chip with a tensor engine"
+        raise BadInputError("engine runtime", found, expected, "without it a unit is priced as its profile says")
+    return profile.model_copy(update={"units": {**profile.units, unit: changed}})
+
+
+def predict_network(
+    profile: Profile,
+    graph: GraphFile,
+    unit: UnitName,
+    performance_profile: str = BURST,
+    minutes: float = 0.0,
+    governor: str | None = None,
+    wanted: Wanted = NOTHING,
+) -> dict[str, Any]:
+    """Return everything about one network on one unit, as plain data.
+
+    `profile`: hardware profile of the chip, with the unit in the network's precision.
+    `graph`: graph of the network, from a file.
+    `unit`: unit that runs it.
+    `performance_profile`: its name; published latencies are taken to be under `burst`.
+    `minutes`: virtual time from a cold start, at the wanted rate or as fast as it can; 0 for none.
+    `governor`: name in GOVERNORS; None for the profile's own.
+    `wanted`: a rate that may hold or not, and a limit of power.
+    Raises BadInputError for an unknown name, a time out of range, and operators that cannot be counted.
+    """
+    work, corners = graph.work, corners_of(profile, performance_profile)
+    time = price(profile, work, unit, corners)
+    around = interval(profile, work, time)
+
+    known = {corners: time.total_ms}
+
+    def ms_at(at: Corners) -> float:
+        if at not in known:
+            known[at] = price(profile, work, unit, at).total_ms
+        return known[at]
+
+    def running(at: Corners) -> _Running:
+        frame_ms = max(ms_at(at), 1e3 / wanted.fps if wanted.fps else 0.0)
+        return _Running(frame_ms, {u: ms_at(at) / frame_ms if u == unit else 0.0 for u in UNITS})
+
+    moments = warm_up(profile, running, performance_profile, minutes, governor) if minutes else []
+    at_last = settled_corners(moments) if moments else corners
+    answer = {
+        "file": str(graph.path),
+        "unit": unit,
+        "numbers": graph.numbers,
+        "precision": profile.units[unit].precision,
+        "engine_runtime": profile.units[unit].engine_runtime if profile.units[unit].engine else None,
+        "parameters_m": work.weights / 1e6,
+        "gmac": work.macs / 1e9,
+        **_times(time, around),
+        "operators": operator_rows(work, time),
+        "without_rule": without_rule(work),
+        "power": device_power(profile, running(at_last).busy, at_last, {unit: spread_of(around)}),
+        **answers(
+            profile,
+            FrameLoad(lambda at: {unit: ms_at(at)}, ms_at),
+            corners,
+            wanted,
+            FrameInterval(time.total_ms, *around[:2]),
+        ),
+        **(_over_minutes(moments) if moments else {}),
+    }
+    if profile.name != HOST:
+        return answer
+    why = answer["why"] if profile.units[unit].measured is not None else [UNMEASURED, *answer["why"][1:]]
+    return with_known_intervals(profile, unit, {**answer, "why": why})
+
+
+def _times(time: NetworkTime, around: Interval) -> dict[str, Any]:
+    return {
+        "network_ms": time.total_ms,
+        "low_ms": around.low_ms,
+        "high_ms": around.high_ms,
+        "why": [*around.why, *([INSIDE] if any(o.op_type in COMPILED for o in time.operators) else [])],
+        "fps": 1e3 / time.total_ms,
+        "job_ms": time.job_ms,
+    }
+
+
+def operator_rows(work: Work, time: NetworkTime) -> list[dict[str, Any]]:
+    """The operators in the order of the file, with what bounds each and its share of the network's time.
+
+    An operator that the unit's runtime folds into another one is missing, as it is in `time`.
+    """
+    counts = {operator.name: (operator.macs, operator.moved) for operator in work.operators}
+    total_ms = time.total_ms
+    return [
+        {
+            "name": one.name,
+            "op_type": one.op_type,
+            "ms": one.ms,
+            "share": one.ms / total_ms,
+            "bound": one.bound,
+            "macs": counts.get(one.name, (0, 0))[0],
+            "elements": counts.get(one.name, (0, 0))[1],
+        }
+        for one in time.operators
+    ]
+
+
+def without_rule(work: Work) -> list[dict[str, Any]]:
+    """Types of operators without a rule: how many there are, and their share of all moved elements."""
+    moved = Counter[str]()
+    for operator in work.operators:
+        if not operator.ruled:
+            moved[operator.op_type] += operator.moved
+    counts = Counter(operator.op_type for operator in work.operators if not operator.ruled)
+    total = sum(operator.moved for operator in work.operators)
+    return [
+        {"op_type": op_type, "count": counts[op_type], "share_of_elements": elements / total}
+        for op_type, elements in moved.most_common()
+    ]
+
+
+def _over_minutes(moments: list[Moment]) -> dict[str, Any]:
+    return {
+        **ends_of(moments),
+        "temperature_c": temperatures_of(moments),
+        "caps": caps_of(moments),
+        "timeline": timeline_of(moments),
+    }

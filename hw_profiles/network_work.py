@@ -1,6 +1,6 @@
 """The work of a network: its ONNX operators, each with its multiply-accumulates and the elements that it moves.
 
-Rule: nothing here knows any hardware; `operator_times.py` turns the counts into time.
+Nothing here knows any hardware; `unit_times.py` turns the counts into time.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import onnx
 from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles.engine_layers import NO_LAYERS, RENAMES, Layers, first_result, layers_of
+from trilane.hw_profiles.engine_layers import NO_LAYERS, RENAMES, Layers, Shapes, first_result, layers_of
 from trilane.hw_profiles.operator_kinds import (
     CLASSES,
     CONVOLUTIONS,
@@ -33,12 +33,12 @@ from trilane.hw_profiles.operator_kinds import (
     UNKNOWN,
     WEIGHTED,
     has_rule,
+    product_of,
 )
-from trilane.hw_profiles.product_counts import product_of
 
 #: Name of a weight in a graph without weights, where each is an input.
 WEIGHT_INPUT = re.compile(r"w\d+")
-#: Inputs of a batch normalisation up to those that are learned; mean and variance become part of them.
+#: First inputs of a batch normalisation, up to the learned ones; mean and variance become part of these.
 SCALE_AND_SHIFT = 3
 #: Least dimensions of a tensor that is convolved: pictures, channels, one side.
 CONVOLVED = 3
@@ -47,10 +47,10 @@ CONVOLVED = 3
 class Operator(NamedTuple):
     """One operator of a network and its counts.
 
-    `op_type`: of ONNX. `kind`: of CLASSES. `macs`: multiply-accumulates. `moved`: activation elements read and written.
-    `weights`: elements of its weights. `c_in`, `c_out`: input and output channels per group, 0 for an operator without
-    products. `out`: elements of the result. `live`: elements that later operators still need after it. `ruled`: whether
-    `operator_kinds.py` knows the operator; one that it does not know counts as the movement of its elements.
+    `op_type`: its ONNX type. `kind`: one of CLASSES. `macs`: multiply-accumulates. `moved`: activation elements read
+    and written. `weights`: elements of its weights. `c_in`, `c_out`: input and output channels per group, 0 for an
+    operator without products. `out`: elements of the result. `live`: elements that later operators still need after it.
+    `ruled`: whether `operator_kinds.py` knows the operator; an unknown one counts as the movement of its elements.
     """
 
     name: str
@@ -70,8 +70,8 @@ class Operator(NamedTuple):
 class Work:
     """The operators of a network, in order, and the sizes of its inputs and outputs in elements.
 
-    `input_tensors`: those that its picture comes in, joined by the first operator; 1 for inputs that are no parts of
-    one picture. `layers`: the same as a tensor engine runs it.
+    `input_tensors`: number of tensors that its picture comes in, joined by the first operator; 1 for inputs that are
+    not parts of one picture. `layers`: the same work as a tensor engine runs it.
     """
 
     operators: tuple[Operator, ...]
@@ -105,7 +105,7 @@ class Work:
 class Network(NamedTuple):
     """A network with the input that the raster stage draws for it.
 
-    `facts`: what reports call it. `height`, `width`, `channels`: of its input. `layout`: `packed` (one tensor) or
+    `facts`: what reports call it. `height`, `width`, `channels`: size of its input. `layout`: `packed` (one tensor) or
     `split` (one tensor per raster pass).
     """
 
@@ -121,11 +121,8 @@ class Network(NamedTuple):
         return self.height * self.width
 
 
-Shapes = Mapping[str, tuple[int, ...]]
-
-
 def count_work(model: Any) -> Work:
-    """The work of `model`, an `onnx.ModelProto` with static shapes, NCHW, in floats or quantised with QDQ.
+    """Count the work of `model`, an `onnx.ModelProto` with static shapes, NCHW, in floats or quantised with QDQ.
 
     What follows from constants and shapes alone costs nothing. An operator without a rule counts as the movement of its
     elements, with `ruled` False. Raises BadInputError for a tensor without a static shape.
@@ -152,7 +149,7 @@ def count_work(model: Any) -> Work:
 
 
 def _picture_tensors(graph: Any, inputs: list[str]) -> int:
-    """How many tensors a picture comes in: all inputs, where one concatenation is the only one that reads them."""
+    """Number of tensors that a picture comes in: all inputs, where nothing but one concatenation reads them."""
     given, readers = set(inputs), []
     for node in graph.node:
         if given.intersection(node.input):
@@ -164,15 +161,15 @@ def _picture_tensors(graph: Any, inputs: list[str]) -> int:
 
 
 def graph_facts(model: Any) -> dict[str, Any]:
-    """`parameters` of the layers as they are in the file, `gmac` of one pass. Raises as `count_work`."""
+    """`parameters`: those of the layers, as in the file. `gmac`: of one pass. Raises as `count_work` does."""
     work = count_work(model)
     return {"parameters": work.weights, "gmac": work.macs / 1e9}
 
 
 def constant_tensors(graph: Any) -> set[str]:
-    """Names of the tensors that do not depend on what the network is given: weights, and what follows from them.
+    """Names of the tensors that do not depend on the network's input: weights, and what follows from them.
 
-    In a graph without weights, these are the inputs named `w<n>`, and those that a layer has after its first input.
+    In a graph without weights these are the inputs named `w<n>`, and every input of a layer after its first.
     """
     names = {i.name for i in graph.initializer} | _weight_inputs(graph) | {""}  # "" is an input that is left out
     for node in graph.node:
@@ -214,7 +211,7 @@ def _size(shapes: Shapes, name: str) -> int:
 
 
 def _lone_normalisations(graph: Any) -> set[str]:
-    """Results of batch normalisations that no product before them takes up."""
+    """Results of batch normalisations that follow no product which could absorb them."""
     maker = {name: node.op_type for node in graph.node for name in node.output}
     reads = Counter(name for node in graph.node for name in node.input)
     return {
@@ -251,7 +248,7 @@ def _live_counts(graph: Any, shapes: Shapes, constants: set[str]) -> list[int]:
 
 
 def _operator(node: Any, shapes: Shapes, constants: set[str], read: set[str]) -> Operator:
-    """Counts of `node`. `constants`: tensors that are given once. `read`: tensors that somebody reads."""
+    """Counts of `node`. `constants`: tensors that do not depend on the input. `read`: tensors that somebody reads."""
     known = has_rule(node.op_type, node.domain)
     weighted = node.op_type in WEIGHTED and known
     own = node.input[:SCALE_AND_SHIFT] if node.op_type == "BatchNormalization" else node.input
@@ -271,7 +268,7 @@ def _operator(node: Any, shapes: Shapes, constants: set[str], read: set[str]) ->
 
 
 def _convolution(node: Any, shapes: Shapes, plain: Operator) -> Operator:
-    """Counts of a convolution. `plain`: what it moves and its weights."""
+    """Counts of a convolution. `plain`: counts of its movement and its weights."""
     groups = next((a.i for a in node.attribute if a.name == "group"), 1)
     weight, source, result = (
         shapes[name] for name in (node.input[CONVOLUTIONS[node.op_type]], node.input[0], node.output[0])

@@ -1,9 +1,13 @@
-"""Which kind of work each ONNX operator is.
+"""Tables of ONNX operators: which kind of work each one is, and what those that multiply tensors multiply.
 
-Rule: tables and nothing else. An operator that is in none of them is priced by what it moves, and named.
+An operator that no table names is priced by the elements that it moves, and reports name it. The count of a product
+follows from shapes and attributes alone; `network_work.py` counts convolutions.
 """
 
 from __future__ import annotations
+
+from math import prod
+from typing import Any, NamedTuple
 
 ARITHMETIC = ("convolution", "pointwise", "depthwise")
 TRAFFIC = ("normalisation", "resize", "elementwise", "permute")
@@ -88,7 +92,73 @@ UNKNOWN = "elementwise"
 
 _KNOWN = frozenset([*FOLDED, *OF_SHAPES, *CONVOLUTIONS, *PRODUCTS, *RECURRENT, *KIND_OF])
 
+Shape = tuple[int, ...]
+
 
 def has_rule(op_type: str, domain: str = "") -> bool:
     """Whether the tables know the ONNX operator `op_type` of `domain`."""
     return domain in DOMAINS and op_type in _KNOWN
+
+
+class Product(NamedTuple):
+    """Counts of a product.
+
+    `macs`: multiply-accumulates. `c_in`: how many of them each result sums. `c_out`: how many results share a factor.
+    """
+
+    macs: int
+    c_in: int
+    c_out: int
+
+
+def product_of(node: Any, shapes: list[Shape], out: Shape) -> Product | None:
+    """Return what `node` multiplies; None where its shapes do not tell.
+
+    `node`: operator of PRODUCTS or RECURRENT.
+    `shapes`: shape of each input.
+    `out`: shape of its first result.
+    """
+    if node.op_type in RECURRENT:
+        return _recurrent(shapes) if [len(shape) for shape in shapes[:3]] == [3, 3, 3] else None
+    if node.op_type == "Einsum":
+        return _einsum(node, shapes)
+    at = PRODUCTS[node.op_type]
+    if len(shapes) <= at or not shapes[0] or not shapes[at]:
+        return None
+    first, second = shapes[0], shapes[at]
+    turned = {a.name: a.i for a in node.attribute if a.name in ("transA", "transB")}
+    depth = first[-2] if turned.get("transA") else first[-1]
+    width = 1 if len(second) == 1 else second[-2] if turned.get("transB") else second[-1]
+    return Product(prod(out) * depth, depth, width)
+
+
+def _recurrent(shapes: list[Shape]) -> Product:
+    """Count every step of every sequence times all weights.
+
+    Shapes: X (steps, sequences, size), W and R (directions, gates, size).
+    """
+    steps, weights, recurrence = shapes[0], shapes[1], shapes[2]
+    macs = prod(steps[:2]) * (prod(weights) + prod(recurrence))
+    return Product(macs, steps[2], weights[1])
+
+
+def _einsum(node: Any, shapes: list[Shape]) -> Product | None:
+    """Count one product for every combination of all indices. An equation with an ellipsis is not looked into."""
+    equation = next((a.s.decode() for a in node.attribute if a.name == "equation"), "").replace(" ", "")
+    sources, _, result = equation.partition("->")
+    terms = sources.split(",")
+    if (
+        "." in equation
+        or len(terms) != len(shapes)
+        or any(len(t) != len(s) for t, s in zip(terms, shapes, strict=True))
+    ):
+        return None
+    sizes = {
+        index: size for term, shape in zip(terms, shapes, strict=True) for index, size in zip(term, shape, strict=True)
+    }
+    summed = set(sizes) - set(result)
+    return Product(
+        prod(sizes.values()),
+        prod(sizes[index] for index in summed),
+        prod(sizes[index] for index in set(terms[-1]) - summed),
+    )

@@ -1,32 +1,32 @@
-"""The application on a chip over minutes: it warms up, and the governor throttles it.
+"""What runs on a chip, over minutes: it warms up, the governor throttles it, and reports sum the moments up.
 
-Rule: between two polls of the governor the application is in its settled state at the corners of that time; nothing
-else changes the power.
+Between two polls of the governor the application is in its settled state at the corners of that time; nothing else
+changes the power. What reports say of the moments models nothing more.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import Plan, steady
-from trilane.hw_profiles.performance_profiles import Corners, corners_of
-from trilane.hw_profiles.schema import CORNERS, Profile
-from trilane.hw_profiles.thermal_state import ThermalState
-from trilane.hw_profiles.throttling import GOVERNORS, Throttle
+from trilane.hw_profiles.governor import GOVERNORS, ThermalState, Throttle
+from trilane.hw_profiles.schema import CORNERS, Corners, Profile, corners_of
 from trilane.units import UNITS, UnitName
 
 MAX_MINUTES = 24 * 60
+MOST_SHOWN = 360  # moments in a report
 
 
 @dataclass(frozen=True)
 class Moment:
-    """The application at one poll of the governor.
+    """The state at one poll of the governor.
 
     `device_c`, `junction_c`: temperatures of the device and of the hottest junction, degrees Celsius. `throttled`:
-    whether a unit is below the corner that the performance profile requests; `corners`: where the units are.
+    whether a unit is below the corner that the performance profile requests. `corners`: corner of each unit.
     """
 
     t_s: float
@@ -39,7 +39,7 @@ class Moment:
 
 
 class Settled(Protocol):
-    """What runs at constant corners, once it has settled. `frame_ms`: its frame time. `busy`: share of each unit."""
+    """A settled state at constant corners. `frame_ms`: its frame time. `busy`: share of the time, by unit."""
 
     @property
     def frame_ms(self) -> float: ...
@@ -51,13 +51,13 @@ class Settled(Protocol):
 def over_time(
     profile: Profile, plan: Plan, performance_profile: str, minutes: float, governor: str | None = None
 ) -> list[Moment]:
-    """The application from a cold start, one moment per poll of the governor.
+    """Run the application from a cold start and return one moment per poll of the governor.
 
-    `profile`: of the chip.
-    `plan`: what runs on it.
-    `performance_profile`: by name.
-    `minutes`: of virtual time.
-    `governor`: of GOVERNORS; None for the profile's own.
+    `profile`: hardware profile of the chip.
+    `plan`: application that runs on it.
+    `performance_profile`: its name, one of PERFORMANCE_PROFILES.
+    `minutes`: virtual time, above 0 to MAX_MINUTES.
+    `governor`: name in GOVERNORS; None for the profile's own.
     Raises BadInputError for an unknown name or a time out of range.
     """
     return warm_up(profile, lambda corners: steady(profile, plan, corners), performance_profile, minutes, governor)
@@ -70,7 +70,10 @@ def warm_up(
     minutes: float,
     governor: str | None = None,
 ) -> list[Moment]:
-    """`over_time` of whatever settles `at` given corners as it says; it is asked once for each."""
+    """Do the same as `over_time` for whatever settles as `at` says.
+
+    `at`: returns the settled state at given corners; it is called once for each combination.
+    """
     name = governor or profile.thermal.governor
     if name not in GOVERNORS:
         raise BadInputError("governor", repr(name), " or ".join(GOVERNORS))
@@ -97,7 +100,59 @@ def warm_up(
 
 
 def unit_power_w(profile: Profile, now: Settled, corners: Corners) -> dict[UnitName, float]:
-    """Mean power in watts of each unit while the application runs as in `now` with the units at `corners`."""
+    """Mean power of each unit in watts in the settled state `now`, with the units at `corners`."""
     return {
         name: profile.units[name].power_w(corner, now.busy[name]) for name, corner in zip(UNITS, corners, strict=True)
+    }
+
+
+def last_fifth(moments: Sequence[Moment]) -> Sequence[Moment]:
+    """The moments to which a run settles: the last fifth of them, at least one; empty without moments."""
+    return moments[-max(1, len(moments) // 5) :]
+
+
+def ends_of(moments: Sequence[Moment]) -> dict[str, float]:
+    """Frames a second at the start, and those to which it settles: the mean of the last fifth of the time."""
+    last = last_fifth(moments)
+    return {"fps_start": 1e3 / moments[0].frame_ms, "fps_settled": 1e3 / (sum(m.frame_ms for m in last) / len(last))}
+
+
+def settled_corners(moments: Sequence[Moment]) -> Corners:
+    """The corners at which the units mostly are in the last fifth of the time."""
+    return Counter(moment.corners for moment in last_fifth(moments)).most_common(1)[0][0]
+
+
+def temperatures_of(moments: Sequence[Moment]) -> dict[str, float]:
+    """Degrees Celsius of the device and of its hottest junction; empty without moments."""
+    if not moments:
+        return {}
+    return {
+        "device_end": moments[-1].device_c,
+        "device_max": max(m.device_c for m in moments),
+        "junction_max": max(m.junction_c for m in moments),
+    }
+
+
+def caps_of(moments: Sequence[Moment]) -> dict[str, Any]:
+    """Share of the time in which a unit was lowered for heat, and the first second of it."""
+    throttled_s = [m.t_s for m in moments if m.throttled]
+    return {
+        "throttled_share": len(throttled_s) / len(moments) if moments else 0.0,
+        "first_throttled_s": throttled_s[0] if throttled_s else None,
+    }
+
+
+def timeline_of(moments: Sequence[Moment]) -> list[dict[str, Any]]:
+    """The moments as plain data, thinned."""
+    return [_shown(m) for m in moments[:: max(1, len(moments) // MOST_SHOWN)]]
+
+
+def _shown(moment: Moment) -> dict[str, Any]:
+    return {
+        "t_s": moment.t_s,
+        "fps": 1e3 / moment.frame_ms,
+        "device_c": moment.device_c,
+        "junction_c": moment.junction_c,
+        "power_w": moment.power_w,
+        "corners": dict(zip(UNITS, moment.corners, strict=True)),
     }

@@ -19,7 +19,7 @@ SUFFIXES = (".png", ".svg", ".pdf")
 def figure_for(path: Path, inches: tuple[float, float]) -> Any:
     """An empty `matplotlib.figure.Figure`, `inches` wide and high, that can be drawn into the file.
 
-    `path`: of the file; its ending is one of SUFFIXES.
+    `path`: path of the file; its ending is one of SUFFIXES.
     Raises MissingPartError without Matplotlib, BadInputError for another ending.
     """
     if path.suffix not in SUFFIXES:
@@ -36,8 +36,8 @@ def plot_over_time(runs: Mapping[str, Sequence[Moment]], limit_c: float, title: 
 
     `runs`: label of each curve -> its moments.
     `limit_c`: temperature that is marked.
-    `title`: of the picture.
-    `path`: of the file; its ending is one of SUFFIXES.
+    `title`: title of the picture.
+    `path`: path of the file; its ending is one of SUFFIXES.
     Raises MissingPartError without Matplotlib, BadInputError for another ending or a file that cannot be written.
     """
     figure = figure_for(path, (8, 6))

@@ -1,12 +1,14 @@
-"""Predictions for a chip: one configuration over minutes, or a table of many.
+"""Predictions for a chip: one configuration over minutes or at a rate, its alternatives, or a table of many.
 
-Rule: every number is on the virtual clock and comes with the relative error that is to be expected of it. `confidence`
-is one minus that error, and zero when the error is as large as the number.
+Every number is on the virtual clock and comes with the relative error to expect of it. `confidence` is one minus that
+error, and zero when the error is as large as the number. A rate holds the application as a display of that rate would;
+policies that release frames at a rate have it themselves.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 from trilane.hw_profiles.application import (
@@ -17,44 +19,36 @@ from trilane.hw_profiles.application import (
     Steady,
     Variant,
     isolated_job_time,
-    relative_error,
     simulated,
+    stage_times_ms,
     steady,
 )
-from trilane.hw_profiles.application_rates import (
-    around_frame,
-    at_rate,
-    every_variant,
-    held_to,
-    least_ms,
-    load_of,
-    power_of,
-    settled_power_w,
-    unheld_times,
-)
-from trilane.hw_profiles.configuration_table import Row
-from trilane.hw_profiles.host import host_cores, usable_cores
-from trilane.hw_profiles.load import HOST
-from trilane.hw_profiles.measured_host import UNMEASURED, with_known_intervals
-from trilane.hw_profiles.network_time import interval, price
+from trilane.hw_profiles.host import described, host_cores, usable_cores
+from trilane.hw_profiles.host_model import UNMEASURED, Placed, on_cores, place_units, with_known_intervals
+from trilane.hw_profiles.network_time import Interval, interval, price, spread_of
 from trilane.hw_profiles.network_work import Network
-from trilane.hw_profiles.operator_times import JobTime
-from trilane.hw_profiles.over_time import over_time
-from trilane.hw_profiles.performance_profiles import Corners, corners_of
-from trilane.hw_profiles.placed_host import Placed, on_cores, place_units
-from trilane.hw_profiles.placement_facts import NS_PER_MS, described
-from trilane.hw_profiles.rates import NOTHING, Wanted, answers
-from trilane.hw_profiles.reference_networks import reference_network
-from trilane.hw_profiles.schema import Profile
-from trilane.hw_profiles.timeline import caps_of, ends_of, settled_corners, temperatures_of, timeline_of
+from trilane.hw_profiles.over_time import (
+    caps_of,
+    ends_of,
+    over_time,
+    settled_corners,
+    temperatures_of,
+    timeline_of,
+    unit_power_w,
+)
+from trilane.hw_profiles.profile_files import HOST
+from trilane.hw_profiles.rates import NOTHING, FrameInterval, FrameLoad, Wanted, answers, device_power
+from trilane.hw_profiles.reference_networks import ConfigurationRow, reference_network
+from trilane.hw_profiles.schema import Corners, Profile, corners_of
+from trilane.hw_profiles.unit_times import JobTime, relative_error
 from trilane.scheduler.placement import Ranked
 from trilane.scheduler.policy import POLICIES
-from trilane.scheduler.stats import energy_score
+from trilane.scheduler.stats import NS_PER_MS, energy_score
 from trilane.scheduler.virtual import Simulation
 from trilane.units import SUSTAINED, UNITS, UnitName
 
-#: Rows of `what_if`: name, how the stages are joined, share of the network on the GPU. All have frames as often as the
-#: display can show them, for they are compared with each other.
+#: Rows of `what_if`: name, how the stages are joined, share of the network on the GPU. All release frames as
+#: often as the display can show them, because they are compared with each other.
 ALTERNATIVES: tuple[tuple[str, Variant, float], ...] = (
     ("reference application", REFERENCE, 0.0),
     ("one frame at a time", Variant("sequential", "single"), 0.0),
@@ -66,6 +60,11 @@ ALTERNATIVES: tuple[tuple[str, Variant, float], ...] = (
     ("pipelined, 5 % of the network on the GPU", Variant("pipelined", "double"), 0.05),
 )
 
+#: Edges that are compared at a rate.
+EDGES = ("single", "double", "triple", "fifo:4", "orphan")
+#: Part of a rate that may be missing while the rate still holds: the first frames of a simulated run take longer.
+MISSING = 0.002
+
 
 def predict(
     profile: Profile,
@@ -75,13 +74,13 @@ def predict(
     governor: str | None = None,
     wanted: Wanted = NOTHING,
 ) -> dict[str, Any]:
-    """Everything about one configuration, as plain data with the keys of report.json and more.
+    """Return everything about one configuration, as plain data with the keys of report.json and more.
 
-    `profile`: of the chip.
-    `plan`: what runs on it.
-    `performance_profile`: by name.
-    `minutes`: of virtual time from a cold start; 0 for the settled application at constant temperature.
-    `governor`: of GOVERNORS; None for the profile's own.
+    `profile`: hardware profile of the chip.
+    `plan`: application that runs on it.
+    `performance_profile`: its name, one of PERFORMANCE_PROFILES.
+    `minutes`: virtual time from a cold start; 0 for the settled application at constant temperature.
+    `governor`: name in GOVERNORS; None for the profile's own.
     `wanted`: a rate, to which the application is held, and a limit of power.
     Raises BadInputError for an unknown name or a time out of range.
     """
@@ -89,7 +88,7 @@ def predict(
     now = steady(profile, plan, corners)
     moments = over_time(profile, plan, performance_profile, minutes, governor) if minutes else []
     frame = _mean([m.frame_ms for m in moments]) if moments else now.frame_ms
-    power = _mean([m.power_w for m in moments]) if moments else settled_power_w(profile, now, corners)
+    power = _mean([m.power_w for m in moments]) if moments else _settled_power_w(profile, now, corners)
     job = isolated_job_time(profile, plan.network, plan.runtime, corners)
     around = interval(profile, plan.network.work, price(profile, plan.network.work, plan.runtime, corners))
     times = unheld_times(profile, plan, corners, around, job.total_ms)
@@ -127,18 +126,66 @@ def predict(
 def predicted_run(
     profile: Profile, plan: Plan, performance_profile: str = SUSTAINED, wanted: Wanted = NOTHING
 ) -> Simulation:
-    """The run in virtual time, at constant temperature, from which `predict` has its shares of time; as that raises.
+    """Return the run in virtual time, at constant temperature, that `predict` takes its shares of time from.
 
-    `profile`, `plan`, `performance_profile`, `wanted`: as of `predict`.
+    Parameters and errors: as in `predict`.
     """
     profile, plan, corners, _ = _settled_on(profile, plan, performance_profile, wanted)
     return simulated(profile, plan, corners)
 
 
+def what_if(
+    profile: Profile, network: Network, runtime: UnitName, performance_profile: str, fps: float | None = None
+) -> list[dict[str, Any]]:
+    """Return the same network under every row of `ALTERNATIVES` that the runtime allows.
+
+    With `fps` it is every policy with every edge at that rate; rows then say whether it holds and at which power.
+    `profile`: hardware profile of the chip.
+    `network`: network that runs.
+    `runtime`: unit that runs it, gpu or dsp.
+    `performance_profile`: its name; raises BadInputError for an unknown one.
+    `fps`: the rate, frames a second; None for no rate.
+    """
+    corners = corners_of(profile, performance_profile)
+    if fps is not None:
+        return [at_rate(profile, Plan(network, runtime, variant), corners, fps) for variant in every_variant()]
+    rows = []
+    for name, variant, share in ALTERNATIVES:
+        if not share or runtime == "dsp":
+            now = steady(profile, Plan(network, runtime, variant, share), corners)
+            means = {"name": name, "policy": variant.policy, "edge": variant.edge}
+            rows.append({**means, "frame_ms": now.frame_ms, "fps": 1e3 / now.frame_ms, "latency_ms": now.latency_ms})
+    return rows
+
+
+def predict_table(
+    profile: Profile,
+    rows: Sequence[ConfigurationRow],
+    performance_profile: str = SUSTAINED,
+    variant: Variant = REFERENCE,
+    on_row: Callable[[int], None] = lambda _count: None,
+) -> Iterator[dict[str, Any]]:
+    """Yield for each row its cells, then `bench_*_ms`, `app_*_ms` with their ranges, and `confidence`.
+
+    `profile`: hardware profile of the chip.
+    `rows`: rows of a table of configurations.
+    `performance_profile`: its name; raises BadInputError for an unknown one.
+    `variant`: how the stages are joined.
+    `on_row`: called after each row with the count of rows so far.
+    """
+    corners = corners_of(profile, performance_profile)
+    for count, row in enumerate(rows, 1):
+        yield {**_cells(row), **_row_predictions(profile, reference_network(row.spec), corners, variant)}
+        on_row(count)
+
+
 def _settled_on(
     profile: Profile, plan: Plan, performance_profile: str, wanted: Wanted
 ) -> tuple[Profile, Plan, Corners, Placed | None]:
-    """The chip, of this machine with its units on cores; the plan at its rate; the corners; how units were placed."""
+    """Return the chip, the plan at its rate, the corners, and how the units were placed.
+
+    On this machine the chip's units are on cores; elsewhere nothing is placed.
+    """
     corners = corners_of(profile, performance_profile)
     placed = place_units(profile, plan, corners, host_cores(usable_cores())) if profile.name == HOST else None
     if placed is not None:
@@ -147,7 +194,7 @@ def _settled_on(
 
 
 def _notes(profile: Profile, plan: Plan, placed: Placed | None) -> list[str]:
-    """What a reader of the figures has to know of the profile, of the policy and of the placement."""
+    """What a reader of the figures must know of the profile, the policy and the placement."""
     notes, variant, measured = [], plan.variant, profile.units[plan.runtime].measured
     if POLICIES[variant.policy].paced:
         notes.append(
@@ -233,50 +280,6 @@ def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values)
 
 
-def what_if(
-    profile: Profile, network: Network, runtime: UnitName, performance_profile: str, fps: float | None = None
-) -> list[dict[str, Any]]:
-    """The same network under every row of `ALTERNATIVES` that the runtime allows, or under all policies at a rate.
-
-    `profile`: of the chip.
-    `network`: that runs.
-    `runtime`: the unit that runs it.
-    `performance_profile`: by name; raises BadInputError for an unknown one.
-    `fps`: the rate, for every policy with every edge; rows say whether it holds and at which power.
-    """
-    corners = corners_of(profile, performance_profile)
-    if fps is not None:
-        return [at_rate(profile, Plan(network, runtime, variant), corners, fps) for variant in every_variant()]
-    rows = []
-    for name, variant, share in ALTERNATIVES:
-        if not share or runtime == "dsp":
-            now = steady(profile, Plan(network, runtime, variant, share), corners)
-            means = {"name": name, "policy": variant.policy, "edge": variant.edge}
-            rows.append({**means, "frame_ms": now.frame_ms, "fps": 1e3 / now.frame_ms, "latency_ms": now.latency_ms})
-    return rows
-
-
-def predict_table(
-    profile: Profile,
-    rows: Sequence[Row],
-    performance_profile: str = SUSTAINED,
-    variant: Variant = REFERENCE,
-    on_row: Callable[[int], None] = lambda _count: None,
-) -> Iterator[dict[str, Any]]:
-    """For each row: its cells, then `bench_*_ms`, `app_*_ms` with their ranges, and `confidence`.
-
-    `profile`: of the chip.
-    `rows`: of a table of configurations.
-    `performance_profile`: by name; raises BadInputError for an unknown one.
-    `variant`: how the stages are joined.
-    `on_row`: called after each row with the count of rows so far.
-    """
-    corners = corners_of(profile, performance_profile)
-    for count, row in enumerate(rows, 1):
-        yield {**_cells(row), **_row_predictions(profile, reference_network(row.spec), corners, variant)}
-        on_row(count)
-
-
 def _row_predictions(profile: Profile, network: Network, corners: Corners, variant: Variant) -> dict[str, Any]:
     predictions: dict[str, Any] = {}
     errors = []
@@ -292,6 +295,111 @@ def _row_predictions(profile: Profile, network: Network, corners: Corners, varia
     return with_known_intervals(profile, RUNTIMES[-1], answer) if profile.name == HOST else answer
 
 
-def _cells(row: Row) -> dict[str, Any]:
-    """The cells of the row as text, those that are whole numbers as integers."""
+def _cells(row: ConfigurationRow) -> dict[str, Any]:
+    """The cells of the row as text, whole numbers as integers."""
     return {key: int(text) if text.isdecimal() else text for key, text in row.cells.items()}
+
+
+def held_to(plan: Plan, fps: float | None) -> Plan:
+    """Return the plan at a rate. A policy that releases frames releases at it; any other one is held to it."""
+    if fps is None:
+        return plan
+    if POLICIES[plan.variant.policy].paced:
+        return replace(plan, variant=plan.variant._replace(fps=fps))
+    return replace(plan, most_fps=fps)
+
+
+def _unheld(plan: Plan) -> Plan:
+    return replace(plan, most_fps=None, variant=plan.variant._replace(fps=MOST_FPS))
+
+
+def unheld_times(profile: Profile, plan: Plan, corners: Corners, around: Interval, network_ms: float) -> FrameInterval:
+    """Times of a frame when neither the display nor a rate holds the application.
+
+    A frame's times follow from the network's. Where the other stages were measured with it, they have its relative
+    error.
+    `profile`: hardware profile of the chip.
+    `plan`: application that runs on it.
+    `corners`: corner of each unit.
+    `around`, `network_ms`: interval and mean of the network's time, milliseconds.
+    """
+    display = profile.application.display_ms.model_copy(update={"value": 1e3 / MOST_FPS})
+    free = profile.model_copy(update={"application": profile.application.model_copy(update={"display_ms": display})})
+    stretches = (1.0, around.low_ms / network_ms, around.high_ms / network_ms)
+    if profile.units[plan.runtime].measured is not None:
+        frame_ms = steady(free, _unheld(plan), corners, quick=True).frame_ms
+        return FrameInterval(*(stretch * frame_ms for stretch in stretches))
+    plans = (replace(_unheld(plan), stretch=stretch) for stretch in stretches)
+    return FrameInterval(*(steady(free, each, corners, quick=True).frame_ms for each in plans))
+
+
+def least_ms(profile: Profile, plan: Plan) -> float:
+    """Least milliseconds between frames that the display, or the rate, allows."""
+    fps = plan.variant.fps if POLICIES[plan.variant.policy].paced else plan.most_fps
+    return max(profile.application.display_ms.or_else(0), 1e3 / fps if fps else 0.0)
+
+
+def around_frame(frame_ms: float, times: FrameInterval, least: float) -> dict[str, float]:
+    """The 80 % interval of a mean frame time, from that of the network.
+
+    `frame_ms`: mean frame time.
+    `times`: times of a frame when nothing holds the application.
+    `least`: result of `least_ms`.
+    """
+    low, high = (frame_ms * max(ms, least) / max(times.ms, least) for ms in times[1:])
+    return {"low": low, "high": high}
+
+
+def load_of(profile: Profile, plan: Plan) -> FrameLoad:
+    """The application as fast as it can be, but no faster than the display."""
+
+    def work_ms(corners: Corners) -> dict[UnitName, float]:
+        times = stage_times_ms(profile, plan, corners)
+        return {u: sum(ms for (_, unit), ms in times.items() if unit == u) / plan.variant.batch for u in UNITS}
+
+    return FrameLoad(work_ms, lambda corners: steady(profile, _unheld(plan), corners, quick=True).frame_ms)
+
+
+def power_of(profile: Profile, plan: Plan, corners: Corners, around: Interval) -> dict[str, Any]:
+    """Power of the settled application, as `device_power` returns it.
+
+    `profile`: hardware profile of the chip.
+    `plan`: application that runs on it.
+    `corners`: corner of each unit.
+    `around`: interval of the network's time; the busy share of its unit has the same relative error.
+    """
+    busy = steady(profile, plan, corners).busy
+    return device_power(profile, busy, corners, {plan.runtime: spread_of(around)})
+
+
+def _settled_power_w(profile: Profile, now: Steady, corners: Corners) -> float:
+    """Mean power of the whole device in watts, its base included."""
+    return sum(unit_power_w(profile, now, corners).values()) + profile.thermal.base_power_w.or_else(0)
+
+
+def every_variant() -> Iterator[Variant]:
+    """Yield the reference application, then every policy with every edge that is compared."""
+    yield REFERENCE
+    yield from (Variant(policy, edge) for policy in POLICIES for edge in EDGES if (policy, edge) != REFERENCE[:2])
+
+
+def at_rate(profile: Profile, plan: Plan, corners: Corners, fps: float) -> dict[str, Any]:
+    """One row of the comparison at a rate: whether the rate holds, the share of dropped frames, and the power.
+
+    `profile`: hardware profile of the chip.
+    `plan`: application that runs on it.
+    `corners`: corner of each unit.
+    `fps`: the rate, frames a second.
+    """
+    now, variant = steady(profile, held_to(plan, fps), corners), plan.variant
+    return {
+        "name": "reference application" if variant == REFERENCE else f"{variant.policy}, {variant.edge}",
+        "policy": variant.policy,
+        "edge": variant.edge,
+        "frame_ms": now.frame_ms,
+        "fps": 1e3 / now.frame_ms,
+        "latency_ms": now.latency_ms,
+        "holds": 1e3 / now.frame_ms >= fps * (1 - MISSING),
+        "dropped": now.dropped,
+        "power_w": _settled_power_w(profile, now, corners),
+    }

@@ -1,24 +1,26 @@
-"""Latencies that others have published for two networks, to check profiles of chips that were never measured here.
+"""Published latencies of networks on chips: a folder of rows to fit to, and two networks to check profiles by.
 
-Rule: `fit_engines.py` has seen these networks among some thirty others, so the check says how well the fit holds, and
-nothing of networks that it has not seen; `trilane profiles fit-chips` says that.
-
-Source: Qualcomm AI Hub Models, `unet_segmentation` and `resnet18`, w8a8, TFLite and QNN runtimes, QAIRT 2.41
-(BSD-3-Clause, github.com/quic/ai-hub-models, perf.yaml). The first is milesial's U-Net of
-31.0 M parameters on 640x1280x3.
+Which rows count is decided in `read_latencies`, by what the file says of them. `fit_engines.py` has seen both networks
+among some thirty others, so `check_published` says how well the fit holds; `trilane profiles fit-chips` says how well
+unseen networks are predicted. Source: Qualcomm AI Hub Models, `unet_segmentation` (milesial's U-Net of 31.0 M
+parameters on 640x1280x3) and `resnet18`, w8a8, TFLite and QNN runtimes, QAIRT 2.41 (BSD-3-Clause,
+github.com/quic/ai-hub-models, perf.yaml).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import csv
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from pathlib import Path
 from typing import NamedTuple
 
-from trilane.hw_profiles.graph_builder import GraphBuilder, TensorRef
+from trilane.errors import BadInputError
+from trilane.hw_profiles.engine_layers import Layers
+from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.network_work import Work, count_work
-from trilane.hw_profiles.performance_profiles import corners_of
-from trilane.hw_profiles.reference_encoders import resnet18
-from trilane.hw_profiles.schema import EngineRuntime, Profile
+from trilane.hw_profiles.reference_networks import GraphBuilder, TensorRef, resnet18
+from trilane.hw_profiles.schema import EngineName, EngineRuntime, Profile, corners_of
 from trilane.hw_profiles.unit_times import time_on
 from trilane.units import UNITS
 
@@ -27,7 +29,7 @@ Times = Mapping[str, Mapping[EngineRuntime, float]]
 UNET_SIZE = (640, 1280)
 UNET_WIDTHS = (64, 128, 256, 512, 1024)
 
-#: Of a profile, the time of each network in ms by the engine's runtime.
+#: Milliseconds of each network, by the engine's runtime.
 _QCS8450: Times = {"unet": {"tflite": 54.07, "qnn_dlc": 57.895}, "resnet18": {"tflite": 0.609, "qnn_dlc": 0.743}}
 #: The times of the 8 Gen 1 were published for the QCS8450, which Qualcomm also takes for the XR2 Gen 2; those of the
 #: 8 Gen 2 for the QCS8550.
@@ -52,11 +54,21 @@ PUBLISHED_MS: dict[str, Times] = {
     "snapdragon-8-elite-gen-5": {"unet": {"tflite": 15.895}, "resnet18": {"tflite": 0.233}},
 }
 
+ENGINE_OF: dict[tuple[str, str], EngineName] = {
+    ("w8a8", "tflite"): "int8_tflite",
+    ("w8a8", "qnn_dlc"): "int8_qnn_dlc",
+    ("float", "tflite"): "fp16_tflite",
+    ("float", "qnn_dlc"): "fp16_qnn_dlc",
+}
+#: Rows that say so ran elsewhere, or fell off the engine.
+NOT_OF_THE_ENGINE = ("layers on", "over 1 s")
+COLUMNS = ("network", "chip", "hexagon", "precision", "runtime", "ms", "caution", "use")
 
-class Check(NamedTuple):
+
+class PublishedTime(NamedTuple):
     """A published time beside the predicted one, both of the same runtime.
 
-    `independent`: no number of the profile comes from this time.
+    `independent`: whether no number of the profile comes from this time.
     """
 
     profile: str
@@ -106,8 +118,8 @@ def resnet18_work() -> Work:
 WORK = {"unet": unet_work, "resnet18": resnet18_work}
 
 
-def check_published(name: str, profile: Profile) -> list[Check]:
-    """Published times of the chip `name` beside those that `profile` predicts under `burst`; none if none is known.
+def check_published(name: str, profile: Profile) -> list[PublishedTime]:
+    """Published times of the chip `name` beside those that `profile` predicts under `burst`; empty where none is known.
 
     A runtime for which the profile has no numbers of the tensor engine is left out.
     """
@@ -119,5 +131,57 @@ def check_published(name: str, profile: Profile) -> list[Check]:
             running = unit.model_copy(update={"engine_runtime": runtime})
             if running.engine is not None:
                 predicted = time_on(running, profile.memory, WORK[network](), clock).total_ms
-                checks.append(Check(name, network, runtime, False, ms, predicted))
+                checks.append(PublishedTime(name, network, runtime, False, ms, predicted))
     return checks
+
+
+class Latency(NamedTuple):
+    """One published time. `hexagon`: generation of the engine. `anchor`: whether the chip has only such rows."""
+
+    network: str
+    family: str
+    chip: str
+    hexagon: str
+    engine: EngineName
+    ms: float
+    anchor: bool = False
+
+
+def read_latencies(folder: Path) -> list[Latency]:
+    """The rows of `chip_rows.csv` that tell something of the engine. Raises BadInputError."""
+    families = {row["name"]: row["family"] for row in _table(folder / "networks.csv") if row["split"] != "extra"}
+    rows = _table(folder / "chip_rows.csv")
+    if not rows or set(COLUMNS) - rows[0].keys():
+        raise BadInputError(folder / "chip_rows.csv", "other columns", "the columns " + ", ".join(COLUMNS))
+    return [
+        Latency(
+            row["network"],
+            families[row["network"]],
+            row["chip"],
+            row["hexagon"],
+            ENGINE_OF[row["precision"], row["runtime"]],
+            float(row["ms"]),
+            row["use"] == "anchor",
+        )
+        for row in rows
+        if row["network"] in families and not any(words in row["caution"] for words in NOT_OF_THE_ENGINE)
+    ]
+
+
+def _table(path: Path) -> list[dict[str, str]]:
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return list(csv.DictReader(file))
+    except OSError as error:
+        raise BadInputError.of_os_error(path, error, "a CSV file that can be read") from None
+
+
+@lru_cache(maxsize=128)
+def layers_in(folder: Path, network: str) -> Layers:
+    """The layers of a network of the folder."""
+    return read_graph(folder / "networks" / f"{network}.onnx").work.layers
+
+
+def layers_of_rows(folder: Path, rows: Sequence[Latency]) -> dict[str, Layers]:
+    """The layers of every network that `rows` name."""
+    return {name: layers_in(folder, name) for name in sorted({row.network for row in rows})}

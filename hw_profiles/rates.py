@@ -1,22 +1,23 @@
-"""Whether a rate holds, and which rate a limit of power leaves.
+"""Whether a rate holds, which rate a limit of power leaves, and the power of a device with its intervals.
 
-Rule: pure functions of times and of a profile's powers. All powers are of the whole device, its base included.
+All are pure functions of times and of a profile's powers, for the whole device, its base included. A mean is that of
+`Unit.power_w`. An interval follows from the spreads of the profile's numbers and of the busy shares, which are taken
+as independent. Powers are positive, so their sums are taken as log-normal.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from itertools import product
 from typing import Any, NamedTuple
 
-from trilane.hw_profiles.device_power import device_power
-from trilane.hw_profiles.performance_profiles import Corners
-from trilane.hw_profiles.schema import CORNERS, Corner, Profile
+from trilane.hw_profiles.schema import CORNERS, NORMAL_80, Corner, Corners, Profile
 from trilane.units import UNITS, UnitName
 
 
 class Wanted(NamedTuple):
-    """What people want of a chip. `fps`: frames a second. `power_limit_w`: watts of the whole device."""
+    """What a user wants of a chip. `fps`: frames a second. `power_limit_w`: watts of the whole device."""
 
     fps: float | None = None
     power_limit_w: float | None = None
@@ -25,7 +26,7 @@ class Wanted(NamedTuple):
 NOTHING = Wanted()
 
 
-class FrameTimes(NamedTuple):
+class FrameInterval(NamedTuple):
     """Least milliseconds between two frames: expected, and at both ends of the 80 % interval."""
 
     ms: float
@@ -33,10 +34,10 @@ class FrameTimes(NamedTuple):
     high_ms: float
 
 
-def holding(fps: float, times: FrameTimes) -> dict[str, Any]:
-    """Whether `fps` frames a second hold, in words too, with the reserve: the part of a frame's time that is left.
+def holding(fps: float, times: FrameInterval) -> dict[str, Any]:
+    """Say whether `fps` frames a second hold, in words too. The reserve is the part of a frame's time that is left.
 
-    `times`: of a frame when none waits for its turn.
+    `times`: time of a frame that never waits for its turn.
     """
     reserve, high, low = (1 - ms * fps / 1e3 for ms in times)
     if low >= 0:
@@ -57,29 +58,30 @@ def holding(fps: float, times: FrameTimes) -> dict[str, Any]:
     }
 
 
-class Load(NamedTuple):
-    """What runs: per frame and at given corners, for how many milliseconds each unit works, and the least frame time.
+class FrameLoad(NamedTuple):
+    """What runs, as functions of the corners of the units.
 
-    `work_ms`: of the units that work. `frame_ms`: may take a simulation, and is asked only where it decides.
+    `work_ms`: milliseconds that each working unit works for a frame. `frame_ms`: least time between frames; it may take
+    a simulation, so it is called only where it decides.
     """
 
     work_ms: Callable[[Corners], Mapping[UnitName, float]]
     frame_ms: Callable[[Corners], float]
 
 
-def within_power(profile: Profile, requested: Corners, load: Load, limit_w: float) -> dict[str, Any]:
+def within_power(profile: Profile, requested: Corners, load: FrameLoad, limit_w: float) -> dict[str, Any]:
     """The highest rate at which the device takes at most `limit_w`, and the corners of its units there.
 
-    It is limited by `speed` where it is that of the requested corners, by `power` otherwise. `low_fps`, `high_fps`: the
-    rates if the device takes as much more or less than expected as the 80 % interval of its power says.
+    `limited_by` is `speed` where the requested corners reach that rate, `power` otherwise. `low_fps` and `high_fps` are
+    the rates if the device takes as much more or less than expected as the 80 % interval of its power says.
 
-    The units may be at any corner up to the `requested` ones. At one choice of corners the power is linear in the
-    rate: what idle units take, and for each frame the energy of the work.
+    Each unit may be at any corner up to the `requested` one. For given corners the power is linear in the rate: the
+    power of idle units, plus the energy of the work for each frame.
 
-    `profile`: of the chip.
-    `requested`: corners of the performance profile.
-    `load`: what runs.
-    `limit_w`: watts of the whole device.
+    `profile`: hardware profile of the chip.
+    `requested`: corner of each unit under the performance profile.
+    `load`: what runs, as work and least frame time.
+    `limit_w`: limit of the whole device, watts.
     """
     best, fps = _best(profile, requested, load, limit_w)
     work = load.work_ms(best.corners)
@@ -98,7 +100,7 @@ def within_power(profile: Profile, requested: Corners, load: Load, limit_w: floa
     }
 
 
-def _best(profile: Profile, requested: Corners, load: Load, limit_w: float) -> tuple[_Choice, float]:
+def _best(profile: Profile, requested: Corners, load: FrameLoad, limit_w: float) -> tuple[_Choice, float]:
     """The choice of corners with the highest rate, and the rate."""
     choices = sorted(
         (_by_power(profile, corners, load, limit_w) for corners in _allowed(requested, load)),
@@ -117,8 +119,8 @@ def _best(profile: Profile, requested: Corners, load: Load, limit_w: float) -> t
 class _Choice(NamedTuple):
     """One choice of corners.
 
-    `most_fps`: that power and the busiest unit allow. `idle_w`: of the device when no unit works. `joules`: of a frame,
-    beside that.
+    `most_fps`: rate that power and the busiest unit allow. `idle_w`: watts of the device when no unit works. `joules`:
+    energy of a frame on top of that.
     """
 
     most_fps: float
@@ -127,7 +129,7 @@ class _Choice(NamedTuple):
     joules: float
 
 
-def _by_power(profile: Profile, corners: Corners, load: Load, limit_w: float) -> _Choice:
+def _by_power(profile: Profile, corners: Corners, load: FrameLoad, limit_w: float) -> _Choice:
     units = {unit: (profile.units[unit], corner) for unit, corner in zip(UNITS, corners, strict=True)}
     idle = {unit: one.power_w(corner, 0.0) for unit, (one, corner) in units.items()}
     idle_w = sum(idle.values()) + profile.thermal.base_power_w.or_else(0.0)
@@ -137,8 +139,8 @@ def _by_power(profile: Profile, corners: Corners, load: Load, limit_w: float) ->
     return _Choice(min(by_power, 1e3 / max(work.values())), corners, idle_w, joules)
 
 
-def _allowed(requested: Corners, load: Load) -> list[Corners]:
-    """All corners up to the requested ones; of a unit that does nothing, the requested one."""
+def _allowed(requested: Corners, load: FrameLoad) -> list[Corners]:
+    """All corners up to the requested ones; only the requested one for a unit that does nothing."""
     working = load.work_ms(requested)
 
     def up_to(unit: UnitName, corner: Corner) -> tuple[Corner, ...]:
@@ -148,14 +150,16 @@ def _allowed(requested: Corners, load: Load) -> list[Corners]:
     return list(product(cpu, gpu, dsp))
 
 
-def answers(profile: Profile, load: Load, corners: Corners, wanted: Wanted, times: FrameTimes) -> dict[str, Any]:
-    """`rate` and `power_limit`, each where it is wanted.
+def answers(
+    profile: Profile, load: FrameLoad, corners: Corners, wanted: Wanted, times: FrameInterval
+) -> dict[str, Any]:
+    """`rate` and `power_limit`, each only where it is wanted.
 
-    `profile`: of the chip.
-    `load`: what runs.
-    `corners`: of the performance profile.
+    `profile`: hardware profile of the chip.
+    `load`: what runs, as work and least frame time.
+    `corners`: corner of each unit under the performance profile.
     `wanted`: the rate and the limit.
-    `times`: of a frame of `load` at `corners`.
+    `times`: times of a frame of `load` at `corners`.
     """
     found: dict[str, Any] = {}
     if wanted.fps is not None:
@@ -163,3 +167,57 @@ def answers(profile: Profile, load: Load, corners: Corners, wanted: Wanted, time
     if wanted.power_limit_w is not None:
         found["power_limit"] = within_power(profile, corners, load, wanted.power_limit_w)
     return found
+
+
+class _Watts(NamedTuple):
+    """A mean in watts, and the interval that holds it with a probability of 80 %."""
+
+    w: float
+    low_w: float
+    high_w: float
+
+
+def device_power(
+    profile: Profile, busy: Mapping[str, float], corners: Corners, busy_error: Mapping[UnitName, float]
+) -> dict[str, Any]:
+    """Power of the whole device, of each unit, and of the base, which is no unit (memory, screen, radio).
+
+    `profile`: hardware profile of the chip.
+    `busy`: share of the time in which each unit works.
+    `corners`: corner of each unit.
+    `busy_error`: relative error of these shares; 0 for a unit without one.
+    """
+    base = profile.thermal.base_power_w
+    spreads = {
+        unit: _unit(profile, unit, corners, busy[unit], busy_error.get(unit, 0.0) * (busy[unit] < 1)) for unit in UNITS
+    }
+    spreads_of_all = [*spreads.values(), (base.or_else(0.0), base.or_else(0.0) * base.relative_error)]
+    whole = _watts(sum(mean for mean, _ in spreads_of_all), math.hypot(*(deviation for _, deviation in spreads_of_all)))
+    return {
+        **whole._asdict(),
+        "units": {unit: _watts(*spread)._asdict() for unit, spread in spreads.items()},
+        "base": {**_watts(*spreads_of_all[-1])._asdict(), "kind": base.kind},
+    }
+
+
+def _unit(profile: Profile, name: UnitName, corners: Corners, busy: float, busy_error: float) -> tuple[float, float]:
+    """Mean and standard deviation of the power of a unit, in watts."""
+    unit, corner = profile.units[name], corners[UNITS.index(name)]
+    active, idle = unit.power_w(corner, 1.0), unit.power_w(corner, 0.0)
+    exponent = unit.power_exponent.or_else(3.0) * unit.power_exponent.relative_error
+    active_error = math.hypot(unit.power_max_w.relative_error, exponent * math.log(unit.clock(corner)))
+    parts = (
+        busy * active * active_error,
+        (1 - busy) * idle * unit.idle_w.relative_error,
+        busy * busy_error * (active - idle),
+    )
+    return unit.power_w(corner, busy), math.hypot(*parts)
+
+
+def _watts(mean: float, deviation: float) -> _Watts:
+    """The interval of a log-normal distribution of this mean and standard deviation."""
+    if not mean:
+        return _Watts(0.0, 0.0, 0.0)
+    variance = math.log1p((deviation / mean) ** 2)
+    middle, factor = mean * math.exp(-variance / 2), math.exp(NORMAL_80 * math.sqrt(variance))
+    return _Watts(mean, middle / factor, middle * factor)

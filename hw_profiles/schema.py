@@ -1,7 +1,7 @@
 """The schema of a hardware profile: units, speeds, powers and limits, each number with its source.
 
-Rule: every number is a `Quantity`, which states where the number is from; the unit of measure ends the key's name.
-Only shapes and ranges are checked here.
+Every number is a `Quantity`, which states where the number is from; the unit of measure ends the key's name. The
+schema checks shapes and ranges only. `corners_of` tells the corner of each unit under a performance profile.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
+from trilane.errors import BadInputError
 from trilane.hw_profiles.engine_layers import TERMS
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import PERFORMANCE_PROFILES, UNITS, PerformanceProfile, UnitName
@@ -19,19 +20,23 @@ CORNERS: tuple[Corner, ...] = ("max", "turbo", "nominal_plus", "nominal", "svs_p
 Kind = Literal["measured", "published", "fitted", "assumed", "unknown"]
 #: Relative error (standard deviation of the logarithm) of a kind of number, where its profile states none.
 SPREAD_OF_KIND: dict[str, float] = {"measured": 0.05, "published": 0.1, "fitted": 0.15, "assumed": 0.5, "unknown": 1.0}
+#: Standard deviations from the mean within which 80 % of a normal distribution lie.
+NORMAL_80 = 1.2816
 BYTES = {"int8": 1, "fp16": 2, "fp32": 4}
 
+Corners = tuple[Corner, Corner, Corner]
 
-class Model(BaseModel):
+
+class ProfileTable(BaseModel):
     """Base of all tables: unknown keys are errors, and values never change after loading."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Quantity(Model):
-    """A number, its kind and where it is from. One of kind `unknown` has no value.
+class Quantity(ProfileTable):
+    """A number, its kind and its source. A quantity of kind `unknown` has no value.
 
-    `spread`: its relative error, as the standard deviation of its logarithm; None for the usual one of its kind.
+    `spread`: relative error, as the standard deviation of the value's logarithm; None for the usual error of its kind.
     """
 
     value: float | None = Field(default=None, allow_inf_nan=False, strict=True)
@@ -48,7 +53,7 @@ class Quantity(Model):
 
     @property
     def relative_error(self) -> float:
-        """`spread`, or the usual one of the kind of number."""
+        """`spread`, or the usual error of this kind of number."""
         return SPREAD_OF_KIND[self.kind] if self.spread is None else self.spread
 
     def or_else(self, default: float) -> float:
@@ -57,7 +62,7 @@ class Quantity(Model):
 
 
 class _Range:
-    """Validator of a quantity's value, from `low` to `high`. Raises UnexpectedValue for any other."""
+    """Validator of a quantity's value, from `low` to `high`. Raises UnexpectedValue for a value outside."""
 
     def __init__(self, low: float, high: float) -> None:
         self.low, self.high = low, high
@@ -79,18 +84,19 @@ Seconds = Annotated[Quantity, AfterValidator(_Range(1e-3, 1e6))]
 Count = Annotated[Quantity, AfterValidator(_Range(1, 1e6))]
 
 
-class Memory(Model):
-    """The memory that the units share. `bandwidth_gb_s`: of the whole chip.
+class Memory(ProfileTable):
+    """The memory that the units share.
 
-    `application_use_fraction`: share of it that camera, display and composition take.
+    `bandwidth_gb_s`: bandwidth of the whole chip. `application_use_fraction`: share of it that camera, display and
+    composition take.
     """
 
     bandwidth_gb_s: Rate
     application_use_fraction: Annotated[Quantity, AfterValidator(_Range(0, 0.95))]
 
 
-class Efficiencies(Model):
-    """Reached share of a peak: of arithmetic for the first three, of memory bandwidth for the others.
+class Efficiencies(ProfileTable):
+    """Reached share of a peak: a peak of arithmetic for the first three, of memory bandwidth for the others.
 
     `*_traffic` are the shares of bandwidth that the products reach when traffic bounds them. Winograd and similar
     shortcuts may take an arithmetic share above 1.
@@ -108,16 +114,18 @@ class Efficiencies(Model):
     permute: Efficiency
 
 
-#: An engine's numbers are those of a precision under a runtime.
+#: A precision under a runtime: each has numbers of its own.
 EngineName = Literal["int8_tflite", "int8_qnn_dlc", "fp16_tflite", "fp16_qnn_dlc"]
 EngineRuntime = Literal["tflite", "qnn_dlc"]
 ENGINE_RUNTIMES: tuple[EngineRuntime, ...] = ("tflite", "qnn_dlc")
 ENGINES: tuple[EngineName, ...] = ("int8_tflite", "int8_qnn_dlc", "fp16_tflite", "fp16_qnn_dlc")
 
 
-class EngineRates(Model):
-    """The six numbers of a chip: products, activations on the chip, activations that do not fit there, weights; what an
-    operator and a job cost besides.
+class EngineRates(ProfileTable):
+    """The six numbers of a chip.
+
+    They are the rates of products, of activations on the chip, of activations that do not fit there and of weights, and
+    the fixed cost of an operator and of a job.
     """
 
     arithmetic_tmac_s: Rate
@@ -128,7 +136,7 @@ class EngineRates(Model):
     job_us: Cost
 
 
-#: Rate of a term -> key of `EngineRates`, and how many of what it counts are one of the key's unit of measure.
+#: Rate of a term -> key of `EngineRates`, and the factor from the key's unit of measure to base units.
 KEY_OF_RATE = {
     "arithmetic": ("arithmetic_tmac_s", 1e12),
     "activation": ("activation_gb_s", 1e9),
@@ -139,13 +147,13 @@ KEY_OF_RATE = {
 }
 
 
-class Engine(Model):
+class Engine(ProfileTable):
     """A tensor engine at one precision under one runtime.
 
-    `on_chip_mb`: activations that it holds. `factors`: how much dearer each term of `engine_layers.py` is than a plain
-    convolution's; 1 where none is given. `error_fraction`: relative error of the model itself, apart from that of its
-    numbers, for a network that shares no term with those that the numbers were fitted to; `seen`: each of these, with
-    the terms' shares in its time.
+    `on_chip_mb`: megabytes of activations that it holds. `factors`: how many times dearer each term of
+    `engine_layers.py` is than a plain convolution's; 1 where none is given. `error_fraction`: relative error of the
+    model itself, apart from that of its numbers, for a network that shares no term with the networks of the fit.
+    `seen`: each network of the fit, with the terms' shares in its time.
     """
 
     element_bytes: Literal[1, 2]
@@ -163,11 +171,11 @@ class Engine(Model):
         return self
 
     def factor(self, term: str) -> float:
-        """How much dearer `term` is."""
+        """How many times dearer `term` is than a plain convolution's."""
         return self.factors[term].or_else(1.0) if term in self.factors else 1.0
 
     def seconds_per_unit(self, rate: str) -> float:
-        """Seconds of one product, one element of one activation or weight, one operator, or one job."""
+        """Seconds of one product, of one element of an activation or weight, of one operator, or of one job."""
         key, unit = KEY_OF_RATE[rate]
         value: float = getattr(self.rates, key).or_else(1.0)
         if rate in ("operator", "job"):
@@ -175,11 +183,11 @@ class Engine(Model):
         return (1 if rate == "arithmetic" else self.element_bytes) / (value * unit)
 
 
-class Measured(Model):
+class Measured(ProfileTable):
     """What was measured of a network on a unit of this machine.
 
-    `slower`: by threads, how many times longer it took than by the unit's numbers. `error`: relative, of a time that
-    follows. `said`: how it was measured.
+    `slower`: by number of threads, the measured time over the time by the unit's numbers. `error`: relative error of a
+    time that follows from it. `said`: sentence that tells how it was measured.
     """
 
     slower: dict[int, float] = Field(min_length=1)
@@ -187,18 +195,19 @@ class Measured(Model):
     said: str
 
 
-class Unit(Model):
-    """One unit. `fallback`: ONNX operators that it cannot run and hands to the CPU.
+class Unit(ProfileTable):
+    """One unit.
 
-    `channel_block`: channel counts are rounded up to it. `job_fixed_ms` is paid once a job, `operator_fixed_us` once
-    an operator, `input_ns_per_element` for each element of the network's input, `permute_fixed_ms` where the picture
-    comes in several tensors. `corners`: clock at each voltage corner as a fraction of the highest. While a job runs
-    the unit takes `power_max_w` times the clock fraction to the power of `power_exponent`, and `idle_w` otherwise.
-    `model_error_fraction`: relative error of the roofline itself, apart from that of its numbers. `runtimes`: how many
-    times faster than ONNX Runtime in FP32 each runtime runs an INT8 network; only the host's DSP unit has them. `core`:
-    units with the same one, unless it is empty, work in turns: on a host with too few cores. `engines`: a tensor
-    engine's numbers by precision and runtime, of which `engine_runtime` is taken; a unit without is priced by
-    `efficiency`. Of this machine alone: `threads` have the peak rates together; `measured`: where it was.
+    `fallback`: ONNX operators that it cannot run and hands to the CPU. `channel_block`: block to which channel counts
+    are rounded up. `job_fixed_ms` is paid once a job, `operator_fixed_us` once an operator, `input_ns_per_element` for
+    each element of the network's input, `permute_fixed_ms` where the picture comes in several tensors. `corners`: clock
+    at each voltage corner as a fraction of the highest. While a job runs the unit takes `power_max_w` times the clock
+    fraction to the power of `power_exponent`, and `idle_w` otherwise. `model_error_fraction`: relative error of the
+    roofline itself, apart from that of its numbers. `runtimes`: how many times faster than ONNX Runtime in FP32 each
+    runtime runs an INT8 network; only the host's DSP unit has them. `core`: units with the same text share a core and
+    work in turns, as on a host with too few cores; empty for a unit of its own. `engines`: numbers of a tensor engine
+    by precision and runtime, from which `engine_runtime` chooses; a unit without any is priced by `efficiency`. Only
+    this machine's units have `threads`, which share the peak rates, and `measured`.
     """
 
     title: str
@@ -247,7 +256,7 @@ class Unit(Model):
 
     @property
     def slower(self) -> float:
-        """How many times longer it takes than by its numbers."""
+        """How many times longer the unit takes than its numbers say; 1 where nothing was measured."""
         return 1.0 if self.measured is None else self.measured.slower[self.threads]
 
     @property
@@ -272,14 +281,14 @@ class Unit(Model):
         return BYTES[self.precision]
 
 
-class Application(Model):
-    """The stages beside the network. Times at the `max` corner.
+class Application(ProfileTable):
+    """The stages beside the network. Times are those at the `max` corner.
 
-    `raster_ns_per_pixel` and `raster_ns_per_vertex` on the GPU; `readback_ns_per_byte` from GPU memory to the network's
-    input, done with the GPU held; `handover_ms` from the end of the read-back to the network's start, with its unit
-    held; `composite_ms` on the GPU; `pose_ms` on the CPU; `display_ms` the shortest interval between shown frames.
-    `vertices` and `pose_ms` are those of one avatar.
-    `ema20_half_range_fraction`: how far the exponential average over 20 frames strays from the mean.
+    `raster_ns_per_pixel` and `raster_ns_per_vertex`: drawing on the GPU. `readback_ns_per_byte`: from GPU memory to the
+    network's input, with the GPU held. `handover_ms`: from the end of the read-back to the network's start, with the
+    network's unit held. `composite_ms`: on the GPU. `pose_ms`: on the CPU. `display_ms`: shortest interval between
+    shown frames. `vertices` and `pose_ms` are those of one avatar. `ema20_half_range_fraction`: how far the exponential
+    average over 20 frames strays from the mean, as a fraction of it.
     """
 
     vertices: Annotated[Quantity, AfterValidator(_Range(0, 1e7))]
@@ -294,7 +303,7 @@ class Application(Model):
     ema20_half_range_fraction: Annotated[Quantity, AfterValidator(_Range(0, 1))]
 
 
-class PerformanceSettings(Model):
+class PerformanceSettings(ProfileTable):
     """A performance profile: the corner of each unit, and how soon an idle unit may sleep."""
 
     cpu: Corner
@@ -308,10 +317,10 @@ class PerformanceSettings(Model):
         return corner
 
 
-class Thermal(Model):
+class Thermal(ProfileTable):
     """The device as a slow thermal mass under the junction of each unit, its limits, and the governor that keeps them.
 
-    `governor`: of the Linux thermal framework. `poll_s`: how often it looks.
+    `governor`: name of a governor of the Linux thermal framework. `poll_s`: seconds between two of its looks.
     """
 
     ambient_c: Celsius
@@ -325,7 +334,7 @@ class Thermal(Model):
     poll_s: Seconds
 
 
-class Profile(Model):
+class Profile(ProfileTable):
     """A chip in a device. `template`: whether it describes no chip and is only there to be extended."""
 
     name: str = Field(min_length=1)
@@ -349,3 +358,12 @@ class Profile(Model):
         if (self.thermal.skin_limit_c.value or 0) <= (self.thermal.ambient_c.value or 0):
             raise UnexpectedValue("thermal.skin_limit_c at or below thermal.ambient_c", "it above")
         return self
+
+
+def corners_of(profile: Profile, performance_profile: str) -> Corners:
+    """Corners of cpu, gpu and dsp. Raises BadInputError for a name that is no performance profile."""
+    for name, settings in profile.performance_profiles.items():
+        if name == performance_profile:
+            return settings.cpu, settings.gpu, settings.dsp
+    known = ", ".join(profile.performance_profiles)
+    raise BadInputError("performance profile", repr(performance_profile), f"one of {known}")

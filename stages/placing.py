@@ -22,14 +22,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.cache import cached_arrays
-from trilane.hw_profiles.host import host_cores, rule_placement, settings_of, usable_cores
-from trilane.hw_profiles.placement_facts import NS_PER_MS, described, placement_of, predictions, unit_rows
+from trilane.hw_profiles.host import (
+    described,
+    host_cores,
+    placement_of,
+    predictions,
+    rule_placement,
+    settings_of,
+    unit_rows,
+    usable_cores,
+)
 from trilane.pipeline.other_programs import OtherPrograms
 from trilane.pipeline.rehearsal import Rehearsed
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.placement import Ranked, chosen, fastest, ranked, typical, worth_trying
 from trilane.scheduler.placement_model import Rules, frame_ns
 from trilane.scheduler.places import Core, Place, Placement, Times, Work
+from trilane.scheduler.stats import NS_PER_MS
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.avatar_pipeline import measured_times, thread_counts, tried
 from trilane.stages.configure import Checked

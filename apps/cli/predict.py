@@ -190,7 +190,7 @@ def predict(
     profile `host`, this machine, where a run has no cap.
     """
     from trilane.hw_profiles.application import Plan
-    from trilane.hw_profiles.load import load_runnable
+    from trilane.hw_profiles.profile_files import load_runnable
 
     networks = network or []
     bare = bool(networks) and not application
@@ -278,8 +278,8 @@ def _predict_table(chip: Profile, path: Path, performance_profile: str, variant:
     """Return an answer for each row of the table."""
     from rich.progress import Progress
 
-    from trilane.hw_profiles.configuration_table import read_table
     from trilane.hw_profiles.predict import predict_table
+    from trilane.hw_profiles.reference_networks import read_table
 
     rows = read_table(path)
     console = stderr_console()

@@ -35,7 +35,7 @@ def show_table(profile: str, performance_profile: str, answers: list[dict[str, A
     """
     from rich.table import Table
 
-    from trilane.hw_profiles.configuration_table import KEYS
+    from trilane.hw_profiles.reference_networks import KEYS
 
     if as_json:
         document = {"schema": 1, "clock": "virtual", "profile": profile, "performance_profile": performance_profile}

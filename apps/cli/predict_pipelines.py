@@ -1,7 +1,7 @@
 """`trilane predict SCENE --beside …`: several pipelines on one chip, as options and as tables.
 
 Rule: nothing is computed here; `apps/predict/asked_pipelines.py` reads what the pipelines are, and
-`hw_profiles/beside_answer.py` answers.
+`hw_profiles/shared_chip.py` answers.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from trilane.hw_profiles.application import Variant
-    from trilane.hw_profiles.beside import Tenant
     from trilane.hw_profiles.schema import Profile
+    from trilane.hw_profiles.shared_chip import Tenant
 
 SceneToPredict = Annotated[
     str | None,
@@ -83,8 +83,8 @@ def predict_pipelines(
     Raises BadInputError for options that do not go with a scene and for what is wrong in one of them.
     """
     from trilane.apps.predict.asked_pipelines import tenants
-    from trilane.hw_profiles.beside_answer import predict_beside
-    from trilane.hw_profiles.load import HOST, load_runnable
+    from trilane.hw_profiles.profile_files import HOST, load_runnable
+    from trilane.hw_profiles.shared_chip import predict_beside
     from trilane.scheduler.turns import TURNS
 
     if scene is None:
@@ -120,8 +120,8 @@ def _write_trace(
 ) -> None:
     """Write the simulated runs of the pipelines as one trace."""
     from trilane.apps.explain.trace import write_predicted
-    from trilane.hw_profiles.beside import together
-    from trilane.hw_profiles.performance_profiles import corners_of
+    from trilane.hw_profiles.schema import corners_of
+    from trilane.hw_profiles.shared_chip import together
 
     runs = together(chip, found, corners_of(chip, performance_profile), turns, keep=True).runs
     named = {tenant.name: run for tenant, run in zip(found, runs, strict=True)}
@@ -131,7 +131,7 @@ def _write_trace(
 def _variant(policy: str, edge: str | None) -> Variant:
     """Return how the avatars' stages are joined. `policy`: "" where none was asked for."""
     from trilane.hw_profiles.application import REFERENCE
-    from trilane.hw_profiles.beside import NEWEST
+    from trilane.hw_profiles.shared_chip import NEWEST
     from trilane.scheduler.policy import POLICIES
     from trilane.transport.slots import edge_rule
     from trilane.unexpected_value import UnexpectedValue

@@ -18,7 +18,7 @@ from trilane.files import read_text
 from trilane.writing import WRITABLE, write_bytes
 
 if TYPE_CHECKING:
-    from trilane.hw_profiles.fit import Fit
+    from trilane.hw_profiles.fit import ProfileFit
 
 app = Commands(no_args_is_help=True, help="Hardware profiles.")
 
@@ -34,7 +34,7 @@ def list_profiles(json: JsonOption = False) -> None:
     """List the profiles that come with Trilane."""
     from rich.table import Table
 
-    from trilane.hw_profiles.load import load_profile, profile_names
+    from trilane.hw_profiles.profile_files import load_profile, profile_names
 
     known = [(name, load_profile(name)) for name in profile_names()]
     rows = [
@@ -60,7 +60,7 @@ def show(
     """Show every number of a profile with its kind and source."""
     from rich.table import Table
 
-    from trilane.hw_profiles.load import load_profile
+    from trilane.hw_profiles.profile_files import load_profile
 
     profile = load_profile(name)
     if json:
@@ -92,7 +92,7 @@ def check(
     """Check profiles: their keys and ranges, and published latencies that they should reproduce."""
     from rich.table import Table
 
-    from trilane.hw_profiles.load import load_profile, profile_names
+    from trilane.hw_profiles.profile_files import load_profile, profile_names
     from trilane.hw_profiles.published_times import check_published
 
     profiles = {name: load_profile(name) for name in names or profile_names()}
@@ -154,9 +154,7 @@ def fit_chips(
     plot: Annotated[Path | None, typer.Option(help="Picture of predicted against published times.")] = None,
 ) -> None:
     """Fit tensor engines to published latencies: shared terms, six numbers a chip, and how far off both are."""
-    from trilane.hw_profiles.engine_report import as_markdown, plot_errors, with_table
-    from trilane.hw_profiles.engine_study import study_engines
-    from trilane.hw_profiles.engine_tables import profile_texts
+    from trilane.hw_profiles.engine_study import as_markdown, plot_errors, profile_texts, study_engines, with_table
 
     with stderr_console().status("fitting, a fifth of the networks left out in turn"):
         study = study_engines(folder)
@@ -170,7 +168,7 @@ def fit_chips(
     stdout_console().print(as_markdown(study), highlight=False)
 
 
-def _fit_document(result: Fit) -> dict[str, Any]:
+def _fit_document(result: ProfileFit) -> dict[str, Any]:
     return {
         "free_numbers": result.free_count,
         "measurements": len(result.residuals),
@@ -194,7 +192,7 @@ def _fit_document(result: Fit) -> dict[str, Any]:
     }
 
 
-def _show_fit(result: Fit) -> None:
+def _show_fit(result: ProfileFit) -> None:
     from rich.table import Table
 
     console = stdout_console()

@@ -22,10 +22,10 @@ from trilane.avatars.bundle import load_bundle
 from trilane.bench.lib.interleaved_processes import Variant, runners
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import Plan
-from trilane.hw_profiles.load import HOST, load_runnable
-from trilane.hw_profiles.network_time import NORMAL_80
-from trilane.hw_profiles.placed_host import NETWORK
+from trilane.hw_profiles.host_model import NETWORK
+from trilane.hw_profiles.profile_files import HOST, load_runnable
 from trilane.hw_profiles.rates import NOTHING
+from trilane.hw_profiles.schema import NORMAL_80
 from trilane.stages.configure import requested_runtime
 from trilane.stages.run_options import RunOptions
 from trilane.units import BURST

@@ -19,13 +19,12 @@ from trilane.body.skinning import DETAILS, left_out
 from trilane.errors import BadInputError
 from trilane.figure_sources import COMPUTED, MEASURED
 from trilane.hw_profiles.application import Plan, Variant, stage_times_ms, steady, workers_of
-from trilane.hw_profiles.host import host_cores, usable_cores
-from trilane.hw_profiles.load import HOST, load_runnable
+from trilane.hw_profiles.host import described, host_cores, usable_cores
+from trilane.hw_profiles.host_model import place_units
 from trilane.hw_profiles.network_work import Network, count_work
-from trilane.hw_profiles.performance_profiles import corners_of
-from trilane.hw_profiles.placed_host import place_units
-from trilane.hw_profiles.placement_facts import NS_PER_MS, described
-from trilane.hw_profiles.schema import Profile
+from trilane.hw_profiles.placement_facts import NS_PER_MS
+from trilane.hw_profiles.profile_files import HOST, load_runnable
+from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.scene.planner import ALL_WORK, MOST_DENSITY, FrameWork
 from trilane.scheduler.placement import Ranked
 from trilane.shapes import Shape

@@ -28,7 +28,7 @@ from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError
 from trilane.files import MAX_TEXT_BYTES, read_npz, read_text
 from trilane.hw_profiles.graph_file import read_graph
-from trilane.hw_profiles.load import load_profile
+from trilane.hw_profiles.profile_files import load_profile
 from trilane.pipeline.journal import NAME as JOURNAL
 from trilane.pipeline.journal import read_journal
 from trilane.scene.camera.files import load_camera

@@ -14,9 +14,9 @@ from trilane.apps.explain.scene_plan import ScenePlan
 from trilane.avatars.network_file import reshaped
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import LEAST_FPS, MOST_FPS, RUNTIMES, Variant
-from trilane.hw_profiles.beside import MOST_TENANTS, NEWEST, SKIPS, Tenant
 from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.network_work import Network, count_work
+from trilane.hw_profiles.shared_chip import MOST_TENANTS, NEWEST, SKIPS, Tenant
 from trilane.scene.planner import FrameWork
 from trilane.scene.schema import ENDING
 from trilane.shapes import Shape

@@ -64,7 +64,7 @@ def engine_runtime_of(text: str | None) -> EngineRuntime | None:
 
 
 def check_governor(governor: str | None) -> None:
-    from trilane.hw_profiles.throttling import GOVERNORS
+    from trilane.hw_profiles.governor import GOVERNORS
 
     if governor is not None and governor not in GOVERNORS:
         raise BadInputError("--governor", repr(governor), " or ".join(GOVERNORS))
@@ -89,8 +89,7 @@ def unit_of(runtime: str, *more: str) -> Any:
 
 
 def reference_of(encoder: str, norm: str, size: str, channels: int, layout: str) -> Network:
-    from trilane.hw_profiles.configuration_table import spec_of
-    from trilane.hw_profiles.reference_networks import reference_network
+    from trilane.hw_profiles.reference_networks import reference_network, spec_of
 
     cells = {"encoder": encoder, "norm": norm, "size": size, "channels": str(channels), "layout": layout}
     return reference_network(spec_of(cells, "options"))
@@ -109,8 +108,8 @@ def predict_networks(
     `on`: unit, its precision and the runtime of its tensor engine. `over`: performance profile, minutes, governor, and
     what is wanted. `say`: function that is told before something takes seconds.
     """
-    from trilane.hw_profiles.bare_network import in_precision, predict_network, under_runtime
     from trilane.hw_profiles.graph_file import read_graph
+    from trilane.hw_profiles.network_time import in_precision, predict_network, under_runtime
     from trilane.hw_profiles.network_work import constant_tensors
 
     graphs = [read_graph(path, shapes) for path in paths]
@@ -143,9 +142,8 @@ def network_of(
     This machine is measured with the network. `say`: function that is told before something takes seconds.
     """
     from trilane.avatars.bundle import load_bundle
-    from trilane.hw_profiles.bare_network import in_precision
-    from trilane.hw_profiles.graph_file import read_graph
-    from trilane.hw_profiles.image_network import image_network
+    from trilane.hw_profiles.graph_file import image_network, read_graph
+    from trilane.hw_profiles.network_time import in_precision
     from trilane.hw_profiles.network_work import Network, count_work
 
     if layout not in ("packed", "split"):

@@ -15,14 +15,12 @@ from trilane.avatars.network_file import reshaped
 from trilane.errors import TrilaneError
 from trilane.hw_profiles.graph_file import GraphFile, read_graph
 from trilane.hw_profiles.host import usable_cores
-from trilane.hw_profiles.measured_host import error_of, with_network, with_stages
+from trilane.hw_profiles.host_model import NETWORK, error_of, with_network, with_stages
 from trilane.hw_profiles.network_time import price
 from trilane.hw_profiles.network_work import Network, count_work
-from trilane.hw_profiles.performance_profiles import corners_of
-from trilane.hw_profiles.placed_host import NETWORK
-from trilane.hw_profiles.placement_facts import NS_PER_MS
-from trilane.hw_profiles.schema import Profile
+from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.pipeline.unit_starter import UnitStarter
+from trilane.scheduler.stats import NS_PER_MS
 from trilane.stages import PRELOAD
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.avatar_pipeline import one_shape

@@ -17,9 +17,9 @@ from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import reshaped
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import Plan, application_graph, stage_times_ms
-from trilane.hw_profiles.load import load_runnable
 from trilane.hw_profiles.network_work import Network, count_work
-from trilane.hw_profiles.performance_profiles import corners_of
+from trilane.hw_profiles.profile_files import load_runnable
+from trilane.hw_profiles.schema import corners_of
 from trilane.scheduler.events import Settings
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.release import run_settings

@@ -26,7 +26,7 @@ from trilane.arrays import F64, U8, Mask
 from trilane.bench.lib.picture_error import psnr_of_frames, require_metrics
 from trilane.errors import TrilaneError
 from trilane.hw_profiles.governor import Governor
-from trilane.hw_profiles.load import load_runnable
+from trilane.hw_profiles.profile_files import load_runnable
 from trilane.pipeline import journal
 from trilane.pipeline.controls import RunControls
 from trilane.pipeline.result import RunResult

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.joints import JOINT_PARENTS
-from trilane.hw_profiles.fit import Fit, fit_profile
+from trilane.hw_profiles.fit import ProfileFit, fit_profile
 
 VERTICES, FACES, CORNERS = 90, 120, 130
 
 
 @pytest.fixture(scope="session")
-def fitted(shared_data: Path) -> Fit:
+def fitted(shared_data: Path) -> ProfileFit:
     """The fit of the committed profile of the Snapdragon 888, which takes seconds."""
     pytest.importorskip("scipy")
     return fit_profile("snapdragon-888-facts", shared_data / "snapdragon888_measured.csv")

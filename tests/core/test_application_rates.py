@@ -6,9 +6,10 @@ from typing import Any
 
 import pytest
 
-from trilane.hw_profiles import application_rates, predict
+from trilane.hw_profiles import predict
 from trilane.hw_profiles.application import REFERENCE, Plan, Variant, stage_times_ms, steady
-from trilane.hw_profiles.application_rates import (
+from trilane.hw_profiles.network_time import Interval, spread_of
+from trilane.hw_profiles.predict import (
     EDGES,
     around_frame,
     at_rate,
@@ -19,12 +20,10 @@ from trilane.hw_profiles.application_rates import (
     power_of,
     unheld_times,
 )
-from trilane.hw_profiles.device_power import device_power
-from trilane.hw_profiles.load import load_profile
-from trilane.hw_profiles.network_time import Interval, spread_of
-from trilane.hw_profiles.performance_profiles import corners_of
-from trilane.hw_profiles.rates import FrameTimes, Wanted
+from trilane.hw_profiles.profile_files import load_profile
+from trilane.hw_profiles.rates import FrameInterval, Wanted, device_power
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
+from trilane.hw_profiles.schema import corners_of
 from trilane.scheduler.policy import POLICIES
 
 PROFILE = load_profile("snapdragon-888")
@@ -73,7 +72,7 @@ def test_what_a_frame_needs_when_nothing_holds_it() -> None:
     ],
 )
 def test_the_interval_of_a_frame(frame: float, least: float, low: float, high: float) -> None:
-    found = around_frame(frame, FrameTimes(30.0, 20.0, 45.0), least)
+    found = around_frame(frame, FrameInterval(30.0, 20.0, 45.0), least)
     assert found == pytest.approx({"low": low, "high": high})
 
 
@@ -111,7 +110,7 @@ def test_a_row_of_the_comparison(frame_ms: float, holds: bool, monkeypatch: pyte
     asked: list[Any] = []
     now = steady(PROFILE, PLAN, CORNERS)
     told = type(now)(**{**vars(now), "frame_ms": frame_ms, "latency_ms": 70.0, "dropped": 0.25})
-    monkeypatch.setattr(application_rates, "steady", lambda *given: asked.append(given) or told)
+    monkeypatch.setattr(predict, "steady", lambda *given: asked.append(given) or told)
     row = at_rate(PROFILE, PACED, CORNERS, 25.0)
     assert asked == [(PROFILE, held_to(PACED, 25.0), CORNERS)]
     power = row.pop("power_w")

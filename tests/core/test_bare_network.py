@@ -14,17 +14,25 @@ from onnx import TensorProto, helper
 
 from support.small_inputs import net
 from trilane.errors import BadInputError
-from trilane.hw_profiles import bare_network
-from trilane.hw_profiles.bare_network import in_precision, operator_rows, predict_network, under_runtime, without_rule
-from trilane.hw_profiles.device_power import device_power
-from trilane.hw_profiles.graph_file import read_graph
-from trilane.hw_profiles.image_network import image_network
-from trilane.hw_profiles.load import load_profile
-from trilane.hw_profiles.network_time import Interval, NetworkTime, OperatorTime, interval, price, spread_of
+from trilane.hw_profiles import network_time
+from trilane.hw_profiles.graph_file import image_network, read_graph
+from trilane.hw_profiles.network_time import (
+    Interval,
+    NetworkTime,
+    OperatorTime,
+    in_precision,
+    interval,
+    operator_rows,
+    predict_network,
+    price,
+    spread_of,
+    under_runtime,
+    without_rule,
+)
 from trilane.hw_profiles.network_work import Operator, Work, count_work
-from trilane.hw_profiles.performance_profiles import Corners, corners_of
-from trilane.hw_profiles.rates import FrameTimes, Load, Wanted, answers, holding, within_power
-from trilane.hw_profiles.schema import CORNERS, ENGINE_RUNTIMES, Profile, Quantity
+from trilane.hw_profiles.profile_files import load_profile
+from trilane.hw_profiles.rates import FrameInterval, FrameLoad, Wanted, answers, device_power, holding, within_power
+from trilane.hw_profiles.schema import CORNERS, ENGINE_RUNTIMES, Corners, Profile, Quantity, corners_of
 from trilane.units import UNITS, UnitName
 
 
@@ -83,19 +91,19 @@ def test_the_busy_share_of_a_held_rate_is_as_uncertain_as_the_time() -> None:
 )
 def test_whether_a_rate_holds(times: tuple[float, float, float], holds: bool, words: str) -> None:
     """At 25 frames a second, a frame has 40 ms."""
-    found = holding(25.0, FrameTimes(*times))
+    found = holding(25.0, FrameInterval(*times))
     assert (found["holds"], found["words"], found["fps"]) == (holds, words, 25.0)
     reserves = [found[key] for key in ("reserve", "reserve_high", "reserve_low")]
     assert reserves == pytest.approx([1 - ms / 40 for ms in times])
 
 
-def on_dsp(ms: float) -> Load:
+def on_dsp(ms: float) -> FrameLoad:
     """A network of `ms` at the highest clock, half as fast at each lower corner."""
 
     def work_ms(corners: Corners) -> Mapping[UnitName, float]:
         return {"dsp": ms * 2 ** CORNERS.index(corners[2])}
 
-    return Load(work_ms, lambda corners: work_ms(corners)["dsp"])
+    return FrameLoad(work_ms, lambda corners: work_ms(corners)["dsp"])
 
 
 @pytest.mark.parametrize(
@@ -121,7 +129,7 @@ def test_the_rate_within_a_power(limit: float, fps: float, corner: str, by: str)
 def test_only_corners_that_may_be_the_best_are_simulated() -> None:
     """At the highest clock 100 a second are within the power; no lower one can pass that."""
     load, asked = on_dsp(10.0), list[Corners]()
-    told = Load(load.work_ms, lambda corners: asked.append(corners) or load.frame_ms(corners))
+    told = FrameLoad(load.work_ms, lambda corners: asked.append(corners) or load.frame_ms(corners))
     assert within_power(chip(), TOP, told, 9.0)["fps"] == 100.0
     assert set(asked) == {TOP}
 
@@ -156,12 +164,12 @@ def test_the_rate_within_a_power_is_the_best_of_all_corners() -> None:
             watts = sum(profile.units[u].power_w(c, busy[u]) for u, c in zip(UNITS, corners, strict=True))
             if sum(work.values()) * fps <= 1e3 and watts + profile.thermal.base_power_w.or_else(0) <= limit:
                 best = max(best, fps)
-    found = within_power(profile, requested, Load(work_ms, lambda c: sum(work_ms(c).values())), limit)
+    found = within_power(profile, requested, FrameLoad(work_ms, lambda c: sum(work_ms(c).values())), limit)
     assert best == int(found["fps"])
 
 
 def test_only_what_is_wanted_is_answered() -> None:
-    times = FrameTimes(10.0, 9.0, 11.0)
+    times = FrameInterval(10.0, 9.0, 11.0)
     assert answers(chip(), on_dsp(10.0), TOP, Wanted(), times) == {}
     found = answers(chip(), on_dsp(10.0), TOP, Wanted(30.0, 6.0), times)
     assert (found["rate"]["fps"], found["power_limit"]["limit_w"]) == (30.0, 6.0)
@@ -269,8 +277,8 @@ def test_a_network_at_a_rate_is_busy_for_its_share(tmp_path: Path, monkeypatch: 
     """A network of 8 ms 25 times a second works a fifth of the time; of 50 ms, always."""
     for ms, share in ((8.0, 0.2), (50.0, 1.0)):
         time = NetworkTime("dsp", 0.0, (OperatorTime("", "Conv", ms, "fixed"),))
-        monkeypatch.setattr(bare_network, "price", lambda *_, time=time: time)
-        monkeypatch.setattr(bare_network, "interval", lambda *_, ms=ms: Interval(ms / 2, 2 * ms, ()))
+        monkeypatch.setattr(network_time, "price", lambda *_, time=time: time)
+        monkeypatch.setattr(network_time, "interval", lambda *_, ms=ms: Interval(ms / 2, 2 * ms, ()))
         found = predict_network(chip(), graph_of(tmp_path), "dsp", wanted=Wanted(25.0))
         corner = corners_of(chip(), "burst")[2]
         assert found["power"]["units"]["dsp"]["w"] == pytest.approx(chip().units["dsp"].power_w(corner, share))

@@ -18,15 +18,15 @@ from onnx import TensorProto, helper
 from support.trace_reading import read_trace
 from trilane.apps.predict import asked_pipelines as sources
 from trilane.errors import BadInputError
-from trilane.hw_profiles import beside_answer
+from trilane.hw_profiles import shared_chip
 from trilane.hw_profiles.application import REFERENCE, Plan, Variant, stage_times_ms, steady
-from trilane.hw_profiles.beside import SKIPS, Tenant, Together, moved_bytes, together
-from trilane.hw_profiles.beside_answer import predict_beside
-from trilane.hw_profiles.load import load_profile
-from trilane.hw_profiles.measured_host import UNMEASURED, with_network
+from trilane.hw_profiles.host_model import UNMEASURED, with_network
 from trilane.hw_profiles.network_work import Network, count_work
-from trilane.hw_profiles.performance_profiles import corners_of
+from trilane.hw_profiles.over_time import temperatures_of
+from trilane.hw_profiles.profile_files import load_profile
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
+from trilane.hw_profiles.schema import corners_of
+from trilane.hw_profiles.shared_chip import SKIPS, Tenant, Together, moved_bytes, predict_beside, together
 from trilane.units import SUSTAINED
 
 CHIP = load_profile("snapdragon-888")
@@ -214,25 +214,25 @@ def test_what_it_settles_to_is_the_last_fifth_of_the_time() -> None:
         for corner, ms in (("early", 20.0), ("late", 30.0), ("last", 40.0))
     }
     moments: list[Any] = [SimpleNamespace(corners=corner) for corner in ["early"] * 8 + ["late", "last"]]
-    assert beside_answer._settled_ms(moments, reports.__getitem__, 1) == 35.0  # type: ignore[arg-type]
-    assert beside_answer._settled_ms([], reports.__getitem__, 1) is None  # type: ignore[arg-type]
+    assert shared_chip._settled_ms(moments, reports.__getitem__, 1) == 35.0  # type: ignore[arg-type]
+    assert shared_chip._settled_ms([], reports.__getitem__, 1) is None  # type: ignore[arg-type]
 
 
 def test_temperatures_by_hand() -> None:
     moments: list[Any] = [SimpleNamespace(device_c=device, junction_c=80 - device) for device in (30.0, 41.0, 35.0)]
-    assert beside_answer._temperatures(moments) == {"device_end": 35.0, "device_max": 41.0, "junction_max": 50.0}
-    assert beside_answer._temperatures([]) == {}
+    assert temperatures_of(moments) == {"device_end": 35.0, "device_max": 41.0, "junction_max": 50.0}
+    assert temperatures_of([]) == {}
 
 
 def test_what_is_said_of_a_machine_and_of_turns() -> None:
     host = load_profile("host")
-    one, two = [beside_answer._notes(CHIP, [avatar()] * count, "deadline") for count in (1, 2)]
+    one, two = [shared_chip._notes(CHIP, [avatar()] * count, "deadline") for count in (1, 2)]
     assert len(one) == 1 and one[0].startswith("frames are released from one instant on")
     assert two[1:] == ["a unit that several pipelines have handed a job takes them by deadline, each job to its end"]
-    plain = beside_answer._notes(host, [avatar()] * 2, "deadline")
+    plain = shared_chip._notes(host, [avatar()] * 2, "deadline")
     assert "divide it in equal shares" in plain[1] and plain[2].startswith(UNMEASURED)
     measured = with_network(host, avatar().networks[0].work, {1: 5.0}, 0.1, "measured by a test")
-    told = beside_answer._notes(measured, [avatar()] * 2, "deadline")
+    told = shared_chip._notes(measured, [avatar()] * 2, "deadline")
     assert told[:2] == plain[:2] and told[2].startswith("the first pipeline was measured by a test;")
 
 
@@ -369,7 +369,7 @@ def test_what_joins_the_stages_is_asked(
         return predict_beside(CHIP, [bare("dsp", 10, 32), bare("gpu", 10, 32)])
 
     monkeypatch.setattr(sources, "tenants", lambda texts, variant: (tuple(texts), variant))
-    monkeypatch.setattr(beside_answer, "predict_beside", told)
+    monkeypatch.setattr(shared_chip, "predict_beside", told)
     command("predict", "a.toml", "--beside", "b.toml", "--edge", "triple", "--turns", "deadline")
     command("predict", "a.toml", "--policy", "pipelined", "--minutes", 3, "--governor", "step_wise")
     command("predict", "a.toml", "--policy", "reference", "--performance-profile", "burst")

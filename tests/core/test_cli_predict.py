@@ -17,7 +17,7 @@ from trilane.apps.cli import predict_output
 from trilane.apps.predict import asked_prediction
 from trilane.avatars.bundle import load_bundle
 from trilane.errors import BadInputError
-from trilane.hw_profiles import configuration_table, load, over_time, plot
+from trilane.hw_profiles import over_time, plot, profile_files, reference_networks
 from trilane.hw_profiles import predict as predictions
 from trilane.hw_profiles.application import REFERENCE, Plan, Variant
 from trilane.hw_profiles.network_work import Network, count_work
@@ -26,7 +26,7 @@ from trilane.hw_profiles.reference_networks import NetworkSpec
 from trilane.units import BURST, SUSTAINED
 
 Command = Callable[..., tuple[str, str]]
-CHIP = load.load_profile("snapdragon-888").model_copy(update={"name": "chip", "title": "A Chip"})
+CHIP = profile_files.load_profile("snapdragon-888").model_copy(update={"name": "chip", "title": "A Chip"})
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     def show(answer: Any, as_json: bool) -> None:
         found["shown"] = (answer, as_json)
 
-    monkeypatch.setattr(load, "load_runnable", lambda name: found.setdefault("profile", name) and CHIP)
+    monkeypatch.setattr(profile_files, "load_runnable", lambda name: found.setdefault("profile", name) and CHIP)
     monkeypatch.setattr(predictions, "predict", answer)
     monkeypatch.setattr(predictions, "what_if", what_if)
     monkeypatch.setattr(cli, "draw", draw)
@@ -114,7 +114,7 @@ def test_networks_by_themselves(
     tiny_bundle: Path, tmp_path: Path, asked: dict[str, Any], monkeypatch: pytest.MonkeyPatch, command: Command
 ) -> None:
     """Each is read on its own, priced in the precision of its numbers, and nothing of the application is asked."""
-    monkeypatch.setattr(load, "load_runnable", lambda _: CHIP)
+    monkeypatch.setattr(profile_files, "load_runnable", lambda _: CHIP)
     file = tiny_bundle / "network.onnx"
     words = ("predict", "--network", file, "--network", file, "--fps", 20, "--json")
     found = json.loads(command(*words)[0])
@@ -235,7 +235,7 @@ def test_a_table_of_answers(
         arguments[-1](1)
         return iter(ROWS)
 
-    monkeypatch.setattr(configuration_table, "read_table", lambda path: [path] * 2)
+    monkeypatch.setattr(reference_networks, "read_table", lambda path: [path] * 2)
     monkeypatch.setattr(predictions, "predict_table", predict_table)
     words = ("predict", "--table", "rows.csv", "--policy", "latest", "--batch", 2, "--performance-profile", "balanced")
     check_printed("predict-table", command(*words)[0])
@@ -260,7 +260,7 @@ def test_a_table_has_a_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch, comman
     screen = io.StringIO()
     console = Console(file=screen, force_terminal=True, width=100)
     monkeypatch.setattr(cli, "stderr_console", lambda: console)
-    monkeypatch.setattr(configuration_table, "read_table", lambda _: [0] * 4)
+    monkeypatch.setattr(reference_networks, "read_table", lambda _: [0] * 4)
     monkeypatch.setattr(predictions, "predict_table", predict_table)
     command("predict", "--table", "rows.csv")
     assert "predicting" in screen.getvalue() and "50%" in screen.getvalue()

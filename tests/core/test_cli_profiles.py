@@ -12,11 +12,10 @@ import pytest
 
 from trilane.apps.cli import profiles as cli
 from trilane.hw_profiles import fit as fit_module
-from trilane.hw_profiles import load, published_times
-from trilane.hw_profiles.configuration_table import Row
-from trilane.hw_profiles.fit import Fit, Residual
-from trilane.hw_profiles.published_times import Check
-from trilane.hw_profiles.reference_networks import NetworkSpec
+from trilane.hw_profiles import profile_files, published_times
+from trilane.hw_profiles.fit import ProfileFit, Residual
+from trilane.hw_profiles.published_times import PublishedTime
+from trilane.hw_profiles.reference_networks import ConfigurationRow, NetworkSpec
 
 Command = Callable[..., tuple[str, str]]
 
@@ -44,17 +43,17 @@ def known(monkeypatch: pytest.MonkeyPatch) -> None:
     def load_profile(name: str) -> Profile:
         return Profile(name=name, title=f"The {name}", template=name == "form", units=units(name))
 
-    def check_published(name: str, profile: Profile) -> list[Check]:
+    def check_published(name: str, profile: Profile) -> list[PublishedTime]:
         assert profile.title == f"The {name}"
         if name != "one":
             return []
         return [
-            Check("one", "unet", "tflite", False, 54.1, 55.678),
-            Check("one", "resnet18", "qnn_dlc", True, 0.5, 0.4),
+            PublishedTime("one", "unet", "tflite", False, 54.1, 55.678),
+            PublishedTime("one", "resnet18", "qnn_dlc", True, 0.5, 0.4),
         ]
 
-    monkeypatch.setattr(load, "load_profile", load_profile)
-    monkeypatch.setattr(load, "profile_names", lambda: ["one", "form", "two"])
+    monkeypatch.setattr(profile_files, "load_profile", load_profile)
+    monkeypatch.setattr(profile_files, "profile_names", lambda: ["one", "form", "two"])
     monkeypatch.setattr(published_times, "check_published", check_published)
 
 
@@ -88,17 +87,17 @@ def test_profiles_are_checked(command: Command, check_printed: Callable[..., Non
     assert json.loads(command("profiles", "check", "two", "--json")[0]) == {"valid": ["two"], "published": []}
 
 
-def a_fit() -> Fit:
+def a_fit() -> ProfileFit:
     spec = NetworkSpec("resnet18", "batch", 512, 256, 16, "packed")
     other = NetworkSpec("mobilenetv2", "group", 64, 32, 8, "split")
-    rows = [Row("rows.csv: line 2", {}, spec), Row("rows.csv: line 7", {}, other)]
+    rows = [ConfigurationRow("rows.csv: line 2", {}, spec), ConfigurationRow("rows.csv: line 7", {}, other)]
     residuals = (
         Residual("network", rows[0], "bench_gpu_ms", 10.0, 11.0, 12.5),
         Residual("network", rows[1], "bench_gpu_ms", 20.0, 19.0, 14.0),
         Residual("application", rows[1], "app_dsp_ms", 40.0, 40.4, 39.2),
     )
     numbers = {"units.gpu.peak": (12345.678, 0.126), "units.dsp.idle_w": (0.25, 0.5)}
-    return Fit({"title": "A Chip, before the fit"}, numbers, residuals, 2)
+    return ProfileFit({"title": "A Chip, before the fit"}, numbers, residuals, 2)
 
 
 def test_what_a_fit_prints(

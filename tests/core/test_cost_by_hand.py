@@ -11,12 +11,12 @@ import onnx
 import pytest
 from onnx import TensorProto, helper
 
-from trilane.hw_profiles.load import load_profile
+from trilane.hw_profiles.governor import ThermalState, headroom_k
 from trilane.hw_profiles.network_work import Operator, Work, count_work
 from trilane.hw_profiles.operator_kinds import CLASSES
-from trilane.hw_profiles.operator_times import Machine, job_time, machine_of
+from trilane.hw_profiles.profile_files import load_profile
 from trilane.hw_profiles.schema import CORNERS
-from trilane.hw_profiles.thermal_state import ThermalState, headroom_k
+from trilane.hw_profiles.unit_times import UnitNumbers, job_time, machine_of
 from trilane.units import UNITS, UnitName
 
 
@@ -132,7 +132,7 @@ def test_a_picture_in_several_tensors_and_inputs_that_are_none(nodes: str, tenso
 
 
 #: Powers of two, so that the sums below are exact.
-MACHINE = Machine(
+MACHINE = UnitNumbers(
     arithmetic=np.array([1024.0, 2048.0, 512.0, np.inf, np.inf, np.inf, np.inf]),
     traffic=np.array([256.0, 128.0, 64.0, 32.0, 16.0, 8.0, 4.0]),
     stream=128.0,

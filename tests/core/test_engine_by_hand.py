@@ -11,16 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
-from trilane.hw_profiles.engine_layers import INDEX, NAMES, TERM_OF, TERMS, Layer, Layers
-from trilane.hw_profiles.engine_times import EngineNumbers, engine_time, join, numbers_of
-from trilane.hw_profiles.load import load_profile, profile_names
+from trilane.hw_profiles.engine_layers import INDEX, NAMES, TERM_OF, TERMS, EngineLayer, Layers
+from trilane.hw_profiles.engine_times import EngineNumbers, engine_time, join, numbers_of, spilled
 from trilane.hw_profiles.network_work import count_work
-from trilane.hw_profiles.on_chip import spilled
+from trilane.hw_profiles.profile_files import load_profile, profile_names
 from trilane.hw_profiles.reference_networks import NetworkSpec, network_work
 from trilane.hw_profiles.unit_times import time_on
 
 
-def layers_of_nodes(nodes: list[Any], shapes: dict[str, tuple[int, ...]]) -> tuple[Layer, ...]:
+def layers_of_nodes(nodes: list[Any], shapes: dict[str, tuple[int, ...]]) -> tuple[EngineLayer, ...]:
     """Layers of a chain of nodes from `x` to `y`; other shapes are weights where they begin with w."""
     values = {n: helper.make_tensor_value_info(n, TensorProto.FLOAT, shape) for n, shape in shapes.items()}
     inputs = [value for name, value in values.items() if name == "x" or name.startswith("w")]
@@ -322,7 +321,7 @@ def test_the_layers_from_one_on() -> None:
 
 def chain(*sizes: int) -> Layers:
     """Layers from tensor 0 to tensor n, of so many elements."""
-    layers = tuple(Layer(f"l{i}", "Conv", {}, (str(i),), str(i + 1)) for i in range(len(sizes) - 1))
+    layers = tuple(EngineLayer(f"l{i}", "Conv", {}, (str(i),), str(i + 1)) for i in range(len(sizes) - 1))
     return Layers(layers, {str(i): size for i, size in enumerate(sizes)}, sizes[0], sizes[-1])
 
 
@@ -335,8 +334,8 @@ def test_what_does_not_fit_goes_out_and_comes_back() -> None:
 def test_what_is_read_last_goes_first() -> None:
     """Of `a` (8) and `b` (8), 12 fit. `a` is read by the last layer, so 4 of it go out when `b` comes, and return."""
     layers = (
-        *(Layer("0", "Conv", {}, ("x",), "a"), Layer("1", "Conv", {}, ("a",), "b")),
-        *(Layer("2", "Conv", {}, ("b",), "c"), Layer("3", "Add", {}, ("c", "a"), "y")),
+        *(EngineLayer("0", "Conv", {}, ("x",), "a"), EngineLayer("1", "Conv", {}, ("a",), "b")),
+        *(EngineLayer("2", "Conv", {}, ("b",), "c"), EngineLayer("3", "Add", {}, ("c", "a"), "y")),
     )
     network = Layers(layers, {"x": 1, "a": 8, "b": 8, "c": 1, "y": 1}, 1, 1)
     assert spilled(network, 12) == (1, 4, 0, 4 + 1)
@@ -347,7 +346,9 @@ def drawn_network(random: Random) -> Layers:
     names, layers = ["x"], []
     for index in range(10):
         reads = tuple(random.sample(names, min(len(names), random.randint(1, 3))))
-        layers.append(Layer(f"l{index}", random.choice(["Conv", "Conv", "Add", "Concat"]), {}, reads, f"t{index}"))
+        layers.append(
+            EngineLayer(f"l{index}", random.choice(["Conv", "Conv", "Add", "Concat"]), {}, reads, f"t{index}")
+        )
         names.append(f"t{index}")
     return Layers(tuple(layers), {name: random.randint(0, 9) for name in names}, 1, 1)
 
@@ -400,7 +401,7 @@ def test_drawn_networks_move_what_goes_out_one_by_one(seed: int) -> None:
 
 
 def test_a_concatenation_moves_nothing() -> None:
-    layers = (Layer("0", "Concat", {}, ("x", "z"), "c"), Layer("1", "Conv", {}, ("c",), "y"))
+    layers = (EngineLayer("0", "Concat", {}, ("x", "z"), "c"), EngineLayer("1", "Conv", {}, ("c",), "y"))
     assert spilled(Layers(layers, {"x": 5, "z": 6, "c": 11, "y": 2}, 11, 2), 100) == (0, 5 + 6 + 2)
 
 

@@ -13,15 +13,36 @@ import numpy as np
 import pytest
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles import engine_study, latency_rows
+from trilane.hw_profiles import engine_study, published_times
 from trilane.hw_profiles.engine_layers import NAMES, RATES, TERMS
-from trilane.hw_profiles.engine_report import BEGIN, END, as_markdown, plot_errors
-from trilane.hw_profiles.engine_study import NORMAL_80, EngineStudy, Rate, Study, misses_of, study_engines
-from trilane.hw_profiles.engine_tables import HEXAGON_OF, MARK, PROFILE_OF, profile_texts
-from trilane.hw_profiles.fit_engines import Fitted, LeftOut, Numbers
-from trilane.hw_profiles.fit_priors import FACTORS, ON_CHIP_MB, UNITS_OF_RATES, Prior, factor_prior, rate_prior
-from trilane.hw_profiles.latency_rows import Latency, layers_in, layers_of_rows, read_latencies
-from trilane.hw_profiles.schema import EngineName
+from trilane.hw_profiles.engine_study import (
+    BEGIN,
+    END,
+    HEXAGON_OF,
+    MARK,
+    PROFILE_OF,
+    ChipRate,
+    EngineStudy,
+    Study,
+    as_markdown,
+    misses_of,
+    plot_errors,
+    profile_texts,
+    study_engines,
+)
+from trilane.hw_profiles.fit_engines import (
+    FACTORS,
+    ON_CHIP_MB,
+    UNITS_OF_RATES,
+    Fitted,
+    LeftOut,
+    Numbers,
+    Prior,
+    factor_prior,
+    rate_prior,
+)
+from trilane.hw_profiles.published_times import Latency, layers_in, layers_of_rows, read_latencies
+from trilane.hw_profiles.schema import NORMAL_80, EngineName
 
 KEYS = ("arithmetic_tmac_s", "activation_gb_s", "spill_gb_s", "weight_gb_s", "operator_us", "job_us")
 COLUMNS = "network,chip,hexagon,precision,runtime,ms,caution,use"
@@ -72,7 +93,7 @@ def test_a_folder_without_the_tables_is_refused(folder: Path) -> None:
 
 def test_each_network_of_the_rows_is_read_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        latency_rows, "read_graph", lambda path: SimpleNamespace(work=SimpleNamespace(layers=str(path)))
+        published_times, "read_graph", lambda path: SimpleNamespace(work=SimpleNamespace(layers=str(path)))
     )
     layers_in.cache_clear()
     found = layers_of_rows(folder, read_latencies(folder))
@@ -139,8 +160,8 @@ def test_each_engine_is_fitted_to_its_own_rows(studied: tuple[Study, list[Any]],
         assert study.rates["8elite5", "int8_tflite"][key].value == pytest.approx(twice)
 
 
-def rates(value: float, kind: str = "fitted") -> dict[str, Rate]:
-    return {key: Rate(value * (number + 1), 0.5, kind) for number, key in enumerate(KEYS)}
+def rates(value: float, kind: str = "fitted") -> dict[str, ChipRate]:
+    return {key: ChipRate(value * (number + 1), 0.5, kind) for number, key in enumerate(KEYS)}
 
 
 ALL: tuple[EngineName, ...] = ("int8_tflite", "int8_qnn_dlc", "fp16_tflite", "fp16_qnn_dlc")

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ValidationError, field_validator
 
 import trilane
 from trilane.errors import BadInputError, MissingPartError, TrilaneError, UnitLostError, reason
-from trilane.hw_profiles.load import merged_tables, parse_profile, profile_folder
+from trilane.hw_profiles.profile_files import merged_tables, parse_profile, profile_folder
 from trilane.scene.schema import scene_from
 from trilane.scheduler.events import Graph, StageSpec
 from trilane.scheduler.policy import policy_named

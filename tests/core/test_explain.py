@@ -34,10 +34,10 @@ from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import DETAILS, CpuSkinner
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import Plan, stage_times_ms, steady
-from trilane.hw_profiles.load import load_profile
 from trilane.hw_profiles.network_work import Network, count_work
-from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.hw_profiles.predict import predict
+from trilane.hw_profiles.profile_files import load_profile
+from trilane.hw_profiles.schema import corners_of
 from trilane.scene.crop import Rect
 from trilane.scene.planner import MOST_DENSITY, FrameWork
 from trilane.stages.avatar_assets import shaped_body, staged_of
@@ -250,7 +250,7 @@ def test_phases_and_the_fixed_square_count_the_avatars_in_view(tiny_bundle: Path
 
 def test_a_crowds_units_are_placed_by_the_crowds_times(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Five avatars on one core: 4 poses and 4 meshes more than one, whatever the placement."""
-    for module in ("hw_profiles.host_profile", "hw_profiles.predict", "apps.explain.explanation"):
+    for module in ("hw_profiles.host", "hw_profiles.predict", "apps.explain.explanation"):
         monkeypatch.setattr(f"trilane.{module}.usable_cores", lambda: (0,))
     costs = CostModel(load_bundle(tiny_bundle).read_network(), "host", CAP)
     chip = load_profile("host")
@@ -297,7 +297,7 @@ def test_on_this_machine_units_are_placed_as_in_a_prediction(
     checked: Checked, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """For the shape of most frames, on two cores."""
-    for module in ("host_profile", "predict"):
+    for module in ("host", "predict"):
         monkeypatch.setattr(f"trilane.hw_profiles.{module}.usable_cores", lambda: (0, 1))
     monkeypatch.setattr("trilane.apps.explain.explanation.usable_cores", lambda: (0, 1))
     document = json.loads(explained(tmp_path, "--json", "--profile", "host").stdout)
@@ -349,7 +349,7 @@ def test_both_commands_explain_an_option_alike() -> None:
 
 def test_cores_that_are_asked_for_are_kept(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of two cores: the other units go where frames are shortest; a network on both cores may share them."""
-    for module in ("hw_profiles.host_profile", "hw_profiles.predict", "apps.explain.explanation"):
+    for module in ("hw_profiles.host", "hw_profiles.predict", "apps.explain.explanation"):
         monkeypatch.setattr(f"trilane.{module}.usable_cores", lambda: (0, 1))
     costs = CostModel(load_bundle(tiny_bundle).read_network(), "host", CAP)
     free = costs.placement((96, 64))

@@ -10,11 +10,23 @@ import pytest
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.engine_layers import INDEX, NAMES, RATES, Layers
-from trilane.hw_profiles.engine_report import BEGIN, END, errors_of, with_table
-from trilane.hw_profiles.engine_study import NORMAL_80, Rate, middle, own_error, study_engine
-from trilane.hw_profiles.engine_tables import MARK, PROFILE_OF, head_of
+from trilane.hw_profiles.engine_study import (
+    BEGIN,
+    END,
+    MARK,
+    PROFILE_OF,
+    ChipRate,
+    errors_of,
+    head_of,
+    middle,
+    own_error,
+    study_engine,
+    with_table,
+)
 from trilane.hw_profiles.fit_engines import (
     ALWAYS,
+    FACTORS,
+    UNITS_OF_RATES,
     Fitted,
     LeftOut,
     Numbers,
@@ -28,15 +40,15 @@ from trilane.hw_profiles.fit_engines import (
     folds,
     predict_rows,
     priors,
+    rate_prior,
 )
-from trilane.hw_profiles.fit_priors import FACTORS, UNITS_OF_RATES, rate_prior
 from trilane.hw_profiles.graph_file import read_graph
-from trilane.hw_profiles.latency_rows import Latency, layers_in, read_latencies
-from trilane.hw_profiles.load import load_profile, profile_folder
 from trilane.hw_profiles.network_time import interval, price
 from trilane.hw_profiles.network_work import count_work
-from trilane.hw_profiles.performance_profiles import corners_of
+from trilane.hw_profiles.profile_files import load_profile, profile_folder
+from trilane.hw_profiles.published_times import Latency, layers_in, read_latencies
 from trilane.hw_profiles.reference_networks import NetworkSpec, network_work
+from trilane.hw_profiles.schema import NORMAL_80, corners_of
 from trilane.hw_profiles.unit_times import nearest
 
 SPECS = {
@@ -184,7 +196,7 @@ def test_errors_of_rows() -> None:
 
 def test_the_middle_of_two_chips_is_geometric() -> None:
     """1 and 4: in the middle 2; they differ by a factor of 2 to either side, beside what is open of each."""
-    (number,) = middle([{"x": Rate(1, 0.3, "fitted")}, {"x": Rate(4, 0.3, "fitted")}]).values()
+    (number,) = middle([{"x": ChipRate(1, 0.3, "fitted")}, {"x": ChipRate(4, 0.3, "fitted")}]).values()
     assert number == pytest.approx((2, math.hypot(math.log(2), 0.3)))
 
 

@@ -11,14 +11,23 @@ import pytest
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles import fit
-from trilane.hw_profiles.configuration_table import Row
-from trilane.hw_profiles.fit import Fit, Measurement, Residual, as_toml, measurements, with_factors
-from trilane.hw_profiles.fit_steps import STEPS, UNIT_OF_COLUMN, Step
+from trilane.hw_profiles.fit import (
+    STEPS,
+    UNIT_OF_COLUMN,
+    Measurement,
+    ProfileFit,
+    Residual,
+    Step,
+    as_toml,
+    measurements,
+    with_factors,
+)
+from trilane.hw_profiles.reference_networks import ConfigurationRow
 
 
-def row(**cells: str) -> Row:
+def row(**cells: str) -> ConfigurationRow:
     spec: Any = "spec"
-    return Row("table.csv: line 2", cells, spec)
+    return ConfigurationRow("table.csv: line 2", cells, spec)
 
 
 def test_an_application_is_measured_in_the_middle_of_its_range() -> None:
@@ -47,7 +56,7 @@ RESIDUALS = (
 
 
 def test_errors_are_relative_and_their_median_is_kept() -> None:
-    found = Fit({}, {}, RESIDUALS, 3)
+    found = ProfileFit({}, {}, RESIDUALS, 3)
     assert found.columns == ("bench_dsp_ms", "bench_gpu_ms", "app_dsp_ms")
     assert (RESIDUALS[4].error, RESIDUALS[4].left_out_error) == pytest.approx((-0.2, -0.4))
     assert found.median_error("bench_dsp_ms") == pytest.approx(0.05)
@@ -88,7 +97,9 @@ def test_the_file_of_a_fit() -> None:
         "units.dsp.efficiency.resize": (1234.56, 0.25),
         "units.dsp.a": (2.0, 0.5),
     }
-    found = as_toml(Fit({}, numbers, RESIDUALS, 7), "mine", 'The "best"', "base", "trilane profiles fit --from x.csv")
+    found = as_toml(
+        ProfileFit({}, numbers, RESIDUALS, 7), "mine", 'The "best"', "base", "trilane profiles fit --from x.csv"
+    )
     number = 'kind = "fitted", spread = {}, source = "profiles fit --from x.csv" }}'
     assert found.splitlines() == [
         "# Written by `trilane profiles fit --from x.csv`: 7 numbers from 5 measurements.",

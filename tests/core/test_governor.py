@@ -9,7 +9,7 @@ import pytest
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import application_graph
 from trilane.hw_profiles.governor import Governor
-from trilane.hw_profiles.load import load_runnable
+from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import Profile
 from trilane.scheduler.events import SetDuty, Settings
 from trilane.scheduler.virtual import simulate

@@ -9,7 +9,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from trilane.hw_profiles.graph_folding import fold
+from trilane.hw_profiles.graph_shapes import fold
 
 INT64 = TensorProto.INT64
 

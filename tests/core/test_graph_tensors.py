@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from trilane.hw_profiles.graph_tensors import bytes_of, check_size, forget_data, is_ordinary, type_name
+from trilane.hw_profiles.graph_checks import bytes_of, check_size, forget_data, is_ordinary, type_name
 from trilane.unexpected_value import UnexpectedValue
 
 BITS = {

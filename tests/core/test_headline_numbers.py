@@ -22,8 +22,8 @@ from trilane.apps.explain.explained_run import explain_run
 from trilane.apps.explain.scene_plan import ScenePlan
 from trilane.hw_profiles.application import Plan
 from trilane.hw_profiles.governor import Governor
-from trilane.hw_profiles.load import load_profile
 from trilane.hw_profiles.predict import predict
+from trilane.hw_profiles.profile_files import load_profile
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
 from trilane.hw_profiles.schema import Profile
 from trilane.pipeline.journal import records_of

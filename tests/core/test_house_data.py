@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from trilane.hw_profiles.load import profile_folder, profile_names
+from trilane.hw_profiles.profile_files import profile_folder, profile_names
 
 
 def leaves(data: Any, key: str = "") -> Iterator[tuple[str, Any]]:

@@ -8,18 +8,22 @@ from typing import Any
 import pytest
 
 from trilane.hw_profiles.application import Plan, Variant, stage_times_ms
-from trilane.hw_profiles.bare_network import predict_network
-from trilane.hw_profiles.configuration_table import Row
 from trilane.hw_profiles.graph_file import GraphFile
-from trilane.hw_profiles.load import load_profile
-from trilane.hw_profiles.measured_host import MODEL_ERROR, UNMEASURED, error_of, with_network, with_stages
-from trilane.hw_profiles.network_time import price
-from trilane.hw_profiles.performance_profiles import corners_of
-from trilane.hw_profiles.placed_host import place_units, with_threads
+from trilane.hw_profiles.host_model import (
+    MODEL_ERROR,
+    UNMEASURED,
+    error_of,
+    place_units,
+    with_network,
+    with_stages,
+    with_threads,
+)
+from trilane.hw_profiles.network_time import predict_network, price
 from trilane.hw_profiles.predict import predict, predict_table, what_if
+from trilane.hw_profiles.profile_files import load_profile
 from trilane.hw_profiles.rates import Wanted
-from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
-from trilane.hw_profiles.schema import Profile
+from trilane.hw_profiles.reference_networks import ConfigurationRow, NetworkSpec, reference_network
+from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.hw_profiles.unit_times import time_on
 from trilane.scheduler.places import Core
 from trilane.units import BURST
@@ -40,7 +44,7 @@ SAID = "measured here"
 
 @pytest.fixture(autouse=True)
 def four_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("host_profile", "predict"):
+    for module in ("host", "predict"):
         monkeypatch.setattr(f"trilane.hw_profiles.{module}.usable_cores", lambda: (0, 1, 2, 3))
 
 
@@ -180,7 +184,7 @@ def test_alternatives_and_longer_times_are_of_the_measured_profile() -> None:
 def test_a_table_says_nothing_of_how_sure_it_is_of_this_machine() -> None:
     spec = NetworkSpec("resnet18", "batch", 64, 96, 10)
     of_host, of_chip = (
-        next(iter(predict_table(load_profile(name), [Row("rows.csv: line 2", {}, spec)])))
+        next(iter(predict_table(load_profile(name), [ConfigurationRow("rows.csv: line 2", {}, spec)])))
         for name in ("host", "snapdragon-888")
     )
     unsure = {"confidence", "expected_error_gpu", "expected_error_dsp"}

@@ -9,16 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.hw_profiles.application import isolated_job_time, relative_error
-from trilane.hw_profiles.engine_layers import NAMES, Layer, Layers
-from trilane.hw_profiles.load import load_profile
+from trilane.hw_profiles.application import isolated_job_time
+from trilane.hw_profiles.engine_layers import NAMES, EngineLayer, Layers
 from trilane.hw_profiles.network_time import Interval, NetworkTime, OperatorTime, interval, price, spread_of
 from trilane.hw_profiles.network_work import Operator, Work
-from trilane.hw_profiles.performance_profiles import corners_of
+from trilane.hw_profiles.over_time import caps_of, ends_of, settled_corners, temperatures_of, timeline_of
+from trilane.hw_profiles.profile_files import load_profile
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
-from trilane.hw_profiles.schema import Profile, Quantity
-from trilane.hw_profiles.timeline import caps_of, ends_of, settled_corners, temperatures_of, timeline_of
-from trilane.hw_profiles.unit_times import layer_times, time_on, unsure
+from trilane.hw_profiles.schema import Profile, Quantity, corners_of
+from trilane.hw_profiles.unit_times import layer_times, relative_error, time_on, unsure
 
 CHIP = load_profile("snapdragon-888")
 TOP = corners_of(CHIP, "burst")
@@ -86,7 +85,7 @@ def test_what_bounds_an_operator_by_the_roofline(one: Operator, ms: float, bound
 )
 def test_what_bounds_a_layer_of_an_engine(term: str, bound: str) -> None:
     amounts = {term: 1e6}
-    layers = Layers((Layer("l", "Conv", amounts, ("x",), "y"),), {"x": 1, "y": 1}, 1, 1)
+    layers = Layers((EngineLayer("l", "Conv", amounts, ("x",), "y"),), {"x": 1, "y": 1}, 1, 1)
     work = Work((), 1, 1, 1, layers)
     ((layer,), found) = price(CHIP, work, "dsp", TOP).operators, time_on(CHIP.units["dsp"], CHIP.memory, work)
     assert (layer.name, layer.op_type, layer.bound) == ("l", "Conv", bound)
@@ -107,7 +106,7 @@ def test_what_an_engine_hands_to_the_processor() -> None:
     told = {"fallback_fixed_ms": 2.0, "fallback_ns_per_element": 1e3, "permute_fixed_ms": 7.0}
     told |= {"input_ns_per_element": 1e4}
     unit = own.model_copy(update={"fallback": ("Odd",), **{key: number(value) for key, value in told.items()}})
-    layers = tuple(Layer(name, kind, {"operator": 1}, (), name) for name, kind in (("a", "Odd"), ("b", "Conv")))
+    layers = tuple(EngineLayer(name, kind, {"operator": 1}, (), name) for name, kind in (("a", "Odd"), ("b", "Conv")))
     operators = tuple(
         Operator("", kind, "elementwise", 0, 0, 0, 0, 0, out) for kind, out in (("Odd", 500), ("Odd", 700), ("Conv", 9))
     )
@@ -126,7 +125,7 @@ def test_what_an_engine_hands_to_the_processor() -> None:
 
 def test_an_engine_has_the_memory_that_the_application_leaves() -> None:
     memory = CHIP.memory.model_copy(update={"application_use_fraction": number(0.75)})
-    layers = Layers((Layer("l", "Conv", {"weights": 1e6}, ("x",), "y"),), {"x": 1, "y": 1}, 1, 1)
+    layers = Layers((EngineLayer("l", "Conv", {"weights": 1e6}, ("x",), "y"),), {"x": 1, "y": 1}, 1, 1)
     work = Work((), 1, 1, 1, layers)
     alone, beside = (
         time_on(CHIP.units["dsp"], memory, work, contended=both).parts["weights"] for both in (False, True)
@@ -185,7 +184,7 @@ def test_the_interval_on_an_engine_names_what_is_ill_known() -> None:
     unit = own.model_copy(update={"engines": engines})
     chip = CHIP.model_copy(update={"units": {**CHIP.units, "dsp": unit}})
     assert unit.engine is not None and name
-    layers = Layers((Layer("l", "MaxPool", {"pool": 1e12}, ("x",), "y"),), {"x": 1, "y": 1}, 1, 1)
+    layers = Layers((EngineLayer("l", "MaxPool", {"pool": 1e12}, ("x",), "y"),), {"x": 1, "y": 1}, 1, 1)
     work = Work((), 1, 1, 1, layers)
     found = interval(chip, work, price(chip, work, "dsp", TOP))
     assert spread_of(found) == pytest.approx(math.hypot(0.3, 0.4, 0.06), rel=1e-4)

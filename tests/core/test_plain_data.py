@@ -25,8 +25,8 @@ NEEDS_MORE = ("stages.dsp.openvino", "stages.dsp.qnn", "stages.dsp.cuda")
 CHANGING = {
     "apps.experiments.error_by_cause._Moved",
     "apps.experiments.error_by_cause._Pooled",
-    "hw_profiles.thermal_state.ThermalState",
-    "hw_profiles.throttling.Throttle",
+    "hw_profiles.governor.ThermalState",
+    "hw_profiles.governor.Throttle",
     "pipeline.moved_bytes.ByteCounter",
     "scene.motion.bvh.BvhJoint",
     "scene.motion.bvh._Hierarchy",

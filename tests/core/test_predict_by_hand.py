@@ -10,16 +10,15 @@ from typing import Any
 import pytest
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles import over_time, predict, timeline
+from trilane.hw_profiles import over_time, predict
 from trilane.hw_profiles.application import REFERENCE, Plan, Steady, Variant
-from trilane.hw_profiles.load import load_tables, parse_profile
+from trilane.hw_profiles.governor import ThermalState, Throttle
 from trilane.hw_profiles.network_time import Interval
-from trilane.hw_profiles.operator_times import JobTime
 from trilane.hw_profiles.over_time import Moment
-from trilane.hw_profiles.rates import FrameTimes
+from trilane.hw_profiles.profile_files import load_tables, parse_profile
+from trilane.hw_profiles.rates import FrameInterval
 from trilane.hw_profiles.schema import CORNERS, Profile
-from trilane.hw_profiles.thermal_state import ThermalState
-from trilane.hw_profiles.throttling import Throttle
+from trilane.hw_profiles.unit_times import JobTime
 from trilane.units import UNITS
 
 NETWORK: Any = SimpleNamespace(
@@ -96,7 +95,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 AROUND = Interval(15.0, 22.0, ("it is so",))
 #: Held to 16 ms by the display, 20 to 24 ms are left of 12, 20 and 24.
-TIMES = FrameTimes(20.0, 12.0, 24.0)
+TIMES = FrameInterval(20.0, 12.0, 24.0)
 
 
 def power_of(profile: Profile, corners: Any) -> dict[str, float]:
@@ -195,11 +194,11 @@ def test_an_answer_about_minutes_is_of_its_moments(asked: list[Any], monkeypatch
 
 
 def test_a_long_timeline_is_thinned_and_few_moments_settle_at_their_last() -> None:
-    assert [each["t_s"] for each in timeline.timeline_of([moment(n, 1.0) for n in range(1080)])] == [
+    assert [each["t_s"] for each in over_time.timeline_of([moment(n, 1.0) for n in range(1080)])] == [
         6.0 * n for n in range(360)
     ]
-    assert len(timeline.timeline_of([moment(n, 1.0) for n in range(719)])) == 719
-    assert timeline.ends_of([moment(1, 10.0), moment(2, 40.0)]) == {"fps_start": 100.0, "fps_settled": 25.0}
+    assert len(over_time.timeline_of([moment(n, 1.0) for n in range(719)])) == 719
+    assert over_time.ends_of([moment(1, 10.0), moment(2, 40.0)]) == {"fps_start": 100.0, "fps_settled": 25.0}
 
 
 def test_percentiles_of_a_hundred_moments() -> None:

@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 
 from trilane.hw_profiles.application import Plan, Variant
-from trilane.hw_profiles.load import load_profile, profile_names
 from trilane.hw_profiles.network_work import Network
 from trilane.hw_profiles.predict import predict, what_if
+from trilane.hw_profiles.profile_files import load_profile, profile_names
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
 from trilane.units import PERFORMANCE_PROFILES, SUSTAINED, UnitName
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from trilane.apps.cli.main import main
-from trilane.hw_profiles.fit import Fit
+from trilane.hw_profiles.fit import ProfileFit
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
@@ -189,7 +189,11 @@ def test_profiles_are_listed_shown_and_checked(
 
 
 def test_a_fit_prints_its_errors_and_writes_a_profile(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, fitted: Fit, shared_data: Path
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    fitted: ProfileFit,
+    shared_data: Path,
 ) -> None:
     """The fit itself is the one that other tests look at."""
     path = tmp_path / "mine.toml"

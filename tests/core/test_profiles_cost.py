@@ -13,11 +13,9 @@ from onnx import TensorProto, helper
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import isolated_job_time, split_work
-from trilane.hw_profiles.load import load_profile
 from trilane.hw_profiles.network_work import Operator, count_work
 from trilane.hw_profiles.operator_kinds import CLASSES, has_rule
-from trilane.hw_profiles.operator_times import job_time, machine_of
-from trilane.hw_profiles.performance_profiles import corners_of
+from trilane.hw_profiles.profile_files import load_profile
 from trilane.hw_profiles.published_times import PUBLISHED_MS, check_published, resnet18_work, unet_work
 from trilane.hw_profiles.reference_networks import (
     LAYOUTS,
@@ -27,7 +25,8 @@ from trilane.hw_profiles.reference_networks import (
     parameters,
     reference_network,
 )
-from trilane.hw_profiles.unit_times import time_on
+from trilane.hw_profiles.schema import corners_of
+from trilane.hw_profiles.unit_times import job_time, machine_of, time_on
 from trilane.training.quantising.quantise import Quantised
 from trilane.unet_tables import ENCODERS, NORMS
 from trilane.units import UnitName

@@ -10,17 +10,18 @@ import pytest
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles import fit as fit_module
-from trilane.hw_profiles.configuration_table import read_table, spec_of
 from trilane.hw_profiles.fit import (
-    Fit,
+    STEPS,
+    UNIT_OF_COLUMN,
+    ProfileFit,
     as_toml,
     fit_profile,
     measurements,
     predicted_ms,
     with_factors,
 )
-from trilane.hw_profiles.fit_steps import STEPS, UNIT_OF_COLUMN
-from trilane.hw_profiles.load import load_profile, load_tables, parse_profile
+from trilane.hw_profiles.profile_files import load_profile, load_tables, parse_profile
+from trilane.hw_profiles.reference_networks import read_table, spec_of
 
 HEADER = (
     "encoder,norm,size,channels,layout,bench_dsp_ms,bench_gpu_ms,"
@@ -50,7 +51,7 @@ def test_the_committed_profile_is_as_near_as_promised(measured: Path, columns: t
     assert median(abs(predicted_ms(profile, measurement) / measurement.ms - 1) for measurement in compared) <= most
 
 
-def test_fitting_again_gives_the_committed_numbers(fitted: Fit) -> None:
+def test_fitting_again_gives_the_committed_numbers(fitted: ProfileFit) -> None:
     committed, _ = load_tables("snapdragon-888")
     for key, (value, _) in fitted.numbers.items():
         table = committed
@@ -111,7 +112,7 @@ def test_numbers_that_made_the_rows_are_found_again(tmp_path: Path, monkeypatch:
             )
 
 
-def test_the_written_profile_can_be_read(fitted: Fit, tmp_path: Path) -> None:
+def test_the_written_profile_can_be_read(fitted: ProfileFit, tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(as_toml(fitted, "mine", "Mine", "snapdragon-888-facts", "trilane profiles fit --from x.csv"))
     profile = load_profile(str(path))

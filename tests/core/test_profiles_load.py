@@ -11,7 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles import schema
-from trilane.hw_profiles.load import (
+from trilane.hw_profiles.profile_files import (
     load_profile,
     load_runnable,
     merged_tables,

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles import placed_host
+from trilane.hw_profiles import host_model
 from trilane.hw_profiles.application import (
     MOST_FPS,
     REFERENCE,
@@ -21,16 +21,13 @@ from trilane.hw_profiles.application import (
     stage_times_ms,
     steady,
 )
-from trilane.hw_profiles.configuration_table import read_table
-from trilane.hw_profiles.load import load_profile
+from trilane.hw_profiles.governor import GOVERNORS, ThermalState
+from trilane.hw_profiles.host_model import on_cores, place_units
 from trilane.hw_profiles.over_time import over_time
-from trilane.hw_profiles.performance_profiles import corners_of
-from trilane.hw_profiles.placed_host import on_cores, place_units
 from trilane.hw_profiles.predict import predict, predict_table, what_if
-from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
-from trilane.hw_profiles.schema import Profile
-from trilane.hw_profiles.thermal_state import ThermalState
-from trilane.hw_profiles.throttling import GOVERNORS
+from trilane.hw_profiles.profile_files import load_profile
+from trilane.hw_profiles.reference_networks import NetworkSpec, read_table, reference_network
+from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.scheduler.placement_model import Rules
 from trilane.scheduler.places import Core, Place
 from trilane.units import UNITS, UnitName
@@ -257,8 +254,8 @@ def test_units_are_placed_by_the_rules_of_the_policy(
         asked.append(given)
         raise StopIteration
 
-    monkeypatch.setattr(placed_host, "ranked", ranked)
-    monkeypatch.setattr(placed_host, "_times", lambda *given: given)
+    monkeypatch.setattr(host_model, "ranked", ranked)
+    monkeypatch.setattr(host_model, "_times", lambda *given: given)
     plan: Any = SimpleNamespace(variant=SimpleNamespace(policy=policy))
     cores = [Core(0, 0), Core(1, 1)]
     with pytest.raises(StopIteration):
@@ -322,7 +319,7 @@ def test_a_placed_network_has_the_rates_of_its_threads_and_no_other_unit_changes
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The profile's rates are those of as many threads as the rule gives, here 4."""
-    monkeypatch.setattr("trilane.hw_profiles.host_profile.network_threads", lambda: 4)
+    monkeypatch.setattr("trilane.hw_profiles.host.network_threads", lambda: 4)
     profile = load_profile("host")
     placement = {"cpu": Place((2,), 1), "gpu": Place((0, 1), 1), "dsp": Place((0, 1, 3), 3)}
     units = on_cores(profile, placement).units
@@ -333,8 +330,8 @@ def test_a_placed_network_has_the_rates_of_its_threads_and_no_other_unit_changes
         before, after = getattr(profile.units["dsp"], peak), getattr(units["dsp"], peak)
         assert after.value == pytest.approx(0.75 * before.or_else(0.0)) and after.kind == before.kind
     assert units["dsp"].threads == 3
-    others = units["dsp"].model_dump(exclude={"core", "threads", *placed_host.PEAKS})
-    assert others == profile.units["dsp"].model_dump(exclude={"core", "threads", *placed_host.PEAKS})
+    others = units["dsp"].model_dump(exclude={"core", "threads", *host_model.PEAKS})
+    assert others == profile.units["dsp"].model_dump(exclude={"core", "threads", *host_model.PEAKS})
 
 
 def test_units_with_cores_of_their_own_are_predicted_as_without() -> None:
@@ -347,7 +344,7 @@ def test_units_with_cores_of_their_own_are_predicted_as_without() -> None:
 def test_the_units_of_this_machine_share_cores_as_a_run_does(
     cores: tuple[int, ...], shared: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("trilane.hw_profiles.host_profile.usable_cores", lambda: cores)
+    monkeypatch.setattr("trilane.hw_profiles.host.usable_cores", lambda: cores)
     units = load_profile("host").units
     counts = Counter(unit.core for unit in units.values())
     assert " ".join(name for name, unit in units.items() if counts[unit.core] > 1) == shared
@@ -368,7 +365,7 @@ def test_a_quick_answer_is_the_settled_one(variant: Variant, within: float, runt
 def test_this_machine_in_virtual_time_is_placed_as_its_times_ask(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The scheduler in virtual time finds no placement better by more than the model's margin."""
     cores = tuple(range(count))
-    for module in ("host_profile", "predict"):
+    for module in ("host", "predict"):
         monkeypatch.setattr(f"trilane.hw_profiles.{module}.usable_cores", lambda: cores)
     profile, plan = load_profile("host"), Plan(NETWORK, "dsp", Variant("pipelined", "double"))
     corners = corners_of(profile, SUSTAINED)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from trilane.hw_profiles.placement_facts import described, placement_of, predictions, unit_rows
+from trilane.hw_profiles.host import described, placement_of, predictions, unit_rows
 from trilane.pipeline import rehearsal
 from trilane.pipeline.rehearsal import Chain, on_rungs, timed, works_of
 from trilane.pipeline.run_log import UnitError

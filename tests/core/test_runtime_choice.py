@@ -6,9 +6,9 @@ import pytest
 
 from trilane import machine
 from trilane.errors import MissingPartError
-from trilane.hw_profiles import host_profile
-from trilane.hw_profiles.load import load_profile
-from trilane.hw_profiles.runtime_choice import fastest_runtime
+from trilane.hw_profiles import host
+from trilane.hw_profiles.host import fastest_runtime
+from trilane.hw_profiles.profile_files import load_profile
 from trilane.stages.dsp import runtime
 from trilane.stages.dsp.runtime import RUNTIMES
 
@@ -30,8 +30,8 @@ def test_nothing_to_take_says_what_to_install():
 
 
 def test_the_table_knows_only_runtimes_that_there_are():
-    assert {name for speeds, *_ in host_profile.RUNTIMES.values() for name in speeds} <= set(RUNTIMES)
-    assert set(host_profile.RUNTIMES) == set(host_profile.RATES)
+    assert {name for speeds, *_ in host.RUNTIMES.values() for name in speeds} <= set(RUNTIMES)
+    assert set(host.RUNTIMES) == set(host.RATES)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 
 from trilane.bench.lib.handoff_variants import BARE, CHANNELS, SLOT, WRITTEN
 from trilane.body import body
-from trilane.hw_profiles.host_profile import RATES
+from trilane.hw_profiles.host import RATES
 from trilane.hw_profiles.operator_kinds import CLASSES, KIND_OF, LAYOUT_CHANGES, STATISTICS
 from trilane.scene import camera_placement
 from trilane.stages.machine_facts import OPTIONAL_PACKAGES

@@ -17,8 +17,8 @@ from trilane.apps.predict import asked_prediction, this_machine
 from trilane.avatars.bundle import load_bundle
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.graph_file import read_graph
-from trilane.hw_profiles.load import load_profile
 from trilane.hw_profiles.network_work import Network, count_work
+from trilane.hw_profiles.profile_files import load_profile
 from trilane.machine import Machine
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.rehearsal import Rehearsed

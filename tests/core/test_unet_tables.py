@@ -6,8 +6,7 @@ from collections import Counter
 
 import pytest
 
-from trilane.hw_profiles.graph_builder import GraphBuilder
-from trilane.hw_profiles.reference_encoders import encode
+from trilane.hw_profiles.reference_networks import GraphBuilder, encode
 from trilane.unet_tables import (
     DECODER,
     ENCODERS,

@@ -7,11 +7,10 @@ from typing import Any
 
 import pytest
 
-from trilane.hw_profiles.load import load_profile, load_tables, parse_profile
-from trilane.hw_profiles.operator_times import machine_of
+from trilane.hw_profiles.governor import ThermalState, Throttle, headroom_k, power_allocator, step_wise
+from trilane.hw_profiles.profile_files import load_profile, load_tables, parse_profile
 from trilane.hw_profiles.schema import CORNERS, Profile
-from trilane.hw_profiles.thermal_state import ThermalState, headroom_k
-from trilane.hw_profiles.throttling import Throttle, power_allocator, step_wise
+from trilane.hw_profiles.unit_times import machine_of
 from trilane.units import UNITS
 
 

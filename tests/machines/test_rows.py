@@ -24,7 +24,7 @@ from support.machines import lowest_versions
 from trilane import machine
 from trilane.apps.run.run_folder import RunFolder
 from trilane.cache import cache_dir
-from trilane.hw_profiles.load import load_profile
+from trilane.hw_profiles.profile_files import load_profile
 from trilane.pipeline.hardware_counters import availability
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.stages.dsp.runtime import installed

@@ -26,7 +26,7 @@ from trilane.apps.run.pace import Pace, compare
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.application import Variant, application_graph, settings_of
 from trilane.hw_profiles.governor import Governor
-from trilane.hw_profiles.load import load_runnable
+from trilane.hw_profiles.profile_files import load_runnable
 from trilane.pipeline.controls import RunControls
 from trilane.pipeline.description import Pipeline, UnitSettings
 from trilane.pipeline.result import RunResult

@@ -1,19 +1,15 @@
 """Several pipelines on one chip: avatars and bare networks, each at a rate, on the same units, memory and heat.
 
-Rule: what a frame costs comes from `application.py`, who waits for whom from the cores of `trilane.scheduler.beside`;
-here is only how much slower the memory makes a network while others use it too.
-
-Memory. The bandwidth that a network has is what others leave over (Gables, Hill and Reddi, 2019), as it is in an
-application alone. Each avatar's camera, display and composition take `application_use_fraction` all the time; and while
-a network of another pipeline runs on another unit, that one's bytes over its time are taken too. What one unit does
-never competes with itself: its jobs follow each other.
-
-Heat. Each unit's power follows from how long all pipelines together keep it busy.
+`application.py` says what a frame costs, and the cores of `trilane.scheduler.beside` decide who waits. This file adds
+how much a network slows while others use the memory: it has the bandwidth that they leave (Gables, Hill and Reddi,
+2019). Each avatar's camera, display and composition take `application_use_fraction` all the time, and a network of
+another pipeline on another unit takes its bytes over its time. Jobs of one unit follow each other and never compete.
+The answer has the keys of report.json where they mean the same.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, NamedTuple
@@ -28,27 +24,29 @@ from trilane.hw_profiles.application import (
     application_graph,
     stage_times_ms,
 )
-from trilane.hw_profiles.engine_times import numbers_of
+from trilane.hw_profiles.engine_times import numbers_of, spilled
+from trilane.hw_profiles.host_model import UNMEASURED
 from trilane.hw_profiles.network_work import Network
-from trilane.hw_profiles.on_chip import spilled
-from trilane.hw_profiles.performance_profiles import Corners
-from trilane.hw_profiles.schema import Profile, Unit
+from trilane.hw_profiles.over_time import Moment, last_fifth, temperatures_of, unit_power_w, warm_up
+from trilane.hw_profiles.profile_files import HOST
+from trilane.hw_profiles.schema import Corners, Profile, Unit, corners_of
 from trilane.scheduler.beside import ONE, Member, Runs, simulate_beside
 from trilane.scheduler.events import Graph, Settings, Stop, chain
 from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.release import run_settings
+from trilane.scheduler.stats import NS_PER_MS
 from trilane.scheduler.turns import ROUND_ROBIN
 from trilane.scheduler.virtual import Service, Simulation, Skips
-from trilane.units import BYPASS, INFER, UNITS, UnitName
+from trilane.units import BYPASS, INFER, SUSTAINED, UNITS, UnitName
 
 MOST_TENANTS = 8
-#: Of the bandwidth, what others can take at most: something is always left.
+#: Share of the bandwidth that others can take at most: something is always left.
 MOST_USE = 0.95
-#: Virtual seconds of a run, at least; and so many frames of the slowest tenant.
+#: A run lasts at least LEAST_S virtual seconds and LEAST_FRAMES of the slowest tenant, but at most MOST_S.
 LEAST_S, LEAST_FRAMES, MOST_S = 10.0, 64, 600.0
-#: How frames are taken if nothing else is asked for: the newest counts, as of a camera; a staler one is dropped.
+#: How frames are taken by default: only the newest counts, as with a camera; an older one is dropped.
 NEWEST = Variant("latest", "double")
-NS_PER_MS, NS_PER_S = 1_000_000, 1_000_000_000
+NS_PER_S = 1_000_000_000
 ENDLESS = 1 << 40
 SKIPS = -1
 
@@ -57,11 +55,12 @@ SKIPS = -1
 class Tenant:
     """A pipeline that shares the chip with others.
 
-    `name`: in reports; `source`: what was asked for. `networks`: one for each shape of its tensor and number of avatars
-    in view. `frames`: of each frame, the place of its network in `networks`, or `SKIPS`; they begin anew after the last
-    one. `unit`: of the network. `fps`: frames released a second. `variant`: how the stages are joined. `is_bare`:
-    nothing but the network, whose result is due when the next frame comes. `avatars`: in view where each of `networks`
-    runs; one in each if it is empty. Raises BadInputError for a unit or a rate out of range.
+    `name`: its name in reports. `source`: what was asked for. `networks`: one network for each shape of the tensor and
+    number of avatars in view. `frames`: for each frame, the place of its network in `networks`, or `SKIPS`; the list
+    begins anew after its end. `unit`: unit of the network. `fps`: frames released a second. `variant`: how the stages
+    are joined. `is_bare`: whether there is nothing but the network, whose result is due when the next frame comes.
+    `avatars`: number of avatars in view for each of `networks`; empty for one each. Raises BadInputError for a unit or
+    a rate out of range.
     """
 
     name: str
@@ -89,7 +88,7 @@ class Tenant:
         return replace(application_graph(self.variant.edge, [(name, self.unit)]), bypass=BYPASS)
 
     def settings(self, display_ns: int) -> Settings:
-        """Of its core: frames without end, at its rate. `display_ns`: an avatar is not shown more often."""
+        """Settings of its core: frames without end, at its rate. `display_ns`: an avatar is not shown more often."""
         policy = self.variant.policy
         limits: dict[str, Any] = {"in_queue": 0 if POLICIES[policy].newest else 1, "hang_ns": ENDLESS}
         period_ns = round(NS_PER_S / self.fps)
@@ -99,7 +98,7 @@ class Tenant:
         return run_settings(policy, ENDLESS, shown_ns, shown_ns, **limits)
 
     def plan(self, kind: int) -> Plan:
-        """What runs in a frame whose network is the one at place `kind`."""
+        """What runs in a frame with the network at place `kind`."""
         return Plan(self.networks[kind], self.unit, self.variant, avatars=self.avatars[kind] if self.avatars else 1)
 
     def kind(self, frame: int) -> int:
@@ -111,8 +110,9 @@ class Tenant:
 class Together:
     """The pipelines once they have settled, at constant corners.
 
-    `runs`: what the scheduler says of each. `stages_ms`: of each, mean time of a job by stage if nothing else ran.
-    `busy`: share of the time in which each unit works, for all; `by_tenant`: for each.
+    `runs`: what the scheduler says of each pipeline. `stages_ms`: for each, mean milliseconds of a job by stage if
+    nothing else ran. `busy`: share of the time in which each unit works for all of them; `by_tenant`: the same for
+    each.
     """
 
     runs: tuple[Simulation, ...]
@@ -122,7 +122,7 @@ class Together:
 
     @property
     def frame_ms(self) -> float:
-        """Of the first tenant."""
+        """Mean frame time of the first tenant."""
         mean: float = self.runs[0].report["frame_time_ms"]["mean"]
         return mean
 
@@ -130,9 +130,9 @@ class Together:
 def together(
     profile: Profile, tenants: Sequence[Tenant], corners: Corners, turns: str = ROUND_ROBIN, *, keep: bool = False
 ) -> Together:
-    """The `tenants` on the chip `profile`, its units at `corners`.
+    """Run the `tenants` on the chip `profile`, with its units at `corners`, until they have settled.
 
-    `turns`: whose job a unit takes that several wait for.
+    `turns`: rule that chooses whose job a unit takes when several wait.
     `keep`: whether the steps and jobs of each are recorded.
     """
     costs = _Costs(profile, tenants, corners)
@@ -159,7 +159,7 @@ def _busy_s(run: Simulation, unit: str) -> float:
 
 
 def _seconds(tenants: Sequence[Tenant], costs: _Costs) -> float:
-    """How long the run lasts."""
+    """Virtual seconds that the run lasts."""
     slowest = max(
         max(1 / tenant.fps, sum(means.values()) / 1e3) for tenant, means in zip(tenants, costs.mean_ms, strict=True)
     )
@@ -167,7 +167,7 @@ def _seconds(tenants: Sequence[Tenant], costs: _Costs) -> float:
 
 
 class _Job(NamedTuple):
-    """A network: number of its tenant, place among the networks of that one."""
+    """A network: number of its tenant, and its place among the networks of that tenant."""
 
     tenant: int
     kind: int
@@ -191,7 +191,7 @@ class _Costs:
         return lambda frame, _fresh: tenant.kind(frame) == SKIPS
 
     def service(self, number: int) -> Service:
-        """The service times of a tenant, beside nobody."""
+        """Service times of a tenant when no other one runs."""
         tenant = self._tenants[number]
 
         def service(stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
@@ -200,7 +200,7 @@ class _Costs:
         return service
 
     def speed(self, job: Runs, others: Sequence[Runs]) -> int:
-        """Of a network's job beside `others`, by what they leave of the memory's bandwidth; of any other job, `ONE`."""
+        """Speed of a job beside `others`: for a network, by the bandwidth that they leave; `ONE` for any other job."""
         if job.stage != INFER[0]:
             return ONE
         beside = [other for other in others if self._competes(job, other)]
@@ -228,7 +228,7 @@ class _Costs:
         return bytes_s / (self._profile.memory.bandwidth_gb_s.or_else(10.0) * 1e9)
 
     def _network_ms(self, job: _Job, use: float) -> float:
-        """Of a network while the share `use` of the bandwidth is taken."""
+        """Milliseconds of a network while the share `use` of the bandwidth is taken."""
         return self._stages_ms(job, use)[INFER[0]]
 
     def _stages_ms(self, job: _Job, use: float) -> dict[str, float]:
@@ -243,7 +243,7 @@ class _Costs:
         return {stage: round(ms * NS_PER_MS) for stage, ms in self._stages_ms(job, self._always).items()}
 
     def _means(self, number: int) -> dict[str, float]:
-        """Mean over the frames that have a network, by stage; of the first network where none has one."""
+        """Mean milliseconds by stage over the frames that have a network; of the first network where none has one."""
         kinds = [kind for kind in self._tenants[number].frames if kind != SKIPS] or [0]
         each = [self._times(_Job(number, kind)) for kind in kinds]
         return {stage: sum(times[stage] for times in each) / len(each) / NS_PER_MS for stage in each[0]}
@@ -257,11 +257,138 @@ def _used(profile: Profile, use: float) -> Profile:
 
 
 def moved_bytes(network: Network, unit: Unit) -> float:
-    """Bytes that a network reads and writes in a job on `unit`: every operator's elements, and the weights once.
+    """Bytes that a network reads and writes in a job on `unit`: the elements of every operator, and the weights once.
 
-    On a tensor engine only what does not stay on the chip.
+    A tensor engine moves only what does not stay on the chip.
     """
     work = network.work
     if unit.engine is not None:
         return float(sum(spilled(work.layers, numbers_of(unit.engine).room)) + work.weights) * unit.element_bytes
     return float(work.table[:, 1].sum() + work.weights) * unit.element_bytes
+
+
+def predict_beside(
+    profile: Profile,
+    tenants: Sequence[Tenant],
+    performance_profile: str = SUSTAINED,
+    minutes: float = 0.0,
+    governor: str | None = None,
+    turns: str = ROUND_ROBIN,
+) -> dict[str, Any]:
+    """Return everything about the `tenants` on one chip: each one beside the others and alone, and the chip's units.
+
+    `profile`: hardware profile of the chip.
+    `performance_profile`: its name, one of PERFORMANCE_PROFILES.
+    `minutes`: virtual time from a cold start; 0 for constant temperature.
+    `governor`: name in GOVERNORS; None for the profile's own.
+    `turns`: name in TURNS, the rule that chooses whose job a unit takes when several wait.
+    Raises BadInputError for an unknown name or a time out of range.
+    """
+    corners = corners_of(profile, performance_profile)
+    at = cache(lambda where: together(profile, tenants, where, turns))
+    now = together(profile, tenants, corners, turns)
+    moments = warm_up(profile, at, performance_profile, minutes, governor) if minutes else []
+    last = at(moments[-1].corners) if moments else now
+    powers = unit_power_w(profile, now, corners)
+    return {
+        "schema": 1,
+        "clock": "virtual",
+        "machine": {"profile": profile.name, "title": profile.title},
+        "config": {
+            "performance_profile": performance_profile,
+            "minutes": minutes,
+            "governor": governor or profile.thermal.governor,
+            "turns": turns,
+        },
+        "pipelines": [
+            _row(profile, tenant, number, now, corners, _settled_ms(moments, at, number))
+            for number, tenant in enumerate(tenants)
+        ],
+        "units": {unit: _unit(unit, now, tenants) for unit in UNITS},
+        "units_settled": {unit: _unit(unit, last, tenants) for unit in UNITS},
+        "power_w": _mean([moment.power_w for moment in moments]) or sum(powers.values()) + _base_w(profile),
+        "base_power_w": _base_w(profile),
+        "base_power_kind": profile.thermal.base_power_w.kind,
+        "unit_power_w": dict(powers),
+        "temperature_c": temperatures_of(moments),
+        "caps": {"throttled_share": _mean([float(moment.throttled) for moment in moments])},
+        "notes": _notes(profile, tenants, turns),
+    }
+
+
+def _base_w(profile: Profile) -> float:
+    return profile.thermal.base_power_w.or_else(0.0)
+
+
+def _row(
+    profile: Profile, tenant: Tenant, number: int, now: Together, corners: Corners, settled_ms: float | None
+) -> dict[str, Any]:
+    report = now.runs[number].report
+    alone = together(profile, [tenant], corners).runs[0].report
+    return {
+        "name": tenant.name,
+        "source": tenant.source,
+        "kind": "network" if tenant.is_bare else "avatar",
+        "unit": tenant.unit,
+        "rate_fps": tenant.fps,
+        "policy": tenant.variant.policy,
+        "edge": tenant.variant.edge,
+        **_kept(report),
+        "frame_ms_settled": settled_ms or report["frame_time_ms"]["mean"],
+        "alone": _kept(alone),
+        "stages": {stage: {**report["stages"][stage], "alone_ms": ms} for stage, ms in now.stages_ms[number].items()},
+        "units": {
+            unit: {"busy": row["busy"], "idle": row["idle"], "jobs": row["jobs"]}
+            for unit, row in report["units"].items()
+        },
+    }
+
+
+def _kept(report: Mapping[str, Any]) -> dict[str, Any]:
+    """The part of a run's report that is told both of a run among others and of one alone.
+
+    `in_time`: share of the released frames that were presented in time.
+    """
+    frames, misses = report["frames"], report["deadline_misses"]
+    return {
+        "frames": {key: frames[key] for key in ("requested", "presented", "dropped")},
+        "frame_time_ms": report["frame_time_ms"],
+        "latency_ms": report["latency_ms"],
+        "response_ms": report["response_ms"],
+        "fps": report["fps"],
+        "deadline_misses": misses,
+        "in_time": (frames["presented"] - misses) / max(frames["requested"], 1),
+    }
+
+
+def _settled_ms(moments: Sequence[Moment], at: Callable[[Corners], Together], number: int) -> float | None:
+    """Mean frame time of a pipeline in the last fifth of the time; None where no time passes."""
+    last = last_fifth(moments)
+    return _mean([at(each.corners).runs[number].report["frame_time_ms"]["mean"] for each in last]) or None
+
+
+def _unit(unit: str, now: Together, tenants: Sequence[Tenant]) -> dict[str, Any]:
+    by_name = {tenant.name: row[unit] for tenant, row in zip(tenants, now.by_tenant, strict=True)}
+    return {"busy": now.busy[unit], "idle": 1 - now.busy[unit], "by_pipeline": by_name}
+
+
+def _notes(profile: Profile, tenants: Sequence[Tenant], turns: str) -> list[str]:
+    notes = [
+        "frames are released from one instant on, each pipeline's at its own rate; response: from release to shown; "
+        "a network's result is due when its next frame comes, an avatar's frame three of its periods after its release"
+    ]
+    if profile.name == HOST:
+        measured = profile.units[INFER[1]].measured
+        notes += [
+            "units on one core of this machine divide it in equal shares; cores are given by the rule for any run",
+            f"{UNMEASURED}: `trilane bench pipeline --beside` measures"
+            if measured is None
+            else f"the first pipeline was {measured.said}; others have the same ratios of measured to modelled times",
+        ]
+    elif len(tenants) > 1:
+        notes.append(f"a unit that several pipelines have handed a job takes them by {turns}, each job to its end")
+    return notes
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values) if values else 0.0

@@ -1,7 +1,7 @@
 """Reads hardware profiles: TOML files that may extend each other, checked against the schema.
 
-Rule: every defect of a file becomes a `BadInputError` that names the file, the key, what was found and what was
-expected.
+Every defect of a file becomes a `BadInputError` that names the file, the key, what was found and what was expected.
+The profile `host` also gets the numbers that `host.py` computes for this machine.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles.host_profile import host_tables
+from trilane.hw_profiles.host import host_tables
 from trilane.hw_profiles.schema import Profile
 from trilane.unexpected_value import unexpected_in
 
@@ -66,7 +66,7 @@ def load_tables(name: str | Path) -> tuple[dict[str, Any], Path]:
 
 
 def parse_profile(data: Mapping[str, Any], path: Path) -> Profile:
-    """The profile of the tables `data`; `path` is named in errors. Raises BadInputError for any defect."""
+    """Check the tables `data` against the schema. `path`: file to name in errors. Raises BadInputError."""
     try:
         return Profile.model_validate(data)
     except ValidationError as error:
@@ -122,7 +122,7 @@ def _read(path: Path) -> dict[str, Any]:
         if path.stat().st_size > MAX_BYTES:
             raise BadInputError(path, f"{path.stat().st_size} bytes", f"at most {MAX_BYTES}")
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:  # of bytes that are no text, of numbers and lists that are too long
+    except (ValueError, RecursionError) as error:  # bytes that are no text, numbers that are too long, deep lists
         raise BadInputError(path, str(error), "TOML in UTF-8") from None
     except OSError as error:
         raise BadInputError.of_os_error(path, error, "a file that can be read") from None
@@ -167,7 +167,7 @@ def _short(value: Any) -> str:
 
 
 def _siblings(keys: Sequence[str]) -> Iterator[str]:
-    """The keys that the schema allows in the table that the last of `keys` is in."""
+    """The keys that the schema allows beside the last of `keys`."""
     model: Any = Profile
     for key in keys[:-1]:
         fields = getattr(model, "model_fields", {})

@@ -1,0 +1,219 @@
+"""The profile `host` in a prediction: its units placed on cores, and measured times in place of assumed ones.
+
+Units are placed as a run's are, by modelled times. Virtual time knows units with cores of their own and units that
+take turns on one core, so no unit floats and none with several cores shares one, except where cores are asked for.
+A network's measured time over its modelled one says how much slower its unit is than assumed, for each number of
+threads, so another shape of its tensor takes a time in proportion to its work. What is not measured has no interval.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from statistics import median, stdev
+from typing import Any, NamedTuple
+
+from trilane.hw_profiles.application import Plan, stage_times_ms
+from trilane.hw_profiles.host import predictions, rule_placement, unit_rows
+from trilane.hw_profiles.network_work import Network, Work
+from trilane.hw_profiles.reference_networks import CHANNELS_PER_PASS
+from trilane.hw_profiles.schema import Corners, Measured, Profile, Quantity, Unit
+from trilane.hw_profiles.unit_times import time_on
+from trilane.scheduler.placement import Ranked, chosen, ranked
+from trilane.scheduler.placement_model import SCHEDULER_NS, Rules, frame_ns
+from trilane.scheduler.places import Core, Place, Placement, Times, shared_cores
+from trilane.scheduler.places import Work as FrameWork
+from trilane.scheduler.stats import NS_PER_MS
+from trilane.units import BEFORE_INFER, UNITS, UnitName
+
+NETWORK: UnitName = "dsp"
+SEQUENTIAL = "sequential"
+PEAKS = ("peak_int8_tmac_s", "peak_fp16_tmac_s", "peak_fp32_tmac_s")
+
+#: Relative error of a prediction from measured times, besides their scatter: frame times that followed from CPU times
+#: were 0.90 to 1.15 of 11 measured runs (docs/decisions/placement.md), a range that fits a deviation of 0.08.
+MODEL_ERROR = 0.08
+#: Keys of intervals of times, and of numbers that stand for one.
+OF_TIMES = frozenset(
+    [
+        "low",
+        "high",
+        "low_ms",
+        "high_ms",
+        "reserve_low",
+        "reserve_high",
+        "confidence",
+        "expected_error",
+        "expected_error_gpu",
+        "expected_error_dsp",
+    ]
+)
+OF_POWER = frozenset(["low_w", "high_w", "low_fps", "high_fps"])
+UNMEASURED = "of this machine are cores, clock and instructions; its speeds are assumed, so there is no interval"
+
+
+class Placed(NamedTuple):
+    """How the units were placed.
+
+    `best`: placement that was taken. `rule`: placement by the rule for any run. `found`: all placements, the least
+    frame time first.
+    """
+
+    best: Ranked
+    rule: Ranked
+    found: Sequence[Ranked]
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Key `placement` of a prediction."""
+        return {"units": unit_rows(self.best.placement), **predictions(self.best, self.rule, self.found)}
+
+
+def place_units(
+    profile: Profile,
+    plan: Plan,
+    corners: Corners,
+    cores: Sequence[Core],
+    asked: Mapping[str, tuple[int, ...]] | None = None,
+) -> Placed:
+    """Place the units of `profile` for `plan`, at these `corners`, on `cores`, by the times that the model predicts.
+
+    `asked`: cores that the user chose for units, all of them among `cores`.
+    """
+    given = {unit: Place(own, len(own)) for unit, own in (asked or {}).items()}
+    times = _times(profile, plan, corners, len(cores), given)
+    rules = Rules(BEFORE_INFER[0][1], plan.variant.policy == SEQUENTIAL)
+    where = rule_placement(tuple(core.number for core in cores), asked)
+    found = [each for each in ranked(cores, times, rules, given) if given or _can_be_simulated(each.placement)]
+    rule = Ranked(where, frame_ns(where, cores, times, rules))
+    return Placed(chosen(found, rule), rule, found)
+
+
+def on_cores(profile: Profile, placement: Placement) -> Profile:
+    """Return `profile` with its units on the cores of `placement`; the network's unit has the rates of its threads."""
+    units = {}
+    for name, unit in profile.units.items():
+        place = placement[name]
+        core = f"core {place.cores[0]}" if len(place.cores) == 1 else ""
+        placed = with_threads(unit, place.threads) if name == NETWORK else unit
+        units[name] = placed.model_copy(update={"core": core})
+    return profile.model_copy(update={"units": units})
+
+
+def _can_be_simulated(placement: Placement) -> bool:
+    shared = shared_cores(placement)
+    return all(len(place.cores) == place.threads for place in placement.values()) and not any(
+        shared.intersection(place.cores) for place in placement.values() if place.threads > 1
+    )
+
+
+def _times(profile: Profile, plan: Plan, corners: Corners, cores: int, given: Placement) -> Times:
+    """The model's times of a frame, by unit and number of threads.
+
+    The network's unit may have as many threads as there are cores.
+    `cores`: number of cores.
+    `given`: places that the user chose for units, whose threads are known too.
+    """
+    rule = rule_placement(tuple(range(cores)))
+    counts = {unit: {1, rule[unit].threads} for unit in UNITS}
+    measured = profile.units[NETWORK].measured
+    counts[NETWORK] = counts[NETWORK] | set(range(1, cores + 1)) if measured is None else set(measured.slower)
+    for unit in UNITS:
+        counts[unit] |= {place.threads for name, place in given.items() if name == unit}
+    times: dict[str, dict[int, FrameWork]] = {unit: {} for unit in UNITS}
+    for unit, threads in ((unit, each) for unit, of in counts.items() for each in sorted(of)):
+        network = with_threads(profile.units[NETWORK], threads) if unit == NETWORK else profile.units[NETWORK]
+        threaded = profile.model_copy(update={"units": {**profile.units, NETWORK: network}})
+        stages = stage_times_ms(threaded, plan, corners)
+        own = [ms / plan.variant.batch for (_, other), ms in stages.items() if other == unit]
+        ns = round(sum(own) * NS_PER_MS)
+        times[unit][threads] = FrameWork(ns, ns, len(own))
+    return times
+
+
+def with_threads(unit: Unit, threads: int) -> Unit:
+    """Return the network's unit with `threads` threads. Each thread has the peak rates of a core.
+
+    A measured unit is slower by the factor that was measured with that number of threads.
+    """
+    scale = threads / unit.threads
+    rates: dict[str, Quantity] = {name: getattr(unit, name) for name in PEAKS}
+    scaled = {name: rate.model_copy(update={"value": rate.or_else(0.0) * scale}) for name, rate in rates.items()}
+    return unit.model_copy(update={**scaled, "threads": threads})
+
+
+def error_of(took: Sequence[float]) -> float:
+    """Relative error of what follows from measured times: their scatter and `MODEL_ERROR`.
+
+    `took`: measured times, each above 0; a single one has no scatter.
+    """
+    scatter = stdev(map(math.log, took)) if len(took) > 1 else 0.0
+    return math.hypot(scatter, MODEL_ERROR)
+
+
+def with_network(profile: Profile, work: Work, ms: Mapping[int, float], error: float, said: str) -> Profile:
+    """Return `profile` with the measured times of a network on the unit for networks.
+
+    `work`: work of the network. `ms`: measured milliseconds, by threads. `error`: result of `error_of`. `said`:
+    sentence that tells how it was measured.
+    """
+    fraction = _measured(0.0, "the stages were measured beside each other")
+    memory = profile.memory.model_copy(update={"application_use_fraction": fraction})
+    unit = profile.units[NETWORK]
+    slower = {
+        threads: took / time_on(with_threads(unit, threads), memory, work).total_ms for threads, took in ms.items()
+    }
+    measured = unit.model_copy(update={"measured": Measured(slower=slower, error=error, said=said)})
+    threads = unit.threads if unit.threads in slower else min(slower)
+    units = {**profile.units, NETWORK: with_threads(measured, threads)}
+    return profile.model_copy(update={"units": units, "memory": memory})
+
+
+def with_stages(
+    profile: Profile, network: Network, took_ns: Mapping[str, Sequence[int]], said: str, avatars: int = 1
+) -> Profile:
+    """Return `profile` with the measured times of the stages beside the network; the medians over the frames count.
+
+    `network`: network whose tensor the frames had. `took_ns`: nanoseconds of each stage, frame by frame. `avatars`:
+    number of avatars that were posed. The scheduler works on the cores of the first and the last stage, so half of its
+    time for a frame is added to each.
+    """
+    ms = {name: median(each) / NS_PER_MS for name, each in took_ns.items()}
+    scheduler_ms = len(ms) * SCHEDULER_NS / NS_PER_MS / 2
+    drawn = network.pixels * -(-network.channels // CHANNELS_PER_PASS)
+    costs = {
+        "pose_ms": (ms["pose"] + scheduler_ms) / avatars,
+        "raster_ns_per_vertex": 0.0,
+        "raster_ns_per_pixel": ms["raster"] * NS_PER_MS / drawn,
+        "readback_ns_per_byte": 0.0,
+        "handover_ms": 0.0,
+        "composite_ms": ms["composite"],
+        "present_ms": ms["present"] + scheduler_ms,
+    }
+    update = {key: _measured(value, said) for key, value in costs.items()}
+    return profile.model_copy(update={"application": profile.application.model_copy(update=update)})
+
+
+def _measured(value: float, source: str) -> Quantity:
+    return Quantity(value=value, kind="measured", source=source)
+
+
+def with_known_intervals(profile: Profile, unit: UnitName, answer: dict[str, Any]) -> dict[str, Any]:
+    """Return `answer`, a prediction for `unit` of this machine, with null for the intervals of what was not measured.
+
+    No power of this machine is ever measured. Without measured times the words of a rate say only whether it holds.
+    """
+    if profile.units[unit].measured is not None:
+        return _without(answer, OF_POWER)
+    known = _without(answer, OF_POWER | OF_TIMES)
+    if rate := known.get("rate"):
+        rate["words"] = rate["words"].partition(",")[0]
+    return known
+
+
+def _without(found: dict[str, Any], keys: frozenset[str]) -> dict[str, Any]:
+    """Return `found` with None under `keys`, in the mappings in it too."""
+    return {
+        key: None if key in keys else _without(value, keys) if isinstance(value, dict) else value
+        for key, value in found.items()
+    }
