@@ -22,11 +22,11 @@ from trilane.hw_profiles.application import Plan, Variant, stage_times_ms, stead
 from trilane.hw_profiles.host import described, host_cores, usable_cores
 from trilane.hw_profiles.host_model import place_units
 from trilane.hw_profiles.network_work import Network, count_work
-from trilane.hw_profiles.placement_facts import NS_PER_MS
 from trilane.hw_profiles.profile_files import HOST, load_runnable
 from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.scene.planner import ALL_WORK, MOST_DENSITY, FrameWork
 from trilane.scheduler.placement import Ranked
+from trilane.scheduler.stats import NS_PER_MS
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, network_of, shaped_body
 from trilane.stages.configure import Checked
