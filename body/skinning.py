@@ -242,7 +242,10 @@ def _blend_reach(shaped: ShapedBody) -> F64:
 
 
 def _groups(weights: F32) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Group vertices by their two largest joints; return where each group begins in the order (V,), and that order."""
+    """Sort vertices by the two joints that weigh most on each.
+
+    Return where each group begins in the sorted list, and the sorted vertex indices (V,).
+    """
     two = np.sort(np.argsort(-weights, axis=1, kind="stable")[:, :2], axis=1)
     key = two[:, 0] * JOINTS + two[:, 1]
     order = np.argsort(key, kind="stable")

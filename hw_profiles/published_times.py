@@ -136,7 +136,8 @@ def check_published(name: str, profile: Profile) -> list[PublishedTime]:
 
 
 class Latency(NamedTuple):
-    """One published time. `hexagon`: generation of the engine. `anchor`: whether the chip has only such rows."""
+    """One published time. `hexagon`: generation of the engine. `anchor`: whether the table marks the
+    row as an anchor: its chip has a few rows only, and begins at the numbers of the chip before it."""
 
     network: str
     family: str

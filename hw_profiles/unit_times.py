@@ -150,7 +150,7 @@ class UnitNumbers:
     `arithmetic`: multiply-accumulates per second of each of CLASSES, infinite for classes without products. `traffic`:
     bytes per second of each of CLASSES. `stream`: bytes of weights per second. `element_bytes`: bytes of one element.
     `block`: multiple to which channel counts are rounded up. `job`, `operator`: fixed time of a job, of an operator.
-    `input`: time of an element of the network's input. `permute`: time of a picture that comes in several tensors.
+    `input`: time of an element of the network's input. `permute`: extra time where the input comes as several tensors.
     `fallback`: ONNX types of the operators that run on the CPU; `fallback_job`: fixed time of each; `fallback_element`:
     time of an element of its result.
     """

@@ -212,7 +212,7 @@ class UnitHistory:
 
     @property
     def cut_until_ns(self) -> int:
-        """The time before which no slice ends that may still come while the unit has a job."""
+        """Return a time; while the unit has a job, every slice still to come ends then or later."""
         return self._cut_ns
 
     def note_idle(self, now_ns: int, cause: str) -> Iterator[IdleSlice]:

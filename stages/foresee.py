@@ -51,7 +51,8 @@ KEY = "error_budget_db"
 def tensor_works(scene: Scene, policy: str, losses: Sequence[SizeLoss]) -> tuple[tuple[int, ...], str]:
     """Return `RunConfig.works` of a scene under `policy`, and a note for a person, which may be empty.
 
-    `losses`: measured losses of the scene's avatars. Raises BadInputError for a budget when an avatar has no figures.
+    `losses`: measured losses of the scene's avatars. Raises BadInputError if `policy` is an error budget and
+    an avatar has no measured losses.
     """
     if not scene.plans_tensor:
         return (ALL_WORK,), ""

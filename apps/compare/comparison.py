@@ -94,7 +94,10 @@ class Bounds(NamedTuple):
 
 @dataclass(frozen=True)
 class Comparison:
-    """A side beside the base. `differing`: figures that differ in the test of all figures together."""
+    """One side compared with the base.
+
+    `differing`: figures that differ significantly, corrected for testing all figures at once.
+    """
 
     base: Side
     other: Side

@@ -218,7 +218,10 @@ def unsure(base: float, other: float, *, is_ratio: bool) -> Difference:
 
 
 def judged(base: float, other: float, deviation: float, *, is_ratio: bool) -> Difference:
-    """Return a difference with a known deviation; where `is_ratio`, that of the logarithm, and values are above 0."""
+    """Return the difference of `other` from `base`, whose standard deviation is `deviation`.
+
+    With `is_ratio` both are above 0, and the difference and `deviation` are those of their logarithms.
+    """
     return _told((base, other), log(other / base) if is_ratio else other - base, deviation, is_ratio=is_ratio)
 
 

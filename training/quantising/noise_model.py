@@ -326,7 +326,10 @@ class _IdealGraph(NoiseGraph):
         return self.widened * low, self.widened * high, step
 
     def is_multiple(self, name: str, step: float) -> bool:
-        """Return whether tensor `name` is a stored one that was only moved; joined and added ones have own steps."""
+        """Return whether all values of tensor `name` are multiples of `step`.
+
+        They are where it only copies a stored tensor; joined and added tensors have steps of their own.
+        """
         maker = self.makers.get(name)
         if maker is None or maker.op_type == "DequantizeLinear":
             return maker is not None
