@@ -15,20 +15,18 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from trilane.apps.dashboard.finished_view import PIECE_ROWS, TimeTable
+pytest.importorskip("prometheus_client", reason="the extra dashboard is not installed")
+
+from support.run_report import make_report
+from trilane.apps.dashboard.finished_view import CUT_OFF, MOST_JOBS, NO_VIDEO, PIECE_ROWS, FinishedView, TimeTable
+from trilane.apps.dashboard.pages import Client, ControlSaid, Seek
+from trilane.apps.dashboard.run_facts import facts_of_report
 from trilane.apps.run.report import Report
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import NAME, Ended, JournalWriter, journal_of
 from trilane.scheduler.events import Settings, chain
 from trilane.scheduler.virtual import simulate
 from trilane.stages.cpu.present import Segment
-
-pytest.importorskip("prometheus_client", reason="the extra dashboard is not installed")
-
-from support.run_report import make_report
-from trilane.apps.dashboard.finished_view import CUT_OFF, MOST_JOBS, NO_VIDEO, FinishedView
-from trilane.apps.dashboard.pages import Client, ControlSaid, Seek
-from trilane.apps.dashboard.run_facts import facts_of_report
 
 MS = 1_000_000
 FRAMES, FPS = 40, 30.0

@@ -9,6 +9,10 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+pytest.importorskip("prometheus_client", reason="the extra dashboard is not installed")
+
 from trilane.apps.watch.metrics import COUNTERS, GAUGES, HISTOGRAMS, SOURCE
 
 DOCS = Path(__file__).parents[2] / "docs"

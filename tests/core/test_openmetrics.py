@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 
+pytest.importorskip("prometheus_client", reason="the extra dashboard is not installed")
+
 from trilane.apps.watch.followed_run import RunState
 from trilane.apps.watch.live_figures import LiveFigures
 from trilane.apps.watch.metrics import COUNTERS, GAUGES, HISTOGRAMS, SOURCE
 from trilane.pipeline.journal import SCHEMA, Accounted, Begun, Counted, Ended, Sampled, Stepped, Worked
 from trilane.scheduler.events import Dispatch, Job, JobDone, Settings, UnitReady, chain
 from trilane.scheduler.ledger import ASSIGNED, STARVED, JobRecord
-
-pytest.importorskip("prometheus_client")
 
 MS = 1_000_000
 GRAPH = chain((("a", "u"), ("b", "v")), "double", "b")
