@@ -145,7 +145,7 @@ def _no_figures(bundle: Bundle, changed: Sequence[str], why: str, how: str = "",
 
 
 def name_of(folder: Path) -> str:
-    """Return what a person types for `folder`: the name of an avatar of the package, or the folder."""
+    """Return what a person types for `folder`: the name of a bundled avatar, or the folder."""
     known = (name for name in BUILT_IN if folder.absolute() == bundle_folder(name).absolute())
     return next(known, str(folder))
 

@@ -1,6 +1,6 @@
 """How long from the producer's last byte written until the consumer, another process, can read them all, and has?
 
-Rule: one definition holds for every variant, and all run interleaved; the producer writes every byte anew, then reads
+Rule: one definition holds for every variant, and all run interleaved; the producer writes every byte again, then reads
 the clock. The variant that is judged and compared with the peers is a real run through the scheduler. Its units form a
 chain: the second one fills its slot, the third one reads every byte of it, and the others do nothing.
 """

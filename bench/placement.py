@@ -1,6 +1,6 @@
 """Is the placement that a run chooses the best one, what does it gain over the rule, and does the model predict it?
 
-Rule: a run's own choice is made first, then everything is tried anew. All placements run in turns, a few frames each.
+Rule: a run's own choice is made first, then everything is tried again. All placements run in turns, a few frames each.
 Those that could be the best run in further rounds, which alone decide. Whole runs of the chosen placement and of the
 rule's stand beside them. Other numbers of cores are computed in virtual time, and the results say so.
 """

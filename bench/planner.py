@@ -82,7 +82,7 @@ def measure(
     `fixed_ms`, `planned_ms`; `placements`: by plan, on which cores its units were and why; `psnr_fixed_db`,
     `psnr_planned_db`, `ssim_*`, `flip_*` of the frames against those of
     `full`, the same with `box_` in the avatars' rectangles, None with nobody in view; PSNR is that of the mean square
-    over all frames; `truth`: the same against the clothed body that an avatar of the package was trained on, `full`
+    over all frames; `truth`: the same against the clothed body that a bundled avatar was trained on, `full`
     too; `network`: what paints `full`; `tensors`: the planned ones; `by_frame`: what `by_frame` says of all frames,
     None where there is no truth. `median_speedup`, `least_speedup`, `largest_loss_db` (fixed minus planned) and
     `worst_loss_db`, the same of the worst frames, None without any truth; `sources`; `driver`; `config`.

@@ -123,7 +123,7 @@ def _check_inside(tensor: TensorProto, folder: Path) -> None:
         inside = False
     if not inside:
         found = f"tensor {tensor.name!r} kept in {location!r}"
-        raise UnexpectedValue(found, "data in the folder of the file", "move it there and save the file anew")
+        raise UnexpectedValue(found, "data in the folder of the file", "move it there and save the file again")
 
 
 def _forget(tensor: TensorProto) -> None:

@@ -58,7 +58,7 @@ def read_graph(path: Path, input_shapes: Mapping[str, Shape] | None = None) -> G
     A small file of the same bytes as an earlier one is not checked again.
     `path`: path of an ONNX file.
     `input_shapes`: shapes of inputs by name, which replace those of the file.
-    Raises BadInputError that says what is wrong and how to mend it.
+    Raises BadInputError that says what is wrong and how to fix it.
     """
     data = _bytes(path)
     check = _checked_before if len(data) <= REMEMBERED_BYTES else _checked

@@ -57,7 +57,7 @@ class Tenant:
 
     `name`: its name in reports. `source`: what was asked for. `networks`: one network for each shape of the tensor and
     number of avatars in view. `frames`: for each frame, the place of its network in `networks`, or `SKIPS`; the list
-    begins anew after its end. `unit`: unit of the network. `fps`: frames released a second. `variant`: how the stages
+    starts over after its end. `unit`: unit of the network. `fps`: frames released a second. `variant`: how the stages
     are joined. `is_bare`: whether there is nothing but the network, whose result is due when the next frame comes.
     `avatars`: number of avatars in view for each of `networks`; empty for one each. Raises BadInputError for a unit or
     a rate out of range.

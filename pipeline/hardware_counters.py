@@ -181,7 +181,7 @@ def paranoid_level() -> int | None:
 
 
 def remedy(why: str) -> str:
-    """Return the command that mends what `absence` found, or what it takes."""
+    """Return the command that fixes what `absence` found, or what it takes."""
     if "perf_event_paranoid" in why:
         return f"sysctl kernel.perf_event_paranoid={MOST_PARANOID}"
     return "needs a machine of its own" if "virtual" in why else "allow perf_event_open"

@@ -153,7 +153,7 @@ class JournalWriter:
 
 
 class JournalReader:
-    """Reads the journal at `path` again and again while it grows; after a move of the file, set `path` anew.
+    """Reads the journal at `path` while it grows; after a move of the file, set `path` to the new place.
 
     Raises BadInputError for a file that is no journal, and for a bad record, which it names by its number, from 1 on.
     """

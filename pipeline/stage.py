@@ -59,7 +59,7 @@ class SkippingStage(Stage, Protocol):
         """Do not skip the next frame because of what earlier frames brought to the bypass's end.
 
         Called before `run` for the first frame. Called again whenever a frame that did not skip failed to reach the
-        bypass's end, or the unit there was started anew.
+        bypass's end, or the unit there was restarted.
         """
 
 

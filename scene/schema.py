@@ -282,7 +282,7 @@ def _steps(first: Mapping[str, Any]) -> str:
 
 
 def _remedy(first: Mapping[str, Any]) -> str:
-    """Say how to mend a value, by one of the `errors()` of a scene; empty when the expectation says all."""
+    """Say how to fix a value, by one of the `errors()` of a scene; empty when the expectation says all."""
     if first["type"] == "literal_error":
         return did_you_mean(str(first["input"]), _choices(first["loc"]))
     return REASONS.get(".".join(map(str, first["loc"])), "") if first["type"] == "greater_than" else ""

@@ -5,7 +5,7 @@ waits in `EdgeSlots.passing` of the edge behind that stage, for the stage at whi
 frames from two sides. It takes the oldest frame, and a frame that skips only when no older frame is still before it.
 
 A frame that skips relies on what a frame that did not skip left at the bypass's end. Such a frame may be lost or
-dropped before it gets there, or the unit at the end may be started anew. Then the next job at the bypass's begin is
+dropped before it gets there, or the unit at the end may be restarted. Then the next job at the bypass's begin is
 `fresh`.
 """
 

@@ -80,7 +80,7 @@ FORESEEN_FRAMES, LEAST_FRAMES = 96, 24
 MOST_APART = 15
 #: Most shapes of each size that is stepped down to.
 MOST_SMALLER = 3
-#: A network that is ready to run holds its tensors once, and a runtime may lay each of them out anew.
+#: A network that is ready to run holds each tensor once, and a runtime may keep a second copy in its own layout.
 COPIES = 2
 MB = 1_000_000
 BYTE_TYPES = (2, 3)  # ONNX's uint8 and int8

@@ -175,7 +175,7 @@ class RunOptions(BaseModel):
     )
     calibration: Annotated[str | None, AfterValidator(_known_calibration)] = Field(
         default=None,
-        description="Quantise the avatar's network anew: minmax, percentile or entropy, or METHOD:VIEWS; "
+        description="Quantise the avatar's network again: minmax, percentile or entropy, or METHOD:VIEWS; "
         "5 views if none.",
     )
     frames: Annotated[int | None, Option(unit="frames")] = Field(

@@ -2,7 +2,7 @@
 
 Rule: the grid is the quantiser's own, measured once, when the rounding begins. Gradients pass a rounding unchanged and
 stop where a value is clipped (Bengio et al., Estimating or propagating gradients, 2013). The final export measures the
-ranges anew.
+ranges again.
 
 The export folds each batch norm into the convolution before it. A weight is therefore rounded in its folded form, times
 the scale of its norm, whose statistics must not change. Biases are not rounded: their steps are far finer.

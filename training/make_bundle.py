@@ -42,7 +42,7 @@ CALIBRATION_SHAPE = (320, 192)
 STORED_SHAPE = (256, 256)
 CALIBRATION_FRAMES = 96
 METHOD = "minmax"
-#: Files from which a person can quantise the avatar anew; 20 inputs of the calibration's shape take 40 MB.
+#: Files from which a person can quantise the avatar again; 20 inputs of the calibration's shape take 40 MB.
 FLOAT_NETWORK, FRAMES, WRITTEN_FRAMES = "network.onnx", "frames.npy", 20
 TEXEL_MARGIN = 3
 

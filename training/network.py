@@ -340,7 +340,7 @@ def _check(encoder: str, norm: str, width: int, channels: int) -> None:
 
 BYTE_STEPS = 255
 #: Number of random values beyond those of the largest output. Noise starts at a random one of them, which costs a fifth
-#: of drawing all of it anew.
+#: of drawing all of it again.
 STARTS = 1 << 16
 
 

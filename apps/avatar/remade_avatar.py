@@ -1,4 +1,4 @@
-"""A scene's avatar made anew for a run: its network calibrated otherwise, or of another width or number of channels.
+"""A scene's avatar made again for a run: its network has another calibration, width or number of channels.
 
 Rule: calibrating quantises the avatar's own float network, so its pictures count. A network of another width or number
 of channels is untrained: its times count and its pictures do not, and its manifest says so. What was made is kept below
@@ -41,7 +41,7 @@ VERSION = 1
 
 @dataclass(frozen=True)
 class _Recipe:
-    """How an avatar is made anew. `trained`: whether width and channels are the avatar's own."""
+    """What the new avatar differs in. `trained`: whether width and channels are the avatar's own."""
 
     width: int
     channels: int
@@ -55,7 +55,9 @@ class _Recipe:
 
 
 def remade_avatar(name: str, options: RunOptions) -> tuple[Path, str]:
-    """Make avatar `name` anew as `options` ask, or find it in the cache; returns its folder and a sentence on it.
+    """Make avatar `name` again with the network that `options` ask for, or find it in the cache.
+
+    Returns its folder and a sentence about it.
 
     Raises BadInputError for an avatar whose float network is needed and not here, MissingPartError without PyTorch,
     TrilaneError where nothing can be kept.
@@ -72,7 +74,7 @@ def remade_avatar(name: str, options: RunOptions) -> tuple[Path, str]:
         if not (folder / MANIFEST).exists():
             _make(bundle, recipe, folder)
     what = "" if recipe.trained else "; its times count, its pictures do not"
-    return folder, f"made anew: {recipe}{what}"
+    return folder, f"made again: {recipe}{what}"
 
 
 def is_untrained(bundle: Bundle) -> bool:
@@ -153,7 +155,7 @@ def _quantised(bundle: Bundle, recipe: _Recipe, chosen: NDArray[np.intp]) -> Qua
         from trilane.training.quantising.quantise import quantise
         from trilane.training.validate import open_renderer
     except ImportError as error:
-        raise MissingPartError(f"an avatar made anew needs {error.name}", extra="train") from None
+        raise MissingPartError(f"making an avatar again needs {error.name}", extra="train") from None
     model = _float_model(bundle, recipe)
     frames: list[F32] = training_views(open_renderer(bundle, 1), bundle, recipe.views)
     return quantise(model, [np.ascontiguousarray(frame[..., chosen]) for frame in frames], recipe.method or METHOD)

@@ -91,7 +91,7 @@ def _trial_table(pairs: Sequence[TrialPair]) -> Table:
 
 
 def _left_out(comparison: Comparison, shown: Sequence[Figure]) -> Iterator[str]:
-    """Say how many figures the table leaves out, apart for those of which nobody knows whether they differ."""
+    """Say how many figures the table leaves out: those that do not differ, then those that cannot be told."""
     left = [comparison.outcome(figure) for figure in comparison.rows if figure not in shown]
     unknown = left.count(Finding.UNKNOWN)
     if alike := len(left) - unknown:

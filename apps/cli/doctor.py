@@ -32,7 +32,7 @@ class PartCheck:
 
     `name`: name of the part. `found`: what is here of it.
     `works`: whether it was tried and works. `needed`: whether a run needs it.
-    `install`: line that mends it.
+    `install`: line that fixes it.
     """
 
     name: str
@@ -152,7 +152,7 @@ def _print_table(rows: list[PartCheck]) -> None:
     from rich.table import Table
 
     table = Table(title="What this machine has", title_justify="left")
-    for column in ("part", "state", "found", "mend with"):
+    for column in ("part", "state", "found", "fix"):
         table.add_column(column, overflow="fold")
     for row in rows:
         table.add_row(row.name, _state(row), escape(row.found), "" if row.works else escape(row.install))

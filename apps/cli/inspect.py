@@ -99,7 +99,7 @@ def lines(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _because(what: str, why: str) -> str:
-    return f"{what}, told by {why}" if what and why else what
+    return f"{what}, detected by {why}" if what and why else what
 
 
 def _length(length: Mapping[str, Any]) -> str:

@@ -57,7 +57,7 @@ Exit codes:
 def command_of(name: str) -> Any:
     """Import the module of command `name` and return the command.
 
-    The `app` of a module holds one command, a group, or several small commands of which one has the name.
+    A module's `app` holds one command, one group, or several small commands; then the name picks one.
     """
     command = typer.main.get_command(importlib.import_module(COMMANDS[name][0]).app)
     return getattr(command, "commands", {}).get(name, command)  # small commands share a module

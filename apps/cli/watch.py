@@ -112,7 +112,7 @@ def _print_lines(first: RunLook, rest: Iterator[RunLook]) -> None:
 
 
 def _show(first: RunLook, rest: Iterator[RunLook]) -> None:
-    """Show looks on a screen that is drawn anew, or line by line where stdout is no terminal."""
+    """Show looks on a screen that is redrawn, or line by line where stdout is no terminal."""
     from rich.live import Live
 
     from trilane.apps.cli.top_view import ending, heading, line, screen

@@ -41,8 +41,8 @@ METHOD: Final = (
     f"{100 * ALPHA:.0f} % (Holm); no difference: surely less than {100 * MATTERS:.0f} %; cannot tell: neither"
 )
 SEVERAL: Final = (
-    "of several runs a side: base and other are the arithmetic means of the runs' values; the change of a ratio is "
-    "that of their geometric means, so it need not be the ratio of these means"
+    "a side with several runs shows the arithmetic mean of their values; the change of a ratio compares "
+    "geometric means, so it may differ from the ratio of the means shown"
 )
 NO_DIFFERENCE: Final = str(Finding.SAME)
 TOO_FEW: Final = f"{Finding.UNKNOWN}: too short"
@@ -181,7 +181,7 @@ def _compared(base: Side, other: Side) -> Comparison:
 
 
 def _differing(rows: Rows, figures: Sequence[Figure]) -> tuple[Figure, ...]:
-    """Return those of `figures` that differ, all tested together; figures without chance do not weaken the test."""
+    """Return the `figures` that differ. All are tested together; a figure without scatter does not weaken the test."""
     tested = {figure: rows[figure].probability or 0.0 for figure in figures if rows[figure].probability is not None}
     uncertain = [figure for figure in tested if rows[figure].deviation]
     fallen = dict(zip(uncertain, rejected([tested[figure] for figure in uncertain]), strict=True))
@@ -269,7 +269,7 @@ def verdict(
 def _not_told(
     rows: Rows, named: Sequence[Figure], changes: Sequence[Change], stages: Mapping[str, Sequence[str]]
 ) -> str:
-    """Return the verdict where nothing surely differs: no difference that matters, or figures of which nobody can tell.
+    """Return the verdict where no figure surely differs: there is no difference that matters, or it cannot be told.
 
     Counted instructions alone stand for the program if every stage has them and no setting changed.
     """

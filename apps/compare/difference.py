@@ -188,12 +188,12 @@ def settled(
 
 
 def combined(pairs: Sequence[Difference]) -> Difference:
-    """Return one difference for several pairs, which may scatter by more than each one's interval says.
+    """Return one difference for several pairs; the pairs may scatter more than their own intervals say.
 
-    `base` and `other` are the arithmetic means of the values. The change is the mean of the effects, so for ratios the
-    geometric mean. Its deviation is that of the mean of independent pairs, or, where the pairs scatter more (Birge's
-    ratio above 1), that of their scatter. Where some pairs are ratios and others are not, nobody knows how sure the
-    change of the means is. `pairs`: at least one.
+    `base` and `other` are the arithmetic means of the values. The change is the mean of the effects: for ratios the
+    geometric mean. Its deviation assumes independent pairs. If the pairs scatter more than that (Birge's ratio above
+    1), their scatter gives the deviation. If only some pairs are ratios, the change has no deviation.
+    `pairs`: at least one.
     """
     base, other = (sum(getattr(pair, side) for pair in pairs) / len(pairs) for side in ("base", "other"))
     is_ratio = all(pair.is_ratio for pair in pairs)

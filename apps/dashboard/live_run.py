@@ -1,7 +1,7 @@
 """A run under a dashboard: `trilane run`'s own code, again whenever the page asks for another configuration.
 
 Rule: this process runs the pipeline and answers the page's server, which is a process of its own; neither waits for the
-other. What can be changed while the run goes on is. For the rest the run is ended cleanly and begins anew, once the
+other. What can be changed while the run goes on is. For the rest the run is ended cleanly and starts again, once the
 change was checked as a command line is; each of these runs leaves a folder of its own.
 """
 
@@ -180,7 +180,7 @@ class Director:
             return
         with self._lock:
             self._next = prepared
-        self._send(StateIs(RESTARTING, f"{name.replace('_', ' ')} {value}: the run begins anew"))
+        self._send(StateIs(RESTARTING, f"{name.replace('_', ' ')} {value}: the run starts again"))
         controls.stop()
 
 

@@ -23,7 +23,7 @@ LEAST_ZOOM, MOST_ZOOM = 0.25, 4.0
 MOST_DRAG_DEG: Final = 360.0
 #: Controls that the server itself answers, by the window.
 OF_THE_CAMERA: Final = ("orbit", "zoom", "recentre")
-#: Controls for which a run begins anew.
+#: Controls for which a run starts again.
 OF_A_NEW_RUN: Final = tuple(
     name for name, field in RunOptions.model_fields.items() if option_of(field).offered is not None
 )
@@ -170,7 +170,7 @@ def facts_of_folder(folder: Path, begun: Begun) -> RunFacts:
 class Control:
     """One control.
 
-    `kind`: action, choice, number or drag. `live`: whether the run goes on when it is used, or begins anew.
+    `kind`: action, choice, number or drag. `live`: whether the run goes on when it is used, or starts again.
     `choices`: values of a choice. `min`, `max`: range of a number, and of both numbers of a drag. `why_not`: reason why
     it cannot be used now, "" when it can.
     """
@@ -225,8 +225,8 @@ def controls_of_run(
         Control("recentre", ACTION, True),
         Control("kill", CHOICE, True, choices=tuple(units)),
     )
-    anew = (
+    restarting = (
         Control(name, CHOICE, False, choices=tuple(choices[name]), why_not=why_not.get(name, ""))
         for name in OF_A_NEW_RUN
     )
-    return (*live, *anew)
+    return (*live, *restarting)

@@ -1,4 +1,4 @@
-"""The avatar of a scene with its network quantised anew, by another method of calibration; all else is as it was.
+"""The avatar of a scene with its network quantised again, by another method of calibration; all else is as it was.
 
 Rule: it is quantised from the same float network as the avatar's own, on views drawn as in the training. A part that
 cannot be found is refused; nothing else takes its place.
@@ -66,7 +66,7 @@ def drawn_material(avatar: str, views: int, held_out: int) -> tuple[onnx.ModelPr
     try:
         from trilane.training.make_bundle import float_model, held_out_views, training_views
     except ImportError as error:
-        raise MissingPartError(f"quantising an avatar anew needs {error.name}", extra="train") from None
+        raise MissingPartError(f"quantising an avatar again needs {error.name}", extra="train") from None
     from trilane.training.validate import open_renderer
 
     renderer = open_renderer(bundle, 1)

@@ -316,4 +316,4 @@ def _why_placed(asked: Mapping[str, tuple[int, ...]], rule: Ranked) -> str:
         return "as asked"
     how = "as asked, the others for the least predicted frame time" if asked else "the least predicted frame time"
     by_rule = f"{described(rule.placement)}, {rule.frame_ns / NS_PER_MS:.1f} ms"
-    return f"{how}; by the rule for any run, {by_rule}. A run measures and decides anew"
+    return f"{how}; by the rule for any run, {by_rule}. A run measures and decides for itself"

@@ -80,7 +80,7 @@ def _with_remade_avatar(options: RunOptions) -> tuple[RunOptions, tuple[str, ...
 
     avatars = requested_scene(options).avatars
     if len(avatars) > 1:
-        expected = "one avatar, whose network is made anew"
+        expected = "one avatar, whose network is made again"
         raise BadInputError("--width, --channels, --calibration", f"a scene of {len(avatars)} avatars", expected)
     folder, said = remade_avatar(str(avatars[0].bundle), options)
     if options.check and is_untrained(load_bundle(folder)):

@@ -277,7 +277,7 @@ def _require_one_order(path: Path, numbers: F64, names: tuple[str, ...]) -> None
     if not (mine < min(prices.values()) + MUCH_DEARER and mine < prices.get(other, np.inf) - AS_DEAR):
         raise BadInputError(
             path,
-            f"{where} with quaternions whose order is not told by how the camera is held",
+            f"{where} with quaternions whose order does not follow from how the camera is held",
             "an order that makes a level camera, and no other",
             'set camera.format to "tum" (qx qy qz qw) or "euroc" (qw qx qy qz), or ' + SAY_ORDER,
         )

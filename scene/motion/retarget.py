@@ -268,7 +268,7 @@ def _notes(work: Retarget) -> list[str]:
         trunk = "skeleton: built like the avatar's"
     elif count:
         trunk = (
-            "skeleton: not built like the avatar's; how trunk and shoulders stand at rest is told by the straightest "
+            "skeleton: not built like the avatar's; how trunk and shoulders stand at rest comes from the straightest "
             f"legs, {count} of {work.tracks.frames} frames"
         )
     else:

@@ -1,4 +1,4 @@
-"""The errors that reach a person: each says what was found, what was expected and how to mend it.
+"""The errors that reach a person: each says what was found, what was expected and how to fix it.
 
 Code raises these for anything a user can cause; the command line turns them into one sentence and an exit code. The
 parts of a sentence are fields: no code parses them out of a text. A remedy may be the word that a person most likely

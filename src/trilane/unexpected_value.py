@@ -13,7 +13,7 @@ from typing import Any
 class UnexpectedValue(ValueError):  # noqa: N818 - the value is at fault, as in ValueError
     """A value that is not what it should be.
 
-    `found`, `expected`: sentence parts. `remedy`: how to mend the value; may be empty.
+    `found`, `expected`: sentence parts. `remedy`: how to fix the value; may be empty.
     """
 
     def __init__(self, found: str, expected: str, remedy: str = "") -> None:

@@ -310,7 +310,7 @@ def test_on_this_machine_units_are_placed_as_in_a_prediction(
     expected = predict(load_profile("host"), Plan(described, "dsp", PIPELINED), CAP)["placement"]
     assert document["placement"]["units"] == expected["units"]
     assert document["placement"]["predicted_ms"] == expected["predicted_ms"]
-    assert f"{expected['rule_ms']:.1f} ms. A run measures and decides anew" in document["placement"]["why"]
+    assert f"{expected['rule_ms']:.1f} ms. A run measures and decides for itself" in document["placement"]["why"]
 
 
 def test_what_a_run_may_be_asked_can_be_explained(checked: Checked, tmp_path: Path) -> None:  # noqa: ARG001

@@ -92,7 +92,7 @@ def test_another_number_of_channels_is_untrained_and_has_as_many_of_the_texture(
     """Channels 4 to 7 are the first four once more. It is made once, by another recipe again."""
     remake = RunOptions(width=4, channels=8, calibration="minmax:2")
     folder, said = remade_avatar.remade_avatar(str(drawable_bundle), remake)
-    assert said == "made anew: width 4, 8 channels, untrained; minmax on 2 views; its times count, its pictures do not"
+    assert said == "made again: width 4, 8 channels, untrained; minmax on 2 views; its times count, its pictures do not"
     made, own = load_bundle(folder), load_bundle(drawable_bundle)
     assert (made.manifest.network.width, made.manifest.network.channels, views) == (4, 8, [2])
     assert made.read_network().shape == (1, 64, 64, 8)
@@ -134,7 +134,7 @@ def test_a_calibration_quantises_the_float_network_that_the_manifest_names(
     (named / MANIFEST).write_text(json.dumps(manifest))
     folder, said = remade_avatar.remade_avatar(str(named), RunOptions(calibration="minmax:1", width=8))
     made = load_bundle(folder)
-    assert said == "made anew: minmax on 1 view" and not remade_avatar.is_untrained(made)
+    assert said == "made again: minmax on 1 view" and not remade_avatar.is_untrained(made)
     assert full_network.float_weights(made) == weights
     assert views == [1] and made.manifest.quantisation["method"] == "minmax" and made.manifest.validation is None
     assert (made.read_texture() == load_bundle(named).read_texture()).all()

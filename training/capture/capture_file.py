@@ -25,7 +25,7 @@ from trilane.scene.schema import LISTED, Finite, Table
 from trilane.shapes import MAX_SIDE, Shape
 from trilane.unexpected_value import UnexpectedValue
 
-# The faults of a capture: they are listed together, so that a person mends all of them before trying again.
+# The faults of a capture: they are listed together, so that a person fixes all of them before trying again.
 #
 # Rule: a fault names the file, what was found and what was expected; faults that differ only in the file are one entry.
 
@@ -56,7 +56,7 @@ class FaultyCaptureError(BadInputError):
 
     def __init__(self, folder: str, faults: Sequence[Fault]) -> None:
         count = "1 fault" if len(faults) == 1 else f"{len(faults)} faults"
-        super().__init__(folder, count, "a capture without any", "mend what is listed")
+        super().__init__(folder, count, "a capture without any", "fix what is listed")
         self.faults = tuple(faults)
         self.details = tuple(fault_lines(self.faults))
 
@@ -189,7 +189,7 @@ MODES = {
     "RGBA": "four channels (RGBA)",
     "CMYK": "four channels (CMYK)",
 }
-#: For each kind of picture, the modes that it is stored in, what is expected, how to mend it, and PyAV's format of a
+#: For each kind of picture, the modes that it is stored in, what is expected, how to fix it, and PyAV's format of a
 #: video.
 FRAME, MASK = "frame", "mask"
 STORED: dict[str, tuple[tuple[str, ...], str, str, str]] = {
@@ -275,7 +275,7 @@ class PictureVideo:
         return np.asarray(frame.to_ndarray(format=form))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state for another process, which opens the video anew."""
+        """Return the state for another process, which opens the video itself."""
         return self.__dict__ | {"_stream": iter(()), "_next": 0}
 
     def _frames(self) -> Iterator[Any]:

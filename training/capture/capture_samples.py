@@ -205,7 +205,7 @@ class BodyRaster:
 #
 # Rule: a single map, in pixels, resamples the ground truth from its full resolution. The same map, brought into clip
 # space, moves the camera that rasterises the body. So both agree for any camera matrix, any turn, scale, flip and
-# shift, and any aspect; the body is rasterised anew and never resampled.
+# shift, and any aspect; the body is rasterised for each view and never resampled.
 #
 # The thesis (section 3.3, formulas 3.18 to 3.20) turns and scales the extrinsics and moves the principal point, which
 # is the same only for lenses with fx = fy. After projection the map is exact for every lens.

@@ -429,7 +429,7 @@ def test_a_motion_in_metres_and_seconds_with_its_notes(tmp_path: Path) -> None:
         "BVH, 25 joints named as in SMPL-X, 3 frames at 20/s",
         "units: cm, by the length of the legs (leg of 0.82 m)",
         "23 joints have a partner, 1 of them in the hands",
-        "skeleton: not built like the avatar's; how trunk and shoulders stand at rest is told by the straightest legs, "
+        "skeleton: not built like the avatar's; how trunk and shoulders stand at rest comes from the straightest legs, "
         "3 of 3 frames",
         "head: as the file turns it, straight ahead on average",
         "betas: none in the format",
