@@ -8,7 +8,7 @@ shows a run and a prediction as a table of HTML, in which every value is escaped
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,16 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.apps.explain.explained_run import COLUMNS, explain_run, figure_names, job_rows, open_journal
+from trilane.apps.predict.predict_options import PredictOptions
 from trilane.apps.run.asked_run import run_asked
 from trilane.apps.run.report import Report, read_report
-from trilane.errors import BadInputError, MissingPartError, TrilaneError, did_you_mean
+from trilane.errors import BadInputError, MissingPartError, TrilaneError
 from trilane.figure_sources import COMPUTED, MEASURED, NO_FIGURES
+from trilane.options import Options
 from trilane.pipeline.journal import Record, Stepped
 from trilane.pipeline.timeline import Presented, Timeline
 from trilane.pipeline.unit_history import IdleSlice
 from trilane.scheduler.events import Event
 from trilane.stages.run_options import RunOptions
-from trilane.units import PERFORMANCE_PROFILES
 
 if TYPE_CHECKING:
     import pandas
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
 INTERRUPTED = 130
 #: Defaults of a program's run that are not those of the command line.
 DEFAULTS = {"baseline_frames": 0}
+#: Options of a prediction that a program may give: those that lead to one answer, and to no file.
+PREDICTED = PredictOptions.model_fields.keys() - {"scene", "beside", "turns", "what_if", "plot", "trace", "table"}
 FRAME_TYPE = np.dtype(
     [("frame", np.int64), ("presented_ns", np.int64), ("frame_ns", np.int64), ("latency_ns", np.int64)]
 )
@@ -174,20 +177,23 @@ def run(
     return done
 
 
-def _signature() -> inspect.Signature:
-    """Return the parameters of `run`, with one for each option."""
-    scene, *told, _ = inspect.signature(run, eval_str=True).parameters.values()
+def _signature(
+    function: Callable[..., Any], model: type[Options], names: Iterable[str], defaults: Mapping[str, Any] | None = None
+) -> inspect.Signature:
+    """Return the parameters of `function`, with one for each option in `names` in place of `**options`."""
+    signature = inspect.signature(function, eval_str=True)
+    first, *told, _ = signature.parameters.values()
     options = [
         inspect.Parameter(
-            name, scene.KEYWORD_ONLY, default=DEFAULTS.get(name, field.default), annotation=field.annotation
+            name, first.KEYWORD_ONLY, default=(defaults or {}).get(name, field.default), annotation=field.annotation
         )
-        for name, field in RunOptions.model_fields.items()
-        if name != scene.name
+        for name, field in model.model_fields.items()
+        if name in names and name != first.name
     ]
-    return inspect.Signature([scene, *options, *told], return_annotation=Run)
+    return signature.replace(parameters=[first, *options, *told])
 
 
-run.__signature__ = _signature()  # type: ignore[attr-defined]
+run.__signature__ = _signature(run, RunOptions, RunOptions.model_fields, DEFAULTS)  # type: ignore[attr-defined]
 
 
 @dataclass(frozen=True)
@@ -241,59 +247,39 @@ class Prediction:
 
 
 def predict(
-    profile: str | Path = "snapdragon-888",
-    *,
-    avatar: str | Path | None = None,
-    network: str | Path | None = None,
-    application: bool = False,
-    encoder: str = "resnet18",
-    norm: str = "batch",
-    size: int | str = 512,
-    channels: int = 16,
-    runtime: str = "dsp",
-    policy: str | None = None,
-    edge: str | None = None,
-    fps: float | None = None,
-    power_limit_w: float | None = None,
-    minutes: float = 0.0,
-    performance_profile: str | None = None,
-    on_message: Callable[[str], None] | None = None,
+    profile: str | Path = "snapdragon-888", *, on_message: Callable[[str], None] | None = None, **options: Any
 ) -> Prediction:
     """Predict frame time, idleness, heat and energy on a chip.
 
-    `profile`: a hardware profile, by name or file. The other arguments are the options of `trilane predict` of that
-    name.
+    `profile`: a hardware profile, by name or file. `options`: fields of
+    `trilane.apps.predict.predict_options.PredictOptions` in `PREDICTED`; `trilane predict --help` explains them.
     `avatar`: the application with this avatar's network. `network`: an ONNX file by itself, or with `application` in
     the avatar's application. Without either, the application with a network of `encoder`, `norm`, `size`, `channels`.
     `on_message(text)`: is told before the profile `host`, this machine, is measured, which may take half a minute.
     Raises BadInputError.
     """
     from trilane.apps.predict import asked_prediction as asked
-    from trilane.hw_profiles.application import Plan
     from trilane.hw_profiles.profile_files import load_runnable
 
-    if network is not None and avatar is not None:
-        raise BadInputError("predict", "an avatar and a network", "one of them")
-    if application and network is None:
-        raise BadInputError("predict", "application without a network", "a network, which the application then has")
-    bare = network is not None and not application
-    cap = performance_profile or asked.usual_cap(str(profile), bare=bare)
-    _check_name("performance_profile", cap, PERFORMANCE_PROFILES)
-    chip, wanted = load_runnable(str(profile)), asked.wanted_of(fps, power_limit_w)
-    files, say = [] if network is None else [Path(network)], on_message or (lambda _: None)
-    if bare:
-        on = (asked.unit_of(runtime, "cpu"), None, None)
-        (answer,) = asked.predict_networks(chip, files, {}, on, (cap, minutes, None, wanted), say)
-        times = (answer["network_ms"], answer["low_ms"], answer["high_ms"])
-        return Prediction(answer, chip.name, str(network), *times, None, answer["power"]["w"])
-    unit, named = asked.unit_of(runtime), None if avatar is None else str(avatar)
-    chip, described = asked.network_of(chip, files, {}, named, "packed", unit, None, say)
-    counted = described or asked.reference_of(encoder, norm, str(size), channels, "packed")
-    plan = Plan(counted, unit, asked.variant_of(policy or asked.usual_policy(str(profile)), edge, 1, fps))
-    answer = asked.answer_of(chip, plan, cap, minutes, None, False, wanted)
-    frame, what = answer["frame_time_ms"], str(avatar or network or f"{encoder}, {size}")
+    given = inspect.signature(predict).bind(profile, **options).arguments
+    wanted = PredictOptions.checked({name: value for name, value in given.items() if value is not None})
+    wanted.check_together()
+    chip, say = load_runnable(wanted.profile), on_message or (lambda _: None)
+    if wanted.is_bare:
+        answers = asked.predict_networks(chip, wanted, say)
+        if len(answers) != 1:
+            raise BadInputError("network", f"{len(answers)} networks", "one")
+        times = (answers[0]["network_ms"], answers[0]["low_ms"], answers[0]["high_ms"])
+        return Prediction(answers[0], chip.name, str(wanted.network[0]), *times, None, answers[0]["power"]["w"])
+    chip, plan = asked.application_of(chip, wanted, say)
+    answer = asked.answer_of(chip, plan, wanted)
+    frame = answer["frame_time_ms"]
+    what = wanted.avatar or (str(wanted.network[0]) if wanted.network else f"{wanted.encoder}, {wanted.size}")
     times = (frame["mean"], frame["low"], frame["high"])
     return Prediction(answer, chip.name, what, *times, answer["latency_ms"]["mean"], answer["power_w"])
+
+
+predict.__signature__ = _signature(predict, PredictOptions, PREDICTED)  # type: ignore[attr-defined]
 
 
 def _place(where: str, given: str | Path) -> Path:
@@ -301,11 +287,6 @@ def _place(where: str, given: str | Path) -> Path:
     if isinstance(given, str) and not given.strip():
         raise BadInputError(where, repr(given), "the name of a folder")
     return Path(given)
-
-
-def _check_name(where: str, name: str, names: Sequence[str] | Mapping[str, Any]) -> None:
-    if name not in names:
-        raise BadInputError(where, repr(name), f"one of {', '.join(names)}", did_you_mean(str(name), list(names)))
 
 
 def table(title: str, rows: Iterable[Row]) -> str:

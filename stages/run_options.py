@@ -6,19 +6,17 @@ Rule: no other list of the options exists. A field is plain data; `configure` fi
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path, PurePath
-from types import NoneType, UnionType
-from typing import Annotated, Any, Final, Self, Union, get_args, get_origin
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Final
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
-from pydantic.fields import FieldInfo
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from trilane.errors import BadInputError, did_you_mean
+from trilane.options import Finite, Option, Options, Text, Texts, one_of, texts_of
 from trilane.scheduler.policy import POLICIES
 from trilane.transport.slots import RULES, edge_rule
-from trilane.unexpected_value import UnexpectedValue, unexpected_in
+from trilane.unexpected_value import UnexpectedValue
 from trilane.units import PERFORMANCE_PROFILES
 
 AVATARS_HELP: Final = "`default`, `hiker`, or the folder of an avatar."
@@ -40,46 +38,6 @@ MOST_VIEWS: Final = 1000
 CHANNELS: Final = (4, 8, 12, 16)
 
 
-@dataclass(frozen=True)
-class Option:
-    """Facts about an option that its field's type does not state.
-
-    `spelling`: option on the command line where it is not the field's name, such as `--latch`.
-    `is_argument`: whether the command line takes it without a name.
-    `unit`: unit of a number, as a plural noun.
-    `words`: all words that it may be; any text where empty.
-    `offered`: words that the dashboard's control offers beside what it finds here; None where the dashboard has no
-    control.
-    """
-
-    spelling: str = ""
-    is_argument: bool = False
-    unit: str = ""
-    words: tuple[str, ...] = ()
-    offered: tuple[str, ...] | None = None
-
-
-def option_of(field: FieldInfo) -> Option:
-    """Return the field's `Option`; an empty one where it has none."""
-    return next((each for each in field.metadata if isinstance(each, Option)), Option())
-
-
-def kind_of(field: FieldInfo) -> Any:
-    """Return the field's type without None, limits and elements: str, int, float, bool, Path or tuple."""
-    kind: Any = field.annotation
-    while get_origin(kind) in (Annotated, Union, UnionType):
-        kind = next(each for each in get_args(kind) if each is not NoneType)
-    return get_origin(kind) or kind
-
-
-def limits_of(field: FieldInfo) -> tuple[float | None, float | None]:
-    """Return the least and the largest number that the field may be; None where there is no limit."""
-    least, most = (
-        next((getattr(one, key) for one in field.metadata if hasattr(one, key)), None) for key in ("ge", "le")
-    )
-    return least, most
-
-
 def calibration_of(text: str) -> tuple[str, int] | None:
     """Parse `text`, METHOD or METHOD:VIEWS, into method and number of views; None for `AS_IT_IS`.
 
@@ -96,19 +54,10 @@ def calibration_of(text: str) -> tuple[str, int] | None:
     return method, int(views) if colon else VIEWS
 
 
-def _text(value: object) -> object:
-    """Turn paths and whole numbers (sizes), which programs may give, into text."""
-    return str(value) if isinstance(value, PurePath) or type(value) is int else value
-
-
-def _texts(value: object) -> object:
-    return tuple(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
-
-
 def _cores(value: object) -> object:
     """Accept {"dsp": [0, 1]}, which programs give."""
     if not isinstance(value, Mapping):
-        return _texts(value)
+        return texts_of(value)
     return tuple(f"{unit}={','.join(map(str, own))}" for unit, own in value.items())
 
 
@@ -141,23 +90,8 @@ def _known_edge(text: str) -> str:
     return text
 
 
-def _one_of(*words: str) -> AfterValidator:
-    def known(word: str | None) -> str | None:
-        if word is not None and word not in words:
-            raise UnexpectedValue(repr(word), f"one of {', '.join(words)}", did_you_mean(word, words))
-        return word
-
-    return AfterValidator(known)
-
-
-Text = Annotated[str, BeforeValidator(_text)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-
-
-class RunOptions(BaseModel):
+class RunOptions(Options):
     """The options of `trilane run`, in the order of its help; None leaves what the scene or the avatar says."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     scene: Annotated[Text, Option(is_argument=True)] = Field(
         default="default", description="A scene file (TOML), or the name of one that comes with Trilane."
@@ -179,7 +113,7 @@ class RunOptions(BaseModel):
         "5 views if none.",
     )
     frames: Annotated[int | None, Option(unit="frames")] = Field(
-        default=None, description="How many frames to present."
+        default=None, description="How many frames; the scene's if none."
     )
     fps: Finite | None = Field(default=None, description="Frames a second of the scene's time, and of the video.")
     output: str | None = Field(default=None, description="Size of the picture in pixels: WIDTHxHEIGHT.")
@@ -187,7 +121,7 @@ class RunOptions(BaseModel):
         default=None, description=f"{SIZE_HELP} auto: planned, as the network paints best."
     )
     hud: bool | None = Field(default=None, description="Write frame, rate and age on the picture.")
-    policy: Annotated[str, _one_of(*POLICIES), Option(words=tuple(POLICIES), offered=tuple(POLICIES))] = Field(
+    policy: Annotated[str, one_of(*POLICIES), Option(words=tuple(POLICIES), offered=tuple(POLICIES))] = Field(
         default="pipelined",
         description="pipelined: highest rate; sequential: one frame at a time; latest: newest pose wins; "
         "deadline: frames that would be late are dropped.",
@@ -205,7 +139,7 @@ class RunOptions(BaseModel):
     skinning: str = Field(
         default="auto", description="Which unit poses the vertices: cpu, gpu; auto: cpu when OpenGL is software."
     )
-    split: Annotated[tuple[str, ...], BeforeValidator(_texts)] = Field(
+    split: Texts = Field(
         default=(),
         description="TENSOR=UNIT: cut the network there, the rest runs on UNIT. `trilane avatar split` lists.",
     )
@@ -227,7 +161,7 @@ class RunOptions(BaseModel):
     )
     performance_profile: Annotated[
         str | None,
-        _one_of(*PERFORMANCE_PROFILES),
+        one_of(*PERFORMANCE_PROFILES),
         Option(words=PERFORMANCE_PROFILES, offered=(NOTHING, *PERFORMANCE_PROFILES)),
     ] = Field(default=None, description="Which power and speed the units ask for, by SNPE's names.")
     baseline_frames: Annotated[int, Option("--baseline", unit="frames")] = Field(
@@ -243,34 +177,6 @@ class RunOptions(BaseModel):
         default=None, description="Run folder to write; runs/TIME-SCENE if none."
     )
     video: bool = Field(default=True, description="Encode the frames; not for runs that last.")
-
-    @classmethod
-    def checked(cls, values: Mapping[str, Any], *, as_typed: bool = False) -> Self:
-        """Check `values`, by the fields' names. Raises BadInputError for the first that its field does not allow.
-
-        `as_typed`: whether the error names the option of the command line in place of the field.
-        """
-        try:
-            return cls(**values)
-        except ValidationError as error:
-            first = error.errors()[0]
-        name = str(first["loc"][0])
-        field, where = cls.model_fields[name], cls.spelling(name) if as_typed else name
-        unexpected = unexpected_in(first) or UnexpectedValue(repr(first["input"]), _expected(field))
-        raise BadInputError.at(where, unexpected)
-
-    @classmethod
-    def spelling(cls, name: str) -> str:
-        """Return the option of field `name` on the command line."""
-        return option_of(cls.model_fields[name]).spelling or f"--{name.replace('_', '-')}"
-
-    def changed(self, **values: Any) -> Self:
-        """Return the same options with other `values`. Raises BadInputError as `checked`."""
-        return self.checked({**dict(self), **values})
-
-    def as_json(self) -> dict[str, Any]:
-        """Return every option by its field's name, as the report has it."""
-        return {name: _as_json(value) for name, value in self}
 
     @property
     def remakes_avatar(self) -> bool:
@@ -293,24 +199,3 @@ class RunOptions(BaseModel):
         if self.performance_profile is not None:
             found = "--performance-profile with --pace"
             raise BadInputError("options", found, "one of them", "a pace is capped already")
-
-
-def _as_json(value: object) -> object:
-    if isinstance(value, tuple):
-        return list(value)
-    return str(value) if isinstance(value, PurePath) else value
-
-
-def _expected(field: FieldInfo) -> str:
-    """Say what a field's value must be, from its type, range and unit."""
-    kind, unit = kind_of(field), option_of(field).unit
-    if kind not in (int, float):
-        return {str: "text", bool: "true or false", tuple: "a list of texts", Path: "a path"}[kind]
-    noun = unit or "a number"
-    if kind is int:
-        noun = f"a whole number of {unit}" if unit else "a whole number"
-    least, most = limits_of(field)
-    comma = "," if unit else ""
-    if least is None:
-        return noun
-    return f"{noun}{comma} {least} or more" if most is None else f"{noun}{comma} from {least} to {most}"

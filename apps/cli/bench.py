@@ -16,8 +16,9 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from trilane.apps.cli.commands import ENCODER_HELP, NORM_HELP, POLICY_HELP, Commands, JsonOption
+from trilane.apps.cli.commands import POLICY_HELP, Commands, JsonOption
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console, stdout_kept
+from trilane.apps.predict.predict_options import ENCODER_HELP, NORM_HELP
 from trilane.stages.run_options import RUNTIME_HELP, SIZE_HELP, WIDTH_HELP
 
 #: Bench: its module, and the line that `trilane bench --help` shows for it.

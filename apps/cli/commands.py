@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
@@ -18,12 +18,12 @@ import typer
 from pydantic import ValidationError
 from typer.core import TyperCommand, TyperOption
 
+from trilane.apps.predict.predict_options import ENCODER_HELP, FIXED_SIZE_HELP, NORM_HELP
 from trilane.errors import BadInputError, did_you_mean
-from trilane.stages.run_options import AVATARS_HELP, PROFILE_HELP, WIDTH_HELP, RunOptions, kind_of, limits_of, option_of
+from trilane.options import Options, element_of, kind_of, limits_of, option_of
+from trilane.stages.run_options import AVATARS_HELP, PROFILE_HELP, WIDTH_HELP, RunOptions
 from trilane.units import PerformanceProfile
 
-ENCODER_HELP = "resnet18, mobilenetv2, mobilenetv3 or efficientnet-lite0."
-NORM_HELP = "batch, instance or group."
 POLICY_HELP = "sequential, pipelined, latest or deadline."
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")]
 OutFileOption = Annotated[Path, typer.Option("--out", help="File to write.")]
@@ -88,14 +88,14 @@ class Commands(typer.Typer):
         return super().command(name, cls=OnceCommand, **settings)
 
 
-def _run_parameter(name: str) -> Any:
-    """Describe field `name` of `RunOptions` to Typer as an option or argument, whose value the field checks."""
-    field = RunOptions.model_fields[name]
+def _described(model: type[Options], name: str) -> Any:
+    """Describe field `name` of `model` to Typer as an option or argument, whose value the field checks."""
+    field = model.model_fields[name]
     option = option_of(field)
 
     def checked(value: Any) -> Any:
         if value is not None:
-            RunOptions.checked({name: value}, as_typed=True)
+            model.checked({name: value}, as_typed=True)
         return value
 
     least, most = limits_of(field)
@@ -103,53 +103,69 @@ def _run_parameter(name: str) -> Any:
     if option.is_argument:
         return typer.Argument(**settings)
     is_pair = kind_of(field) is bool and not option.spelling  # which Typer spells --NAME/--no-NAME
-    return typer.Option(*() if is_pair else (RunOptions.spelling(name),), **settings)
+    return typer.Option(*() if is_pair else (model.spelling(name), *option.synonyms), **settings)
 
 
-def with_run_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Return `command` with an option for every field of `RunOptions` in place of its first parameter, a `RunOptions`.
+def with_options(
+    model: type[Options], names: Collection[str] | None = None
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Return a decorator for a command whose first parameter is a `model`: each field becomes an option of its own.
 
-    Typer reads the options of a command from its signature, which is put together here.
+    Typer reads the options of a command from its signature, which is put together here. The command's model has the
+    fields that the command line gives; the others have their defaults.
+    `names`: fields that become options; all if None.
     """
+    fields = [name for name in model.model_fields if names is None or name in names]
 
-    def called(**values: Any) -> None:
-        given = {name: values.pop(name) for name in RunOptions.model_fields}
-        asked = {name: value for name, value in given.items() if value is not None}
-        command(RunOptions.checked(asked, as_typed=True), **values)
+    def decorated(command: Callable[..., None]) -> Callable[..., None]:
+        _, *own = inspect.signature(command, eval_str=True).parameters.values()
+        context = inspect.Parameter("ctx", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
+        takes_context = any(parameter.name == context.name for parameter in own)
 
-    _, *own = inspect.signature(command, eval_str=True).parameters.values()
-    called.__signature__ = inspect.Signature([*map(_parameter, RunOptions.model_fields), *own])  # type: ignore[attr-defined]
-    called.__name__, called.__doc__ = command.__name__, command.__doc__
-    return called
+        def called(ctx: typer.Context, **values: Any) -> None:
+            typed = given(ctx)
+            asked = {name: value for name in fields if (value := values.pop(name)) is not None and name in typed}
+            if takes_context:
+                values["ctx"] = ctx
+            command(model.checked(asked, as_typed=True), **values)
+
+        parameters = [_parameter(model, name) for name in fields]
+        rest = [parameter.replace(kind=context.kind) for parameter in own if parameter.name != context.name]
+        called.__signature__ = inspect.Signature([context, *parameters, *rest])  # type: ignore[attr-defined]
+        called.__name__, called.__doc__ = command.__name__, command.__doc__
+        return called
+
+    return decorated
 
 
-def _parameter(name: str) -> inspect.Parameter:
-    field = RunOptions.model_fields[name]
+def _parameter(model: type[Options], name: str) -> inspect.Parameter:
+    field = model.model_fields[name]
     words, kind = option_of(field).words, kind_of(field)
-    typed: Any = Literal[words] if words else list[str] if kind is tuple else kind
+    element: Any = element_of(field) if kind is tuple else None
+    typed: Any = Literal[words] if words else list[element] if element else kind
     default = None if field.default == () else field.default
-    annotation: Any = Annotated[typed if default is not None else typed | None, _run_parameter(name)]
+    annotation: Any = Annotated[typed if default is not None else typed | None, _described(model, name)]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
 # Options of a run that other commands have too.
-SceneArgument = Annotated[str, _run_parameter("scene")]
+SceneArgument = Annotated[str, _described(RunOptions, "scene")]
 
-SceneAvatarOption = Annotated[str | None, _run_parameter("avatar")]
+SceneAvatarOption = Annotated[str | None, _described(RunOptions, "avatar")]
 
-SceneSizeOption = Annotated[str | None, _run_parameter("size")]
+SceneSizeOption = Annotated[str | None, _described(RunOptions, "size")]
 
-MotionOption = Annotated[str | None, _run_parameter("motion")]
+MotionOption = Annotated[str | None, _described(RunOptions, "motion")]
 
-CameraOption = Annotated[str | None, _run_parameter("camera")]
+CameraOption = Annotated[str | None, _described(RunOptions, "camera")]
 
-FpsOption = Annotated[float | None, _run_parameter("fps")]
+FpsOption = Annotated[float | None, _described(RunOptions, "fps")]
 
-OutputOption = Annotated[str | None, _run_parameter("output")]
+OutputOption = Annotated[str | None, _described(RunOptions, "output")]
 
-SkinningOption = Annotated[str, _run_parameter("skinning")]
+SkinningOption = Annotated[str, _described(RunOptions, "skinning")]
 
-CoresOption = Annotated[list[str] | None, _run_parameter("cores")]
+CoresOption = Annotated[list[str] | None, _described(RunOptions, "cores")]
 
 PerformanceProfileOption = typer.Option(help=RunOptions.model_fields["performance_profile"].description)
 
@@ -164,7 +180,7 @@ NormOption = Annotated[str, typer.Option(help=NORM_HELP)]
 
 WidthOption = Annotated[int, typer.Option(help=WIDTH_HELP)]
 
-FixedSizeOption = Annotated[str, typer.Option("--size", help="Tensor size in pixels: one side, or HEIGHTxWIDTH.")]
+FixedSizeOption = Annotated[str, typer.Option("--size", help=FIXED_SIZE_HELP)]
 
 ChannelsOption = Annotated[int, typer.Option(help="Channels of the neural texture, 1 to 16.")]
 

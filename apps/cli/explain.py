@@ -12,18 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from trilane.apps.cli.commands import (
-    CameraOption,
     Commands,
-    CoresOption,
-    FpsOption,
     JsonOption,
-    MotionOption,
-    OutputOption,
     PerformanceProfileOption,
-    SceneAvatarOption,
-    SceneSizeOption,
-    SkinningOption,
     given,
+    with_options,
 )
 from trilane.apps.cli.console import print_json, spinner, stderr_console, stdout_console, without_controls
 from trilane.errors import BadInputError
@@ -54,7 +47,6 @@ READ_PLAN_SO = (
 )
 RECTANGLES = "in blue how far each reaches with its clothes, in orange what the tensor shows"
 ChipOption = Annotated[str, typer.Option("--profile", help=f"{PROFILE_HELP} Its times are those that are saved.")]
-FramesOption = Annotated[int | None, typer.Option(min=1, help="How many frames to look at; the scene's if none.")]
 PictureOption = Annotated[Path | None, typer.Option(help=f"Draw bodies, {RECTANGLES}, here (.png).")]
 CapOption = Annotated[PerformanceProfile, PerformanceProfileOption]
 SceneOrRunArgument = Annotated[str, typer.Argument(help="A scene, by file (TOML) or name; or the folder of a run.")]
@@ -62,6 +54,8 @@ SlowestOption = Annotated[
     int, typer.Option(min=1, max=MOST_SLOWEST, help="Of a run: how many of the slowest frames are explained.")
 ]
 JobsOption = Annotated[Path | None, typer.Option(help="Of a run: write every job here (.csv, .parquet).")]
+#: Options of a run that its plan depends on.
+OF_A_PLAN = frozenset({"motion", "camera", "avatar", "frames", "fps", "output", "size", "skinning", "cores"})
 #: Options that mean something with a run folder.
 OF_A_RUN = frozenset({"scene", "slowest", "jobs", "json"})
 #: Options that mean nothing with a scene.
@@ -77,18 +71,12 @@ SLOWEST_SO = (
 
 
 @app.command(epilog=EPILOG)
+@with_options(RunOptions, OF_A_PLAN)
 def explain(
+    options: RunOptions,
+    *,
     ctx: typer.Context,
     scene: SceneOrRunArgument = "default",
-    motion: MotionOption = None,
-    camera: CameraOption = None,
-    avatar: SceneAvatarOption = None,
-    frames: FramesOption = None,
-    fps: FpsOption = None,
-    output: OutputOption = None,
-    size: SceneSizeOption = None,
-    skinning: SkinningOption = "auto",
-    cores: CoresOption = None,
     profile: ChipOption = "host",
     performance_profile: CapOption = PerformanceProfile.SUSTAINED_HIGH_PERFORMANCE,
     picture: PictureOption = None,
@@ -117,19 +105,7 @@ def explain(
             raise BadInputError("--picture", f"'{picture}'", "a name that ends in .png")
         require_writable(picture)
     with spinner("planning"):
-        options = RunOptions(
-            scene=scene,
-            motion=motion,
-            camera=camera,
-            avatar=avatar,
-            frames=frames,
-            fps=fps,
-            output=output,
-            size=size,
-            skinning=skinning,
-            cores=tuple(cores or ()),
-        )
-        checked = configure(options, Path.cwd())
+        checked = configure(options.changed(scene=scene), Path.cwd())
         explanation = explained(checked, profile, str(performance_profile))
     for note in checked.notes:
         stderr_console().print(note, soft_wrap=True, markup=False)

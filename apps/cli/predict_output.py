@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from trilane.apps.predict.predict_options import PredictOptions
     from trilane.hw_profiles.application import Plan
-    from trilane.hw_profiles.rates import Wanted
     from trilane.hw_profiles.schema import Profile
 
 IDLE = ("starved", "blocked", "throttled", "preempted", "overhead")
@@ -69,19 +69,16 @@ def draw(chip: Profile, plan: Plan, asked: str, minutes: float, governor: str | 
     plot_over_time(runs, chip.thermal.skin_limit_c.or_else(0.0), title, path)
 
 
-def show_networks(
-    chip: Profile, over: tuple[str, float, str | None, Wanted], answers: list[dict[str, Any]], as_json: bool
-) -> None:
+def show_networks(chip: Profile, options: PredictOptions, answers: list[dict[str, Any]], as_json: bool) -> None:
     """Print what is predicted of networks by themselves.
 
     `chip`: hardware profile of the chip.
-    `over`: performance profile, minutes, governor, and what is wanted.
-    `answers`: answers of `predict_network`.
+    `options`: options of the prediction. `answers`: answers of `predict_network`.
     `as_json`: whether to print one JSON document, or text and tables for people.
     """
-    performance_profile, minutes, governor, wanted = over
+    performance_profile, minutes, governor = options.cap, options.minutes, options.governor
     if as_json:
-        config = {"performance_profile": performance_profile, "minutes": minutes, **wanted._asdict()}
+        config = {"performance_profile": performance_profile, "minutes": minutes, **options.wanted._asdict()}
         print_json(
             {
                 "schema": 1,

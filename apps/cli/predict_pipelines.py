@@ -6,104 +6,45 @@ Rule: nothing is computed here; `apps/predict/asked_pipelines.py` reads what the
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
-
-import typer
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from trilane.apps.cli.console import print_json, say, spinner, stdout_console
 from trilane.apps.cli.predict_output import IDLE
 from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from rich.console import Console
     from rich.table import Table
 
+    from trilane.apps.predict.predict_options import PredictOptions
     from trilane.hw_profiles.application import Variant
     from trilane.hw_profiles.schema import Profile
     from trilane.hw_profiles.shared_chip import Tenant
 
-SceneToPredict = Annotated[
-    str | None,
-    typer.Argument(help="A scene, priced frame by frame, instead of one network: a name, a file, or SCENE@RATE."),
-]
-BesideOption = Annotated[
-    list[str] | None,
-    typer.Option(help="What else the chip does: SCENE, SCENE@RATE, NETWORK.onnx@RATE or @RATE:gpu. Once for each."),
-]
-TurnsOption = Annotated[
-    str, typer.Option(help="Whose job a unit takes that several pipelines wait for: round-robin or deadline.")
-]
-#: Options that mean something beside a scene.
-USED = {
-    "scene",
-    "beside",
-    "turns",
-    "profile",
-    "minutes",
-    "policy",
-    "edge",
-    "performance_profile",
-    "governor",
-    "trace",
-    "json",
-}
 
+def predict_pipelines(options: PredictOptions, as_json: bool) -> None:
+    """Print how the scene of `options` and the pipelines beside it do on one chip.
 
-class ChipOptions(NamedTuple):
-    """Options of the chip: its profile and performance profile, minutes with heat, and its governor."""
-
-    profile: str
-    performance_profile: str
-    minutes: float
-    governor: str | None
-
-
-class SchedulerOptions(NamedTuple):
-    """Options of the scheduler: policy and edge of the avatars, and the rule for turns on a unit."""
-
-    policy: str
-    edge: str | None
-    turns: str
-
-
-def predict_pipelines(
-    scene: str | None,
-    beside: Sequence[str],
-    typed: Set[str],
-    on: ChipOptions,
-    joined: SchedulerOptions,
-    trace: Path | None,
-    as_json: bool,
-) -> None:
-    """Print how `scene` and the pipelines `beside` it do on one chip.
-
-    `typed`: names of the options that the command line has. `trace`: file to write the simulated runs to.
-    Raises BadInputError for options that do not go with a scene and for what is wrong in one of them.
+    Raises BadInputError for what is wrong in one of them.
     """
     from trilane.apps.predict.asked_pipelines import tenants
     from trilane.hw_profiles.profile_files import HOST, load_runnable
     from trilane.hw_profiles.shared_chip import predict_beside
-    from trilane.scheduler.turns import TURNS
 
-    if scene is None:
-        raise BadInputError("options", "--beside without a scene", "a scene, such as `trilane predict default`")
-    if useless := typed - USED:
-        names = ", ".join(sorted(f"--{name.replace('_', '-')}" for name in useless))
-        raise BadInputError("options", f"{names} beside a scene", "none of them", "the scene says so itself")
-    if joined.turns not in TURNS:
-        raise BadInputError("--turns", repr(joined.turns), " or ".join(TURNS))
-    chip, variant = load_runnable(on.profile), _variant(joined.policy, joined.edge)
+    scene = str(options.scene)
+    chip, variant = load_runnable(options.profile), _variant(options.policy or "", options.edge)
     if chip.name == HOST:
         from trilane.apps.predict.this_machine import with_first
 
         chip = with_first(chip, scene, say)
     with spinner("predicting"):
-        found = tenants([scene, *beside], variant)
-        answer = predict_beside(chip, found, on.performance_profile, on.minutes, on.governor, joined.turns)
-        if trace is not None:
-            _write_trace(chip, found, on.performance_profile, joined.turns, answer, trace)
+        found = tenants([scene, *options.beside], variant)
+        answer = predict_beside(chip, found, options.cap, options.minutes, options.governor, options.turns)
+        if options.trace is not None:
+            _write_trace(chip, found, options, answer, options.trace)
     if as_json:
         print_json(answer)
         return
@@ -111,19 +52,14 @@ def predict_pipelines(
 
 
 def _write_trace(
-    chip: Profile,
-    found: Sequence[Tenant],
-    performance_profile: str,
-    turns: str,
-    answer: Mapping[str, Any],
-    target: Path,
+    chip: Profile, found: Sequence[Tenant], options: PredictOptions, answer: Mapping[str, Any], target: Path
 ) -> None:
     """Write the simulated runs of the pipelines as one trace."""
     from trilane.apps.explain.trace import write_predicted
     from trilane.hw_profiles.schema import corners_of
     from trilane.hw_profiles.shared_chip import together
 
-    runs = together(chip, found, corners_of(chip, performance_profile), turns, keep=True).runs
+    runs = together(chip, found, corners_of(chip, options.cap), options.turns, keep=True).runs
     named = {tenant.name: run for tenant, run in zip(found, runs, strict=True)}
     write_predicted(named, {key: answer[key] for key in ("machine", "config")}, target)
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trilane.apps.cli.commands import Commands, JsonOption, PortOption, with_run_options
+from trilane.apps.cli.commands import Commands, JsonOption, PortOption, with_options
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console
 from trilane.errors import BadInputError
 from trilane.stages.run_options import RunOptions
@@ -72,7 +72,7 @@ def _hooks() -> Iterator[Hooks]:
 
 
 @app.command(epilog=EPILOG)
-@with_run_options
+@with_options(RunOptions)
 def run(
     options: RunOptions, *, dashboard: DashboardOption = False, port: PortOption = None, as_json: JsonOption = False
 ) -> None:

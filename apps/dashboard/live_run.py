@@ -24,10 +24,11 @@ from trilane.apps.run.run_job import Hooks, Prepared, RunOutcome, Watched
 from trilane.apps.watch.followed_run import run_name
 from trilane.avatars.bundle import BUILT_IN, MANIFEST
 from trilane.errors import TrilaneError
+from trilane.options import kind_of, option_of
 from trilane.pipeline.controls import ALL, RunControls
 from trilane.stages.configure import Checked, GlFacts, required_machine
 from trilane.stages.dsp.runtime import installed
-from trilane.stages.run_options import NOTHING, RunOptions, kind_of, option_of
+from trilane.stages.run_options import NOTHING, RunOptions
 from trilane.units import UNITS
 
 ENDLESS: Final = 1_000_000_000  # frames: a year at 30 a second

@@ -11,8 +11,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from trilane.options import option_of
 from trilane.pipeline.journal import Begun
-from trilane.stages.run_options import NOTHING, RunOptions, option_of
+from trilane.stages.run_options import NOTHING, RunOptions
 
 if TYPE_CHECKING:
     from trilane.apps.run.report import Report

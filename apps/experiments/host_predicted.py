@@ -15,20 +15,18 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from trilane.apps.avatar.remade_avatar import remade_avatar
-from trilane.apps.predict.asked_prediction import answer_of, network_of, predict_networks, usual_policy, variant_of
+from trilane.apps.predict.asked_prediction import answer_of, application_of, predict_networks
+from trilane.apps.predict.predict_options import PredictOptions
 from trilane.apps.run.asked_run import run_asked
 from trilane.apps.run.run_job import Hooks
 from trilane.avatars.bundle import load_bundle
 from trilane.bench.lib.interleaved_processes import Variant, runners
 from trilane.errors import BadInputError
-from trilane.hw_profiles.application import Plan
 from trilane.hw_profiles.host_model import NETWORK
 from trilane.hw_profiles.profile_files import HOST, load_runnable
-from trilane.hw_profiles.rates import NOTHING
 from trilane.hw_profiles.schema import NORMAL_80
 from trilane.stages.configure import requested_runtime
 from trilane.stages.run_options import RunOptions
-from trilane.units import BURST
 
 RUN, ALONE = "run", "network"
 MIN_FRAMES = 100  # frames of a run that is placed by its times
@@ -77,10 +75,9 @@ def measure(
 
 
 def _of_run(avatar: str) -> Predicted:
-    chip, network = network_of(load_runnable(HOST), [], {}, avatar, "packed", NETWORK, None)
-    assert network is not None
-    plan = Plan(network, NETWORK, variant_of(usual_policy(HOST), None, 1, None))
-    frame = answer_of(chip, plan, BURST, 0.0, None, False, NOTHING)["frame_time_ms"]
+    options = PredictOptions(profile=HOST, avatar=avatar)
+    chip, plan = application_of(load_runnable(HOST), options)
+    frame = answer_of(chip, plan, options)["frame_time_ms"]
     return Predicted(frame["mean"], frame["low"], frame["high"])
 
 
@@ -92,8 +89,7 @@ def _run(avatar: str, frames: int, out: Path) -> tuple[float, float | None]:
 
 
 def _of_network(file: Path) -> Predicted:
-    over = (BURST, 0.0, None, NOTHING)
-    (answer,) = predict_networks(load_runnable(HOST), [file], {}, (NETWORK, None, None), over)
+    (answer,) = predict_networks(load_runnable(HOST), PredictOptions(profile=HOST, network=(file,)))
     return Predicted(answer["network_ms"], answer["low_ms"], answer["high_ms"])
 
 

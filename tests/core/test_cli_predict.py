@@ -15,6 +15,7 @@ import pytest
 from trilane.apps.cli import predict as cli
 from trilane.apps.cli import predict_output
 from trilane.apps.predict import asked_prediction
+from trilane.apps.predict.predict_options import PredictOptions
 from trilane.avatars.bundle import load_bundle
 from trilane.errors import BadInputError
 from trilane.hw_profiles import over_time, plot, profile_files, reference_networks
@@ -147,7 +148,7 @@ def test_a_rate_a_limit_and_a_precision(asked: dict[str, Any], command: Command)
 
 @pytest.mark.parametrize(("edge", "batch"), [(None, 1), (REFERENCE.edge, 4)])
 def test_the_reference_keeps_its_edge(edge: str | None, batch: int) -> None:
-    assert asked_prediction.variant_of("reference", edge, batch, None) == REFERENCE._replace(batch=batch)
+    assert PredictOptions(edge=edge, batch=batch).variant == REFERENCE._replace(batch=batch)
 
 
 ONE = "expected one or the other"
@@ -195,8 +196,16 @@ REFUSED = {
         for other in ("encoder", "norm", "size", "channels")
     },
     **{
-        ("--table", "x", f"--{other}", "1"): f"options: found --{other} beside --table, {ONE}; each row says so itself"
-        for other in ("layout", "avatar", "network", "runtime", "minutes", "gpu-share", "governor", "plot")
+        (
+            "--table",
+            "x",
+            f"--{other}",
+            value,
+        ): f"options: found --{other} beside --table, {ONE}; each row says so itself"
+        for other, value in (
+            *((name, "1") for name in ("avatar", "network", "runtime", "minutes", "gpu-share", "plot")),
+            *(("layout", "split"), ("governor", "step_wise")),
+        )
     },
     ("--table", "x", "--what-if", "--norm", "a", "--gpu-share", "1"): (
         f"options: found --gpu-share, --norm, --what-if beside --table, {ONE}; each row says so itself"
@@ -372,7 +381,7 @@ def a_network(**changes: Any) -> dict[str, Any]:
 def test_networks_are_shown_with_their_ten_most_expensive_operators(
     capsys: pytest.CaptureFixture[str], check_printed: Callable[..., None]
 ) -> None:
-    asked = ("burst", 30.0, None, Wanted(30.0, 3.0))
+    asked = PredictOptions(performance_profile="burst", minutes=30.0, fps=30.0, power_limit_w=3.0)
     over = {"fps_settled": 25.55, "fps_start": 40.0, "caps": {"throttled_share": 0.5}, "without_rule": [ODD]}
     heat = {"device_max": 41.25, "junction_max": 77.75}
     rate = {**RATE, "holds": False, "reserve": -0.5, "reserve_low": -0.75, "reserve_high": -0.255, "words": "no"}
@@ -401,8 +410,8 @@ def test_inputs_that_may_have_another_shape_are_told_without_the_weights(tmp_pat
     graph = onnx.helper.make_graph([onnx.helper.make_node("Conv", ["image", "w0"], ["y"])], "g", values[:2], values[2:])
     onnx.save(onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)]), tmp_path / "net.onnx")
     with pytest.raises(BadInputError, match=r"found no input 'picture', expected one of image$"):
-        over: Any = None
-        asked_prediction.predict_networks(CHIP, [tmp_path / "net.onnx"], {"picture": (1,)}, ("dsp", None, None), over)
+        options = PredictOptions(network=(tmp_path / "net.onnx",), input_shape=("picture=1",))
+        asked_prediction.predict_networks(CHIP, options)
 
 
 def test_a_limit_below_what_an_idle_device_takes(capsys: pytest.CaptureFixture[str]) -> None:

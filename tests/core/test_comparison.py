@@ -410,9 +410,7 @@ def test_the_command(
     assert said["changes"] == [{"run": other, "key": "policy", "base": "pipelined", "other": "sequential"}]
     more = [str(make(name, seed)) for seed, name in enumerate(("a2", "b2"), 3)]
     assert run_cli(monkeypatch, f"{base},{more[0]}", f"{other},{more[1]}", "--fail-if-slower", "500 %") == 0
-    assert "a side with several runs shows the arithmetic mean" in " ".join(
-        capsys.readouterr().out.split()
-    )
+    assert "a side with several runs shows the arithmetic mean" in " ".join(capsys.readouterr().out.split())
     assert run_cli(monkeypatch, f"{base},{more[0]}", other) == 0
     assert "verdict: frame time +" in capsys.readouterr().out
     assert run_cli(monkeypatch, f"{base},{base}", f"{other},{more[1]}") == 2

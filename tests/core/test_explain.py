@@ -458,7 +458,7 @@ def test_a_sheet_has_at_most_nine_frames(checked: Checked, tmp_path: Path) -> No
     ("options", "words"),
     [
         (["--profile", "no-such-chip"], "no-such-chip"),
-        (["--frames", "0"], "--frames"),
+        (["--frames", "0"], "frames: found 0"),
         (["--size", "300"], "a multiple of 32"),
         (["--picture", "/nowhere/at/all.png"], "/nowhere"),
         (["--picture", "plan.jpg"], "--picture: found 'plan.jpg', expected a name that ends in .png"),

@@ -264,8 +264,8 @@ def test_a_network_by_itself_is_predicted_like_on_the_command_line(tiny_bundle: 
 @pytest.mark.parametrize(
     ("arguments", "found"),
     [
-        ({"avatar": "default", "network": "n.onnx"}, "an avatar and a network"),
-        ({"application": True}, "application without a network"),
+        ({"avatar": "default", "network": "n.onnx"}, "--avatar beside --network"),
+        ({"application": True}, "--application with 0 networks"),
         ({"performance_profile": "turbo"}, "found 'turbo'"),
         ({"profile": "none"}, "none"),
         ({"runtime": "npu"}, "npu"),

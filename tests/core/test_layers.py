@@ -19,6 +19,7 @@ ROWS = (
         "machine",
         "figure_sources",
         "files",
+        "options",
         "shapes",
         "unet_tables",
         "unexpected_value",

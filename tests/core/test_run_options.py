@@ -15,16 +15,18 @@ from typer.main import get_command
 import trilane
 from trilane.apps.cli.run import app
 from trilane.errors import BadInputError
-from trilane.stages.run_options import RunOptions, kind_of, limits_of
+from trilane.options import kind_of, limits_of
+from trilane.stages.run_options import RunOptions
 
 ADDED = """
 import contextlib, inspect, json
 from typing import Annotated
 from pydantic import Field
+from trilane.options import Option
 from trilane.stages import run_options
 
 class RunOptions(run_options.RunOptions):
-    glow_ms: Annotated[float, run_options.Option("--glow", unit="milliseconds", offered=("1.0", "2.0"))] = Field(
+    glow_ms: Annotated[float, Option("--glow", unit="milliseconds", offered=("1.0", "2.0"))] = Field(
         default=1.0, ge=0, le=50, description="How long a frame glows.")
 
 run_options.RunOptions = RunOptions  # in place of a line in the model

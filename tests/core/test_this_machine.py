@@ -14,8 +14,10 @@ from onnx import TensorProto, helper
 
 from trilane import machine
 from trilane.apps.predict import asked_prediction, this_machine
+from trilane.apps.predict.predict_options import PredictOptions
 from trilane.avatars.bundle import load_bundle
 from trilane.errors import BadInputError, TrilaneError
+from trilane.hw_profiles.application import REFERENCE
 from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.network_work import Network, count_work
 from trilane.hw_profiles.profile_files import load_profile
@@ -328,13 +330,13 @@ def test_only_what_this_machine_would_run_is_measured(
     monkeypatch.setattr(this_machine, "with_file", lambda chip, *_: asked.append("file") or chip)
     monkeypatch.setattr(this_machine, "with_file_in_application", lambda chip, *_: asked.append("both") or chip)
     chip, files = load_profile(profile), [tiny_bundle / "network.onnx"]
-    asked_prediction.network_of(chip, [], {}, str(tiny_bundle), "packed", unit, precision)
-    asked_prediction.network_of(chip, files, {}, None, "packed", unit, precision)
-    over: Any = (BURST, 0.0, None, asked_prediction.wanted_of(None, None))
-    asked_prediction.predict_networks(chip, files, {}, (unit, precision, None), over)
+    same = {"runtime": unit, "precision": precision}
+    asked_prediction.application_of(chip, PredictOptions(avatar=str(tiny_bundle), **same))
+    asked_prediction.application_of(chip, PredictOptions(network=files, application=True, **same))
+    asked_prediction.predict_networks(chip, PredictOptions(network=files, **same))
     assert asked == (["avatar", "both", "file"] if is_measured else [])
 
 
 def test_this_machine_has_the_policy_of_a_run() -> None:
-    assert asked_prediction.usual_policy("host") == "pipelined"
-    assert asked_prediction.usual_policy("qcs6490") == "reference"
+    assert PredictOptions(profile="host").variant.policy == "pipelined"
+    assert PredictOptions(profile="qcs6490").variant == REFERENCE

@@ -1,0 +1,294 @@
+"""The options of a prediction, each as one field: `trilane predict` and `trilane.predict` have theirs from here.
+
+Rule: what is wrong with one option is found by its field, what does not go together by `check_together`. Words of a
+chip's model are read when they are checked, because importing it takes long.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Annotated, Final
+
+from pydantic import AfterValidator, BeforeValidator, Field
+
+from trilane.errors import BadInputError
+from trilane.options import Finite, Option, Options, Text, Texts
+from trilane.stages.run_options import AVATARS_HELP, PROFILE_HELP
+from trilane.unexpected_value import UnexpectedValue
+from trilane.units import BURST, PERFORMANCE_PROFILES, SUSTAINED, UnitName
+
+if TYPE_CHECKING:
+    from trilane.hw_profiles.application import Variant
+    from trilane.hw_profiles.rates import Wanted
+    from trilane.hw_profiles.schema import EngineRuntime
+
+ENCODER_HELP: Final = "resnet18, mobilenetv2, mobilenetv3 or efficientnet-lite0."
+NORM_HELP: Final = "batch, instance or group."
+FIXED_SIZE_HELP: Final = "Tensor size in pixels: one side, or HEIGHTxWIDTH."
+HOST: Final = "host"
+#: How people call precisions -> as a hardware profile does.
+PRECISIONS: Final = {"w8a8": "int8", "int8": "int8", "float": "fp16", "fp16": "fp16", "fp32": "fp32"}
+OF_A_FILE: Final = {"encoder", "norm", "size", "channels"}
+OF_THE_APPLICATION: Final = {"layout", "policy", "edge", "batch", "gpu_share", "what_if", "plot", "trace"}
+#: Option: those that have no effect beside it.
+IGNORED: Final = {
+    "avatar": OF_A_FILE | {"input_shape"},
+    "network": OF_A_FILE | {"avatar"},
+    "table": OF_A_FILE
+    | {"layout", "avatar", "network", "application", "runtime", "minutes", "gpu_share", "governor", "what_if", "plot"}
+    | {"fps", "power_limit_w", "precision", "input_shape", "trace"},
+}
+WHY_IGNORED: Final = {
+    "avatar": "the avatar's network says so itself",
+    "network": "the file says so itself",
+    "table": "each row says so itself",
+}
+#: Options that mean something beside a scene.
+OF_A_SCENE: Final = {"scene", "beside", "turns", "profile", "minutes", "policy", "edge", "performance_profile"} | {
+    "governor",
+    "trace",
+}
+
+
+def _either(read_words: Callable[[], tuple[str, ...]], expected: str = "") -> AfterValidator:
+    """Return a validator of words that are read when a value comes. `expected`: what an error says of them."""
+
+    def known(text: str | None) -> str | None:
+        if text is not None and text not in (words := read_words()):
+            raise UnexpectedValue(repr(text), expected or " or ".join(words))
+        return text
+
+    return AfterValidator(known)
+
+
+def _engine_runtimes() -> tuple[str, ...]:
+    from trilane.hw_profiles.schema import ENGINE_RUNTIMES
+
+    return tuple(ENGINE_RUNTIMES)
+
+
+def _governors() -> tuple[str, ...]:
+    from trilane.hw_profiles.governor import GOVERNORS
+
+    return tuple(GOVERNORS)
+
+
+def _turns() -> tuple[str, ...]:
+    from trilane.scheduler.turns import TURNS
+
+    return tuple(TURNS)
+
+
+def _paths(value: object) -> object:
+    """Turn one file, or several, into paths."""
+    several = [value] if isinstance(value, str | PurePath) else value
+    return tuple(Path(each) if isinstance(each, str) else each for each in several) if several else ()  # type: ignore[attr-defined]
+
+
+def _path(value: object) -> object:
+    return Path(value) if isinstance(value, str) else value
+
+
+def _rate(fps: float | None) -> float | None:
+    from trilane.hw_profiles.application import LEAST_FPS, MOST_FPS
+
+    if fps is not None and not LEAST_FPS <= fps <= MOST_FPS:
+        raise UnexpectedValue(f"{fps:g}", f"{LEAST_FPS:g} to {MOST_FPS:g}")
+    return fps
+
+
+def _watts(limit: float | None) -> float | None:
+    if limit is not None and not 0 < limit < float("inf"):
+        raise UnexpectedValue(f"{limit:g}", "watts above 0")
+    return limit
+
+
+def _shape(text: str) -> tuple[str, tuple[int, ...]]:
+    found = re.fullmatch(r"(.+)=(\d{1,9}(?:x\d{1,9})*)", text)
+    if found is None or 0 in (sizes := tuple(map(int, found[2].split("x")))):
+        raise UnexpectedValue(repr(text), "a name and sizes, such as image=1x3x224x224")
+    return found[1], sizes
+
+
+def _shapes(texts: tuple[str, ...]) -> tuple[str, ...]:
+    names = [_shape(text)[0] for text in texts]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise UnexpectedValue(f"{twice[0]!r} twice", "each input once")
+    return texts
+
+
+class PredictOptions(Options):
+    """The options of `trilane predict`, in the order of its help."""
+
+    scene: Annotated[Text | None, Option(is_argument=True)] = Field(
+        default=None,
+        description="A scene, priced frame by frame, instead of one network: a name, a file, or SCENE@RATE.",
+    )
+    beside: Texts = Field(
+        default=(),
+        description="What else the chip does: SCENE, SCENE@RATE, NETWORK.onnx@RATE or @RATE:gpu. Once for each.",
+    )
+    turns: Annotated[str, _either(_turns)] = Field(
+        default="round-robin",
+        description="Whose job a unit takes that several pipelines wait for: round-robin or deadline.",
+    )
+    profile: Text = Field(default="snapdragon-888", description=PROFILE_HELP)
+    encoder: str = Field(default="resnet18", description=ENCODER_HELP)
+    norm: str = Field(default="batch", description=NORM_HELP)
+    size: Text = Field(default="512", description=FIXED_SIZE_HELP)
+    channels: int = Field(default=16, description="Channels of the neural texture, 1 to 16.")
+    layout: Annotated[str, _either(lambda: ("packed", "split"))] = Field(
+        default="packed", description="packed: one raster pass; split: one for every 4 channels."
+    )
+    avatar: Text | None = Field(default=None, description=f"An avatar's network instead: {AVATARS_HELP}")
+    network: Annotated[tuple[Path, ...], BeforeValidator(_paths)] = Field(
+        default=(),
+        description="A network by itself, without raster and composite: an ONNX file. May be given again.",
+    )
+    application: Annotated[bool, Option("--application")] = Field(
+        default=False, description="The application with the --network instead of the network by itself."
+    )
+    input_shape: Annotated[Texts, AfterValidator(_shapes)] = Field(
+        default=(), description="Shape of an input of a --network: NAME=1x3x224x224. May be given again."
+    )
+    precision: Annotated[str | None, _either(lambda: tuple(PRECISIONS), "w8a8 (int8), float (fp16) or fp32")] = Field(
+        default=None, description="w8a8 (int8), float (fp16) or fp32; as the network says and its unit has it."
+    )
+    engine_runtime: Annotated[str | None, _either(_engine_runtimes)] = Field(
+        default=None,
+        description="Of a tensor engine that runs a --network by itself: tflite (if not given) or qnn_dlc.",
+    )
+    runtime: str = Field(
+        default="dsp", description="Unit of the network: gpu or dsp; cpu too for a --network by itself."
+    )
+    minutes: Finite = Field(default=0.0, description="Virtual minutes with heat; 0: settled, without heat.")
+    policy: Annotated[str | None, Option(synonyms=("--pipelining",))] = Field(
+        default=None,
+        description="reference (if not given), or sequential, pipelined (if not given, on host), latest, deadline.",
+    )
+    edge: str | None = Field(
+        default=None, description="Buffers between stages: single, double (if not given), triple, fifo:N, orphan."
+    )
+    batch: int = Field(default=1, description="Frames per job of the network.")
+    fps: Annotated[float | None, AfterValidator(_rate)] = Field(
+        default=None, description="A rate: does it hold, at which power? latest and deadline have 30 without."
+    )
+    power_limit_w: Annotated[float | None, AfterValidator(_watts)] = Field(
+        default=None, description="Also the highest rate within so many watts of the device."
+    )
+    gpu_share: Finite = Field(default=0.0, description="Share of the network that the GPU does for the DSP.")
+    performance_profile: Annotated[str, _either(lambda: PERFORMANCE_PROFILES), Option(words=PERFORMANCE_PROFILES)] = (
+        Field(default=SUSTAINED, description="Which power and speed the units ask for, by SNPE's names.")
+    )
+    governor: Annotated[str | None, _either(_governors)] = Field(
+        default=None, description="step_wise or power_allocator; the profile's if not given."
+    )
+    what_if: Annotated[bool, Option("--what-if")] = Field(
+        default=False, description="Compare policies and edges for the same network, at --fps all."
+    )
+    plot: Annotated[Path | None, BeforeValidator(_path)] = Field(
+        default=None, description="Draw frame rate and temperature here (.png, .svg, .pdf)."
+    )
+    trace: Annotated[Path | None, BeforeValidator(_path)] = Field(
+        default=None, description="Write the simulated run here, for ui.perfetto.dev (docs/trace.md)."
+    )
+    table: Annotated[Path | None, BeforeValidator(_path)] = Field(
+        default=None, description="CSV of configurations: one answer per row."
+    )
+
+    @property
+    def is_bare(self) -> bool:
+        """Say whether networks are predicted by themselves, without the application."""
+        return bool(self.network) and not self.application
+
+    @property
+    def cap(self) -> str:
+        """Return the performance profile.
+
+        If none was given, a network by itself has that of published latencies, and a run on this machine has no cap.
+        """
+        if "performance_profile" in self.model_fields_set:
+            return self.performance_profile
+        return BURST if self.is_bare or self.profile == HOST else SUSTAINED
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Return the shapes of inputs, by name."""
+        return dict(map(_shape, self.input_shape))
+
+    @property
+    def numbers(self) -> str | None:
+        """Return the precision by a hardware profile's name."""
+        return None if self.precision is None else PRECISIONS[self.precision]
+
+    @property
+    def engine(self) -> EngineRuntime | None:
+        """Return the runtime of a tensor engine."""
+        from trilane.hw_profiles.schema import ENGINE_RUNTIMES
+
+        return next((runtime for runtime in ENGINE_RUNTIMES if runtime == self.engine_runtime), None)
+
+    @property
+    def unit(self) -> UnitName:
+        """Return the unit of the network. Raises BadInputError for none that it can be."""
+        units: tuple[UnitName, ...] = ("cpu", "gpu", "dsp") if self.is_bare else ("gpu", "dsp")
+        for unit in units:
+            if unit == self.runtime:
+                return unit
+        raise BadInputError("--runtime", repr(self.runtime), " or ".join(", ".join(units).rsplit(", ", 1)))
+
+    @property
+    def wanted(self) -> Wanted:
+        """Return the rate and the limit of power to judge."""
+        from trilane.hw_profiles.rates import Wanted
+
+        return Wanted(self.fps, self.power_limit_w)
+
+    @property
+    def variant(self) -> Variant:
+        """Return how stages are joined. Without a policy: as in the published application, on this machine as in a run.
+
+        Raises BadInputError for an edge that the published application does not have.
+        """
+        from trilane.hw_profiles.application import REFERENCE, Variant
+
+        policy = self.policy or ("pipelined" if self.profile == HOST else "reference")
+        if policy != "reference":
+            rate = {} if self.fps is None else {"fps": self.fps}
+            return Variant(policy, self.edge or "double", self.batch, **rate)
+        if self.edge not in (None, REFERENCE.edge):
+            remedy = "choose a --policy of your own, such as pipelined"
+            expected = f"{REFERENCE.edge}, which the reference application has"
+            raise BadInputError("--edge", repr(self.edge), expected, remedy)
+        return REFERENCE._replace(batch=self.batch)
+
+    def check_together(self) -> None:
+        """Raise BadInputError for options that leave another one without effect, or that lack another."""
+        given = self.model_fields_set
+        for option, others in IGNORED.items():
+            if option in given and (useless := given & others):
+                found = f"{self._spelt(useless)} beside --{option}"
+                raise BadInputError("options", found, "one or the other", WHY_IGNORED[option])
+        if "engine_runtime" in given and not self.is_bare:
+            remedy = "the application runs as its profile says"
+            raise BadInputError("options", "--engine-runtime", "a --network by itself beside it", remedy)
+        if self.is_bare and "table" not in given and (useless := given & OF_THE_APPLICATION):
+            found, remedy = f"{self._spelt(useless)} with a network by itself", "they are of the application"
+            remedy += ": add --application for it with this network"
+            raise BadInputError("options", found, "it without them", remedy)
+        if self.application and len(self.network) != 1:
+            found = f"--application with {len(self.network)} networks"
+            remedy = "it says that the application runs the network of the file"
+            raise BadInputError("options", found, "one --network", remedy)
+        if self.input_shape and not self.network:
+            raise BadInputError("options", "--input-shape without --network", "a network whose input it is")
+        if self.beside and self.scene is None:
+            raise BadInputError("options", "--beside without a scene", "a scene, such as `trilane predict default`")
+        if self.scene is not None and (useless := given - OF_A_SCENE):
+            found = f"{self._spelt(useless)} beside a scene"
+            raise BadInputError("options", found, "none of them", "the scene says so itself")
+
+    def _spelt(self, names: set[str]) -> str:
+        return ", ".join(sorted(map(self.spelling, names)))

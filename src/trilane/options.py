@@ -1,0 +1,148 @@
+"""What an option is: a field of a pydantic model, with its help text, default, range, unit and words.
+
+The command line and programs read their options from the fields. Rule: a model of options is the only list of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from types import NoneType, UnionType
+from typing import Annotated, Any, Self, Union, get_args, get_origin
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
+
+from trilane.errors import BadInputError, did_you_mean
+from trilane.unexpected_value import UnexpectedValue, unexpected_in
+
+
+@dataclass(frozen=True)
+class Option:
+    """Facts about an option that its field's type does not state.
+
+    `spelling`: option on the command line where it is not the field's name, such as `--latch`.
+    `synonyms`: other spellings of it.
+    `is_argument`: whether the command line takes it without a name.
+    `unit`: unit of a number, as a plural noun.
+    `words`: all words that it may be; any text where empty.
+    `offered`: words that the dashboard's control offers beside what it finds here; None where the dashboard has no
+    control.
+    """
+
+    spelling: str = ""
+    synonyms: tuple[str, ...] = ()
+    is_argument: bool = False
+    unit: str = ""
+    words: tuple[str, ...] = ()
+    offered: tuple[str, ...] | None = None
+
+
+def option_of(field: FieldInfo) -> Option:
+    """Return the field's `Option`; an empty one where it has none."""
+    return next((each for each in field.metadata if isinstance(each, Option)), Option())
+
+
+def kind_of(field: FieldInfo) -> Any:
+    """Return the field's type without None, limits and elements: str, int, float, bool, Path or tuple."""
+    kind: Any = field.annotation
+    while get_origin(kind) in (Annotated, Union, UnionType):
+        kind = next(each for each in get_args(kind) if each is not NoneType)
+    return get_origin(kind) or kind
+
+
+def element_of(field: FieldInfo) -> Any:
+    """Return the type of a tuple's elements."""
+    kind: Any = field.annotation
+    while get_origin(kind) is not tuple:
+        kind = get_args(kind)[0]
+    return get_args(kind)[0]
+
+
+def limits_of(field: FieldInfo) -> tuple[float | None, float | None]:
+    """Return the least and the largest number that the field may be; None where there is no limit."""
+    least, most = (
+        next((getattr(one, key) for one in field.metadata if hasattr(one, key)), None) for key in ("ge", "le")
+    )
+    return least, most
+
+
+def text_of(value: object) -> object:
+    """Turn paths and whole numbers (sizes), which programs may give, into text."""
+    return str(value) if isinstance(value, PurePath) or type(value) is int else value
+
+
+def texts_of(value: object) -> object:
+    return tuple(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
+
+
+def one_of(*words: str) -> AfterValidator:
+    """Return a validator that refuses a text which is none of `words`; None passes."""
+
+    def known(word: str | None) -> str | None:
+        if word is not None and word not in words:
+            raise UnexpectedValue(repr(word), f"one of {', '.join(words)}", did_you_mean(word, words))
+        return word
+
+    return AfterValidator(known)
+
+
+Text = Annotated[str, BeforeValidator(text_of)]
+Texts = Annotated[tuple[str, ...], BeforeValidator(texts_of)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class Options(BaseModel):
+    """A model of options. `model_fields_set` names those that somebody gave."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    @classmethod
+    def checked(cls, values: Mapping[str, Any], *, as_typed: bool = False) -> Self:
+        """Check `values`, by the fields' names. Raises BadInputError for the first that its field does not allow.
+
+        `as_typed`: whether the error names the option of the command line in place of the field.
+        """
+        try:
+            return cls(**values)
+        except ValidationError as error:
+            first = error.errors()[0]
+        name = str(first["loc"][0])
+        field, where = cls.model_fields[name], cls.spelling(name) if as_typed else name
+        unexpected = unexpected_in(first) or UnexpectedValue(repr(first["input"]), _expected(field))
+        raise BadInputError.at(where, unexpected)
+
+    @classmethod
+    def spelling(cls, name: str) -> str:
+        """Return the option of field `name` on the command line."""
+        return option_of(cls.model_fields[name]).spelling or f"--{name.replace('_', '-')}"
+
+    def changed(self, **values: Any) -> Self:
+        """Return the same options with other `values`. Raises BadInputError as `checked`."""
+        return self.checked({**dict(self), **values})
+
+    def as_json(self) -> dict[str, Any]:
+        """Return every option by its field's name, as the report has it."""
+        return {name: _as_json(value) for name, value in self}
+
+
+def _as_json(value: object) -> object:
+    if isinstance(value, tuple):
+        return list(value)
+    return str(value) if isinstance(value, PurePath) else value
+
+
+def _expected(field: FieldInfo) -> str:
+    """Say what a field's value must be, from its type, range and unit."""
+    kind, unit = kind_of(field), option_of(field).unit
+    if kind not in (int, float):
+        return {str: "text", bool: "true or false", tuple: "a list of texts", Path: "a path"}[kind]
+    noun = unit or "a number"
+    if kind is int:
+        noun = f"a whole number of {unit}" if unit else "a whole number"
+    least, most = limits_of(field)
+    comma = "," if unit else ""
+    if least is None:
+        return noun
+    return f"{noun}{comma} {least} or more" if most is None else f"{noun}{comma} from {least} to {most}"
