@@ -7,6 +7,7 @@ zero pose nor its axes matter. A joint that the file does not have follows its p
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -42,7 +43,7 @@ from trilane.scene.motion.turns import (
     with_neck_on,
     with_shoulders_on,
 )
-from trilane.scene.rotations import about, rotvec_from_matrix
+from trilane.scene.rotations import rotvec_from_matrix
 
 UP, LEFT, FORWARD = (np.eye(3)[k] for k in (1, 0, 2))
 FINGERS = ("index", "middle", "pinky", "ring", "thumb")
@@ -50,9 +51,11 @@ FINGERS = ("index", "middle", "pinky", "ring", "thumb")
 HAND_ENDS = ("middle1", "index1", "ring1", "pinky1")
 #: Weights of evidence for a twist beside the bend of a limb: toes, and the least twist from the part above.
 OF_TOES, OF_LEAST_TWIST = 0.5, 0.02
-#: Difference in slope above which a foot stands on its sole, not along its bone: its bone is steeper or flatter than
+#: Difference in slope above which a planted foot is laid flat, not along its bone: its bone is steeper or flatter than
 #: the avatar's.
 SAME_SLOPE = np.radians(8.0)
+#: How far the heel is behind the ankle, as a share of the bone from the ankle to the toes: the built-in walker's.
+HEEL_BEHIND = 0.057 / np.hypot(0.062, 0.146)
 #: Largest difference by which a program's feet are steeper than the avatar's; beyond it, a heel is raised throughout.
 MOST_STEEPER = np.radians(27.0)
 
@@ -110,16 +113,15 @@ def retarget(tracks: Tracks, joints: F64) -> tuple[F64, F64, tuple[str, ...]]:
         upper = with_shoulders_on(tracks.across("shoulder"), upper, rest)
     work.turns.update(with_neck_on(trunk, upper, rest) if line.top == "neck" else upper)
     work.turns["neck"] = turns_of_neck(tracks, rest, work.turns["spine3"])
-    up = upward(tracks, trunk, stands)
-    steeper = _steeper(work, up)
     for side in SIDES:
-        _leg(work, side, up, steeper)
+        _leg(work, side)
         _arm(work, side)
+    _feet(work, upward(tracks, trunk, stands))
     _head(work)
     return _local(work.turns, tracks.frames), _pelvis_places(work, joints), (*_notes(work), *work.notes)
 
 
-def _leg(work: Retarget, side: str, up: F64, steeper: float) -> None:
+def _leg(work: Retarget, side: str) -> None:
     hip, knee, ankle, toes = (f"{side}_{part}" for part in ("hip", "knee", "ankle", "foot"))
     tracks = work.tracks
     thigh, shin = tracks.bone(hip, knee), tracks.bone(knee, ankle)
@@ -132,13 +134,90 @@ def _leg(work: Retarget, side: str, up: F64, steeper: float) -> None:
         of_shin.append((work.bone(ankle, toes), unit(foot) * OF_TOES))
     work.lay(hip, work.bone(hip, knee), thigh, of_thigh)
     work.lay(knee, work.bone(knee, ankle), shin, of_shin)
-    if foot is None:
-        work.turns[ankle] = work.turns[toes] = work.turns[knee]
-        return
-    level = [(work.bone(ankle, knee), -unit(shin) * OF_LEAST_TWIST)]
-    level.append((UP, planted_frames(tracks, side, foot, up)[:, None] * up))
-    work.lay(ankle, about(0, steeper) @ work.bone(ankle, toes), foot, level)
-    work.turns[toes] = _levelled(work, toes, work.turns[ankle])
+
+
+def _feet(work: Retarget, up: F64) -> None:
+    """Lay the feet along the recorded ones, as far as toes and heels stay above the floor.
+
+    `up` (3,): direction that is up in the recording.
+    """
+    tracks = work.tracks
+    feet = [foot for side in SIDES if (foot := _recorded_foot(work, side, up)) is not None]
+    planted = [foot for foot in feet if foot.planted.any()]
+    steeper, flat_by = _steeper(work, planted)
+    floor = min((float(np.median(foot.height[foot.planted])) for foot in planted), default=0.0)
+    for side in SIDES:
+        ankle, toes = f"{side}_ankle", f"{side}_foot"
+        work.turns[ankle] = work.turns[toes] = work.turns[f"{side}_knee"]
+    for foot in feet:
+        ankle, toes = f"{foot.side}_ankle", f"{foot.side}_foot"
+        way = foot.above(floor, steeper, flat_by, up)
+        shin = tracks.bone(f"{foot.side}_knee", ankle)
+        level = [(work.bone(ankle, f"{foot.side}_knee"), -unit(shin) * OF_LEAST_TWIST)]
+        level.append((UP, foot.planted[:, None] * up))
+        work.lay(ankle, work.bone(ankle, toes), way, level)
+        work.turns[toes] = _levelled(work, toes, work.turns[ankle])
+
+
+@dataclass(frozen=True)
+class _RecordedFoot:
+    """A recorded foot on the avatar.
+
+    `way` (T, 3): way from the ankle to the toes. `falls` (T,): how steeply it falls, radians. `planted` (T,): frames in
+    which it most likely lies flat. `height` (T,): height of the avatar's ankle, metres, from any zero. `ours`,
+    `length`: how steeply the avatar's own bone falls at rest, radians, and its length, metres.
+    """
+
+    side: str
+    way: F64
+    falls: F64
+    planted: NDArray[np.bool_]
+    height: F64
+    ours: float
+    length: float
+
+    def above(self, floor: float, steeper: float, flat_by: float, up: F64) -> F64:
+        """Return the way (T, 3) of the foot, raised or lowered as far as toes or heel would pass through the floor.
+
+        A foot that lies flat falls by `ours` + `flat_by`. With its ankle raised by r it may fall by the angle whose
+        sine is larger by r / `length`: then the toes are as high as those of a flat foot. In the other direction the
+        heel turns about the ankle. `floor`: height of the ankle of a flat foot. `steeper`: as `_steeper` says.
+        """
+        if not steeper:
+            return self.way
+        flat = self.ours + flat_by
+        rise = np.maximum(self.height - floor, 0.0) / self.length
+        if steeper > 0:
+            falls = np.minimum(self.falls, np.arcsin(np.minimum(np.sin(flat) + rise, 1.0)))
+        else:
+            falls = np.maximum(self.falls, flat - np.arcsin(np.minimum(rise / HEEL_BEHIND, 1.0)))
+        level = unit(self.way - (self.way @ up)[:, None] * up)
+        return np.asarray(np.cos(falls)[:, None] * level - np.sin(falls)[:, None] * up)
+
+
+def _recorded_foot(work: Retarget, side: str, up: F64) -> _RecordedFoot | None:
+    """Return the recorded foot of a leg whose thigh and shin are laid; None when the file does not tell it."""
+    way = _foot(work.tracks, side)
+    if way is None:
+        return None
+    ours = work.rest.bone(f"{side}_ankle", f"{side}_foot")[0]
+    return _RecordedFoot(
+        side,
+        way,
+        angle_between(way, up) - np.pi / 2,
+        planted_frames(work.tracks, side, way, up),
+        _ankle(work, side) @ up,
+        float(angle_between(ours, UP)) - np.pi / 2,
+        float(np.linalg.norm(ours)),
+    )
+
+
+def _ankle(work: Retarget, side: str) -> F64:
+    """Return places (T, 3) of the avatar's ankle in metres, from the recording's origin."""
+    rest, hip, knee, ankle = work.rest, *(f"{side}_{part}" for part in ("hip", "knee", "ankle"))
+    from_middle = rest.places[hip][0] - rest.between("hip")[0]
+    legs = turned(work.turns[hip], rest.bone(hip, knee)[0]) + turned(work.turns[knee], rest.bone(knee, ankle)[0])
+    return np.asarray(work.tracks.between("hip") / _scale(work) + turned(work.turns["pelvis"], from_middle) + legs)
 
 
 def _foot(tracks: Tracks, side: str) -> F64 | None:
@@ -151,27 +230,22 @@ def _foot(tracks: Tracks, side: str) -> F64 | None:
     return foot if np.linalg.norm(foot, axis=-1).min() > 0 else None
 
 
-def _steeper(work: Retarget, up: F64) -> float:
-    """Return how much steeper a bone the recorded feet have than the avatar's while they are planted, radians.
+def _steeper(work: Retarget, planted: Sequence[_RecordedFoot]) -> tuple[float, float]:
+    """Return how much steeper the recorded feet are than the avatar's, and by how much a flat one falls more; radians.
 
-    The flatter of both feet counts, as the other may stand on its toes. The result is 0 where they are nearly as steep.
+    `planted`: feet that lie flat in some frames. The flatter of both counts, as the other may stand on its toes. Both
+    results are 0 where they are nearly as steep; the second is what is beyond MOST_STEEPER.
     """
-    found = []
-    for side in SIDES:
-        foot = _foot(work.tracks, side)
-        planted = planted_frames(work.tracks, side, foot, up) if foot is not None else np.zeros(1, dtype=bool)
-        if foot is not None and planted.any():
-            ours = angle_between(work.bone(f"{side}_ankle", f"{side}_foot"), UP)
-            found.append(float(np.median(angle_between(foot, up)[planted]) - ours))
-    steeper = float(np.clip(min(found, default=0.0), -MOST_STEEPER, MOST_STEEPER))
+    found = min((float(np.median(foot.falls[foot.planted]) - foot.ours) for foot in planted), default=0.0)
+    steeper = float(np.clip(found, -MOST_STEEPER, MOST_STEEPER))
     if work.own or abs(steeper) < SAME_SLOPE:
-        return 0.0
+        return 0.0, 0.0
     word = "steeper" if steeper > 0 else "flatter"
     work.notes.append(
-        f"feet: {abs(np.degrees(steeper)):.0f}° {word} than the avatar's where they are planted, so soles are laid on "
-        "recorded soles, not bones on bones"
+        f"feet: {abs(np.degrees(steeper)):.0f}° {word} than the avatar's where they are planted, so they are laid flat "
+        "there, and elsewhere as recorded, as far as toes and heels stay above the floor"
     )
-    return steeper
+    return steeper, found - steeper
 
 
 def _levelled(work: Retarget, name: str, base: F64) -> F64:
@@ -257,9 +331,13 @@ def _local(turns: dict[str, F64], frames: int) -> F64:
 
 def _pelvis_places(work: Retarget, joints: F64) -> F64:
     """Return places (T, 3) of the avatar's pelvis that bring the middle of its hips to the recorded one."""
-    scale = leg_length(work.tracks) / leg_length(work.rest)
     from_hips = joints[0] - work.rest.between("hip")[0]
-    return np.asarray(work.tracks.between("hip") + turned(work.turns["pelvis"], from_hips * scale))
+    return np.asarray(work.tracks.between("hip") + turned(work.turns["pelvis"], from_hips * _scale(work)))
+
+
+def _scale(work: Retarget) -> float:
+    """Return the length of a recorded leg, in the recording's unit, over the avatar's in metres."""
+    return leg_length(work.tracks) / leg_length(work.rest)
 
 
 def _notes(work: Retarget) -> list[str]:
