@@ -37,6 +37,7 @@ FALLBACK_GHZ = 2.5
 ZEN_5 = "ResNet18 of width 64 at 512x512 on four Zen 5 cores"
 ZEN_3 = "ResNet18 of width 64 at 512x512 on four Zen 3 cores, docs/networks.md"
 #: CPU flag -> how many times faster each runtime is than ONNX Runtime in FP32, kind of these numbers, their source.
+#: `cuda` and `qnn` have none: neither was measured beside the others, and their speed is that of a device.
 RUNTIMES: dict[str, tuple[dict[str, float], str, str]] = {
     "avx512_vnni": ({"openvino": 3.7, "ort": 2.2}, "measured", ZEN_5),
     "avx_vnni": ({"openvino": 3.7, "ort": 2.2}, "assumed", f"like {ZEN_5}"),
@@ -217,12 +218,15 @@ def fastest_runtime(profile: Profile, installed: Sequence[str]) -> tuple[str, st
 
     Raises MissingPartError when the profile has a number for none of them.
     """
-    speeds = {name: profile.units["dsp"].runtimes[name] for name in installed if name in profile.units["dsp"].runtimes}
+    known = profile.units["dsp"].runtimes
+    speeds = {name: known[name] for name in installed if name in known}
     if not speeds:
         raise MissingPartError("no runtime that the host profile knows is installed", package_line("onnxruntime"))
     name = max(speeds, key=lambda runtime: speeds[runtime].or_else(0.0))
     times = ", ".join(f"{runtime} {speed.or_else(0.0):g}" for runtime, speed in speeds.items())
-    return name, f"times the speed of FP32, by the host profile: {times}; {speeds[name].source}"
+    unknown = ", ".join(runtime for runtime in installed if runtime not in known)
+    left_out = f"; installed, but of unknown speed: {unknown}" if unknown else ""
+    return name, f"times the speed of FP32, by the host profile: {times}; {speeds[name].source}{left_out}"
 
 
 def described(placement: Placement) -> str:

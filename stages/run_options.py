@@ -13,7 +13,7 @@ from typing import Annotated, Final
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from trilane.errors import BadInputError, did_you_mean
-from trilane.options import Finite, Option, Options, Text, Texts, one_of, texts_of
+from trilane.options import NOTHING, Finite, Option, Options, Text, Texts, one_of, texts_of
 from trilane.scheduler.policy import POLICIES
 from trilane.transport.slots import RULES, edge_rule
 from trilane.unexpected_value import UnexpectedValue
@@ -25,8 +25,6 @@ RUNTIME_HELP: Final = "auto, ort, openvino, qnn or cuda; auto is the fastest tha
 SIZE_HELP: Final = "Tensor size in pixels: HEIGHTxWIDTH, or a side S for areas up to SxS."
 WIDTH_HELP: Final = "Width of the network: 64 is full, every channel count scales with it."
 
-#: Word for None on the dashboard.
-NOTHING: Final = "none"
 #: Word for the calibration of the network in the avatar's own file.
 AS_IT_IS: Final = "as-it-is"
 #: Methods of `trilane.training.quantising.calibration`, repeated here because that module takes long to import.

@@ -24,11 +24,11 @@ from trilane.apps.run.run_job import Hooks, Prepared, RunOutcome, Watched
 from trilane.apps.watch.followed_run import run_name
 from trilane.avatars.bundle import BUILT_IN, MANIFEST
 from trilane.errors import TrilaneError
-from trilane.options import kind_of, option_of
+from trilane.options import option_of
 from trilane.pipeline.controls import ALL, RunControls
 from trilane.stages.configure import Checked, GlFacts, required_machine
 from trilane.stages.dsp.runtime import installed
-from trilane.stages.run_options import NOTHING, RunOptions
+from trilane.stages.run_options import RunOptions
 from trilane.units import UNITS
 
 ENDLESS: Final = 1_000_000_000  # frames: a year at 30 a second
@@ -174,8 +174,7 @@ class Director:
             current = self._next or self._now
         assert current is not None
         try:
-            asked = None if value == NOTHING else kind_of(RunOptions.model_fields[name])(value)
-            prepared = self._prepare(current.options.changed(**{name: asked}))
+            prepared = self._prepare(current.options.changed(**{name: RunOptions.value_of(name, value)}))
         except TrilaneError as error:
             self._send(Refused(name, str(error)))
             return

@@ -11,9 +11,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from trilane.options import option_of
+from trilane.options import NOTHING, option_of
 from trilane.pipeline.journal import Begun
-from trilane.stages.run_options import NOTHING, RunOptions
+from trilane.stages.run_options import RunOptions
 
 if TYPE_CHECKING:
     from trilane.apps.run.report import Report
@@ -77,13 +77,14 @@ class RunFacts:
 
 
 def config_in_force(config: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the value of each control that is set before a run.
+    """Return the value of each control that is set before a run, as the word that its choices have for it.
 
     `config`: block of report.json, which says what an option left open. `options`: by name, as they were asked for.
     """
     scene = config["scene"]
     chosen = {**config, "size": scene["size"], "avatar": scene["avatars"][0]["bundle"]}
-    return {name: chosen.get(name) or options.get(name) or NOTHING for name in OF_A_NEW_RUN}
+    values = {name: options.get(name) if chosen.get(name) is None else chosen[name] for name in OF_A_NEW_RUN}
+    return {name: NOTHING if value is None else str(value) for name, value in values.items()}
 
 
 def _machine_line(machine: Mapping[str, Any]) -> str:

@@ -9,13 +9,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from types import NoneType, UnionType
-from typing import Annotated, Any, Self, Union, get_args, get_origin
+from typing import Annotated, Any, Final, Self, Union, get_args, get_origin
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
 from trilane.errors import BadInputError, did_you_mean
 from trilane.unexpected_value import UnexpectedValue, unexpected_in
+
+#: Word for None on the dashboard.
+NOTHING: Final = "none"
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,15 @@ class Options(BaseModel):
     def spelling(cls, name: str) -> str:
         """Return the option of field `name` on the command line."""
         return option_of(cls.model_fields[name]).spelling or f"--{name.replace('_', '-')}"
+
+    @classmethod
+    def value_of(cls, name: str, word: str) -> Any:
+        """Return the value of field `name` for which the dashboard says `word`. Raises BadInputError."""
+        field = cls.model_fields[name]
+        try:
+            return None if word == NOTHING else TypeAdapter(kind_of(field)).validate_python(word)
+        except ValidationError:
+            raise BadInputError(name, repr(word), _expected(field)) from None
 
     def changed(self, **values: Any) -> Self:
         """Return the same options with other `values`. Raises BadInputError as `checked`."""

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from trilane.apps.dashboard import live_run, run_facts
 from trilane.apps.dashboard.channel import ControlAsked, Message, Refused, StateIs
 from trilane.apps.dashboard.live_run import Director, _numbered, choices_of, reasons_against
 from trilane.apps.run.run_job import Prepared
@@ -99,6 +100,50 @@ def test_a_control_changes_its_own_option_alone(run: tuple[Director, RunControls
         following = director.take_next()
         assert following is not None and following.options == expected
         director.begin(following)
+
+
+@pytest.mark.parametrize(
+    ("name", "word", "expected"),
+    [
+        ("video", "False", False),
+        ("hud", "True", True),
+        ("hud", "none", None),
+        ("check", "0", 0),
+        ("latch_ms", "2.5", 2.5),
+    ],
+)
+def test_a_word_stands_for_the_value_of_its_option(
+    run: tuple[Director, RunControls], monkeypatch: pytest.MonkeyPatch, name: str, word: str, expected: object
+) -> None:
+    """`bool("False")` is True. A value in force is told as the word that asks for it."""
+    monkeypatch.setattr(live_run, "OF_A_NEW_RUN", (name,))
+    monkeypatch.setattr(run_facts, "OF_A_NEW_RUN", (name,))
+    run[0].do(ControlAsked(name, word))
+    following = run[0].take_next()
+    assert following is not None and following.options == ASKED.changed(**{name: expected})
+    config = {"scene": {"size": "64", "avatars": [{"bundle": "default"}]}}
+    assert run_facts.config_in_force(config, dict(following.options)) == {name: word}
+
+
+@pytest.mark.parametrize(
+    ("name", "word", "said"),
+    [
+        ("video", "perhaps", "video: found 'perhaps', expected true or false"),
+        ("check", "2.5", "check: found '2.5', expected a whole number of frames, from 0 to 1000"),
+        ("check", "-1", "check: found -1, expected a whole number of frames, from 0 to 1000"),
+    ],
+)
+def test_a_word_that_stands_for_no_value_is_refused(
+    run: tuple[Director, RunControls],
+    told: list[Message],
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    word: str,
+    said: str,
+) -> None:
+    monkeypatch.setattr(live_run, "OF_A_NEW_RUN", (name,))
+    run[0].do(ControlAsked(name, word))
+    assert (told, run[0].take_next()) == ([Refused(name, said)], None)
 
 
 def test_what_is_in_force_can_be_chosen_and_a_pace_is_capped_already(tmp_path: Any) -> None:
