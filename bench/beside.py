@@ -20,12 +20,12 @@ from typing import Any, NamedTuple
 from trilane.bench.lib.avatar_process import Asked, AvatarProcess, Ran, avatar_processes
 from trilane.errors import TrilaneError
 from trilane.hw_profiles.application import application_graph
-from trilane.scheduler.beside import Member, simulate_beside
 from trilane.scheduler.events import Settings, Stop
 from trilane.scheduler.ledger import JobRecord
-from trilane.scheduler.placement_model import SCHEDULER_NS
-from trilane.scheduler.stats import NS_PER_MS, median_interval
-from trilane.units import AFTER_INFER, BEFORE_INFER
+from trilane.scheduler.placement import SCHEDULER_NS
+from trilane.scheduler.shared_units import Member, simulate_beside
+from trilane.scheduler.stats import median_interval
+from trilane.units import AFTER_INFER, BEFORE_INFER, NS_PER_MS
 
 SEQUENTIAL, PIPELINED = "sequential", "pipelined"
 FIRST, LAST = BEFORE_INFER[0][0], AFTER_INFER[-1][0]

@@ -27,12 +27,13 @@ from trilane.pipeline.timeline import Presented, Timeline
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.policy import policy_named
 from trilane.scheduler.recording import Recording
-from trilane.scheduler.stats import NS_PER_MS, median_interval, percentile, samples_needed
+from trilane.scheduler.stats import median_interval, percentile, samples_needed
 from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.configure import Checked, configure
 from trilane.stages.run_options import RunOptions
 from trilane.transport.slots import edge_rule
 from trilane.unexpected_value import UnexpectedValue
+from trilane.units import NS_PER_MS
 
 SEQUENTIAL = "sequential"
 MIN_FRAMES = 20

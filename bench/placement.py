@@ -27,17 +27,16 @@ from trilane.hw_profiles.schema import corners_of
 from trilane.pipeline.run_metrics import RunMetrics
 from trilane.pipeline.trial import Round
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.scheduler.placement import Ranked, ranked, worth_trying
-from trilane.scheduler.placement_model import Rules, frame_ns
+from trilane.scheduler.placement import Ranked, Rules, frame_ns, ranked, worth_trying
 from trilane.scheduler.places import Core, Placement
-from trilane.scheduler.stats import NS_PER_MS, median_interval
+from trilane.scheduler.stats import median_interval
 from trilane.stages import PRELOAD
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.avatar_pipeline import measured_times, run_avatar, tried
 from trilane.stages.configure import Checked, configure
 from trilane.stages.placing import FIRST, choice, considered, times_rows
 from trilane.stages.run_options import RunOptions
-from trilane.units import BURST
+from trilane.units import BURST, NS_PER_MS
 
 MIN_FRAMES = 20
 VIRTUAL_CORES = (1, 2, 3, 4, 8)

@@ -16,10 +16,10 @@ from typing import Any
 from trilane.bench.lib.load import PATTERNS, Load, Queries, bound_ms, play, verdict
 from trilane.bench.lib.loadgen import LoadGenPlayer, load_generator
 from trilane.errors import BadInputError, TrilaneError
+from trilane.pipeline.controls import FrameRequestQueue
 from trilane.pipeline.description import Pipeline
-from trilane.pipeline.requests import FrameRequestQueue
+from trilane.pipeline.memory import Assets
 from trilane.pipeline.run import run_pipeline
-from trilane.pipeline.shared_assets import Assets
 from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.configure import configure
 from trilane.stages.run_options import RunOptions

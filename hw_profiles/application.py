@@ -19,12 +19,10 @@ from trilane.hw_profiles.reference_networks import CHANNELS_PER_PASS
 from trilane.hw_profiles.schema import Corners, Profile
 from trilane.hw_profiles.unit_times import JobTime, time_on
 from trilane.scheduler.events import Graph, Settings, chain
-from trilane.scheduler.policy import POLICIES
-from trilane.scheduler.release import run_settings
-from trilane.scheduler.stats import NS_PER_MS
+from trilane.scheduler.policy import POLICIES, run_settings
 from trilane.scheduler.virtual import Simulation, simulate
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import AFTER_INFER, BEFORE_INFER, INFER, LATENCY_TO, UNITS, UnitName
+from trilane.units import AFTER_INFER, BEFORE_INFER, INFER, LATENCY_TO, NS_PER_MS, UNITS, UnitName
 
 RUNTIMES: tuple[UnitName, ...] = ("gpu", "dsp")
 PACKED_BYTES_PER_PIXEL = 16

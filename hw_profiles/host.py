@@ -20,8 +20,7 @@ from trilane.hw_profiles.schema import Profile
 from trilane.pipeline.description import UnitSettings
 from trilane.scheduler.placement import Ranked
 from trilane.scheduler.places import FULL, Core, Place, Placement, has_own_cores
-from trilane.scheduler.stats import NS_PER_MS
-from trilane.units import UNITS
+from trilane.units import NS_PER_MS, UNITS
 
 CORES = "UNIT=LIST, such as dsp=0,1 or dsp=2-5"
 

@@ -19,12 +19,10 @@ from trilane.hw_profiles.network_work import Network, Work
 from trilane.hw_profiles.reference_networks import CHANNELS_PER_PASS
 from trilane.hw_profiles.schema import Corners, Measured, Profile, Quantity, Unit
 from trilane.hw_profiles.unit_times import time_on
-from trilane.scheduler.placement import Ranked, chosen, ranked
-from trilane.scheduler.placement_model import SCHEDULER_NS, Rules, frame_ns
+from trilane.scheduler.placement import SCHEDULER_NS, Ranked, Rules, chosen, frame_ns, ranked
 from trilane.scheduler.places import Core, Place, Placement, Times, shared_cores
 from trilane.scheduler.places import Work as FrameWork
-from trilane.scheduler.stats import NS_PER_MS
-from trilane.units import BEFORE_INFER, UNITS, UnitName
+from trilane.units import BEFORE_INFER, NS_PER_MS, UNITS, UnitName
 
 NETWORK: UnitName = "dsp"
 SEQUENTIAL = "sequential"

@@ -43,9 +43,9 @@ from trilane.hw_profiles.schema import Corners, Profile, corners_of
 from trilane.hw_profiles.unit_times import JobTime, relative_error
 from trilane.scheduler.placement import Ranked
 from trilane.scheduler.policy import POLICIES
-from trilane.scheduler.stats import NS_PER_MS, energy_score
+from trilane.scheduler.stats import energy_score
 from trilane.scheduler.virtual import Simulation
-from trilane.units import SUSTAINED, UNITS, UnitName
+from trilane.units import NS_PER_MS, SUSTAINED, UNITS, UnitName
 
 #: Rows of `what_if`: name, how the stages are joined, share of the network on the GPU. All release frames as
 #: often as the display can show them, because they are compared with each other.

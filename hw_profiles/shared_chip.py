@@ -1,7 +1,7 @@
 """Several pipelines on one chip: avatars and bare networks, each at a rate, on the same units, memory and heat.
 
-`application.py` says what a frame costs, and the cores of `trilane.scheduler.beside` decide who waits. This file adds
-how much a network slows while others use the memory: it has the bandwidth that they leave (Gables, Hill and Reddi,
+`application.py` says what a frame costs, and the cores of `trilane.scheduler.shared_units` decide who waits. This file
+adds how much a network slows while others use the memory: it has the bandwidth that they leave (Gables, Hill and Reddi,
 2019). Each avatar's camera, display and composition take `application_use_fraction` all the time, and a network of
 another pipeline on another unit takes its bytes over its time. Jobs of one unit follow each other and never compete.
 The answer has the keys of report.json where they mean the same.
@@ -30,14 +30,11 @@ from trilane.hw_profiles.network_work import Network
 from trilane.hw_profiles.over_time import Moment, last_fifth, temperatures_of, unit_power_w, warm_up
 from trilane.hw_profiles.profile_files import HOST
 from trilane.hw_profiles.schema import Corners, Profile, Unit, corners_of
-from trilane.scheduler.beside import ONE, Member, Runs, simulate_beside
 from trilane.scheduler.events import Graph, Settings, Stop, chain
-from trilane.scheduler.policy import POLICIES
-from trilane.scheduler.release import run_settings
-from trilane.scheduler.stats import NS_PER_MS
-from trilane.scheduler.turns import ROUND_ROBIN
+from trilane.scheduler.policy import POLICIES, run_settings
+from trilane.scheduler.shared_units import ONE, ROUND_ROBIN, Member, Runs, simulate_beside
 from trilane.scheduler.virtual import Service, Simulation, Skips
-from trilane.units import BYPASS, INFER, SUSTAINED, UNITS, UnitName
+from trilane.units import BYPASS, INFER, NS_PER_MS, NS_PER_S, SUSTAINED, UNITS, UnitName
 
 MOST_TENANTS = 8
 #: Share of the bandwidth that others can take at most: something is always left.
@@ -46,7 +43,6 @@ MOST_USE = 0.95
 LEAST_S, LEAST_FRAMES, MOST_S = 10.0, 64, 600.0
 #: How frames are taken by default: only the newest counts, as with a camera; an older one is dropped.
 NEWEST = Variant("latest", "double")
-NS_PER_S = 1_000_000_000
 ENDLESS = 1 << 40
 SKIPS = -1
 

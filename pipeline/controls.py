@@ -1,15 +1,24 @@
-"""What somebody asks of a run while it goes on. Rule: any thread may ask; the run does it between two of its steps.
+"""What somebody asks of a run while it goes on: controls, frames on request, and signals.
+
+Rule: any thread may ask; the run does it between two of its steps, on its own thread. A signal interrupts nothing: its
+handler only counts.
 
 A request becomes an event of the scheduler, so the recording holds it and a replay does the same. A kill becomes an
-event when the unit's end is heard.
+event when the unit's end is heard. Frames that were asked for are answered in the order in which they were presented.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
+import signal
 import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from types import FrameType
+from typing import Any, Self
 
-from trilane.scheduler.events import Event, Hold, Stop
+from trilane.scheduler.events import Event, FrameRequest, Hold, Stop
 
 ALL = -1
 
@@ -58,3 +67,102 @@ class RunControls:
             if not self._closed:
                 self._events.append(event)
                 os.eventfd_write(self.fd, 1)
+
+
+class FrameRequestQueue:
+    """The way into one run; frames are numbered from 0 in the order in which they are asked for.
+
+    `answered(frame)`: function that is called when the frame was presented.
+    `ended()`: function that is called when the run is over, after which nothing is answered.
+    `unanswered(causes)`: function that is called once, with the first frames that were dropped or lost: their number by
+    each cause's key in the report.
+    """
+
+    def __init__(
+        self,
+        answered: Callable[[int], None],
+        ended: Callable[[], None],
+        unanswered: Callable[[Mapping[str, int]], None] = lambda _causes: None,
+    ) -> None:
+        self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self.is_open = threading.Event()
+        self.answered, self._ended, self._unanswered = answered, ended, unanswered
+        self._told = False
+        self._events: deque[Event] = deque()
+        self._lock = threading.Lock()
+        self._closed = False
+
+    def request(self, count: int = 1) -> None:
+        """Ask for `count` frames; once the run is over this does nothing."""
+        self._put(FrameRequest(count))
+
+    def end(self) -> None:
+        """Ask for no more frames; those that were asked for are finished."""
+        self._put(Stop())
+
+    def events(self) -> list[Event]:
+        """Return what was requested since the last call."""
+        events: list[Event] = []
+        with contextlib.suppress(IndexError):
+            while True:
+                events.append(self._events.popleft())
+        return events
+
+    def tell_unanswered(self, causes: Mapping[str, int]) -> None:
+        """Tell the caller how many frames were dropped or lost so far, by cause; called by the run."""
+        if causes and not self._told:
+            self._told = True
+            self._unanswered(causes)
+
+    def close(self) -> None:
+        """Note that the run is over: call `ended`, and let whoever waits for `is_open` go on."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            os.close(self.fd)
+        self._ended()
+        self.is_open.set()
+
+    def _put(self, event: Event) -> None:
+        with self._lock:
+            if not self._closed:
+                self._events.append(event)
+                os.eventfd_write(self.fd, 1)
+
+
+_UNLESS_IGNORED = (signal.SIGHUP, signal.SIGQUIT)
+
+
+class Interrupts:
+    """Counts the signals and makes `fd` readable while entered from the main thread; in other threads it does nothing.
+
+    SIGHUP and SIGQUIT stay ignored if the caller was started so (`nohup`, a shell's background job). SIGPIPE is ignored
+    meanwhile, as Python does it: a message to a unit that is gone must not end the program.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.fd, self._write_fd = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        self._before: dict[int, Any] = {}
+        self._wakeup_before = -1
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():
+            self._wakeup_before = signal.set_wakeup_fd(self._write_fd, warn_on_full_buffer=False)
+            hears = [number for number in _UNLESS_IGNORED if signal.getsignal(number) not in (signal.SIG_IGN, None)]
+            for number in (signal.SIGINT, signal.SIGTERM, *hears):
+                self._before[number] = signal.signal(number, self._count)
+            self._before[signal.SIGPIPE] = signal.signal(signal.SIGPIPE, signal.SIG_IGN)
+        return self
+
+    def __exit__(self, *_exc: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        if self._before:
+            signal.set_wakeup_fd(self._wakeup_before)
+        os.close(self.fd)
+        os.close(self._write_fd)
+
+    def _count(self, _number: int, _frame: FrameType | None) -> None:
+        self.count += 1

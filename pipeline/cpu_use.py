@@ -1,20 +1,25 @@
-"""Compares the CPU time of units with their wall time. Rule: only the run counts, and no core does more than it can.
+"""Compares the CPU time of units with their wall time, and adds both to the report of a run on the host clock.
+
+Rule: only the run counts, and no core does more than it can. Figures that must agree stand side by side. Where they
+contradict each other, or were not measured, a message says so.
 
 A unit's CPU time is that of all threads of its process, including those that a runtime lets spin between jobs. Units
 that may only run on a set of cores cannot have more CPU time than these cores had time. Where the figures say
-otherwise, a thread has run elsewhere or a clock is wrong. Efficiencies use the CPU time of jobs alone.
+otherwise, a thread has run elsewhere or a clock is wrong.
 """
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from trilane.scheduler.ledger import JobRecord
-from trilane.scheduler.places import Place, Placement, busiest_core_ns
-from trilane.scheduler.samples import Samples, Sketch
+from trilane.pipeline.description import Pipeline
+from trilane.pipeline.job_times import counts_run_delay
+from trilane.pipeline.result import RunLog
+from trilane.scheduler.stats import Samples, Sketch
 from trilane.transport.messages import Done
+from trilane.units import NS_PER_S
 
 CLOCKS_DIFFER = 0.001  # CLOCK_MONOTONIC is slewed by up to 500 ppm, but the clock of CPU times is not
 
@@ -40,7 +45,7 @@ class CpuTimes:
     """The CPU time of each unit and of each stage's jobs, in ns.
 
     `cores`: number of cores of each unit.
-    `sketch`: function that makes a sketch, as for `trilane.scheduler.samples.Samples`.
+    `sketch`: function that makes a sketch, as for `trilane.scheduler.stats.Samples`.
     """
 
     def __init__(self, cores: Mapping[str, int], sketch: Callable[[], Sketch] | None = None) -> None:
@@ -69,7 +74,7 @@ class CpuTimes:
 
         It counts from the begin of the run to the end of the unit's last job.
         """
-        return (self.in_jobs_ns[unit] + self.between_ns[unit]) / 1e9
+        return (self.in_jobs_ns[unit] + self.between_ns[unit]) / NS_PER_S
 
 
 def use_of_cores(
@@ -92,66 +97,31 @@ def use_of_cores(
     return rows
 
 
-class Efficiencies:
-    """How much of the time between the first and the last presented frame was work of jobs; no share can pass 1.
+NO_RUN_DELAY = (
+    "this kernel does not count how long threads wait for a core (CONFIG_SCHED_INFO): the time in which a unit had a "
+    "job but not its core is not known, and counts as overhead"
+)
 
-    Jobs are added in the order of their ends. A job may begin before that time or end after it. Then it counts only the
-    CPU time that must lie within: its CPU time less the time that its cores had outside. So what a unit or a set of
-    cores is credited with fits into the time.
 
-    A unit's work counts the CPU time of a job divided by the unit's threads. It also counts the busy time beyond the
-    CPU time, because a device of its own worked then while the threads slept.
+def add_accounts(report: dict[str, Any], pipeline: Pipeline, cpu: CpuTimes, log: RunLog) -> None:
+    """Add `cpu_s`, `cpu_ms` and `core_shares` to a ledger's report.
 
-    `places`: cores and threads of each unit.
+    `pipeline`: pipeline that ran.
+    `cpu`: CPU time of its units and stages.
+    `log`: log for what was not measured, and what contradicts itself.
     """
-
-    def __init__(self, places: Placement) -> None:
-        self._places = places
-        self._work_ns: dict[str, float] = dict.fromkeys(places, 0.0)
-        self._cpu_ns: dict[str, float] = dict.fromkeys(places, 0.0)
-        self._first_ns: int | None = None
-        self._last_ns = 0
-        self._unsettled: list[JobRecord] = []  # jobs since the last presented frame
-
-    def add(self, job: JobRecord, *, presents: bool) -> None:
-        """Take the next job that has ended. `presents`: whether its end is that of a presented frame."""
-        self._unsettled.append(job)
-        if not presents:
-            return
-        self._first_ns = self._first_ns or job.end_ns
-        self._last_ns = job.end_ns
-        settled = [each for each in self._unsettled if each.end_ns <= job.end_ns]
-        self._unsettled = [each for each in self._unsettled if each.end_ns > job.end_ns]
-        self._book(settled, self._first_ns)
-
-    def close(self) -> dict[str, float | None]:
-        """Return `efficiency`, `core_efficiency` and `machine_efficiency` of a report; None for one frame.
-
-        Called after all jobs.
-
-        The first is the work of the slowest unit. The second is the CPU time on the fullest set of cores, of the units
-        that have no other cores. No division of the work avoids it. The third is the CPU time of all units on all
-        cores. Each is a share of the time that these had.
-        """
-        had_ns = self._last_ns - (self._first_ns or 0)
-        if self._first_ns is None or had_ns <= 0:
-            return dict.fromkeys(("efficiency", "core_efficiency", "machine_efficiency"))
-        self._book(self._unsettled, self._first_ns)
-        anywhere = {unit: Place(place.cores, 1) for unit, place in self._places.items()}
-        cores = {core for place in anywhere.values() for core in place.cores}
-        return {
-            "efficiency": max(self._work_ns.values()) / had_ns,
-            "core_efficiency": busiest_core_ns(anywhere, self._cpu_ns) / had_ns,
-            "machine_efficiency": sum(self._cpu_ns.values()) / len(cores) / had_ns,
-        }
-
-    def _book(self, jobs: Sequence[JobRecord], first_ns: int) -> None:
-        """Book the part of each job that must lie between the first and the last presented frame."""
-        for job in jobs:
-            cores, threads = self._places[job.unit]
-            length_ns = job.end_ns - job.begin_ns
-            outside_ns = max(first_ns - job.begin_ns, 0) + max(job.end_ns - self._last_ns, 0)
-            busy_ns = length_ns - job.preempted_ns - job.asleep_ns
-            work_ns = min(job.cpu_ns / threads, length_ns) + max(busy_ns - job.cpu_ns, 0)
-            self._work_ns[job.unit] += max(work_ns - outside_ns, 0)
-            self._cpu_ns[job.unit] += max(job.cpu_ns - outside_ns * len(cores), 0)
+    for unit, row in report["units"].items():
+        row.update(cpu_s=cpu.of_unit_s(unit), cpu_in_jobs_s=cpu.in_jobs_ns[unit] / NS_PER_S)
+    for stage, row in report["stages"].items():
+        row["cpu_ms"] = cpu.stage_ns[stage].summary_ms()
+    cores = {unit: pipeline.units[unit].cores for unit in report["units"]}
+    cpu_s = {unit: cpu.of_unit_s(unit) for unit in cores}
+    uses = use_of_cores(cores, cpu_s, {unit: report["units"][unit]["busy"] for unit in cores}, report["duration_s"])
+    report["core_shares"] = [use._asdict() for use in uses]
+    for use in uses:
+        if not use.is_possible:
+            log.say(f"{', '.join(use.units)} had {use.cpu:.1%} of the time of cores {use.cores}: please report this")
+    if not counts_run_delay():
+        for row in report["units"].values():
+            row["idle"]["preempted"] = None
+        log.say(NO_RUN_DELAY)

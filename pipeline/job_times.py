@@ -1,25 +1,173 @@
-"""Measures in a unit's process what happens around its jobs.
+"""Measures in a unit's process what happens around its jobs: how long it ran, waited for a core, or slept.
 
-Rule: the kernel is asked where no frame waits for the answer.
+Rule: the kernel counts, and it is asked where no frame waits for the answer. A unit is busy for at most its CPU time.
 
-A piece of time is a job, or the time between two jobs. Every ns of CPU time is in one piece. Run delay is read after
-the answer to a job, and before the answer only if the job may have lost more than LOSS_NS. Before a job something is
-read in three cases only:
+CPU time is CLOCK_PROCESS_CPUTIME_ID, over all threads. The run delay of a thread is the time in ns in which it was
+ready and another thread had the core. It is the second number of `/proc/self/task/TID/schedstat`
+(Documentation/scheduler/sched-stats.rst of the kernel). The file is opened once and read again.
+
+A piece of time is a job, or the time between two jobs. Every ns of CPU time is in one piece. Three numbers are known of
+each piece, in ns:
+- `wall_ns`: its length;
+- `cpu_ns`: CPU time of all threads of the unit's process in it;
+- `delay_ns`: run delay in it, summed over these threads.
+
+Run delay is read after the answer to a job, and before the answer only if the job may have lost more than LOSS_NS.
+Before a job something is read in three cases only:
 - the unit has had the job for longer than HELD_NS;
 - its stage's last job lost time;
 - other threads may have run between the jobs.
 
-docs/decisions/preempted-time.md says what the two thresholds can hide.
+docs/decisions/preempted-time.md says what the two thresholds can hide. It derives what follows from the three numbers,
+and proves that units which share cores are never busy for more than those cores.
 """
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Callable
-from typing import Final, Protocol
+from collections.abc import Callable, Set
+from typing import Final, NamedTuple, Protocol
 
-from trilane.pipeline.core_shares import lost_in_job, most_preempted_ns, preempted_ns
 from trilane.transport.messages import Done
+
+PROCESS = "/proc/self"
+TASKS = f"{PROCESS}/task"
+_LINE_BYTES = 64  # three numbers of 64 bits
+_LINKS_BESIDE_THREADS = 2  # a folder has a link for each folder in it, `.` and its own name
+
+
+def counts_run_delay(process: str = PROCESS) -> bool:
+    """Return whether this kernel says how long threads waited for a core (CONFIG_SCHED_INFO)."""
+    try:
+        with open(f"{process}/schedstat", "rb") as file:  # noqa: PTH123 - as the meter reads it
+            return int(file.read(_LINE_BYTES).split()[0]) > 0
+    except (OSError, ValueError, IndexError):
+        return False
+
+
+class CoreMeter:
+    """Counts from its creation on. `look` finds threads that appear later; those in `others` are left out.
+
+    `process`: path of the kernel's folder of this process.
+    """
+
+    def __init__(self, others: Set[int] = frozenset(), process: str = PROCESS) -> None:
+        self._others, self._tasks = others, f"{process}/task"
+        self._files: dict[int, int] = {}  # file of each thread
+        self._seen_ns: dict[int, int] = {}  # delay of each file when it was last read
+        self._threads = self._born_ns = 0
+        self._folder = os.open(self._tasks, os.O_RDONLY | os.O_CLOEXEC) if counts_run_delay(process) else -1
+        self._cpu_ns = time.process_time_ns()
+        self.look()
+        self._born_ns = 0  # what these threads waited before does not count
+
+    @property
+    def threads(self) -> int:
+        """The number of threads that the last look found."""
+        return len(self._files)
+
+    def cpu_ns(self) -> int:
+        """Return the CPU time of all threads since the last call, in ns."""
+        cpu_ns = time.process_time_ns()
+        passed_ns, self._cpu_ns = cpu_ns - self._cpu_ns, cpu_ns
+        return passed_ns
+
+    def delay_ns(self) -> int:
+        """Return the sum of the threads' run delays since the last call, in ns."""
+        delay_ns, self._born_ns = self._born_ns, 0
+        for file, seen_ns in self._seen_ns.items():
+            try:
+                now_ns = int(os.pread(file, _LINE_BYTES, 0).split()[1])
+            except ProcessLookupError:  # the thread has ended; `look` closes its file
+                continue
+            if now_ns != seen_ns:
+                delay_ns += now_ns - seen_ns
+                self._seen_ns[file] = now_ns
+        return delay_ns
+
+    def look(self) -> None:
+        """Find the threads that have begun and ended since the last look; this is quick if their number is the same."""
+        if self._folder < 0:
+            return
+        threads = os.fstat(self._folder).st_nlink - _LINKS_BESIDE_THREADS
+        if threads == self._threads:
+            return
+        self._threads = threads
+        alive = {int(name) for name in os.listdir(self._folder)} - self._others  # noqa: PTH208 - by descriptor
+        for thread in self._files.keys() - alive:
+            file = self._files.pop(thread)
+            del self._seen_ns[file]
+            os.close(file)
+        for thread in alive - self._files.keys():
+            self._open(thread)
+
+    def _open(self, thread: int) -> None:
+        try:
+            file = os.open(f"{self._tasks}/{thread}/schedstat", os.O_RDONLY | os.O_CLOEXEC)
+        except (FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
+            return
+        try:
+            delay_ns = int(os.pread(file, _LINE_BYTES, 0).split()[1])
+        except ProcessLookupError:  # it has ended since its file was opened
+            os.close(file)
+            return
+        self._files[thread], self._seen_ns[file] = file, delay_ns
+        self._born_ns += delay_ns
+
+    def close(self) -> None:
+        """Close every file."""
+        for file in self._seen_ns:
+            os.close(file)
+        self._files.clear()
+        self._seen_ns.clear()
+        if self._folder >= 0:
+            os.close(self._folder)
+            self._folder = -1
+
+
+class Lost(NamedTuple):
+    """Parts of a piece of time in which a unit did not work, in ns.
+
+    `preempted_ns`: time for which it waited for a core.
+    `asleep_ns`: time for which it slept.
+    """
+
+    preempted_ns: int
+    asleep_ns: int
+
+
+def most_preempted_ns(wall_ns: int, cpu_ns: int, cores: int) -> int:
+    """Return the most of `wall_ns` that a unit with `cores` cores can have waited for them.
+
+    This is what its CPU time leaves of the time.
+    """
+    return max(wall_ns - -(-cpu_ns // cores), 0)
+
+
+def preempted_ns(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int) -> int:
+    """Return how much of `wall_ns` a unit with `cores` cores waited for them.
+
+    Its threads were ready for cpu + delay. So m = (cpu + delay) / wall of them were ready at a time, but at least one.
+    Their waiting took delay / m, and never more than what the CPU time leaves of the cores. With one core this is
+    min(delay, wall - cpu).
+    """
+    if not delay_ns:
+        return 0
+    waited_ns = delay_ns * wall_ns // max(cpu_ns + delay_ns, wall_ns)
+    return min(waited_ns, most_preempted_ns(wall_ns, cpu_ns, cores))
+
+
+def lost_in_job(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int, has_device: bool) -> Lost:
+    """Return what a job of `wall_ns` lost. The unit was busy in the rest, which is at most `cpu_ns` without a device.
+
+    `has_device`: whether something else than the cores works (a graphics card, a modelled chip), so that the unit works
+    while its threads sleep.
+    """
+    preempted = preempted_ns(wall_ns, cpu_ns, delay_ns, cores)
+    asleep = 0 if has_device else wall_ns - preempted - cpu_ns
+    return Lost(preempted, asleep if asleep > 0 else 0)
+
 
 LOSS_NS: Final = 20_000
 HELD_NS: Final = 100_000  # longer than a hand-over takes
@@ -27,7 +175,7 @@ JOBS_PER_LOOK: Final = 64  # jobs between two searches for new threads, where no
 
 
 class Meter(Protocol):
-    """The part of `trilane.pipeline.core_meter.CoreMeter` that a `JobClock` uses."""
+    """The part of `CoreMeter` that a `JobClock` uses."""
 
     @property
     def threads(self) -> int: ...

@@ -1,7 +1,7 @@
 """The clock of this machine, for the scheduler's loop. Rule: it waits and does what the core says; it decides nothing.
 
 `wait` turns messages of the units, signals and the governor's duties into events; `perform` turns actions into
-messages.
+messages. The run's figures include the time for which a viewer held the run, and the run says how much (`HeldTime`).
 """
 
 from __future__ import annotations
@@ -9,17 +9,14 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Protocol
 
 from trilane.errors import TrilaneError
-from trilane.pipeline.controls import RunControls
+from trilane.pipeline.controls import FrameRequestQueue, Interrupts, RunControls
 from trilane.pipeline.cpu_use import CpuTimes
-from trilane.pipeline.held_time import HeldTime
 from trilane.pipeline.journal import Worked
-from trilane.pipeline.requests import FrameRequestQueue
-from trilane.pipeline.run_log import RunLog
-from trilane.pipeline.signals import Interrupts
+from trilane.pipeline.result import RunLog
 from trilane.pipeline.unit_processes import UnitMessage, UnitProcesses
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
@@ -28,6 +25,7 @@ from trilane.scheduler.events import (
     Action,
     Dispatch,
     Event,
+    Hold,
     Job,
     JobDone,
     JobFailed,
@@ -42,9 +40,10 @@ from trilane.scheduler.events import (
     UnitReady,
 )
 from trilane.scheduler.ledger import JobRecord
-from trilane.scheduler.samples import Sketch
+from trilane.scheduler.stats import Sketch
 from trilane.transport import messages
 from trilane.transport.messages import Done, Failed, Ping, Ready, RunJob
+from trilane.units import NS_PER_S
 
 PROGRESS_S = 0.1
 PING_NS = 500_000_000
@@ -64,7 +63,7 @@ class Governor(Protocol):
 
 
 class RealtimeClock:
-    """The `trilane.scheduler.loop.Clock` of one run over `processes`, which lets `core` run until it finishes.
+    """The `trilane.scheduler.core.Clock` of one run over `processes`, which lets `core` run until it finishes.
 
     `metrics`: sums of what the jobs of each stage reported, over the jobs that `ended` has returned.
     `reported`: number of those jobs that reported each figure.
@@ -234,7 +233,7 @@ class RealtimeClock:
         for unit in stopped - self._stopped_ns.keys():
             self._stopped_ns[unit] = now_ns
         for unit in self._stopped_ns.keys() - stopped:
-            seconds = (now_ns - self._stopped_ns.pop(unit)) / 1e9
+            seconds = (now_ns - self._stopped_ns.pop(unit)) / NS_PER_S
             self._log.say(f"unit {unit} was stopped by a signal for about {seconds:.1f} s")
 
     def _event(self, unit_message: UnitMessage) -> Event | None:
@@ -291,3 +290,32 @@ class RealtimeClock:
         if self._on_progress is not None and (final or now_s - self._progress_s >= PROGRESS_S):
             self._progress_s = now_s
             self._on_progress(self._core.ledger.presented_count, self._core.settings.frames)
+
+
+class HeldTime:
+    """Takes what somebody asked of the run. A hold that lets some frames through lasts until the run goes on."""
+
+    def __init__(self) -> None:
+        self._total_ns = 0
+        self._since_ns: int | None = None
+
+    def hear(self, now_ns: int, events: Iterable[Event]) -> None:
+        """Take `events`, which were asked for at `now_ns`."""
+        for event in events:
+            if not isinstance(event, Hold):
+                continue
+            if event.frames < 0:
+                self._total_ns, self._since_ns = self.until(now_ns), None
+            elif self._since_ns is None:
+                self._since_ns = now_ns
+
+    def until(self, now_ns: int) -> int:
+        """Return for how many ns the run was held up to `now_ns`."""
+        return self._total_ns + (0 if self._since_ns is None else now_ns - self._since_ns)
+
+    def sentence(self, now_ns: int) -> str:
+        """Return the sentence for the report; empty if the run was never held."""
+        held_s = self.until(now_ns) / NS_PER_S
+        if not held_s:
+            return ""
+        return f"held for {held_s:.1f} s by who watched it: frame times, rates and shares of the run have that in them"

@@ -6,16 +6,80 @@ again. The memory for reading a run is bounded, however long the run lasts.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Reversible
+from collections.abc import Iterable, Mapping, Reversible, Sequence
 from typing import Any, NamedTuple
 
-from trilane.pipeline.cpu_use import Efficiencies
-from trilane.pipeline.critical_path import Budget, Part, Paths
+from trilane.pipeline.critical_path import Budget, Part, Paths, Sharing, Taken
 from trilane.pipeline.journal import Begun, Record, config_of
-from trilane.pipeline.sharing import Sharing, Taken
 from trilane.pipeline.timeline import Down, ExplainedJob, Timeline
 from trilane.scheduler.events import Graph, Settings
-from trilane.scheduler.places import Place, Placement
+from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.places import Place, Placement, busiest_core_ns
+
+
+class Efficiencies:
+    """How much of the time between the first and the last presented frame was work of jobs; no share can pass 1.
+
+    Jobs are added in the order of their ends. A job may begin before that time or end after it. Then it counts only the
+    CPU time that must lie within: its CPU time less the time that its cores had outside. So what a unit or a set of
+    cores is credited with fits into the time.
+
+    A unit's work counts the CPU time of a job divided by the unit's threads. It also counts the busy time beyond the
+    CPU time, because a device of its own worked then while the threads slept.
+
+    `places`: cores and threads of each unit.
+    """
+
+    def __init__(self, places: Placement) -> None:
+        self._places = places
+        self._work_ns: dict[str, float] = dict.fromkeys(places, 0.0)
+        self._cpu_ns: dict[str, float] = dict.fromkeys(places, 0.0)
+        self._first_ns: int | None = None
+        self._last_ns = 0
+        self._unsettled: list[JobRecord] = []  # jobs since the last presented frame
+
+    def add(self, job: JobRecord, *, presents: bool) -> None:
+        """Take the next job that has ended. `presents`: whether its end is that of a presented frame."""
+        self._unsettled.append(job)
+        if not presents:
+            return
+        self._first_ns = self._first_ns or job.end_ns
+        self._last_ns = job.end_ns
+        settled = [each for each in self._unsettled if each.end_ns <= job.end_ns]
+        self._unsettled = [each for each in self._unsettled if each.end_ns > job.end_ns]
+        self._book(settled, self._first_ns)
+
+    def close(self) -> dict[str, float | None]:
+        """Return `efficiency`, `core_efficiency` and `machine_efficiency` of a report; None for one frame.
+
+        Called after all jobs.
+
+        The first is the work of the slowest unit. The second is the CPU time on the fullest set of cores, of the units
+        that have no other cores. No division of the work avoids it. The third is the CPU time of all units on all
+        cores. Each is a share of the time that these had.
+        """
+        had_ns = self._last_ns - (self._first_ns or 0)
+        if self._first_ns is None or had_ns <= 0:
+            return dict.fromkeys(("efficiency", "core_efficiency", "machine_efficiency"))
+        self._book(self._unsettled, self._first_ns)
+        anywhere = {unit: Place(place.cores, 1) for unit, place in self._places.items()}
+        cores = {core for place in anywhere.values() for core in place.cores}
+        return {
+            "efficiency": max(self._work_ns.values()) / had_ns,
+            "core_efficiency": busiest_core_ns(anywhere, self._cpu_ns) / had_ns,
+            "machine_efficiency": sum(self._cpu_ns.values()) / len(cores) / had_ns,
+        }
+
+    def _book(self, jobs: Sequence[JobRecord], first_ns: int) -> None:
+        """Book the part of each job that must lie between the first and the last presented frame."""
+        for job in jobs:
+            cores, threads = self._places[job.unit]
+            length_ns = job.end_ns - job.begin_ns
+            outside_ns = max(first_ns - job.begin_ns, 0) + max(job.end_ns - self._last_ns, 0)
+            busy_ns = length_ns - job.preempted_ns - job.asleep_ns
+            work_ns = min(job.cpu_ns / threads, length_ns) + max(busy_ns - job.cpu_ns, 0)
+            self._work_ns[job.unit] += max(work_ns - outside_ns, 0)
+            self._cpu_ns[job.unit] += max(job.cpu_ns - outside_ns * len(cores), 0)
 
 
 class Reckoned(NamedTuple):

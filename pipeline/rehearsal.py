@@ -15,13 +15,11 @@ from itertools import pairwise
 from statistics import median
 from typing import NamedTuple
 
+from trilane.pipeline.controls import Interrupts
 from trilane.pipeline.description import Pipeline
-from trilane.pipeline.lifecycle import START_S, listen_before_run, start_units
-from trilane.pipeline.regions import edge_regions
-from trilane.pipeline.run_log import UnitError
-from trilane.pipeline.shared_assets import Assets, share_assets
-from trilane.pipeline.signals import Interrupts
-from trilane.pipeline.unit_processes import UnitProcesses
+from trilane.pipeline.memory import Assets, edge_regions, share_assets
+from trilane.pipeline.result import UnitError
+from trilane.pipeline.unit_processes import START_S, UnitProcesses, listen_before_run, start_units
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.events import Graph, StageAlone
 from trilane.scheduler.places import Times, Work

@@ -114,7 +114,7 @@ class XrBench(Record):
 
 
 class MovedBytes(Record):
-    """Mean bytes that were moved for a presented frame (`trilane.pipeline.moved_bytes`).
+    """Mean bytes that were moved for a presented frame (`trilane.pipeline.memory`).
 
     `read`: bytes read from slots, shared assets and samples.
     `written`: bytes written into slots and files.

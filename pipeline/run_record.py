@@ -104,7 +104,7 @@ class RunRecord(Protocol):
         """Note that the run is over, with this report."""
 
 
-class KeptRun:
+class _KeptRun:
     """A record of the run in memory."""
 
     def __init__(self, graph: Graph, settings: Settings) -> None:
@@ -136,7 +136,7 @@ class KeptRun:
 _Step = tuple[Stepped, list[Accounted | Counted], int]
 
 
-class JournaledRun:
+class _JournaledRun:
     """A record of the run in the journal of `file`; `recording` has no steps and `jobs` stays empty.
 
     `writer`: writer of that file.
@@ -234,14 +234,14 @@ def recorded(file: JournalFile | None, graph: Graph, settings: Settings, caps: C
     file cannot be made.
     """
     if file is None:
-        yield KeptRun(graph, settings)
+        yield _KeptRun(graph, settings)
         return
     try:
         writer = JournalWriter(file.path)
     except OSError as error:
         raise BadInputError.of_os_error(file.path, error, WRITABLE) from None
     with writer:
-        run = JournaledRun(file, writer, graph, settings, caps)
+        run = _JournaledRun(file, writer, graph, settings, caps)
         try:
             yield run
         finally:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
 from trilane.pipeline.description import UnitSettings
-from trilane.pipeline.shared_assets import Assets
+from trilane.pipeline.memory import Assets
 from trilane.transport.packets import Packet
 
 T = TypeVar("T")

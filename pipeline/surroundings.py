@@ -1,24 +1,124 @@
-"""What a run needs around it and undoes afterwards.
+"""What a run needs around it: checks before it, cores and processes to undo afterwards, and the share of others.
 
-Rule: whatever happens, cores, memory and processes are as before.
+Rule: a check that raises has started nothing, so nothing has to be undone. Whatever happens, cores, memory and
+processes are as before. What is not ours is other programs', by the kernel's counts.
 """
 
 from __future__ import annotations
 
 import contextlib
 import gc
+import math
 import os
+import resource
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TypeVar
 
+import psutil
+
 from trilane import machine
+from trilane.errors import BadInputError, TrilaneError
+from trilane.pipeline import fork_server
 from trilane.pipeline.description import Pipeline
-from trilane.pipeline.regions import edge_regions
-from trilane.pipeline.shared_assets import Assets, share_assets
+from trilane.pipeline.memory import Assets, edge_regions, share_assets
 from trilane.pipeline.unit_processes import UnitProcesses
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.transport.wakeup import DEFAULT, SHORTEST_NS, use_slice
+
+#: Number of files and sockets that a run holds open, with room for a unit that is restarted.
+LEAST_FILES = 96
+
+
+def refuse_in_a_unit() -> None:
+    """Raise BadInputError if a unit is importing the module of its stages, as that would start units without end."""
+    spec = sys.modules["__main__"].__spec__
+    if spec is not None and spec.name == fork_server.__name__:
+        found = "run_pipeline was called while a unit imported its stages"
+        raise BadInputError("run_pipeline", found, 'a call under `if __name__ == "__main__":`')
+
+
+def check_open_files() -> None:
+    """Raise TrilaneError if this process may open too few files for a run."""
+    limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    if limit != resource.RLIM_INFINITY and limit < LEAST_FILES:
+        raise TrilaneError(f"open files: found a limit of {limit}, expected at least {LEAST_FILES}: ulimit -n 1024")
+
+
+def check_cores(pipeline: Pipeline) -> None:
+    """Raise BadInputError for cores that the units could not get."""
+    here = machine.here.cores()
+    for unit, settings in pipeline.units.items():
+        if absent := set(settings.cores).difference(here):
+            found, expected = ", ".join(map(str, sorted(absent))), ", ".join(map(str, sorted(here)))
+            raise BadInputError(f"cores of unit {unit}", found, f"some of this process's: {expected}")
+
+
+def check_positive(**values: float | None) -> None:
+    """Raise BadInputError for a value that is not None, not above 0 or not finite."""
+    for name, value in values.items():
+        if value is not None and not 0 < value < math.inf:
+            raise BadInputError(name, str(value), "more than 0")
+
+
+class OtherPrograms:
+    """Counts from its creation on.
+
+    `cores`: numbers of the cores that count.
+    `pids`: processes that are ours beside this one.
+    """
+
+    def __init__(self, cores: Sequence[int], pids: Sequence[int] = ()) -> None:
+        self._cores, self._processes = cores, [psutil.Process(pid) for pid in (os.getpid(), *pids)]
+        self._stat = machine.here.proc / "stat"
+        self._begin_s, self._before_s = time.monotonic(), self._others_s()
+
+    def share(self) -> float:
+        """Return the others' share of the time of the cores, at most 1.
+
+        The kernel counts in steps of 10 ms, so under 0.1 s the share says little.
+        """
+        had_s = max(time.monotonic() - self._begin_s, 1e-9) * len(self._cores)
+        return min(max(self._others_s() - self._before_s, 0.0) / had_s, 1.0)
+
+    def _others_s(self) -> float:
+        own = [process.cpu_times() for process in self._processes]
+        own_s: float = sum(times.user + times.system for times in own)
+        return busy_s(self._stat.read_text(), self._cores) - own_s
+
+
+def beside_units(cores: Sequence[int], pids: Mapping[str, int]) -> Callable[[Mapping[str, int]], float | None]:
+    """Count from now on what others have of `cores`, beside the processes `pids` of units.
+
+    Return a function that takes the units' present processes and returns the others' share. It returns None if a unit
+    has died in between, because its CPU time is then unknown.
+    """
+    try:
+        others = OtherPrograms(cores, [*pids.values()])
+    except (psutil.Error, OSError):
+        return lambda _: None
+
+    def share(now: Mapping[str, int]) -> float | None:
+        with contextlib.suppress(psutil.Error, OSError):
+            return others.share() if now == pids else None
+        return None
+
+    return share
+
+
+def busy_s(stat: str, cores: Sequence[int]) -> float:
+    """Return how many seconds `cores` were not idle since the system began, including steal time.
+
+    `stat`: text of /proc/stat (proc_stat(5)): cpuN user nice system idle iowait irq softirq steal guest guest_nice. The
+    guests' time is also counted in user and nice.
+    """
+    names = {f"cpu{core}" for core in cores}
+    rows = [line.split() for line in stat.splitlines()]
+    busy = [[*map(int, fields[:3]), *map(int, fields[5:8])] for name, *fields in rows if name in names]
+    steps = sum(map(sum, busy))
+    return steps / os.sysconf("SC_CLK_TCK")
+
 
 Processes = TypeVar("Processes", bound=UnitProcesses)
 SWITCH_S = 0.0002  # seconds for which another thread of this process keeps the interpreter at most

@@ -19,11 +19,11 @@ from typing import Any, Final, NamedTuple
 
 from trilane.pipeline.journal import Accounted, Counted, Record, Stepped, Worked
 from trilane.pipeline.unit_history import KEPT, Handed, IdleCutter, IdleSlice, Key, UnitHistory
-from trilane.scheduler.causes import DropCause, OutcomeKind
 from trilane.scheduler.events import (
     NEVER,
     Action,
     Dispatch,
+    DropCause,
     Finish,
     FrameRequest,
     Graph,
@@ -32,6 +32,7 @@ from trilane.scheduler.events import (
     JobDone,
     JobFailed,
     Kill,
+    OutcomeKind,
     Settings,
     Stop,
     UnitDied,

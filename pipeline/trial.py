@@ -13,21 +13,17 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
+from trilane.pipeline.controls import Interrupts
 from trilane.pipeline.description import Pipeline
-from trilane.pipeline.lifecycle import start_units
-from trilane.pipeline.other_programs import OtherPrograms
+from trilane.pipeline.memory import Assets
 from trilane.pipeline.realtime_clock import RealtimeClock
-from trilane.pipeline.result import Failure
-from trilane.pipeline.run_log import RunLog, UnitError
-from trilane.pipeline.shared_assets import Assets
-from trilane.pipeline.signals import Interrupts
-from trilane.pipeline.surroundings import on_cores, prompt_answers, unit_processes
-from trilane.pipeline.unit_processes import UnitProcesses
+from trilane.pipeline.result import Failure, RunLog, UnitError
+from trilane.pipeline.surroundings import OtherPrograms, on_cores, prompt_answers, unit_processes
+from trilane.pipeline.unit_processes import UnitProcesses, start_units
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.scheduler.core import Core
+from trilane.scheduler.core import Core, run_loop
 from trilane.scheduler.events import Action, Event
-from trilane.scheduler.loop import run_loop
-from trilane.scheduler.release import run_settings
+from trilane.scheduler.policy import run_settings
 from trilane.transport.messages import Message, RunJob
 from trilane.transport.wakeup import awake
 
@@ -143,7 +139,7 @@ class _Live:
 
 
 class _Turns:
-    """The `trilane.scheduler.loop.Clock` that moves the units to the next of `places` after each SLICE frames."""
+    """The `trilane.scheduler.core.Clock` that moves the units to the next of `places` after each SLICE frames."""
 
     def __init__(self, core: Core, clock: RealtimeClock, processes: UnitProcesses, places: Sequence[Cores]) -> None:
         self._core, self._clock, self._processes, self._places = core, clock, processes, places

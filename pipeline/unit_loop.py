@@ -1,6 +1,9 @@
-"""The loop inside a unit's process. Rule: one message, one answer; an error is an answer, never silence.
+"""A unit's process: what it gets at its start, its stages on their slots, and the loop that answers messages.
 
-Slots are bound once, before the first job.
+Rule: one message, one answer; an error is an answer, never silence. Slots are bound once, before the first job. Headers
+are passed on here; no stage has to think of them.
+
+A process gets its `UnitSpec` as one JSON document: plain data, and descriptors by number.
 """
 
 from __future__ import annotations
@@ -9,20 +12,20 @@ import contextlib
 import gc
 import os
 import sys
+import time
 import traceback
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+from trilane.arrays import U8
 from trilane.errors import TrilaneError, UnitLostError
-from trilane.pipeline.bound_stage import BoundStage
-from trilane.pipeline.core_meter import TASKS, CoreMeter
+from trilane.pipeline.description import Model, PipelineStage, UnitSettings
 from trilane.pipeline.hardware_counters import HardwareCounters, NoCounters, counters_here
-from trilane.pipeline.job_times import JobClock
-from trilane.pipeline.shared_assets import map_assets
-from trilane.pipeline.stage import Skip, StageFactory, UnitContext
-from trilane.pipeline.unit_spec import UnitSpec
+from trilane.pipeline.job_times import TASKS, CoreMeter, JobClock
+from trilane.pipeline.memory import EdgeRegion, map_assets
+from trilane.pipeline.stage import Skip, SkippingStage, Stage, StageFactory, SteppedStage, UnitContext
 from trilane.transport.link import LINGER_MS, Link, context_on_cores
 from trilane.transport.messages import (
     BUILDING,
@@ -32,14 +35,170 @@ from trilane.transport.messages import (
     Closed,
     Failed,
     JobPipe,
+    JobPipeEnd,
     MessageError,
     Ping,
     Pong,
     Ready,
     RunJob,
 )
-from trilane.transport.packets import map_region
+from trilane.transport.packets import FRAME_FIELDS, Packet, map_region
 from trilane.transport.wakeup import UNIT_NS, use_slice
+from trilane.units import NS_PER_S
+
+
+class UnitSpec(Model):
+    """One unit of a run.
+
+    `unit`: name of the unit.
+    `endpoint`: address of the heartbeat socket.
+    `job_pipe`, `assets_fd`: descriptors of the job pipe and the assets.
+    `settings`: settings of the unit.
+    `scheduler_cores`: cores of the scheduler.
+    `run_cores`: cores of all units.
+    `stages`: stages of this unit; messages name a stage by its place in this list.
+    `module_folders`: folders that are put before the module search path.
+    `edges`: regions with their descriptors, by the edge's name.
+    `inputs`, `outputs`: edges of each stage that has any.
+    `may_skip`: name of the stage at which the pipeline's bypass begins, or "".
+    """
+
+    unit: str
+    endpoint: str
+    job_pipe: JobPipeEnd
+    assets_fd: int
+    settings: UnitSettings
+    scheduler_cores: tuple[int, ...]
+    run_cores: tuple[int, ...]
+    stages: tuple[PipelineStage, ...]
+    module_folders: tuple[Path, ...]
+    edges: dict[str, EdgeRegion]
+    inputs: dict[str, tuple[str, ...]]
+    outputs: dict[str, str]
+    may_skip: str = ""
+
+    @property
+    def fds(self) -> list[int]:
+        """The descriptors that the process needs, with their numbers in this process."""
+        return [*self.job_pipe, self.assets_fd, *(edge.fd for edge in self.edges.values())]
+
+    def renumbered(self, number_of: Mapping[int, int]) -> UnitSpec:
+        """Return the same spec with the number `number_of[n]` for each descriptor n."""
+        edges = {name: edge.model_copy(update={"fd": number_of[edge.fd]}) for name, edge in self.edges.items()}
+        return self.model_copy(
+            update={
+                "job_pipe": JobPipeEnd(*(number_of[fd] for fd in self.job_pipe)),
+                "assets_fd": number_of[self.assets_fd],
+                "edges": edges,
+            }
+        )
+
+
+WAKE_UP_NS = 150_000  # a sleep ends about this much late
+
+
+class BoundStage:
+    """A stage with its slots."""
+
+    def __init__(
+        self,
+        name: str,
+        stage: Stage,
+        inputs: list[Packet],
+        outputs: list[Packet],
+        pace_ns: int,
+        unit: UnitContext,
+        may_skip: bool = False,
+    ) -> None:
+        """Bind `stage` to its slots.
+
+        `pace_ns`: least time in ns for which a job is held.
+        `unit`: context of the unit that it runs on.
+        `may_skip`: whether a bypass begins at it.
+        """
+        self.name, self._pace_ns, self._may_skip = name, pace_ns, may_skip
+        self._stage, self._outputs, self._unit = stage, outputs, unit
+        self._is_first, self._rung = not inputs, 0
+        self._pass_on = _header_copier(inputs, outputs)
+        stage.bind(inputs, outputs)
+
+    def run(
+        self, frame: int, slot_in: int, slot_out: int, epoch: int, fresh: bool = False, rung: int = 0
+    ) -> Mapping[str, float]:
+        """Do the job, hold it until its pace has passed, and return the stage's metrics.
+
+        The metrics are a `Skip` if the frame skips. A slot is -1 where the stage has no such edge.
+
+        `fresh`: whether the stage must ignore what earlier frames left behind.
+        `rung`: rung of the frame's work, which the first stage is told.
+
+        Raises TrilaneError for a `Skip` of a stage that may not skip.
+        """
+        if fresh and self._may_skip:
+            cast(SkippingStage, self._stage).forget()
+        if self._is_first and rung != self._rung:
+            self._rung = rung
+            cast(SteppedStage, self._stage).step_to(rung)
+        end_ns = time.monotonic_ns() + self._pace_ns
+        if slot_out >= 0:
+            if slot_in >= 0:
+                self._pass_on(slot_in, slot_out)
+            else:
+                header = self._outputs[slot_out].header
+                header["frame"], header["t_sampled_ns"] = frame, time.monotonic_ns()
+            self._outputs[slot_out].header["epoch"] = epoch
+        metrics = self._stage.run(frame, slot_in if slot_in >= 0 else None, slot_out if slot_out >= 0 else None)
+        if isinstance(metrics, Skip) and not self._may_skip:
+            raise TrilaneError(f"stage {self.name} returned a Skip, and the pipeline's bypass does not begin at it")
+        if self._pace_ns:
+            hold_until(end_ns)
+        return metrics
+
+    @property
+    def works_asleep(self) -> bool:
+        """Whether the job goes on while its threads sleep.
+
+        It does on hardware other than the cores, and when it is held to the pace of a chip.
+        """
+        return self._pace_ns > 0 or self._unit.has_device
+
+    def sampled_ns(self, slot_in: int, slot_out: int) -> int:
+        """Return when the frame in the output slot of a pipeline's first stage was sampled; 0 for other stages."""
+        return int(self._outputs[slot_out].header["t_sampled_ns"]) if slot_in < 0 <= slot_out else 0
+
+    def close(self) -> None:
+        self._stage.close()
+
+
+def hold_until(end_ns: int) -> None:
+    """Return at `end_ns` of CLOCK_MONOTONIC, or at once if that has passed: sleep first, then watch the clock."""
+    while (left_ns := end_ns - time.monotonic_ns()) > 0:
+        if left_ns > WAKE_UP_NS:
+            time.sleep((left_ns - WAKE_UP_NS) / NS_PER_S)
+
+
+def _header_copier(inputs: list[Packet], outputs: list[Packet]) -> Callable[[int, int], None]:
+    """Return a function that copies the header from an input slot to an output slot.
+
+    If the headers differ, it copies only the frame's fields.
+    """
+    if inputs and outputs and inputs[0].header.dtype != outputs[0].header.dtype:
+        return lambda slot_in, slot_out: _copy_fields(inputs[slot_in].header, outputs[slot_out].header)
+    sources, targets = [_bytes_of(packet) for packet in inputs], [_bytes_of(packet) for packet in outputs]
+
+    def copy(slot_in: int, slot_out: int) -> None:
+        targets[slot_out][:] = sources[slot_in]
+
+    return copy
+
+
+def _copy_fields(source: Any, target: Any) -> None:
+    for name, _ in FRAME_FIELDS:
+        target[name] = source[name]
+
+
+def _bytes_of(packet: Packet) -> U8:
+    return packet.header.reshape(1).view("u1")
 
 
 def serve(raw_spec: dict[str, Any], number_of: Mapping[int, int]) -> int:

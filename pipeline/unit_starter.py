@@ -22,7 +22,7 @@ from trilane.errors import TrilaneError
 from trilane.pipeline.fork_server import THREAD_LIMITS
 
 if TYPE_CHECKING:
-    from trilane.pipeline.unit_spec import UnitSpec
+    from trilane.pipeline.unit_loop import UnitSpec
 
 ANSWER_S = 60.0  # the modules to preload may come from a slow disk
 LOOK_S = 0.1  # between two looks at a fork server that has not answered

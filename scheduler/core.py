@@ -1,4 +1,7 @@
-"""The scheduler: which job runs where, and when. Rule: pure; it knows the time only from `step`, and does no I/O.
+"""The scheduler (which job runs where, and when), and the loop that every driver runs.
+
+Rule: pure; it knows the time only from `step`, and does no I/O. One loop serves all clocks; drivers differ in their
+`Clock` alone.
 
 Theory of operation. A driver calls `step` with the time and the events since the last step. The core answers with
 actions to do now and with the time at which it wants to be asked again. The same steps give the same answers, so a run
@@ -14,15 +17,15 @@ its output slot from dispatch until it is done. So a stage can begin only when a
 free behind it. Nothing else holds back the stages before a slow one.
 
 Bypass. A frame may skip the stages between two others, when the first of these says so. It then waits for the second in
-the slot that it has, and overtakes no frame (bypass.py).
+the slot that it has, and overtakes no frame (flow.py).
 
 Dirty units. A step looks only at units for which something has changed. The unit's own job ended, a frame came to one
 of its stages, a slot got free behind one, or its life or duty changed. Whoever changes such a thing calls `mark_dirty`.
 A dispatch may make a unit dirty that this step has already looked at; the step then looks at it again.
 
-The alarm is a time before which no unit's deadline or hold can be over (watchdog.py). It is found by asking all units,
-and only when it has gone off or was reset. Events that put a deadline off leave the alarm as it is, so it may go off
-too early.
+The alarm is a time before which no unit's deadline or hold can be over (`next_alarm_ns`). It is found by asking all
+units, and only when it has gone off or was reset. Events that put a deadline off leave the alarm as it is, so it may go
+off too early.
 
 Dispatch ahead and leading. A unit holds its next job while one runs, so that no message delay lies between them. A
 policy that wants the newest frame hands the next job over only `lead_ns` before the running one should end. Latching is
@@ -31,17 +34,16 @@ the same for the first stage: it begins so late that its pose is new when the se
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
-from trilane.scheduler import watchdog
-from trilane.scheduler.assignment import Assignment
-from trilane.scheduler.causes import Drop, DropCause, Loss, LossKind, Outcome, OutcomeKind
-from trilane.scheduler.choice import Choice
+from trilane.scheduler.assignment import Assignment, Choice
 from trilane.scheduler.events import (
     NEVER,
     Abort,
     Action,
     Decision,
+    Drop,
+    DropCause,
     Event,
     Finish,
     FrameRequest,
@@ -50,6 +52,10 @@ from trilane.scheduler.events import (
     JobDone,
     JobFailed,
     Kill,
+    Loss,
+    LossKind,
+    Outcome,
+    OutcomeKind,
     Pinged,
     Pong,
     SchedulerStalled,
@@ -65,8 +71,23 @@ from trilane.scheduler.flow import Flow
 from trilane.scheduler.frame_source import Source
 from trilane.scheduler.ledger import Books, Ledger
 from trilane.scheduler.policy import policy_named
-from trilane.scheduler.state import FULL_DUTY, FrameState, StageState, UnitState
-from trilane.scheduler.unit_life import READY, STOPPING, DeadlinePassed
+from trilane.scheduler.state import (
+    FULL_DUTY,
+    KILL,
+    LOOK,
+    READY,
+    RESUME,
+    START,
+    STOPPING,
+    DeadlinePassed,
+    FrameState,
+    StageState,
+    UnitState,
+    back_off_ns,
+    extended_deadline_ns,
+    next_alarm_ns,
+    verdict,
+)
 from trilane.scheduler.work_ladder import WorkLadder
 
 
@@ -162,7 +183,7 @@ class Core:
 
     def _next_deadline(self) -> int:
         if self._lead_ns or self.alarm_ns <= self.now_ns:
-            self.alarm_ns = watchdog.next_alarm_ns(self.units.values(), self.now_ns, self._lead_ns)
+            self.alarm_ns = next_alarm_ns(self.units.values(), self.now_ns, self._lead_ns)
         # before the start nothing is released, even if it is due
         next_ns = self.source.due_ns if self.started else NEVER
         if self.alarm_ns < next_ns:
@@ -253,7 +274,7 @@ class Core:
         self.flow.mark_dirty(unit)
         self._on_stop(Stop())
 
-    # events of units, each by unit_life.py's table
+    # events of units, each by the table in state.py
 
     def _on_ready(self, event: UnitReady) -> None:
         unit = self.units[event.unit]
@@ -271,7 +292,7 @@ class Core:
         """Plan the restart and reclaim the slots, or end the run when the unit fails too often."""
         unit = self.units[event.unit]
         loss = Loss(LossKind.HUNG if unit.life == STOPPING else LossKind.DIED, unit.name)
-        unit.move(UnitDied, self.now_ns + watchdog.back_off_ns(unit.failures + 1))
+        unit.move(UnitDied, self.now_ns + back_off_ns(unit.failures + 1))
         unit.failures += 1
         unit.update_queue_capacity()
         self._reset_alarm()
@@ -297,24 +318,24 @@ class Core:
         self.flow.mark_dirty(unit)
 
     def _check_units(self) -> None:
-        """Carry out what the watchdog says of each unit."""
+        """Carry out the verdict on each unit."""
         for unit in self.units.values():
-            verdict = watchdog.verdict(unit, self.now_ns, self._lead_ns)
-            if verdict == watchdog.KILL:
+            found = verdict(unit, self.now_ns, self._lead_ns)
+            if found == KILL:
                 unit.move(DeadlinePassed, NEVER)
                 unit.update_queue_capacity()
                 self.flow.mark_dirty(unit)
                 self.actions.append(Kill(unit.name))
-            elif verdict == watchdog.START:
+            elif found == START:
                 unit.move(DeadlinePassed, self.now_ns + self.settings.start_ns)
                 unit.hold_until_ns = NEVER
                 self.ledger.restart(unit.name)
                 self.actions.append(Start(unit.name))
-            elif verdict == watchdog.RESUME:
+            elif found == RESUME:
                 unit.hold_until_ns = NEVER
                 unit.update_queue_capacity()
                 self.flow.mark_dirty(unit)
-            elif verdict == watchdog.LOOK:
+            elif found == LOOK:
                 self.flow.mark_dirty(unit)
 
     # events of the run
@@ -322,7 +343,7 @@ class Core:
     def _on_stalled(self, event: SchedulerStalled) -> None:
         # The units could not be heard in that time, so their deadlines and expected ends do not count it.
         for unit in self.units.values():
-            unit.deadline_ns = watchdog.extended_deadline_ns(unit, event.ns)
+            unit.deadline_ns = extended_deadline_ns(unit, event.ns)
             unit.head_since_ns += event.ns
         self._reset_alarm()
 
@@ -344,3 +365,47 @@ class Core:
 
     def _on_abort(self, _event: Abort) -> None:
         self._finish_at_once(Loss(LossKind.ABORTED), Outcome(OutcomeKind.ABORTED))
+
+
+class Clock(Protocol):
+    """The world around the core: it knows the time, hears what happens and does what the core says."""
+
+    def wait(self, deadline_ns: int) -> tuple[int, tuple[Event, ...]]:
+        """Wait until something happens or the deadline comes; return the time and what has happened.
+
+        Times never go back. It may return without an event at any time.
+
+        `deadline_ns`: latest time of return; NEVER when only an event can bring the core on. The first call of a run
+        has NEVER. It must return the first events: a `UnitReady` for each unit that is up.
+        """
+        ...
+
+    def perform(self, now_ns: int, actions: tuple[Action, ...]) -> None:
+        """Do what the core answered at `now_ns`: one action or more."""
+        ...
+
+
+class Recorder(Protocol):
+    """Takes the steps of a run, such as `trilane.scheduler.recording.Recording`."""
+
+    def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
+        """Add a step of `core` that has just been taken, and whose actions were performed."""
+        ...
+
+
+def run_loop(core: Core, clock: Clock, recording: Recorder | None = None) -> Outcome:
+    """Run `core` until it finishes, and add every step to `recording`.
+
+    Raises what `clock` raises, KeyError and UnitLifeError (see Core.step).
+    """
+    wait, perform = clock.wait, clock.perform  # looked up once: they are called for every step
+    deadline_ns: int = NEVER
+    while True:
+        now_ns, events = wait(deadline_ns)
+        actions, deadline_ns = core.step(now_ns, events)
+        if actions:
+            perform(now_ns, actions)
+        if recording is not None:
+            recording.add(now_ns, events, actions, core)
+        if core.outcome is not None:
+            return core.outcome

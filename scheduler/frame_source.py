@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 
-from trilane.scheduler.causes import DropCause
-from trilane.scheduler.events import NEVER, Settings
+from trilane.scheduler.events import NEVER, DropCause, Settings
 
 
 class Source:

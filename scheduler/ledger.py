@@ -19,10 +19,9 @@ from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any, Final, NamedTuple
 
-from trilane.scheduler.causes import Drop, Loss
-from trilane.scheduler.events import NEVER, Graph, Job
-from trilane.scheduler.frame_times import FrameTimes, Lateness
-from trilane.scheduler.samples import Samples, Sketch
+from trilane.scheduler.events import NEVER, Drop, Graph, Job, Loss
+from trilane.scheduler.stats import FrameTimes, Lateness, Samples, Sketch
+from trilane.units import NS_PER_S
 
 ASSIGNED: Final = 0
 STARVED: Final = 1
@@ -98,7 +97,7 @@ class Books:
 
     `target_period_ns`: longest frame time that is not a missed deadline; the frames' own deadlines then do not count.
     0: only the frames' own deadlines count.
-    `sketch`: function that makes a sketch, as for `trilane.scheduler.samples.Samples`.
+    `sketch`: function that makes a sketch, as for `trilane.scheduler.stats.Samples`.
     """
 
     target_period_ns: int = 0
@@ -256,10 +255,10 @@ class Ledger:
                 "not_begun": not_begun,
                 **({"skipped": self.skipped} if self._graph.bypass else {}),
             },
-            "duration_s": (self.end_ns - self.start_ns) / 1e9,
+            "duration_s": (self.end_ns - self.start_ns) / NS_PER_S,
             "frame_time_ms": self._frame_times.row(),
             "latency_ms": self._latency.summary_ms(),
-            "fps": intervals * 1e9 / span_ns if span_ns else 0.0,
+            "fps": intervals * NS_PER_S / span_ns if span_ns else 0.0,
             **self._frame_times.fps_interval(),
             "deadline_misses": self._lateness.missed,
             "xrbench": {

@@ -1,19 +1,222 @@
-"""Chooses cores and the number of threads of each unit. Rule: measured times alone decide, by one formula.
+"""Predicts the frame time of placements, and chooses the cores and the number of threads of each unit.
 
-`places.py` defines the words, `placement_list.py` lists the possible placements, and `placement_model.py` has the
-formula. The formula is not exact. Where real frames can be had, they decide between the few placements that it cannot
-tell apart.
+Rule: measured times alone decide, by one formula; nothing is tried here. The formula is not exact. Where real frames
+can be had, they decide between the few placements that it cannot tell apart.
+
+A placement gives each unit cores and threads. Its frame time is predicted from `Work`: the time that the unit needs for
+a frame, and the time for which it takes each of its cores. Let T be the frame time. In a pipelined run these hold:
+
+- *A unit does one job at a time.* Its jobs of a frame take at most T.
+- *A core does one thing at a time.* What the units need of it is at most T. A unit with one thread and several cores
+  *floats*: the kernel runs it where there is room. So for every set of cores, work that cannot go elsewhere is at most
+  what they can do in T, less what the kernel misses. By Hall's condition the work can then be divided, and only then.
+- *Each of a job's parallel regions waits for its slowest thread.* Let others have core c for the share o(c) of the
+  time. A job of several threads goes on only while all its cores are free. If the others come independently, that is
+  the product of 1 - o(c) over its cores, as a share of the time. The job takes that much longer, and at most T too.
+- *Siblings* of one physical core together do `SIBLINGS` times the work that one does alone.
+
+The least such T is the answer. A sequential run has one stage at work at any time: T is the sum, and nothing waits.
+
+A floating unit that has one core to itself *stays* there, because the kernel moves a thread only when it has to wait.
+
+Every job of a unit on a shared core costs a change of threads more. A floating unit that does not stay is moved once a
+frame. The time that the scheduler takes on its cores counts like work that nothing waits for.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import combinations
+from math import prod
 from statistics import median
 from typing import Final, NamedTuple
 
-from trilane.scheduler.placement_list import placements
-from trilane.scheduler.placement_model import Rules, frame_ns
-from trilane.scheduler.places import Core, Placement, Times, shared_cores
+from trilane.scheduler.places import (
+    FULL,
+    Core,
+    Place,
+    Placement,
+    Times,
+    Work,
+    has_own_cores,
+    placements,
+    share_ns,
+    shared_cores,
+)
+
+#: Assumed: work of two threads on the siblings of a physical core, over the work of one thread alone.
+SIBLINGS: Final = 1.25
+#: Assumed: the cost of a change of threads, with the first-level cache, and of a move, with a second-level cache of 2
+#: MiB at 8 GB/s. A simulated fair scheduler moved floating units 0.5 to 1.2 times a frame
+#: (docs/decisions/placement.md).
+CHANGE_NS: Final = 30_000
+MOVE_NS: Final = 250_000
+#: Assumed share of what several cores can do for floating units. The kernel moves a waiting thread to a core that has
+#: just become idle, but hardly ever a running one. So a core may idle while a unit that has no other core waits.
+ROOM_USED: Final = 0.9
+#: Time that the scheduler takes for a job, measured as CPU time of its process (docs/decisions/placement.md).
+SCHEDULER_NS: Final = 100_000
+LEAST_FREE: Final = 1e-9  # free share of a core below which it counts as none
+
+
+class Rules(NamedTuple):
+    """The rules of the run that the frame time depends on.
+
+    `first`: unit on whose cores the scheduler runs.
+    `sequential`: whether one stage works at a time.
+    """
+
+    first: str
+    sequential: bool = False
+
+
+def frame_ns(placement: Placement, cores: Sequence[Core], times: Times, rules: Rules) -> int:
+    """Return the predicted time from a frame to the next, in ns."""
+    model = _Model(placement, cores, times, rules)
+    return model.sum_ns() if rules.sequential else model.pipelined_ns()
+
+
+class _Load(NamedTuple):
+    """What a unit, or the scheduler, needs of its cores for a frame.
+
+    `serial_ns`: time that the unit needs for its jobs.
+    `core_ns`: time that it takes of each core, or of all together where it `floats`.
+    `work_ns`: the same time if siblings did not slow each other.
+    """
+
+    cores: tuple[int, ...]
+    serial_ns: float
+    core_ns: float
+    work_ns: float
+    floats: bool
+
+    def on(self, core: int) -> float:
+        """Return what the unit needs of one core in ns; for a floating unit, an even part."""
+        if core not in self.cores:
+            return 0.0
+        return self.core_ns / len(self.cores) if self.floats else self.core_ns
+
+
+def _settled(placement: Placement) -> Placement:
+    """Return `placement` with each floating unit that has one core to itself on that core alone.
+
+    Such a unit leaves its other cores free.
+    """
+    shared = shared_cores(placement)
+    settled = dict(placement)
+    for unit, place in placement.items():
+        own = [core for core in place.cores if core not in shared]
+        if len(own) == 1 and place.threads < len(place.cores):
+            settled[unit] = Place((own[0],), 1)
+    return settled if settled == placement else _settled(settled)
+
+
+class _Model:
+    """The model of one placement."""
+
+    def __init__(self, placement: Placement, cores: Sequence[Core], times: Times, rules: Rules) -> None:
+        self._speed = {core.number: core.permille / FULL for core in cores}
+        self._physical = {core.number: core.physical for core in cores}
+        works = {unit: times[unit][place.threads] for unit, place in placement.items()}
+        self._units = []
+        settled = _settled(placement)
+        for unit, place in settled.items():
+            changes = 0 if has_own_cores(unit, settled) else works[unit].jobs
+            moves = place.threads < len(place.cores)
+            self._units.append(self._load(place, works[unit], changes * CHANGE_NS + moves * MOVE_NS))
+        jobs = sum(work.jobs for work in works.values())
+        where = placement[rules.first].cores
+        self._scheduler_ns = float(jobs * SCHEDULER_NS)
+        taken_ns = self._scheduler_ns / min(self._speed[core] for core in where)
+        self._loads = [*self._units, _Load(where, 0.0, taken_ns, taken_ns, len(where) > 1)]
+
+    def _load(self, place: Place, work: Work, cost_ns: int) -> _Load:
+        """Return the unit's needs on its cores: the slowest core decides, and siblings that are both used are slower.
+
+        `cost_ns`: cost in ns of sharing the cores with others.
+        """
+        floats = place.threads < len(place.cores)
+        speed = min(self._speed[core] for core in place.cores)
+        physical = [self._physical[core] for core in place.cores]
+        was_measured_so = len(physical) > len(list(self._physical_cores))
+        both = not floats and len(set(physical)) < len(physical) and not was_measured_so
+        slower = 2 / SIBLINGS if both else 1.0
+        serial_ns, core_ns = work.serial_ns / speed + cost_ns, work.core_ns / speed + cost_ns
+        return _Load(place.cores, serial_ns * slower, core_ns * slower, core_ns, floats)
+
+    def sum_ns(self) -> int:
+        """Return the frame time of a sequential run in ns."""
+        return round(sum(unit.serial_ns for unit in self._units) + self._scheduler_ns)
+
+    def pipelined_ns(self) -> int:
+        """Return the least whole number of ns that is long enough, searched upwards from what every frame needs."""
+        high = low = int(max([*self._crowded(), *(unit.serial_ns for unit in self._units)]))
+        gangs = [self._gang(unit) for unit in self._units if len(unit.cores) > 1 and not unit.floats]
+        while not all(gang.fits(high) for gang in gangs):
+            low, high = high, 2 * high + 1
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (low, middle) if all(gang.fits(middle) for gang in gangs) else (middle, high)
+        return high
+
+    def _crowded(self) -> Iterator[float]:
+        """Yield, for each set of cores that can be too full, what it needs over what it can do."""
+        floating = [load for load in self._loads if load.floats]
+        sets = {frozenset([core]): 1.0 for core in self._speed}
+        for one in self._physical_cores:
+            sets[frozenset(core for core in self._speed if self._physical[core] == one)] = 1.0
+        for count in range(1, len(floating) + 1):
+            for some in combinations(floating, count):
+                sets[frozenset().union(*(load.cores for load in some))] = ROOM_USED
+        for these, used in sets.items():
+            yield sum(self._within(load, these) for load in self._loads) / (self._capacity(these) * used)
+
+    @property
+    def _physical_cores(self) -> Iterable[int]:
+        return dict.fromkeys(self._physical.values())
+
+    @staticmethod
+    def _within(load: _Load, these: frozenset[int]) -> float:
+        """Return the part of a load that must be done on `these` cores."""
+        return share_ns(load.cores, load.core_ns if len(these) == 1 else load.work_ns, load.floats, these)
+
+    def _capacity(self, these: frozenset[int]) -> float:
+        """Return how many cores' worth of work the set does.
+
+        Loads are in the time of these very cores, so each core counts 1.
+        """
+        counts = [sum(self._physical[core] == one for core in these) for one in self._physical_cores]
+        return sum(SIBLINGS if count > 1 else count for count in counts)
+
+    def _gang(self, unit: _Load) -> _Gang:
+        others = [load for load in self._loads if load is not unit]
+        on = {core: sum(load.on(core) for load in others) for core in self._speed}
+        beside = {
+            core: sum(on[other] for other, physical in self._physical.items() if physical == own and other != core)
+            for core, own in self._physical.items()
+        }
+        return _Gang(unit.serial_ns, unit.core_ns, [(on[core], beside[core]) for core in unit.cores])
+
+
+class _Gang(NamedTuple):
+    """A unit of several threads, each on a core.
+
+    `serial_ns`, `core_ns`: times of its jobs, as in `_Load`.
+    `others_ns`: time of others on each of its cores, and on the core's siblings.
+    """
+
+    serial_ns: float
+    core_ns: float
+    others_ns: Sequence[tuple[float, float]]
+
+    def fits(self, frame: int) -> bool:
+        """Return whether its jobs, stretched by their waits, end within `frame` ns."""
+        free = prod(
+            max(1 - on / frame, 0.0) * (1 - (1 - SIBLINGS / 2) * min(beside / frame, 1.0))
+            for on, beside in self.others_ns
+        )
+        return self.serial_ns - self.core_ns + self.core_ns / max(free, LEAST_FREE) <= frame
+
 
 #: Relative difference from the shortest within which predictions are as good; the model's own error is not smaller.
 WORTH: Final = 0.03

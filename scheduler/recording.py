@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from trilane.errors import BadInputError
-from trilane.scheduler.causes import Outcome
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
     ACTIONS,
@@ -24,10 +23,11 @@ from trilane.scheduler.events import (
     Finish,
     Graph,
     Job,
+    Outcome,
     Settings,
     StageSpec,
 )
-from trilane.scheduler.unit_life import UnitLifeError
+from trilane.scheduler.state import UnitLifeError
 from trilane.unexpected_value import UnexpectedValue
 
 SCHEMA = 7

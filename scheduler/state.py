@@ -1,17 +1,69 @@
-"""The core's memory of stages, units and frames. Rule: it holds fields and what follows from them; core.py decides.
+"""The core's memory of units, stages and frames. Rule: it holds fields and what follows from them; core.py decides.
 
-A time that is not set is NEVER.
+A time that is not set is NEVER. A unit moves by a table alone. An event that the table refuses is a driver's defect.
+
+    down --back-off over--> starting --UnitReady--> ready --too slow--> stopping --UnitDied--> down
+
+A unit has one deadline, and its state says what happens when the deadline passes:
+- `down`: the process is started again.
+- `starting`: the start took too long, and the process is killed.
+- `ready`: the running job or the answer to a ping took too long, and the process is killed.
+- `stopping`: there is no deadline, because the process is about to end.
+
+`verdict` says what is to be done with a unit now, and `next_alarm_ns` says when the next verdict is due.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from typing import Final
 
-from trilane.scheduler.events import NEVER, Graph, Job
+from trilane.scheduler.events import NEVER, Graph, Job, JobDone, JobFailed, Pinged, Pong, UnitDied, UnitReady
 from trilane.scheduler.ledger import STARVED
-from trilane.scheduler.unit_life import IGNORED, READY, STARTING, state_after
 from trilane.transport.slots import EdgeSlots, edge_rule
+
+DOWN: Final = 0
+STARTING: Final = 1
+READY: Final = 2
+STOPPING: Final = 3
+STATES = ("down", "starting", "ready", "stopping")
+
+IGNORED: Final = -1  # the event was under way when the unit's process was killed or died
+REFUSED: Final = -2  # the event cannot happen
+
+
+class DeadlinePassed:
+    """The event that a unit's deadline has passed; the core finds it out itself, no driver sends it."""
+
+
+class UnitLifeError(Exception):
+    """An event that the table refuses in the unit's state: a defect of the driver, never of the user's input."""
+
+
+# fmt: off
+#: The state that follows each event. The job events move no unit, so core.py need not look them up. A job counts when
+#: it is the first of its unit's queue, also while the unit is stopping; a unit that is down or starting has no jobs.
+TABLE: dict[type, tuple[int, int, int, int]] = {
+    #                from DOWN  STARTING  READY     STOPPING
+    UnitReady:      (REFUSED,   READY,    REFUSED,  IGNORED),
+    UnitDied:       (REFUSED,   DOWN,     DOWN,     DOWN),
+    Pinged:         (IGNORED,   REFUSED,  READY,    IGNORED),
+    Pong:           (IGNORED,   IGNORED,  READY,    IGNORED),
+    JobDone:        (IGNORED,   IGNORED,  READY,    STOPPING),
+    JobFailed:      (IGNORED,   IGNORED,  READY,    STOPPING),
+    DeadlinePassed: (STARTING,  STOPPING, STOPPING, REFUSED),
+}
+# fmt: on
+
+
+def state_after(unit: str, state: int, event: type) -> int:
+    """Return the state that follows `state`, or IGNORED; raises UnitLifeError if the table refuses the event."""
+    after = TABLE[event][state]
+    if after == REFUSED:
+        raise UnitLifeError(f"unit {unit} is {STATES[state]}: {event.__name__} cannot happen")
+    return after
+
 
 HELD_JOBS: Final = 2  # the one that runs and the one dispatched ahead
 FULL_DUTY: Final = 1000
@@ -20,7 +72,7 @@ FULL_DUTY: Final = 1000
 class UnitState:
     """The state of one unit.
 
-    `life`: state in the table of unit_life.py.
+    `life`: state in the table `TABLE`.
     `deadline_ns`: time from which on the event that this state waits for is late.
     `queue`: the running job, then the one dispatched ahead.
     `queue_capacity`: number of jobs that it may hold now (`update_queue_capacity`).
@@ -170,3 +222,53 @@ def build(graph: Graph) -> tuple[list[StageState], dict[str, UnitState], list[Ed
         units[spec.unit].stages.append(stage)
         stages.append(stage)
     return stages, units, edges
+
+
+#: Verdicts: leave the unit alone, kill its process, start it again, let it work after a hold, see if it takes a job.
+NOTHING: Final = 0
+KILL: Final = 1
+START: Final = 2
+RESUME: Final = 3
+LOOK: Final = 4
+
+#: Waits before a restart, by the number of failures in a row without a finished job; the last repeats.
+BACK_OFF_NS = (0, 100_000_000, 400_000_000, 1_600_000_000)
+
+
+def verdict(unit: UnitState, now_ns: int, lead_ns: int) -> int:
+    """Return what is to be done with the unit now.
+
+    `lead_ns`: lead of the policy; with a lead, the unit's next job may be due.
+    """
+    if unit.deadline_ns <= now_ns:
+        return START if unit.life == DOWN else KILL
+    if unit.hold_until_ns <= now_ns:
+        return RESUME
+    return LOOK if lead_ns and len(unit.queue) == 1 else NOTHING
+
+
+def next_alarm_ns(units: Iterable[UnitState], now_ns: int, lead_ns: int) -> int:
+    """Return when the first verdict other than NOTHING is due, or NEVER.
+
+    Until a deadline or a hold is set, no verdict can be due earlier: a job's end and a Pong only put deadlines off.
+    """
+    alarm_ns = NEVER
+    for unit in units:
+        alarm_ns = min(alarm_ns, unit.deadline_ns, unit.hold_until_ns)
+        if lead_ns and len(unit.queue) == 1:
+            lead_from_ns = unit.expected_end_ns() - lead_ns
+            if now_ns < lead_from_ns < alarm_ns:
+                alarm_ns = lead_from_ns
+    return alarm_ns
+
+
+def back_off_ns(failures: int) -> int:
+    """Return how long a unit stays down after `failures` failures in a row, 1 or more."""
+    return BACK_OFF_NS[min(failures, len(BACK_OFF_NS)) - 1]
+
+
+def extended_deadline_ns(unit: UnitState, ns: int) -> int:
+    """Return the unit's deadline, put off by the `ns` for which the scheduler did nothing; a restart is not put off."""
+    if unit.deadline_ns == NEVER or unit.life not in (STARTING, READY):
+        return unit.deadline_ns
+    return unit.deadline_ns + ns

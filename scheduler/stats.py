@@ -1,11 +1,29 @@
-"""Summaries of times. Rule: percentiles are exact for what was measured (linear between ranks), without bins."""
+"""Summaries of the times of a run: percentiles, means with their uncertainty, and scores.
+
+Rule: percentiles are exact (linear between ranks, without bins) while the values are few, then those of a sketch.
+`is_exact` says so. A sketch is a structure of bounded size that gives percentiles within a stated error. This folder
+knows none: the maker of `Samples` provides one for a run that may last for days. Without one, all values are kept.
+
+The interval of a mean frame time follows from the run's own frames. Successive frames are not independent, so the
+method is nonoverlapping batch means. The times are cut into batches of equal length, longer than what one frame carries
+over to the next. The means of the batches count as independent, and Student's t over them gives the interval. Once a
+sketch has the times, the interval is computed from the means of blocks. The blocks have equally many times, each about
+a thousandth of the run.
+
+Sources: Schmeiser, "Batch Size Effects in the Analysis of Simulation Output", Operations Research 30 (1982), who finds
+little use in more than 10 to 30 batches; Law, Simulation Modeling and Analysis, chapter 9.
+"""
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Iterable, Sequence
-from math import ceil, comb, log
+from math import ceil, comb, exp, log, sqrt
+from statistics import fmean, stdev
+from typing import Final, Protocol
 
-NS_PER_MS = 1e6
+from trilane.units import NS_PER_MS, NS_PER_S
+
 CONFIDENCE = 0.95
 SCORE_PER_MS = 15.0
 LARGEST_ENERGY_MJ = 1500.0
@@ -25,12 +43,12 @@ def percentile(ordered: Sequence[int], share: float) -> float:
 def summary_ms(values_ns: Iterable[int]) -> dict[str, float]:
     """Return mean, p50, p90, p95, p99 and max in ms, all 0 without values, and the number of values as `samples`."""
     ordered = sorted(values_ns)
-    return summary_row(
+    return _summary_row(
         len(ordered), sum(ordered), ordered[-1] if ordered else 0, lambda share: percentile(ordered, share)
     )
 
 
-def summary_row(count: int, total: int, largest: int, percentile_of: Callable[[float], float]) -> dict[str, float]:
+def _summary_row(count: int, total: int, largest: int, percentile_of: Callable[[float], float]) -> dict[str, float]:
     """Return `summary_ms` of `count` values in ns. `percentile_of`: function that returns their percentiles in ns."""
     if not count:
         return dict.fromkeys(("mean", "p50", "p90", "p95", "p99", "max", "samples"), 0)
@@ -69,3 +87,227 @@ def energy_score(frame_mj: float) -> float:
     Kwon et al., XRBench, MLSys 2023, section 3, with their E.
     """
     return max(0.0, 1 - frame_mj / LARGEST_ENERGY_MJ)
+
+
+MOST_BATCHES = 10
+LEAST_BATCHES = 5
+#: Least number of frames in a batch: as many as can be in flight in five stages with two slots between each.
+LEAST_FRAMES = 10
+#: The 0.975 quantile of Student's t, by degrees of freedom.
+T_975 = {4: 2.776445, 5: 2.570582, 6: 2.446912, 7: 2.364624, 8: 2.306004, 9: 2.262157}
+
+
+def mean_interval(values: Sequence[float], mean: float | None = None) -> tuple[float, float] | None:
+    """Return the 95 % interval of the mean that a run like this one would have if it went on, in units of `values`.
+
+    None stands for too few values: fewer than `LEAST_BATCHES` batches of `LEAST_FRAMES`, or an interval that reaches 0.
+
+    `values`: values above 0 in the order of measurement. The first ones, which do not fill a batch, count for the mean
+    alone.
+    `mean`: mean of all values, where `values` are means of blocks.
+    """
+    batches = min(len(values) // LEAST_FRAMES, MOST_BATCHES)
+    if batches < LEAST_BATCHES:
+        return None
+    mean = fmean(values) if mean is None else mean
+    half = _half_width(values, batches)
+    return (mean - half, mean + half) if half < mean else None
+
+
+def batch_interval(values: Sequence[float]) -> float | None:
+    """Return half the width of the 95 % interval of a mean, from `values` over equal batches of at least LEAST_FRAMES.
+
+    None stands for fewer than LEAST_BATCHES batches. With more than MOST_BATCHES, neighbours are merged.
+    """
+    batches = min(len(values), MOST_BATCHES)
+    return _half_width(values, batches) if batches >= LEAST_BATCHES else None
+
+
+def _half_width(values: Sequence[float], batches: int) -> float:
+    """Return half the width of the 95 % interval: Student's t over the means of `batches` batches.
+
+    The first values, which fill no batch, do not count.
+    """
+    length = len(values) // batches
+    first = len(values) - batches * length
+    means = [fmean(values[first + batch * length : first + (batch + 1) * length]) for batch in range(batches)]
+    return T_975[batches - 1] * stdev(means) / sqrt(batches)
+
+
+def frame_interval_ms(interval_ns: tuple[float, float] | None) -> dict[str, float | None]:
+    """Return `mean_low` and `mean_high` of the frame time in ms; both are None without an interval."""
+    low, high = interval_ns or (None, None)
+    return {"mean_low": low and low / NS_PER_MS, "mean_high": high and high / NS_PER_MS}
+
+
+def fps_interval(interval_ns: tuple[float, float] | None) -> dict[str, float | None]:
+    """Return `fps_low` and `fps_high`, the same interval in frames a second."""
+    low, high = interval_ns or (None, None)
+    return {"fps_low": high and NS_PER_S / high, "fps_high": low and NS_PER_S / low}
+
+
+# At 8 bytes a value, runs of some minutes stay exact, and runs of days stay small (docs/decisions/journal.md).
+MOST_EXACT: Final = 20_000
+#: Number of kept values that go to the sketch with each further value, so that no step of the scheduler takes long.
+MOVED_AT_ONCE: Final = 4
+
+
+class Sketch(Protocol):
+    """Percentiles of any number of values."""
+
+    def add(self, value: int) -> None:
+        """Add one value."""
+        ...
+
+    def percentile(self, share: float) -> float:
+        """Return the value that `share` of the values do not exceed, within the error of the sketch."""
+        ...
+
+
+class Samples:
+    """Values in ns. `count`, `total` and `largest` are exact.
+
+    `is_exact`: whether all values are in `kept`, in the order in which they came. Otherwise `kept` is on its way into
+    the sketch.
+    """
+
+    def __init__(self, sketch: Callable[[], Sketch] | None = None) -> None:
+        """Begin without values.
+
+        `sketch`: function that makes the sketch for more than MOST_EXACT values; None: all values are kept.
+        """
+        self.count = self.total = self.largest = 0
+        self.kept = array("q")
+        self._make_sketch = sketch
+        self._sketch: Sketch | None = None
+
+    @property
+    def is_exact(self) -> bool:
+        return self._sketch is None
+
+    @property
+    def mean(self) -> float:
+        """The mean in ns; 0 without values."""
+        return self.total / self.count if self.count else 0.0
+
+    def add(self, value: int) -> None:
+        """Add one value."""
+        if value > self.largest or not self.count:
+            self.largest = value
+        self.count += 1
+        self.total += value
+        if self._sketch is not None:
+            self._sketch.add(value)
+            self._move(MOVED_AT_ONCE)
+            return
+        self.kept.append(value)
+        if self._make_sketch is not None and self.count > MOST_EXACT:
+            self._sketch = self._make_sketch()
+
+    def summary_ms(self) -> dict[str, float]:
+        """Return `summary_ms` of all values."""
+        sketch = self._sketch
+        if sketch is None:
+            ordered = sorted(self.kept)
+            return _summary_row(self.count, self.total, self.largest, lambda share: percentile(ordered, share))
+        self._move(len(self.kept))
+        return _summary_row(self.count, self.total, self.largest, sketch.percentile)
+
+    def _move(self, count: int) -> None:
+        if self._sketch is not None:
+            for _ in range(min(count, len(self.kept))):
+                self._sketch.add(self.kept.pop())
+
+
+SPAN: Final = 20  # frames of the exponential average
+WEIGHT: Final = 2 / (SPAN + 1)
+MOST_BLOCKS: Final = 2048
+
+
+class FrameTimes:
+    """The times between presented frames. `samples`: the times in ns."""
+
+    def __init__(self, sketch: Callable[[], Sketch] | None = None) -> None:
+        self.samples = Samples(sketch)
+        self._last_ns = self._steps_ns = 0
+        self._average = self._least = self._most = 0.0
+        self._blocks: list[float] = []
+        self._block_frames = 1
+        self._open_ns = self._open_frames = 0
+
+    def add(self, interval_ns: int) -> None:
+        """Add the time from one presented frame to the next."""
+        number = self.samples.count
+        if number:
+            self._steps_ns += abs(interval_ns - self._last_ns)
+            self._average += WEIGHT * (interval_ns - self._average)
+        else:
+            self._average = float(interval_ns)
+        if number < SPAN:
+            self._least = self._most = self._average
+        else:
+            self._least, self._most = min(self._least, self._average), max(self._most, self._average)
+        self._last_ns = interval_ns
+        self.samples.add(interval_ns)
+        self._add_to_block(interval_ns)
+
+    def row(self) -> dict[str, float | None]:
+        """Return `frame_time_ms` of a report: summary, exponential average, jitter, interval of the mean.
+
+        The average over SPAN frames (weight 2 / (SPAN + 1)) counts from frame SPAN on, if there are that many. Jitter
+        is the mean absolute difference of successive times.
+        """
+        return {
+            **self.samples.summary_ms(),
+            f"ema{SPAN}_min": round(self._least / NS_PER_MS, 6),
+            f"ema{SPAN}_max": round(self._most / NS_PER_MS, 6),
+            "jitter": round(self._steps_ns / max(self.samples.count - 1, 1) / NS_PER_MS, 6),
+            **frame_interval_ms(self._interval()),
+        }
+
+    def fps_interval(self) -> dict[str, float | None]:
+        """Return `fps_low` and `fps_high` of a report."""
+        return fps_interval(self._interval())
+
+    def _interval(self) -> tuple[float, float] | None:
+        if self.samples.is_exact:
+            return mean_interval(self.samples.kept)
+        return mean_interval(self._blocks, self.samples.mean)
+
+    def _add_to_block(self, interval_ns: int) -> None:
+        self._open_ns += interval_ns
+        self._open_frames += 1
+        if self._open_frames == self._block_frames:
+            self._blocks.append(self._open_ns / self._open_frames)
+            self._open_ns = self._open_frames = 0
+        if len(self._blocks) == MOST_BLOCKS:
+            # Two neighbours become one block, so that the memory stays bounded.
+            pairs = zip(self._blocks[::2], self._blocks[1::2], strict=True)
+            self._blocks = [(before + after) / 2 for before, after in pairs]
+            self._block_frames *= 2
+
+
+class Lateness:
+    """How late frames were.
+
+    `count`: number of frames that had a deadline.
+    `missed`: number of frames that came after it.
+    """
+
+    def __init__(self) -> None:
+        self.count = self.missed = 0
+        self._score = 0.0
+
+    def add(self, late_ns: int) -> None:
+        """Add a frame that came `late_ns` after its deadline, or before it if that is negative."""
+        self.count += 1
+        self.missed += late_ns > 0
+        self._score += 1 / (1 + exp(min(SCORE_PER_MS * late_ns / NS_PER_MS, LARGEST_EXPONENT)))
+
+    @property
+    def real_time_score(self) -> float | None:
+        """The mean of 1 / (1 + e^(15 l)), l the lateness of a frame in ms: 1 in time, 0 late, None for no frame.
+
+        Kwon et al., XRBench, MLSys 2023, section 3.
+        """
+        return self._score / self.count if self.count else None

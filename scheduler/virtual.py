@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from heapq import heappop, heappush
 from typing import Any, Final
 
-from trilane.scheduler.causes import Outcome
-from trilane.scheduler.core import Core
+from trilane.scheduler.core import Core, run_loop
 from trilane.scheduler.events import (
     NEVER,
     Action,
@@ -22,13 +21,13 @@ from trilane.scheduler.events import (
     Job,
     JobDone,
     Kill,
+    Outcome,
     Settings,
     Start,
     UnitDied,
     UnitReady,
 )
 from trilane.scheduler.ledger import Books, JobRecord
-from trilane.scheduler.loop import run_loop
 from trilane.scheduler.recording import Recording
 
 #: (stage, unit, frame, begin_ns) -> service time in ns.
@@ -71,7 +70,7 @@ class _VirtualUnit:
 
 
 class VirtualDriver:
-    """The clock of simulated time (loop.py), and the core that it runs."""
+    """The clock of simulated time (`core.Clock`), and the core that it runs."""
 
     def __init__(
         self,

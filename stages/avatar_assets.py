@@ -20,7 +20,7 @@ from trilane.avatars.bundle import Bundle
 from trilane.avatars.network_file import NetworkFile, check_network
 from trilane.body.body import Body, ShapedBody
 from trilane.errors import BadInputError
-from trilane.pipeline.shared_assets import Assets
+from trilane.pipeline.memory import Assets
 from trilane.scene.staging import Staged, staged_from_arrays, staged_to_arrays
 from trilane.stages.config import RunConfig
 from trilane.stages.gpu.packed_pass import Quantisation

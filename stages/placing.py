@@ -32,19 +32,17 @@ from trilane.hw_profiles.host import (
     unit_rows,
     usable_cores,
 )
-from trilane.pipeline.other_programs import OtherPrograms
 from trilane.pipeline.rehearsal import Rehearsed
+from trilane.pipeline.surroundings import OtherPrograms
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.scheduler.placement import Ranked, chosen, fastest, ranked, typical, worth_trying
-from trilane.scheduler.placement_model import Rules, frame_ns
+from trilane.scheduler.placement import Ranked, Rules, chosen, fastest, frame_ns, ranked, typical, worth_trying
 from trilane.scheduler.places import Core, Place, Placement, Times, Work
-from trilane.scheduler.stats import NS_PER_MS
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.avatar_pipeline import measured_times, thread_counts, tried
 from trilane.stages.configure import Checked
 from trilane.stages.dsp.runtime import RUNTIMES
 from trilane.stages.machine_facts import cpu_facts, versions_with
-from trilane.units import BEFORE_INFER, UNITS
+from trilane.units import BEFORE_INFER, NS_PER_MS, UNITS
 
 #: Least number of frames; shorter runs gain less than a rehearsal costs.
 LEAST_FRAMES = 100

@@ -21,8 +21,8 @@ from trilane.pipeline.journal import Begun, Counted, Ended, Record, Worked, read
 from trilane.pipeline.timeline import Presented, Timeline
 from trilane.pipeline.unit_history import BUSY, IDLE_CAUSES, OVERHEAD, PREEMPTED, IdleSlice
 from trilane.scheduler.ledger import JobRecord
+from trilane.units import NS_PER_MS
 
-NS_PER_MS = 1e6
 STATES = (BUSY, *IDLE_CAUSES)
 INSTRUCTIONS, INSTRUCTION_TIME = "instructions", "time of an instruction"
 #: Figures of jobs that stages report or the processor counts -> their measures here.

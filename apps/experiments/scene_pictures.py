@@ -20,8 +20,7 @@ from trilane.bench.lib.full_picture import FullPictures
 from trilane.bench.lib.layers import Box
 from trilane.bench.lib.stage_chain import StageChain, units_of
 from trilane.errors import BadInputError
-from trilane.pipeline.core_meter import CoreMeter
-from trilane.pipeline.core_shares import preempted_ns
+from trilane.pipeline.job_times import CoreMeter, preempted_ns
 from trilane.pipeline.stage import UnitContext
 from trilane.shapes import Shape
 from trilane.stages.avatar_pipeline import avatar_pipeline

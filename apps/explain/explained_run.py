@@ -18,13 +18,12 @@ from trilane.apps.run.report import Report, read_report
 from trilane.apps.watch.followed_run import CUT_OFF, FollowedRun, RunState
 from trilane.errors import BadInputError, MissingPartError
 from trilane.figure_sources import COMPUTED, MEASURED
-from trilane.pipeline.critical_path import WHATS, Part
+from trilane.pipeline.critical_path import WHATS, Part, Taken
 from trilane.pipeline.journal import NAME, Begun, Ended, Record, Worked, config_of, journal_in, read_journal
 from trilane.pipeline.reckoning import Reckoning, places_of
-from trilane.pipeline.sharing import Taken
 from trilane.pipeline.timeline import ExplainedJob, Timeline
 from trilane.pipeline.unit_history import PREEMPTED
-from trilane.scheduler.stats import NS_PER_MS
+from trilane.units import NS_PER_MS
 from trilane.writing import write_atomically
 
 SCHEMA = 1

@@ -26,12 +26,11 @@ from trilane.hw_profiles.profile_files import HOST, load_runnable
 from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.scene.planner import ALL_WORK, MOST_DENSITY, FrameWork
 from trilane.scheduler.placement import Ranked
-from trilane.scheduler.stats import NS_PER_MS
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, network_of, shaped_body
 from trilane.stages.configure import Checked
 from trilane.stages.cpu.pose import FramePlan
-from trilane.units import UNITS, UnitName
+from trilane.units import NS_PER_MS, UNITS, UnitName
 
 #: What every plan is compared with: the square that the reference application fills.
 FIXED: Shape = (512, 512)

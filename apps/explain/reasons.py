@@ -20,14 +20,14 @@ from trilane.pipeline.critical_path import (
     WORK,
     Part,
     Paths,
+    Sharing,
     parts,
 )
-from trilane.pipeline.sharing import Sharing
 from trilane.pipeline.timeline import ExplainedJob, Presented
 from trilane.pipeline.unit_history import DOWN, HELD, LOST, OVERHEAD, PREEMPTED, THROTTLED
 from trilane.scheduler.events import Graph
 from trilane.scheduler.ledger import JobRecord
-from trilane.scheduler.stats import NS_PER_MS
+from trilane.units import NS_PER_MS
 
 DELAY: Final = 16  # presented frames; by then all jobs beside those of a frame have ended
 MOST_SAMPLES: Final = 4096

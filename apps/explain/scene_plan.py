@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw
 from trilane.arrays import F64
 from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import CpuSkinner
-from trilane.pipeline.shared_assets import Assets
+from trilane.pipeline.memory import Assets
 from trilane.scene.crop import Rect
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, shaped_body, staged_of

@@ -76,7 +76,7 @@ def _governors() -> tuple[str, ...]:
 
 
 def _turns() -> tuple[str, ...]:
-    from trilane.scheduler.turns import TURNS
+    from trilane.scheduler.shared_units import TURNS
 
     return tuple(TURNS)
 

@@ -20,7 +20,6 @@ from trilane.hw_profiles.network_time import price
 from trilane.hw_profiles.network_work import Network, count_work
 from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.scheduler.stats import NS_PER_MS
 from trilane.stages import PRELOAD
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.avatar_pipeline import one_shape
@@ -29,7 +28,7 @@ from trilane.stages.dsp.bare_calls import calls_of
 from trilane.stages.machine_facts import gl_facts
 from trilane.stages.placing import rehearsed
 from trilane.stages.run_options import RunOptions
-from trilane.units import BURST
+from trilane.units import BURST, NS_PER_MS
 
 MEASURING = "measuring {} on this machine: at most half a minute, once for this machine and these packages ..."
 #: A call that is expected to take longer is not tried: warm-up and counted calls would take more than was said.

@@ -22,7 +22,7 @@ from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import corners_of
 from trilane.scheduler.events import Settings
 from trilane.scheduler.ledger import JobRecord
-from trilane.scheduler.release import run_settings
+from trilane.scheduler.policy import run_settings
 from trilane.scheduler.virtual import simulate
 from trilane.stages.config import RunConfig
 from trilane.units import BEFORE_INFER, BYPASS, SUSTAINED

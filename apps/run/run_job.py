@@ -28,10 +28,9 @@ from trilane.errors import TrilaneError
 from trilane.hw_profiles.governor import Governor
 from trilane.hw_profiles.profile_files import load_runnable
 from trilane.pipeline import journal
-from trilane.pipeline.controls import RunControls
+from trilane.pipeline.controls import Interrupts, RunControls
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run_record import JournalFile
-from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.policy import policy_named
 from trilane.stages.avatar_pipeline import run_avatar

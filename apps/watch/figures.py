@@ -12,7 +12,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-NS_PER_S = 1e9
+from trilane.units import NS_PER_S
+
 #: Upper bounds in seconds: a few to each halving of the rate between 200 and 10 frames a second, fewer on both sides.
 BOUNDS_S = (
     *(0.001, 0.002, 0.003, 0.004, 0.005, 0.006, 0.008),

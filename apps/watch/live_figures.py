@@ -32,10 +32,10 @@ from trilane.pipeline.timeline import Done, ExplainedJob, Presented, Timeline
 from trilane.pipeline.unit_history import BUSY, IDLE_CAUSES, NAMES, OVERHEAD, PREEMPTED
 from trilane.scheduler.events import NEVER, Finish, JobDone, Start
 from trilane.scheduler.ledger import STARVED
-from trilane.scheduler.stats import NS_PER_MS, summary_ms
+from trilane.scheduler.stats import summary_ms
+from trilane.units import NS_PER_MS, NS_PER_S
 
 WINDOW_NS: Final = 5_000_000_000
-NS_PER_S: Final = 1e9
 MOST_NOTES = 5
 BYTES, LEAST = "bytes_", "least"  # bytes that a stage moved, and those that would have done
 LEAST_KEY = f"stages.*.bytes.{LEAST}"

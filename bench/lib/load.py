@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from trilane.errors import TrilaneError
-from trilane.pipeline.requests import FrameRequestQueue
+from trilane.pipeline.controls import FrameRequestQueue
 
 CONFIDENCE = 0.99
 WARM_UP = 8

@@ -16,7 +16,7 @@ from typing import Any
 
 from trilane.bench.lib.load import WARM_UP, Load, Queries, queries_needed
 from trilane.errors import MissingPartError, TrilaneError
-from trilane.pipeline.requests import FrameRequestQueue
+from trilane.pipeline.controls import FrameRequestQueue
 
 NAMES = {"single-stream": "SingleStream", "multi-stream": "MultiStream", "server": "Server", "offline": "Offline"}
 VERDICT = re.compile(r"^Result is : (\w+)", re.MULTILINE)

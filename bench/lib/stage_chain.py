@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import U8
-from trilane.pipeline.bound_stage import BoundStage
 from trilane.pipeline.description import Pipeline
-from trilane.pipeline.shared_assets import Assets
+from trilane.pipeline.memory import Assets
 from trilane.pipeline.stage import Skip, UnitContext
-from trilane.pipeline.unit_loop import factory_named
+from trilane.pipeline.unit_loop import BoundStage, factory_named
 from trilane.scene.planner import FrameWork
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.avatar_pipeline import avatar_pipeline

@@ -5,6 +5,9 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Literal, get_args
 
+#: Nanoseconds in a millisecond and in a second.
+NS_PER_MS, NS_PER_S = 1e6, 1e9
+
 UnitName = Literal["cpu", "gpu", "dsp"]
 UNITS: tuple[UnitName, ...] = get_args(UnitName)
 

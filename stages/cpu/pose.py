@@ -24,8 +24,7 @@ from trilane.body.kinematics import Posed, Skeleton
 from trilane.body.skinning import DETAILS, DetailBounds, FrameSkinner
 from trilane.errors import TrilaneError
 from trilane.machine import moved_of_kept
-from trilane.pipeline.moved_bytes import ByteCounter
-from trilane.pipeline.shared_assets import Assets
+from trilane.pipeline.memory import Assets, ByteCounter
 from trilane.pipeline.stage import Skip, UnitContext
 from trilane.scene.camera_placement import steered
 from trilane.scene.crop import SCREEN, Rect, cheapest_within, error_px, least_w

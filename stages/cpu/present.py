@@ -22,7 +22,7 @@ from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from numpy.typing import NDArray
 
 from trilane.arrays import U8
-from trilane.pipeline.moved_bytes import ByteCounter
+from trilane.pipeline.memory import ByteCounter
 from trilane.pipeline.stage import UnitContext
 from trilane.stages.config import RunConfig
 from trilane.transport.packets import Packet

@@ -26,7 +26,7 @@ from trilane.avatars.network_split import NetworkPart, Shapes, split
 from trilane.cache import Arrays, cached_arrays
 from trilane.errors import BadInputError
 from trilane.machine import moved_of_kept
-from trilane.pipeline.moved_bytes import ByteCounter
+from trilane.pipeline.memory import ByteCounter
 from trilane.pipeline.stage import UnitContext
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import network_of

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from trilane.arrays import U8, Floats
 from trilane.errors import EGL_LINE, MissingPartError, TrilaneError, UnitLostError
-from trilane.pipeline.moved_bytes import ByteCounter
+from trilane.pipeline.memory import ByteCounter
 
 REQUIRED_VERSION = 330
 CONTEXT = "OpenGL context"  # key of the context among what the stages of the unit share

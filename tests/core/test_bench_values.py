@@ -17,7 +17,7 @@ from trilane.bench.lib.float_raster import quantise, rasterise, sample
 from trilane.bench.lib.limits import LIMITS, check_limits
 from trilane.bench.lib.load import Load, Queries
 from trilane.errors import BadInputError, TrilaneError
-from trilane.pipeline.requests import FrameRequestQueue
+from trilane.pipeline.controls import FrameRequestQueue
 from trilane.pipeline.run_metrics import StageTimes, TimeSummary
 from trilane.scheduler.events import Settings, chain
 from trilane.scheduler.ledger import JobRecord

@@ -13,7 +13,7 @@ from trilane.bench.lib.avatar_process import Asked, Ran
 from trilane.errors import TrilaneError
 from trilane.hw_profiles.host import usable_cores
 from trilane.scheduler.ledger import JobRecord
-from trilane.scheduler.placement_model import SCHEDULER_NS
+from trilane.scheduler.placement import SCHEDULER_NS
 
 MS = 1_000_000
 #: Milliseconds of each stage; the first has less, for what the scheduler takes counts with it.

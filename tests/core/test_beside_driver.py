@@ -10,11 +10,10 @@ import pytest
 
 from support.plain_scheduler import drawn, service_of, skips_of, with_bypass
 from support.second_accounts import largest_difference, second_accounts
-from trilane.scheduler.beside import ONE, BesideDriver, Member, Runs, simulate_beside
 from trilane.scheduler.events import NEVER, SetDuty, Settings, Stop, chain
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.recording import replay
-from trilane.scheduler.turns import TURNS, Waiting
+from trilane.scheduler.shared_units import ONE, TURNS, BesideDriver, Member, Runs, Waiting, simulate_beside
 from trilane.scheduler.virtual import simulate
 from trilane.unexpected_value import UnexpectedValue
 

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from trilane.hw_profiles.application import application_graph
-from trilane.scheduler.beside import Member, simulate_beside
 from trilane.scheduler.events import Settings, Stop
+from trilane.scheduler.shared_units import Member, simulate_beside
 
 STEP_MS, SLOTS, MS = 0.1, 2, 1_000_000
 SECONDS, WARM = 4.0, 10

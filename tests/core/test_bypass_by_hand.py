@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from trilane.scheduler.completion import earliest_completion_ns
+from trilane.scheduler.assignment import earliest_completion_ns
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
     Dispatch,

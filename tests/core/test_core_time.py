@@ -9,10 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from trilane.pipeline.core_meter import CoreMeter
-from trilane.pipeline.core_shares import Lost, lost_in_job, most_preempted_ns, preempted_ns
 from trilane.pipeline.cpu_use import CpuTimes, use_of_cores
-from trilane.pipeline.job_times import HELD_NS, JOBS_PER_LOOK, LOSS_NS, JobClock
+from trilane.pipeline.job_times import (
+    HELD_NS,
+    JOBS_PER_LOOK,
+    LOSS_NS,
+    CoreMeter,
+    JobClock,
+    Lost,
+    lost_in_job,
+    most_preempted_ns,
+    preempted_ns,
+)
 from trilane.scheduler.events import JobDone
 from trilane.transport.messages import Done
 

@@ -7,15 +7,14 @@ from collections.abc import Iterator, Mapping
 
 import pytest
 
-from trilane.pipeline.core_shares import lost_in_job
-from trilane.pipeline.cpu_use import Efficiencies
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
+from trilane.pipeline.job_times import lost_in_job
 from trilane.pipeline.journal import Begun, records_of
-from trilane.pipeline.reckoning import Reckoned, places_of, reckoned
-from trilane.scheduler.beside import Member, simulate_beside
+from trilane.pipeline.reckoning import Efficiencies, Reckoned, places_of, reckoned
 from trilane.scheduler.events import Settings, chain
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.places import Place
+from trilane.scheduler.shared_units import Member, simulate_beside
 from trilane.scheduler.virtual import simulate
 
 ON_0, ON_1, ON_BOTH, FLOATS = Place((0,), 1), Place((1,), 1), Place((0, 1), 2), Place((0, 1), 1)

@@ -8,9 +8,8 @@ from itertools import pairwise
 
 import pytest
 
-from trilane.pipeline.critical_path import MARGIN, Budget, Paths, Piece, parts
+from trilane.pipeline.critical_path import MARGIN, Budget, Paths, Piece, Sharing, parts
 from trilane.pipeline.journal import journal_of
-from trilane.pipeline.sharing import Sharing
 from trilane.pipeline.timeline import ExplainedJob, Timeline
 from trilane.scheduler.events import Graph, Settings, chain
 from trilane.scheduler.ledger import JobRecord

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from trilane.pipeline.held_time import HeldTime
+from trilane.pipeline.realtime_clock import HeldTime
 from trilane.scheduler.events import Hold, Stop
 
 S = 1_000_000_000

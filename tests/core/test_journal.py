@@ -27,8 +27,7 @@ from trilane.pipeline.journal import (
     Worked,
     read_journal,
 )
-from trilane.scheduler.causes import Outcome, OutcomeKind
-from trilane.scheduler.events import Dispatch, Finish, Job, JobDone, Settings, UnitReady
+from trilane.scheduler.events import Dispatch, Finish, Job, JobDone, Outcome, OutcomeKind, Settings, UnitReady
 from trilane.scheduler.ledger import JobRecord
 
 SETTINGS = Settings(3, period_ns=9, works=(1000, 500), follow=("infer",))

@@ -16,7 +16,6 @@ from support.told_journal import told_journal
 from trilane.apps.watch.figures import DropCount, Figures, Moved, Shares
 from trilane.apps.watch.live_figures import LiveFigures
 from trilane.pipeline.journal import SCHEMA, Accounted, Begun, Counted, Ended, Record, Stepped, Worked, journal_of
-from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
     NEVER,
@@ -24,6 +23,8 @@ from trilane.scheduler.events import (
     FrameRequest,
     Graph,
     Hold,
+    Outcome,
+    OutcomeKind,
     SetDuty,
     Settings,
     StageSpec,

@@ -17,8 +17,8 @@ from trilane.avatars.network_file import reshaped
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import application_graph
 from trilane.hw_profiles.network_work import count_work
-from trilane.pipeline.bound_stage import hold_until
 from trilane.pipeline.description import UnitSettings
+from trilane.pipeline.unit_loop import hold_until
 from trilane.scene.schema import Scene
 from trilane.scheduler.events import Settings
 from trilane.scheduler.ledger import JobRecord

@@ -14,15 +14,11 @@ import pytest
 from support.small_pipeline import EDGES, OWN, STAGES, UNITS, ToldTime, packets, pipeline, spec_of
 from trilane import machine
 from trilane.errors import BadInputError, TrilaneError
-from trilane.pipeline import (
-    bound_stage,
-    shared_assets,
-)
-from trilane.pipeline.bound_stage import BoundStage
+from trilane.pipeline import memory, unit_loop
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
-from trilane.pipeline.regions import edge_regions
+from trilane.pipeline.memory import edge_regions
 from trilane.pipeline.stage import UnitContext
-from trilane.pipeline.unit_spec import UnitSpec
+from trilane.pipeline.unit_loop import BoundStage, UnitSpec
 from trilane.transport.packets import Packet, header_dtype
 
 MS = 1_000_000
@@ -88,7 +84,7 @@ def test_a_header_is_passed_on_whole_or_with_its_frame_alone(
 def test_all_fields_of_a_frame_are_copied_to_another_header() -> None:
     source, target = packets(OWN, 1)[0].header, packets(header_dtype(), 1)[0].header
     source["frame"], source["t_sampled_ns"], source["epoch"] = 1, 2, 3
-    bound_stage._copy_fields(source, target)
+    unit_loop._copy_fields(source, target)
     assert target.tolist() == (1, 2, 3)
 
 
@@ -120,19 +116,19 @@ def test_the_first_stage_is_told_of_another_rung_before_its_frame() -> None:
 
 def test_a_hold_sleeps_until_shortly_before_its_end_and_then_watches(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = ToldTime()
-    monkeypatch.setattr(bound_stage, "time", clock)
-    bound_stage.hold_until(7 * MS)
+    monkeypatch.setattr(unit_loop, "time", clock)
+    unit_loop.hold_until(7 * MS)
     assert clock.slept == [2 * MS - 1000 - 150_000]
     assert clock.now_ns == 7 * MS
-    bound_stage.hold_until(7 * MS + 151_000)  # 150 µs are left at the first look: too short to sleep
+    unit_loop.hold_until(7 * MS + 151_000)  # 150 µs are left at the first look: too short to sleep
     assert (len(clock.slept), clock.now_ns) == (1, 7 * MS + 151_000)
-    bound_stage.hold_until(clock.now_ns + 1001)  # at the first look a nanosecond is left
+    unit_loop.hold_until(clock.now_ns + 1001)  # at the first look a nanosecond is left
     assert clock.now_ns == 7 * MS + 153_000
 
 
 def test_a_job_is_held_for_its_pace_and_one_without_a_pace_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = ToldTime()
-    monkeypatch.setattr(bound_stage, "time", clock)
+    monkeypatch.setattr(unit_loop, "time", clock)
     start = clock.now_ns
     BoundStage("present", FakeStage(), packets(OWN, 1), [], 3 * MS, context()).run(0, 0, -1, 0)
     assert clock.now_ns == start + 1000 + 3 * MS
@@ -265,7 +261,7 @@ def test_what_two_stages_share_is_made_once() -> None:
 
 
 def test_assets_lie_on_pages_of_their_own_behind_the_index() -> None:
-    fd = shared_assets.share_assets({"a": np.arange(5000, dtype=np.uint8), "b": np.array([7], np.uint16)})
+    fd = memory.share_assets({"a": np.arange(5000, dtype=np.uint8), "b": np.array([7], np.uint16)})
     try:
         assert os.fstat(fd).st_size == 4 * 4096
         length = int.from_bytes(os.pread(fd, 8, 0), "little")
@@ -283,9 +279,9 @@ def test_assets_that_fit_to_the_byte_are_taken(monkeypatch: pytest.MonkeyPatch) 
         monkeypatch.setattr(machine.here, "free_bytes", lambda free=free: free)
         if is_refused:
             with pytest.raises(TrilaneError, match=r"^assets: found 0 MiB, expected at most 0 MiB, which are free$"):
-                shared_assets.share_assets({})
+                memory.share_assets({})
         else:
-            os.close(shared_assets.share_assets({}))
+            os.close(memory.share_assets({}))
 
 
 def test_assets_that_find_no_room_leave_no_file(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -295,5 +291,5 @@ def test_assets_that_find_no_room_leave_no_file(monkeypatch: pytest.MonkeyPatch)
     before = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
     monkeypatch.setattr(os, "posix_fallocate", full)
     with pytest.raises(TrilaneError, match=r"^assets: no room for 3 MiB: no space left on device$"):
-        shared_assets.share_assets({"a": np.zeros(3 << 20, np.uint8)})
+        memory.share_assets({"a": np.zeros(3 << 20, np.uint8)})
     assert len(os.listdir("/proc/self/fd")) == before  # noqa: PTH208

@@ -11,8 +11,7 @@ from random import Random
 
 import pytest
 
-from trilane.scheduler.placement import Ranked, ranked, worth_trying
-from trilane.scheduler.placement_model import Rules
+from trilane.scheduler.placement import Ranked, Rules, ranked, worth_trying
 from trilane.scheduler.places import Core, Placement, Times, Work
 
 STEP_MS, SLICE_MS, SLOTS, FRAMES, WARM = 0.1, 1.0, 2, 40, 10

@@ -27,7 +27,7 @@ CHANGING = {
     "apps.experiments.error_by_cause._Pooled",
     "hw_profiles.governor.ThermalState",
     "hw_profiles.governor.Throttle",
-    "pipeline.moved_bytes.ByteCounter",
+    "pipeline.memory.ByteCounter",
     "scene.motion.bvh.BvhJoint",
     "scene.motion.bvh._Hierarchy",
     "scene.motion.bvh._Words",

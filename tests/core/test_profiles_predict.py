@@ -28,7 +28,7 @@ from trilane.hw_profiles.predict import predict, predict_table, what_if
 from trilane.hw_profiles.profile_files import load_profile
 from trilane.hw_profiles.reference_networks import NetworkSpec, read_table, reference_network
 from trilane.hw_profiles.schema import Profile, corners_of
-from trilane.scheduler.placement_model import Rules
+from trilane.scheduler.placement import Rules
 from trilane.scheduler.places import Core, Place
 from trilane.units import UNITS, UnitName
 

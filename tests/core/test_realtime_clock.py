@@ -17,10 +17,8 @@ from trilane.errors import TrilaneError
 from trilane.pipeline import realtime_clock
 from trilane.pipeline.journal import Worked
 from trilane.pipeline.realtime_clock import RealtimeClock
-from trilane.pipeline.result import Failure
-from trilane.pipeline.run_log import RunLog
+from trilane.pipeline.result import Failure, RunLog
 from trilane.pipeline.unit_processes import UnitMessage
-from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
     NEVER,
@@ -32,6 +30,8 @@ from trilane.scheduler.events import (
     JobDone,
     JobFailed,
     Kill,
+    Outcome,
+    OutcomeKind,
     Pinged,
     Pong,
     SchedulerStalled,

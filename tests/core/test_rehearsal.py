@@ -10,7 +10,7 @@ import pytest
 from trilane.hw_profiles.host import described, placement_of, predictions, unit_rows
 from trilane.pipeline import rehearsal
 from trilane.pipeline.rehearsal import Chain, on_rungs, timed, works_of
-from trilane.pipeline.run_log import UnitError
+from trilane.pipeline.result import UnitError
 from trilane.scheduler.events import StageAlone, chain
 from trilane.scheduler.placement import Ranked
 from trilane.scheduler.places import Core, Place, Work

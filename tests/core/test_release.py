@@ -9,8 +9,7 @@ import pytest
 from trilane.hw_profiles.application import Variant, settings_of
 from trilane.pipeline import run
 from trilane.scheduler.events import Settings
-from trilane.scheduler.policy import POLICIES
-from trilane.scheduler.release import run_settings
+from trilane.scheduler.policy import POLICIES, run_settings
 from trilane.unexpected_value import UnexpectedValue
 
 MS = 1_000_000

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from trilane.scheduler import events
-from trilane.scheduler.causes import DropCause, LossKind, Outcome, OutcomeKind
+from trilane.scheduler.events import DropCause, LossKind, Outcome, OutcomeKind
 from trilane.scheduler.policy import POLICIES
 from trilane.transport.slots import RULES
 

@@ -19,20 +19,11 @@ import pytest
 from support.small_pipeline import ToldTime, pipeline
 from trilane import machine
 from trilane.errors import BadInputError, TrilaneError
-from trilane.pipeline import (
-    lifecycle,
-    preconditions,
-    run,
-    run_log,
-    surroundings,
-)
-from trilane.pipeline.lifecycle import close_units, listen_before_run, start_units
-from trilane.pipeline.requests import FrameRequestQueue
-from trilane.pipeline.result import Failure
-from trilane.pipeline.run_log import RunLog, UnitError, after_stderr
-from trilane.pipeline.signals import Interrupts
-from trilane.pipeline.unit_processes import UnitMessage
-from trilane.scheduler import release
+from trilane.pipeline import result, run, surroundings, unit_processes
+from trilane.pipeline.controls import FrameRequestQueue, Interrupts
+from trilane.pipeline.result import Failure, RunLog, UnitError, after_stderr
+from trilane.pipeline.unit_processes import UnitMessage, close_units, listen_before_run, start_units
+from trilane.scheduler import policy
 from trilane.scheduler.events import FrameRequest, Settings, Stop
 from trilane.transport.messages import (
     Close,
@@ -54,7 +45,7 @@ def test_ninety_six_open_files_are_enough(monkeypatch: pytest.MonkeyPatch, limit
         if is_enough
         else pytest.raises(TrilaneError, match=r"limit of 95, expected at least 96")
     ):
-        preconditions.check_open_files()
+        surroundings.check_open_files()
     assert asked == [resource.RLIMIT_NOFILE]
 
 
@@ -62,27 +53,27 @@ def test_cores_that_are_not_there_are_named(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(machine.here, "cores", lambda: (0, 1))
     said = r"^cores of unit right: found 3, expected some of this process's: 0, 1$"
     with pytest.raises(BadInputError, match=said):
-        preconditions.check_cores(pipeline())
+        surroundings.check_cores(pipeline())
     monkeypatch.setattr(machine.here, "cores", lambda: (0, 1, 3))
-    preconditions.check_cores(pipeline())
+    surroundings.check_cores(pipeline())
 
 
 def test_only_finite_values_above_0_are_positive() -> None:
-    preconditions.check_positive(a=None, b=1e-9, c=5)
+    surroundings.check_positive(a=None, b=1e-9, c=5)
     for value in (0, -1, math.inf, math.nan):
         with pytest.raises(BadInputError, match=rf"fps: found {value}, expected more than 0"):
-            preconditions.check_positive(frames=1, fps=value)
+            surroundings.check_positive(frames=1, fps=value)
 
 
 def test_a_run_is_refused_where_a_unit_imports_its_stages(monkeypatch: pytest.MonkeyPatch) -> None:
-    preconditions.refuse_in_a_unit()
+    surroundings.refuse_in_a_unit()
     monkeypatch.setitem(sys.modules, "__main__", SimpleNamespace(__spec__=None))
-    preconditions.refuse_in_a_unit()
+    surroundings.refuse_in_a_unit()
     monkeypatch.setitem(
         sys.modules, "__main__", SimpleNamespace(__spec__=SimpleNamespace(name="trilane.pipeline.fork_server"))
     )
     with pytest.raises(BadInputError, match=r"^run_pipeline: found run_pipeline was called while a unit imported"):
-        preconditions.refuse_in_a_unit()
+        surroundings.refuse_in_a_unit()
 
 
 def test_the_first_failure_stands_and_every_message_is_said() -> None:
@@ -99,7 +90,7 @@ def test_the_first_failure_stands_and_every_message_is_said() -> None:
     assert (quiet.failure, quiet.messages) == (Failure("five", 1), ["six"])
     assert (UnitError("x").exit_code, UnitError("x", 4).exit_code, str(UnitError("x"))) == (1, 4, "x")
     assert (after_stderr("a\nb\n"), after_stderr("")) == ("it wrote last: b", "")
-    assert run_log.Failure("x").exit_code == 1
+    assert result.Failure("x").exit_code == 1
 
 
 def test_requests_come_in_order_wake_the_run_and_end_with_it() -> None:
@@ -199,7 +190,7 @@ NOBODY: Any = SimpleNamespace(count=0)
 
 def test_units_are_started_all_at_once_and_waited_for_until_the_last_is_ready(monkeypatch: pytest.MonkeyPatch) -> None:
     """Started at 5.001 and 5.002 ms; looks at 5.003 (the end), 5.004, 5.005 (left), 5.006, 5.007 (right)."""
-    monkeypatch.setattr(lifecycle, "time", ToldTime())
+    monkeypatch.setattr(unit_processes, "time", ToldTime())
     processes: Any = FakeProcesses([[("left", Ready(4))], [], [("right", Ready(5))]])
     took = start_units(processes, ["left", "right"], NOBODY)
     assert {unit: round(ms, 6) for unit, ms in took.items()} == {"left": 0.004, "right": 0.006}
@@ -210,7 +201,7 @@ def test_units_that_are_not_ready_in_time_are_named(monkeypatch: pytest.MonkeyPa
     clock = ToldTime()
     processes: Any = FakeProcesses()
     processes.listen = lambda _: clock.sleep(60.1) or []
-    monkeypatch.setattr(lifecycle, "time", clock)
+    monkeypatch.setattr(unit_processes, "time", clock)
     with pytest.raises(UnitError, match=r"^unit a, b was not ready after 120 s$"):
         start_units(processes, ["b", "a"], NOBODY)
     assert len(clock.slept) == 2
@@ -250,7 +241,7 @@ def test_a_unit_that_fails_or_ends_while_it_closes_is_said() -> None:
 
 def test_units_that_do_not_close_are_named_unless_somebody_has_lost_patience(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = ToldTime()
-    monkeypatch.setattr(lifecycle, "time", clock)
+    monkeypatch.setattr(unit_processes, "time", clock)
     script = [[], []]
     monkeypatch.setattr(FakeProcesses, "listen", lambda self, _: clock.sleep(15.1) or self.script.popleft())
     _, log = closed(script)
@@ -278,7 +269,7 @@ def test_settings_follow_from_policy_and_rate() -> None:
     assert run._settings("pipelined", 9, 30.0, None, 5, 0.0, requests).asked
     with pytest.raises(BadInputError, match=r"^the run's settings: found policy 'no'"):
         run._settings("no", 9, 30.0, None, 5, 0.0, None)
-    assert (run.HANG_NS, release.DEADLINE_PERIODS) == (10 * 10**9, 3)
+    assert (run.HANG_NS, policy.DEADLINE_PERIODS) == (10 * 10**9, 3)
 
 
 def test_the_scheduler_is_on_its_cores_and_back_afterwards() -> None:

@@ -9,12 +9,10 @@ from math import exp
 import numpy as np
 import pytest
 
-from trilane.pipeline.sketch import RELATIVE_ERROR, DdSketch
+from trilane.pipeline.run import RELATIVE_ERROR, DdSketch
 from trilane.scheduler.events import NEVER, chain
-from trilane.scheduler.frame_times import MOST_BLOCKS, FrameTimes
 from trilane.scheduler.ledger import Books, Ledger
-from trilane.scheduler.samples import MOST_EXACT, MOVED_AT_ONCE, Samples
-from trilane.scheduler.stats import summary_ms
+from trilane.scheduler.stats import MOST_BLOCKS, MOST_EXACT, MOVED_AT_ONCE, FrameTimes, Samples, summary_ms
 
 RANKS = (50, 90, 95, 99)
 

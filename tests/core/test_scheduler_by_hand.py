@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 
-from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
     NEVER,
@@ -20,6 +19,8 @@ from trilane.scheduler.events import (
     JobDone,
     JobFailed,
     Kill,
+    Outcome,
+    OutcomeKind,
     Pinged,
     Pong,
     SchedulerStalled,

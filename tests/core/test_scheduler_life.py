@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from trilane.hw_profiles.application import application_graph
-from trilane.scheduler import watchdog
+from trilane.scheduler import state as watchdog
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
     NEVER,
@@ -23,9 +23,9 @@ from trilane.scheduler.events import (
     UnitDied,
     UnitReady,
 )
-from trilane.scheduler.state import HELD_JOBS, UnitState
-from trilane.scheduler.unit_life import (
+from trilane.scheduler.state import (
     DOWN,
+    HELD_JOBS,
     IGNORED,
     READY,
     REFUSED,
@@ -35,6 +35,7 @@ from trilane.scheduler.unit_life import (
     TABLE,
     DeadlinePassed,
     UnitLifeError,
+    UnitState,
     state_after,
 )
 

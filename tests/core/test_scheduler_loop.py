@@ -8,24 +8,28 @@ import pytest
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import application_graph
-from trilane.scheduler.causes import Drop, DropCause, Loss, LossKind, Outcome, OutcomeKind
-from trilane.scheduler.core import Core
+from trilane.scheduler.core import Core, run_loop
 from trilane.scheduler.events import (
     NEVER,
     Abort,
     Action,
     Dispatch,
+    Drop,
+    DropCause,
     Event,
     Finish,
     FrameRequest,
     JobDone,
+    Loss,
+    LossKind,
+    Outcome,
+    OutcomeKind,
     Settings,
     Stop,
     UnitDied,
     UnitReady,
     chain,
 )
-from trilane.scheduler.loop import run_loop
 from trilane.scheduler.recording import Recording, read, replay
 from trilane.scheduler.virtual import simulate
 

@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trilane.pipeline.run_metrics import FrameCounts
-from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
     Abort,
@@ -21,6 +20,8 @@ from trilane.scheduler.events import (
     Hold,
     Job,
     JobDone,
+    Outcome,
+    OutcomeKind,
     Settings,
     StageSpec,
     Stop,

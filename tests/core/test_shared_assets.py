@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from trilane.errors import TrilaneError
-from trilane.pipeline.shared_assets import map_assets, share_assets
+from trilane.pipeline.memory import map_assets, share_assets
 
 ASSETS: dict[str, NDArray[Any]] = {
     "weights": np.arange(5000, dtype=np.float32).reshape(50, 100),

@@ -11,8 +11,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilane.scheduler.frame_times import SPAN, FrameTimes, Lateness
-from trilane.scheduler.stats import energy_score, median_interval, percentile, samples_needed, summary_ms
+from trilane.scheduler.stats import (
+    SPAN,
+    FrameTimes,
+    Lateness,
+    energy_score,
+    median_interval,
+    percentile,
+    samples_needed,
+    summary_ms,
+)
 
 TIMES = st.lists(st.integers(0, 10**12), min_size=1, max_size=60)
 

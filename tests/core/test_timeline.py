@@ -6,7 +6,6 @@ from collections.abc import Iterable
 
 from trilane.pipeline.journal import Counted, Record, Stepped
 from trilane.pipeline.timeline import Done, Fact, Gone, Presented, Timeline
-from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.events import (
     Dispatch,
     Event,
@@ -16,6 +15,8 @@ from trilane.scheduler.events import (
     Job,
     JobDone,
     Kill,
+    Outcome,
+    OutcomeKind,
     Settings,
     StageSpec,
     UnitDied,

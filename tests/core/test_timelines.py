@@ -16,8 +16,7 @@ import pytest
 
 from trilane.scheduler.events import chain
 from trilane.scheduler.ledger import JobRecord
-from trilane.scheduler.policy import POLICIES
-from trilane.scheduler.release import run_settings
+from trilane.scheduler.policy import POLICIES, run_settings
 from trilane.scheduler.virtual import Simulation, simulate
 
 NS_PER_MS = 1_000_000

@@ -43,7 +43,6 @@ from trilane.pipeline.journal import (
     journal_of,
 )
 from trilane.pipeline.timeline import Gone, Presented, Timeline
-from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
     Abort,
@@ -54,6 +53,8 @@ from trilane.scheduler.events import (
     Hold,
     Job,
     JobDone,
+    Outcome,
+    OutcomeKind,
     Settings,
     StageSpec,
     Stop,

@@ -10,8 +10,7 @@ import pytest
 
 from trilane import machine
 from trilane.pipeline import trial
-from trilane.pipeline.result import Failure
-from trilane.pipeline.run_log import UnitError
+from trilane.pipeline.result import Failure, UnitError
 from trilane.pipeline.trial import DRAIN, SKIPPED, SLICE, Group
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import Settings, chain

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from trilane.scheduler.events import Settings, chain
-from trilane.scheduler.uncertainty import T_975, fps_interval, frame_interval_ms, mean_interval
+from trilane.scheduler.stats import T_975, fps_interval, frame_interval_ms, mean_interval
 from trilane.scheduler.virtual import simulate
 
 #: Five batches of ten frames with the means 10, 12, 11, 13, 14: mean 12, variance (4 + 0 + 1 + 1 + 4) / 4 = 2.5, so the

@@ -15,11 +15,9 @@ from trilane import machine
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host import asked_cores, host_cores, rule_placement, settings_of
 from trilane.machine import Machine
-from trilane.scheduler import placement_model, places
-from trilane.scheduler.placement import Ranked, chosen, fastest, ranked, typical, worth_trying
-from trilane.scheduler.placement_list import placements
-from trilane.scheduler.placement_model import Rules, frame_ns
-from trilane.scheduler.places import Core, Place, Placement, Times, Work, busiest_core_ns
+from trilane.scheduler import placement, places
+from trilane.scheduler.placement import Ranked, Rules, chosen, fastest, frame_ns, ranked, typical, worth_trying
+from trilane.scheduler.places import Core, Place, Placement, Times, Work, busiest_core_ns, placements
 
 MS = 1_000_000
 FIRST = Rules("cpu")
@@ -30,8 +28,8 @@ ALONE, TWO = Place((0,), 1), Place((1,), 1)
 def without_costs(monkeypatch: pytest.MonkeyPatch) -> None:
     """By hand, nothing but the work counts; one test is about the costs."""
     for name in ("SCHEDULER_NS", "CHANGE_NS", "MOVE_NS"):
-        monkeypatch.setattr(placement_model, name, 0)
-    monkeypatch.setattr(placement_model, "ROOM_USED", 1.0)
+        monkeypatch.setattr(placement, name, 0)
+    monkeypatch.setattr(placement, "ROOM_USED", 1.0)
 
 
 def equal(count: int) -> list[Core]:
@@ -168,12 +166,12 @@ def test_a_device_needs_its_core_only_to_be_told() -> None:
 
 def test_what_a_change_of_threads_a_move_and_the_scheduler_take(monkeypatch: pytest.MonkeyPatch) -> None:
     of = times(5, 10, 20)  # two, two and one jobs
-    monkeypatch.setattr(placement_model, "CHANGE_NS", MS)
+    monkeypatch.setattr(placement, "CHANGE_NS", MS)
     assert [ms(on(0, 0, 1), of, equal(2)), ms(on(0, 1, 0), of, equal(2))] == [20, 28]
-    monkeypatch.setattr(placement_model, "MOVE_NS", 2 * MS)
+    monkeypatch.setattr(placement, "MOVE_NS", 2 * MS)
     assert ms(on(0, 1, (0, 1)), of, equal(2)) == 20 + 1 + 2  # its one job, and the move of a frame
     assert ms(on(0, 0, (0, 1)), of, equal(2)) == 20  # it stays on core 1, where nobody else is
-    monkeypatch.setattr(placement_model, "SCHEDULER_NS", 4 * MS)
+    monkeypatch.setattr(placement, "SCHEDULER_NS", 4 * MS)
     assert ms(on(0, 0, 1), of, equal(2)) == 5 + 10 + 4 + 5 * 4
     assert ms(on(0, 0, 1), of, equal(2), Rules("dsp")) == 20 + 5 * 4
     assert ms(on(0, 1, 2), of, equal(3), Rules("cpu", sequential=True)) == 35 + 5 * 4
@@ -182,7 +180,7 @@ def test_what_a_change_of_threads_a_move_and_the_scheduler_take(monkeypatch: pyt
 def test_a_unit_that_floats_stays_where_nobody_else_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """And what it leaves may be the core where another one that floats can stay."""
     for name, value in (("MOVE_NS", 99 * MS), ("ROOM_USED", 0.5)):
-        monkeypatch.setattr(placement_model, name, value)
+        monkeypatch.setattr(placement, name, value)
     of = times(6, 13, 7)
     assert ms(on(0, (0, 1), 0), of, equal(2)) == ms(on(0, 1, 0), of, equal(2)) == 13
     assert ms(on((0, 1), (1, 2), 0), of, equal(3)) == 13  # the GPU unit on core 2, then the CPU unit on core 1
@@ -190,7 +188,7 @@ def test_a_unit_that_floats_stays_where_nobody_else_is(monkeypatch: pytest.Monke
 
 
 def test_of_what_cores_can_do_for_units_that_float_a_tenth_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(placement_model, "ROOM_USED", 0.9)
+    monkeypatch.setattr(placement, "ROOM_USED", 0.9)
     of = times(9, 9, 9)
     assert ms(on((0, 1), 0, 1), of, equal(2)) == 15  # 27 / 2 / 0.9
     assert ms(on(0, 0, 1), of, equal(2)) == 18

@@ -13,7 +13,7 @@ import pytest
 from support.small_pipeline import OWN, pipeline
 from trilane.errors import TrilaneError
 from trilane.pipeline import unit_processes
-from trilane.pipeline.regions import EdgeRegion
+from trilane.pipeline.memory import EdgeRegion
 from trilane.pipeline.unit_processes import UnitProcesses
 from trilane.transport.packets import header_dtype
 

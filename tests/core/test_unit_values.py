@@ -20,16 +20,12 @@ import pytest
 from support.small_pipeline import OWN, STAGES, UNITS, packets, pipeline, spec_of
 from trilane import machine
 from trilane.errors import BadInputError, MissingPartError, TrilaneError, UnitLostError
-from trilane.pipeline import (
-    shared_assets,
-    unit_loop,
-)
-from trilane.pipeline.bound_stage import BoundStage
+from trilane.pipeline import memory, unit_loop
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.job_times import LOSS_NS
-from trilane.pipeline.regions import edge_regions
+from trilane.pipeline.memory import edge_regions
 from trilane.pipeline.stage import UnitContext
-from trilane.pipeline.unit_spec import UnitSpec
+from trilane.pipeline.unit_loop import BoundStage, UnitSpec
 from trilane.transport.messages import (
     Close,
     Closed,
@@ -271,7 +267,7 @@ def test_stages_are_built_in_order_on_the_slots_of_their_edges(tmp_path: Path, m
     before = list(sys.path)
     monkeypatch.setattr(sys, "path", list(before))
     monkeypatch.setattr(unit_loop, "factory_named", lambda name: NamedStage if name == "json:loads" else None)
-    assets_fd = shared_assets.share_assets({"one": np.arange(3)})
+    assets_fd = memory.share_assets({"one": np.arange(3)})
     stages = (STAGES[0].model_copy(update={"settings": {"a": 1}, "unit": "left"}), STAGES[2])
     with edge_regions(pipeline()) as regions:
         spec = spec_of(

@@ -27,7 +27,7 @@ SHARE = 0.2
 #: Python imports a module of this name when it starts, in the units' processes too.
 HOOK = """
 import os, time
-from trilane.pipeline.bound_stage import BoundStage
+from trilane.pipeline.unit_loop import BoundStage
 
 run = BoundStage.run
 

@@ -9,10 +9,9 @@ import pytest
 from support.doubles import pipeline_of_doubles as doubles
 from trilane.pipeline import run_record
 from trilane.pipeline.journal import Sampled, Worked, read_journal
-from trilane.pipeline.run import run_pipeline
+from trilane.pipeline.run import SKETCHED, run_pipeline
 from trilane.pipeline.run_record import JournalFile
-from trilane.pipeline.sketch import SKETCHED
-from trilane.scheduler.samples import MOST_EXACT, MOVED_AT_ONCE
+from trilane.scheduler.stats import MOST_EXACT, MOVED_AT_ONCE
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("nothing_left")]
 

@@ -17,9 +17,9 @@ from trilane.apps.run.report import read_report
 from trilane.apps.run.run_job import Hooks, Prepared, RunOutcome, run_to_folder
 from trilane.errors import TrilaneError
 from trilane.hw_profiles.host import host_units
+from trilane.pipeline.memory import Assets
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline
-from trilane.pipeline.shared_assets import Assets
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scene.schema import OutputSpec, Scene
 from trilane.scheduler.recording import read, replay

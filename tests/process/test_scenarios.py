@@ -12,7 +12,7 @@ from trilane.bench import scenario
 from trilane.bench.lib import load
 from trilane.bench.lib.load import Load
 from trilane.errors import BadInputError, TrilaneError
-from trilane.pipeline.requests import FrameRequestQueue
+from trilane.pipeline.controls import FrameRequestQueue
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
 

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from trilane.avatars.bundle import load_bundle
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
-from trilane.pipeline.moved_bytes import BYTES
-from trilane.pipeline.regions import EdgeRegion
-from trilane.pipeline.unit_spec import UnitSpec
+from trilane.pipeline.memory import BYTES, EdgeRegion
+from trilane.pipeline.unit_loop import UnitSpec
 from trilane.scene.staging import stage_scene
 from trilane.stages.avatar_assets import distinct, load_avatar, pack_assets, require_one_tensor
 from trilane.stages.config import RunConfig

@@ -13,7 +13,7 @@ from trilane import machine
 from trilane.body.body import load_body
 from trilane.body.skinning import FrameSkinner
 from trilane.machine import Machine, last_level_bytes, moved_of_kept
-from trilane.pipeline.moved_bytes import BYTES, ByteCounter, add_bytes
+from trilane.pipeline.memory import BYTES, ByteCounter, add_bytes
 from trilane.pipeline.run_metrics import MovedInAll
 from trilane.stages.cpu.present import Segment
 from trilane.stages.dsp.infer import BoundPart

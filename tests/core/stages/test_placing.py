@@ -15,12 +15,11 @@ import pytest
 
 from trilane.bench.placement import rank_correlation
 from trilane.machine import Machine
-from trilane.pipeline import other_programs
-from trilane.pipeline.other_programs import OtherPrograms, busy_s
+from trilane.pipeline import surroundings
 from trilane.pipeline.rehearsal import Rehearsed
+from trilane.pipeline.surroundings import OtherPrograms, busy_s
 from trilane.pipeline.trial import Round
-from trilane.scheduler.placement import Ranked
-from trilane.scheduler.placement_model import Rules
+from trilane.scheduler.placement import Ranked, Rules
 from trilane.scheduler.places import Core, Place, Work
 from trilane.stages import placing
 from trilane.stages.placing import TriedPlacement, choice
@@ -276,8 +275,8 @@ def test_the_share_of_others_is_what_is_not_ours(tmp_path: Path, monkeypatch: py
         def cpu_times(self) -> SimpleNamespace:
             return SimpleNamespace(user=used[self._pid] - 0.1, system=0.1)
 
-    monkeypatch.setattr(other_programs, "psutil", SimpleNamespace(Process=Process))
-    monkeypatch.setattr(other_programs, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(surroundings, "psutil", SimpleNamespace(Process=Process))
+    monkeypatch.setattr(surroundings, "time", SimpleNamespace(monotonic=lambda: now[0]))
     idle = (0,) * 9
     file.write_text(stat((round(8 / STEP_S), *idle), (0, *idle)))
     others = OtherPrograms((0, 1), [77])
@@ -307,11 +306,11 @@ def test_beside_units_that_live_others_have_a_share_and_beside_a_dead_one_nobody
                 raise psutil.NoSuchProcess(12)
             return 0.5
 
-    monkeypatch.setattr(other_programs, "OtherPrograms", Others)
-    share = other_programs.beside_units((0, 1), {"cpu": 11, "gpu": 12})
+    monkeypatch.setattr(surroundings, "OtherPrograms", Others)
+    share = surroundings.beside_units((0, 1), {"cpu": 11, "gpu": 12})
     assert asked == [((0, 1), [11, 12])]
     assert (share({"cpu": 11, "gpu": 12}), share({"cpu": 11, "gpu": 14})) == (0.5, None)
-    assert other_programs.beside_units((0,), {"cpu": 13})({"cpu": 13}) is None
+    assert surroundings.beside_units((0,), {"cpu": 13})({"cpu": 13}) is None
     assert share({"cpu": 11, "gpu": 12}) is None
 
 

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from support.small_pipeline import EDGES, OWN, STAGES, assets_of, packets, pipeline, without_bytes
 from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError, TrilaneError
-from trilane.pipeline.bound_stage import BoundStage
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.stage import Skip, UnitContext
+from trilane.pipeline.unit_loop import BoundStage
 from trilane.scene.crop import Rect
 from trilane.scene.planner import FrameWork, shown_by, work_of
 from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, Scene

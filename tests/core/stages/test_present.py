@@ -16,7 +16,7 @@ from support.small_pipeline import without_bytes
 from trilane.apps.run import run_files
 from trilane.apps.run.run_files import contact_sheet, join_segments, run_checksum
 from trilane.pipeline.description import UnitSettings
-from trilane.pipeline.moved_bytes import BYTES
+from trilane.pipeline.memory import BYTES
 from trilane.scene.schema import OutputSpec, Scene
 from trilane.stages.config import RunConfig, pose_dtype
 from trilane.stages.cpu.present import SEGMENTS, PresentStage

@@ -23,7 +23,7 @@ from trilane.body.body import Body
 from trilane.errors import BadInputError, MissingPartError
 from trilane.figure_sources import NO_FIGURES
 from trilane.pipeline.description import UnitSettings
-from trilane.pipeline.moved_bytes import BYTES
+from trilane.pipeline.memory import BYTES
 from trilane.scene.schema import AvatarSpec, OutputSpec, Scene
 from trilane.scene.staging import stage_scene
 from trilane.stages import FACTORIES, PRELOAD, avatar_assets, avatar_pipeline, configure, machine_facts

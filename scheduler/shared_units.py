@@ -1,13 +1,16 @@
 """Runs several pipelines in virtual time on the same hardware, each with a scheduler (`Core`) of its own.
 
 Rule: nothing here decides which job a pipeline does next; its `Core` decides that. This module decides whose job a unit
-takes when several pipelines have handed it one (turns.py). It also decides how fast jobs go that run at the same time.
+takes when several pipelines have handed it one. It also decides how fast jobs go that run at the same time.
 
 Theory of operation. Each pipeline has its own `Core` with its own policy, ledger and recording, like two applications
 on one phone, and none knows of the others. Each unit of a pipeline has a *seat*: the hardware that does its jobs. On a
 seat with turns one job runs at a time; the others wait, and their units are preempted. On a *divided* seat all jobs run
 at once, each with an equal share. An example is a processor core of this machine, between whose processes the kernel
 switches. A unit does its own jobs in the order in which they were handed to it.
+
+Turns. The first waiting job of each pipeline is a candidate, and a row of `TURNS` chooses one. A running job is never
+taken off its unit. Source of `deadline`: Liu and Layland, Journal of the ACM 20 (1973).
 
 At one instant, all events and all deadlines of the schedulers come first; each is a step of one `Core`. Only then do
 jobs begin, so that no ready job is passed over because it was named later. Running jobs change their speed when others
@@ -25,14 +28,56 @@ from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from typing import Any, Final, NamedTuple
 
-from trilane.scheduler.causes import Outcome
 from trilane.scheduler.core import Core
-from trilane.scheduler.events import NEVER, Action, Dispatch, Event, Graph, Job, JobDone, Settings, UnitReady
+from trilane.scheduler.events import NEVER, Action, Dispatch, Event, Graph, Job, JobDone, Outcome, Settings, UnitReady
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.recording import Recording
 from trilane.scheduler.stats import summary_ms
-from trilane.scheduler.turns import ROUND_ROBIN, Waiting, turns_named
 from trilane.scheduler.virtual import Service, Simulation, Skips, none_skips
+from trilane.unexpected_value import UnexpectedValue
+
+ROUND_ROBIN: Final = "round-robin"
+
+
+class Waiting(NamedTuple):
+    """The first job of a pipeline that waits for the unit.
+
+    `behind`: number of pipelines before this one, counted in turn from the one that had the unit last. 0 is the next in
+    turn; the pipeline that had the unit last comes last.
+    `deadline_ns`: deadline of the job's frame, or NEVER.
+    `order`: number that grows with each job handed out.
+    """
+
+    behind: int
+    deadline_ns: int
+    order: int
+
+
+def _in_turn(waiting: Sequence[Waiting]) -> Waiting:
+    """Choose the next pipeline in turn: between two jobs of one pipeline, each other waiting pipeline gets one job."""
+    return min(waiting, key=lambda job: (job.behind, job.order))
+
+
+def _earliest_deadline(waiting: Sequence[Waiting]) -> Waiting:
+    """Choose the job whose frame must be presented first; of equal deadlines, the next in turn.
+
+    Jobs without a deadline come last. When the pipelines ask for more than the unit can do, these may never have it.
+    """
+    return min(waiting, key=lambda job: (job.deadline_ns, job.behind, job.order))
+
+
+TURNS: Final[dict[str, Callable[[Sequence[Waiting]], Waiting]]] = {
+    ROUND_ROBIN: _in_turn,
+    "deadline": _earliest_deadline,
+}
+
+
+def _turns_named(name: str) -> Callable[[Sequence[Waiting]], Waiting]:
+    """Return the row of `TURNS`; raises UnexpectedValue for an unknown name."""
+    if name not in TURNS:
+        raise UnexpectedValue(f"turns {name!r}", f"one of {', '.join(TURNS)}")
+    return TURNS[name]
+
 
 #: The speed of a job that nothing slows; divisible by 1 to 10, so that equal shares of a core are exact.
 ONE: Final = 2520 * 1024
@@ -152,7 +197,7 @@ class BesideDriver:
 
         Raises ValueError for an unknown policy, edge or rule of turns.
         """
-        self._choose, self._divided, self._speed = turns_named(turns), frozenset(divided), speed
+        self._choose, self._divided, self._speed = _turns_named(turns), frozenset(divided), speed
         self.lines = [_Line(number, member, keep) for number, member in enumerate(members)]
         self._heap: list[tuple[int, int, int, Event]] = []
         self._running: list[_Running] = []

@@ -1,0 +1,228 @@
+"""The memory that the units of a run share: regions for the edges, and the assets; and how many bytes move through it.
+
+Rule: the parent makes a region for each edge, and closes it whatever happens. Assets are written once, sealed, mapped,
+never copied.
+
+One region of anonymous memory holds all assets. It begins with 8 bytes for the length of the index, then the index as
+JSON, then the arrays, each on its own page. A unit maps it read-only. The kernel frees it when the last process that
+has it ends.
+
+A stage counts the bytes that it copies for a frame, beside the least that would do. A byte counts at each memory that
+it is read from or written to. A copy from a slot to the GPU counts as read and as uploaded; a copy back counts as read
+back and as written. So the four figures add up to what passed through the memories. A stage that copies nothing between
+its input and its output moves its least.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import mmap
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane import machine
+from trilane.errors import TrilaneError, reason
+from trilane.pipeline.description import HeaderDtype, Model, Pipeline
+from trilane.transport.packets import (
+    F_ADD_SEALS,
+    F_SEAL_GROW,
+    F_SEAL_SHRINK,
+    PAGE,
+    RegionLayout,
+    SlotLayout,
+    create_region,
+)
+from trilane.transport.slots import edge_rule
+
+
+class EdgeRegion(Model):
+    """A region that a unit maps.
+
+    `fd`: descriptor, which the unit's process inherits.
+    `slots`: number of slots.
+    `header`: dtype of every packet's header.
+    `payload_bytes`: bytes of every packet's payload.
+    """
+
+    fd: int
+    slots: int
+    header: HeaderDtype
+    payload_bytes: int
+
+    @property
+    def layout(self) -> RegionLayout:
+        return RegionLayout(self.slots, SlotLayout(self.header, self.payload_bytes))
+
+
+@contextlib.contextmanager
+def edge_regions(pipeline: Pipeline) -> Iterator[dict[str, EdgeRegion]]:
+    """Yield a region for each edge, by the edge's name; raises TrilaneError when there is too little memory."""
+    regions: dict[str, EdgeRegion] = {}
+    try:
+        for name, edge in zip(pipeline.edge_names, pipeline.edges, strict=True):
+            slots = edge_rule(edge.rule).slots
+            fd = create_region(name, RegionLayout(slots, SlotLayout(edge.header, edge.payload_bytes)))
+            regions[name] = EdgeRegion(fd=fd, slots=slots, header=edge.header, payload_bytes=edge.payload_bytes)
+        yield regions
+    finally:
+        for region in regions.values():
+            os.close(region.fd)
+
+
+Assets = Mapping[str, NDArray[Any]]
+
+_F_SEAL_WRITE = 0x8  # <linux/fcntl.h>
+_LENGTH_BYTES = 8
+_KINDS = "?biufcmMSU"  # kinds of NumPy types that consist of their bytes alone
+
+
+def share_assets(assets: Assets) -> int:
+    """Return a descriptor of sealed memory that holds `assets`.
+
+    Raises TrilaneError when there is too little memory, and for arrays of another kind than numbers, times and text.
+    """
+    index, end = _index(assets)
+    free = machine.here.free_bytes()
+    if end > free:
+        raise TrilaneError(f"assets: found {end >> 20} MiB, expected at most {free >> 20} MiB, which are free")
+    head = json.dumps(index).encode()
+    start = _page_up(_LENGTH_BYTES + len(head))
+    fd = os.memfd_create("trilane:assets", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    try:
+        os.posix_fallocate(fd, 0, start + end)
+        os.pwrite(fd, len(head).to_bytes(_LENGTH_BYTES, "little") + head, 0)
+        for name, array in assets.items():
+            _write_all(fd, np.ascontiguousarray(array), start + index[name]["offset"])
+        # Sealed, so that no unit can change what another one reads.
+        fcntl.fcntl(fd, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW | _F_SEAL_WRITE)
+    except OSError as error:
+        os.close(fd)
+        raise TrilaneError(f"assets: no room for {(start + end) >> 20} MiB: {reason(error)}") from None
+    return fd
+
+
+def map_assets(fd: int) -> dict[str, NDArray[Any]]:
+    """Return read-only views of the arrays in `fd`, in the order in which they were given."""
+    view = memoryview(mmap.mmap(fd, os.fstat(fd).st_size, prot=mmap.PROT_READ))
+    length = int.from_bytes(view[:_LENGTH_BYTES], "little")
+    index: dict[str, Any] = json.loads(bytes(view[_LENGTH_BYTES : _LENGTH_BYTES + length]))
+    start = _page_up(_LENGTH_BYTES + length)
+    return {
+        name: np.frombuffer(
+            view, dtype=np.dtype(entry["dtype"]), count=int(np.prod(entry["shape"])), offset=start + entry["offset"]
+        ).reshape(entry["shape"])
+        for name, entry in index.items()
+    }
+
+
+def _index(assets: Assets) -> tuple[dict[str, dict[str, Any]], int]:
+    """Return type, shape and place of every array, and the end of the last one.
+
+    Places count from the first page after the index.
+    """
+    index, offset = {}, 0
+    for name, array in assets.items():
+        if array.dtype.kind not in _KINDS:
+            raise TrilaneError(f"assets: found {name} of type {array.dtype}, expected numbers, times or text")
+        index[name] = {"dtype": array.dtype.str, "shape": list(array.shape), "offset": offset}
+        offset += _page_up(array.nbytes)
+    return index, max(offset, PAGE)
+
+
+def _page_up(size: int) -> int:
+    return -(-size // PAGE) * PAGE
+
+
+def _write_all(fd: int, array: NDArray[Any], offset: int) -> None:
+    data = memoryview(array.reshape(-1).view(np.uint8).data) if array.nbytes else memoryview(b"")
+    while data:
+        written = os.pwrite(fd, data, offset)
+        data, offset = data[written:], offset + written
+
+
+#: Keys in report.json, with the name under which a stage reports each with a job.
+NAMES = {
+    "read": "bytes_read",
+    "written": "bytes_written",
+    "uploaded": "bytes_uploaded",
+    "read_back": "bytes_read_back",
+    "least": "bytes_least",
+}
+BYTES = frozenset(NAMES.values())
+_LEAST = "least"
+
+
+@dataclass(slots=True)
+class ByteCounter:
+    """The bytes that a stage moves for one frame.
+
+    `read`: bytes read from slots, shared assets and what the stage samples.
+    `written`: bytes written into the output slot or the file.
+    `uploaded`: bytes moved from the CPU's memory into the GPU's.
+    `read_back`: bytes moved from the GPU's memory into the CPU's.
+    `least`: bytes that the frame needs: the part of the input that it depends on, read once, and the output, written
+    once.
+    """
+
+    read: int = 0
+    written: int = 0
+    uploaded: int = 0
+    read_back: int = 0
+    least: int = 0
+
+    def start(self, passed_on: int = 0) -> None:
+        """Begin a frame. `passed_on`: bytes of the header, copied from the input slot to the output slot."""
+        self.read = self.written = passed_on
+        self.uploaded = self.read_back = self.least = 0
+
+    def copied(self, count: int) -> None:
+        """Count `count` bytes that were read in one slot and written to another."""
+        self.read += count
+        self.written += count
+
+    def figures(self) -> dict[str, float]:
+        """Return what the stage reports of its job."""
+        return {
+            "bytes_read": self.read,
+            "bytes_written": self.written,
+            "bytes_uploaded": self.uploaded,
+            "bytes_read_back": self.read_back,
+            "bytes_least": self.least,
+        }
+
+
+def add_bytes(report: dict[str, Any], sums: Mapping[str, Mapping[str, float]]) -> None:
+    """Add what each stage moved for a presented frame, and the total, to `report`, the keys of report.json.
+
+    `sums`: sums of what the jobs of each stage reported. A stage without a job moved nothing; a stage that does not
+    count has no row. Nothing is added where no frame was presented or no stage counts.
+    """
+    frames = report["frames"]["presented"]
+    counted = {stage: row for stage, row in sums.items() if row.keys() >= BYTES}
+    if not frames or not counted:
+        return
+    nothing = dict.fromkeys(BYTES, 0.0)
+    for stage, row in report["stages"].items():
+        if stage in counted or not row["jobs"]:
+            row["bytes"] = _per_frame(counted.get(stage, nothing), frames)
+    total = {name: sum(row[name] for row in counted.values()) for name in BYTES}
+    seconds = report["duration_s"]
+    report["bytes"] = {**_per_frame(total, frames), "gb_per_second": _moved(total) / 1e9 / seconds if seconds else None}
+
+
+def _per_frame(sums: Mapping[str, float], frames: int) -> dict[str, float | None]:
+    """Return the means per frame, and `ratio`, all that was moved over the least; null where the least is 0."""
+    least = sums[NAMES[_LEAST]]
+    means = {key: sums[name] / frames for key, name in NAMES.items()}
+    return {**means, "ratio": _moved(sums) / least if least else None}
+
+
+def _moved(sums: Mapping[str, float]) -> float:
+    return sum(sums[name] for key, name in NAMES.items() if key != _LEAST)
