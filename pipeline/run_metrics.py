@@ -310,20 +310,16 @@ class Bound(Record):
     stage: PathShare | None = None
 
 
-class RunMetrics(Record):
-    """What a run measured.
+class PolicyMetrics(Record):
+    """What a run measured of its policy, so that runs of two policies can be compared.
 
-    `clock`: `host`, measured on this machine, or `virtual`, computed from a hardware profile.
     `frames`: counts of frames by what became of them.
-    `duration_s`: time in seconds from the first job to the end of the run.
-    `percentiles`: whether percentiles are exact, or which come from a sketch and within what error; on the host clock.
     `frame_time_ms`: times between presented frames.
     `latency_ms`: times from the sampled pose to the end of the stage that the pipeline names (the composited frame).
     `fps`: presented frames a second; 0 for fewer than two.
     `fps_low`, `fps_high`: bounds of the 95 % interval of `fps`, from that of the mean frame time; null when there are
     too few frames.
     `deadline_misses`: number of frames presented after their deadline, or of frame times above the target.
-    `xrbench`: XRBench's scores.
     `stages`: times of each stage, in the order of the pipeline.
     `bytes`: bytes that the stages moved for a presented frame, over all stages that count them; absent where none does.
     `units`: shares of each unit.
@@ -335,23 +331,16 @@ class RunMetrics(Record):
     null without a path.
     `bound`: share of the bottleneck in the path, and the stage that has most of it.
     `core_shares`: use of each set of cores that a unit has, and of all cores; on the host clock.
-    `policy`, `edge`: policy and edge rule of the scheduler.
-    `idle_cores`: whether cores without work stayed awake; on the host clock.
-    `other_programs`: share of other programs in the time of the run's cores; null where a unit died.
-    `caps`, `temperature_c`: caps and temperatures of a capped run.
+    `policy`: policy of the scheduler.
     """
 
-    clock: Literal["host", "virtual"]
     frames: FrameCounts
-    duration_s: float
-    percentiles: str = ""
     frame_time_ms: FrameTimes
     latency_ms: TimeSummary
     fps: float
     fps_low: float | None = None
     fps_high: float | None = None
     deadline_misses: int
-    xrbench: XrBench
     stages: dict[str, StageTimes]
     bytes: MovedInAll | None = None
     units: dict[str, UnitShares]
@@ -362,6 +351,25 @@ class RunMetrics(Record):
     bound: Bound | None = None
     core_shares: tuple[CoreShare, ...] = ()
     policy: str = ""
+
+
+class RunMetrics(PolicyMetrics):
+    """All that a run measured.
+
+    `clock`: `host`, measured on this machine, or `virtual`, computed from a hardware profile.
+    `duration_s`: time in seconds from the first job to the end of the run.
+    `percentiles`: whether percentiles are exact, or which come from a sketch and within what error; on the host clock.
+    `xrbench`: XRBench's scores.
+    `edge`: edge rule of the scheduler.
+    `idle_cores`: whether cores without work stayed awake; on the host clock.
+    `other_programs`: share of other programs in the time of the run's cores; null where a unit died.
+    `caps`, `temperature_c`: caps and temperatures of a capped run.
+    """
+
+    clock: Literal["host", "virtual"]
+    duration_s: float
+    percentiles: str = ""
+    xrbench: XrBench
     edge: str = ""
     idle_cores: str = ""
     other_programs: float | None = None

@@ -17,12 +17,13 @@ from trilane.scheduler.stats import samples_needed
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from trilane.apps.run.report import Baseline, Check, FrameErrors, Made, PaceComparison, Report
+    from trilane.apps.run.report import Check, FrameErrors, Made, PaceComparison, Report
     from trilane.pipeline.run_metrics import (
         Caps,
         FrameCounts,
         MovedBytes,
         PathShare,
+        PolicyMetrics,
         StageTimes,
         Temperature,
         TimeSummary,
@@ -45,7 +46,7 @@ def run_table(report: Report) -> Table:
     """Return rows of stages, units, times and rates; a column for the run and one for its baseline."""
     from rich.table import Table
 
-    runs: list[Report | Baseline] = [report, report.baseline] if report.baseline else [report]
+    runs: list[PolicyMetrics] = [report, report.baseline] if report.baseline else [report]
     table = Table(title=_title(report), title_justify="left", caption=_caption(report), caption_justify="left")
     table.add_column("")
     table.add_column("")
@@ -76,7 +77,7 @@ def _caption(report: Report) -> str:
     if report.frames.skipped:
         lines.append(_skipped(report))
     lines.append("in brackets: 95 % interval, by the scatter of this run's frames; two runs may differ by more")
-    runs: list[Report | Baseline] = [report, report.baseline] if report.baseline else [report]
+    runs: list[PolicyMetrics] = [report, report.baseline] if report.baseline else [report]
     summaries = [times for run in runs for times in (run.frame_time_ms, run.latency_ms)]
     if any(_too_few(times, name) for times in summaries for name in NEEDED):
         lines.append(f"{TOO_FEW.strip()} of too few frames: {', '.join(f'{k} needs {n}' for k, n in NEEDED.items())}")
@@ -150,7 +151,7 @@ def _worst(facts: Mapping[str, Any]) -> str:
     return f"; worst of {facts['samples']} views (seeds {', '.join(facts['by_seed'])}) {facts['worst']['psnr_db']:.1f}"
 
 
-def _stage_rows(runs: Sequence[Report | Baseline]) -> Rows:
+def _stage_rows(runs: Sequence[PolicyMetrics]) -> Rows:
     for stage, times in runs[0].stages.items():
         cells = [_service_and_wait(run.stages.get(stage)) for run in runs]
         yield f"{stage} ({times.unit})", "service + wait, ms", cells
@@ -160,7 +161,7 @@ def _service_and_wait(times: StageTimes | None) -> str:
     return f"{_number(times.service_ms.mean)} + {_number(times.wait_ms.mean)}" if times else DASH
 
 
-def _byte_rows(runs: Sequence[Report | Baseline]) -> Rows:
+def _byte_rows(runs: Sequence[PolicyMetrics]) -> Rows:
     """Yield what every stage moved for a frame, and all of it beside the least; nothing where no run counted it."""
     if not any(run.bytes for run in runs):
         return
@@ -170,11 +171,11 @@ def _byte_rows(runs: Sequence[Report | Baseline]) -> Rows:
     yield "", "all, MB (times the least); GB/s", [_all_moved(run) for run in runs]
 
 
-def _bytes_of(run: Report | Baseline, stage: str) -> MovedBytes | None:
+def _bytes_of(run: PolicyMetrics, stage: str) -> MovedBytes | None:
     return run.stages[stage].bytes if stage in run.stages else None
 
 
-def _all_moved(run: Report | Baseline) -> str:
+def _all_moved(run: PolicyMetrics) -> str:
     if run.bytes is None:
         return DASH
     return f"{_megabytes(run.bytes)} ({_number(run.bytes.ratio, 2)}); {_number(run.bytes.gb_per_second, 2)}"
@@ -184,7 +185,7 @@ def _megabytes(moved: MovedBytes | None) -> str:
     return DASH if moved is None else f"{moved.all / 1e6:.2f}"
 
 
-def _unit_rows(runs: Sequence[Report | Baseline]) -> Rows:
+def _unit_rows(runs: Sequence[PolicyMetrics]) -> Rows:
     for unit in runs[0].units:
         yield unit, "busy / " + " ".join(IDLE) + ", %", [_shares(run.units.get(unit)) for run in runs]
 
@@ -195,7 +196,7 @@ def _shares(unit: UnitShares | None) -> str:
     return f"{_percent(unit.busy)} / " + " ".join(_percent(getattr(unit.idle, cause)) for cause in IDLE)
 
 
-def _core_rows(runs: Sequence[Report | Baseline]) -> Rows:
+def _core_rows(runs: Sequence[PolicyMetrics]) -> Rows:
     """Yield the CPU time of the units of each set of cores; nothing for a report without such figures."""
     for index, first in enumerate(runs[0].core_shares):
         shares = [run.core_shares[index] if index < len(run.core_shares) else None for run in runs]
@@ -208,14 +209,14 @@ def _percent(share: float | None) -> str:
     return DASH if share is None else f"{100 * share:.0f}"
 
 
-def _time_rows(runs: Sequence[Report | Baseline]) -> Rows:
+def _time_rows(runs: Sequence[PolicyMetrics]) -> Rows:
     for key, name in (("frame_time_ms", "frame time"), ("latency_ms", "latency")):
         for statistic in STATISTICS:
             cells = [_time(run, getattr(run, key), statistic) for run in runs]
             yield name if statistic == "mean" else "", f"{statistic}, ms", cells
 
 
-def _time(run: Report | Baseline, times: TimeSummary, statistic: str) -> str:
+def _time(run: PolicyMetrics, times: TimeSummary, statistic: str) -> str:
     value = _number(_of_several(run, getattr(times, statistic)))
     if statistic == "mean" and times is run.frame_time_ms:
         return f"{value} ({_between(run.frame_time_ms.mean_low, run.frame_time_ms.mean_high)})"
@@ -242,12 +243,12 @@ def _skipped(report: Report) -> str:
     return f"skipped raster and infer: {frames.skipped} of {frames.presented} frames ({parts})"
 
 
-def _of_several(run: Report | Baseline, value: float) -> float | None:
+def _of_several(run: PolicyMetrics, value: float) -> float | None:
     """Return a time between frames, or a latency; None with one frame, which is no statistic."""
     return value if run.frames.presented > 1 else None
 
 
-def _rate_rows(runs: Sequence[Report | Baseline]) -> Rows:
+def _rate_rows(runs: Sequence[PolicyMetrics]) -> Rows:
     rates = [f"{_number(_of_several(run, run.fps))} ({_between(run.fps_low, run.fps_high)})" for run in runs]
     yield "rate", "frames per second", rates
     yield "efficiency", "slowest unit's work / frame time", [_number(run.efficiency, 2) for run in runs]

@@ -16,18 +16,11 @@ from pydantic_core import from_json
 from trilane.errors import BadInputError
 from trilane.files import require_file
 from trilane.pipeline.run_metrics import (
-    Bound,
     Caps,
-    CoreShare,
-    FrameCounts,
-    FrameTimes,
-    MovedInAll,
+    PolicyMetrics,
     Record,
     RunMetrics,
-    StageTimes,
     Temperature,
-    TimeSummary,
-    UnitShares,
 )
 from trilane.shapes import Shape
 
@@ -86,28 +79,6 @@ class WorkPlan(Record):
     """What the scene's size allows. `tensor_shapes`: (height, width) in pixels of the tensors that may be drawn."""
 
     tensor_shapes: tuple[Shape, ...]
-
-
-class Baseline(Record):
-    """The same scene under another policy; its keys mean what they mean in the report. `policy`: that policy."""
-
-    policy: str
-    frames: FrameCounts
-    frame_time_ms: FrameTimes
-    latency_ms: TimeSummary
-    fps: float
-    fps_low: float | None = None
-    fps_high: float | None = None
-    deadline_misses: int
-    stages: dict[str, StageTimes]
-    bytes: MovedInAll | None = None
-    units: dict[str, UnitShares]
-    efficiency: float | None = None
-    core_efficiency: float | None = None
-    machine_efficiency: float | None = None
-    bottleneck: str | None = None
-    bound: Bound | None = None
-    core_shares: tuple[CoreShare, ...] = ()
 
 
 class PaceComparison(Record):
@@ -311,7 +282,7 @@ class Report(RunMetrics, Preamble):
     `messages`: sentences to a person on what went wrong on the way.
     `interrupted`: whether a signal ended the run.
     `failure`: reason for an early end, else null.
-    `baseline`: `sequential` run of the same scene, null without one.
+    `baseline`: metrics of a `sequential` run of the same scene, null without one.
     `placement`: reason for the cores of the units; absent for a run by a program.
     `resolution`: sizes of a planned tensor, where frames had to be in time; else absent.
     `pace`: comparison with virtual time of a run at a chip's pace.
@@ -333,7 +304,7 @@ class Report(RunMetrics, Preamble):
     messages: tuple[str, ...]
     interrupted: bool
     failure: str | None
-    baseline: Baseline | None
+    baseline: PolicyMetrics | None
     placement: PlacementFacts | None = None
     resolution: Resolution | None = None
     pace: PaceComparison | None = None

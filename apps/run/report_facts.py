@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from trilane.apps.run.report import SCHEMA, Baseline, Report, Resolution, TensorSize
+from trilane.apps.run.report import SCHEMA, Report, Resolution, TensorSize
 from trilane.avatars.validation import SizeLoss
 from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
 from trilane.machine import here
 from trilane.pipeline.result import RunResult
-from trilane.pipeline.run_metrics import RunMetrics
+from trilane.pipeline.run_metrics import PolicyMetrics, RunMetrics
 from trilane.scene.planner import ALL_WORK
 from trilane.stages.config import RunConfig
 
@@ -104,8 +104,8 @@ def config_facts(config: RunConfig, policy: str, edge: str) -> dict[str, Any]:
     return {**config.model_dump(mode="json", exclude={"out_dir", "window", "kept"}), "policy": policy, "edge": edge}
 
 
-def _compared(metrics: RunMetrics) -> Baseline:
-    return Baseline.model_validate({key: getattr(metrics, key) for key in Baseline.model_fields})
+def _compared(metrics: RunMetrics) -> PolicyMetrics:
+    return PolicyMetrics.model_validate({key: getattr(metrics, key) for key in PolicyMetrics.model_fields})
 
 
 def sources_of(document: Mapping[str, Any]) -> dict[str, str]:
