@@ -50,6 +50,10 @@ def load_avatar(bundle: Bundle) -> AvatarData:
     return AvatarData(bundle, shaped, bundle.read_texture(), bundle.read_network(), bundle.read_levels())
 
 
+#: What helps where two avatars cannot share a tensor.
+APART = "give each avatar a scene of its own, or name one avatar twice"
+
+
 def require_one_tensor(avatars: Sequence[AvatarData]) -> None:
     """Raise BadInputError unless `avatars` can share a tensor: one network, and one encoding of its input."""
     first, *others = avatars
@@ -57,10 +61,14 @@ def require_one_tensor(avatars: Sequence[AvatarData]) -> None:
         if other.network.digest != first.network.digest:
             found = "another network than the scene's first avatar has"
             expected = "one network for all avatars, as they share a tensor"
-            raise BadInputError(other.bundle.network_path, found, expected)
+            made = f"trilane avatar create {other.bundle.folder} --network {first.bundle.network_path} --out NEW"
+            remedy = f"{APART}; `{made}` makes one with that network, untrained for it"
+            raise BadInputError(other.bundle.network_path, found, expected, remedy)
         if _encoding(other) != _encoding(first):
             names = f"{first.bundle.folder} and {other.bundle.folder}"
-            raise BadInputError(names, "networks with different inputs", "avatars that one network can draw together")
+            raise BadInputError(
+                names, "networks with different inputs", "avatars that one network can draw together", APART
+            )
 
 
 def _encoding(avatar: AvatarData) -> tuple[Any, ...]:

@@ -109,7 +109,7 @@ def _digest(bundle: Bundle, recipe: _Recipe) -> str:
 def _alone(lock: Path) -> Iterator[None]:
     """Wait until no other process makes the same avatar, and keep others from it meanwhile."""
     try:
-        file = lock.open("w")
+        file = lock.open("w+")  # "w" alone would wait on a pipe
     except OSError as error:
         raise BadInputError.of_os_error(lock, error, "a cache that can be written") from error
     with file:

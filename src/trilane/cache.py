@@ -36,16 +36,25 @@ def cache_dir(name: str) -> Path | None:
     return folder if os.access(folder, os.W_OK) else None
 
 
+def cache_entry(name: str, file: str) -> Path | None:
+    """Return the path of `file` in the cache `name`; None when the cache cannot be written.
+
+    None also when something else than a file has that name, such as a pipe, on which reading would wait.
+    """
+    folder = cache_dir(name)
+    if folder is None:
+        return None
+    entry = folder / file
+    return entry if entry.is_file() or not entry.exists() else None
+
+
 def cached_arrays(name: str, sources: Iterable[NDArray[Any] | str], make: Callable[[], Arrays]) -> Arrays:
     """Return the result of `make`, from the cache when it was made from the same `sources` before.
 
     `name`: name of the result, with a number that grows when the code that makes it changes.
     """
-    folder = cache_dir(ARRAYS)
-    if folder is None:
-        return make()
-    entry = folder / f"{_digest(name, sources)}.npz"
-    if entry.exists() and not entry.is_file():  # a pipe, say, on which reading would wait
+    entry = cache_entry(ARRAYS, f"{_digest(name, sources)}.npz")
+    if entry is None:
         return make()
     stored = _read(entry)
     if stored is not None:
@@ -54,7 +63,7 @@ def cached_arrays(name: str, sources: Iterable[NDArray[Any] | str], make: Callab
     with contextlib.suppress(OSError, BadInputError):
         with write_atomically(entry) as draft, draft.open("wb") as file:
             np.savez(file, allow_pickle=False, **made)
-        _forget_oldest(folder)
+        _forget_oldest(entry.parent)
     return made
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from trilane.arrays import U8
 from trilane.avatars.network_file import IntegerNetwork
-from trilane.cache import cache_dir
+from trilane.cache import cache_entry
 from trilane.errors import BadInputError
 from trilane.stages.dsp.runtime import RuntimeOptions, quiet_openvino
 from trilane.writing import write_bytes
@@ -62,8 +62,7 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OpenvinoSession:
         "NUM_STREAMS": 1,
         "ENABLE_CPU_PINNING": False,
     }
-    folder = cache_dir("openvino")
-    stored = folder / f"{_key(network, settings)}.blob" if folder else None
+    stored = cache_entry("openvino", f"{_key(network, settings)}.blob")
     if stored is not None:
         with contextlib.suppress(OSError, ValueError, RuntimeError):  # missing or damaged: it is compiled again
             blob = _without_digest(stored.read_bytes())

@@ -17,7 +17,7 @@ import onnxruntime_qnn
 
 from trilane import machine
 from trilane.avatars.network_file import IntegerNetwork, NetworkFile, check_integer_layers
-from trilane.cache import cache_dir
+from trilane.cache import cache_entry
 from trilane.errors import BadInputError, MissingPartError
 from trilane.stages.dsp.ort import ERRORS_ONLY, LOAD_ERRORS, OrtSession
 from trilane.stages.dsp.runtime import RuntimeOptions
@@ -36,10 +36,9 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
     """
     check_integer_layers(network)
     device = {**DEFAULTS, **options.device}
-    source, folder = network.model.SerializeToString(), cache_dir("qnn")
-    if folder is None:
+    source, compiled = network.model.SerializeToString(), cache_entry("qnn", f"{_key(network, device)}.onnx")
+    if compiled is None:
         return OrtSession(_session(network.where, source, device, {}))
-    compiled = folder / f"{_key(network, device)}.onnx"
     with contextlib.suppress(OSError, BadInputError):  # a missing or damaged file: the network is compiled again
         return OrtSession(_session(network.where, compiled.read_bytes(), device, {}))
     with write_atomically(compiled) as draft:

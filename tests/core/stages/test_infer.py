@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import os
 import shutil
 import subprocess
 import sys
@@ -252,7 +253,7 @@ def test_qnn_writes_contexts_for_chips_that_it_knows(qnn: Any, network: Any, mon
     assert made[0][1].devices[1] == {"backend_path": "/lib/htp.so", "soc_model": "30", "htp_arch": "68"}
     with pytest.raises(BadInputError, match=r"soc: found 'sm1', expected one of sm8350"):
         qnn.write_context(network, "sm1", tmp_path / "other.onnx")
-    monkeypatch.setattr(qnn, "cache_dir", lambda _name: None)
+    monkeypatch.setattr(qnn, "cache_entry", lambda *_names: None)
     qnn.load(network, RuntimeOptions())
     assert made[-1][1].entries == {"session.disable_cpu_ep_fallback": "1"}
     with pytest.raises(BadInputError, match="as a whole"):
@@ -324,9 +325,19 @@ def test_openvino_compiles_once_and_reads_what_it_stored(vino: Any, network: Any
     assert vino.core.calls[2][0] == "compile" and len(vino.core.calls) == 3
     vino.module.load(network, RuntimeOptions(1))
     assert vino.core.calls[3][0] == "compile" and len(list(vino.folder.iterdir())) == 2
-    monkeypatch.setattr(vino.module, "cache_dir", lambda _name: None)
+    monkeypatch.setattr(vino.module, "cache_entry", lambda *_names: None)
     vino.module.load(network, RuntimeOptions(2))
     assert vino.core.calls[4][0] == "compile"
+
+
+def test_openvino_waits_for_no_pipe_in_its_cache(vino: Any, network: Any) -> None:
+    vino.module.load(network, RuntimeOptions(2))
+    (stored,) = vino.folder.iterdir()
+    stored.unlink()
+    os.mkfifo(stored)
+    vino.module.load(network, RuntimeOptions(2))
+    assert [call[0] for call in vino.core.calls] == ["compile", "compile"]
+    assert stored.is_fifo()
 
 
 def test_openvino_without_room_for_its_cache_and_with_a_bad_model(vino: Any, network: Any, monkeypatch: Any) -> None:
@@ -594,8 +605,10 @@ def test_avatars_of_different_networks_are_refused(tiny_bundle, tmp_path):
     units = {"dsp": UnitSettings(cores=(0,), threads=1)}
     scene = Scene.model_validate({"size": "64", "avatars": [{}] * 2})
     config = RunConfig(scene=scene, out_dir=tmp_path, avatar_dirs=(tiny_bundle, other), units=units)
-    with pytest.raises(BadInputError, match="one network for all avatars"):
+    with pytest.raises(BadInputError, match="one network for all avatars") as refused:
         assets_of(config)
+    made = f"`trilane avatar create {other} --network {tiny_bundle / 'network.onnx'} --out NEW`"
+    assert refused.value.remedy.startswith("give each avatar a scene of its own, or name one avatar twice; " + made)
 
 
 def test_one_network_is_loaded_once(tiny_bundle):
