@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
@@ -28,6 +29,7 @@ from trilane.scheduler.events import Action, Event, Graph, JobDone, Settings
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.recording import Recording, row_of
 from trilane.unexpected_value import UnexpectedValue
+from trilane.writing import require_name
 
 NAME = "journal.msgpack"
 SCHEMA: Final = 1
@@ -116,29 +118,45 @@ _PLACES = {kind: place for place, kind in enumerate(RECORDS)}
 class JournalWriter:
     """Context manager that writes records: `add` writes one, and `flush` or the end brings all to the file.
 
-    `path`: path of a file that does not exist yet; raises OSError where it cannot be made. Every other method raises
-    UnwrittenError where the file cannot be written, such as on a full disk.
+    `path`: path of a file that does not exist yet; raises OSError where it cannot be made.
+    `failure`: the UnwrittenError that a method raised, once, when the file could not be written, such as on a full
+    disk. After it nothing more is written.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._file: IO[bytes] = path.open("xb", buffering=CHUNK_BYTES)
         self._packer = msgpack.Packer()
+        self.failure: UnwrittenError | None = None
 
     def add(self, record: Record) -> None:
+        if self.failure is not None:
+            return
         kind = type(record)
         fields = _FIELDS[kind](record) if kind in _FIELDS else record
-        try:
+        with self._errors():
             self._file.write(self._packer.pack([_PLACES[kind], *fields]))
-        except OSError as error:
-            raise UnwrittenError(self._path, error) from None
 
     def flush(self) -> None:
-        """Bring all added records to the file, where whoever follows the journal sees them."""
+        """Bring all added records to the file, where whoever follows the journal sees them.
+
+        A file that was removed counts as one that cannot be written.
+        """
+        if self.failure is None:
+            with self._errors():
+                self._file.flush()
+                require_name(self._path, self._file.fileno())
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
         try:
-            self._file.flush()
+            yield
         except OSError as error:
-            raise UnwrittenError(self._path, error) from None
+            self.failure = UnwrittenError(self._path, error)
+        except UnwrittenError as error:
+            self.failure = error
+        if self.failure is not None:
+            raise self.failure
 
     def __enter__(self) -> Self:
         return self
@@ -149,7 +167,8 @@ class JournalWriter:
         try:
             self._file.close()
         except OSError as failed:
-            raise UnwrittenError(self._path, failed) from None
+            if self.failure is None:
+                raise UnwrittenError(self._path, failed) from None
 
 
 class JournalReader:

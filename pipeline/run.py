@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 from ddsketch import LogCollapsingLowestDenseDDSketch
 
-from trilane.errors import BadInputError
+from trilane.errors import BadInputError, UnwrittenError
 from trilane.pipeline.controls import FrameRequestQueue, Interrupts, RunControls
 from trilane.pipeline.cpu_use import add_accounts
 from trilane.pipeline.description import Pipeline
@@ -38,7 +38,7 @@ from trilane.pipeline.surroundings import (
 from trilane.pipeline.unit_processes import UnitProcesses, close_units, start_units
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.core import Core, run_loop
-from trilane.scheduler.events import Outcome, OutcomeKind, Settings
+from trilane.scheduler.events import Abort, Outcome, OutcomeKind, Settings
 from trilane.scheduler.ledger import Books
 from trilane.scheduler.policy import run_settings
 from trilane.scheduler.stats import MOST_EXACT, energy_score
@@ -176,6 +176,8 @@ def run_pipeline(
         add_bytes(report, clock.metrics)
         metrics = metrics_of(report)
         record.end(metrics.as_json())
+        if record.failure is not None:
+            log.fail(str(record.failure))
     return run.result(metrics)
 
 
@@ -221,7 +223,10 @@ class _Run:
         chain.frame(0)
         others = beside_units(self._cores, self.pids)
         self._record.begin(self._clock, lambda: self._processes.pids)
-        self._outcome = run_loop(self._core, self._clock, self._record)
+        try:
+            self._outcome = run_loop(self._core, self._clock, self._record)
+        except UnwrittenError:  # the record keeps it as its `failure`
+            self._core.step(self._core.now_ns, (Abort(),))
         self.other_programs = others(self._processes.pids)
         self._clock.finish()
         if self._outcome.kind is OutcomeKind.GAVE_UP:

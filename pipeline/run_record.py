@@ -83,22 +83,29 @@ class RunRecord(Protocol):
     """Takes steps from the scheduler's loop through `add`.
 
     `recording`, `jobs`: part of the run that is in memory.
+    `failure`: why nothing more can be noted; None while all is well.
     """
 
     recording: Recording
     jobs: list[JobRecord]
 
+    @property
+    def failure(self) -> UnwrittenError | None: ...
+
     def begin(self, source: Source, pids: Callable[[], Mapping[str, int]]) -> None:
         """Note that the loop begins. `pids`: function that returns the process id of each unit at any time."""
 
     def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
-        """Note a step of `core` whose actions were carried out."""
+        """Note a step of `core` whose actions were carried out; raises `failure` when there is one."""
 
     def say(self, text: str) -> None:
         """Note a message to a person."""
 
     def reckoned(self, places: Placement) -> Reckoned:
-        """Return what bounded the whole run; called after the loop. `places`: places of the run's units."""
+        """Return what bounded the whole run; called after the loop. `places`: places of the run's units.
+
+        Raises `failure` where what was noted is gone.
+        """
 
     def end(self, report: Mapping[str, Any]) -> None:
         """Note that the run is over, with this report."""
@@ -110,6 +117,7 @@ class _KeptRun:
     def __init__(self, graph: Graph, settings: Settings) -> None:
         self.recording = Recording(graph, settings)
         self.jobs: list[JobRecord] = []
+        self.failure = None
         self._source: Source | None = None
 
     def begin(self, source: Source, pids: Callable[[], Mapping[str, int]]) -> None:  # noqa: ARG002 - a `RunRecord`
@@ -161,7 +169,13 @@ class _JournaledRun:
     def begin(self, source: Source, pids: Callable[[], Mapping[str, int]]) -> None:
         self._source, self._pids = source, pids
 
+    @property
+    def failure(self) -> UnwrittenError | None:
+        return self._writer.failure
+
     def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
+        if self._writer.failure is not None:
+            raise self._writer.failure
         follows: list[Accounted | Counted] = []
         accounts = self._accounts
         for unit in core.units.values():
@@ -192,17 +206,26 @@ class _JournaledRun:
         self._steps.clear()
 
     def say(self, text: str) -> None:
-        self._writer.add(Said(time.monotonic_ns(), text))
-        self._writer.flush()
+        with suppress(UnwrittenError):  # the next `add` raises it
+            self._writer.add(Said(time.monotonic_ns(), text))
+            self._writer.flush()
 
     def reckoned(self, places: Placement) -> Reckoned:
-        self.flush()
+        with suppress(UnwrittenError):  # it stays as `failure`
+            self.flush()
         records = read_journal(self._file.path)
-        next(records)  # the header
+        try:
+            next(records)  # the header
+        except BadInputError:
+            if self.failure is not None:  # it was removed
+                raise self.failure from None
+            raise
         return reckoned(self.recording.graph, self.recording.settings, places, records)
 
     def end(self, report: Mapping[str, Any]) -> None:
-        self._writer.add(Ended(time.monotonic_ns(), report))
+        with suppress(UnwrittenError):  # it stays as `failure`
+            self._writer.add(Ended(time.monotonic_ns(), report))
+            self._writer.flush()
 
     def flush(self) -> None:
         """Write everything that was noted to the file; raises UnwrittenError when it cannot be written."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,33 +19,54 @@ from PIL import Image, ImageDraw
 
 from trilane.apps.explain.trace import NAME as TRACE_NAME
 from trilane.apps.explain.trace import TraceWriter
+from trilane.errors import UnwrittenError
 from trilane.pipeline.journal import NAME, Begun, Stepped, read_journal
 from trilane.scheduler.recording import header_line, step_line
-from trilane.stages.cpu.present import SEGMENTS
+from trilane.stages.cpu.present import SEGMENTS, full_disk_told
 
-EVENTS = "events.jsonl"
+EVENTS, VIDEO, SHEET = "events.jsonl", "video.mp4", "contact.png"
 COLUMNS, ROWS = 4, 5
 THUMB_WIDTH = 320
 KEYFRAME_EVERY = 30  # frames, as the present stage encodes them
 FAST_PNG = 1  # a fifth larger than the best compression, in a quarter of the time
 
 
-def write_files(work: Path, fps: float) -> dict[str, Any]:
+def write_files(work: Path, fps: float) -> tuple[dict[str, Any], UnwrittenError | None]:
     """Write every file of the run folder `work` but the report; returns what the report says of them.
+
+    Where the disk takes no more, also returns the error. Files are then whole or absent, and the segments stay.
 
     `fps`: frames a second of the scene. Raises BadInputError for a broken journal.
     """
     segments = work / SEGMENTS
     facts: dict[str, Any] = {"video": None, "checksum": None}
-    if segments.is_dir():
-        joined = join_segments(sorted(segments.glob("*.mp4")), work / "video.mp4", fps)
-        facts["checksum"] = run_checksum(sorted(segments.glob("*.sha256")))
-        if joined is not None:
-            facts["video"] = {"frames": joined.frames, "seconds": joined.seconds}
-            contact_sheet(work / "video.mp4", work / "contact.png", fps)
-        shutil.rmtree(segments)
-    _write_from_journal(work / NAME, work)
-    return facts
+    try:
+        if segments.is_dir():
+            facts["checksum"] = run_checksum(sorted(segments.glob("*.sha256")))
+            with _whole_or_absent(work / VIDEO):
+                joined = join_segments(sorted(segments.glob("*.mp4")), work / VIDEO, fps)
+            if joined is not None:
+                facts["video"] = {"frames": joined.frames, "seconds": joined.seconds}
+                with _whole_or_absent(work / SHEET):
+                    contact_sheet(work / VIDEO, work / SHEET, fps)
+            shutil.rmtree(segments)
+        with _whole_or_absent(work / EVENTS, work / TRACE_NAME):
+            _write_from_journal(work / NAME, work)
+    except UnwrittenError as error:
+        return facts, error
+    return facts, None
+
+
+@contextmanager
+def _whole_or_absent(*files: Path) -> Iterator[None]:
+    """Remove `files` when they cannot be written to their end. Raises UnwrittenError where the disk takes no more."""
+    try:
+        with full_disk_told(files[0]):
+            yield
+    except Exception:
+        for file in files:
+            file.unlink(missing_ok=True)
+        raise
 
 
 def _write_from_journal(journal: Path, folder: Path) -> None:

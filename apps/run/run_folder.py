@@ -6,7 +6,6 @@ could not be written, such as on a full disk, what was written stays, and the er
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import glob
 import os
@@ -16,11 +15,11 @@ from types import TracebackType
 from typing import Self
 
 from trilane import machine
-from trilane.errors import BadInputError, TrilaneError, UnwrittenError, reason
+from trilane.errors import FREE_SPACE, FULL, BadInputError, TrilaneError, UnwrittenError, reason
 from trilane.writing import WRITABLE
 
-#: What the system says of a place that takes no more.
-FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS})
+#: Bytes that are kept free for the report: MOST_MESSAGES of 2000 bytes each, twice as long as JSON, and its figures.
+RESERVED_BYTES = 4 << 20
 
 
 def default_place(scene: str) -> Path:
@@ -38,14 +37,15 @@ class RunFolder:
     """Make a run folder under a temporary name, `work`; without `complete()` it and parents that it made are removed.
 
     A context manager. On entry it raises BadInputError when `target` exists, when another run that goes on has the
-    name, or when nothing can be written there.
+    name, or when no report can be written there: RESERVED_BYTES are taken, and given back by `release`.
     On leaving by an error about a file that could not be written, it raises TrilaneError; a folder that holds anything
-    then stays.
+    then stays. It also raises TrilaneError when `work` was removed.
     """
 
     def __init__(self, target: Path) -> None:
         self.target = target.absolute()
         self.work = self.target.with_name(f"{self.target.name}.{os.getpid()}.partial")
+        self._reserve = self.work / ".reserved"
         self._made: list[Path] = []
         self._lock = -1
         self._keep = False
@@ -56,6 +56,7 @@ class RunFolder:
                 raise BadInputError(self.target, "a file or folder", "a name that is free", "choose another --out")
             self._make_parents()
             self._claim()
+            self._reserve_space()
         except OSError as error:
             self._remove()
             raise BadInputError.of_os_error(self.target, error, WRITABLE, "choose another --out") from None
@@ -82,12 +83,21 @@ class RunFolder:
         finally:
             os.close(parent)
 
+    def _reserve_space(self) -> None:
+        with self._reserve.open("wb") as file:
+            os.posix_fallocate(file.fileno(), 0, RESERVED_BYTES)
+
+    def release(self) -> None:
+        """Give back the space that was kept free, for the files that are written last."""
+        self._reserve.unlink(missing_ok=True)
+
     def complete(self) -> Path:
         """Give the folder its name.
 
         Raises BadInputError when something else got the name in the meantime; the temporary folder stays then.
         """
-        self._keep = True
+        self.release()
+        self._keep = self._is_there()
         try:
             self.work.rename(self.target)
         except OSError as error:
@@ -98,8 +108,15 @@ class RunFolder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        is_there = self._keep or self._is_there()
         os.close(self._lock)
         if self._keep:
+            return
+        self.release()
+        if not is_there:
+            self._remove()
+            if isinstance(error, Exception) or error is None:
+                raise TrilaneError(f"{self.work}: it was moved or removed while the run went on") from error
             return
         failed = self._unwritten(error)
         is_kept = failed and any(file.is_file() and file.stat().st_size for file in self.work.rglob("*"))
@@ -107,17 +124,24 @@ class RunFolder:
             self._remove()
         if failed:
             left = f"what was written stays in {self.work}" if is_kept else "nothing was written"
-            raise TrilaneError(f"{failed}; free space there or choose another --out; {left}") from error
+            raise TrilaneError(f"{failed}; {left}") from error
 
     def _unwritten(self, error: BaseException | None) -> str:
         """Say which file could not be written, and why; "" for an error about anything else."""
         if isinstance(error, UnwrittenError):
             return str(error)
         if isinstance(error, BadInputError) and isinstance(error.__cause__, OSError):
-            return f"{error.where}: {error.found}"
+            return f"{error.where}: {error.found}; {FREE_SPACE}"
         if isinstance(error, OSError) and error.errno in FULL:
-            return f"{error.filename or self.work}: {reason(error)}"
+            return f"{error.filename or self.work}: {reason(error)}; {FREE_SPACE}"
         return ""
+
+    def _is_there(self) -> bool:
+        """Say whether `work` is still the folder that was made."""
+        try:
+            return os.path.samestat(self.work.stat(), os.fstat(self._lock))
+        except OSError:
+            return False
 
     def _remove(self) -> None:
         shutil.rmtree(self.work, ignore_errors=True)

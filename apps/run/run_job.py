@@ -29,7 +29,7 @@ from trilane.hw_profiles.governor import Governor
 from trilane.hw_profiles.profile_files import load_runnable
 from trilane.pipeline import journal
 from trilane.pipeline.controls import Interrupts, RunControls
-from trilane.pipeline.result import RunResult
+from trilane.pipeline.result import Failure, RunResult
 from trilane.pipeline.run_record import JournalFile
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.policy import policy_named
@@ -163,7 +163,11 @@ def run_to_folder(
                 facts |= _checked_frames(checked, folder.work, hooks, ended)
             from trilane.apps.run.run_files import write_files
 
-            facts |= write_files(folder.work, checked.config.scene.fps)
+            files, unwritten = write_files(folder.work, checked.config.scene.fps)
+            facts |= files
+            if unwritten is not None:
+                result = replace(result, failure=result.failure or Failure(str(unwritten)))
+            folder.release()
             report = build_report(result, checked.config, machine=machine, baseline=baseline, facts=facts)
             _tell(report, hooks)
             write_report(report, folder.work / "report.json")
@@ -197,18 +201,18 @@ class _Job:
         if not self._options.baseline_frames or self._options.policy == BASELINE_POLICY:
             return None, False
         place = folder / BASELINE_POLICY
-        place.mkdir()
         frames = min(self._options.baseline_frames, self._checked.config.scene.frames)
         try:
+            place.mkdir()
             result = self._run(place, self._options.changed(policy=BASELINE_POLICY, latch_ms=0.0), frames)
         except KeyboardInterrupt:
             self._hooks.message(f"interrupted: the {BASELINE_POLICY} run to compare with is left out")
             return None, True
-        except TrilaneError as error:
+        except (TrilaneError, OSError) as error:
             self._hooks.message(f"the {BASELINE_POLICY} run to compare with failed and is left out: {error}")
             return None, False
         finally:
-            shutil.rmtree(place)
+            shutil.rmtree(place, ignore_errors=True)
         return (result if _is_complete(result) else None), result.interrupted
 
     def _run(

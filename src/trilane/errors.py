@@ -8,6 +8,7 @@ Trilane was installed. It never fetches Trilane from a package index: none has i
 
 from __future__ import annotations
 
+import errno
 import importlib.metadata
 import re
 import shlex
@@ -94,6 +95,9 @@ def _requirements(extra: str) -> Iterator[str]:
             yield requirement.strip()
 
 
+#: What the system says of a place that takes no more, and what helps then.
+FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS})
+FREE_SPACE = "free space there or choose another --out"
 #: Most letters of what was found that are shown.
 LONGEST_FOUND = 500
 
@@ -150,7 +154,7 @@ class BadInputError(TrilaneError):
 
 
 class UnwrittenError(TrilaneError):
-    """A file could not be written any further, for example on a full disk. Exit code 1.
+    """A file could not be written any further, for example on a full disk, or was removed. Exit code 1.
 
     `path`: path of the file. `error`: error of the system.
     """
@@ -160,7 +164,8 @@ class UnwrittenError(TrilaneError):
         self.path, self.error = str(path), error
 
     def __str__(self) -> str:
-        return f"{self.path}: {reason(self.error)}"
+        remedy = f"; {FREE_SPACE}" if self.error.errno in FULL else ""
+        return f"{self.path}: {reason(self.error)}{remedy}"
 
 
 class UnitLostError(TrilaneError):

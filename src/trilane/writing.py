@@ -6,6 +6,7 @@ that is killed outright may leave its temporary file, `.trilane-*`.
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 import shutil
@@ -14,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from trilane.errors import BadInputError
+from trilane.errors import BadInputError, UnwrittenError
 
 WRITABLE = "a place that can be written"
 PREFIX = ".trilane-"
@@ -48,6 +49,12 @@ def require_writable(path: Path) -> None:
     """
     with _os_errors_about(path), tempfile.TemporaryFile(prefix=PREFIX, dir=path.parent):
         pass
+
+
+def require_name(path: Path, fd: int) -> None:
+    """Raise UnwrittenError when somebody has removed the file `path`, which is still open as `fd`."""
+    if not os.fstat(fd).st_nlink:
+        raise UnwrittenError(path, FileNotFoundError(errno.ENOENT, "it was removed while it was written"))
 
 
 def write_bytes(path: Path, content: bytes, remedy: str = "") -> None:

@@ -11,7 +11,8 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -22,10 +23,12 @@ from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from numpy.typing import NDArray
 
 from trilane.arrays import U8
+from trilane.errors import FULL, UnwrittenError
 from trilane.pipeline.memory import ByteCounter
 from trilane.pipeline.stage import UnitContext
 from trilane.stages.config import RunConfig
 from trilane.transport.packets import Packet
+from trilane.writing import require_name
 
 SEGMENTS = "segments"
 KEYFRAME_EVERY = 30
@@ -35,6 +38,17 @@ ENCODER_OPTIONS = {"preset": "ultrafast", "crf": "20", "tune": "zerolatency"}
 FRAGMENTS = {"movflags": "empty_moov+default_base_moof+frag_every_frame", "flush_packets": "1"}
 MS = 1e-6  # milliseconds in a nanosecond
 NOTHING = ByteCounter().figures()
+
+
+@contextmanager
+def full_disk_told(path: Path) -> Iterator[None]:
+    """Raise UnwrittenError about `path` where the disk takes no more; other errors pass."""
+    try:
+        yield
+    except (OSError, av.error.FFmpegError) as error:
+        if error.errno not in FULL:
+            raise
+        raise UnwrittenError(path, OSError(error.errno, os.strerror(error.errno))) from error
 
 
 class Segment:
@@ -57,23 +71,27 @@ class Segment:
         self._digest = ""
         self._picture: Any = None
         self.moved = ByteCounter()
+        self._path = path
         # Line buffering keeps the digests of finished frames when the process is killed.
         self._digests = path.with_suffix(".sha256").open("w", encoding="ascii", buffering=1)
 
     def digest(self, frame: int, pixels: NDArray[np.uint8], repeats: bool = False) -> None:
         """Write the digest of `pixels`, (height, width, 3) and C-contiguous.
 
-        `repeats`: whether they are those of the last call.
+        `repeats`: whether they are those of the last call. Raises UnwrittenError, also when the file was removed.
         """
         if not repeats:
             self._digest = hashlib.sha256(pixels.data).hexdigest()
             self.moved.read += pixels.nbytes
-        self.moved.written += self._digests.write(f"{frame} {self._digest}\n")
+        with full_disk_told(self._path):
+            self.moved.written += self._digests.write(f"{frame} {self._digest}\n")
+        require_name(self._path, self._digests.fileno())
 
     def add(self, frame: int, pixels: NDArray[np.uint8], repeats: bool = False) -> None:
         """Show `pixels`, (height, width, 3) RGB, from the instant of frame number `frame` on.
 
-        `repeats`: whether they are those of the last call, which are converted for the encoder already.
+        `repeats`: whether they are those of the last call, which are converted for the encoder already. Raises
+        UnwrittenError.
         """
         if not repeats:
             rgb = av.VideoFrame.from_numpy_buffer(pixels, format="rgb24")
@@ -86,16 +104,18 @@ class Segment:
         self._last = max(self._last + 1, frame)
         picture.pts, picture.time_base = self._last, self._stream.codec_context.time_base
         packets = self._stream.encode(picture)
-        self._container.mux(packets)
+        with full_disk_told(self._path):
+            self._container.mux(packets)
         encoded = sum(packet.size for packet in packets)
         self.moved.written += encoded
         self.moved.least += encoded
 
     def close(self) -> None:
-        """Flush the encoder and complete the file."""
-        self._container.mux(self._stream.encode(None))
-        self._container.close()
-        self._digests.close()
+        """Flush the encoder and complete the file. Raises UnwrittenError."""
+        with full_disk_told(self._path):
+            self._container.mux(self._stream.encode(None))
+            self._container.close()
+            self._digests.close()
 
 
 class PresentStage:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -153,7 +153,7 @@ def test_no_journal_is_written_over(tmp_path: Path) -> None:
 
 
 def test_a_disk_that_is_full_is_said_with_the_file(tmp_path: Path) -> None:
-    """/dev/full takes nothing: what is written, flushed and left over at the end is refused alike."""
+    """/dev/full takes nothing: what is written, flushed and left over at the end is refused alike, but once."""
     (tmp_path / "j").touch()
 
     class Full(JournalWriter):
@@ -162,7 +162,7 @@ def test_a_disk_that_is_full_is_said_with_the_file(tmp_path: Path) -> None:
             self._file.close()
             self._file = Path("/dev/full").open("wb", buffering=64)  # noqa: SIM115 - the writer closes it
 
-    said = f"^{tmp_path}/none: no space left on device$"
+    said = f"^{tmp_path}/none: no space left on device; free space there or choose another --out$"
     writer = Full()
     with pytest.raises(UnwrittenError, match=said), writer:
         writer.add(Said(1, "short"))
@@ -170,8 +170,23 @@ def test_a_disk_that_is_full_is_said_with_the_file(tmp_path: Path) -> None:
     writer = Full()
     with pytest.raises(UnwrittenError, match=said):
         writer.add(Said(1, "long" * 100))
+    assert re.match(said, str(writer.failure))
+    writer.add(Said(1, "short"))
+    writer.flush()
+    writer.__exit__(None, None, None)
+    (tmp_path / "none").unlink()
+    writer = Full()
     with pytest.raises(UnwrittenError, match=said):
         writer.add(Said(1, "short"))
         writer.flush()
-    with contextlib.suppress(UnwrittenError):
-        writer.__exit__(None, None, None)
+    writer.__exit__(None, None, None)
+
+
+def test_a_journal_that_was_removed_is_told_at_the_next_flush(tmp_path: Path) -> None:
+    with JournalWriter(tmp_path / "j") as writer:
+        writer.add(Said(1, "a"))
+        writer.flush()
+        (tmp_path / "j").unlink()
+        writer.add(Said(2, "b"))
+        with pytest.raises(UnwrittenError, match=f"^{tmp_path}/j: it was removed while it was written$"):
+            writer.flush()

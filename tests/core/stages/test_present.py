@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,11 +17,12 @@ from PIL import Image
 from support.small_pipeline import without_bytes
 from trilane.apps.run import run_files
 from trilane.apps.run.run_files import contact_sheet, join_segments, run_checksum
+from trilane.errors import UnwrittenError
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.memory import BYTES
 from trilane.scene.schema import OutputSpec, Scene
 from trilane.stages.config import RunConfig, pose_dtype
-from trilane.stages.cpu.present import SEGMENTS, PresentStage
+from trilane.stages.cpu.present import SEGMENTS, PresentStage, full_disk_told
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 WIDTH, HEIGHT, FPS = 96, 64, 30.0
@@ -94,6 +97,31 @@ def test_a_segment_that_was_cut_off_keeps_all_but_its_last_frame(tmp_path: Path)
     joined = join_segments([empty, whole], tmp_path / "video.mp4", FPS)
     assert joined is not None
     assert joined.frames >= 8
+
+
+@pytest.mark.parametrize("removed", ["folder", "digests"])
+def test_a_segment_that_is_removed_is_told_at_the_next_frame(tmp_path: Path, removed: str) -> None:
+    stage, slot = PresentStage(make_config(tmp_path)), make_slot()
+    stage.bind([slot], [])
+    stage.run(0, 0, None)
+    (segment,) = segments(tmp_path)
+    shutil.rmtree(segment.parent) if removed == "folder" else segment.with_suffix(".sha256").unlink()
+    with pytest.raises(UnwrittenError) as raised:
+        stage.run(1, 0, None)
+    assert str(raised.value) == f"{segment}: it was removed while it was written"
+    stage.close()
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "x"), av.error.err_check])
+def test_a_full_disk_is_told_with_its_file(error: Any) -> None:
+    """As the system says it, and as FFmpeg does; another error stays itself."""
+    with pytest.raises(UnwrittenError) as raised, full_disk_told(Path("/a/b")):
+        if isinstance(error, OSError):
+            raise error
+        error(-errno.ENOSPC)
+    assert str(raised.value) == "/a/b: no space left on device; free space there or choose another --out"
+    with pytest.raises(FileNotFoundError), full_disk_told(Path("/a/b")):
+        raise FileNotFoundError(errno.ENOENT, "x")
 
 
 def test_no_segment_gives_no_video(tmp_path: Path) -> None:

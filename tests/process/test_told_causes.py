@@ -1,0 +1,108 @@
+"""What somebody takes away from a run that goes on, and what its report and its last sentence then say."""
+
+from __future__ import annotations
+
+import resource
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from support.doubles import pipeline_of_doubles
+from trilane.apps.run import run_folder
+from trilane.apps.run.report import read_report
+from trilane.apps.run.run_job import Hooks, Prepared, RunOutcome, run_to_folder
+from trilane.errors import BadInputError, TrilaneError
+from trilane.hw_profiles.host import host_units
+from trilane.pipeline.memory import Assets
+from trilane.pipeline.result import RunResult
+from trilane.pipeline.run import run_pipeline
+from trilane.pipeline.unit_starter import UnitStarter
+from trilane.scene.schema import OutputSpec, Scene
+from trilane.stages.config import RunConfig
+from trilane.stages.configure import Checked
+from trilane.stages.machine_facts import machine_facts
+from trilane.stages.run_options import RunOptions
+
+FRAMES = 5000
+pytestmark = pytest.mark.usefixtures("no_new_process")
+
+
+@pytest.fixture
+def run(starter: UnitStarter, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., RunOutcome]:
+    """Run mock units to tmp_path/a/run; `at(work)` is called once, when frames were presented."""
+
+    def run_doubles(config: RunConfig, assets: Assets, frames: int | None, edge: str, **options: Any) -> RunResult:
+        pipeline = pipeline_of_doubles().with_rule(edge)
+        count, fps = frames or config.scene.frames, config.scene.fps
+        return run_pipeline(pipeline, count, fps=fps, assets=assets, **{**options, "starter": starter})
+
+    monkeypatch.setattr("trilane.apps.run.run_job.run_avatar", run_doubles)
+
+    def run(at: Callable[[Path], None], frames: int = FRAMES) -> RunOutcome:
+        waiting = [at]
+
+        def progress(_what: str, presented: int, _requested: int) -> None:
+            if presented and waiting:
+                waiting.pop()(next((tmp_path / "a").glob("run.*.partial")))
+
+        scene = Scene(frames=frames, output=OutputSpec(width=64, height=64))
+        config = RunConfig(scene=scene, out_dir=tmp_path, avatar_dirs=(), units=host_units())
+        prepared = Prepared(RunOptions(baseline_frames=0), Checked(config, assets={}, notes=(), accuracy={}))
+        hooks = Hooks(progress, lambda _text: None)
+        return run_to_folder(prepared, tmp_path / "a" / "run", hooks, machine=machine_facts())
+
+    return run
+
+
+@contextmanager
+def file_limit(bytes_: int) -> Iterator[None]:
+    """No file of this process may be longer: what stands for a disk that takes no more."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (bytes_, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_run_whose_folder_is_removed_ends_and_says_so(run: Callable[..., RunOutcome], tmp_path: Path) -> None:
+    with pytest.raises(TrilaneError) as raised:
+        run(shutil.rmtree)
+    assert not isinstance(raised.value, BadInputError) and raised.value.exit_code == 1
+    said = str(raised.value)
+    assert said.startswith(f"{tmp_path}/a/run.") and said.endswith(": it was moved or removed while the run went on")
+    assert list(tmp_path.rglob("*")) == []
+
+
+def test_a_run_whose_journal_is_removed_says_so(run: Callable[..., RunOutcome], tmp_path: Path) -> None:
+    """The journal cannot be read back, so there is no report; the sentence names the file."""
+    with pytest.raises(TrilaneError, match=r"journal\.msgpack: it was removed while it was written; nothing") as raised:
+        run(lambda work: (work / "journal.msgpack").unlink())
+    assert raised.value.exit_code == 1
+    assert list(tmp_path.rglob("*")) == []
+
+
+def test_a_disk_that_fills_keeps_the_report(
+    run: Callable[..., RunOutcome], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Journal, trace and recording would each be some MB long; the report has a third of what the journal may."""
+    monkeypatch.setattr(run_folder, "RESERVED_BYTES", 50_000)
+    with file_limit(150_000):
+        outcome = run(lambda _work: None)
+    said = "journal.msgpack: file too large; free space there or choose another --out"
+    assert outcome.exit_code == 1 and (outcome.report.failure or "").endswith(said)
+    frames = read_report(tmp_path / "a" / "run").frames
+    assert frames.presented > 20
+    assert frames.presented + frames.lost + (frames.not_begun or 0) == FRAMES
+    names = {path.name for path in outcome.folder.iterdir()}
+    assert names <= {"report.json", "journal.msgpack", "events.jsonl", "trace.pftrace"}
+
+
+def test_a_run_takes_the_space_of_its_report_before_it_begins(run: Callable[..., RunOutcome], tmp_path: Path) -> None:
+    with file_limit(150_000), pytest.raises(BadInputError, match="found file too large, expected a place that can be"):
+        run(lambda _work: pytest.fail("it began"))
+    assert list(tmp_path.rglob("*")) == []
