@@ -9,6 +9,7 @@ A process gets its `UnitSpec` as one JSON document: plain data, and descriptors 
 from __future__ import annotations
 
 import contextlib
+import errno
 import gc
 import os
 import sys
@@ -21,6 +22,7 @@ from typing import Any, cast
 
 from trilane.arrays import U8
 from trilane.errors import TrilaneError, UnitLostError
+from trilane.memory import shortage
 from trilane.pipeline.description import Model, PipelineStage, UnitSettings
 from trilane.pipeline.hardware_counters import HardwareCounters, NoCounters, counters_here
 from trilane.pipeline.job_times import TASKS, CoreMeter, JobClock
@@ -333,6 +335,8 @@ def _fail(link: Link, job_id: int, where: str, error: Exception) -> int:
     traceback.print_exception(error)
     known = isinstance(error, TrilaneError)
     text = str(error) if known else f"{where}: {type(error).__name__}: {error}"
+    if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+        text = f"{where}: memory is short: {shortage() or error}"
     code = error.exit_code if isinstance(error, TrilaneError) else 1
     sentence = " ".join(text.split()).encode(errors="replace")  # a file's name may hold bytes that are no text
     link.job_pipe.send(Failed(job_id, code, sentence[:MAX_TEXT].decode(errors="ignore")))

@@ -21,6 +21,7 @@ import zmq
 
 from trilane import machine
 from trilane.errors import TrilaneError
+from trilane.memory import ended_by_system, shortage
 from trilane.pipeline.controls import Interrupts
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.memory import EdgeRegion
@@ -189,9 +190,9 @@ class UnitProcesses:
         return messages
 
     def why_ended(self, unit: str) -> str:
-        """Return the end of a sentence that says what an ended unit wrote last; empty if it wrote nothing."""
-        end = after_stderr(self.stderr_tails.get(unit, ""))
-        return f"; {end}" if end else ""
+        """Return the end of a sentence that says why a unit ended: what it wrote last, and whether memory ran out."""
+        ends = (after_stderr(self.stderr_tails.get(unit, "")), ended_by_system())
+        return "".join(f"; {end}" for end in ends if end)
 
     @property
     def stopped(self) -> set[str]:
@@ -330,10 +331,15 @@ def listen_before_run(processes: UnitProcesses, interrupts: Interrupts) -> list[
     if interrupts.count:
         raise KeyboardInterrupt
     for unit, message in messages:
-        if isinstance(message, Failed):
-            raise UnitError(message.message, message.exit_code)
+        if message is not None and not isinstance(message, Failed):
+            continue
+        if short := shortage():
+            end = "ended before the run began" if message is None else "could not start"
+            said = "" if message is None else f"; it said: {message.message}"
+            raise UnitError(f"unit {unit} {end}; memory is short: {short}{said}")
         if message is None:
             raise UnitError(f"unit {unit} ended before the run began{processes.why_ended(unit)}")
+        raise UnitError(message.message, message.exit_code)
     return messages
 
 

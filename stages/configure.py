@@ -19,9 +19,10 @@ from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import NetworkFile
 from trilane.avatars.network_split import split
 from trilane.avatars.validation import DrawnAs, SizeLoss, accuracy_of, size_loss
-from trilane.errors import EGL_LINE, BadInputError, MissingPartError, did_you_mean
+from trilane.errors import EGL_LINE, BadInputError, MissingPartError, TrilaneError, did_you_mean
 from trilane.hw_profiles.host import asked_cores, fastest_runtime, rule_placement, settings_of, usable_cores
 from trilane.hw_profiles.profile_files import HOST, load_profile
+from trilane.memory import shortage
 from trilane.pipeline.memory import Assets
 from trilane.scene.footage import Footage
 from trilane.scene.planner import TensorBudget
@@ -210,8 +211,13 @@ def skinning_unit(asked: str, gl: GlFacts = gl_facts) -> tuple[str, str]:
 
 
 def required_machine(gl: GlFacts = gl_facts) -> dict[str, Any]:
-    """Return facts about this machine. Raises MissingPartError when no OpenGL context can be made."""
+    """Return facts about this machine. Raises MissingPartError when no OpenGL context can be made.
+
+    Raises TrilaneError when memory is what it lacks.
+    """
     driver = gl()
+    if driver is None and (short := shortage()):
+        raise TrilaneError(f"no OpenGL context could be made; memory is short: {short}")
     if driver is None:
         raise MissingPartError("no OpenGL 3.3 context through EGL", EGL_LINE)
     return machine_facts(driver)

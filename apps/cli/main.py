@@ -18,6 +18,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from trilane.errors import TrilaneError, install_line, reason
+from trilane.memory import require_memory, shortage
 
 #: Command: its module, and the line that `trilane --help` shows for it.
 COMMANDS = {
@@ -59,6 +60,7 @@ def command_of(name: str) -> Any:
 
     A module's `app` holds one command, one group, or several small commands; then the name picks one.
     """
+    require_memory(part=2)  # with less, NumPy's import or the kernel would end the process
     command = typer.main.get_command(importlib.import_module(COMMANDS[name][0]).app)
     return getattr(command, "commands", {}).get(name, command)  # small commands share a module
 
@@ -127,6 +129,10 @@ def _describe(error: Exception) -> tuple[str, int]:
     """Return the sentence and the exit code of an error that no command handled."""
     if isinstance(error, TrilaneError):
         return str(error), error.exit_code
+    if short := "" if isinstance(error, ModuleNotFoundError) else shortage():
+        return f"memory is short: {short}; {type(error).__name__}: {error}", FAILED
+    if isinstance(error, MemoryError):
+        return f"memory is short: {error or 'nothing says how much was wanted'}", FAILED
     if isinstance(error, ModuleNotFoundError):
         return f"the Python package {error.name} is missing; install it with: {install_line()}", MISSING_PART
     if isinstance(error, OSError) and not error.filename and _is_of_stdout(error):

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from trilane import machine
 from trilane.errors import BadInputError
+from trilane.memory import require_memory
 from trilane.stages.run_options import RunOptions
 
 if TYPE_CHECKING:
@@ -106,8 +107,9 @@ def early_processes() -> Iterator[tuple[UnitStarter, GlFacts]]:
     """Start the fork server, which imports what the units need while this process goes on, and look for OpenGL.
 
     Yields the server and a function that waits for the facts of OpenGL. A process of its own looks at the driver,
-    because the driver may crash.
+    because the driver may crash. Raises TrilaneError where no run can begin for lack of memory.
     """
+    require_memory()
     from trilane.pipeline.unit_starter import UnitStarter
     from trilane.stages import PRELOAD
 

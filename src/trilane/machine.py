@@ -13,9 +13,9 @@ import importlib.util
 import os
 import platform
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 import psutil
@@ -86,6 +86,25 @@ class Machine:
     def free_bytes(self) -> int:
         """Return the memory in bytes that programs can still have without swapping."""
         return int(psutil.virtual_memory().available)
+
+    def memory_limit_bytes(self) -> int | None:
+        """Return the least memory limit of this process's control group and of those above it; None without one."""
+        limits = [int(text) for file in self._limit_files() if (text := _text_of(file)).isdecimal()]
+        return min((limit for limit in limits if limit < self.memory_bytes()), default=None)
+
+    def _limit_files(self) -> Iterator[Path]:
+        """Yield the files of these limits, by version 2 and version 1 of control groups."""
+        for line in _text_of(self.proc / "self/cgroup").splitlines():
+            _, kind, path = line.split(":", 2)
+            if kind in ("", "memory"):
+                group = PurePosixPath(path.lstrip("/"))
+                name = "memory.limit_in_bytes" if kind else "memory.max"
+                yield from (self.sys / "fs/cgroup" / kind / part / name for part in (group, *group.parents))
+
+    def oom_kills(self) -> int:
+        """Return how many processes the kernel has ended since it began because memory ran out; 0 where untold."""
+        lines = (line.split() for line in _text_of(self.proc / "vmstat").splitlines())
+        return next((int(words[1]) for words in lines if words[0] == "oom_kill"), 0)
 
     def open_counter(self, attributes: bytes, flags: int) -> int:
         """Return a descriptor of an event that is counted for this thread: perf_event_open(2). Raises OSError.
@@ -163,6 +182,14 @@ def moved_of_kept(kept_bytes: int) -> int:
     `kept_bytes`: bytes that a stage keeps from frame to frame, such as a network's weights.
     """
     return 0 if kept_bytes <= last_level_bytes(here.cores()) else kept_bytes
+
+
+def _text_of(file: Path) -> str:
+    """Return the text of a file of the kernel, without its last line's end; "" where it cannot be read."""
+    try:
+        return file.read_text(encoding="utf-8", errors="replace").strip()
+    except OSError:
+        return ""
 
 
 def _cache_bytes(caches: Path) -> int:

@@ -17,6 +17,7 @@ ROWS = (
         "cache",
         "errors",
         "machine",
+        "memory",
         "figure_sources",
         "files",
         "options",

@@ -1,0 +1,129 @@
+"""Whether memory is what a failure lacks: limits, the kernel's count, and what is said of them."""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from trilane import machine, memory
+from trilane.apps.cli.main import _describe
+from trilane.errors import MissingPartError, TrilaneError
+from trilane.machine import Machine
+from trilane.stages.configure import required_machine
+
+MB = 1 << 20
+GIGABYTE = str(1 << 30)
+
+
+@pytest.fixture
+def plenty(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    """No limit, and no process ended for lack of memory."""
+    monkeypatch.setattr(resource, "getrlimit", lambda _kind: (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    monkeypatch.setattr(machine.here, "memory_limit_bytes", lambda: None)
+    monkeypatch.setattr(machine.here, "oom_kills", lambda: memory._KILLS)
+    monkeypatch.setattr(machine.here, "free_bytes", lambda: 77 * MB)
+    return monkeypatch
+
+
+def test_plenty_of_memory_is_never_short(plenty: pytest.MonkeyPatch) -> None:
+    memory.require_memory()
+    assert memory.shortage() == ""
+    plenty.setattr(machine.here, "memory_limit_bytes", lambda: memory.RUN_BYTES)
+    assert memory.shortage() == ""
+
+
+def test_each_shortage_says_what_is_there_and_what_is_needed(plenty: pytest.MonkeyPatch) -> None:
+    plenty.setattr(machine.here, "oom_kills", lambda: memory._KILLS + 1)
+    ended = "the system has meanwhile ended a process because memory ran out, and a run takes 600 MB"
+    assert memory.shortage() == memory.ended_by_system() == f"{ended}; 77 MB are free now"
+    plenty.setattr(machine.here, "memory_limit_bytes", lambda: 200 * MB)
+    assert memory.shortage() == "the control group may have 200 MB of memory, and a run takes 600 MB"
+    plenty.setattr(resource, "getrlimit", lambda _kind: (900 * MB, 900 * MB))
+    said = "each process may have 900 MB of addresses (ulimit -v), and a run's largest process takes 1700 MB"
+    assert memory.shortage() == f"{said}: ulimit -v unlimited"
+
+
+@pytest.mark.parametrize("part", [1, 2])
+def test_a_control_group_that_no_run_fits_in_is_refused(plenty: pytest.MonkeyPatch, part: int) -> None:
+    """The kernel would end a process of it, which says nothing."""
+    least = memory.LEAST_RUN_BYTES // part
+    plenty.setattr(machine.here, "memory_limit_bytes", lambda: least)
+    memory.require_memory(part)
+    plenty.setattr(machine.here, "memory_limit_bytes", lambda: least - 1)
+    with pytest.raises(TrilaneError) as raised:
+        memory.require_memory(part)
+    found = f"memory: found a limit of {(least - 1) // MB} MB for the control group"
+    assert str(raised.value) == f"{found}, expected at least 600 MB for a run"
+
+
+def test_no_opengl_context_is_no_missing_package_where_memory_is_short(plenty: pytest.MonkeyPatch) -> None:
+    with pytest.raises(MissingPartError, match=r"no OpenGL 3\.3 context"):
+        required_machine(lambda: None)
+    plenty.setattr(resource, "getrlimit", lambda _kind: (600 * MB, 600 * MB))
+    with pytest.raises(TrilaneError) as raised:
+        required_machine(lambda: None)
+    assert str(raised.value).startswith("no OpenGL context could be made; memory is short: each process may have 600")
+    assert raised.value.exit_code == 1
+
+
+def test_an_unexpected_error_is_no_defect_where_memory_is_short(plenty: pytest.MonkeyPatch) -> None:
+    assert _describe(ValueError("x"))[0].endswith("this is a defect of Trilane, --debug shows where")
+    assert _describe(MemoryError("cannot have 3 GB")) == ("memory is short: cannot have 3 GB", 1)
+    plenty.setattr(resource, "getrlimit", lambda _kind: (600 * MB, 600 * MB))
+    said, code = _describe(ImportError("failed to map segment from shared object"))
+    assert code == 1 and said.startswith("memory is short: each process may have 600 MB of addresses")
+    assert said.endswith("; ImportError: failed to map segment from shared object")
+    assert _describe(TrilaneError("its own reason"))[0] == "its own reason"
+
+
+@pytest.mark.parametrize("limit_mb", [100, 200, 300, 500])
+def test_a_run_without_room_for_its_libraries_says_how_much_it_needs(limit_mb: int, tmp_path: Path) -> None:
+    """OpenBLAS ends a process, NumPy raises MemoryError, and EGL finds no driver, as the limit rises."""
+
+    def limited() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (limit_mb * MB, limit_mb * MB))
+
+    command = [sys.executable, "-m", "trilane", "run", "--frames", "4"]
+    done = subprocess.run(command, cwd=tmp_path, preexec_fn=limited, capture_output=True, text=True, check=False)
+    found = f"found a limit of {limit_mb} MB of addresses (ulimit -v), expected at least 1700 MB for a run"
+    assert (done.returncode, done.stderr) == (1, f"error: memory: {found}: ulimit -v unlimited\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def group(root: Path, said: str, **limits: str) -> Machine:
+    """A machine whose process is in the groups that `said` lists. `limits`: by path, `__` for a slash."""
+    (root / "proc/self").mkdir(parents=True)
+    (root / "proc/self/cgroup").write_text(said)
+    for path, text in limits.items():
+        file = root / "sys/fs/cgroup" / path.replace("__", "/").replace("_dot_", ".")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text + "\n")
+    return Machine(root)
+
+
+def test_the_least_limit_of_the_control_groups_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Machine, "memory_bytes", lambda _self: 8 << 30)
+    none = "9223372036854771712"
+    two = group(tmp_path / "2", "0::/a/b\n", a__b__memory_dot_max="max", a__memory_dot_max=GIGABYTE)
+    assert two.memory_limit_bytes() == 1 << 30
+    one = group(
+        tmp_path / "1",
+        "5:cpu:/a\n4:memory:/a\n0::/\n",
+        memory__a__memory_dot_limit_in_bytes=none,
+        memory__memory_dot_limit_in_bytes="4096",
+    )
+    assert one.memory_limit_bytes() == 4096
+    free = group(tmp_path / "0", "4:memory:/\n", memory__memory_dot_limit_in_bytes=none)
+    assert free.memory_limit_bytes() is None
+    assert Machine(tmp_path / "nothing").memory_limit_bytes() is None
+
+
+def test_the_kernel_counts_what_it_ended(tmp_path: Path) -> None:
+    (tmp_path / "proc").mkdir()
+    (tmp_path / "proc/vmstat").write_text("nr_free_pages 12\noom_kill 3\nswap_ra 0\n")
+    assert Machine(tmp_path).oom_kills() == 3
+    assert Machine(tmp_path / "nothing").oom_kills() == 0
