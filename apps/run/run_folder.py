@@ -10,6 +10,7 @@ import fcntl
 import glob
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -23,11 +24,11 @@ RESERVED_BYTES = 4 << 20
 
 
 def default_place(scene: str) -> Path:
-    """Return `runs/<UTC time>-<scene>` in the working directory, a name that nothing has at this moment."""
+    """Return `runs/<UTC time>-<scene>` in the working directory, a name that no run has or is to have."""
     stamp = machine.here.now().strftime("%Y%m%dT%H%M%SZ")
     safe = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in scene)
     place, tries = Path("runs") / f"{stamp}-{safe}", 1
-    while place.exists():
+    while place.exists() or any(_partial(place)):
         tries += 1
         place = Path("runs") / f"{stamp}-{safe}-{tries}"
     return place
@@ -73,7 +74,7 @@ class RunFolder:
         parent = os.open(self.target.parent, os.O_RDONLY | os.O_DIRECTORY)
         try:
             fcntl.flock(parent, fcntl.LOCK_EX)
-            for other in self.target.parent.glob(f"{glob.escape(self.target.name)}.*.partial"):
+            for other in _partial(self.target):
                 if _is_locked(other):
                     found = f"a run that goes on, in {other.name}"
                     raise BadInputError(self.target, found, "a name that is free", "choose another --out")
@@ -150,6 +151,11 @@ class RunFolder:
                 folder.rmdir()
             except OSError:
                 return
+
+
+def _partial(target: Path) -> Iterator[Path]:
+    """Yield the folders of runs to `target` that have not completed."""
+    return target.parent.glob(f"{glob.escape(target.name)}.*.partial")
 
 
 def _is_locked(folder: Path) -> bool:

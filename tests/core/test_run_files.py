@@ -109,7 +109,9 @@ def test_a_second_run_of_the_same_second_has_a_number(tmp_path: Path, monkeypatc
     monkeypatch.setattr(machine.here, "now", lambda: datetime(2026, 11, 22, 3, 4, 5, tzinfo=UTC))
     for name in ("20261122T030405Z-a_b-1", "20261122T030405Z-a_b-1-2", "20261122T030405Z-a_b-1-3"):
         assert default_place("a_b-1") == Path("runs") / name
-        (Path("runs") / name).mkdir(parents=True)
+        (Path("runs") / f"{name}.17.partial").mkdir(parents=True)  # one goes on
+        if not name.endswith("2"):
+            (Path("runs") / name).mkdir()
 
 
 def refusal(target: Path) -> str:
