@@ -241,9 +241,10 @@ def test_a_journal_that_cannot_be_begun_or_written(tmp_path: Path, monkeypatch: 
     with pytest.raises(BadInputError, match="a place that can be written"):
         go(journal=JournalFile(tmp_path / "none" / "j", {}))
 
-    def full(_self: Any, record: Any) -> None:
+    def full(self: Any, record: Any) -> None:
         if isinstance(record, Stepped):
-            raise UnwrittenError(tmp_path / "j", OSError(28, "No space left on device"))
+            self.failure = UnwrittenError(tmp_path / "j", OSError(28, "No space left on device"))
+            raise self.failure
 
     monkeypatch.setattr(JournalWriter, "add", full)
     with pytest.raises(UnwrittenError, match=f"{tmp_path}/j: no space left on device"):
