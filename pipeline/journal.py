@@ -12,11 +12,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, Final, NamedTuple, Self
+from typing import IO, Any, Final, NamedTuple, NoReturn, Self
 
 import msgpack
 
@@ -134,29 +133,29 @@ class JournalWriter:
             return
         kind = type(record)
         fields = _FIELDS[kind](record) if kind in _FIELDS else record
-        with self._errors():
+        try:
             self._file.write(self._packer.pack([_PLACES[kind], *fields]))
+        except OSError as error:
+            self._fail(UnwrittenError(self._path, error))
 
     def flush(self) -> None:
         """Bring all added records to the file, where whoever follows the journal sees them.
 
         A file that was removed counts as one that cannot be written.
         """
-        if self.failure is None:
-            with self._errors():
-                self._file.flush()
-                require_name(self._path, self._file.fileno())
-
-    @contextmanager
-    def _errors(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            self.failure = UnwrittenError(self._path, error)
-        except UnwrittenError as error:
-            self.failure = error
         if self.failure is not None:
-            raise self.failure
+            return
+        try:
+            self._file.flush()
+            require_name(self._path, self._file.fileno())
+        except OSError as error:
+            self._fail(UnwrittenError(self._path, error))
+        except UnwrittenError as error:
+            self._fail(error)
+
+    def _fail(self, error: UnwrittenError) -> NoReturn:
+        self.failure = error
+        raise error from None
 
     def __enter__(self) -> Self:
         return self

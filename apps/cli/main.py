@@ -42,6 +42,9 @@ COMMANDS = {
 
 FAILED, MISSING_PART, INTERRUPTED = 1, 3, 130  # 2 is wrong usage, as Typer has it, and so is 130
 
+#: What libraries raise, among other reasons, where they get no memory, no thread, or no room for their code.
+OF_MEMORY = (MemoryError, ImportError, RuntimeError)
+
 EPILOG = """\b
 Examples:
   trilane run
@@ -129,12 +132,12 @@ def _describe(error: Exception) -> tuple[str, int]:
     """Return the sentence and the exit code of an error that no command handled."""
     if isinstance(error, TrilaneError):
         return str(error), error.exit_code
-    if short := "" if isinstance(error, ModuleNotFoundError) else shortage():
+    if isinstance(error, ModuleNotFoundError):
+        return f"the Python package {error.name} is missing; install it with: {install_line()}", MISSING_PART
+    if isinstance(error, OF_MEMORY) and (short := shortage()):
         return f"memory is short: {short}; {type(error).__name__}: {error}", FAILED
     if isinstance(error, MemoryError):
         return f"memory is short: {error or 'nothing says how much was wanted'}", FAILED
-    if isinstance(error, ModuleNotFoundError):
-        return f"the Python package {error.name} is missing; install it with: {install_line()}", MISSING_PART
     if isinstance(error, OSError) and not error.filename and _is_of_stdout(error):
         return f"stdout: {reason(error)}; free space there, or write the output elsewhere", FAILED
     if isinstance(error, OSError):
