@@ -9,6 +9,7 @@ is printed can be asked at once.
 from __future__ import annotations
 
 import errno
+import re
 import secrets
 import socket
 from collections import Counter
@@ -31,6 +32,8 @@ ADDRESS: Final = "127.0.0.1"
 SECRET_PATHS: Final = frozenset({"/", "/live", "/metrics", "/trace.pftrace"})
 #: Of a page that is not there: who asks for one asks for nothing that may not be asked.
 NOT_FOUND: Final = 404
+#: Path that could name a page; the longest name of one has 30 characters.
+SOUND_PATH: Final = re.compile(r"(/(?!\.\.?(/|$))[\w.-]{0,60}){1,4}", re.ASCII)
 MOST_FIELDS: Final = 16
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -167,6 +170,8 @@ class Guard:
         ours = [[f"http://{host}"] for host in self._hosts]
         if origins not in ours and (origins or scope["type"] == "websocket"):
             return Refusal.FOREIGN_ORIGIN
+        if SOUND_PATH.fullmatch(scope["path"]) is None:
+            return Refusal.MALFORMED
         if scope["path"] in SECRET_PATHS:
             return self._refusal_of_token(scope["query_string"])
         return None
