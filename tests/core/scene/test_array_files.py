@@ -65,23 +65,6 @@ def test_an_array_of_any_width_of_the_family(tmp_path: Path, width: int, whose: 
     assert raw.poses[:, 22:25].any() == (width == 165)
 
 
-def test_turns_of_smpls_hands_are_said_to_be_left_out(tmp_path: Path) -> None:
-    assert (
-        "turns of SMPL's two hand joints left out: the body has none such" in read(save(tmp_path / "a.npy", ROWS)).notes
-    )
-    still = ROWS.copy()
-    still[:, 66:] = 0
-    assert len(read(save(tmp_path / "a.npy", still)).notes) == 4
-
-
-def test_an_array_in_an_npz_or_a_pickle_is_poses_too(tmp_path: Path) -> None:
-    np.savez(tmp_path / "a.npz", ROWS)
-    for path in (tmp_path / "a.npz", save(tmp_path / "a.pkl", ROWS)):
-        raw = read(path)
-        assert raw.poses[:, :22] == pytest.approx(body_of(ROWS))
-        assert raw.notes[0] == f"SMPL {path.suffix}, 4 frames"
-
-
 @pytest.mark.parametrize("shape", [(3, 71), (3, 23, 3), (3, 69), (72,), (0, 72)])
 def test_arrays_that_are_no_axis_angle_are_refused_with_the_widths(tmp_path: Path, shape: tuple[int, ...]) -> None:
     path = save(tmp_path / "a.npy", np.zeros(shape))
@@ -332,15 +315,6 @@ def test_limbs_point_where_the_places_say(tmp_path: Path, walk: Motion) -> None:
     notes = " ".join(raw.notes)
     assert raw.notes[0].startswith("places of 22 joints .npy, as of HumanML3D, 50 frames, 20 frames/s")
     assert "units: m, by the length of the legs" in notes and "the head follows the neck" in notes
-
-
-@pytest.mark.parametrize(("unit", "unit_m"), [("cm", 0.01), ("m", 1.0)])
-def test_units_are_told_by_the_legs(tmp_path: Path, walk: Motion, unit: str, unit_m: float) -> None:
-    truth = places_of(walk.poses[:300:60], walk.translation[:300:60])
-    raw = saved_and_read(tmp_path / "a.npy", truth / unit_m)
-    assert f"units: {unit}, by the length of the legs" in " ".join(raw.notes)
-    assert raw.translation is not None
-    assert raw.translation[:, 2] == pytest.approx(truth[:, 0, 2], abs=0.01)
 
 
 def test_flat_rows_and_more_joints_are_read_alike(tmp_path: Path, walk: Motion) -> None:

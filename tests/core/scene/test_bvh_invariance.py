@@ -102,7 +102,7 @@ class Node:
     tip: np.ndarray | None = None
 
 
-def skeleton(style: Style, turns: np.ndarray, places: np.ndarray, random: np.random.Generator) -> Node:
+def tree(style: Style, turns: np.ndarray, places: np.ndarray, random: np.random.Generator) -> Node:
     """The tree of joints, in random order, with the names of the family."""
     names: dict[str, str] = {}
     for theirs, ours in DIALECTS[style.family].items():
@@ -143,7 +143,7 @@ def written(style: Style, poses: np.ndarray, pelvis: np.ndarray, rest: np.ndarra
     turns, places = chain(poses, pelvis, rest)
     unit_m = float(random.choice(UNITS_M))
     world = _axes(style, random)
-    root = skeleton(style, world @ turns, places @ world.T, random)
+    root = tree(style, world @ turns, places @ world.T, random)
     lines, columns = ["HIERARCHY"], []
 
     def write(node: Node, parent: Node | None) -> None:
@@ -389,22 +389,10 @@ def places_in(path: Path) -> dict[str, np.ndarray]:
     return found
 
 
-def matrix_of(v: np.ndarray) -> np.ndarray:
-    angle = np.linalg.norm(v, axis=-1)[:, None, None]
-    a = v / np.maximum(angle[:, 0], 1e-12)
-    zero = np.zeros(len(a))
-    rows = [[zero, -a[:, 2], a[:, 1]], [a[:, 2], zero, -a[:, 0]], [-a[:, 1], a[:, 0], zero]]
-    cross = np.moveaxis(np.array(rows), -1, 0)
-    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
-
-
 def places_of(motion: Motion, body: ShapedBody) -> np.ndarray:
     """Places (55, T, 3) of the body's joints, from the pelvis."""
-    turns, places = [matrix_of(motion.poses[:, 0])], [np.zeros((len(motion.poses), 3))]
-    for joint, parent in enumerate(JOINT_PARENTS[1:], 1):
-        turns.append(turns[parent] @ matrix_of(motion.poses[:, joint]))
-        places.append(places[parent] + turns[parent] @ (body.joints[joint] - body.joints[parent]))
-    return np.array(places)
+    _, places = chain(motion.poses, np.zeros((len(motion.poses), 3)), body.joints)
+    return places.swapaxes(0, 1)
 
 
 def recordings(shared_data: Path) -> list[Path]:
@@ -437,7 +425,7 @@ def test_limbs_and_lines_are_the_recorded_ones(shared_data: Path, body: ShapedBo
 
 def test_feet_that_stand_are_on_the_floor(shared_data: Path, body: ShapedBody) -> None:
     """By all vertices of the feet, in frames in which a recorded toe is slow and low."""
-    skinner, chain = CpuSkinner(body, 4, pose_blend=False), Skeleton(body.joints, body.body.parents)
+    skinner, skeleton = CpuSkinner(body, 4, pose_blend=False), Skeleton(body.joints, body.body.parents)
     soles = np.isin(body.body.weights.argmax(axis=1), [JOINT_INDEX[name] for name in FEET])
     for path in recordings(shared_data):
         spec = AvatarSpec(motion=str(path))
@@ -453,5 +441,7 @@ def test_feet_that_stand_are_on_the_floor(shared_data: Path, body: ShapedBody) -
         slow = np.linalg.norm(np.gradient(toes, axis=1), axis=-1) < SLOW_M_S * motion.times_s[1]
         stands = (slow & (toes[..., 1] - np.percentile(toes[..., 1], 2) < LOW_M)).any(axis=0)
         assert stands.sum() > 20
-        heights = [skinner.vertices(chain.pose(*mover.sample(t_s)))[soles, 1].min() for t_s in motion.times_s[stands]]
+        heights = [
+            skinner.vertices(skeleton.pose(*mover.sample(t_s)))[soles, 1].min() for t_s in motion.times_s[stands]
+        ]
         assert np.abs(heights).max() < 0.005, path.name

@@ -29,12 +29,11 @@ from support.camera_files import (
     write_stray,
 )
 from trilane.errors import BadInputError
-from trilane.scene.camera import json_files
 from trilane.scene.camera.colmap import MODELS, checked_camera
 from trilane.scene.camera.path import axes_towards
 from trilane.scene.camera.recorded import LengthUnit, looked_at_from, metres_per_unit
 from trilane.scene.lens import Bent, Lens, distortion_note, largest_px
-from trilane.scene.rotations import about
+from trilane.scene.rotations import about, matrix_from_quat
 from trilane.scene.schema import CameraSpec
 
 TURNS = about(1, np.linspace(0.0, 0.8, 5)) @ about(0, -0.1)
@@ -71,17 +70,6 @@ def test_each_view_has_its_own_lens(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(json.dumps(content))
     with pytest.raises(BadInputError, match=r"frames\[1\]\.fl_x: found -3, expected a positive number"):
         load(tmp_path / "a.json")
-
-
-def test_the_lens_of_a_frame_is_no_missing_lens(tmp_path: Path) -> None:
-    """All keys at the frames, none at the top, as Polycam and nerfstudio write them."""
-    matrix = pose_z_up(0).tolist()
-    frame = {"transform_matrix": matrix, "fl_x": 480, "fl_y": 480, "cx": 320, "cy": 240, "w": 640, "h": 480}
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame, frame]}))
-    camera = load(tmp_path)  # the folder
-    assert camera.optics.lenses == (Lens(640, 480, 480, 480, 320, 240),)
-    assert camera.notes[-1] == "taken for NeRF transforms.json: transforms.json in the folder"
-    assert not any("none" in note for note in camera.notes)
 
 
 def test_stray_scanner_without_a_lens_of_each_frame(tmp_path: Path) -> None:
@@ -206,12 +194,6 @@ def test_kitti_times(tmp_path: Path) -> None:
     assert "10 a second assumed, as the file has no times" in camera.notes[0]
 
 
-def test_views_without_times_take_the_scenes_rate(tmp_path: Path) -> None:
-    (tmp_path / "a.json").write_text(nerf_text(*(pose_z_up(20 * k) for k in range(3))))
-    assert load(tmp_path / "a.json", rate_hz=24).times_s == pytest.approx(np.arange(3) / 24)
-    assert load(write_colmap_text(tmp_path, TURNS, PLACES), rate_hz=2).times_s == pytest.approx(np.arange(5) / 2)
-
-
 def test_colmap_text_and_binary_say_the_same(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     text = load(write_colmap_text(tmp_path / "a", TURNS, PLACES))
@@ -242,6 +224,7 @@ BENT: list[tuple[str, list[float], float]] = [
     ("RADIAL", [100, 100, 100, 0.0, 0.05], math.sqrt(2) * 0.2 * 100),
     ("OPENCV", [100, 100, 100, 100, 0.1, 0, 0, 0], math.sqrt(2) * 0.2 * 100),
     ("OPENCV", [100, 100, 100, 100, 0, 0, 0.01, 0], math.hypot(2 * 0.01, 0.01 * 4) * 100),
+    ("OPENCV", [100, 100, 100, 100, 0, 0, 0, 0.01], math.hypot(0.01 * 4, 2 * 0.01) * 100),
     ("FULL_OPENCV", [100, 100, 100, 100, 0, 0, 0, 0, 0, 0.5, 0, 0], math.sqrt(2) * 0.5 * 100),
     ("OPENCV_FISHEYE", [100, 100, 100, 100, 0, 0, 0, 0], (math.sqrt(2) - math.atan(math.sqrt(2))) * 100),
 ]
@@ -373,6 +356,10 @@ REFUSED: dict[str, tuple[str, str]] = {
     "four.txt": ("1 2 3 4\n", "found 4 columns, expected 8 (TUM, EuRoC), 12 (KITTI) or 13 (ARKit), or column names"),
     "ragged.txt": ("0 0 0 0 0 0 0 1\n0 0 0 0 0 0 0\n", "line 2: found 7 columns"),
     "k.json": (nerf_text(pose_z_up(0), k1="x"), "k1: found 'x', expected a number"),
+    "comments.txt": ("# nothing\n", "found 0 columns"),
+    "empty.txt": ("", "found an empty file"),
+    "not.json": ("{", "found no valid JSON"),
+    "no matrix.json": ('{"frames": [{}]}', "frames[0].transform_matrix"),
     "m.json": ('{"frames": [{"transform_matrix": 3, "fl_x": 5}]}', "frames[0].transform_matrix: found shape ()"),
 }
 
@@ -392,6 +379,28 @@ def test_a_folder_without_a_camera(tmp_path: Path) -> None:
     for kind in ("colmap", "nerf", "record3d", "stray", "tum"):
         with pytest.raises(BadInputError):
             load(tmp_path, format=kind)
+
+
+@given(st.text(max_size=200))
+@settings(max_examples=60)
+def test_any_text_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
+    path = tmp_path_factory.mktemp("any") / "a.txt"
+    path.write_text(text, encoding="utf-8")
+    for kind in ("auto", "arkit", "tum", "nerf"):
+        try:
+            load(path, format=kind)
+        except BadInputError as error:
+            assert "a.txt" in str(error)
+
+
+def test_real_logs_are_what_they_are(shared_data: Path) -> None:
+    arkit = load(shared_data / "camera" / "arkit_camera_pose.txt")
+    assert "Y up, device held so that the picture is turned by 90 degrees" in arkit.notes
+    assert any("1 gaps, the longest 33 ms" in note for note in arkit.notes)
+    tum = load(shared_data / "camera" / "tum_freiburg1_xyz.txt")
+    assert "Z up" in tum.notes and any("1 gaps, the longest 110 ms" in note for note in tum.notes)
+    for camera in (arkit, tum):
+        assert np.median(matrix_from_quat(camera.quats)[:, 1, 1]) > 0.6
 
 
 def damaged(draw: st.DataObject, content: bytes) -> bytes:
@@ -449,28 +458,12 @@ def test_columns_that_hold_no_quaternion_are_refused_with_those_that_may(tmp_pat
     ] == pytest.approx([2, 0, 0])
 
 
-def test_quaternions_of_two_digits_are_some(tmp_path: Path) -> None:
-    (tmp_path / "a.txt").write_text("".join(f"{k} {k} 2 3 0.58 0.58 0.58 0\n" for k in range(3)))  # length 1.0046
-    assert len(load(tmp_path / "a.txt", format="tum").times_s) == 3
-
-
 @pytest.mark.parametrize(("columns", "way"), [(1, "commas"), (7, "as TUM has them"), (16, "KITTI's 12")])
 def test_tables_of_others_are_refused_with_a_way(tmp_path: Path, columns: int, way: str) -> None:
     (tmp_path / "a.txt").write_text("1 " * columns + "\n" + "2 " * columns + "\n")
     with pytest.raises(BadInputError) as refused:
         load(tmp_path / "a.txt")
     assert way in refused.value.remedy
-
-
-def test_a_nerf_view_puts_points_at_their_pixels(tmp_path: Path) -> None:
-    """fl_y = 600 of 480 rows: at (1, 2, 3), 4 m along +Y, 0.5 m right (+X), 1 m up (+Z) is 150 above the middle."""
-    (tmp_path / "a.json").write_text(nerf_text(pose_z_up(0, (1, 2, 3)), fl_y=600, h=480, fl_x=300, w=640))
-    assert pixel(load(tmp_path / "a.json"), [1.5, 4.0, -6.0]) == pytest.approx((320 + 300 / 8, 90))
-    lens = {"fl_y": 600, "h": 480, "fl_x": 300, "w": 640, "cx": 310, "cy": 260}
-    (tmp_path / "a.json").write_text(nerf_text(pose_z_up(0, (1, 2, 3)), **lens))
-    assert pixel(load(tmp_path / "a.json"), [1.5, 4.0, -6.0]) == pytest.approx((310 + 300 / 8, 110))
-    (tmp_path / "a.json").write_text(nerf_text(pose_z_up(0, (1, 2, 3))[:3]))  # 3x4 is enough
-    load(tmp_path / "a.json")
 
 
 #: Keys of the file -> field of view of height and width (by tangents of their halves), and where they come from.
@@ -555,9 +548,7 @@ REFUSED_KEYS: dict[str, tuple[Any, str]] = {
         [],
         ": found no list `frames`, expected a NeRF transforms.json: `frames`, each with a 4x4 `transform_matrix`",
     ),
-    "frames": ({"frames": {}}, ": found no list `frames`, expected"),
     "none": ({"frames": []}, ": frames: found 0 frames, expected 1 to 100000"),
-    "number": ({"frames": [3]}, ": frames[0].transform_matrix: found shape (), expected a 4x4 matrix"),
     "text": (
         {"frames": [{"transform_matrix": ONE}, {"transform_matrix": "x"}]},
         ": frames[1].transform_matrix: found something else than numbers, expected a 4x4 matrix",
@@ -571,28 +562,11 @@ REFUSED_KEYS: dict[str, tuple[Any, str]] = {
         ": frames[3].transform_matrix: found a matrix without an inverse, expected a 4x4 matrix, camera to world; "
         "leave this view out",
     ),
-    "two directions": (
-        {"frames": [{"transform_matrix": [[1, 2, 0, 5], [0, 0, 1, 5], [0, 0, 0, 5]]}]},
-        ": frames[0].transform_matrix: found a matrix without an inverse",
-    ),
-    "no last row": (
-        {"frames": [{"transform_matrix": [[1, 0, 0, 5], [0, 1, 0, 5], [0, 0, 1, 5], [0] * 4]}]},
-        ": frames[0].transform_matrix: found a matrix without an inverse",
-    ),
     "no rotation": (
         {"frames": [{"transform_matrix": [[2, 0, 0, 5], [0, 1, 0, 5], [0, 0, 1, 5], [0, 0, 0, 1]]}]},
         ": found 1 samples that are no rotation (first: frames[0].transform_matrix) and 0 times",
     ),
     "true": ({"frames": [{"transform_matrix": ONE}], "w": True}, ": w: found True, expected a positive number"),
-    "zero": ({"frames": [{"transform_matrix": ONE}], "h": 0}, ": h: found 0, expected a positive number"),
-    "words": (
-        {"frames": [{"transform_matrix": ONE}], "fl_x": "x" * 50},
-        f": fl_x: found '{'x' * 39}, expected a positive",
-    ),
-    "infinite": (
-        {"frames": [{"transform_matrix": ONE}], "fl_y": math.inf},
-        ": fl_y: found inf, expected a positive nu",
-    ),
     "pi": (
         {"frames": [{"transform_matrix": ONE}], "camera_angle_x": math.pi},
         ": camera_angle_x: found 3.14159, expected an angle in radians below pi",
@@ -600,10 +574,6 @@ REFUSED_KEYS: dict[str, tuple[Any, str]] = {
     "wide": (
         {"frames": [{"transform_matrix": ONE}], "fl_y": 1, "h": 24, "w": 24},
         ": found a field of view of 170.5 degrees over the height, expected 1 to 170",
-    ),
-    "narrow": (
-        {"frames": [{"transform_matrix": ONE}], "fl_y": 60, "h": 1, "w": 60},
-        ": found a field of view of 0.9549 degrees over the height, expected 1 to 170",
     ),
     "wide only across": (
         {"frames": [{"transform_matrix": ONE}], "fl_y": 1, "h": 2, "w": 24},
@@ -620,19 +590,3 @@ def test_a_wrong_nerf_file_is_refused_in_one_sentence(tmp_path: Path, case: str)
     with pytest.raises(BadInputError) as raised:
         load(path)
     assert f"{path}{sentence}" in str(raised.value)
-
-
-def test_fields_of_view_just_inside_the_range_are_read(tmp_path: Path) -> None:
-    for degrees in (1.1, 169.0):
-        tangent = math.tan(math.radians(degrees / 2))
-        (tmp_path / "a.json").write_text(nerf_text(pose_z_up(0), fl_y=100.0, h=200 * tangent, w=200 * tangent))
-        assert load(tmp_path / "a.json").lens(0.0, (480, 640)).fov_y_deg == pytest.approx(degrees)
-
-
-def test_a_nerf_file_may_have_so_many_views(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(json_files, "MAX_FRAMES", 2)
-    (tmp_path / "a.json").write_text(nerf_text(*[pose_z_up(0)] * 2))
-    load(tmp_path / "a.json")
-    (tmp_path / "a.json").write_text(nerf_text(*[pose_z_up(0)] * 3))
-    with pytest.raises(BadInputError, match="found 3 frames, expected 1 to 2"):
-        load(tmp_path / "a.json")

@@ -117,13 +117,6 @@ def test_a_point_falls_on_its_pixel() -> None:
     assert pixel(LENS, (0, 0, -1)) == pytest.approx([210, 140])
 
 
-def test_a_lens_projects_by_hand() -> None:
-    """90 degrees high, twice as wide as high, from 2 m to 6 m: depth = (-2 z - 6) / -z, written out."""
-    assert centred(200, 100, 50).projection(2.0, 6.0) == pytest.approx(
-        np.array([[0.5, 0, 0, 0], [0, 1, 0, 0], [0, 0, -2, -6], [0, 0, -1, 0]])
-    )
-
-
 def test_each_change_by_hand() -> None:
     assert LENS.scaled(200, 600) == Lens(200, 600, 250, 960, 105, 280)
     assert LENS.cropped(10, -20, 50, 60) == Lens(50, 60, 500, 480, 200, 160)

@@ -16,7 +16,7 @@ from trilane.scene.camera_placement import HIGHEST_DEG, LOWEST_DEG, PlacedCamera
 from trilane.scene.motion.builtin import BUILTIN
 from trilane.scene.motion.motion import Wrap
 from trilane.scene.mover import make_mover
-from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, Scene
+from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
 
 #: Of x and of y: factor and addend to normalised device coordinates.
 LENS = ((1.3, 0.05), (1.73, -0.1))
@@ -79,46 +79,6 @@ def test_how_much_of_the_people_is_seen_from_a_place() -> None:
     np.testing.assert_array_equal(placement._best(f, ahead), ahead[int(np.argmax(score))])
 
 
-def test_an_eye_is_never_on_the_floor() -> None:
-    """The place that shows most, but with the floor 0.29 m below the eye, loses; at 0.31 m it wins."""
-    f = footage()
-    eye = float(f.eyes[:, 1].min())
-    good, poor = np.array([20.0, 0.0, -11.0]), np.array([20.0, 0.0, -30.0])
-    for below, wins in ((0.31, True), (0.29, False)):
-        places = np.array([poor, [good[0], eye - below, good[2]]])
-        scores = [a + 0.12 * min(b, 0.75) for a, b in (plain_visibility(f, place) for place in places)]
-        best = placement._best(f, places)
-        assert (best == places[1]).all() == (wins and scores[1] > scores[0])
-        assert scores[1] > 0 or not wins
-
-
-def test_the_grids_of_places() -> None:
-    f = footage()
-    grid = placement._coarse_grid(f) - f.eyes.mean(axis=0)
-    assert len(grid) == 29 * 15 * 29
-    for axis, low, high, step in ((0, -7.0, 7.0, 0.5), (1, -3.6, -0.8, 0.2), (2, -7.0, 7.0, 0.5)):
-        values = np.unique(np.round(grid[:, axis], 9))
-        assert (values[0], values[-1]) == pytest.approx((low, high))
-        assert np.diff(values) == pytest.approx(step)
-    finer = placement._finer_grid(np.array([1.0, 2.0, 3.0]), 0.25)
-    assert finer[0].tolist() == [1, 2, 3] and len(finer) == 28
-    wanted = {(1 + a, 2 + b, 3 + c) for a in (-0.25, 0, 0.25) for b in (-0.25, 0, 0.25) for c in (-0.25, 0, 0.25)}
-    assert {tuple(row) for row in finer[1:]} == wanted
-
-
-def test_turn_shift_and_distance_of_a_place() -> None:
-    """The scene's origin comes to the place, and +Z there points to the first eye."""
-    f = footage()
-    place = np.array([18.0, -1.0, -9.0])
-    turn, shift = placement._transform(f, place)
-    assert turn @ place + shift == pytest.approx([0, 0, 0], abs=1e-12)
-    towards = (turn @ (f.eyes[0] - place))[[0, 2]]
-    assert towards == pytest.approx([0, math.hypot(*(f.eyes[0] - place)[[0, 2]])], abs=1e-12)
-    assert turn[1] == pytest.approx([0, 1, 0])
-    distances = [math.hypot(eye[0] - 18.0, eye[2] + 9.0) for eye in f.eyes]
-    assert placement._distance(f, place) == pytest.approx(sum(distances) / 3)
-
-
 @pytest.mark.parametrize(
     ("sights", "tilt"),
     [([-10, -20, 0], 0), ([-24.0], 0), ([-30.0], 6), ([5.0, 15.0, 7.0], -7), ([-80.0], 40), ([60.0], -40)],
@@ -127,31 +87,6 @@ def test_a_camera_that_looks_down_is_tilted_up(sights: list[float], tilt: float)
     """The median line of sight comes into -24 to 0 degrees, by at most 40."""
     cameras = path([rot.about(0, math.radians(sight)) for sight in sights], [[0, 0, 0]] * len(sights))
     assert placement._tilt_deg(cameras, cameras.times_s) == pytest.approx(tilt, abs=1e-9)
-
-
-def test_what_is_filmed_is_boxed_in(body: ShapedBody) -> None:
-    """Two avatars in the T pose, 3 m apart: the box of each frame reaches from one to the other."""
-    motion = BUILTIN["t-pose"]()
-    specs = [AvatarSpec(position=(x, 0.0, 1.0)) for x in (-1.5, 1.5)]
-    movers = [make_mover(spec, motion, body) for spec in specs]
-    lows, highs = placement._bounds(np.array([0.0, 1.0]), movers, [body, body])
-    rest = body.vertices - body.joints[0]
-    wide = rest[:, 0].max() + 1.5
-    assert highs[1] == pytest.approx([wide, np.ptp(rest[:, 1]), 1 + rest[:, 2].max()], abs=2e-3)
-    assert lows[0] == pytest.approx([rest[:, 0].min() - 1.5, 0, 1 + rest[:, 2].min()], abs=2e-3)
-    camera = path([np.eye(3), rot.about(1, 0.3)], [[0, 1, 5], [1, 1, 5]])
-    mount = rot.about(0, 0.2)
-    scene = Scene(output=OutputSpec(width=800, height=400))
-    made = placement._footage(camera, mount, camera.times_s, scene, movers, [body, body])
-    assert made.eyes.tolist() == [[0, 1, 5], [1, 1, 5]]
-    assert made.lenses == pytest.approx(np.array([[[math.sqrt(3) / 2, 0], [math.sqrt(3), 0]]] * 2))
-    for k, turn in enumerate((np.eye(3), rot.about(1, 0.3))):
-        axes = turn @ mount
-        assert made.views[k] == pytest.approx(np.column_stack([axes.T, -axes.T @ made.eyes[k]]), abs=1e-6)
-    assert {tuple(corner) for corner in made.boxes[0]} == {
-        tuple((lows, highs)[bit][0][axis] for axis, bit in enumerate(bits))
-        for bits in [(a, b, c) for a in (0, 1) for b in (0, 1) for c in (0, 1)]
-    }
 
 
 def test_a_built_in_camera_stays_and_a_placed_one_is_moved_with_its_path(body: ShapedBody) -> None:
@@ -174,13 +109,6 @@ def test_a_built_in_camera_stays_and_a_placed_one_is_moved_with_its_path(body: S
         "warning: the body is whole in less than 50% of them; if the picture lies on its side or looks past the "
         "body, state camera.up_axis or another camera.place",
     )
-
-
-def test_the_warning_of_a_body_that_is_not_filmed() -> None:
-    assert len(placement._seen_notes(0.5, 0.6)) == 1
-    seen, warning = placement._seen_notes(0.49, 0.6)
-    assert seen == "whole body in the picture in 49% of the first 10 s, 60% of its height on average"
-    assert warning.startswith("warning: the body is whole in less than 50% of them")
 
 
 def test_notes_of_a_placed_camera(body: ShapedBody) -> None:

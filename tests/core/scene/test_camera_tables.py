@@ -13,7 +13,6 @@ import pytest
 from support.camera_files import OPTICAL, lines_of, load, nerf_text, pose_z_up, rows_of
 from trilane.arrays import F64
 from trilane.errors import BadInputError
-from trilane.scene.camera import pose_table
 from trilane.scene.camera.files import load_camera
 from trilane.scene.camera.pose_table import TableLayout, elapsed, layout_of, read_table
 from trilane.scene.rotations import Y_UP_FROM_Z_UP, about, matrix_from_quat, quat_from_matrix
@@ -244,17 +243,6 @@ def test_column_names_without_end_take_no_time(tmp_path: Path) -> None:
     """Brackets that are never closed: a search that looks for the end of each would take minutes."""
     (tmp_path / "a.txt").write_text("[" * 2_000_000 + "\n0 0 0 0 0 0 0 1\n")
     assert layout_of(tmp_path / "a.txt", "a table").columns == 1
-
-
-def test_a_table_may_have_a_million_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pose_table, "MAX_ROWS", 2)
-    path = tmp_path / "a.txt"
-    path.write_text("1\n2\n")
-    assert len(read_table(path, 1, "one").numbers) == 2
-    for text, count in (("1\n2\n3\n", 3), ("# 1\n", 0)):
-        path.write_text(text)
-        with pytest.raises(BadInputError, match=f"found {count} poses, expected 1 to 2; one"):
-            read_table(path, 1, "one")
 
 
 def test_elapsed_times_by_hand() -> None:

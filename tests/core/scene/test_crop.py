@@ -54,7 +54,6 @@ def test_grown_rectangle_holds_the_mesh(rect: Rect, output: tuple[int, int], buc
 
 @given(rects, outputs, bucket_sets)
 def test_no_other_bucket_wastes_less(rect: Rect, output: tuple[int, int], buckets: list[tuple[int, int]]) -> None:
-    """The chosen bucket's rectangle has the least area of all."""
     _, grown = choose_bucket(rect, output, buckets)
     for bucket in buckets:
         _, other = choose_bucket(rect, output, [bucket])
@@ -77,7 +76,6 @@ def test_one_pixel_and_ten_thousand_pixel_bodies() -> None:
 
 
 def test_no_buckets_is_an_error() -> None:
-    """There is nothing to choose from."""
     with pytest.raises(BadInputError, match="tensor shapes"):
         choose_bucket(SCREEN, (480, 640), [])
 
@@ -197,7 +195,6 @@ def test_nothing_on_screen_falls_outside() -> None:
 
 
 def test_rectangle_is_tight_on_whole_bodies() -> None:
-    """With the whole body on the screen the rectangle is the vertices' own."""
     random = np.random.default_rng(3)
     shaped, bounds = default_body(), default_bounds()
     skeleton, skinner = Skeleton(shaped.joints, shaped.body.parents), CpuSkinner(shaped)

@@ -31,11 +31,6 @@ def folder(*names: str, shape: tuple[int, int] = OUTPUT) -> Footage:
     return Footage(("folder",), ("30/s",), (Stored(shape),) * len(names), names, "/photos", 2.0)
 
 
-def test_a_drawn_background_is_filmed_by_nobody() -> None:
-    path = camera(3)
-    assert filmed(path, None, OUTPUT) == (path, ())
-
-
 def test_a_built_in_camera_has_its_own_lens_before_any_background() -> None:
     path = replace(camera(3), recorded=False)
     video = Footage(("video",), ("30/s",), (Stored((1920, 1080)),), period_s=2.5)
@@ -203,13 +198,6 @@ def test_what_is_cut_off() -> None:
     assert cut_note([(1080, 1920)], (480, 640)) == "shown at 640x480: 25% of its width cut off, equally at both ends"
     assert cut_note([(480, 640), (960, 1280)], (480, 640)) == "shown at 640x480: all of it"
     assert cut_note([(480, 640), (64, 640)], (480, 640)) == "shown at 640x480: cut according to their shapes"
-
-
-def test_a_background_of_another_shape_than_the_sensor_is_said() -> None:
-    video = Footage(("video",), ("30/s",), (Stored((720, 1280)),), period_s=2.0)
-    path, notes = filmed(camera(3), video, OUTPUT)
-    assert "taken for the middle of the camera's picture of 640x480, which has another shape" in notes
-    assert path.lens(0.0, (720, 1280)).fx == 1000
 
 
 FILMS: dict[str, tuple[list[str], list[int], int, str]] = {

@@ -106,11 +106,38 @@ AS_WRITTEN = {
         rclavicle head lhumerus rhumerus lradius rradius lwrist rwrist""",
         "lhipjoint rhipjoint upperneck lhand lfingers lthumb",
     ),
+    "Mixamo": (
+        """mixamorig:Hips LeftUpLeg RightUpLeg Spine LeftLeg RightLeg Spine1 LeftFoot RightFoot Spine2
+        LeftToeBase RightToeBase Neck LeftShoulder RightShoulder Head LeftArm RightArm LeftForeArm RightForeArm
+        LeftHand RightHand""",
+        "",
+    ),
+    "CMU": (
+        """Hips LeftUpLeg RightUpLeg LowerBack LeftLeg RightLeg Spine LeftFoot RightFoot Spine1
+        LeftToeBase RightToeBase Neck LeftShoulder RightShoulder Head LeftArm RightArm LeftForeArm RightForeArm
+        LeftHand RightHand""",
+        "",
+    ),
+    "MotionBuilder": (
+        """Hips LeftHip RightHip LowerBack LeftKnee RightKnee Chest LeftAnkle RightAnkle Chest2
+        LeftToe RightToe Neck LeftCollar RightCollar Head LeftShoulder RightShoulder LeftElbow RightElbow
+        LeftWrist RightWrist""",
+        "",
+    ),
+    "3ds Max Biped": (
+        """Bip01_Pelvis Bip01_L_Thigh Bip01_R_Thigh Bip01_Spine Bip01_L_Calf Bip01_R_Calf Bip01_Spine1
+        Bip01_L_Foot Bip01_R_Foot Bip01_Spine2 Bip01_L_Toe0 Bip01_R_Toe0 Bip01_Neck Bip01_L_Clavicle Bip01_R_Clavicle
+        Bip01_Head Bip01_L_UpperArm Bip01_R_UpperArm Bip01_L_Forearm Bip01_R_Forearm Bip01_L_Hand Bip01_R_Hand""",
+        "",
+    ),
+    "SMPL": (
+        """Pelvis L_Hip R_Hip Spine1 L_Knee R_Knee Spine2 L_Ankle R_Ankle Spine3 L_Foot R_Foot Neck L_Collar
+        R_Collar Head L_Shoulder R_Shoulder L_Elbow R_Elbow L_Wrist R_Wrist""",
+        "",
+    ),
+    "SMPL-X": (" ".join(BODY), ""),
 }
-MIXAMO = list(
-    """Hips LeftUpLeg RightUpLeg Spine LeftLeg RightLeg Spine1 LeftFoot RightFoot Spine2 LeftToeBase RightToeBase
-Neck LeftShoulder RightShoulder Head LeftArm RightArm LeftForeArm RightForeArm LeftHand RightHand""".split()  # noqa: SIM905
-)
+MIXAMO = [name.removeprefix("mixamorig:") for name in AS_WRITTEN["Mixamo"][0].split()]
 
 
 @pytest.mark.parametrize("family", AS_WRITTEN)
@@ -123,9 +150,9 @@ def test_every_name_of_a_family_is_that_joint(family: str) -> None:
     assert {ours: names[index] for ours, index in index_of.items()} == expected
 
 
-def test_every_family_is_held_here_or_beside_the_bvh_reader() -> None:
-    first = {"Mixamo", "CMU", "MotionBuilder", "3ds Max Biped", "SMPL", "SMPL-X"}  # in test_bvh_names.py
-    assert set(DIALECTS) == first | set(AS_WRITTEN) | {"VRM 1"}
+def test_every_family_is_held() -> None:
+    assert set(DIALECTS) == set(AS_WRITTEN) | {"VRM 1"}
+    assert list(BODY) == list(JOINT_NAMES[:22])
     for table in DIALECTS.values():
         assert set(table.values()) <= set(JOINT_NAMES) and set(REQUIRED) <= set(table.values())
 
@@ -166,6 +193,8 @@ def test_what_stands_before_all_names_is_no_part_of_them() -> None:
         ("CC_Base_Hip", "hip"),
         ("Character1:Ctrl:Hips", "hips"),
         ("Definition", "definition"),
+        ("a:b:Hips", "hips"),
+        ("Chest2", "chest2"),
     ):
         assert plain(written) == name
 
@@ -215,44 +244,11 @@ def test_the_pelvis_may_have_the_name_of_another_family() -> None:
         match_names(HERE, ["Root", *MIXAMO[1:]])
 
 
-BODY_NAMES = """pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot
-right_foot neck left_collar right_collar head left_shoulder right_shoulder left_elbow right_elbow
-left_wrist right_wrist"""
-#: Names as the programs write them, in the order of BODY_NAMES ("-": the skeleton has no such joint).
-WRITTEN_IN_BVH = {
-    "Mixamo": """mixamorig:Hips LeftUpLeg RightUpLeg Spine LeftLeg RightLeg Spine1 LeftFoot RightFoot Spine2
-        LeftToeBase RightToeBase Neck LeftShoulder RightShoulder Head LeftArm RightArm LeftForeArm RightForeArm
-        LeftHand RightHand""",
-    "CMU": """Hips LeftUpLeg RightUpLeg LowerBack LeftLeg RightLeg Spine LeftFoot RightFoot Spine1
-        LeftToeBase RightToeBase Neck LeftShoulder RightShoulder Head LeftArm RightArm LeftForeArm RightForeArm
-        LeftHand RightHand""",
-    "MotionBuilder": """Hips LeftHip RightHip LowerBack LeftKnee RightKnee Chest LeftAnkle RightAnkle Chest2
-        LeftToe RightToe Neck LeftCollar RightCollar Head LeftShoulder RightShoulder LeftElbow RightElbow
-        LeftWrist RightWrist""",
-    "3ds Max Biped": """Bip01_Pelvis Bip01_L_Thigh Bip01_R_Thigh Bip01_Spine Bip01_L_Calf Bip01_R_Calf Bip01_Spine1
-        Bip01_L_Foot Bip01_R_Foot Bip01_Spine2 Bip01_L_Toe0 Bip01_R_Toe0 Bip01_Neck Bip01_L_Clavicle Bip01_R_Clavicle
-        Bip01_Head Bip01_L_UpperArm Bip01_R_UpperArm Bip01_L_Forearm Bip01_R_Forearm Bip01_L_Hand Bip01_R_Hand""",
-    "SMPL": """Pelvis L_Hip R_Hip Spine1 L_Knee R_Knee Spine2 L_Ankle R_Ankle Spine3 L_Foot R_Foot Neck L_Collar
-        R_Collar Head L_Shoulder R_Shoulder L_Elbow R_Elbow L_Wrist R_Wrist""",
-    "SMPL-X": BODY_NAMES,
-}
 FINGERS = {"Thumb": "thumb", "Index": "index", "Middle": "middle", "Ring": "ring", "Pinky": "pinky"}
 
 
-def test_the_body_is_in_the_order_of_its_joints() -> None:
-    assert BODY_NAMES.split() == list(JOINT_NAMES[:22])
-
-
-@pytest.mark.parametrize("dialect", WRITTEN_IN_BVH)
-def test_every_name_of_a_skeleton_is_that_joint(dialect: str) -> None:
-    names = WRITTEN_IN_BVH[dialect].split()
-    found, index_of = match_names(Path("a.bvh"), names)
-    assert found == dialect
-    assert {name: names[index] for name, index in index_of.items()} == dict(zip(BODY_NAMES.split(), names, strict=True))
-
-
 def test_fingers_have_their_own_names() -> None:
-    names = WRITTEN_IN_BVH["Mixamo"].split()
+    names = AS_WRITTEN["Mixamo"][0].split()
     hands = {
         f"{s}Hand{f}{k}": f"{s.lower()}_{ours}{k}"
         for s in ("Left", "Right")
@@ -264,22 +260,14 @@ def test_fingers_have_their_own_names() -> None:
     assert DIALECTS["CMU"]["lefthandindex1"] == "left_index1" and DIALECTS["CMU"]["righthandindex1"] == "right_index1"
     assert DIALECTS["CMU"]["leftthumb"] == "left_thumb1" and DIALECTS["CMU"]["rightthumb"] == "right_thumb1"
     assert DIALECTS["SMPL-X"]["leftpinky2"] == "left_pinky2" and DIALECTS["SMPL-X"]["jaw"] == "jaw"
-    assert [len(DIALECTS[name]) for name in WRITTEN_IN_BVH] == [52, 26, 22, 22, 22, 55]
-
-
-def test_names_without_prefix_case_and_separators() -> None:
-    assert plain("mixamorig:Left_Hand") == "lefthand"
-    assert plain("a:b:Hips") == "hips"
-    assert plain("Bip01 L Thigh") == "lthigh"
-    assert plain("Chest2") == "chest2"
 
 
 def test_a_name_twice_is_the_first_and_a_joint_that_must_be_there_is_named() -> None:
-    names = [*WRITTEN_IN_BVH["SMPL"].split(), "Pelvis"]
+    names = [*AS_WRITTEN["SMPL"][0].split(), "Pelvis"]
     assert match_names(Path("a.bvh"), names)[1]["pelvis"] == 0
     for required in ("Pelvis", "L_Hip", "R_Hip", "L_Knee", "R_Knee", "L_Ankle", "R_Ankle"):
         rest = [name for name in names if name != required]
-        ours = dict(zip(WRITTEN_IN_BVH["SMPL"].split(), BODY_NAMES.split(), strict=True))[required]
+        ours = dict(zip(AS_WRITTEN["SMPL"][0].split(), BODY, strict=True))[required]
         with pytest.raises(BadInputError) as raised:
             match_names(Path("a.bvh"), rest)
         assert str(raised.value) == (

@@ -16,12 +16,11 @@ from hypothesis import strategies as st
 
 from support.joint_chain import chained_places, degrees_between, limb_directions
 from trilane.errors import BadInputError
-from trilane.scene.camera.files import load_camera
 from trilane.scene.motion.builtin import walk_wave_turn
 from trilane.scene.motion.files import as_played, load_motion
-from trilane.scene.motion.motion import REST_PELVIS, SMPL_REST_PELVIS, T_POSE, Motion, Wrap, wrapped_time
+from trilane.scene.motion.motion import REST_PELVIS, SMPL_REST_PELVIS, T_POSE, Motion, Wrap
 from trilane.scene.rotations import about, matrix_from_rotvec, rotvec_from_matrix
-from trilane.scene.schema import AvatarSpec, CameraSpec, scene_from
+from trilane.scene.schema import AvatarSpec, scene_from
 
 HALF = np.pi / 2
 
@@ -51,111 +50,6 @@ def amass(path: Path, width: int = 165, key: str = "mocap_frame_rate", **extra: 
     return save_npz(path, **{"poses": array, "trans": trans, "betas": np.ones(16), key: np.array(60.0), **extra})
 
 
-def test_npy_has_an_assumed_rate_and_says_so(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", poses(31).astype(np.float32))
-    motion = load(tmp_path / "a.npy")
-    assert motion.poses.shape == (31, 55, 3)
-    assert motion.duration_s == pytest.approx(1.0)
-    assert "30 frames/s assumed" in " ".join(motion.notes)
-    assert not motion.travels
-
-
-def test_unlike_neighbours_are_separate_poses(tmp_path: Path) -> None:
-    array = poses(5)
-    array[:, 3:66] = np.random.default_rng(0).normal(0, 0.6, (5, 63))
-    np.save(tmp_path / "a.npy", array)
-    motion = load(tmp_path / "a.npy")
-    assert motion.duration_s == pytest.approx(4.0)
-    assert "separate poses" in " ".join(motion.notes)
-
-
-@pytest.mark.parametrize(("up", "stated", "note"), [
-    ("y", "auto", "Y up, as the body stands"),
-    ("z", "auto", "Z up, as the body stands"),
-    ("y", "z", "Z up, as given"),
-])  # fmt: skip
-def test_the_up_axis_is_the_bodys_own(tmp_path: Path, up: str, stated: str, note: str) -> None:
-    np.save(tmp_path / "a.npy", poses(up=up))
-    motion = load(tmp_path / "a.npy", up_axis=stated)
-    assert note in motion.notes
-    if stated == "auto":
-        assert matrix_from_rotvec(motion.poses[0, 0]) == pytest.approx(np.eye(3), abs=1e-12)
-
-
-def test_a_motion_faces_the_viewer_at_first_and_is_centred(tmp_path: Path) -> None:
-    path = amass(tmp_path / "a.npz")
-    motion = load(path)
-    assert matrix_from_rotvec(motion.poses[0, 0])[:, 2] == pytest.approx([0, 0, 1], abs=1e-12)
-    ground = motion.translation[:, [0, 2]]
-    assert ground.min(axis=0) + ground.max(axis=0) == pytest.approx([0, 0], abs=1e-12)
-    assert np.ptp(motion.translation[:, 1]) == pytest.approx(0, abs=1e-12)
-
-
-@pytest.mark.parametrize("key", ["mocap_framerate", "mocap_frame_rate"])
-@pytest.mark.parametrize("width", [156, 165])
-def test_amass_in_both_spellings_and_widths(tmp_path: Path, key: str, width: int) -> None:
-    motion = load(amass(tmp_path / "a.npz", width, key))
-    assert motion.times_s == pytest.approx(np.arange(6) / 60)
-    assert motion.poses[0, 54] == pytest.approx([0.5] * 3)
-    assert motion.poses[:, 22:25] == pytest.approx(0)
-    assert motion.betas is not None
-    notes = " ".join(motion.notes)
-    assert key in notes
-    assert f"{width} columns" in notes
-    assert "betas: 16" in notes
-    assert "Z up" in notes
-
-
-def test_broken_frames_are_interpolated_across_and_counted(tmp_path: Path) -> None:
-    array = np.zeros((7, 165))
-    array[:, 48] = np.linspace(0, 0.6, 7)
-    array[3, 100] = np.nan
-    np.save(tmp_path / "a.npy", array)
-    motion = load(tmp_path / "a.npy")
-    assert len(motion.times_s) == 6
-    assert motion.sample(3 / 30)[0][16, 0] == pytest.approx(0.3)
-    assert any("1 samples not finite" in note and "number 3" in note for note in motion.notes)
-    assert any("1 gaps, the longest 67 ms" in note for note in motion.notes)
-
-
-def test_one_frame_is_held(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", poses(1))
-    motion = load(tmp_path / "a.npy")
-    assert "one frame: held" in motion.notes
-    for t_s in (0.0, 0.5, 1e6):
-        assert np.isfinite(motion.sample(t_s)[0]).all()
-
-
-def test_a_recording_plays_back_and_forth(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", poses(31))
-    motion = load(tmp_path / "a.npy")
-    assert motion.wrap is Wrap.BOUNCE
-    for t_s in (0.2, 0.95):
-        assert motion.sample(2 - t_s)[0] == pytest.approx(motion.sample(t_s)[0])
-        assert motion.sample(2 + t_s)[0] == pytest.approx(motion.sample(t_s)[0])
-
-
-WRONG_NPY = {
-    "wide": (np.zeros((3, 71)), "shape (3, 71)"),
-    "no frames": (np.zeros((0, 165)), "shape (0, 165)"),
-    "text": (np.array([["x"] * 165]), "dtype <U1"),
-    "all NaN": (np.full((3, 165), np.nan), "3 samples that are not finite"),
-    "degrees": (np.full((3, 165), 90.0), "an angle of 90"),
-    "scalar": (np.zeros(()), "shape ()"),
-}
-
-
-@pytest.mark.parametrize("case", WRONG_NPY)
-def test_a_wrong_npy_is_refused(tmp_path: Path, case: str) -> None:
-    array, found = WRONG_NPY[case]
-    path = tmp_path / "a.npy"
-    np.save(path, array)
-    with pytest.raises(BadInputError) as raised:
-        load(path)
-    assert str(path) in str(raised.value)
-    assert found in str(raised.value)
-
-
 def test_objects_truncated_and_huge_files_are_refused_unread(tmp_path: Path) -> None:
     pickled, cut, huge, empty = (tmp_path / f"{name}.npy" for name in ("pickled", "cut", "huge", "empty"))
     np.save(pickled, np.array([{}]), allow_pickle=True)
@@ -182,24 +76,6 @@ def test_missing_folders_and_unknown_endings_are_refused(tmp_path: Path) -> None
             load(tmp_path / name)
     with pytest.raises(BadInputError, match="walk-wave-turn"):
         load("builtin:dance")
-
-
-WRONG_AMASS = {
-    "poses": ({"poses": np.zeros((6, 71))}, "shape (6, 71)"),
-    "trans": ({"trans": np.zeros((5, 3))}, "shape (5, 3)"),
-    "betas": ({"betas": np.full(16, np.nan)}, "not finite"),
-    "mocap_frame_rate": ({"mocap_frame_rate": np.array(0.0)}, "one rate from 1 to 1000"),
-}
-
-
-@pytest.mark.parametrize("key", WRONG_AMASS)
-def test_a_wrong_amass_file_is_named_by_key(tmp_path: Path, key: str) -> None:
-    changes, found = WRONG_AMASS[key]
-    path = amass(tmp_path / "a.npz", **changes)
-    with pytest.raises(BadInputError) as raised:
-        load(path)
-    assert f"{path}[{key}]" in str(raised.value)
-    assert found in str(raised.value)
 
 
 def test_an_npz_without_its_keys_or_damaged_is_refused(tmp_path: Path) -> None:
@@ -394,17 +270,6 @@ def test_a_part_faces_ahead_at_first_and_is_in_the_middle_of_its_ground() -> Non
     assert motion.translation == pytest.approx(expected)
 
 
-def test_frames_at_the_ends_of_a_part_are_taken_once() -> None:
-    motion = played(start_s=1, end_s=3)
-    assert motion.times_s.tolist() == [0, 1, 2]
-    assert motion.poses[:, 18, 0] == pytest.approx([0.25, 0.5, 0.75])
-
-
-def test_the_end_of_a_loop_is_its_last_frame() -> None:
-    looping = as_played(walking(), AvatarSpec(loop="repeat", end_s=4.0), "here")
-    assert looping.poses[-1, 18, 0] == pytest.approx(1.0)
-
-
 def test_speed_is_of_what_is_played() -> None:
     motion = played(start_s=1, end_s=3, speed=4)
     assert motion.times_s == pytest.approx([0, 0.25, 0.5])
@@ -422,10 +287,6 @@ def test_what_follows_the_last_frame(loop: str, wrap: Wrap, note: str, at_five: 
     motion = played(loop=loop)
     assert (motion.wrap, motion.notes[-1]) == (wrap, note)
     assert motion.sample(5.0)[0][18, 0] == pytest.approx(at_five)
-
-
-def test_a_held_motion_stays_at_its_ends() -> None:
-    assert [wrapped_time(t_s, 4.0, Wrap.HOLD) for t_s in (-1.0, 0.0, 3.0, 4.0, 1e6)] == [0, 0, 3, 4, 4]
 
 
 @pytest.mark.parametrize(("keys", "sentence"), [
@@ -469,29 +330,3 @@ def test_of_a_real_bvh(shared_data: Path) -> None:
     assert {"LHipJoint", "RHipJoint"} <= set(found.unmapped)
     named = [line.split()[1] for line in path.read_text().splitlines() if line.split()[:1] in (["JOINT"], ["ROOT"])]
     assert sorted((*found.joints.values(), *found.unmapped)) == sorted(named)
-
-
-def test_of_real_poses_without_a_rate(shared_data: Path) -> None:
-    path = shared_data / "motion" / "smplx_poses_8.npy"
-    found = load_motion(AvatarSpec(motion=str(path)), Path()).detected
-    assert found.format == "SMPL-X poses (.npy)"
-    assert found.reason == "an array of shape (8, 165)"
-    assert "taken for separate poses" in found.rate
-
-
-def test_of_real_cameras(shared_data: Path) -> None:
-    formats = {
-        "arkit_camera_pose.txt": ("ARKit log", "13 columns"),
-        "tum_freiburg1_xyz.txt": ("TUM trajectory", "column names"),
-    }
-    for name, (format_, reason) in formats.items():
-        found = load_camera(CameraSpec(source=str(shared_data / "camera" / name)), Path()).detected
-        assert found.format == format_
-        assert found.reason.startswith(reason)
-        assert found.rate.startswith("by the times of the file")
-        assert found.axes and found.lens.startswith("field of view")
-
-
-def test_what_is_built_in_has_no_file() -> None:
-    assert not load_motion(AvatarSpec(motion="builtin:idle"), Path()).detected.format
-    assert not load_camera(CameraSpec(source="builtin:orbit"), Path()).detected.format

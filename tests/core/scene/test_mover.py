@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Any
 
 import numpy as np
@@ -17,14 +16,6 @@ from trilane.scene.motion.motion import Motion, Wrap, rest_leg_m
 from trilane.scene.motion.recorded import stance
 from trilane.scene.mover import DIRECTIONS, feet, floor_lift, ground_rule, make_mover, outline
 from trilane.scene.schema import AvatarSpec
-
-
-def test_directions_are_the_axes_and_diagonals_of_a_cube() -> None:
-    h = 1 / math.sqrt(3)
-    wanted = {tuple(sign * row) for row in np.eye(3) for sign in (1, -1)}
-    wanted |= {(x * h, y * h, z * h) for x in (1, -1) for y in (1, -1) for z in (1, -1)}
-    assert {tuple(np.round(row, 12) + 0.0) for row in DIRECTIONS} == {tuple(np.round(row, 12) + 0.0) for row in wanted}
-    assert len(DIRECTIONS) == 14
 
 
 def test_an_outline_is_the_outermost_vertices_of_each_joint(body: ShapedBody) -> None:

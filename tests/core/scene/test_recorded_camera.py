@@ -134,29 +134,6 @@ def test_a_tum_pose_puts_points_at_their_pixels(tmp_path: Path) -> None:
     assert OPENGL_FROM_OPTICAL.tolist() == [[1, 0, 0], [0, -1, 0], [0, 0, -1]]
 
 
-def test_the_numbers_of_a_tum_quaternion_are_x_y_z_w(tmp_path: Path) -> None:
-    """R written out from Hamilton's product; its columns are right, down and ahead, in a Z-up world."""
-    x, y, z, w = q = np.array([-0.62, 0.13, -0.21, 0.74]) / np.linalg.norm([-0.62, 0.13, -0.21, 0.74])
-    r = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
-    (tmp_path / "a.txt").write_text("0 0 0 0 " + " ".join(str(value) for value in 1.01 * q))
-    turn, _ = load(tmp_path / "a.txt", format="tum").pose(0.0)
-    z_up = np.column_stack([r[:, 0], -r[:, 1], -r[:, 2]])
-    assert turn == pytest.approx(np.stack([z_up[0], z_up[2], -z_up[1]]), abs=1e-9)
-
-
-def test_a_kinect_held_upright_has_its_width_high(tmp_path: Path) -> None:
-    """As above, then rolled by 90 degrees about the line of sight: the quaternions' product by hand."""
-    (tmp_path / "a.txt").write_text("10 1 2 3 -0.5 0.5 0.5 0.5\n")  # (w, x, y, z) = ½ (1, -1, 1, 1)
-    camera = load(tmp_path / "a.txt", up_axis="z", format="tum")
-    assert fov_y(camera) == pytest.approx(2 * math.degrees(math.atan(320 / 517)))
-    assert camera.notes[1] == "Z up, as given, device held so that the picture is turned by 90 degrees"
-    assert camera.notes[0] == "TUM trajectory, 1 poses, optical axes, camera to world"
-
-
 def test_a_camera_that_looks_straight_down_keeps_its_picture() -> None:
     """No turn of the picture has its up near the usual one: up is the axis nearest to the picture's own up."""
     down = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # x right, up = -Z, looks along -Y
@@ -165,21 +142,6 @@ def test_a_camera_that_looks_straight_down_keeps_its_picture() -> None:
     assert camera.notes[0] == "-Z up, as the camera is held (not Y, usual for the format)"
     assert camera.pose(0.0)[0][:, 1] == pytest.approx([0, 1, 0], abs=1e-12)
     assert fov_y(camera) == pytest.approx(36.0)
-
-
-@pytest.mark.parametrize(
-    ("axis", "sign", "usual"), [(0, 1, "y"), (0, -1, "y"), (1, 1, "z"), (1, -1, "z"), (2, 1, "y"), (2, -1, "y")]
-)
-def test_up_is_the_axis_that_the_picture_shows_up(axis: int, sign: int, usual: str) -> None:
-    """Cameras that look along the usual up: every axis of the picture is level, so its own up decides."""
-    up, look = np.eye(3)[axis] * sign, np.eye(3)["xyz".index(usual)]
-    turns = np.column_stack([np.cross(look, up), up, -look])
-    raw = RawCamera(np.zeros(1), turns[None], np.ones((1, 3)), usual, LENSES, "usual", ())
-    camera = path_from_recording(raw, "here", SPEC)
-    assert camera.notes[0].startswith(f"{'-' if sign < 0 else ''}{'XYZ'[axis]} up, as the camera is held")
-    world = camera.pose(0.0)[0] @ turns.T
-    assert world @ up == pytest.approx([0, 1, 0], abs=1e-12)
-    assert camera.places[0] == pytest.approx(world @ np.ones(3), abs=1e-12)
 
 
 @pytest.mark.parametrize(("cosine", "turned"), [(0.31, True), (0.29, False)])
@@ -245,12 +207,6 @@ def test_what_the_scene_says_of_the_lens_wins() -> None:
         "1 samples not finite (first: number 2), interpolated across",
         "1 gaps, the longest 2000 ms, interpolated across",
     )
-
-
-def test_times_too_far_apart_for_a_number_are_left_out(tmp_path: Path) -> None:
-    row = LOOKS_ALONG_X.format(x=0, y=0, z=0)
-    (tmp_path / "a.txt").write_text(arkit_rows(f"-1.7e308 {row}", f"1.7e308 {row}"))
-    assert load(tmp_path / "a.txt").times_s.tolist() == [0.0]
 
 
 def test_each_pose_may_have_a_lens_of_its_own() -> None:
@@ -378,13 +334,6 @@ def test_a_tilted_world_is_levelled_by_its_horizons(seed: int) -> None:
     found = find_upright(system @ turns, "-y", is_levelled=False)
     assert math.degrees(math.acos(found.up @ (system @ [0.0, 1.0, 0.0]))) < 2.0
     assert "where the pictures' horizons are level" in found.note
-
-
-def test_pictures_without_a_horizon_keep_the_usual_axis() -> None:
-    """A camera that looks straight down and turns: no axis is on average above its pictures but the one behind it."""
-    turns = about(1, np.linspace(0, 2 * math.pi, 32, endpoint=False)) @ about(0, -math.pi / 2)
-    found = find_upright(turns, "y", is_levelled=True)
-    assert found.up.tolist() == list(UP["y"]) and "usual for the format" in found.note
 
 
 def test_the_offset_of_a_map_is_taken_off_and_said() -> None:

@@ -17,7 +17,7 @@ from trilane.scene.motion.bvh_retarget import UPS
 from trilane.scene.motion.files import load_motion
 from trilane.scene.motion.motion import REST_PELVIS, Motion, Wrap, bracket, wrapped_time
 from trilane.scene.motion.recorded import ANY, WORLD, RawMotion, lowest, motion_from_recording
-from trilane.scene.motion.smpl_files import hands_note, median_step_rad
+from trilane.scene.motion.smpl_files import median_step_rad
 from trilane.scene.recordings import usable_samples
 from trilane.scene.rotations import matrix_from_rotvec
 from trilane.scene.schema import AvatarSpec
@@ -69,15 +69,6 @@ def test_smplh_has_no_jaw_and_eyes(tmp_path: Path) -> None:
     assert REST_PELVIS.tolist() == [0.003, -0.351, 0.012]
 
 
-def test_smplx_has_all_joints_in_their_order(tmp_path: Path) -> None:
-    poses = np.arange(165.0)[None] / 10
-    raw = load_npz(amass(tmp_path / "a.npz", poses=poses, trans=None, betas=None))
-    assert raw.poses[0].ravel() == pytest.approx(poses[0])
-    assert raw.translation is None and raw.betas is None
-    assert raw.notes[0] == "AMASS .npz (SMPL-X, 165 columns), 1 frames at 120/s (mocap_framerate)"
-    assert raw.notes[2:] == ("betas: none", "no `trans`: stays in place")
-
-
 WRONG_AMASS: list[tuple[dict[str, Any], str]] = [
     (
         {"poses": None},
@@ -118,13 +109,6 @@ def test_a_wrong_amass_file_is_refused_in_one_sentence(tmp_path: Path, case: int
     assert str(raised.value).startswith(f"{path}{sentence}")
 
 
-@pytest.mark.parametrize("rate", [1.0, 1000.0])
-def test_rates_and_betas_at_the_ends_of_their_ranges(tmp_path: Path, rate: float) -> None:
-    raw = load_npz(amass(tmp_path / "a.npz", mocap_framerate=np.array([rate]), betas=np.zeros((1, 400))))
-    assert raw.times_s[1] == 1 / rate
-    assert raw.betas is not None and raw.betas.shape == (400,)
-
-
 # --- SMPL-X arrays ---
 
 
@@ -132,22 +116,6 @@ def stepping(step: float, joint: int = 5, frames: int = 5) -> np.ndarray:
     poses = np.zeros((frames, 55, 3))
     poses[:, joint, 1] = step * np.arange(frames)
     return poses
-
-
-def test_an_array_of_either_shape_is_read(tmp_path: Path) -> None:
-    values = np.arange(2 * 165).reshape(2, 165) / 1000
-    for shape in ((2, 165), (2, 55, 3)):
-        np.save(tmp_path / "a.npy", values.reshape(shape))
-        raw = load_npy(tmp_path / "a.npy")
-        assert raw.poses.reshape(2, 165) == pytest.approx(values)
-    assert raw.times_s == pytest.approx([0, 1 / 30])
-    assert (raw.translation, raw.betas, raw.up) == (None, None, "y")
-    assert raw.notes == (
-        "SMPL-X .npy, 2 frames",
-        "no rate in the format, 30 frames/s assumed",
-        "hands: posed (flat-hand zero)",
-        "betas: none in the format",
-    )
 
 
 def test_steps_above_0_7_are_separate_poses(tmp_path: Path) -> None:
@@ -178,37 +146,6 @@ def test_the_median_step_by_hand() -> None:
     assert median_step_rad(uneven) == pytest.approx((0.3 + 1.0) / 2)
     late = np.concatenate([stepping(0.1, frames=512), stepping(1.0, frames=1500)])
     assert median_step_rad(late) == pytest.approx(0.1)
-
-
-def test_what_is_said_of_hands() -> None:
-    poses = np.zeros((2, 55, 3))
-    poses[:, :25] = 1.0
-    assert hands_note(poses) == "all zero, flat"
-    poses[0, 30] = np.nan
-    assert hands_note(poses) == "all zero, flat"
-    for joint in (25, 54):
-        fingers = np.zeros((2, 55, 3))
-        fingers[1, joint, 2] = 0.1
-        assert hands_note(fingers) == "posed (flat-hand zero)"
-
-
-WRONG_NPY: list[tuple[np.ndarray, str]] = [
-    (
-        np.zeros((2, 164)),
-        "found shape (2, 164), expected (T, 66), (T, 72), (T, 156) or (T, 165), T at least 1, axis-angle",
-    ),
-    (np.zeros((2, 54, 3)), "found shape (2, 54, 3), expected"),
-    (np.zeros((0, 165)), "found shape (0, 165), expected"),
-    (np.full((1, 165), "a"), "found dtype <U1, expected numbers"),
-]
-
-
-@pytest.mark.parametrize("case", range(len(WRONG_NPY)))
-def test_a_wrong_array_is_refused(tmp_path: Path, case: int) -> None:
-    np.save(tmp_path / "a.npy", WRONG_NPY[case][0])
-    with pytest.raises(BadInputError) as raised:
-        load_npy(tmp_path / "a.npy")
-    assert f"{tmp_path}/a.npy: {WRONG_NPY[case][1]}" in str(raised.value)
 
 
 # --- which reader ---
@@ -264,15 +201,6 @@ def test_a_recording_is_turned_to_face_the_viewer() -> None:
     assert motion.poses[:, 0] == pytest.approx(np.array([[0, 0, 0], [0, math.pi / 2, 0]]), abs=1e-12)
     assert motion.translation == pytest.approx(np.array([[0, 1, -1], [0, 1, 1]]), abs=1e-12)
     assert raw.poses[0, 0, 1] == math.pi / 2  # the file's content is left alone
-
-
-def test_a_recording_in_a_z_up_world_is_stood_up() -> None:
-    """The body's up along +Z, facing -Y: it stands by a quarter turn about x; (x, y, z) becomes (x, z, -y)."""
-    raw = raw_motion([[math.pi / 2, 0, 0]] * 2, translation=np.array([[0.0, 0, 1], [2.0, 4, 3]]), up="y")
-    motion = motion_from_recording(raw, "here", "auto")
-    assert motion.poses[:, 0] == pytest.approx(np.zeros((2, 3)), abs=1e-12)
-    assert motion.translation == pytest.approx(np.array([[-1, 1, 2], [1, 3, -2]]), abs=1e-12)
-    assert "Z up, as the body stands" in motion.notes
 
 
 def rolled(cosine: float, axis: str) -> list[float]:
