@@ -17,7 +17,7 @@ from trilane.errors import BadInputError
 from trilane.scene.motion.array_files import load_npy, load_npz, load_pickle, places_in
 from trilane.scene.motion.builtin import walk_wave_turn
 from trilane.scene.motion.files import load_motion
-from trilane.scene.motion.motion import REST_PELVIS, SMPL_REST_PELVIS, T_POSE, Motion
+from trilane.scene.motion.motion import SMPL_REST_PELVIS, T_POSE, Motion
 from trilane.scene.motion.recorded import RawMotion
 from trilane.scene.rotations import matrix_from_rotvec
 from trilane.scene.schema import AvatarSpec
@@ -76,19 +76,6 @@ def test_arrays_that_are_no_axis_angle_are_refused_with_the_widths(tmp_path: Pat
 
 
 # --- AMASS, short and in parts ---
-
-
-@pytest.mark.parametrize("name", ["a.npz", "a.pkl"])
-@pytest.mark.parametrize("width", [66, 72])
-def test_amass_keys_with_poses_of_smpl(tmp_path: Path, name: str, width: int) -> None:
-    values = {"poses": ROWS[:, :width], "trans": PLACES, "mocap_framerate": 120.0, "gender": "neutral"}
-    raw = read(save(tmp_path / name, values))
-    assert raw.poses[:, :22] == pytest.approx(body_of(ROWS))
-    assert raw.translation == pytest.approx(REST_PELVIS + PLACES)
-    assert raw.times_s == pytest.approx(np.arange(4) / 120)
-    assert raw.up == "z"
-    whose = {66: "SMPL body", 72: "SMPL"}[width]
-    assert raw.notes[0] == f"AMASS {name[1:]} ({whose}, {width} columns), 4 frames at 120/s (mocap_framerate)"
 
 
 def test_amass_in_parts(tmp_path: Path) -> None:
