@@ -116,6 +116,15 @@ def test_a_damaged_compiled_network_of_qnn_is_compiled_again(skip_without, tiny_
     assert len(compiled.read_bytes()) > 1000
 
 
+def test_qnn_writes_contexts_for_chips_that_it_knows(skip_without, tiny_quantised, tmp_path):
+    skip_without("qnn")
+    module, path = load_runtime("qnn"), tmp_path / "out.onnx"
+    module.write_context(tiny_quantised.network, "sm8350", path)
+    assert path.stat().st_size > 1000
+    with pytest.raises(BadInputError, match=r"soc: found 'sm1', expected one of sm8350"):
+        module.write_context(tiny_quantised.network, "sm1", path)
+
+
 def test_a_binding_reads_and_writes_the_slots_themselves(module, tiny_quantised, tiny_frames):
     """Bytes written into the slot after it was bound are what is read; the bound address is what is written."""
     network = tiny_quantised.network

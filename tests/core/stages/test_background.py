@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,19 +18,7 @@ from trilane.stages.gpu.survey import survey
 from trilane.stages.gpu.video_reader import HLG, PQ, Pixels, fitted, pq_code, pq_light, roll_off, to_srgb
 
 
-def write_video(path: Path, levels: list[int], fps: int = 10) -> None:
-    """A video of flat grey frames, 64 x 48."""
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("mpeg4", rate=fps)
-        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
-        for level in levels:
-            frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), level, np.uint8), format="rgb24")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-
-
 def test_picture_covers_the_output(tmp_path: Path) -> None:
-    """A wide picture loses its sides, equally; it is given once."""
     pixels = np.zeros((20, 80, 3), np.uint8)
     pixels[:, 30:50] = 200
     Image.fromarray(pixels).save(tmp_path / "wide.png")
@@ -44,27 +31,12 @@ def test_picture_covers_the_output(tmp_path: Path) -> None:
 
 
 def test_folder_is_shown_in_order_and_again(tmp_path: Path) -> None:
-    """Sorted by name, one picture a frame, from the start after the last."""
     for name, level in (("b.png", 20), ("a.jpg", 10), ("c.png", 30)):
         Image.fromarray(np.full((8, 8, 3), level, np.uint8)).save(tmp_path / name)
     background = open_background(tmp_path, (8, 8), 10)
     shown = [background.at(step / 10) for step in range(5)]
     assert [int(picture[0, 0, 0]) for picture in shown if picture is not None] == [10, 20, 30, 10, 20]
     assert background.at(0.4) is None
-
-
-def test_video_follows_media_time_and_repeats(tmp_path: Path) -> None:
-    """Each time shows the newest frame that is due; after the end it starts again; the thread ends with it."""
-    levels = [20, 80, 140, 200]
-    write_video(tmp_path / "grey.mp4", levels)
-    background = open_background(tmp_path / "grey.mp4", (24, 32), 30)
-    seen = []
-    for time_s in (0.0, 0.05, 0.1, 0.3, 0.4, 0.5, 1.7):
-        picture = background.at(time_s)
-        seen.append(None if picture is None else round(float(picture.mean()) / 10) * 10)
-    background.close()
-    assert seen == [20, None, 80, 200, 20, 80, 80]
-    assert not [thread for thread in threading.enumerate() if thread.name == "background video"]
 
 
 BAD_FILES = {
@@ -113,7 +85,6 @@ def test_every_frame_of_a_video_is_shown_at_its_own_time(ramp: Path, numbers: Se
 
 @pytest.mark.parametrize("name", BAD_FILES)
 def test_bad_files_are_named(tmp_path: Path, name: str) -> None:
-    """One BadInputError with the file's name."""
     content = BAD_FILES[name]
     if content is not None:
         (tmp_path / name).write_bytes(content)
@@ -122,20 +93,8 @@ def test_bad_files_are_named(tmp_path: Path, name: str) -> None:
 
 
 def test_folder_without_pictures_is_refused(tmp_path: Path) -> None:
-    """The message lists the endings that count."""
     with pytest.raises(BadInputError, match=r"\.png"):
         open_background(tmp_path, (8, 8), 30)
-
-
-def test_sound_without_video_is_refused(tmp_path: Path) -> None:
-    """A file with no video stream."""
-    with av.open(str(tmp_path / "sound.wav"), "w") as container:
-        stream = container.add_stream("pcm_s16le", rate=8000)
-        frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")
-        frame.sample_rate = 8000
-        container.mux(stream.encode(frame))
-    with pytest.raises(BadInputError, match="no video stream"):
-        open_background(tmp_path / "sound.wav", (8, 8), 30)
 
 
 class Turned:
@@ -170,7 +129,6 @@ class Turned:
     ],
 )
 def test_a_frame_is_turned_as_its_file_says(rotation: float, picture: list[list[int]]) -> None:
-    """At its own size, and at twice the size."""
     wanted = np.array(picture, np.uint8)
     for scale in (1, 2):
         found = fitted(Turned(rotation), Pixels(), (wanted.shape[0] * scale, wanted.shape[1] * scale))
@@ -194,7 +152,6 @@ def test_a_frame_that_is_too_wide_or_too_high_loses_both_sides_equally() -> None
     ],
 )
 def test_what_ffmpeg_would_show_though_it_is_no_video_is_refused(tmp_path: Path, content: bytes, found: str) -> None:
-    """FFmpeg draws text as a terminal does, and opens what a playlist names."""
     (tmp_path / "a.txt").write_bytes(content)
     with pytest.raises(BadInputError) as refused:
         survey(tmp_path / "a.txt", 30.0)
@@ -221,7 +178,6 @@ def srgb(light: float) -> float:
     ("light", "code"), [(0.0, 0.0), (100.0, 0.508), (203.0, 0.581), (1000.0, 0.752), (10000.0, 1.0)]
 )
 def test_the_curve_of_pq(light: float, code: float) -> None:
-    """The well-known levels, to three places; and there and back."""
     assert float(pq_code(np.array(light))) == pytest.approx(code, abs=6e-4)
     assert code_of(light) == pytest.approx(float(pq_code(np.array(light))), abs=1e-7)
     assert float(pq_light(pq_code(np.array(light)))) == pytest.approx(light, abs=1e-6)

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-from fractions import Fraction
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +14,8 @@ from support.small_pipeline import assets_of, without_bytes
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M
 from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import FrameSkinner
-from trilane.errors import BadInputError, TrilaneError
+from trilane.errors import TrilaneError
 from trilane.pipeline.description import UnitSettings
-from trilane.scene import tensor_layout
 from trilane.scene.crop import Rect, choose_bucket, grow
 from trilane.scene.planner import TensorBudget, plan_tensor
 from trilane.scene.schema import AvatarSpec, OutputSpec, Scene
@@ -28,33 +24,12 @@ from trilane.shapes import shape_buckets
 from trilane.stages.avatar_assets import shaped_body, staged_of
 from trilane.stages.config import RunConfig, pose_dtype, posed_vertices, posed_vertices_bytes
 from trilane.stages.cpu import pose
-from trilane.stages.cpu import present as present_stage
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.cpu.pose import PoseStage
-from trilane.stages.cpu.present import PresentStage, Segment
+from trilane.stages.cpu.present import Segment
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 # --- crop ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "length", "expected"),
-    [
-        (0.2, 0.4, 1.0, (-0.2, 0.8)),
-        (0.8, 0.9, 1.0, (0.0, 1.0)),
-        (-0.9, -0.8, 1.0, (-1.0, 0.0)),
-        (0.25, 0.75, 1.999, (-0.999, 1.0)),
-        (0.3, 0.4, 2.0, (-1.0, 1.0)),
-        (0.3, 0.4, 3.0, (-1.5, 1.5)),
-        (0.3, 0.5, 0.1, (0.3, 0.5)),
-        (-1.2, -1.1, 0.5, (-1.2, -0.5)),
-        (1.1, 1.2, 0.5, (0.5, 1.2)),
-    ],
-)
-def test_an_interval_grows_about_its_middle_onto_the_screen(
-    low: float, high: float, length: float, expected: Any
-) -> None:
-    assert grow(low, high, length) == pytest.approx(expected)
 
 
 def test_a_bucket_worked_out_by_hand() -> None:
@@ -69,34 +44,7 @@ def test_a_bucket_worked_out_by_hand() -> None:
     assert line == pytest.approx((0.075, 0.1, 0.125, 0.2))
 
 
-def test_of_equal_waste_the_larger_bucket_is_chosen() -> None:
-    for buckets in ([(64, 64), (96, 96), (32, 32)], [(96, 96), (64, 64)]):
-        assert choose_bucket(Rect(-0.4, -0.4, 0.4, 0.4), (300, 300), buckets)[0] == (96, 96)
-    wide, tall = (64, 128), (100, 50)  # both waste half of themselves on a square; the wide one has more pixels
-    assert choose_bucket(Rect(-0.4, -0.4, 0.4, 0.4), (300, 300), [tall, wide])[0] == wide
-
-
 # --- cells -----------------------------------------------------------------------------------------------------------
-
-
-def test_two_avatars_in_a_row_by_hand() -> None:
-    """50 x 26 and 20 x 30 output pixels, margin 4, tensor 64 x 100.
-
-    One row: (64 - 1) / 50 = 1.26 high, (100 - 4 - 2) / 56 = 1.68 wide. Two rows: (64 - 4 - 2) / 70 = 0.83. So 1.26.
-    """
-    rects = [Rect(-0.9, -0.5, -0.9 + 0.3, 0.0), Rect(-0.26, -0.5, 0.26, 0.5)]
-    sizes = [(25.0, 15.0), (50.0, 26.0)]
-    layout = lay_out(rects, (100, 100), [(32, 50), (64, 100)], 4)
-    assert layout.shape == (64, 100)
-    expected = brute(sizes, [(32, 50), (64, 100)], 4)
-    assert expected[0] == pytest.approx(1.26)
-    (first, first_cell), (second, second_cell) = layout.crops
-    assert second_cell == (0, 0, 63, 33)
-    assert first_cell == (0, 37, 32, 19)
-    for crop, cell, rect in ((first, first_cell, rects[0]), (second, second_cell, rects[1])):
-        assert (crop.width, crop.height) == pytest.approx((2 * cell[3] / 126, 2 * cell[2] / 126))
-        assert crop.x0 <= rect.x0 + 1e-9 and crop.x1 >= rect.x1 - 1e-9
-        assert crop.x0 + crop.x1 == pytest.approx(rect.x0 + rect.x1, abs=0.02) or crop.x0 == -1
 
 
 def brute(sizes: list[tuple[float, float]], buckets: list[tuple[int, int]], margin: int) -> tuple[float, Any, Any]:
@@ -139,24 +87,6 @@ def test_many_avatars_lie_row_by_row_from_the_top_left(seed: int) -> None:
             assert crop == pytest.approx((x0, y0, x1, y1))
             left += width + 16
         top += max(math.ceil(sizes[k][0] * scale) for k in row) + 16
-
-
-def test_margins_are_halved_until_all_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
-    original = tensor_layout._arrangements
-    monkeypatch.setattr(
-        tensor_layout,
-        "_arrangements",
-        lambda sizes, buckets, margin: asked.append(margin) or original(sizes, buckets, margin),
-    )
-    with pytest.raises(BadInputError, match=r"room for 3 avatars.*--size"):
-        lay_out([Rect(-0.5, -0.5, 0.5, 0.5)] * 3, (480, 640), [(2, 2)])
-    assert asked == [16, 8, 4, 2, 1, 0]
-    with pytest.raises(BadInputError):
-        lay_out([Rect(-0.5, -0.5, 0.5, 0.5)] * 2, (480, 640), [(2, 2)])  # exactly no pixel is left
-    with pytest.raises(BadInputError, match="tensor shapes"):
-        lay_out([Rect(-0.5, -0.5, 0.5, 0.5)] * 2, (480, 640), [])
-    assert lay_out([Rect(0.1, 0.1, 0.1, 0.1)] * 2, (4, 4), [(6, 6)], 0).crops[0][1][2:] == (2, 2)
 
 
 # --- pose ------------------------------------------------------------------------------------------------------------
@@ -333,16 +263,6 @@ def test_a_segment_is_h264_of_bt709_with_a_key_frame_every_thirty(tmp_path: Path
         assert luma[row, column] == pytest.approx(expected, abs=3)
 
 
-@pytest.mark.parametrize(
-    ("fps", "rate"), [(30.0, Fraction(30)), (29.97, Fraction(2997, 100)), (23.976, Fraction(2997, 125))]
-)
-def test_a_segments_clock_is_a_fraction(tmp_path: Path, fps: float, rate: str) -> None:
-    segment = Segment(tmp_path / "a.mp4", fps, 32, 48)
-    assert segment._stream.codec_context.time_base == 1 / Fraction(rate)
-    assert segment._stream.codec_context.thread_count == 1
-    segment.close()
-
-
 def test_a_segment_is_on_the_disk_before_it_is_closed(tmp_path: Path) -> None:
     """All but the last frame can be read, and every digest, as when the writer is killed now."""
     path = tmp_path / "a.mp4"
@@ -355,29 +275,3 @@ def test_a_segment_is_on_the_disk_before_it_is_closed(tmp_path: Path) -> None:
     lines = path.with_suffix(".sha256").read_text().splitlines()
     assert [int(line.split()[0]) for line in lines] == list(range(5))
     segment.close()
-
-
-def test_a_jobs_figures_are_milliseconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = Scene(output=OutputSpec(width=96, height=64), fps=24.0)
-    units = {"cpu": UnitSettings(cores=(0,), threads=1)}
-    stage = PresentStage(RunConfig(scene=scene, out_dir=tmp_path, avatar_dirs=(), units=units))
-    slots = [packet(1, 96 * 64 * 3 + 10) for _ in range(2)]
-    slots[1].payload[:] = np.arange(96 * 64 * 3 + 10) % 251
-    monkeypatch.setattr(present_stage.time, "monotonic_ns", lambda: 123)
-    stage.bind(slots, [])
-    ticks = count(0)
-    times = [0, 2_000_000, 7_000_000]
-    monkeypatch.setattr(present_stage.time, "perf_counter_ns", lambda: times[next(ticks) % 3])
-    seen: list[Any] = []
-    monkeypatch.setattr(stage._segment, "add", lambda frame, pixels, _repeats: seen.append((frame, pixels)))
-    assert without_bytes(stage.run(4, 1, None)) == {
-        "digest_ms": pytest.approx(2.0),
-        "encode_ms": pytest.approx(5.0),
-    }
-    (frame, pixels), folder = seen[0], tmp_path / "segments"
-    assert frame == 4 and pixels.shape == (64, 96, 3)
-    assert np.array_equal(pixels.ravel(), slots[1].payload[: 96 * 64 * 3])
-    stage.close()
-    stage.close()
-    name = f"{123:020d}-{os.getpid()}"
-    assert (folder / f"{name}.sha256").read_text().startswith("4 ")

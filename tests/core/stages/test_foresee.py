@@ -68,27 +68,6 @@ def test_the_shapes_are_those_of_frames_spread_over_the_scene(
     assert found.changes == (tuple((frame / 30, shape) for frame, shape in expected),)
 
 
-def test_a_scenes_megabytes_are_a_million_bytes_and_smaller_sizes_get_what_is_left(
-    avatar: AvatarData, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Ten shapes of the first size, three of each further one."""
-    given: list[tuple[int, int, bool]] = []
-    taken: list[int] = []
-
-    def chosen(demands: Any, pixel_bytes: Any, memory_bytes: int, most_shapes: int, *, optional: bool) -> Any:
-        given.append((memory_bytes, most_shapes, optional))
-        found = choose_shapes(demands, pixel_bytes, memory_bytes, most_shapes, optional=optional)
-        taken.append(found.memory_bytes)
-        return found
-
-    monkeypatch.setattr("trilane.stages.foresee.choose_shapes", chosen)
-    scene = Scene(size="auto", frames=1, memory_mb=300)
-    found = foresee(scene, staged(scene, avatar), [avatar.shaped], avatar.network, [OWN, OWN.scaled(563)])
-    assert given == [(300_000_000, 10, False), (300_000_000 - taken[0], 3, True)]
-    assert found.shapes.memory_bytes == sum(taken)
-    assert [area <= OWN.scaled(563).most_of(1) for area in map(prod, found.shapes.shapes)] == [True, False]
-
-
 @pytest.mark.parametrize(("frames", "avatars", "looked_at"), [(500, 1, 96), (40, 1, 40), (500, 3, 32), (500, 8, 24)])
 def test_so_many_frames_are_looked_at(
     avatar: AvatarData, monkeypatch: pytest.MonkeyPatch, frames: int, avatars: int, looked_at: int
@@ -130,16 +109,6 @@ def test_a_networks_memory_is_all_its_bytes_twice(avatar: AvatarData) -> None:
     del network.model.graph.value_info[:]
     assert bytes_per_pixel(network) == pytest.approx(expected)
     assert bytes_per_pixel(reshaped(network, height + 32, width)) == pytest.approx(expected)
-
-
-def test_the_note_says_shapes_frames_and_what_is_less_dense() -> None:
-    shapes = ShapeSet(((64, 96), (128, 32)), 1, 0)
-    text = "tensor: planned in shapes 64x96, 128x32 (somebody is seen in 2 of 3 frames looked at)"
-    assert Foreseen(shapes, (0, 5, 9), 2).note == text
-    less = Foreseen(ShapeSet(shapes.shapes, 1, 4), (0, 5, 9), 2).note
-    two = Foreseen(shapes, (0, 5, 9), 2, changes=(((0.0, (64, 96)), (0.5, (128, 32)), (1.0, (64, 96))), ())).note
-    assert two == f"{text[:-1]}; 2 changes foreseen)"
-    assert less == f"{text}; 4 of them have no shape of their own within memory_mb and are less dense"
 
 
 @pytest.mark.parametrize("room", [False, True])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.kinematics import Posed, Skeleton
-from trilane.body.skinning import CpuSkinner, branch_sums, joint_distance, largest_weights
+from trilane.body.skinning import CpuSkinner
 from trilane.scene.crop import Rect
 from trilane.stages.cpu import mesh_bounds
 from trilane.stages.cpu.mesh_bounds import ROUNDING_M, MeshBounds, Outermost, _blend_reach
@@ -35,66 +35,6 @@ def bent(shaped: ShapedBody, seed: int = 0, size: float = 0.5) -> Any:
 
 
 # --- patches ---------------------------------------------------------------------------------------------------------
-
-
-def test_patches_are_halved_in_the_middle_of_their_longest_axis() -> None:
-    """Ten points on a line, apart by 1, 2, ..., and one axis that is shorter; down to four points or the extent."""
-    features = np.stack([np.cumsum(np.arange(10.0)), np.linspace(0, 20, 10)], axis=1)  # 0 1 3 6 10 15 21 28 36 45
-
-    def groups(points: F64, rows: Any, extent: float) -> list[list[int]]:
-        return [group.tolist() for group in mesh_bounds._bisect(points, np.array(rows), extent)]
-
-    assert groups(features, range(10), 12.0) == [[0, 1, 2, 3, 4], [5, 6], [7, 8, 9]]
-    assert groups(features[:, ::-1], range(9, -1, -1), 12.0) == [[4, 3, 2, 1, 0], [6, 5], [9, 8, 7]]
-    assert groups(features, range(10), 45.0) == [list(range(10))]
-    assert groups(features, range(10), 44.9) == [[0, 1, 2, 3, 4, 5, 6], [7, 8, 9]]
-    steps = np.arange(5.0)[:, None]
-    assert groups(steps, range(5), 3.0) == [[0, 1], [2, 3, 4]]
-    assert groups(steps, range(4), 0.1) == [[0, 1, 2, 3]]
-
-
-def test_a_patchs_centre_is_nearest_to_the_middle_of_its_box() -> None:
-    points = np.array([(0.0, 0), (4.2, 3.0), (5.4, 0.5), (10.0, 1.0)])
-    assert mesh_bounds._nearest_to_middle(points) == 2  # the middle is (5, 1.5)
-
-
-def test_blend_shapes_reach_as_far_as_the_norm_of_their_block() -> None:
-    posedirs = np.random.default_rng(0).normal(size=(4, 3, 486)).astype(np.float32)
-    found = mesh_bounds._blend_reach(posedirs, 4)
-    for vertex in range(4):
-        for joint in range(54):
-            block = posedirs[vertex, :, 9 * joint : 9 * joint + 9].astype(float)
-            assert found[vertex, joint] == pytest.approx(np.sqrt((block**2).sum()), rel=1e-5)
-    assert not mesh_bounds._blend_reach(None, 3).any()
-    assert mesh_bounds._blend_reach(None, 3).shape == (3, 54)
-
-
-def test_levels_hold_what_their_formulas_say(shaped: ShapedBody) -> None:
-    """Two levels of all triangles: size, give and blend of each patch, one vertex at a time."""
-    body, weights = shaped.body, shaped.body.weights.astype(float)
-    coarse, fine = mesh_bounds._build_levels(shaped, weights)
-    branches = branch_sums(body.parents, weights)
-    reach = mesh_bounds._blend_reach(body.posedirs, len(weights))
-    rest = shaped.vertices.astype(float)
-    swing = 0.5 * (branches * joint_distance(shaped))[:, 1:]
-    middles = np.concatenate([rest, swing], axis=1)[body.faces].mean(axis=1)
-    for level, extent in ((coarse, 0.08), (fine, 0.02)):
-        assert sorted(np.concatenate(level.faces)) == list(range(len(body.faces)))
-        for number, faces in enumerate(level.faces):
-            members, centre = np.unique(body.faces[faces]), level.centres[number]
-            assert centre in members
-            assert level.size[number] == pytest.approx(np.linalg.norm(rest[members] - rest[centre], axis=1).max())
-            change = np.abs(branches[members] - branches[centre]).max(axis=0)
-            give = change * np.linalg.norm(rest[centre] - shaped.joints, axis=1)
-            np.testing.assert_allclose(level.give[number], give[1:], atol=1e-12)
-            np.testing.assert_allclose(level.blend[number], reach[members].max(axis=0))
-            assert len(faces) <= 4 or np.ptp(middles[faces], axis=0).max() <= extent
-    for number, parts in enumerate(coarse.parts):
-        held = np.concatenate([fine.faces[part] for part in parts])
-        assert sorted(held) == sorted(coarse.faces[number])
-    for number, vertices in enumerate(fine.parts):
-        assert vertices.tolist() == np.unique(body.faces[fine.faces[number]]).tolist()
-    assert np.concatenate(coarse.parts).tolist() == list(range(len(fine.centres)))
 
 
 def test_levels_are_the_same_from_the_cache(shaped: ShapedBody) -> None:
@@ -125,49 +65,11 @@ def test_spheres_hold_their_patches_in_every_pose(shaped: ShapedBody, size: floa
                 assert away.max() <= radius[number] + 1e-6
 
 
-def test_groups_are_joined_in_the_order_asked_for() -> None:
-    groups = [np.array([4, 5]), np.array([1]), np.array([9, 8])]
-    assert mesh_bounds.join(groups, np.array([2, 0])).tolist() == [9, 8, 4, 5]
-    assert mesh_bounds.join(groups, np.array([], int)).tolist() == []
-
-
 # --- spheres on the screen -------------------------------------------------------------------------------------------
 
 
 def view_of(shaped: ShapedBody, clip: F64 = LENS, posed: Any = None) -> Any:
     return mesh_bounds._View.of(posed or bent(shaped), clip)
-
-
-def test_a_view_knows_its_norms_and_joints(shaped: ShapedBody) -> None:
-    clip, posed = np.random.default_rng(0).normal(size=(4, 4)), bent(shaped)
-    view = view_of(shaped, clip, posed)
-    np.testing.assert_allclose(view.norms, [np.sqrt((row[:3] ** 2).sum()) for row in clip])
-    assert view.near_norm == pytest.approx(np.sqrt(((clip[3] + clip[2])[:3] ** 2).sum()))
-    assert view.far_norm == pytest.approx(np.sqrt(((clip[3] - clip[2])[:3] ** 2).sum()))
-    for joint in (0, 17, 54):
-        whole = np.vstack([posed.matrices[joint], [0, 0, 0, 1]])
-        np.testing.assert_allclose(view.per_joint[joint].reshape(4, 4), clip @ whole, rtol=1e-5, atol=1e-6)
-    turned = [np.sqrt((posed.feature[9 * k : 9 * k + 9] ** 2).sum()) for k in range(54)]
-    np.testing.assert_allclose(view.turned, turned, rtol=1e-6)
-
-
-def test_quotients_are_the_ends_over_the_sphere(shaped: ShapedBody) -> None:
-    """X and W each reach the radius times their norm either way; the quotient's ends are among the four."""
-    random = np.random.default_rng(0)
-    view = view_of(shaped, random.normal(size=(4, 4)))
-    points, radius = random.normal(size=(200, 4)), random.uniform(0, 0.1, 200)
-    points[:, 3] = random.uniform(0.4, 2, 200)
-    low, high = mesh_bounds._quotients(points, radius, view)
-    for point, r, least, most in zip(points, radius, low, high, strict=True):
-        for axis in range(2):
-            ends = [
-                (point[axis] + a * r * view.norms[axis]) / (point[3] + b * r * view.norms[3])
-                for a in (-1, 1)
-                for b in (-1, 1)
-            ]
-            assert (least[axis], most[axis]) == pytest.approx((min(ends), max(ends)))
-    behind = mesh_bounds._quotients(np.array([(1.0, -1, 0, -2)]), np.array([0.1]), view)
-    assert behind[1][0, 0] > 1e8 and behind[0][0, 1] < -1e8
 
 
 def test_spheres_are_sorted_by_the_near_and_far_plane(shaped: ShapedBody) -> None:
@@ -179,29 +81,6 @@ def test_spheres_are_sorted_by_the_near_and_far_plane(shaped: ShapedBody) -> Non
     front, cut = mesh_bounds._against_near(centres, radius, view)
     assert front.tolist() == [True, False, False, False, True, False, True, False, True]
     assert cut.tolist() == [False, True, False, True, False, False, False, False, False]
-
-
-def test_triangles_are_cut_at_the_near_plane() -> None:
-    """Corners in front are kept, edges that cross give the point where z + w + slack is 0."""
-    triangles = np.array(
-        [
-            [(0, 0, 1, 1), (4, 0, -2, 1), (0, 8, 3, 1.0)],
-            [(1, 1, 1, 1), (2, 2, 2, 2), (3, 3, 3, 3)],
-            [(5, 5, -9, 1), (6, 6, -9, 1), (7, 7, -9, 1)],
-            [(0, 0, -3, 1), (4, 0, 0, 1), (0, 4, -4, 1)],
-        ]
-    )
-    for slack in (0.0, 0.5):
-        expected = []
-        for corners in triangles:
-            near = corners[:, 2] + corners[:, 3] + slack
-            expected += [tuple(c) for c, n in zip(corners, near, strict=True) if n > 0]
-            for a, b in ((0, 1), (1, 2), (2, 0)):
-                if (near[a] > 0) != (near[b] > 0):
-                    expected.append(tuple(corners[a] + near[a] / (near[a] - near[b]) * (corners[b] - corners[a])))
-        found = mesh_bounds._clip_near(triangles, slack)
-        assert len(found) == len(expected) > 8
-        np.testing.assert_allclose(sorted(map(tuple, found)), sorted(expected), atol=1e-12)
 
 
 def test_an_extent_grows_and_is_clipped_to_the_screen() -> None:
@@ -220,30 +99,6 @@ def test_an_extent_grows_and_is_clipped_to_the_screen() -> None:
     beside = mesh_bounds._Extent()
     beside.add(np.array([(1.2, 0)]), np.array([(1.4, 0.5)]))
     assert beside.rect() is None
-
-
-@pytest.mark.parametrize("pose_blend", [True, False])
-def test_radii_are_size_give_blend_standoff_and_rounding(
-    shaped: ShapedBody, monkeypatch: pytest.MonkeyPatch, pose_blend: bool
-) -> None:
-    bounds = MeshBounds(shaped, standoff_m=0.03, pose_blend=pose_blend)
-    asked: list[Any] = []
-    original = mesh_bounds._against_near
-    monkeypatch.setattr(mesh_bounds, "_against_near", lambda *given: asked.append(given) or original(*given))
-    posed = bent(shaped)
-    far = np.eye(4)
-    far[2, 3] = -3
-    bounds.rect(posed, LENS @ far)
-    centres, radius, _ = asked[0]
-    level = bounds._levels[0]
-    turned = np.linalg.norm(posed.feature.reshape(54, 9), axis=1)
-    expected = level.size + level.give @ turned / np.sqrt(2) + 0.03 + 1e-4
-    np.testing.assert_allclose(radius, expected + (level.blend @ turned if pose_blend else 0), rtol=1e-6)
-    # The blend shapes' share stands in the radius, so the centres are those without them.
-    rows = np.einsum("vj,jab->vab", shaped.body.weights.astype(float), posed.matrices.astype(float))
-    rest = shaped.vertices[level.centres]
-    world = np.einsum("vab,vb->va", rows[level.centres][..., :3], rest) + rows[level.centres][..., 3]
-    np.testing.assert_allclose(centres, np.c_[world, np.ones(len(world))] @ (LENS @ far).T, rtol=1e-5, atol=1e-5)
 
 
 def whole(points: F64, clip: F64, radius: float) -> tuple[F64, F64]:
@@ -288,18 +143,6 @@ def test_the_quick_way_keeps_the_standoff_from_every_plane(shaped: ShapedBody) -
     for sign in (-1, 1):  # with x = 1.5 X - 0.2 depth the edge lies where |x| + radius norm = w - radius
         edge = (sign * (2 - radius - radius * np.hypot(1.5, 0.2)) + 0.4) / 1.5
         assert seen(edge - sign * 1e-3, 0, 2) and not seen(edge + sign * 1e-3, 0, 2)
-
-
-def test_as_many_weights_as_it_is_drawn_with(shaped: ShapedBody) -> None:
-    few, all_of_them = MeshBounds(shaped, weight_count=4), MeshBounds(shaped)
-    expected = largest_weights(shaped.body.weights, 4).dense()
-    np.testing.assert_allclose(few._weights, expected, atol=1e-7)
-    np.testing.assert_allclose(all_of_them._weights, shaped.body.weights, atol=1e-7)
-    posed, view = bent(shaped), np.eye(4)
-    view[2, 3] = -5
-    found = few._project(np.arange(90), mesh_bounds._View.of(posed, LENS @ view))
-    world = CpuSkinner(shaped, 4).vertices(posed)
-    np.testing.assert_allclose(found, np.c_[world, np.ones(90)] @ (LENS @ view).T, rtol=1e-5, atol=1e-5)
 
 
 SQUARE = np.array([[-0.01, -0.01, 0], [0.01, -0.01, 0], [0.01, 0.01, 0], [-0.01, 0.01, 0]], np.float32)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from support.small_pipeline import EDGES, OWN, STAGES, assets_of, packets, pipeline, without_bytes
-from trilane.body.kinematics import Skeleton
-from trilane.errors import BadInputError, TrilaneError
+from support.small_pipeline import assets_of, without_bytes
+from trilane.errors import BadInputError
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.stage import Skip, UnitContext
 from trilane.pipeline.unit_loop import BoundStage
@@ -27,7 +24,7 @@ from trilane.stages.config import RunConfig, pose_dtype
 from trilane.stages.cpu.pose import PoseStage, build
 from trilane.stages.cpu.present import PresentStage
 from trilane.stages.gpu.composite import DrawnFrames
-from trilane.transport.packets import Packet, SlotLayout, header_dtype, view_packet
+from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 OUTPUT = (480, 640)
 
@@ -47,32 +44,6 @@ def bound(stage: PoseStage, avatars: int = 1) -> Packet:
     packet = view_packet(memoryview(bytearray(layout.slot_bytes)), layout)
     stage.bind([], [packet])
     return packet
-
-
-def test_a_packet_says_everything_of_its_frame(tiny_bundle: Path, tmp_path: Path) -> None:
-    stage = pose_stage(config(tiny_bundle, tmp_path, fps=25.0))
-    packet = bound(stage)
-    before = time.monotonic_ns()
-    assert without_bytes(stage.run(50, None, 0)) == {"visible": 1.0, "level": 5.0, "error_px": 0.0}
-    pose, avatar = packet.header, packet.header["avatars"][0]
-    assert (int(pose["frame"]), float(pose["media_time_s"]), int(pose["avatar_count"])) == (50, 2.0, 1)
-    assert before <= int(pose["t_sampled_ns"]) <= time.monotonic_ns()
-    assert tuple(pose["tensor_shape"]) in shape_buckets("256")
-    assert avatar["visible"] == 1
-    assert tuple(avatar["tensor_rect"]) == (0, 0, *pose["tensor_shape"])
-    rect = avatar["rect"]
-    aspect = (rect[2] - rect[0]) * OUTPUT[1] / ((rect[3] - rect[1]) * OUTPUT[0])
-    assert aspect == pytest.approx(pose["tensor_shape"][1] / pose["tensor_shape"][0], rel=1e-4)
-
-
-def test_the_skinned_feet_stand_on_the_floor(tiny_bundle: Path, tmp_path: Path) -> None:
-    stage = pose_stage(config(tiny_bundle, tmp_path))
-    packet = bound(stage)
-    for frame in (0, 31, 150):
-        stage.run(frame, None, 0)
-        joints = packet.header["avatars"][0]["joints"].astype(np.float64)
-        ankles = [joints[k] @ [0.131 * side, -0.859, -0.001, 1.0] for k, side in ((7, 1), (8, -1))]
-        assert 0.05 < min(place[1] for place in ankles) < 0.11
 
 
 def test_a_frame_is_the_same_whatever_came_before(tiny_bundle: Path, tmp_path: Path) -> None:
@@ -95,26 +66,6 @@ def test_an_avatar_out_of_the_picture_is_not_visible(tiny_bundle: Path, tmp_path
     packet = bound(only_hidden)
     assert without_bytes(only_hidden.run(0, None, 0)) == {"visible": 0.0}
     assert tuple(packet.header["tensor_shape"]) in shape_buckets("256")
-
-
-def test_an_avatar_that_no_pose_brings_into_the_picture_is_not_posed(
-    tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It stands behind the camera; the other one is posed in every frame."""
-    posed: list[float] = []
-    pose = Skeleton.pose
-
-    def noted(self: Skeleton, *args: Any) -> Any:
-        posed.append(float(args[2][2, 3]))
-        return pose(self, *args)
-
-    away = AvatarSpec(position=(0.0, 0.0, 40.0), heading_deg=30.0)
-    stage = pose_stage(config(tiny_bundle, tmp_path, avatars=(away, AvatarSpec())))
-    bound(stage, 2)
-    monkeypatch.setattr(Skeleton, "pose", noted)
-    for frame in range(3):
-        assert stage.run(frame, None, 0)["visible"] == 1.0
-    assert posed == [0.0] * 3
 
 
 def test_a_rung_limits_the_pixels_of_the_tensor(tiny_bundle: Path, tmp_path: Path) -> None:
@@ -150,24 +101,6 @@ def test_the_tensor_has_the_shape_that_was_foreseen_for_its_second(tiny_bundle: 
             stage._made.clear()
             stage.run(frame, None, 0)
             assert tuple(packet.header["tensor_shape"].tolist()) == shape
-
-
-def test_two_avatars_share_the_tensor(tiny_bundle: Path, tmp_path: Path) -> None:
-    pair = (AvatarSpec(position=(-0.6, 0, 0)), AvatarSpec(position=(0.6, 0, 0), motion="builtin:idle"))
-    stage = pose_stage(config(tiny_bundle, tmp_path, avatars=pair))
-    packet = bound(stage, 2)
-    stage.run(0, None, 0)
-    (_, left, _, width), second = sorted(packet.header["avatars"]["tensor_rect"].tolist(), key=lambda cell: cell[1])
-    assert second[1] >= left + width + MARGIN_PX
-
-
-def test_nan_never_leaves_the_stage(tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stage = pose_stage(config(tiny_bundle, tmp_path, camera=CameraSpec(source="builtin:static")))
-    bound(stage)
-    mover = type(stage._actors[0].mover)
-    monkeypatch.setattr(mover, "sample", lambda *_: (np.full((55, 3), np.nan), np.zeros(3)))
-    with pytest.raises(TrilaneError, match="frame 3: the pose of avatar 0 is not finite"):
-        stage.run(3, None, 0)
 
 
 def test_edges_are_checked(tiny_bundle: Path, tmp_path: Path) -> None:
@@ -314,57 +247,3 @@ def test_a_repeated_frame_is_digested_and_shown_as_the_one_that_it_repeats(tmp_p
     digests = [line.split()[1] for line in file.read_text().splitlines()]
     assert digests[0] == digests[1] == digests[2] and digests[3] == digests[4]
     assert len(set(digests)) == 3
-
-
-class Skipping:
-    """Notes what it is asked; every frame skips."""
-
-    def __init__(self) -> None:
-        self.forgot = 0
-
-    def bind(self, inputs: Any, outputs: Any) -> None:
-        self.bound = inputs, outputs
-
-    def run(self, frame: int, *_slots: int | None) -> Mapping[str, float]:
-        return Skip(frame=frame)
-
-    def forget(self) -> None:
-        self.forgot += 1
-
-    def close(self) -> None:
-        pass
-
-
-def test_a_stage_is_told_to_forget_and_may_skip_only_where_a_bypass_begins() -> None:
-    unit = UnitContext("left", UNITS["cpu"], {})
-    stage = Skipping()
-    bound = BoundStage("a", stage, [], packets(OWN, 1), 0, unit, may_skip=True)
-    assert (bound.run(3, -1, 0, 0), stage.forgot) == (Skip(frame=3), 0)
-    bound.run(4, -1, 0, 0, fresh=True)
-    assert stage.forgot == 1
-    other = BoundStage("b", stage, [], packets(OWN, 1), 0, unit)
-    with pytest.raises(TrilaneError, match="stage b returned a Skip, and the pipeline's bypass does not begin at it"):
-        other.run(3, -1, 0, 0, fresh=True)
-    assert stage.forgot == 1
-
-
-def test_a_header_is_passed_on_from_either_edge_at_the_end_of_a_bypass() -> None:
-    inputs, outputs = packets(OWN, 3), packets(OWN, 1)
-    bound = BoundStage("c", Skipping(), inputs, outputs, 0, UnitContext("right", UNITS["cpu"], {}), may_skip=True)
-    inputs[2].header["frame"] = 77
-    bound.run(77, 2, 0, 5)
-    assert (int(outputs[0].header["frame"]), int(outputs[0].header["epoch"])) == (77, 5)
-
-
-def test_a_bypass_joins_edges_of_one_header() -> None:
-    names = (STAGES[0].name, STAGES[2].name)
-    alike = tuple(edge.model_copy(update={"header": OWN}) for edge in EDGES)
-    made = pipeline(edges=alike, bypass=names)
-    assert made.edges_into(names[1]) == ("mid->out", "in->mid")
-    assert made.edges_into("mid") == ("in->mid",) and made.edges_into("in") == ()
-    assert made.graph().bypass == names
-    unlike = (alike[0], alike[1].model_copy(update={"header": header_dtype()}))
-    with pytest.raises(BadInputError, match="different headers of edges mid->out, in->mid"):
-        pipeline(edges=unlike, bypass=names)
-    with pytest.raises(BadInputError, match="bypass"):
-        pipeline(edges=alike, bypass=("in", "mid"))

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from trilane.body.joints import JOINTS
 from trilane.errors import BadInputError, TrilaneError
-from trilane.stages.gpu import raster
 from trilane.stages.gpu.opengl import build_program, shader_source
 from trilane.stages.gpu.skinned_mesh import (
     BodyPose,
@@ -68,34 +67,6 @@ def test_a_closed_body_is_closed_from_the_cache_too(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr("trilane.stages.gpu.skinned_mesh.is_closed", lambda *_: True)
     assert [avatar_mesh(shaped).closed for _ in range(2)] == [True, True]
-
-
-@pytest.mark.parametrize(
-    ("filtering", "hardware", "deferred"),
-    [("linear", False, True), ("linear", True, False), ("anisotropic", False, False), ("mipmap", False, False)],
-)
-def test_uvs_are_drawn_first_where_that_is_quicker(
-    monkeypatch: pytest.MonkeyPatch, filtering: str, hardware: bool, deferred: bool
-) -> None:
-    """On a driver that is software, and with the filter of four texels alone."""
-    asked: list[Any] = []
-
-    def passed(*given: Any) -> Any:
-        asked.append(given)
-        raise StopIteration
-
-    config = SimpleNamespace(scene=SimpleNamespace(texture_filter=filtering))
-    monkeypatch.setattr(raster, "RunConfig", SimpleNamespace(model_validate=lambda _: config))
-    monkeypatch.setattr(raster, "distinct", lambda _: ["folder"])
-    monkeypatch.setattr(raster, "texture_of", lambda *_: np.zeros((2, 2, 8)))
-    monkeypatch.setattr(raster, "quantisation_of", lambda *_: "bytes")
-    monkeypatch.setattr(raster, "describe", lambda _: SimpleNamespace(hardware=hardware, renderer="r"))
-    monkeypatch.setattr(raster, "PackedPass", passed)
-    devices: list[str] = []
-    unit: Any = SimpleNamespace(shared=lambda *_: "context", assets={}, use_device=devices.append)
-    with pytest.raises(StopIteration):
-        raster.build({"config": {}}, unit)
-    assert asked == [("context", 8, "bytes", deferred, filtering)] and devices == (["r"] if hardware else [])
 
 
 def test_a_mesh_says_what_a_pose_lacks() -> None:
@@ -240,10 +211,6 @@ BAD = {
 def test_what_cannot_be_drawn_is_refused_by_its_name(where: str, changed: dict[str, Any]) -> None:
     with pytest.raises(BadInputError, match=f"^mesh {where}: "):
         mesh_arrays(**square(**changed))
-
-
-def test_the_last_index_of_each_kind_is_allowed() -> None:
-    mesh_arrays(**square(joint=np.full((5, 4), 54), faces=np.array([(4, 0, 1), (0, 1, 4)])))
 
 
 @pytest.mark.parametrize(("count", "size"), [(1 << 16, 2), ((1 << 16) + 1, 4)])

@@ -6,8 +6,6 @@ import errno
 import hashlib
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import av
 import numpy as np
@@ -19,7 +17,6 @@ from trilane.apps.run import run_files
 from trilane.apps.run.run_files import contact_sheet, join_segments, run_checksum
 from trilane.errors import UnwrittenError
 from trilane.pipeline.description import UnitSettings
-from trilane.pipeline.memory import BYTES
 from trilane.scene.schema import OutputSpec, Scene
 from trilane.stages.config import RunConfig, pose_dtype
 from trilane.stages.cpu.present import SEGMENTS, PresentStage, full_disk_told
@@ -141,18 +138,6 @@ def test_the_checksum_is_of_the_presented_bytes_whatever_the_segments(tmp_path: 
     assert run_checksum([]) is None
 
 
-def test_the_contact_sheet_shows_first_and_last_frame(tmp_path: Path) -> None:
-    present(tmp_path, range(40))
-    join_segments(segments(tmp_path), tmp_path / "video.mp4", FPS)
-    assert contact_sheet(tmp_path / "video.mp4", tmp_path / "contact.png", FPS) == 20
-    with Image.open(tmp_path / "contact.png") as picture:
-        sheet = np.asarray(picture)
-    cell_height = 320 * HEIGHT // WIDTH
-    assert sheet.shape == (5 * cell_height, 4 * 320, 3)
-    assert sheet[cell_height - 3, 300].mean() == pytest.approx(grey_of(0), abs=3)
-    assert sheet[-3, -3].mean() == pytest.approx(grey_of(39), abs=3)
-
-
 def sheet_of(tmp_path: Path, frames: range, fps: float = FPS) -> tuple[int, np.ndarray]:
     """How many frames a sheet of these has, and the grey of each of its places, read at the lower right."""
     present(tmp_path, frames)
@@ -188,38 +173,6 @@ def test_both_ways_to_decode_give_the_frames_that_are_wanted(
     _, greys_of = sheet_of(tmp_path, range(40))
     assert used == [20]
     assert greys_of.ravel() == pytest.approx([grey_of(round(k * 39 / 19)) for k in range(20)], abs=4)
-
-
-def test_each_frame_is_sought_in_the_time_of_its_stream(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A seek without a stream counts in microseconds: it would end at the first key frame, and all would be decoded."""
-    sought: list[Any] = []
-    frames = [SimpleNamespace(pts=pts) for pts in (0, 512, 1024)]
-    container = SimpleNamespace(
-        streams=SimpleNamespace(video=["the stream"]),
-        seek=lambda pts, **settings: sought.append((pts, settings)),
-        decode=lambda stream: iter(frames) if stream == "the stream" else iter(()),
-    )
-    monkeypatch.setattr(run_files, "_thumbnail", lambda frame: f"of {frame.pts}")
-    assert list(run_files._decode_each(container, [512, 1000])) == [(512, "of 512"), (1000, "of 1024")]
-    assert sought == [(512, {"stream": "the stream"}), (1000, {"stream": "the stream"})]
-
-
-def test_a_sheet_is_compressed(tmp_path: Path) -> None:
-    """Even grey pictures with labels: far below a byte for each of the 320 x 213 x 3."""
-    sheet_of(tmp_path, range(1))
-    assert (tmp_path / "contact.png").stat().st_size < 320 * 213
-
-
-def test_frames_are_labelled_with_their_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames 2, 3 and 7 of a run: the time of a frame tells its number."""
-    said: list[Any] = []
-    monkeypatch.setattr(
-        run_files.ImageDraw, "Draw", lambda _: SimpleNamespace(text=lambda *a, **k: said.append((a, k)))
-    )
-    present(tmp_path, range(2, 4))
-    sheet_of(tmp_path, range(7, 8))
-    style = {"fill": "white", "stroke_width": 2, "stroke_fill": "black", "font_size": 14}
-    assert said == [(((320 * k + 6, 4), f"frame {frame}"), style) for k, frame in enumerate((2, 3, 7))]
 
 
 def test_labels_are_at_the_upper_left_of_their_pictures(tmp_path: Path) -> None:
@@ -264,20 +217,3 @@ def test_what_a_digest_file_says(tmp_path: Path) -> None:
     assert run_checksum(files) == hashlib.sha256(b"1 dd\n2 bb\n10 aa\n").hexdigest()
     (tmp_path / "b.sha256").write_text("1 d")
     assert run_checksum(files[1:]) is None
-
-
-def test_nothing_is_written_when_the_run_is_not_recorded(tmp_path: Path) -> None:
-    stage, slot = PresentStage(make_config(tmp_path, record=False)), make_slot()
-    stage.bind([slot], [])
-    assert stage.run(0, 0, None) == dict.fromkeys(BYTES, 0)
-    stage.close()
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_present_stage_has_an_input_and_no_output(tmp_path: Path) -> None:
-    stage, slot = PresentStage(make_config(tmp_path, record=False)), make_slot()
-    with pytest.raises(ValueError, match="no output"):
-        stage.bind([slot], [slot])
-    stage.bind([slot], [])
-    with pytest.raises(ValueError, match="input slot"):
-        stage.run(0, None, None)
