@@ -14,7 +14,7 @@ import pytest
 
 from support.small_inputs import net
 from trilane.avatars.bundle import Bundle, bundle_folder, load_bundle, write_bundle
-from trilane.avatars.manifest import BANDS, Manifest, NetworkEntry, network_entry, parse_manifest
+from trilane.avatars.manifest import Manifest, NetworkEntry, network_entry, parse_manifest
 from trilane.avatars.network_file import check_network
 from trilane.errors import BadInputError
 
@@ -37,23 +37,6 @@ def edit(folder, **changes):
     path.write_text(json.dumps(manifest))
 
 
-def test_what_is_written_is_read(tiny_bundle, tiny_quantised):
-    bundle = load_bundle(tiny_bundle)
-    assert bundle.manifest.name == "tiny" and bundle.manifest.network.channels == 5
-    assert bundle.read_texture().shape == (32, 32, 5)
-    assert bundle.read_texture().dtype == np.float32
-    assert bundle.read_network().digest == tiny_quantised.network.digest
-    assert bundle.body_path.is_file()
-
-
-def test_an_int8_texture_is_scaled(tiny_bundle, tiny_quantised, tmp_path):
-    manifest = Manifest(name="int8", network=network_entry(tiny_quantised.network, "resnet18", "batch", 8))
-    texture = np.full((4, 4, 5), -3, np.int8)
-    scale = np.arange(1, 6)
-    write_bundle(tmp_path / "b", manifest, tiny_bundle / "body.npz", texture, tiny_quantised.network, scale)
-    assert load_bundle(tmp_path / "b").read_texture()[2, 2] == pytest.approx(-3.0 * scale)
-
-
 def test_a_bundle_whose_parts_do_not_fit_is_not_written(tiny_bundle, tiny_quantised, tmp_path):
     manifest = Manifest(name="wrong", network=network_entry(tiny_quantised.network, "resnet18", "batch", 8))
     texture = np.zeros((4, 4, 6), np.float16)
@@ -63,15 +46,7 @@ def test_a_bundle_whose_parts_do_not_fit_is_not_written(tiny_bundle, tiny_quanti
 
 
 WRONG_MANIFEST = {
-    "width": ({"network__width": 0}, r"network\.width"),
-    "scale 0": ({"network__input": {"scale": 0, "zero_point": 0}}, r"network\.input\.scale"),
-    "scale 1e-40": ({"network__input": {"scale": 1e-40, "zero_point": 0}}, r"network\.input\.scale"),
     "scale text": ({"network__input": {"scale": "inf", "zero_point": 0}}, r"network\.input\.scale"),
-    "zero point": ({"network__input": {"scale": 1, "zero_point": 256}}, r"network\.input\.zero_point"),
-    "unknown key": ({"colour": 1}, "colour"),
-    "future version": ({"schema_version": 2}, "schema_version"),
-    "outside": ({"body": "../body.npz"}, "outside the bundle"),
-    "absolute": ({"texture": "/etc/hostname"}, "outside the bundle"),
     "the folder itself": ({"texture": "."}, "outside the bundle"),
     "missing": ({"network__file": "other.onnx"}, r"other\.onnx"),
     "NaN": ({"betas": [float("nan")]}, "betas"),
@@ -106,41 +81,11 @@ def test_a_link_out_of_the_bundle_is_refused(copied, tmp_path):
         load_bundle(copied)
 
 
-WRONG_TEXTURE = {
-    "NaN": {"texture": np.full((8, 8, 5), np.nan, np.float16)},
-    "channels": {"texture": np.zeros((8, 8, 4), np.float16)},
-    "flat": {"texture": np.zeros((8, 8), np.float16)},
-    "one texel": {"texture": np.zeros((1, 1, 5), np.float16)},
-    "integers": {"texture": np.zeros((8, 8, 5), np.int32)},
-    "objects": {"texture": np.array([{}])},
-    "no scale": {"texture": np.zeros((8, 8, 5), np.int8)},
-    "wrong scale": {"texture": np.zeros((8, 8, 5), np.int8), "scale": np.ones(3, np.float32)},
-    "NaN scale": {"texture": np.zeros((8, 8, 5), np.int8), "scale": np.float32(np.nan)},
-    "other name": {"picture": np.zeros((8, 8, 5), np.float16)},
-}
-
-
-@pytest.mark.parametrize("case", WRONG_TEXTURE)
-def test_wrong_textures_are_named(copied, case):
-    np.savez(copied / "texture.npz", **WRONG_TEXTURE[case])
-    with pytest.raises(BadInputError, match=r"texture\.npz"):
-        load_bundle(copied).read_texture()
-
-
 def test_a_truncated_texture_is_named(copied):
     path = copied / "texture.npz"
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(BadInputError, match=r"texture\.npz"):
         load_bundle(copied).read_texture()
-
-
-def test_a_network_that_is_not_the_manifests_is_named(copied):
-    edit(copied, network__input={"scale": 0.5, "zero_point": 3})
-    with pytest.raises(BadInputError, match=r"network\.onnx \(input\)"):
-        load_bundle(copied).read_network()
-    edit(copied, network__channels=6)
-    with pytest.raises(BadInputError, match="5 channels"):
-        load_bundle(copied).read_network()
 
 
 def test_a_word_like_default_is_no_folder(tmp_path: Path) -> None:
@@ -173,51 +118,24 @@ def manifest(**changes: Any) -> str:
     return json.dumps({"name": "a", "network": entry, **changes})
 
 
-def test_what_a_manifest_leaves_out() -> None:
-    read = parse_manifest(manifest(), Path("m"))
-    assert (read.schema_version, read.body, read.texture, read.betas, read.expression) == (
-        1, "body.npz", "texture.npz", (), (),
-    )  # fmt: skip
-    assert (read.training_command, read.provenance, read.quantisation, read.validation) == ("", {}, {}, None)
-    assert (read.network.output.scale, read.network.output.zero_point) == (1 / 255, 0)
-
-
 #: Change -> key and beginning of what is expected; "" where the value is fine.
 LIMITS: list[tuple[dict[str, Any], str]] = [
     ({"network": {"width": 1}}, ""),
-    ({"network": {"width": 256}}, ""),
     ({"network": {"width": 257}}, "network.width: found 257 (Input should be less than or equal to 256)"),
     ({"network": {"width": 0}}, "network.width: found 0 (Input should be greater than or equal to 1)"),
-    ({"network": {"channels": 1}}, ""),
     ({"network": {"channels": 64}}, ""),
     ({"network": {"channels": 65}}, "network.channels: found 65 (Input should be less than or equal to 64)"),
-    ({"network": {"channels": 0}}, "network.channels: found 0 (Input should be greater"),
-    ({"network": {"file": "x" * 200}}, ""),
     ({"network": {"file": "x" * 201}}, "network.file: found "),
-    ({"network": {"file": ""}}, 'network.file: found "" ('),
     ({"network": {"input": {"scale": 1e-12, "zero_point": 255}}}, ""),
-    ({"network": {"input": {"scale": 1e12, "zero_point": 0}}}, ""),
     ({"network": {"input": {"scale": 0.99e-12, "zero_point": 0}}}, "network.input.scale: found 9.9e-13 ("),
-    ({"network": {"input": {"scale": 1.01e12, "zero_point": 0}}}, "network.input.scale: found 1010000000000.0 ("),
     ({"network": {"input": {"scale": 1, "zero_point": 256}}}, "network.input.zero_point: found 256 ("),
-    ({"network": {"input": {"scale": 1, "zero_point": -1}}}, "network.input.zero_point: found -1 ("),
-    ({"network": {"input": {"scale": 1, "zero_point": 0, "x": 1}}}, "network.input.x: found 1 (Extra inputs"),
-    ({"network": {"more": 1}}, "network.more: found 1 ("),
     ({"more": 1}, "more: found 1 (Extra inputs are not permitted), expected a valid manifest"),
     ({"schema_version": 2}, "schema_version: found 2 (Input should be 1)"),
-    ({"name": ""}, 'name: found "" ('),
-    ({"name": "x" * 100}, ""),
     ({"name": "x" * 101}, f'name: found "{"x" * 56}... ('),
-    ({"betas": [100, -100] * 200}, ""),
     ({"betas": [0] * 401}, "betas: found ["),
-    ({"betas": [100.1]}, "betas.0: found 100.1 ("),
     ({"betas": [0, -100.1]}, "betas.1: found -100.1 ("),
-    ({"expression": [0] * 100}, ""),
     ({"expression": [0] * 101}, "expression: found ["),
-    ({"expression": [101]}, "expression.0: found 101 ("),
-    ({"body": ""}, 'body: found "" ('),
     ({"texture": 3}, "texture: found 3 ("),
-    ({"more": "x" * 58}, f'more: found "{"x" * 58}" ('),
     ({"more": "x" * 59}, f'more: found "{"x" * 56}... ('),
 ]
 
@@ -231,17 +149,6 @@ def test_limits_of_a_manifest_on_either_side(case: int) -> None:
     with pytest.raises(BadInputError) as raised:
         parse_manifest(manifest(**copy.deepcopy(changes)), Path("m"))
     assert f"m: {sentence}" in str(raised.value)
-
-
-def test_bands_go_from_far_to_near() -> None:
-    assert BANDS == ("far", "full_body", "upper_body", "face")
-
-
-def test_a_manifest_that_is_no_json() -> None:
-    with pytest.raises(BadInputError, match=r"m: document: found .*, expected a valid manifest"):
-        parse_manifest("{", Path("m"))
-    with pytest.raises(BadInputError, match=r"m: document: found \[\] \("):
-        parse_manifest("[]", Path("m"))
 
 
 def test_the_entry_of_a_network() -> None:

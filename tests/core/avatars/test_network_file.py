@@ -1,137 +1,312 @@
-"""Every wrong network is refused with the name of what is wrong."""
+"""Network files: what makes one for the pipeline, tensors in files beside it, and each refusal with its sentence."""
 
 from __future__ import annotations
 
-import copy
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from support.small_inputs import net
+from support.small_inputs import net, node_of
 from trilane.avatars import network_file
-from trilane.avatars.network_file import check_network, constants_of, parse_network, read_network
+from trilane.avatars.network_file import (
+    FLOAT_LAYERS_KEY,
+    TO_INTEGERS,
+    Affine,
+    IntegerNetwork,
+    check_integer_layers,
+    check_network,
+    constants_of,
+    node_name,
+    parse_network,
+    read_network,
+)
 from trilane.errors import BadInputError
 
-
-def initializer(model, name):
-    return next(tensor for tensor in model.graph.initializer if tensor.name == name)
+Change = Callable[[onnx.ModelProto], None]
 
 
-def node(model, op_type, name=""):
-    return next(n for n in model.graph.node if n.op_type == op_type and name in n.name)
-
-
-def set_input_scale(value):
-    def change(model):
-        name = node(model, "DequantizeLinear", "bytes_in").input[1]
-        initializer(model, name).CopyFrom(numpy_helper.from_array(np.float32(value), name))
+def constant(name: str, value: Any) -> Change:
+    def change(model: onnx.ModelProto) -> None:
+        tensor = next(tensor for tensor in model.graph.initializer if tensor.name == name)
+        tensor.CopyFrom(numpy_helper.from_array(np.asarray(value), name))
 
     return change
 
 
-def float_input(model):
-    model.graph.input[0].type.tensor_type.elem_type = TensorProto.FLOAT
+def test_a_network_without_zero_points_has_zeros() -> None:
+    model = net()
+    del node_of(model, "bytes_in").input[2:]
+    node_of(model, "bytes_out").input[2] = ""
+    network = check_network(model, "here")
+    assert (network.input, network.output) == (Affine(0.5, 0), Affine(0.25, 0))
 
 
-def dynamic_height(model):
-    model.graph.input[0].type.tensor_type.shape.dim[1].dim_param = "height"
+SIZES: list[tuple[tuple[int, ...], str]] = [
+    ((64, 4096, 1, 1), ""),
+    ((1, 1, 4096, 64), ""),
+    ((65, 8, 8, 1), "input 'bytes' of 65x8x8x1"),
+    ((1, 4097, 8, 1), "input 'bytes' of 1x4097x8x1"),
+    ((1, 8, 4097, 1), "input 'bytes' of 1x8x4097x1"),
+    ((1, 8, 8, 65), "input 'bytes' of 1x8x8x65"),
+]
 
 
-def three_dims(model):
-    del model.graph.input[0].type.tensor_type.shape.dim[3]
+@pytest.mark.parametrize(("shape", "found"), SIZES)
+def test_the_largest_inputs(shape: tuple[int, ...], found: str) -> None:
+    if not found:
+        assert check_network(net(shape), "here").shape == shape
+        return
+    with pytest.raises(BadInputError) as raised:
+        check_network(net(shape), "here")
+    expected = "N x H x W x C with sides up to 4096 and 1 to 64 channels last"
+    assert str(raised.value) == f"here: found {found}, expected {expected}"
 
 
-def channels_first(model):
-    for dim, size in zip(model.graph.input[0].type.tensor_type.shape.dim, (1, 5, 64, 4096), strict=True):
-        dim.dim_value = size
+@pytest.mark.parametrize("wrong", [(2, 32, 64, 4), (1, 33, 64, 4), (1, 32, 65, 4), (1, 32, 64, 3)])
+def test_the_output_is_rgba_of_the_inputs_size(wrong: tuple[int, ...]) -> None:
+    with pytest.raises(BadInputError) as raised:
+        check_network(net(out=wrong), "here")
+    text = "x".join(map(str, wrong))
+    assert str(raised.value) == f"here: found output 'rgba' of {text}, expected 1x32x64x4 (RGBA)"
 
 
-def rgb_output(model):
-    model.graph.output[0].type.tensor_type.shape.dim[3].dim_value = 3
+def input_dims(sizes: list[int | str]) -> Change:
+    def change(model: onnx.ModelProto) -> None:
+        kind = TensorProto.UINT8
+        model.graph.input[0].CopyFrom(helper.make_tensor_value_info("bytes", kind, sizes))
+
+    return change
 
 
-def second_input(model):
-    model.graph.input.append(helper.make_tensor_value_info("more", TensorProto.UINT8, [1]))
+def no_shape(model: onnx.ModelProto) -> None:
+    model.graph.input[0].type.tensor_type.ClearField("shape")
 
 
-def no_scale(model):
-    node(model, "DequantizeLinear", "bytes_in").input[1] = "nowhere"
+def float_end(which: str) -> Change:
+    def change(model: onnx.ModelProto) -> None:
+        getattr(model.graph, which)[0].type.tensor_type.elem_type = TensorProto.FLOAT
+
+    return change
 
 
-def zero_point_300(model):
-    name = node(model, "DequantizeLinear", "bytes_in").input[2]
-    tensor = initializer(model, name)
-    tensor.ClearField("raw_data")
-    tensor.int32_data[:] = [300]
+def more(which: str) -> Change:
+    def change(model: onnx.ModelProto) -> None:
+        getattr(model.graph, which).append(helper.make_tensor_value_info("more", TensorProto.UINT8, [1]))
+
+    return change
 
 
-def float_zero_point(model):
-    name = node(model, "DequantizeLinear", "bytes_in").input[2]
-    initializer(model, name).CopyFrom(numpy_helper.from_array(np.float32(3), name))
+def inputs_of(name: str, *names: str) -> Change:
+    def change(model: onnx.ModelProto) -> None:
+        del node_of(model, name).input[:]
+        node_of(model, name).input.extend(names)
+
+    return change
 
 
-def unsupported_operator(model):
-    node(model, "Concat").op_type = "Einsum"
+def op(name: str, op_type: str, domain: str = "") -> Change:
+    def change(model: onnx.ModelProto) -> None:
+        node_of(model, name).op_type, node_of(model, name).domain = op_type, domain
+
+    return change
 
 
-def foreign_domain(model):
-    node(model, "Concat").domain = "com.acme"
+def nameless(name: str, op_type: str) -> Change:
+    def change(model: onnx.ModelProto) -> None:
+        node = node_of(model, name)
+        node.op_type = op_type
+        node.name = ""
+
+    return change
 
 
-def cut_weights(model):
-    tensor = initializer(model, node(model, "DequantizeLinear", "bytes_in").input[1])
+def zero_of(kind: int, value: int) -> Change:
+    """The zero point of bytes_in as raw numbers of a type, as a damaged file may have them."""
+
+    def change(model: onnx.ModelProto) -> None:
+        tensor = next(tensor for tensor in model.graph.initializer if tensor.name == "mid_zero")
+        tensor.CopyFrom(TensorProto(name="mid_zero", data_type=kind, int32_data=[value]))
+
+    return change
+
+
+def cut_scale(model: onnx.ModelProto) -> None:
+    tensor = next(tensor for tensor in model.graph.initializer if tensor.name == "mid_scale")
     tensor.raw_data = tensor.raw_data[:2]
 
 
-def float_output(model):
-    model.graph.node[-1].op_type = "Identity"
+def scale_of_no_type(model: onnx.ModelProto) -> None:
+    next(tensor for tensor in model.graph.initializer if tensor.name == "mid_scale").data_type = 50
 
 
-WRONG = {
-    "float input": (float_input, "FLOAT"),
-    "dynamic": (dynamic_height, r"\?"),
-    "three dims": (three_dims, "four fixed sizes"),
-    "channels first": (channels_first, "channels"),
-    "rgb": (rgb_output, "RGBA"),
-    "two inputs": (second_input, "2 inputs"),
-    "scale 0": (set_input_scale(0), "bytes_in"),
-    "scale inf": (set_input_scale(np.inf), "bytes_in"),
-    "scale nan": (set_input_scale(np.nan), "bytes_in"),
-    "scale 1e-40": (set_input_scale(1e-40), "bytes_in"),
-    "scale negative": (set_input_scale(-1), "bytes_in"),
-    "no scale": (no_scale, "bytes_in"),
-    "zero point 300": (zero_point_300, "300.*bytes_in"),
-    "float zero point": (float_zero_point, "bytes_in"),
-    "unsupported operator": (unsupported_operator, "Einsum.*joined"),
-    "foreign domain": (foreign_domain, "com.acme.*joined"),
-    "cut data": (cut_weights, "does not decode"),
-    "no quantised output": (float_output, "bytes_out"),
+def input_of_no_type(model: onnx.ModelProto) -> None:
+    model.graph.input[0].type.tensor_type.elem_type = 50
+
+
+def read_twice(model: onnx.ModelProto) -> None:
+    model.graph.node.append(helper.make_node("Relu", ["bytes"], ["spare"], "second"))
+
+
+def made_by_nothing(model: onnx.ModelProto) -> None:
+    node_of(model, "to_nhwc").input[0] = "nowhere"
+
+
+RANGE = "expected a number from 1e-30 to 1e+30"
+
+
+REFUSED: dict[str, tuple[Change, str]] = {
+    "operator": (op("conv1", "Einsum"), "operator Einsum in node 'conv1', expected operators a DSP has"),
+    "domain": (op("conv1", "Conv", "x.y"), "operator x.y:Conv in node 'conv1', expected operators a DSP has"),
+    "no name": (nameless("conv1", "If"), "operator If in node 'If that makes conv1', expected operators a DSP has"),
+    "two inputs": (more("input"), "2 inputs, expected one input, N x H x W x C uint8"),
+    "two outputs": (more("output"), "2 outputs, expected one output, N x H x W x 4 uint8"),
+    "float in": (float_end("input"), f"'bytes' of type FLOAT, expected uint8; {TO_INTEGERS}"),
+    "float out": (float_end("output"), f"'rgba' of type FLOAT, expected uint8; {TO_INTEGERS}"),
+    "dynamic": (input_dims([1, "h", 64, 3]), "'bytes' of shape 1x?x64x3, expected four fixed sizes, N x H x W x C"),
+    "zero side": (input_dims([1, 32, 0, 3]), "'bytes' of shape 1x32x?x3, expected four fixed sizes, N x H x W x C"),
+    "three": (input_dims([32, 64, 3]), "'bytes' of shape 32x64x3, expected four fixed sizes, N x H x W x C"),
+    "no shape": (no_shape, "'bytes' of shape unknown, expected four fixed sizes, N x H x W x C"),
+    "no scale": (inputs_of("mid_in", "mid_q", "x"), "no scale for node 'mid_in', expected a constant scale"),
+    "one input": (inputs_of("mid_in", "mid_q"), "no scale for node 'mid_in', expected a constant scale"),
+    "scale 0": (constant("mid_scale", np.float32(0)), f"scale 0 in node 'mid_out', {RANGE}"),
+    "small": (constant("mid_scale", np.float32(9e-31)), f"scale 9e-31 in node 'mid_out', {RANGE}"),
+    "large": (constant("mid_scale", np.float32(1.1e30)), f"scale 1.1e+30 in node 'mid_out', {RANGE}"),
+    "nan": (constant("mid_scale", np.float32(np.nan)), f"scale nan in node 'mid_out', {RANGE}"),
+    "one of two": (constant("mid_scale", np.float32([1, -2])), f"scale -2 in node 'mid_out', {RANGE}"),
+    "none": (constant("mid_scale", np.zeros(0, np.float32)), f"scale nothing in node 'mid_out', {RANGE}"),
+    "not constant": (
+        inputs_of("mid_in", "mid_q", "mid_scale", "conv1"),
+        "zero point of node 'mid_in' no integer, expected a constant integer",
+    ),
+    "float zero": (
+        constant("mid_zero", np.float32(3)),
+        "zero point of node 'mid_out' no integer, expected a constant integer",
+    ),
+    "cut": (cut_scale, "tensor 'mid_scale' that does not decode"),
+    "no type": (scale_of_no_type, "tensor 'mid_scale' of type 50, expected a type that ONNX has"),
+    "no type of the input": (input_of_no_type, "'bytes' of type 50, expected uint8"),
+    "a scale in words": (
+        constant("mid_scale", np.array(["a"], object)),
+        "tensor 'mid_scale' of object, expected numbers",
+    ),
+    "two scales at the end": (
+        constant("in_scale", np.float32([1, 2])),
+        "node 'bytes_in' of type uint8, expected one scale and one uint8 zero point",
+    ),
+    "two zeros at the end": (
+        constant("in_zero", np.uint8([1, 2])),
+        "node 'bytes_in' of type uint8, expected one scale and one uint8 zero point",
+    ),
+    "int8 at the end": (
+        constant("out_zero", np.int8(1)),
+        "node 'bytes_out' of type int8, expected one scale and one uint8 zero point",
+    ),
+    "read twice": (read_twice, "input used by ['bytes_in', 'second'], expected a DequantizeLinear of the bytes"),
+    "not read": (
+        inputs_of("bytes_in", "mid_q", "in_scale", "in_zero"),
+        "input used by [], expected a DequantizeLinear of the bytes",
+    ),
+    "read by another": (op("bytes_in", "Relu"), "input used by ['bytes_in'], expected a DequantizeLinear of the bytes"),
+    "made by another": (op("to_nhwc", "Relu"), "output made by node 'to_nhwc', expected a QuantizeLinear to bytes"),
+    "made by nothing": (made_by_nothing, "nothing that makes 'nowhere', expected a QuantizeLinear"),
 }
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_wrong_networks_are_named(tiny_quantised, case):
-    change, message = WRONG[case]
-    model = copy.deepcopy(tiny_quantised.network.model)
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_wrong_network_is_refused_in_one_sentence(case: str) -> None:
+    change, sentence = REFUSED[case]
+    model = net()
     change(model)
-    with pytest.raises(BadInputError, match=message):
-        check_network(model, "network.onnx")
+    with pytest.raises(BadInputError) as raised:
+        check_network(model, "here")
+    assert f"here: found {sentence}" in str(raised.value)
 
 
-@pytest.mark.parametrize("content", [b"", b"not a network", b"\x08"])
-def test_wrong_files_are_named(tmp_path, content):
-    path = tmp_path / "network.onnx"
-    path.write_bytes(content)
-    with pytest.raises(BadInputError, match=r"network\.onnx"):
-        read_network(path)
+@pytest.mark.parametrize("scale", [1.01e-30, 0.99e30])
+def test_scales_at_the_ends_of_their_range(scale: float) -> None:
+    assert check_network(net(scales=(scale, 0.25)), "here").input.scale == pytest.approx(scale)
 
 
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(BadInputError, match="no such file"):
-        read_network(tmp_path / "network.onnx")
+@pytest.mark.parametrize(
+    ("kind", "low", "high"),
+    [
+        (TensorProto.UINT8, 0, 255),
+        (TensorProto.INT8, -128, 127),
+        (TensorProto.UINT16, 0, 65535),
+        (TensorProto.INT16, -32768, 32767),
+    ],
+)
+def test_zero_points_of_every_type(kind: int, low: int, high: int) -> None:
+    for value in (low, high):
+        model = net()
+        zero_of(kind, value)(model)
+        check_network(model, "here")
+    for value in (low - 1, high + 1):
+        model = net()
+        zero_of(kind, value)(model)
+        with pytest.raises(BadInputError) as raised:
+            check_network(model, "here")
+        assert str(raised.value) == f"here: found zero point {value} in node 'mid_out', expected {low} to {high}"
+    assert network_file.ZERO_POINT_TYPES[TensorProto.INT32] == (-2147483648, 2147483647)
+
+
+def test_several_transposes_may_lie_before_the_ends() -> None:
+    model = net()
+    twice = helper.make_node("Transpose", ["bytes"], ["turned"], "once", perm=[0, 2, 1, 3])
+    back = helper.make_node("Transpose", ["turned"], ["back"], "again", perm=[0, 2, 1, 3])
+    node_of(model, "bytes_in").input[0] = "back"
+    nodes = [twice, back, *model.graph.node]
+    del model.graph.node[:]
+    model.graph.node.extend(nodes)
+    assert check_network(model, "here").input == Affine(0.5, 7)
+
+
+def test_layers_in_float_are_named() -> None:
+    model = net()
+    network = IntegerNetwork("here", model)
+    check_integer_layers(network)
+    node_of(model, "conv2").input[0] = "conv1"
+    node_of(model, "conv1").input[1] = "w1"
+    with pytest.raises(BadInputError) as raised:
+        check_integer_layers(network)
+    assert str(raised.value) == (
+        "here: found layers left in float: conv1, conv2, expected integer layers; quantise them"
+    )
+    node_of(model, "conv1").input.append("in_scale")  # a bias may be in float
+    model.metadata_props.add(key="other", value="[")
+    model.metadata_props.add(key="trilane.float_layers", value='["conv2"]')
+    assert FLOAT_LAYERS_KEY == "trilane.float_layers"
+    assert network.float_layers == {"conv2"}
+    with pytest.raises(BadInputError, match="layers left in float: conv1, expected"):
+        check_integer_layers(network)
+    for op_type, counts in (("ConvTranspose", True), ("Gemm", True), ("Add", False)):
+        node_of(model, "conv1").op_type = op_type
+        if counts:
+            with pytest.raises(BadInputError, match="layers left in float: conv1"):
+                check_integer_layers(network)
+        else:
+            check_integer_layers(network)
+    model.metadata_props[-1].value = "3"
+    with pytest.raises(BadInputError) as raised:
+        _ = network.float_layers
+    assert str(raised.value) == "here: found trilane.float_layers ['3'], expected a JSON list of names"
+
+
+def test_names_and_constants_of_a_graph() -> None:
+    assert node_name(helper.make_node("Add", ["a"], ["b"], "sum")) == "sum"
+    assert node_name(helper.make_node("Add", ["a"], ["b"])) == "Add that makes b"
+    assert node_name(helper.make_node("Add", ["a"], [])) == "Add that makes nothing"
+    model = net()
+    value = numpy_helper.from_array(np.float32(3))
+    model.graph.node.append(helper.make_node("Constant", [], ["made"], value=value))
+    constants = constants_of(model)
+    assert {"in_scale", "w2", "made"} <= set(constants) and "conv1" not in constants
+    assert numpy_helper.to_array(constants["made"]) == 3
 
 
 def test_a_truncated_file_is_named(tmp_path, tiny_quantised):
@@ -140,33 +315,6 @@ def test_a_truncated_file_is_named(tmp_path, tiny_quantised):
     path.write_bytes(content[: len(content) // 2])
     with pytest.raises(BadInputError, match=r"network\.onnx"):
         read_network(path)
-
-
-def external(model, location):
-    model = copy.deepcopy(model)
-    tensor = initializer(model, "stem.w_quantized")
-    tensor.ClearField("raw_data")
-    tensor.data_location = TensorProto.EXTERNAL
-    tensor.external_data.add(key="location", value=location)
-    return model
-
-
-@pytest.mark.parametrize("location", ["../weights.bin", "/etc/hostname", "missing.bin", "", "."])
-def test_external_data_stays_inside_the_folder(tmp_path, tiny_quantised, location):
-    folder = tmp_path / "bundle"
-    folder.mkdir()
-    (tmp_path / "weights.bin").write_bytes(bytes(1000))
-    onnx.save(external(tiny_quantised.network.model, location), folder / "network.onnx")
-    with pytest.raises(BadInputError, match=r"stem\.w_quantized"):
-        read_network(folder / "network.onnx")
-
-
-def test_external_data_inside_the_folder_is_read(tmp_path, tiny_quantised):
-    model = tiny_quantised.network.model
-    (tmp_path / "weights.bin").write_bytes(initializer(model, "stem.w_quantized").raw_data)
-    (tmp_path / "network.onnx").write_bytes(external(model, "weights.bin").SerializeToString())
-    network = read_network(tmp_path / "network.onnx")
-    assert initializer(network.model, "stem.w_quantized").raw_data == initializer(model, "stem.w_quantized").raw_data
 
 
 # Network files by value: read, refused in whole sentences, and with tensors in files beside them.
@@ -249,6 +397,9 @@ def test_data_in_a_file_beside_is_read(tmp_path: Path, monkeypatch: pytest.Monke
     [
         ("../w.bin", "found tensor 'w1' kept in {above}/w.bin, expected data inside {folder}; move it there"),
         ("no.bin", "found tensor 'w1' kept in {folder}/no.bin, expected a file of the network's folder"),
+        ("/etc/hostname", "found tensor 'w1' kept in /etc/hostname, expected data inside {folder}; move it there"),
+        (".", "found tensor 'w1' kept in "),
+        ("", "found tensor 'w1'"),
         ("short.bin", "found tensor 'w1' in {folder}/short.bin: "),
     ],
 )

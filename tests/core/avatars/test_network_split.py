@@ -59,11 +59,6 @@ def test_the_default_avatar_can_be_cut_at_its_skips() -> None:
     assert max(len(cut.crossing) for cut in places) >= 6
 
 
-def test_a_tensor_that_is_not_quantised_is_no_place_to_cut(network: NetworkFile) -> None:
-    with pytest.raises(BadInputError, match="'nowhere', expected a quantised tensor"):
-        split(network, ["nowhere"])
-
-
 def test_the_command_lists_places_and_writes_parts(tmp_path: Path, tiny_bundle: Path) -> None:
     listed = CliRunner().invoke(app, ["split", str(tiny_bundle), "--size", "64", "--json"])
     places = [row["at"] for row in json.loads(listed.stdout)["cuts"]]
@@ -91,18 +86,6 @@ def test_many_parts_give_the_bytes_of_the_whole(network: NetworkFile) -> None:
         assert set(part.crossing_out) - set(part.outputs) <= set(part.crossing_in)
         known = run(part.model, known)
     assert (known[output] == whole).all()
-
-
-def test_an_uncut_network_is_one_part(network: NetworkFile) -> None:
-    (part,) = split(network, [])
-    assert part.crossing_in == {network.model.graph.input[0].name: network.shape}
-    assert part.crossing_out == {network.model.graph.output[0].name: (*network.shape[:3], 4)}
-
-
-def test_cuts_in_another_order_are_refused(network: NetworkFile) -> None:
-    first, second, *_ = (cut.at for cut in cuts(network))
-    with pytest.raises(BadInputError, match="in the order of the work"):
-        split(network, [second, first])
 
 
 # Networks for another shape and networks cut in parts, by hand.

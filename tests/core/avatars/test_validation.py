@@ -178,11 +178,6 @@ def test_figures_before_one_grey_are_not_shown(own):
     assert "before one grey" in facts["why"] and f"trilane avatar validate {own}" in facts["why"]
 
 
-def test_an_avatar_that_was_never_validated_says_so(tiny_bundle):
-    assert "never validated" in accuracy_of(load_bundle(tiny_bundle), DRAWN)["why"]
-    assert validation_facts(load_bundle(tiny_bundle)) is None
-
-
 def test_a_byte_of_a_part_changes_its_digest_alone(own):
     before = digests_of(own, load_bundle(own).manifest).model_dump()
     for part, file in (("body", "body.npz"), ("texture", "texture.npz"), ("network", "network.onnx")):
@@ -255,12 +250,6 @@ def test_a_run_of_a_spoilt_copy_beside_the_avatar_shows_only_the_avatars_source(
     assert facts["own"]["changed"] == [] and "share" in facts["own"]["why"]
 
 
-@pytest.mark.parametrize(("size", "runtime", "shown"), [("256", "ort", True), ("192", "ort", False)])
-def test_a_run_asks_for_what_it_draws(own, tmp_path, size, runtime, shown):
-    checked = configure(RunOptions(avatar=str(own), size=size, runtime=runtime), tmp_path, gl=lambda: None)
-    assert (checked.accuracy["tiny"]["source"] == SOURCE) == shown
-
-
 def changed_by_hand(folder, **changes):
     path = folder / "manifest.json"
     manifest = json.loads(path.read_text())
@@ -304,10 +293,6 @@ def test_the_digest_of_figures_is_of_their_values_in_one_way_of_writing(own):
     manifest["validation"] = dict(reversed(manifest["validation"].items()))
     path.write_text(json.dumps(manifest))
     assert accuracy_of(load_bundle(own), DRAWN)["source"] == SOURCE
-
-
-def test_the_default_avatars_figures_are_those_of_its_validation():
-    assert validation_facts(load_bundle("default"))["source"] == "from the avatar's validation of 2026-11-23"
 
 
 WORST = {"seed": 1, "number": 2, "band": "face", "psnr_db": 20.0, "body_psnr_db": 19.0}

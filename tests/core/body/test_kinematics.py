@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -43,14 +41,12 @@ def test_rotation_is_exact_at_every_angle(direction: tuple[float, ...], angle: f
 
 
 def test_zero_is_the_identity_exactly() -> None:
-    """And numbers whose squares vanish turn by no more than themselves."""
     assert (rodrigues(np.zeros(3)) == np.eye(3)).all()
     assert np.abs(turn(np.full(3, 1e-200))).max() == 1e-200
     assert np.abs(turn(np.full(3, 5e-324))).max() <= 5e-324
 
 
 def test_half_turns_are_exact() -> None:
-    """By pi about the axes, and about a diagonal, where the antisymmetric part vanishes."""
     for axis in range(3):
         expected = -np.eye(3)
         expected[axis, axis] = 1.0
@@ -60,7 +56,6 @@ def test_half_turns_are_exact() -> None:
 
 
 def test_small_turns_keep_their_digits() -> None:
-    """R - I is as good as its argument: its relative error does not grow as the angle falls."""
     v = np.array([3e-9, -2e-9, 1e-9])
     linear = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
     second = (np.outer(v, v) - v @ v * np.eye(3)) / 2
@@ -82,7 +77,6 @@ def plain_chain(joints: F64, pose: F64, translation: F64, world: F64) -> tuple[F
 
 
 def test_chain_equals_the_plain_recursion() -> None:
-    """Same matrices and joints, for poses with place and heading, call after call."""
     random = np.random.default_rng(4)
     joints = random.normal(0, 0.5, (55, 3))
     skeleton = Skeleton(joints, PARENTS)
@@ -98,14 +92,12 @@ def test_chain_equals_the_plain_recursion() -> None:
 
 
 def test_rest_pose_is_the_identity() -> None:
-    """No rotation, no place: every matrix is the identity and the feature is zero."""
     posed = Skeleton(np.random.default_rng(1).normal(0, 1, (55, 3)), PARENTS).pose(np.zeros(165))
     np.testing.assert_allclose(posed.matrices, np.tile(np.eye(3, 4), (55, 1, 1)), atol=1e-15)
     assert not posed.feature.any()
 
 
 def test_any_order_of_joints() -> None:
-    """Children may come before their parents."""
     parents = np.array([-1, 2, 3, 0], np.int32)
     joints = np.array([[0.0, 0, 0], [3, 0, 0], [2, 0, 0], [1, 0, 0]])
     posed = Skeleton(joints, parents).pose([0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, np.pi / 2])
@@ -114,7 +106,6 @@ def test_any_order_of_joints() -> None:
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
 def test_frames_that_are_not_finite_are_refused(value: float) -> None:
-    """In the pose, the translation and the world matrix alike, before anything is written."""
     skeleton = Skeleton(np.zeros((55, 3)), PARENTS)
     pose = np.zeros(165)
     with pytest.raises(BadInputError, match="place"):
@@ -122,26 +113,3 @@ def test_frames_that_are_not_finite_are_refused(value: float) -> None:
     pose[70] = value
     with pytest.raises(BadInputError, match="pose"):
         skeleton.pose(pose)
-
-
-def test_joints_of_a_frame_cost_no_more_calls_than_three_a_joint() -> None:
-    """What the chain needs is a product for each joint; one by one, rotations and places take five calls more.
-
-    CPU time of this thread, the best of many short loops, so the machine and its load cancel.
-    """
-    skeleton = Skeleton(np.random.default_rng(1).normal(0, 1, (55, 3)), PARENTS)
-    pose, turns = np.random.default_rng(2).normal(0, 1, 165), np.random.default_rng(3).normal(0, 1, (55, 3, 3))
-
-    def products() -> None:
-        chain = [turns[0]]
-        for joint in range(1, 55):
-            chain.append(chain[PARENTS[joint]] @ turns[joint])
-
-    best = dict.fromkeys(("pose", "products"), np.inf)
-    for _ in range(30):
-        for name, work in (("pose", lambda: skeleton.pose(pose)), ("products", products)):
-            start = time.thread_time()
-            for _ in range(20):
-                work()
-            best[name] = min(best[name], time.thread_time() - start)
-    assert best["pose"] <= 3 * best["products"]

@@ -31,7 +31,6 @@ from trilane.body.skinning import (
     posed_vertices,
     weight_error_bound,
 )
-from trilane.errors import BadInputError
 from trilane.scene.crop import Rect, cheapest_within, error_px, least_w
 from trilane.scene.rotations import about
 from trilane.stages.cpu.pose import FINEST, ModelledBody, widened
@@ -56,13 +55,6 @@ def test_largest_weights_are_kept_and_renormalised(shaped: ShapedBody) -> None:
         top.weights[:, 0], np.sort(weights)[:, -1] / np.sort(weights)[:, -4:].sum(axis=1), rtol=1e-5
     )
     np.testing.assert_allclose(largest_weights(weights, 12).dense(), weights, atol=1e-7)
-
-
-@pytest.mark.parametrize("count", [0, 5, 55])
-def test_other_counts_are_refused(shaped: ShapedBody, count: int) -> None:
-    """Only the counts that the shaders know."""
-    with pytest.raises(BadInputError, match="4, 8 or 12"):
-        largest_weights(shaped.body.weights, count)
 
 
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -97,35 +89,6 @@ def test_turning_the_root_turns_the_body(shaped: ShapedBody) -> None:
     moved = next(posed_vertices(shaped, pose, shift))
     expected = (shaped.vertices - shaped.joints[0]) @ rodrigues(vector).T + shaped.joints[0] + shift
     np.testing.assert_allclose(moved, expected, atol=2e-6)
-
-
-def test_vertices_equal_the_sum_over_joints(shaped: ShapedBody) -> None:
-    """x = sum_k w_k G_k (p + posedirs . (R - I)), written out."""
-    body = shaped.body
-    assert body.posedirs is not None
-    posed = Skeleton(shaped.joints, body.parents).pose(np.random.default_rng(3).normal(0, 1, 165))
-    rest = shaped.vertices + np.tensordot(body.posedirs, posed.feature, 1)
-    per_joint = np.einsum("jab,vb->vja", posed.matrices[:, :, :3], rest) + posed.matrices[:, :, 3]
-    expected = np.einsum("vj,vja->va", body.weights, per_joint)
-    np.testing.assert_allclose(CpuSkinner(shaped).vertices(posed), expected, atol=1e-5)
-
-
-def test_each_pose_gives_one_mesh(shaped: ShapedBody) -> None:
-    """(T, 165) gives T meshes; one pose gives one."""
-    poses = np.random.default_rng(3).normal(0, 1, (3, 165))
-    assert [mesh.shape for mesh in posed_vertices(shaped, poses)] == [(90, 3)] * 3
-    assert len(list(posed_vertices(shaped, poses[0]))) == 1
-
-
-def test_a_frame_in_float32_is_within_a_hundredth_of_a_millimetre(shaped: ShapedBody) -> None:
-    """Bodies of any size: rows beyond the last whole block of the product are skinned too."""
-    rng = np.random.default_rng(5)
-    skeleton, slow, fast = Skeleton(shaped.joints, shaped.body.parents), CpuSkinner(shaped), FrameSkinner(shaped)
-    for _ in range(5):
-        posed = skeleton.pose(rng.normal(0, 0.5, 165), rng.normal(0, 1, 3))
-        vertices = np.full((len(shaped.vertices), 3), np.nan, np.float32)
-        fast.skin_into(posed, vertices)
-        assert np.abs(vertices - slow.vertices(posed)).max() <= 1e-5
 
 
 OUTPUT = (480, 640)
@@ -208,12 +171,6 @@ def test_nor_do_those_of_the_default_body() -> None:
 @pytest.mark.slow
 def test_nor_do_five_thousand(blended: ShapedBody) -> None:
     check_bounds(blended, MANY, seed=3)
-
-
-def test_everything_is_exact(blended: ShapedBody) -> None:
-    posed = Skeleton(blended.joints, blended.body.parents).pose(np.full((JOINTS, 3), 0.2))
-    assert DetailBounds(blended).metres(posed)[-1] == 0.0
-    assert EVERYTHING.weights(blended) is blended.body.weights
 
 
 def test_at_rest_only_rounding_is_left(blended: ShapedBody) -> None:
