@@ -125,20 +125,3 @@ def test_a_view_is_taken_when_it_is_clear_and_shows_enough(
     assert asked == [((band, "joints"), rng.random()) for _ in range(4)]
     assert isinstance(found, Sample)
     assert (found.pose is pose, found.view, found.crop.pixels, found.band) == (True, 4, 200.0, index)
-
-
-def test_a_rendered_sample_is_of_its_own_pose_camera_and_crop() -> None:
-    def raster(name: str) -> Any:
-        return SimpleNamespace(render=lambda *words: (name, *words))
-
-    renderer = object.__new__(SampleRenderer)
-    vars(renderer).update(
-        skeleton=SimpleNamespace(pose=lambda pose: SimpleNamespace(matrices=f"joints of {pose}")),
-        _uv=raster("uv"),
-        clothed_body=raster("clothes"),
-    )
-    asked: Any = SimpleNamespace(
-        pose="a pose", view=SimpleNamespace(view="a view"), crop=SimpleNamespace(projection="a crop", shape=(32, 64))
-    )
-    words = ("joints of a pose", "a view", "a crop", (32, 64))
-    assert renderer.render(asked) == (("uv", *words), ("clothes", *words))

@@ -17,8 +17,6 @@ from trilane.training.body_from_anny import (
     about,
     align,
     bake,
-    joint_bones,
-    joint_of_bone,
     power,
     regressor,
     round_weights,
@@ -58,7 +56,6 @@ def test_adult_stands_upright() -> None:
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_arms_are_in_the_t_pose(side: str) -> None:
-    """Shoulder, elbow, wrist and middle finger lie on a horizontal line; the thumb is in front."""
     line = np.array([joint(f"{side}_{name}") for name in ("shoulder", "elbow", "wrist", "middle1")])
     assert np.ptp(line[:, 1:], axis=0).max() < 5e-3
     assert (np.diff(np.abs(line[:, 0])) > 0.05).all()
@@ -66,7 +63,6 @@ def test_arms_are_in_the_t_pose(side: str) -> None:
 
 
 def test_body_is_symmetric() -> None:
-    """Left and right joints mirror each other to a few millimetres."""
     for name in JOINT_NAMES:
         if name.startswith("left_"):
             mirrored = joint(name.replace("left_", "right_")) * np.array([-1.0, 1.0, 1.0])
@@ -103,23 +99,7 @@ def test_uv_islands_do_not_overlap() -> None:
 # --- how it is built -----------------------------------------------------------------------------------------------
 
 
-def test_every_joint_has_its_bones() -> None:
-    """The map from joints to bones is complete, and no bone is used twice."""
-    bones = joint_bones()
-    assert set(bones) == set(JOINT_NAMES)
-    used = [bone for group in bones.values() for bone in group]
-    assert len(used) == len(set(used))
-
-
-def test_unmapped_bones_follow_their_nearest_mapped_ancestor() -> None:
-    """A twist bone goes with its limb, a bone above the pelvis with the pelvis."""
-    labels = ["root", "spine05", "upperleg01.L", "upperleg02.L", "lowerleg01.L"]
-    joints = joint_of_bone(labels, [-1, 0, 1, 2, 3])
-    assert [JOINT_NAMES[j] for j in joints] == ["pelvis", "pelvis", "left_hip", "left_hip", "left_knee"]
-
-
 def test_rounded_weights_sum_to_one_exactly() -> None:
-    """Whatever the rounding takes, the largest weight takes up."""
     weights = np.random.default_rng(0).dirichlet(np.full(55, 0.05), 500)
     rounded = round_weights(weights)
     assert (rounded.astype(np.float32).sum(axis=1) == 1.0).all()
@@ -127,7 +107,6 @@ def test_rounded_weights_sum_to_one_exactly() -> None:
 
 
 def test_regressor_reproduces_joints() -> None:
-    """Affine, sparse, and right for the template and every component."""
     random = np.random.default_rng(0)
     vertices = random.normal(0, 0.5, (5, 500, 3))
     joints = np.einsum("jv,kva->kja", random.dirichlet(np.ones(500), 55), vertices)
@@ -138,7 +117,6 @@ def test_regressor_reproduces_joints() -> None:
 
 
 def test_baking_is_linear_in_shape() -> None:
-    """The sum of two offsets bakes to the sum of what they bake to; the pelvis stays."""
     random = np.random.default_rng(0)
     points = random.normal(0, 0.3, (4, 30 + 55, 3))
     points[3] = points[1] + points[2]
@@ -149,7 +127,6 @@ def test_baking_is_linear_in_shape() -> None:
 
 
 def test_rotations_between_directions() -> None:
-    """The smallest rotation takes one direction to the other; its powers add up."""
     random = np.random.default_rng(0)
     for _ in range(50):
         a, b = random.normal(0, 1, (2, 3))
@@ -170,7 +147,6 @@ def assert_same_quads(found: NDArray[Any], wanted: NDArray[Any]) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_body_is_built_anew_as_committed(tmp_path: Path) -> None:
-    """The same body comes out; the first build on a machine takes minutes."""
     pytest.importorskip("anny")
     from trilane.training.body_from_anny import write_body
 

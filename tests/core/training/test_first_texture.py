@@ -1,4 +1,4 @@
-"""What no frame shows is filled along the surface: beside solutions of Laplace's equation on a cylinder with a seam."""
+"""The first texture: colours and fields by hand; what no frame shows beside solutions of Laplace's equation."""
 
 from __future__ import annotations
 
@@ -7,7 +7,19 @@ import pytest
 
 pytest.importorskip("scipy")
 
-from trilane.training.first_texture import fill_along_surface, fill_beside, fill_gaps, grown, harmonic_fill, lay_out
+from trilane.training.first_texture import (
+    eigenfunctions,
+    fill_along_surface,
+    fill_beside,
+    fill_gaps,
+    first_texture,
+    grown,
+    harmonic_fill,
+    head_on,
+    lay_out,
+    mean_colours,
+)
+from trilane.training.sample_files import U16, ShapeGroup
 from trilane.training.surface import BodyArrays
 
 ROUND, RINGS, SIDE = 24, 13, 96
@@ -110,3 +122,93 @@ def test_texels_beside_known_ones_take_their_mean() -> None:
     filled, near = fill_beside(image, known)
     assert filled[..., 0].tolist() == [[2, 2, 7, 7, 7], [3, 3, 4, 7, 7], [4, 4, 4, 7, 7], [4, 4, 4, 7, 7], [7] * 5]
     assert near.tolist() == (filled[..., 0] < 7).tolist() == grown(known).tolist()
+
+
+def test_pixels_are_weighted_by_how_the_surface_is_seen():
+    """u = 0.01 x, v = t 0.01 y: singular values 0.01 and 0.01 t. At t = 1/2 the weight is (1/2)^3, and (1 / (s side))^2
+    of that above a texel a pixel; nothing at the outline, and nothing where a pixel spans more than 0.03.
+    """
+    y, x = np.mgrid[:6, :7].astype(float)
+    covered = np.ones((6, 7), bool)
+    covered[3, 5] = False
+
+    def weight(step, t, side):
+        return head_on(np.stack([step * x, t * step * y], axis=2), covered, side)
+
+    inner = weight(0.01, 0.5, 50)
+    assert inner[2, 2] == pytest.approx(0.5**3)
+    assert weight(0.01, 0.5, 400)[2, 2] == pytest.approx(0.5**3 / 16)
+    assert (inner > 0).sum() == 4 * 5 - 4, "the frame has none, nor the gap in its last column and three beside it"
+    assert not weight(0.04, 1.0, 50).any()
+    assert weight(0.029, 1.0, 10)[2, 2] == pytest.approx(1.0)
+
+
+def test_a_texels_colour_is_the_weighted_mean_of_its_pixels():
+    """One sample whose left half is red, right half green; u and v run over the texture once."""
+    h = w = 200
+    y, x = np.mgrid[:h, :w]
+    uv = np.stack([(x + 0.5) / w, (y + 0.5) / h], axis=2)
+    rgba = np.zeros((1, h, w, 4), np.uint8)
+    rgba[0, :, : w // 2, 0] = 200
+    rgba[0, :, w // 2 :, 1] = 100
+    rgba[..., 3] = 255
+    group = ShapeGroup(
+        (h, w), np.round(uv * U16).astype(np.uint16)[None], np.ones((1, h, w), np.uint8), rgba, np.zeros(1)
+    )
+    colours = mean_colours([group], 8, sheet())
+    np.testing.assert_allclose(colours[:, :4], np.broadcast_to([200 / 255, 0, 0], (8, 4, 3)), atol=1e-6)
+    np.testing.assert_allclose(colours[:, 4:], np.broadcast_to([0, 100 / 255, 0], (8, 4, 3)), atol=1e-6)
+    small = ShapeGroup((64, 64), group.uv[:, :64, :64], group.covered[:, :64, :64], rgba[:, :64, :64], np.zeros(1))
+    assert not mean_colours([small], 8, sheet()).any()
+
+
+def sheet() -> BodyArrays:
+    """A flat sheet of 6 x 6 vertices, whose texture coordinates cover 0.1 to 0.6."""
+    grid = np.array([[x, y, 0.0] for x in range(6) for y in range(6)], np.float64)
+    corner = [(6 * x + y, 6 * x + y + 6, 6 * x + y + 1) for x in range(5) for y in range(5)]
+    faces = np.array(corner + [(b, b + 1, c) for _, b, c in corner])
+    return BodyArrays(grid, faces, grid[:, :2] / 10 + 0.1, faces, np.zeros((36, 55)), np.zeros((55, 3)))
+
+
+def test_fields_of_a_square_are_cosines():
+    """The smoothest functions of a square sheet with free edges are cos(pi x / L) and cos(pi y / L); a lone vertex has
+    the value of its neighbour."""
+    body = sheet()
+    far = np.vstack([body.vertices, [[0.0, 0.0, 9.0]]])
+    fields = eigenfunctions(far, body.faces, 2)
+    cosines = np.cos(np.pi * body.vertices[:, :2] / 5)
+    fit, *_ = np.linalg.lstsq(cosines, fields[:36], rcond=None)
+    assert np.abs(cosines @ fit - fields[:36]).max() < 0.12
+    assert np.abs(fields).max(axis=0) == pytest.approx([1.0, 1.0])
+    assert np.array_equal(fields[36], fields[0])
+
+
+def test_values_are_laid_out_at_texel_centres():
+    """A field that is u itself is u at the centre of every texel inside; only texels of the sheet are known."""
+    body = sheet()
+    image, known = lay_out(body.uv[:, :1] * [[1.0]], body.faces, body.uv, body.uv_faces, 20)
+    rows, columns = np.nonzero(known)
+    np.testing.assert_allclose(image[rows, columns, 0], (columns + 0.5) / 20, atol=1e-9)
+    assert known[2:12, 2:12].all() and not known[:1].any() and not known[13:].any()
+    assert not image[~known].any()
+
+
+def test_gaps_take_the_mean_of_the_known_texels_of_the_block_round_them():
+    known = np.zeros((4, 4), bool)
+    known[0, 0] = known[3, 3] = True
+    image = np.zeros((4, 4, 1))
+    image[0, 0], image[3, 3] = 2.0, 6.0
+    filled = fill_gaps(image, known)[..., 0]
+    assert filled[:2, :2].tolist() == [[2, 2], [2, 2]]
+    assert filled[2:, 2:].tolist() == [[6, 6], [6, 6]]
+    assert filled[:2, 2:].tolist() == filled[2:, :2].tolist() == [[4, 4], [4, 4]]
+
+
+def test_a_first_texture_is_colours_then_fields():
+    body = sheet()
+    texture = first_texture(body, [], 16, 5)
+    assert texture.shape == (16, 16, 5) and texture.dtype == np.float32
+    assert (texture[..., :3] == -1).all(), "no sample has a colour: 2 * 0 - 1"
+    fields = eigenfunctions(body.vertices, body.faces, 2)
+    image, known = lay_out(fields, body.faces, body.uv, body.uv_faces, 16)
+    np.testing.assert_allclose(texture[..., 3:][known], np.clip(image[known], -1, 1), atol=1e-6)

@@ -11,8 +11,8 @@ import pytest
 pytest.importorskip("skimage")
 
 from trilane.arrays import U8
-from trilane.training.backgrounds import KINDS, SIDE, background, backgrounds, scenes
-from trilane.training.image_error import EDGE_PX, ImageError, image_error, regions
+from trilane.training.backgrounds import KINDS, SIDE, backgrounds, scenes
+from trilane.training.image_error import EDGE_PX, ImageError, SampleError, image_error, regions, summary
 
 SIZE, START, SIDE_PX = 96, 16, 64
 #: The person's colour, in bytes and as a share.
@@ -158,7 +158,74 @@ def test_scenery_has_the_spectrum_of_photographs() -> None:
     assert len({scene.tobytes() for scene in scenes()}) == len(scenes())
 
 
-def test_scenery_larger_than_a_scene_goes_on() -> None:
-    drawn = background("scenery", (SIDE + 40, SIDE + 8), np.random.default_rng(1))
-    assert drawn.shape == (SIDE + 40, SIDE + 8, 3)
-    assert (drawn[SIDE:] == drawn[:40]).all() and (drawn[:, SIDE:] == drawn[:, :8]).all()
+# By hand, and their summary.
+
+
+def test_psnr_in_the_box_and_of_the_body_alone_worked_out_by_hand():
+    """A box of 2 x 4 pixels, three of which are background; one body pixel is wrong by 51 of 255 in every channel.
+
+    In the box the mean square is 0.2**2 / 8 = 0.005, which is 23.01 dB; of the body's five pixels it is 0.2**2 / 5 =
+    0.008, which is 20.97 dB.
+    """
+    truth = np.zeros((5, 6, 4), np.uint8)
+    truth[1:3, 1:5] = (100, 100, 100, 255)
+    truth[1, 2:5, 3] = 0
+    picture = truth.copy()
+    picture[2, 3, :3] = 151
+    error = image_error(picture, truth)
+    assert error.psnr_db == pytest.approx(23.0103, abs=1e-4)
+    assert error.body_psnr_db == pytest.approx(20.9691, abs=1e-4)
+    assert (error.background, error.iou) == (0.375, 1.0)
+
+
+def test_what_is_painted_beside_the_body_counts_in_the_box_alone():
+    """One background pixel of eight is painted white, alpha too: before black a square of 1 / 8, before white none."""
+    truth = np.zeros((5, 6, 4), np.uint8)
+    truth[1:3, 1:5] = (100, 100, 100, 255)
+    truth[1, 2:4, 3] = 0
+    picture = truth.copy()
+    picture[1, 2] = 255
+    error = image_error(picture, truth)
+    assert error.by_background["black"] == pytest.approx(-10 * np.log10(1 / 8), abs=1e-6)
+    assert error.by_background["white"] == 100.0
+    assert error.psnr_db == pytest.approx(np.mean(list(error.by_background.values())), abs=1e-9)
+    assert error.body_psnr_db == 100.0, "the body itself is exact"
+    assert error.iou == pytest.approx(6 / 7)
+
+
+def an_error(psnr_db, body_psnr_db, iou=1.0):
+    before, shares = {"black": psnr_db - 2, "white": psnr_db + 2}, {"alpha_edge": 0.25, "alpha_outside": 0.125}
+    return ImageError(
+        psnr_db, body_psnr_db, before, 0.5, ssim=0.75, iou=iou, alpha_inside=iou / 8, **shares, see_through=iou / 4
+    )
+
+
+def test_a_summary_has_means_and_the_worst_sample_of_all_seeds():
+    errors = [
+        SampleError(1, 0, "far", an_error(30.0, 28.0)),
+        SampleError(1, 24, "face", an_error(20.0, 19.0, iou=0.5)),
+        SampleError(9, 0, "far", an_error(34.0, 30.0)),
+        SampleError(9, 25, "face", an_error(22.0, 15.0)),
+    ]
+    facts = summary(errors)
+    assert list(facts) == [
+        *("psnr_db_by_band", "body_psnr_db_by_band", "see_through_by_band", "iou_by_band", "psnr_db_by_background"),
+        *("psnr_db", "body_psnr_db", "see_through", "alpha_inside", "alpha_edge", "alpha_outside"),
+        *("background", "iou", "ssim"),
+        *("least_psnr_db", "least_body_psnr_db", "worst", "by_seed", "samples"),
+    ]
+    assert facts["psnr_db_by_band"] == {"far": 32.0, "face": 21.0}
+    assert facts["body_psnr_db_by_band"] == {"far": 29.0, "face": 17.0}
+    assert facts["iou_by_band"] == {"far": 1.0, "face": 0.75}
+    assert facts["see_through_by_band"] == {"far": 0.25, "face": 0.1875}
+    assert facts["psnr_db_by_background"] == {"black": 24.5, "white": 28.5}
+    assert (facts["see_through"], facts["alpha_inside"]) == (0.2188, 0.1094)
+    assert (facts["alpha_edge"], facts["alpha_outside"]) == (0.25, 0.125)
+    assert (facts["psnr_db"], facts["body_psnr_db"], facts["samples"]) == (26.5, 23.0, 4)
+    assert (facts["background"], facts["ssim"], facts["iou"]) == (0.5, 0.75, 0.875)
+    assert (facts["least_psnr_db"], facts["least_body_psnr_db"]) == (20.0, 15.0)
+    assert facts["worst"] == {"seed": 1, "number": 24, "band": "face", "psnr_db": 20.0, "body_psnr_db": 19.0}
+    assert facts["by_seed"] == {
+        "1": {"psnr_db": 25.0, "body_psnr_db": 23.5, "least_psnr_db": 20.0},
+        "9": {"psnr_db": 28.0, "body_psnr_db": 22.5, "least_psnr_db": 22.0},
+    }

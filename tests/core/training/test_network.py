@@ -8,6 +8,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from trilane.avatars.bundle import bundle_folder  # noqa: E402
 from trilane.avatars.network_file import reshaped  # noqa: E402
 from trilane.errors import BadInputError  # noqa: E402
 from trilane.training.network import (  # noqa: E402
@@ -18,6 +19,7 @@ from trilane.training.network import (  # noqa: E402
     export_onnx,
 )
 from trilane.training.quantising.quantise import quantise  # noqa: E402
+from trilane.training.trainable_avatar import NeuralTexture, TrainableAvatar, load_network, save_network  # noqa: E402
 
 
 def count_macs(network, height, width, channels):
@@ -114,3 +116,67 @@ def test_a_narrow_shortcut_is_trained_without_a_strided_convolution(channels, mo
         torch.testing.assert_close(shortcut.weight.grad.double(), weight.grad, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(shortcut.eval()(x), found)
     assert strides[-1] == (2, 2)
+
+
+# Its weights in a file.
+
+CHANNELS = 4
+
+
+def avatar():
+    torch.manual_seed(0)
+    start = np.random.default_rng(1).uniform(-0.5, 0.5, (64, 64, CHANNELS)).astype(np.float32)
+    return TrainableAvatar(NeuralTexture(start, sides=(64, 32)), UNet(width=8, channels=CHANNELS))
+
+
+def test_the_network_alone_comes_back_in_half_precision(tmp_path):
+    made, path = avatar(), tmp_path / "network.npz"
+    save_network(made, path)
+    again = load_network(avatar().network, path)
+    for name, value in made.network.state_dict().items():
+        if value.is_floating_point():
+            assert torch.allclose(again.state_dict()[name], value, atol=1e-3, rtol=1e-3), name
+
+
+def test_the_kept_network_of_the_default_avatar_loads():
+    load_network(
+        UNet(width=16, channels=16, input_skip=True),
+        bundle_folder("default").parents[1] / "training" / "default-network.npz",
+    )
+
+
+def test_a_network_of_another_width_is_refused(tmp_path):
+    path = tmp_path / "network.npz"
+    save_network(avatar(), path)
+    with pytest.raises(BadInputError, match="size mismatch"):
+        load_network(UNet(width=16, channels=CHANNELS), path)
+
+
+def kept_weights(path, **changes):
+    """A file of the network's weights, changed: None takes one out."""
+    arrays = {f"network.{name}": value.numpy() for name, value in avatar().network.state_dict().items()} | changes
+    np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
+    return path
+
+
+def test_counters_of_batches_may_be_missing(tmp_path):
+    path = kept_weights(tmp_path / "a.npz", **{"network.mask.1.num_batches_tracked": None})
+    made = load_network(UNet(width=8, channels=CHANNELS), path).state_dict()
+    assert all(torch.equal(made[name], value) for name, value in avatar().network.state_dict().items())
+
+
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [({"network.mask.3.bias": None}, "no mask.3.bias"), ({"network.another": np.zeros(1)}, "also another")],
+)
+def test_weights_that_are_not_all_there_are_refused(tmp_path, changes, found):
+    path = kept_weights(tmp_path / "a.npz", **changes)
+    with pytest.raises(BadInputError) as caught:
+        load_network(UNet(width=8, channels=CHANNELS), path)
+    assert str(caught.value) == f"{path}: found {found}, expected weights that this network's training saved"
+
+
+def test_a_file_that_is_no_archive_is_refused(tmp_path):
+    (tmp_path / "b.npz").write_text("no archive")
+    with pytest.raises(BadInputError, match=r"b\.npz: found .*, expected weights that this network's training saved"):
+        load_network(UNet(width=8, channels=CHANNELS), tmp_path / "b.npz")

@@ -99,10 +99,6 @@ def bits(state: TrainingState) -> dict[str, bytes]:
     return {name: value.detach().contiguous().numpy().tobytes() for name, value in state.tensors().items()}
 
 
-def test_half_size_tensors_have_fewer_than_160_x_160_pixels() -> None:
-    assert sample_files.SMALL_PIXELS == 25600
-
-
 def test_a_batch_is_in_shares(groups: list[ShapeGroup]) -> None:
     group = groups[0]
     uv, covered, target = load_batch(group, np.array([3, 1]))
@@ -227,23 +223,6 @@ def test_a_masked_texture_is_kept_where_no_sample_shows_it(groups: list[ShapeGro
     assert bool((plain != begun).all()) and 0.05 < float((masked == begun).float().mean()) < 0.95
 
 
-def test_small_samples_come_first_and_statistics_stay_at_last(
-    groups: list[ShapeGroup], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen: list[tuple[int, bool]] = []
-    load = step_loop.load_batch
-
-    def loaded(group: ShapeGroup, *words: Any) -> Any:
-        seen.append((group.shape[0], state.avatar.network.colour[1].training))
-        return load(group, *words)
-
-    monkeypatch.setattr(step_loop, "load_batch", loaded)
-    state = first_state(avatar(), settings())
-    go(state, groups, settings(), COUNT)
-    assert [shape for shape, _ in seen[:3]] == [32] * 3 and 64 in [shape for shape, _ in seen[3:]]
-    assert [training for _, training in seen] == [True] * 5 + [False] * 2
-
-
 def test_the_average_is_the_last_weights_where_few_steps_were_done(groups: list[ShapeGroup]) -> None:
     """A tenth of seven steps is less than one; of a time constant of all steps it is their plain mean."""
     state = trained(groups, 3)
@@ -281,39 +260,6 @@ def test_a_state_of_another_training_is_refused(groups: list[ShapeGroup], tmp_pa
             load_state(first_state(avatar(), settings()), tmp_path / name)
 
 
-def test_settings_are_written_whole_and_read_again(tmp_path: Path) -> None:
-    asked = settings(start="new", steps=40, loss={"structure": 20.0, "overlap": 25.0})
-    (tmp_path / "training.toml").write_text(settings_text(asked))
-    assert read_settings(tmp_path / "training.toml") == asked
-    assert asked.loss.by_name()["composite"] == 0.4 and asked.loss.by_name()["structure"] == 20.0
-
-
-def test_the_thesis_loss_has_its_rates_where_a_training_says_no_others(tmp_path: Path) -> None:
-    asked = settings(loss="thesis")
-    weights = {"composite": 25, "overlap": 25, "perceptual": 20, "adversarial": 1, "features": 1}
-    assert {name: weight for name, weight in asked.loss.by_name().items() if weight} == weights
-    assert (asked.network_rate, asked.texture_rate, asked.discriminator_rate, asked.weight_decay) == (
-        1e-3,
-        1e-3,
-        1e-5,
-        0,
-    )
-    assert (asked.optimiser.kind, asked.optimiser.second_momentum, asked.optimiser.clip_norm) == ("adam", 0.999, 0)
-    assert settings(loss="thesis", texture_rate=0.25).texture_rate == 0.25
-    clipped = settings(loss="thesis", optimiser={"clip_norm": 2.0}).optimiser
-    assert (clipped.kind, clipped.clip_norm) == ("adam", 2.0)
-    assert settings(loss="default") == settings()
-    (tmp_path / "training.toml").write_text(settings_text(asked))
-    assert read_settings(tmp_path / "training.toml") == asked
-
-
-def test_a_new_network_is_trained_on_small_samples_first() -> None:
-    known, new = parsed_settings({}, "a test"), parsed_settings({"start": "new"}, "a test")
-    assert (known.small_until, known.freeze_norms_at) == (0.0, 0.3)
-    assert (new.small_until, new.freeze_norms_at) == (0.12, 0.6)
-    assert parsed_settings({"start": "new", "small_until": 0.5}, "a test").small_until == 0.5
-
-
 def test_a_new_network_with_little_time_takes_many_cheap_steps(tmp_path: Path) -> None:
     def rates(**values: Any) -> tuple[float, ...]:
         asked = parsed_settings(values, "a test")
@@ -331,25 +277,6 @@ def test_a_new_network_with_little_time_takes_many_cheap_steps(tmp_path: Path) -
         parsed_settings({"start": "new", "minutes": "1"}, "a test")
     with pytest.raises(BadInputError, match="optimiser: found 3, expected"):
         parsed_settings({"loss": "thesis", "optimiser": 3}, "a test")
-
-
-@pytest.mark.parametrize(
-    ("values", "words"),
-    [
-        (
-            {"sample": 3},
-            "options: sample: found an unknown key, expected one of schema, samples, .*did you mean 'samples'",
-        ),
-        ({"loss": {"dice": 1.0}}, "options: loss.dice: found an unknown key, expected one of composite, "),
-        ({"loss": "thesi"}, "options: loss: found 'thesi', expected one of default, thesis; did you mean 'thesis'"),
-        ({"vgg": "mine.pth"}, "options: vgg: found 'mine.pth', expected String should match pattern"),
-        ({"samples": 3}, "options: samples: found 3, expected greater than or equal to 8"),
-        ({"start": "old"}, "options: start: found 'old', expected 'default', 'hiker' or 'new'"),
-    ],
-)
-def test_wrong_settings_are_refused(values: dict[str, Any], words: str) -> None:
-    with pytest.raises(BadInputError, match=words):
-        parsed_settings(values, "options")
 
 
 def test_a_training_goes_on_only_as_it_was_begun(tmp_path: Path) -> None:

@@ -18,7 +18,6 @@ pytest.importorskip("skimage")
 from trilane.avatars.bundle import load_bundle  # noqa: E402
 from trilane.errors import BadInputError  # noqa: E402
 from trilane.training import train as command  # noqa: E402
-from trilane.training.network import UNet  # noqa: E402
 from trilane.training.sample_files import create_group  # noqa: E402
 from trilane.training.subject import Person, Subject  # noqa: E402
 from trilane.training.train import Places, train_avatar  # noqa: E402
@@ -123,36 +122,6 @@ def settings(**others: Any) -> TrainingSettings:
     )
 
 
-def told_before(folder: Path) -> float:
-    return float(json.loads((folder / "work" / "loss-before.json").read_text()))
-
-
-def test_every_part_gets_what_is_its(log: list[Any], tmp_path: Path) -> None:
-    told = Told()
-    facts = train_avatar(places(tmp_path), settings(), told)
-    assert log.pop(0) == ("raise", "offsets.npz", 1, 2)
-    assert log[:4] == ["render"] * 4 and log[4] == ("draw", "opener", (None,), 8, 1)
-    assert log[5:7] == ["step-0000010.png", "step-0000020.png"]
-    folder, person, (_, shaped, seed), width, provenance, names = log[7]
-    assert (folder, person, shaped, seed, width) == (tmp_path / "mine", Person(Path("body.npz")), "shaped", 1, 4)
-    assert provenance == {"samples": 8, "steps": 20, "batch": 2, "seed": 1, "texture_sides": list(SIDES), **FACTS}
-    command = "trilane avatar train capture --config training.toml"
-    assert names == {"name": "mine", "training_command": command}
-    assert log[8:] == [("bundle of mine", "frames", (3,), 1), ("bundle of mine", {"psnr_db": 21.0, "of": "errors"})]
-    assert read_settings(tmp_path / "mine" / "training.toml") == settings()
-    said = ["trains on 1 thread of the CPU", "9 frames of capture", "measures outlines", "measuring outlines 2"]
-    assert told.lines[:5] == [*said, "choosing views 8"]
-    assert "0 MB on the disk (by 4 that were drawn)" in told.lines[5] and told.lines[6] == "drawing views 3"
-    assert told.lines[7].startswith("20 steps: about 0.") and told.lines[7].endswith(" MB of memory")
-    losses = [loss for _, _, loss in told.steps]
-    assert [step[:2] for step in told.steps] == [(step, 20) for step in range(1, 21)] and losses[-1] < losses[0]
-    assert losses == [pytest.approx(sum(WEIGHTS[name] * terms[name] for name in terms)) for terms in told.terms]
-    assert facts["loss"] == {"before": told_before(tmp_path), "after": pytest.approx(losses[-1], rel=0.5)}
-    assert facts["loss"]["after"] < facts["loss"]["before"]
-    assert (facts["steps"], facts["sheets"]) == (20, str(tmp_path / "work" / "sheets"))
-    assert facts["frames"] == (tmp_path / "work", 1, 1)
-
-
 def test_an_ended_training_goes_on_and_makes_the_same_avatar(
     log: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -201,74 +170,6 @@ def test_steps_are_counted_for_the_minutes(log: list[Any], tmp_path: Path, monke
     assert read_settings(tmp_path / "mine" / "training.toml").steps == 12
     assert train_avatar(places(tmp_path, "other"), settings(steps=None, minutes=0.001), Told())["steps"] == 10
     assert log
-
-
-def clothed(folder: Path) -> Places:
-    return Places(None, folder / "mine", folder / "work", "mine")
-
-
-@pytest.fixture
-def clothed_body(log: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    """The default body in a look, whose renderer, planner and truth are doubles."""
-
-    def clothed(body: Path, threads: int, look: str) -> Subject:
-        log.append(("clothe", body.parts[-2:], threads, look))
-        crop = SimpleNamespace(shape=SHAPE)
-        renderer = SimpleNamespace(
-            training_sample=lambda *_: SimpleNamespace(crop=crop), render=lambda _: log.append("render")
-        )
-        return Subject(Person(body), "shaped", renderer, SimpleNamespace, {"look": look}, "truth")  # type: ignore[arg-type]
-
-    def draw(_: Any, samples: Any, folder: Path, *__: Any) -> None:
-        group = create_group(folder, SHAPE, np.zeros(len(samples), np.int8))
-        group.covered[:] = 1
-
-    monkeypatch.setattr(command, "clothed_subject", clothed)
-    monkeypatch.setattr(command, "write_dataset", draw)
-
-
-@pytest.mark.usefixtures("clothed_body")
-def test_the_default_body_in_a_look_needs_no_capture(log: list[Any], tmp_path: Path) -> None:
-    told = Told()
-    facts = train_avatar(clothed(tmp_path), settings(look="hiker", steps=10, threads=2), told)
-    assert log[0] == ("clothe", ("default", "body.npz"), 2, "hiker")
-    _, _, _, _, provenance, names = next(words for words in log if isinstance(words, tuple) and len(words) == 6)
-    assert provenance["look"] == "hiker" and provenance["steps"] == 10
-    assert names["training_command"] == "trilane avatar train --config training.toml"
-    assert json.loads((tmp_path / "work" / "samples.json").read_text())["look"] == "hiker"
-    assert "held_out_error" not in facts and facts["sheets"] is None
-    measure = f"trilane avatar validate {tmp_path / 'mine'} --float-network {tmp_path / 'work' / 'network.npz'}"
-    assert told.lines[-1].endswith(measure)
-
-
-@pytest.mark.usefixtures("clothed_body")
-def test_training_starts_from_network_and_texture_of_an_avatar(
-    log: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """After the state is there, only shapes matter, and neither is read."""
-    network = UNet(width=4, channels=16, input_skip=True)
-    texture = np.full((64, 64, 16), 0.125, np.float32)
-    begun: list[Any] = []
-    first = command.first_state
-
-    def first_state(avatar: Any, *words: Any) -> Any:
-        begun.append((avatar.network, float(avatar.texture.image().detach().mean())))
-        return first(avatar, *words)
-
-    def network_of(bundle: Any, groups: Any, seed: int) -> UNet:
-        log.append(("network", bundle, len(groups), seed))
-        return network
-
-    monkeypatch.setattr(command, "first_state", first_state)
-    monkeypatch.setattr(command, "network_of", network_of)
-    monkeypatch.setattr(command, "load_bundle", lambda name: SimpleNamespace(name=name, read_texture=lambda: texture))
-    asked = settings(look="hiker", start="hiker", texture="default", steps=10)
-    train_avatar(clothed(tmp_path), asked, Told())
-    calls = [words for words in log if isinstance(words, tuple) and words[0] == "network"]
-    assert [(bundle.name, groups, seed) for _, bundle, groups, seed in calls] == [("hiker", 1, 1)]
-    assert begun[0][0] is network and begun[0][1] == pytest.approx(0.125)
-    train_avatar(clothed(tmp_path), asked, Told())
-    assert len([words for words in log if isinstance(words, tuple) and words[0] == "network"]) == 1
 
 
 @pytest.mark.usefixtures("log")

@@ -10,7 +10,6 @@ import pytest
 
 from trilane.avatars.bundle import bundle_folder, check_levels, load_bundle, pack_levels, split_levels, write_bundle
 from trilane.errors import BadInputError
-from trilane.stages.gpu.packed_pass import filter_of
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("onnxruntime")
@@ -130,12 +129,6 @@ def test_a_bundle_keeps_its_levels(tiny_bundle: Path, tiny_quantised: Any, tmp_p
     np.testing.assert_allclose(first[0].permute(1, 2, 0), texture * scale, rtol=1e-6)
     with pytest.raises(BadInputError, match=r"texture\.npz: found levels of shape \(32, 16, 5\)"):
         write_bundle(tmp_path / "bad", bundle.manifest, body, texture, network, scale, levels=half[:, :16])
-
-
-def test_learnt_levels_are_never_left_unread() -> None:
-    asked = ("linear", "mipmap", "anisotropic")
-    assert [filter_of(name, learnt=True) for name in asked] == ["mipmap", "mipmap", "anisotropic"]
-    assert [filter_of(name, learnt=False) for name in asked] == list(asked)
 
 
 # A float network from an avatar's integers: it paints what they paint, also when it is trained on.

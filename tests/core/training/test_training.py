@@ -1,6 +1,8 @@
-"""Training: samples repeat, held-out poses stay unseen, losses and metrics mean what they say."""
+"""Training's parts against a second implementation in NumPy, values by hand, and what is held."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pytest
@@ -9,31 +11,244 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("scipy")
 pytest.importorskip("skimage")
 
-from trilane.avatars.bundle import bundle_folder  # noqa: E402
-from trilane.body.joints import JOINT_INDEX  # noqa: E402
-from trilane.errors import BadInputError  # noqa: E402
 from trilane.scene.motion.builtin import BUILTIN  # noqa: E402
+from trilane.training import objective, step_loop  # noqa: E402
 from trilane.training.clothing.layers import Layer  # noqa: E402
-from trilane.training.first_texture import (  # noqa: E402
-    eigenfunctions,
-    fill_gaps,
-    lay_out,
+from trilane.training.network import (  # noqa: E402
+    ENCODERS,
+    NORMS,
+    UNet,
+    add_activation_noise,
+    export_onnx,
 )
-from trilane.training.image_error import ImageError, SampleError, image_error, summary  # noqa: E402
-from trilane.training.network import UNet  # noqa: E402
-from trilane.training.objective import loss_terms, total_loss  # noqa: E402
 from trilane.training.random_poses import random_pose  # noqa: E402
-from trilane.training.random_views import BANDS, ClothedSurface, View, look_at, perspective, random_view, vertex_reach  # noqa: E402
-from trilane.training.sample_files import U16, batches, create_group, open_groups  # noqa: E402
+from trilane.training.random_views import ClothedSurface, View, look_at, perspective, vertex_reach  # noqa: E402
+from trilane.training.sample_files import U16, ShapeGroup, batches, create_group, open_groups  # noqa: E402
 from trilane.training.trainable_avatar import (  # noqa: E402
     NeuralTexture,
     TrainableAvatar,
-    load_network,
     read_texture,
-    save_network,
 )
 
-CHANNELS = 4
+
+def avatar() -> TrainableAvatar:
+    torch.manual_seed(0)
+    start = np.random.default_rng(1).uniform(-0.5, 0.5, (64, 64, 4)).astype(np.float32)
+    return TrainableAvatar(NeuralTexture(start, sides=(64, 32)), UNet(width=8, channels=4))
+
+
+@pytest.fixture
+def pictures():
+    """Two outputs and targets (2, 4, 24, 20); the persons are rectangles, one of which touches the edge."""
+    random = np.random.default_rng(2)
+    output, target = random.uniform(0.02, 0.98, (2, 2, 4, 24, 20))
+    target[:, 3] = 0
+    target[0, 3, 8:15, 6:13] = 1
+    target[1, 3, 0:4, 0:3] = 1
+    return output, target
+
+
+BEHIND = np.random.default_rng(6).uniform(0, 1, (2, 3, 24, 20))
+
+
+def terms_by_loops(output, target):
+    """`loss_terms` again, pixel by pixel."""
+    n, _, h, w = output.shape
+    near = np.zeros((n, h, w))
+    for k, y, x in np.ndindex(n, h, w):
+        near[k, y, x] = target[k, 3, max(0, y - 5) : y + 6, max(0, x - 5) : x + 6].any()
+    over = [image[:, :3] * image[:, 3:] + BEHIND * (1 - image[:, 3:]) for image in (output, target)]
+    off = over[0] - over[1]
+    pixels = 3 * near.sum() + 1
+    decibels = [10 * math.log10(1 + (off[k] ** 2 * near[k]).sum() / (3 * near[k].sum() + 1) / 1e-5) for k in range(n)]
+    coarse = sum(
+        abs(off[k, c, y : y + 4, x : x + 4].mean()) * 16
+        for k in range(n)
+        for c in range(3)
+        for y in range(0, h, 4)
+        for x in range(0, w, 4)
+    )
+    mask, true = output[:, 3], target[:, 3]
+    return {
+        "composite": (np.abs(off) * (near[:, None] + 0.05)).sum() / pixels,
+        "decibels": np.mean(decibels),
+        "colour": (np.abs(output[:, :3] - target[:, :3]) * true[:, None]).sum() / pixels,
+        "edges": (np.abs(np.diff(off, axis=3)).sum() + np.abs(np.diff(off, axis=2)).sum()) / pixels,
+        "coarse": coarse / pixels,
+        "mask": -(true * np.log(mask) + (1 - true) * np.log(1 - mask)).mean(),
+        "background": -(np.log(1 - output[:, :3]) * (true == 0)[:, None]).mean(),
+        "overlap": 1 - (2 * (mask * true).sum() + 1) / (mask.sum() + true.sum() + 1),
+    }
+
+
+def test_losses_are_their_formulas(pictures):
+    output, target = pictures
+    terms = objective.loss_terms(*map(torch.from_numpy, (output, target, BEHIND)))
+    wanted = terms_by_loops(output, target)
+    assert set(terms) == set(wanted) == set(objective.WEIGHTS)
+    for name, value in wanted.items():
+        assert float(terms[name]) == pytest.approx(value, rel=1e-6), name
+    weights = {"composite": 0.4, "decibels": 0.03, "colour": 0.1, "edges": 0.2, "coarse": 0.2, "mask": 0.1}
+    weights |= {"overlap": 0.1, "background": 0.05}
+    total = sum(weights[name] * value for name, value in wanted.items())
+    assert float(objective.total_loss(terms)) == pytest.approx(total, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("share", "rate"),
+    [
+        (0.0, 0.02),
+        (0.01, 0.5),
+        (0.02, 1.0),
+        (0.51, 0.01 + 0.99 * 0.5),
+        (1.0, 0.01),
+    ],
+)
+def test_the_learning_rate_rises_and_falls_as_a_cosine(share, rate):
+    assert step_loop.rate_share(share) == pytest.approx(rate)
+
+
+def test_the_average_keeps_its_share():
+    average, now = avatar(), avatar()
+    name = "network.mask.3.bias"
+    old = average.state_dict()[name].clone()
+    with torch.no_grad():
+        now.state_dict()[name] += 8.0
+    step_loop.follow(average, now, keep=0.75)
+    assert torch.allclose(average.state_dict()[name], old + 2.0)
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_frozen_norms_keep_their_statistics(frozen):
+    made = avatar().eval()
+    step_loop.set_mode(made, frozen)
+    norms = [module for module in made.modules() if isinstance(module, torch.nn.BatchNorm2d)]
+    assert norms and made.network.colour[0].training
+    assert all(norm.training is not frozen for norm in norms)
+
+
+def test_activation_noise_is_as_large_as_stated_and_only_where_a_relu_is_open():
+    """Largest output 2, three steps: up to 3 * 2 / 255 either way; nothing in evaluation."""
+    relu = torch.nn.Sequential(torch.nn.ReLU())
+    add_activation_noise(relu, 3.0)
+    values = torch.linspace(-1, 2, 3001)
+    torch.manual_seed(0)
+    noise = (relu.train()(values) - values.clamp(min=0)).numpy()
+    largest = 3.0 * 2.0 / 255
+    assert (noise[values.numpy() <= 0] == 0).all()
+    assert 0.98 * largest < np.abs(noise).max() <= largest + 1e-6
+    assert abs(noise.mean()) < 0.05 * largest
+    assert torch.equal(relu.eval()(values), values.clamp(min=0))
+
+
+@pytest.mark.parametrize("encoder", ENCODERS)
+@pytest.mark.parametrize("norm", NORMS)
+def test_networks_compute_what_they_did(held, encoder, norm):
+    torch.manual_seed(0)
+    network = UNet(encoder, norm, width=16, channels=4, input_skip=norm == "batch").eval()
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.copy_(torch.sin(torch.arange(parameter.numel()) * 1.3).reshape(parameter.shape) * 0.3)
+        picture = network(torch.cos(torch.arange(4 * 64 * 32) * 0.9).reshape(1, 4, 64, 32))
+        held("features", [feature.abs().mean() for feature in network.encoder(torch.ones(1, 4, 64, 32))])
+    held("parameters", [p.numel() for p in network.parameters()])
+    assert picture.shape == (1, 4, 64, 32)
+    held("picture", picture.round(decimals=4))
+
+
+def test_a_group_norm_is_pytorchs():
+    torch.manual_seed(0)
+    ours = NORMS["group"](8)
+    peer = torch.nn.GroupNorm(ours.num_groups, 8)
+    with torch.no_grad():
+        for parameter in (ours.weight, ours.bias):
+            parameter.uniform_(-1, 1)
+    peer.load_state_dict(ours.state_dict())
+    x = torch.randn(2, 8, 6, 5)
+    assert torch.allclose(ours(x), peer(x), atol=1e-5)
+
+
+def test_an_export_names_its_ends_and_has_one_head():
+    model = export_onnx(UNet(width=8, channels=5), 64, 96)
+    shape = [[d.dim_value for d in end.type.tensor_type.shape.dim] for end in (*model.graph.input, *model.graph.output)]
+    assert [end.name for end in (*model.graph.input, *model.graph.output)] == ["tensor", "rgba"]
+    assert shape == [[1, 5, 64, 96], [1, 4, 64, 96]]
+    assert model.opset_import[0].version == 17
+    last = [node.op_type for node in model.graph.node][-4:]
+    assert last == ["Conv", "Relu", "Conv", "Sigmoid"]
+
+
+def test_a_texture_is_a_pyramid_of_differences():
+    """Sides 4 and 2: the coarse scale is the mean of each four texels, the fine one what is missing."""
+    start = np.random.default_rng(0).uniform(-0.9, 0.9, (4, 4, 1)).astype(np.float32)
+    texture = NeuralTexture(start, sides=(2, 4))
+    fine, coarse = (scale.detach().numpy()[0, 0] for scale in texture.scales)
+    np.testing.assert_allclose(coarse, start[..., 0].reshape(2, 2, 2, 2).mean(axis=(1, 3)), atol=1e-6)
+    np.testing.assert_allclose(texture.image().detach()[0, 0], start[..., 0], atol=1e-6)
+    assert fine.shape == (4, 4)
+    with torch.no_grad():
+        texture.scales[1] += 2.0
+        assert float(texture.image().max()) == 1.0
+        texture.scales[1] -= 4.0
+        assert float(texture.image().min()) == -1.0
+
+
+def test_a_texture_is_read_between_texel_centres():
+    """Texels 0, 1 / 2, 3 of a 2 x 2 texture: their centres are at 0.25 and 0.75."""
+    image = torch.tensor([[[[0.0, 1.0], [2.0, 3.0]]]])
+    uv = torch.tensor([[[[0.25, 0.25], [0.75, 0.25]], [[0.5, 0.5], [0.0, 1.0]]]])
+    covered = torch.tensor([[[True, True], [True, True]]])
+    assert read_texture(image, uv, covered)[0, 0].tolist() == [[0.0, 1.0], [1.5, 2.0]]
+    covered[0, 0, 1] = False
+    assert read_texture(image, uv, covered)[0, 0].tolist() == [[0.0, 0.0], [1.5, 2.0]]
+
+
+def test_the_networks_input_is_rounded_and_its_gradient_is_not():
+    made = avatar().eval()
+    seen = []
+    made.network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    uv = torch.rand(1, 32, 32, 2)
+    made(uv, torch.ones(1, 32, 32, dtype=torch.bool)).sum().backward()
+    steps = seen[0].detach() * 127
+    assert torch.allclose(steps, steps.round(), atol=1e-4) and steps.abs().max() > 10
+    assert float(made.texture.scales[0].grad.abs().max()) > 0
+
+
+def test_repeats_show_samples_of_a_band_more_often():
+    group = ShapeGroup((1, 1), *(np.zeros((3, 1, 1, k)) for k in (2, 1, 4)), band=np.array([0, 1, 1], np.int8))
+    stream = batches([group], 2, np.random.default_rng(0), (1, 2, 1, 1, 1))
+    shown = [next(stream) for _ in range(2)]
+    assert sorted(np.concatenate([index for _, index in shown])) == [0, 1, 1, 2, 2]
+    assert all((np.diff(index) >= 0).all() for _, index in shown)
+
+
+def test_each_picture_of_a_batch_stands_before_a_background_of_its_own():
+    """The seed of PyTorch alone decides them, so that a training that goes on draws what it would have drawn."""
+    target = torch.zeros(32, 4, 8, 8)
+    torch.manual_seed(2)
+    first, second = objective.drawn_behind(target), objective.drawn_behind(target)
+    torch.manual_seed(2)
+    assert torch.equal(objective.drawn_behind(target), first) and not torch.equal(first, second)
+    assert first.shape == (32, 3, 8, 8)
+    drawn = {each.numpy().tobytes() for each in first}
+    plain = [each for each in first if float(each.min()) == float(each.max())]
+    assert len(drawn) == 32 - max(0, len(plain) - 2), "black and white are each one picture, all others differ"
+
+
+def test_training_sees_a_person_as_grey_as_the_one_background_that_was():
+    """Alpha of 0.7 before black and white: 0.15 in each colour of a person who fills the picture, 33.5 dB from none."""
+    target = torch.cat((torch.full((2, 3, 16, 16), 0.5), torch.ones(2, 1, 16, 16)), dim=1)
+    ghost = target.clone()
+    ghost[:, 3] = 0.7
+    behind = torch.stack((torch.zeros(3, 16, 16), torch.ones(3, 16, 16)))
+    pixels = 2 * 3 * 16 * 16
+    terms = objective.loss_terms(ghost, target, behind)
+    assert float(terms["composite"]) == pytest.approx(0.15 * 1.05 * pixels / (pixels + 1), rel=1e-5)
+    assert float(terms["decibels"]) == pytest.approx(10 * math.log10(1 + 0.15**2 / 1e-5 * 768 / 769), rel=1e-5)
+    hidden = objective.loss_terms(ghost, target, torch.full((2, 3, 16, 16), 0.5))
+    assert float(hidden["composite"]) == float(hidden["decibels"]) == 0
+
+
 SHAPE = (32, 64)
 
 
@@ -47,25 +262,6 @@ def groups(tmp_path):
     return tmp_path / "data"
 
 
-def avatar():
-    torch.manual_seed(0)
-    start = np.random.default_rng(1).uniform(-0.5, 0.5, (64, 64, CHANNELS)).astype(np.float32)
-    return TrainableAvatar(NeuralTexture(start, sides=(64, 32)), UNet(width=8, channels=CHANNELS))
-
-
-def test_poses_repeat_and_differ():
-    pose, same, other = (random_pose(np.random.default_rng(seed)) for seed in (3, 3, 4))
-    assert np.array_equal(pose, same) and not np.array_equal(pose, other)
-    assert pose.shape == (55, 3) and np.isfinite(pose).all()
-
-
-def test_knees_and_elbows_bend_one_way():
-    for seed in range(200):
-        pose = random_pose(np.random.default_rng(seed))
-        assert pose[JOINT_INDEX["left_knee"], 0] >= 0 and pose[JOINT_INDEX["right_knee"], 0] >= 0
-        assert pose[JOINT_INDEX["left_elbow"], 1] <= 0 <= pose[JOINT_INDEX["right_elbow"], 1]
-
-
 def test_held_out_poses_are_not_trained_on():
     motion = BUILTIN["walk-wave-turn"]()
     held_out = np.array([motion.sample(t)[0] for t in np.linspace(0, motion.duration_s, 40)])
@@ -74,122 +270,10 @@ def test_held_out_poses_are_not_trained_on():
     assert apart.min() > 0.1
 
 
-def test_views_frame_what_the_band_says():
-    joints = np.zeros((55, 3)) + np.random.default_rng(0).normal(size=(55, 3)) * 0.1
-    for band, (_, least, most) in BANDS.items():
-        view = random_view(np.random.default_rng(5), band, joints)
-        distance = np.linalg.norm(np.linalg.inv(view.view)[:3, 3])
-        framed = 2 * distance / view.projection[1, 1]
-        assert 0.5 * least < framed < 2 * most
-
-
 def test_batches_show_every_sample_once_an_epoch(groups):
     stream = batches(open_groups(groups), 2, np.random.default_rng(0))
     seen = np.concatenate([next(stream)[1] for _ in range(3)])
     assert sorted(seen) == list(range(6))
-
-
-def test_texture_starts_as_it_is_told_and_reads_bilinearly():
-    start = np.repeat(np.linspace(-0.5, 0.5, 32, dtype=np.float32)[:, None, None], 32, axis=1)
-    smooth = NeuralTexture(np.repeat(np.repeat(start, 2, axis=0), 2, axis=1).repeat(3, axis=2), sides=(64, 32))
-    assert (
-        float((smooth.image().detach()[0, 0] - torch.from_numpy(start[..., 0].repeat(2, 0).repeat(2, 1))).abs().max())
-        < 0.02
-    )
-    uv = torch.tensor([[[[0.5, 0.25], [0.5, 0.75]]]])
-    read = read_texture(smooth.image(), uv, torch.tensor([[[True, False]]])).detach()
-    assert read.shape == (1, 3, 1, 2)
-    assert float(read[0, 0, 0, 0]) == pytest.approx(-0.25, abs=0.03)
-    assert (read[0, :, 0, 1] == 0).all()
-
-
-def test_a_perfect_picture_costs_nothing():
-    target, behind = torch.zeros(1, 4, 32, 32), torch.rand(1, 3, 32, 32)
-    target[:, :, 8:24, 8:24] = 1.0
-    perfect = total_loss(loss_terms(target, target, behind))
-    worse = total_loss(loss_terms(target * 0.8, target, behind))
-    assert float(perfect) < 0.01 < float(worse)
-
-
-def test_metrics_of_known_pictures():
-    truth = np.zeros((32, 32, 4), np.uint8)
-    truth[8:24, 8:24] = (128, 128, 128, 255)
-    off = truth.copy()
-    off[8:24, 8:24, :3] += 26
-    error = image_error(off, truth)
-    assert error.psnr_db == pytest.approx(-20 * np.log10(26 / 255), abs=0.01)
-    assert error.iou == 1.0
-    assert image_error(truth, np.zeros_like(truth)) is None
-
-
-def test_psnr_in_the_box_and_of_the_body_alone_worked_out_by_hand():
-    """A box of 2 x 4 pixels, three of which are background; one body pixel is wrong by 51 of 255 in every channel.
-
-    In the box the mean square is 0.2**2 / 8 = 0.005, which is 23.01 dB; of the body's five pixels it is 0.2**2 / 5 =
-    0.008, which is 20.97 dB.
-    """
-    truth = np.zeros((5, 6, 4), np.uint8)
-    truth[1:3, 1:5] = (100, 100, 100, 255)
-    truth[1, 2:5, 3] = 0
-    picture = truth.copy()
-    picture[2, 3, :3] = 151
-    error = image_error(picture, truth)
-    assert error.psnr_db == pytest.approx(23.0103, abs=1e-4)
-    assert error.body_psnr_db == pytest.approx(20.9691, abs=1e-4)
-    assert (error.background, error.iou) == (0.375, 1.0)
-
-
-def test_what_is_painted_beside_the_body_counts_in_the_box_alone():
-    """One background pixel of eight is painted white, alpha too: before black a square of 1 / 8, before white none."""
-    truth = np.zeros((5, 6, 4), np.uint8)
-    truth[1:3, 1:5] = (100, 100, 100, 255)
-    truth[1, 2:4, 3] = 0
-    picture = truth.copy()
-    picture[1, 2] = 255
-    error = image_error(picture, truth)
-    assert error.by_background["black"] == pytest.approx(-10 * np.log10(1 / 8), abs=1e-6)
-    assert error.by_background["white"] == 100.0
-    assert error.psnr_db == pytest.approx(np.mean(list(error.by_background.values())), abs=1e-9)
-    assert error.body_psnr_db == 100.0, "the body itself is exact"
-    assert error.iou == pytest.approx(6 / 7)
-
-
-def an_error(psnr_db, body_psnr_db, iou=1.0):
-    before, shares = {"black": psnr_db - 2, "white": psnr_db + 2}, {"alpha_edge": 0.25, "alpha_outside": 0.125}
-    return ImageError(
-        psnr_db, body_psnr_db, before, 0.5, ssim=0.75, iou=iou, alpha_inside=iou / 8, **shares, see_through=iou / 4
-    )
-
-
-def test_a_summary_has_means_and_the_worst_sample_of_all_seeds():
-    errors = [
-        SampleError(1, 0, "far", an_error(30.0, 28.0)),
-        SampleError(1, 24, "face", an_error(20.0, 19.0, iou=0.5)),
-        SampleError(9, 0, "far", an_error(34.0, 30.0)),
-        SampleError(9, 25, "face", an_error(22.0, 15.0)),
-    ]
-    facts = summary(errors)
-    assert list(facts) == [
-        *("psnr_db_by_band", "body_psnr_db_by_band", "see_through_by_band", "iou_by_band", "psnr_db_by_background"),
-        *("psnr_db", "body_psnr_db", "see_through", "alpha_inside", "alpha_edge", "alpha_outside"),
-        *("background", "iou", "ssim"),
-        *("least_psnr_db", "least_body_psnr_db", "worst", "by_seed", "samples"),
-    ]
-    assert facts["psnr_db_by_band"] == {"far": 32.0, "face": 21.0}
-    assert facts["body_psnr_db_by_band"] == {"far": 29.0, "face": 17.0}
-    assert facts["iou_by_band"] == {"far": 1.0, "face": 0.75}
-    assert facts["see_through_by_band"] == {"far": 0.25, "face": 0.1875}
-    assert facts["psnr_db_by_background"] == {"black": 24.5, "white": 28.5}
-    assert (facts["see_through"], facts["alpha_inside"]) == (0.2188, 0.1094)
-    assert (facts["alpha_edge"], facts["alpha_outside"]) == (0.25, 0.125)
-    assert (facts["psnr_db"], facts["body_psnr_db"], facts["samples"]) == (26.5, 23.0, 4)
-    assert (facts["background"], facts["ssim"], facts["iou"]) == (0.5, 0.75, 0.875)
-    assert (facts["least_psnr_db"], facts["least_body_psnr_db"]) == (20.0, 15.0)
-    assert facts["worst"] == {"seed": 1, "number": 24, "band": "face", "psnr_db": 20.0, "body_psnr_db": 19.0}
-    assert facts["by_seed"] == {
-        "1": {"psnr_db": 25.0, "body_psnr_db": 23.5, "least_psnr_db": 20.0},
-        "9": {"psnr_db": 28.0, "body_psnr_db": 22.5, "least_psnr_db": 22.0},
-    }
 
 
 def test_points_reach_over_their_triangles():
@@ -220,68 +304,3 @@ def a_layer(vertices):
     weights = np.eye(1, 55).repeat(count, axis=0)
     ones = np.ones(count)
     return Layer("skin", vertices, np.array([[0, 1, 2]]), vertices, weights, vertices, ones, ones)
-
-
-def test_fields_are_smooth_and_gaps_filled():
-    grid = np.array([[x, y, 0.0] for x in range(6) for y in range(6)], np.float64)
-    corner = [(6 * x + y, 6 * x + y + 6, 6 * x + y + 1) for x in range(5) for y in range(5)]
-    faces = np.array(corner + [(b, b + 1, c) for _, b, c in corner])
-    fields = eigenfunctions(grid, faces, 3)
-    assert fields.shape == (36, 3) and np.abs(fields).max() == pytest.approx(1.0)
-    image, known = lay_out(fields, faces, grid[:, :2] / 10 + 0.1, faces, 32)
-    filled = fill_gaps(image, known)
-    assert known.any() and not known.all()
-    assert np.allclose(filled[known], image[known]) and np.isfinite(filled).all()
-
-
-def test_the_network_alone_comes_back_in_half_precision(tmp_path):
-    made, path = avatar(), tmp_path / "network.npz"
-    save_network(made, path)
-    again = load_network(avatar().network, path)
-    for name, value in made.network.state_dict().items():
-        if value.is_floating_point():
-            assert torch.allclose(again.state_dict()[name], value, atol=1e-3, rtol=1e-3), name
-
-
-def test_the_kept_network_of_the_default_avatar_loads():
-    load_network(
-        UNet(width=16, channels=16, input_skip=True),
-        bundle_folder("default").parents[1] / "training" / "default-network.npz",
-    )
-
-
-def test_a_network_of_another_width_is_refused(tmp_path):
-    path = tmp_path / "network.npz"
-    save_network(avatar(), path)
-    with pytest.raises(BadInputError, match="size mismatch"):
-        load_network(UNet(width=16, channels=CHANNELS), path)
-
-
-def kept_weights(path, **changes):
-    """A file of the network's weights, changed: None takes one out."""
-    arrays = {f"network.{name}": value.numpy() for name, value in avatar().network.state_dict().items()} | changes
-    np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
-    return path
-
-
-def test_counters_of_batches_may_be_missing(tmp_path):
-    path = kept_weights(tmp_path / "a.npz", **{"network.mask.1.num_batches_tracked": None})
-    made = load_network(UNet(width=8, channels=CHANNELS), path).state_dict()
-    assert all(torch.equal(made[name], value) for name, value in avatar().network.state_dict().items())
-
-
-@pytest.mark.parametrize(
-    ("changes", "found"),
-    [({"network.mask.3.bias": None}, "no mask.3.bias"), ({"network.another": np.zeros(1)}, "also another")],
-)
-def test_weights_that_are_not_all_there_are_refused(tmp_path, changes, found):
-    path = kept_weights(tmp_path / "a.npz", **changes)
-    with pytest.raises(BadInputError) as caught:
-        load_network(UNet(width=8, channels=CHANNELS), path)
-    assert str(caught.value) == f"{path}: found {found}, expected weights that this network's training saved"
-
-
-def test_a_file_that_is_no_archive_is_refused(tmp_path):
-    (tmp_path / "b.npz").write_text("no archive")
-    with pytest.raises(BadInputError, match=r"b\.npz: found .*, expected weights that this network's training saved"):
-        load_network(UNet(width=8, channels=CHANNELS), tmp_path / "b.npz")

@@ -167,13 +167,6 @@ def test_bytes_begin_after_their_share_of_the_steps(groups: list[ShapeGroup]) ->
     assert not grids[1].any() and grids[2].any() and torch.equal(grids[2], grids[3])
 
 
-def test_the_training_has_the_optimiser_that_is_asked_for() -> None:
-    options = {"kind": "adam", "momentum": 0.3, "texture_momentum": 0.0, "second_momentum": 0.8}
-    optimiser = first_state(avatar(), settings(optimiser=options, masked_texture=True)).optimiser
-    assert type(optimiser).__name__ == "MaskedAdam"
-    assert [group["betas"] for group in optimiser.param_groups] == [(0.3, 0.8), (0.3, 0.8), (0.0, 0.8)]
-
-
 def test_options_are_written_and_read_again() -> None:
     for change in [*CHANGES.values(), *MANY]:
         asked = settings(**change)
@@ -323,11 +316,6 @@ def test_zoom_is_measured_and_told_apart(groups: list[ShapeGroup]) -> None:
     pairs = {tuple(sorted(map(int, index))) for _, index in drawn(groups, same_zoom=True)}
     assert pairs == {(0, 1), (2,), (3,)}
     assert any(set(index) - {0, 1} and set(index) & {0, 1} for _, index in drawn(groups))
-
-
-def test_a_sample_that_shows_nobody_has_a_zoom(tmp_path: Path) -> None:
-    empty = create_group(tmp_path / "other", (32, 32), np.zeros(1, np.int8))
-    assert zoom(empty).tolist() == [1.0]
 
 
 def test_only_whole_bodies_are_read_at_last(groups: list[ShapeGroup]) -> None:

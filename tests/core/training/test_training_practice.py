@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,8 +23,6 @@ from trilane.training.objective import (  # noqa: E402
 from trilane.training.sample_files import U16, ShapeGroup, create_group  # noqa: E402
 from trilane.training.step_loop import (  # noqa: E402
     chosen_device,
-    device_words,
-    memory_words,
     probe_loss,
 )
 from trilane.training.trainable_avatar import load_batch  # noqa: E402
@@ -50,17 +47,6 @@ def test_a_gpu_that_is_not_there_is_no_cpu(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(MissingPartError, match=r"finds no NVIDIA GPU .* install torch, with NVIDIA's driver"):
         chosen_device("cuda")
-
-
-def test_device_and_memory_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
-    process = SimpleNamespace(memory_info=lambda: SimpleNamespace(rss=1_234_000_000))
-    monkeypatch.setattr("trilane.training.step_loop.psutil.Process", lambda: process)
-    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda _: 2_345_600_000)
-    monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "Nvidia X")
-    cpu, gpu = torch.device("cpu"), torch.device("cuda")
-    assert (device_words(cpu, 1), device_words(cpu, 2)) == ("1 thread of the CPU", "2 threads of the CPU")
-    assert (device_words(gpu, 1), memory_words(cpu)) == ("the GPU Nvidia X", "1234 MB of memory")
-    assert memory_words(gpu) == "1234 MB of memory, 2346 MB of the GPU's"
 
 
 @pytest.fixture
@@ -106,27 +92,6 @@ def test_the_probe_is_the_loss_of_the_same_samples_of_each_shape(groups: list[Sh
     for grey in (0.3, 0.9):
         assert probe_loss(painted(grey), groups) == pytest.approx(expected(groups, grey))
     assert expected(groups, 0.3) != pytest.approx(expected(groups, 0.9), rel=0.1)
-
-
-def test_a_log_takes_back_what_was_logged_after_the_state(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    asked: list[Any] = []
-    module = ModuleType("torch.utils.tensorboard")
-    module.SummaryWriter = lambda *words, **named: (
-        asked.append((words, named))
-        or SimpleNamespace(  # type: ignore[attr-defined]
-            add_scalar=lambda *scalar: asked.append(scalar), close=lambda: asked.append("closed")
-        )
-    )
-    monkeypatch.setitem(sys.modules, module.__name__, module)
-    log = EventLog(tmp_path)
-    log.close()
-    assert asked == [], "without a step there is no file"
-    log.write(8, {"overlap": 0.5}, 3.0)
-    log.write(9, {"overlap": 0.25}, 2.0)
-    log.close()
-    assert asked[0] == ((str(tmp_path),), {"purge_step": 8, "flush_secs": 10})
-    scalars = [("loss", 3.0, 8), ("terms/overlap", 0.5, 8), ("loss", 2.0, 9), ("terms/overlap", 0.25, 9)]
-    assert asked[1:] == [*scalars, "closed"]
 
 
 def test_tensorboard_reads_the_log(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ import math
 import shutil
 from dataclasses import dataclass
 from datetime import UTC, date, datetime
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,14 +20,13 @@ from trilane.arrays import U8
 from trilane.avatars.bundle import Bundle, load_bundle
 from trilane.avatars.manifest import digests_of
 from trilane.body.body import load_body
-from trilane.training import dataset, validate
+from trilane.training import validate
 from trilane.training.backgrounds import scenes
 from trilane.training.clothing.looks import LOOKS
 from trilane.training.image_error import (
     ImageError,
     image_error,
 )
-from trilane.training.random_poses import random_pose
 from trilane.training.sample_renderer import SampleRenderer
 from trilane.training.validate import Evaluated, FloatNetwork, ValidationPlan, worst_sheet
 
@@ -197,18 +195,6 @@ def test_a_validation_is_written_into_its_manifest(parts, tiny_bundle, tmp_path)
     assert len(parts) == 1
 
 
-def test_what_a_plan_leaves_out():
-    assert ValidationPlan() == ValidationPlan(
-        ("builtin:walk-wave-turn",), (1, 2, 3, 4, 5, 6, 7, 8), 24, ("ort",), "256", 1, None, None
-    )
-    assert (validate.FLOAT, validate.BAND_NAMES) == ("float", BANDS)
-
-
-def test_motions_are_found_from_where_one_is(parts):
-    assert validate.held_out_motions(["a.bvh", "builtin:idle"]) == [("a.bvh", Path.cwd()), ("builtin:idle", Path.cwd())]
-    assert not parts
-
-
 def test_samples_are_of_the_avatars_own_shape(monkeypatch, tiny_bundle):
     bundle = load_bundle(tiny_bundle)
     bundle = Bundle(bundle.folder, bundle.manifest.model_copy(update={"betas": (1.0,), "expression": (2.0,)}))
@@ -221,97 +207,6 @@ def test_samples_are_of_the_avatars_own_shape(monkeypatch, tiny_bundle):
 
 
 # --- what samples are made of -------------------------------------------------------------------------------------
-
-
-def test_training_samples_are_drawn_by_share():
-    renderer, tracked = Renderer(), []
-    samples = dataset.plan_training(renderer, 50, 7, lambda rows: tracked.append(len(rows)) or rows)
-    rng = np.random.default_rng((7, 0))
-    bands = rng.choice([*BANDS, "anywhere"], 50, p=[0.16, 0.34, 0.22, 0.16, 0.12])
-    sizes = rng.choice(["256", "128"], 50, p=[0.85, 0.15])
-    assert renderer.planned == [((7, 1, n), str(bands[n]), str(sizes[n])) for n in range(50)]
-    assert {sample.source for sample in samples} == {random_pose} and tracked == [50]
-
-
-def test_poses_of_motions_are_at_any_time_of_any_of_them():
-    motions = [SimpleNamespace(duration_s=s, sample=lambda t, s=s: ((s, t), "no place")) for s in (2.0, 5.0, 9.0)]
-    rng = np.random.default_rng(3)
-    length_s = motions[rng.integers(3)].duration_s
-    pose = dataset.motion_poses(motions)(np.random.default_rng(3))
-    assert pose == (length_s, rng.uniform(0, length_s))
-
-
-class Packed:
-    """A packed pass of 5 channels that counts what it draws."""
-
-    channels = 5
-
-    def __init__(self, ctx, channels, quantisation, deferred):
-        self.made = (ctx, channels, quantisation, deferred)
-        self.drawn = []
-
-    def begin(self, shape):
-        return ("target", shape)
-
-    def read_into(self, shape, tensor):
-        assert tensor.shape == (shape[0] * shape[1] * 5,)
-        tensor[:] = np.arange(tensor.size) % 251
-
-
-def test_the_integer_network_is_run_as_in_the_pipeline(monkeypatch):
-    """On tensors that the packed pass has drawn; one session for each shape."""
-    made, loaded = [], []
-
-    class Session:
-        def __init__(self, network, options):
-            loaded.append((network, options.threads))
-
-        def bind(self, tensors, pictures):
-            ((tensor,), (picture,)) = tensors, pictures
-            assert tensor.shape[:3] == picture.shape[:3] and (tensor.shape[3], picture.shape[3]) == (5, 4)
-
-            def run():
-                picture[..., :4] = tensor[..., 1:]
-
-            return SimpleNamespace(run=run)
-
-    def packed_pass(*words, **options):
-        made.append(Packed(*words, **options))
-        return made[-1]
-
-    def packed_avatar(packed, mesh, texture, levels):
-        assert (mesh, texture.shape, levels) == ("mesh", (8, 8, 5), kept[-1])
-        return SimpleNamespace(draw=lambda *words: packed.drawn.append(words))
-
-    monkeypatch.setattr(validate, "PackedPass", packed_pass)
-    monkeypatch.setattr(validate, "PackedAvatar", packed_avatar)
-    monkeypatch.setattr(validate, "reshaped", lambda network, *shape: (network, shape))
-    monkeypatch.setattr(validate, "load_runtime", lambda name: SimpleNamespace(load=Session, name=name))
-    network = SimpleNamespace(input=SimpleNamespace(scale=0.5, zero_point=7))
-    kept = [None]
-    parts = {
-        "read_network": lambda: network,
-        "read_texture": lambda: np.zeros((8, 8, 5)),
-        "read_levels": lambda: kept[-1],
-    }
-    bundle = SimpleNamespace(**parts)
-    skeleton = SimpleNamespace(pose=lambda pose: SimpleNamespace(matrices=f"joints of {pose}"))
-    renderer = SimpleNamespace(ctx="context", mesh="mesh", skeleton=skeleton)
-    renderer.placed = lambda sample: SampleRenderer.placed(renderer, sample)
-    paint = validate.integer_painter(renderer, bundle, "ort", 3)
-    assert made[0].made == ("context", 5, validate.Quantisation(0.5, 7), True)
-    for number, shape in enumerate(((2, 3), (4, 2), (2, 3))):
-        crop = SimpleNamespace(shape=shape, projection=f"projection {number}")
-        sample = SimpleNamespace(pose=number, crop=crop, view=SimpleNamespace(view=f"view {number}"))
-        picture = paint(sample, None)
-        tensor = (np.arange(shape[0] * shape[1] * 5) % 251).reshape(*shape, 5)
-        assert picture.dtype == np.uint8 and (picture == tensor[..., 1:]).all()
-    placement = validate.Placement("joints of 1", "projection 1", (0, 0, 4, 2))
-    assert made[0].drawn[1] == (("target", (4, 2)), "view 1", placement)
-    assert loaded == [((network, (2, 3)), 3), ((network, (4, 2)), 3)]
-    kept.append("levels")
-    validate.integer_painter(renderer, bundle, "ort", 3)
-    assert made[1].made[3] is False, "a deferred pass cannot read smaller levels"
 
 
 @pytest.mark.parametrize(("side", "window"), [(12, 7), (8, 7), (6, 5), (3, 3)])
@@ -334,11 +229,6 @@ def test_ssim_by_loops(side, window):
     assert found.ssim == pytest.approx(np.mean(values), rel=1e-9)
     assert found.psnr_db == found.body_psnr_db == pytest.approx(-10 * np.log10(((a - b)[..., :3] ** 2).mean()))
     assert (found.background, found.iou) == (0.0, 1.0)
-
-
-def test_a_picture_too_small_for_a_window_is_like():
-    truth = np.full((2, 9, 4), 255, np.uint8)
-    assert image_error(truth // 2 + 128, truth).ssim == 1.0
 
 
 # The figures of smaller tensors: which views, sizes and means, with painter and renderer that are told.
@@ -430,7 +320,6 @@ def test_light_is_linear_between_its_ends() -> None:
 
 # Sheets of pictures side by side: which samples, in which order, how large, before what.
 
-SHEET_BANDS = ("far", "full_body", "upper_body", "face")
 #: Height and width of a cell.
 CELL = (256, 192)
 PAINTERS = ("float", "ort")
@@ -454,14 +343,6 @@ def cells(sheet: np.ndarray) -> list[list[int]]:
     """The grey in the middle of each cell."""
     rows, columns = sheet.shape[0] // CELL[0], sheet.shape[1] // CELL[1]
     return [[int(sheet[256 * r + 128, 192 * c + 96, 0]) for c in range(columns)] for r in range(rows)]
-
-
-def test_a_small_picture_stands_in_the_middle_of_grey() -> None:
-    sheet = worst_sheet([evaluated("far", 2, 1.0), evaluated("face", 7, 1.0)], ("ort",))
-    assert cells(sheet) == [[20, 22], [70, 72]]
-    cell = sheet[:256, :192]
-    assert (cell[96:160, 80:112] == 20).all()
-    assert (cell != 128).all(axis=2).sum() == 64 * 32, "all else is grey"
 
 
 def test_a_large_picture_is_shrunk_into_its_cell() -> None:

@@ -17,10 +17,8 @@ from support.small_inputs import write_capture_folder
 from trilane.body.body import ShapedBody
 from trilane.body.joints import JOINT_INDEX
 from trilane.body.kinematics import Skeleton
-from trilane.errors import BadInputError
 from trilane.scene.lens import Lens
 from trilane.training import subject
-from trilane.training.capture import capture_samples
 from trilane.training.capture.capture import Capture, open_capture
 from trilane.training.capture.capture_samples import (
     Augmentation,
@@ -194,12 +192,6 @@ def test_only_the_frames_that_are_given_are_shown(capture: Capture) -> None:
     assert {sample.picture for sample in samples} == {2, 5} and {sample.band for sample in samples} == {ANYWHERE_BAND}
 
 
-def test_a_band_that_no_frame_can_show_is_said(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(capture_samples, "zoomed_view", lambda *_: None)
-    with pytest.raises(BadInputError, match="no view of band face in 1000 draws"):
-        CaptureRenderer(capture, (1,), WIDE).training_sample((1,), "face", "128")
-
-
 def test_every_tenth_good_frame_is_held_out() -> None:
     kept, held_out = held_out_frames(24, [0, 5, 23])
     assert held_out == [7, 17] and kept == [n for n in range(24) if n not in (0, 5, 7, 17, 23)]
@@ -299,25 +291,6 @@ def test_the_thesis_says_the_same_of_a_lens_with_square_pixels(body: ShapedBody)
         wanted = lens.fx * ray @ turn.T + principal
         clip = augmented_projection(lens.projection(0.05, 100.0), image_map(one, TARGET), FRAME, TARGET)
         assert projected(points, clip, TARGET) == pytest.approx(wanted, abs=1e-6)
-
-
-def test_scaling_and_cutting_is_what_a_lens_says() -> None:
-    by = image_map(Augmentation((100.0, 70.0), 0.0, (2.0, 0.5)), (64, 96))
-    lens = LENS.scaled(640, 90).cropped(2 * 100 - 48, 35 - 32, 96, 64)
-    clip = augmented_projection(PROJECTION, by, FRAME, (64, 96))
-    assert clip == pytest.approx(lens.projection(0.05, 100.0), abs=1e-9)
-
-
-def test_a_quarter_turn_is_what_a_lens_says() -> None:
-    by = image_map(Augmentation((160.0, 90.0), np.pi / 2, (1.0, 1.0)), (320, 180))
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-1, 1, (9, 3)) - (0, 0, 4)
-    clip = augmented_projection(PROJECTION, by, FRAME, (320, 180))
-    turned = np.stack([points[:, 1], -points[:, 0], points[:, 2]], axis=-1)  # what is to the right comes to the bottom
-    lens = LENS.turned(1)
-    assert projected(points, clip, (320, 180)) == pytest.approx(
-        projected(turned, lens.projection(0.05, 100.0), (320, 180)), abs=1e-6
-    )
 
 
 def test_a_dot_of_the_frame_is_resampled_to_where_the_camera_has_it() -> None:

@@ -17,14 +17,11 @@ from trilane.scene.lens import Lens
 from trilane.training.capture import check
 from trilane.training.capture.capture_samples import BodyRaster, projected
 from trilane.training.capture.check import (
-    MOST_CELLS,
     REGIONS,
     CheckedFrame,
     TexelCoverage,
     bad_frames,
-    capture_facts,
     checked,
-    chosen,
     overlaid,
     require_fits,
     sheet,
@@ -139,15 +136,6 @@ def test_the_body_is_drawn_where_its_fit_and_its_lens_put_it(body: ShapedBody) -
         assert abs(seen[0] - pixels[:, axis].min()) < 1.5 and abs(seen[-1] + 1 - pixels[:, axis].max()) < 1.5
 
 
-def test_the_sheet_shows_the_worst_and_some_of_the_others() -> None:
-    frames = frames_of(*np.linspace(0.1, 0.9, 100))
-    bad = frames[:20]
-    numbers = [frame.number for frame in chosen(frames, bad)]
-    assert numbers[:8] == list(range(8)) and (numbers[8], numbers[-1], len(numbers)) == (20, 99, MOST_CELLS)
-    assert [frame.number for frame in chosen(frames[:3], [])] == [0, 1, 2]
-    assert chosen(frames[:2], frames[:2]) == frames[:2]
-
-
 def test_body_and_mask_are_laid_over_the_frame() -> None:
     picture = np.full((2, 2, 4), 100, np.uint8)
     picture[..., 3] = [[255, 255], [0, 0]]
@@ -158,32 +146,3 @@ def test_body_and_mask_are_laid_over_the_frame() -> None:
     image = sheet([("a", np.full((90, 160, 3), 7, np.uint8))] * 5)
     assert image.size == (1280, 360) and isinstance(image, Image.Image)
     assert np.array(image)[100, 100].tolist() == [7, 7, 7] and not np.array(image)[200, 400].any()
-
-
-def test_facts_are_of_what_was_checked() -> None:
-    frames = frames_of(0.8, 0.7, 0.3, 0.9)
-
-    class FourFrames(SimpleNamespace):
-        def __len__(self) -> int:
-            return 4
-
-    capture: Any = FourFrames(
-        folder="f",
-        shape=(10, 20),
-        betas=np.array([0.5]),
-        names=("a", "b", "c", "d"),
-        directions=lambda: [(-170.0, 5.0), (-80.0, -3.0), (0.0, 2.0), (89.0, 1.0)],
-    )
-    texels: Any = SimpleNamespace(
-        share=lambda: 0.9, share_by_region=lambda: {"soles": 0.0}, never_seen=lambda: ["soles"]
-    )
-    facts = capture_facts(capture, frames, frames[2:3], texels)
-    assert facts["bad"] == [{"name": "c", "iou": 0.3, "outside": 0.0}] and facts["size"] == [20, 10]
-    assert facts["fit"] == {"iou_median": 0.75, "iou_least": 0.3, "outside_median": 0.0}
-    assert facts["views"] == {
-        "by_side": {"front": 1, "left": 1, "back": 1, "right": 1},
-        "by_yaw": [1, 0, 0, 1, 0, 0, 1, 0, 1, 0, 0, 0],
-        "widest_gap_deg": 101.0,
-        "height_deg": [-3.0, 5.0],
-    }
-    assert facts["texels"] == {"seen": 0.9, "regions": {"soles": 0.0}, "never_seen": ["soles"]}

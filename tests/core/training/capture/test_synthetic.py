@@ -23,7 +23,6 @@ from trilane.training.capture.synthetic import (
     SyntheticCapture,
     framing_view,
     in_camera,
-    measured_cost,
     moved_outline,
     turned_at_random,
     write_capture,
@@ -150,13 +149,6 @@ def test_the_same_seed_writes_the_same_bytes(body: ShapedBody, tmp_path: Path) -
     assert np.array_equal(open_capture(tmp_path / "a").fits[2].pose, open_capture(tmp_path / "b").fits[2].pose)
 
 
-def test_the_cost_is_that_of_what_is_written(body: ShapedBody, tmp_path: Path) -> None:
-    list(write_capture(tmp_path, drawn := Drawn(body, NOISY), NOISY))
-    written = sum(path.stat().st_size for path in tmp_path.rglob("*.*") if path.suffix != ".toml")
-    cost = measured_cost(drawn, NOISY)
-    assert cost.disk_bytes * 6 == pytest.approx(written, rel=0.1) and cost.seconds > 0
-
-
 def test_fits_have_the_shape_of_the_look(body: ShapedBody, tmp_path: Path) -> None:
     """Of the hiker, whose body the capture then has, which is another one than the default's."""
     recipe = Recipe(4, (64, 96), look="hiker")
@@ -167,12 +159,6 @@ def test_fits_have_the_shape_of_the_look(body: ShapedBody, tmp_path: Path) -> No
     assert np.abs(capture.shaped.vertices - wanted).max() < 1e-6
     assert np.abs(wanted - body.vertices).max() > 0.05
     assert "# Look: hiker." in (tmp_path / "capture.toml").read_text()
-
-
-def test_the_person_wears_what_the_recipe_says(body: ShapedBody, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(synthetic, "SampleRenderer", lambda shaped, look: SimpleNamespace(shaped=shaped, look=look))
-    for name, look in LOOKS.items():
-        assert SyntheticCapture(body, Recipe(4, (64, 96), look=name))._renderer.look is look
 
 
 def test_the_command_writes_all_or_nothing(tmp_path: Path, command: Any, monkeypatch: pytest.MonkeyPatch) -> None:

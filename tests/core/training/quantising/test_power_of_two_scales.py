@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 
 import numpy as np
-import onnx
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -58,19 +57,6 @@ def test_tensors_that_are_added_have_one_step(tiny_quantised):
     add = next(node for node in model.graph.node if node.op_type == "Add")
     after = next(node for node in model.graph.node if add.output[0] in node.input)
     assert len({float(values[node.input[1]]) for node in (*(makers[name] for name in add.input), after)}) == 1
-
-
-def test_a_layer_without_a_bias_gets_one(tiny_float, tiny_frames):
-    model = copy.deepcopy(tiny_float)
-    layer = next(node for node in model.graph.node if node.name == "deep")
-    del layer.input[2]
-    network = quantise(model, tiny_frames).network
-    values, makers = parts(network.model)
-    assert all(
-        (values[makers[node.input[2]].input[0]] % 2).all()
-        for node in network.model.graph.node
-        if node.op_type == "Conv"
-    )
 
 
 def test_biases_of_0_go_up_and_down_in_turn(tiny_float, tiny_frames):
@@ -128,10 +114,6 @@ def test_weights_that_would_put_every_sum_half_way_are_left_alone(tiny_float, ti
     assert not result.facts["rounds_alike"] and result.facts["weight_bits"] == 7
 
 
-def test_full_range_is_not_said_to_round_alike(tiny_float, tiny_frames):
-    assert not quantise(tiny_float, tiny_frames, reduce_range=False).facts["rounds_alike"]
-
-
 def test_a_unit_of_a_sum_is_a_small_part_of_the_step_that_is_written(tiny_quantised):
     model = tiny_quantised.network.model
     values, makers = parts(model)
@@ -167,18 +149,6 @@ def test_a_network_that_is_not_finite_is_refused(tiny_float, tiny_frames, factor
     kernel.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(kernel) * np.float32(factor), "deep.w"))
     with pytest.raises(BadInputError, match=named):
         quantise(model, tiny_frames)
-
-
-def test_a_network_with_a_float_layer_keeps_its_measured_scales(tiny_float, tiny_frames):
-    assert not quantise(tiny_float, tiny_frames, keep_float=["stem"]).facts["rounds_alike"]
-
-
-def test_what_rounds_alike(tiny_float):
-    assert may_round_alike(tiny_float)
-    other = onnx.ModelProto()
-    other.CopyFrom(tiny_float)
-    other.graph.node[0].op_type = "InstanceNormalization"
-    assert not may_round_alike(other)
 
 
 @pytest.mark.parametrize(

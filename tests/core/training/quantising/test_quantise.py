@@ -14,7 +14,6 @@ import onnxruntime
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from trilane.avatars.network_file import reshaped
 from trilane.errors import BadInputError
 from trilane.training.quantising import calibration_table as table
 from trilane.training.quantising.calibration import METHODS, saturated, share_ranges, widen
@@ -83,10 +82,6 @@ def summing_network(norm):
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
 
 
-def test_zero_is_exact(tiny_quantised):
-    assert 0 <= tiny_quantised.network.input.zero_point <= 255
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_calibrates(tiny_float, tiny_frames, method):
     result = quantise(tiny_float, tiny_frames, method)
@@ -105,23 +100,6 @@ def test_a_layer_can_stay_in_float(tiny_float, tiny_frames):
     result = quantise(tiny_float, tiny_frames, keep_float=["stem"])
     assert result.facts["float_layers"] == ["stem"]
     assert run(result.network.model, np.zeros((1, 64, 64, 5), np.uint8)).shape == (1, 64, 64, 4)
-
-
-def test_another_shape_computes_the_same(tiny_quantised):
-    """A constant picture has the same middle at every size."""
-    network = tiny_quantised.network
-    wide = reshaped(network, 32, 96, batch=2)
-    assert wide.shape == (2, 32, 96, 5) and wide.input == network.input
-    tensor = np.full((64, 64, 5), 99, np.uint8)
-    picture = run(wide.model, np.broadcast_to(tensor[:1, :1], (2, 32, 96, 5)).copy())
-    assert picture.shape == (2, 32, 96, 4)
-    assert np.abs(picture[1, 16, 48].astype(int) - run(network.model, tensor[None])[0, 32, 32]).max() <= 1
-
-
-@pytest.mark.parametrize("shape", [(33, 64), (0, 64)])
-def test_wrong_shapes_are_refused(tiny_quantised, shape):
-    with pytest.raises(BadInputError, match="multiples of 32"):
-        reshaped(tiny_quantised.network, *shape)
 
 
 @pytest.mark.parametrize(
@@ -311,10 +289,6 @@ def test_calibrations_are_judged_on_the_last_five_frames(tiny_float: Any, tiny_f
         assert row["psnr_db"] == pytest.approx(np.mean(decibels), abs=1e-4)
         assert row["mean"] == pytest.approx(np.mean(off), rel=1e-5)
         assert row["largest"] == pytest.approx(np.max(off), rel=1e-6)
-
-
-def test_what_a_table_is_made_of_when_nothing_is_asked_for() -> None:
-    assert (table.COUNTS, table.EVALUATED) == ((5, 10, 50, 100), 5)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,6 @@ import pytest
 import trilane.training
 from trilane import machine
 from trilane.apps.cli import avatar_train
-from trilane.errors import BadInputError
 from trilane.training.training_settings import OptimiserOptions, TrainingSettings, parsed_settings, settings_text
 
 Command = Callable[..., tuple[str, str]]
@@ -107,42 +106,6 @@ def test_losses_and_the_time_that_is_left_are_shown(
         "step 2 of 3: loss 1.950, composite 0.250, overlap 0.125, 31 s left",
         "step 3 of 3: loss 1.877, composite 0.250, overlap 0.125, 0 s left",
     ]
-
-
-def test_a_log_is_written_beside_what_is_shown(
-    training: Training, command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """It is closed also where a training ends early."""
-    made: list[Any] = []
-
-    class Log:
-        def __init__(self, folder: Path) -> None:
-            made.append(folder)
-
-        def write(self, *words: Any) -> None:
-            made.append(words)
-
-        def close(self) -> None:
-            made.append("closed")
-
-    monkeypatch.setattr(avatar_train, "EventLog", Log)
-    monkeypatch.setattr(machine.here, "has_package", lambda _: True)
-    words = ("avatar", "train", "their", "--out", tmp_path / "mine", "--work", tmp_path / "work")
-    command(*words)
-    assert made == []
-    command(*words, "--tensorboard")
-    terms = {"composite": 0.25, "overlap": 0.125}
-    assert made == [tmp_path / "work" / "tensorboard", (1, terms, 2.0), (2, terms, 1.0), (3, terms, 0.5), "closed"]
-
-    def refused(*_: Any) -> None:
-        raise BadInputError("capture", "nothing", "frames")
-
-    monkeypatch.setattr(training, "train_avatar", refused)
-    command(*words, "--tensorboard", code=2)
-    assert made[5:] == [tmp_path / "work" / "tensorboard", "closed"]
-    monkeypatch.setattr(machine.here, "has_package", lambda name: name != "tensorboard")
-    _, err = command(*words, "--tensorboard", code=3)
-    assert "a log for TensorBoard needs the package tensorboard" in err and "[tensorboard]" in err
 
 
 def test_without_pytorch_the_lines_that_install_it_are_said(
