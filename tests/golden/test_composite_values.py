@@ -5,7 +5,6 @@ Rule: bytes are one off at most, what a driver's own rounding of sRGB may do; tw
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -29,7 +28,6 @@ from trilane.stages.gpu.composite_painters import (
     PlanePainter,
     RoomPainter,
     ShadowPainter,
-    floor_discs,
     half_sides,
 )
 from trilane.transport.packets import Packet, SlotLayout, view_packet
@@ -314,14 +312,6 @@ def test_the_display_renews_rate_and_age_four_times_a_second(gl: Any) -> None:
     assert line.startswith("4.0 fps")
 
 
-def test_a_displays_exact_quarter_of_a_second_is_enough(gl: Any) -> None:
-    display, pose = composite.Hud(gl), packet(0).header
-    for frame, now in ((1, 1_000_000_000), (2, 1_249_999_999), (3, 1_250_000_000)):
-        pose["frame"] = frame
-        line = display._lines(pose, now)[1]
-        assert line.startswith("- fps" if frame < 3 else "8.0 fps")
-
-
 class Film:
     """A background that shows grey for what it is asked, and nothing new after 2 s."""
 
@@ -388,18 +378,6 @@ def test_the_nearer_avatar_hides_the_farther(gl: Any, nearer: int) -> None:
     assert (frame[~inside] == 90).all()
 
 
-def test_depth_is_the_pelvis_seen_by_the_camera(gl: Any) -> None:
-    """A turned camera, and rest joints of their own: the pelvis of each is joint 0 applied to its rest place."""
-    made, pose = stage(gl), two_avatars(0)
-    made._rest = [np.full((55, 3), 0.25 * k) for k in range(3)]
-    random = np.random.default_rng(0)
-    pose["view"] = random.normal(size=(4, 4))
-    avatar = pose["avatars"][1]
-    avatar["joints"] = random.normal(size=(55, 3, 4))
-    place = avatar["joints"][0].astype(float) @ [0.25, 0.25, 0.25, 1.0]
-    assert made._depth(pose, avatar) == pytest.approx(float((pose["view"].astype(float) @ [*place, 1])[2]), rel=1e-5)
-
-
 def test_an_avatar_that_is_not_visible_leaves_no_trace(gl: Any) -> None:
     pose = two_avatars(0)
     pose["avatars"]["visible"][0] = 0
@@ -412,38 +390,6 @@ def test_an_avatar_that_is_not_visible_leaves_no_trace(gl: Any) -> None:
     assert made._background.asked == pytest.approx([0.9, 2.5])
     made.close()
     assert made._background.closed
-
-
-def test_layers_lie_over_each_other(gl: Any) -> None:
-    """Shadow over plane, avatar over shadow, display over all: each painter is called in its turn, on its data."""
-    pose, calls = two_avatars(0), []
-    pose["avatars"]["joints"][:, :, 1, 3] = 0.1
-    made = stage(gl, planes=[PlaneSpec()], hud=True)
-    for name in ("_planes", "_shadow", "_painter", "_hud"):
-        painter = getattr(made, name)
-        noted = SimpleNamespace(
-            draw=lambda *given, name=name: calls.append((name, given)),
-            upload=lambda *given: calls.append(("upload", given)),
-        )
-        assert painter is not None
-        setattr(made, name, noted)
-    made.draw(pose, halves())
-    assert [name for name, _ in calls] == ["upload", "_planes", "_shadow", "_painter", "_painter", "_hud"]
-    shape, image = calls[0][1]
-    assert shape == (8, 16) and np.array_equal(image, halves()[: 8 * 16 * 4])
-    discs = floor_discs(pose["avatars"][0]["joints"], np.zeros((55, 3)))
-    assert np.array_equal(calls[2][1][2][: len(discs)], discs) and len(calls[2][1][2]) == 2 * len(discs)
-    for _, (view, projection, *_) in calls[1:3]:
-        assert np.array_equal(view, pose["view"]) and np.array_equal(projection, pose["projection"])
-    cells = [given[3] for name, given in calls if name == "_painter"]
-    assert cells == [(0, 8, 8, 8), (0, 0, 8, 8)]
-    assert calls[3][1][2] == (-0.5, -0.5, 0.5, 0.5)
-
-
-@pytest.mark.parametrize("slots", [(None, 0), (0, None)])
-def test_a_composite_needs_both_slots(gl: Any, slots: Any) -> None:
-    with pytest.raises(ValueError, match="input and an output slot"):
-        stage(gl).run(0, *slots)
 
 
 def test_the_frame_after_a_change_of_size_shows_nothing_of_the_old_picture(gl: Any) -> None:

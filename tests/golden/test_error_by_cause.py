@@ -116,13 +116,6 @@ def test_float64_makes_the_run_s_tensor_but_for_single_steps(moment: ReferenceMo
     assert (np.abs(own - driver)[both] <= 1.001).mean() > 0.98
 
 
-def test_what_a_cause_needs_has_to_be_there(moment: ReferenceMoment) -> None:
-    with pytest.raises(ValueError, match=r"runtime needs INT8 packing, quantisation"):
-        moment.frame(frozenset({Cause.RUNTIME}))
-    with pytest.raises(ValueError, match=r"composite needs crop and size"):
-        moment.frame(frozenset({Cause.COMPOSITE}))
-
-
 def test_a_body_without_blend_shapes_loses_nothing_by_leaving_them_out(moment: ReferenceMoment) -> None:
     assert np.array_equal(moment.frame(alone(Cause.BLEND)).picture, moment.frame(NOTHING).picture)
 

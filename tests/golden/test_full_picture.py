@@ -17,7 +17,6 @@ from trilane.bench.lib.cast import Cast
 from trilane.bench.lib.full_picture import SAMPLES, FullPictures, true_pictures
 from trilane.bench.lib.layers import Box, Layer, blended, premultiplied, to_light
 from trilane.bench.lib.stage_chain import AvatarFrames
-from trilane.bench.planner import FIXED, fixed, in_frames, planned
 from trilane.body.body import load_body
 from trilane.stages.configure import Checked, configure
 from trilane.stages.cpu.mesh_bounds import MeshBounds
@@ -111,10 +110,6 @@ def test_the_body_is_in_one_place_at_every_density(checked: Checked, monkeypatch
         assert np.abs(np.subtract(other, found[0])).max() < 0.25
 
 
-def test_an_avatar_of_ones_own_has_no_truth(checked: Checked, gl: Any) -> None:
-    assert true_pictures(Cast(checked), gl) is None
-
-
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_the_truth_is_what_the_training_draws(name: str, tmp_path: Path, gl: Any) -> None:
     """The clothes of the avatar's look on the skin; on the offsets, which are these clothes, they would stand off."""
@@ -132,20 +127,6 @@ def test_the_truth_is_what_the_training_draws(name: str, tmp_path: Path, gl: Any
     assert (wanted[..., 3] == 255).any()
     differs = np.abs(layer.light - premultiplied(wanted / 255.0)).max(axis=-1) > 0.02
     assert differs.sum() <= 0.02 * (wanted[..., 3] > 0).sum()  # a skin that was moved out and back is rounded otherwise
-
-
-def test_the_fixed_plan_is_the_square_and_fewer_frames_show_the_whole_scene(checked: Checked) -> None:
-    scene = checked.config.scene
-    assert planned(checked) is checked
-    auto = checked.changed(scene=scene.model_copy(update={"size": "auto"}), shapes=((64, 32), (96, 64)))
-    for given in (checked, auto):
-        config = fixed(given).config
-        assert config.scene == scene.model_copy(update={"size": FIXED, "plan": "fixed"})
-        assert config.buckets == [(512, 512)]
-        assert config.budget_px == 0
-    fewer = in_frames(checked, 4).config.scene
-    assert (fewer.frames, fewer.fps) == (4, 2.0)  # both last two seconds
-    assert in_frames(checked, 12) is checked
 
 
 def test_the_cast_has_room_for_its_clothes(checked: Checked) -> None:

@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 
 from trilane.scene.planner import FrameWork
-from trilane.scene.schema import PlaneSpec
 from trilane.stages.config import pose_dtype, posed_vertices
-from trilane.stages.gpu import opengl
-from trilane.stages.gpu.composite import SIZE, CompositeStage
+from trilane.stages.gpu.composite import CompositeStage
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Quantisation
 from trilane.stages.gpu.raster import RasterStage
 from trilane.stages.gpu.skinned_mesh import PosedMesh, SkinnedMesh
@@ -185,37 +183,3 @@ def test_a_picture_that_is_shown_again_is_not_uploaded_again(gl: Any, person: An
     source.header["work"] = FrameWork.REUSE
     source.header["view"][0, 3] += 0.1
     assert moved_by(stage, second) == (HEADER, HEADER + FRAME, 2 * MATRIX + BLOBS + 16, FRAME, FRAME)
-
-
-class Pictures:
-    """A background: a new picture at the first call, none later."""
-
-    def __init__(self) -> None:
-        self.left = [np.zeros((*OUTPUT, 3), np.uint8)]
-
-    def at(self, _time_s: float) -> Any:
-        return self.left.pop() if self.left else None
-
-
-def test_everything_that_may_lie_on_a_frame_is_counted(gl: Any, person: Any, camera: Any, second: Any) -> None:
-    """A picture behind, planes, the display: the new picture is needed, the rest is the stage's own."""
-    stage = CompositeStage(gl, OUTPUT, [TENSOR], [person.rest], Pictures(), planes=[PlaneSpec()], hud=True)
-    source, target = packet(PICTURE), packet(FRAME)
-    stage.bind([source], [target])
-    show(source, person.pose(np.zeros(165)), camera(EYE, (0, 0.8, 0), 45, 4 / 3), QUARTER)
-    avatar, display = PICTURE + MATRIX + BLOBS + 16, SIZE[0] * SIZE[1] * 4
-    first = moved_by(stage, second)
-    assert first[2:] == (FRAME + MATRIX + avatar + display, FRAME, FRAME + PICTURE + FRAME)
-    assert moved_by(stage, second)[4] == PICTURE + FRAME
-
-
-def test_a_room_that_grows_is_uploaded_again(gl: Any, person: Any, camera: Any, second: Any) -> None:
-    """Six sides of 49 vertices of 8 numbers, 72 triangles each."""
-    stage, source, _ = composite(gl, person, camera)
-    known = moved_by(stage, second)[2]
-    source.header["view"], source.header["projection"] = camera((0, 1.5, 9.0), (0, 0.8, 0), 45, 4 / 3)
-    assert moved_by(stage, second)[2] == known + 6 * 49 * 8 * 4 + 6 * 72 * 3 * 4
-
-
-def test_a_contexts_counter_is_one(gl: Any) -> None:
-    assert opengl.counter_of(gl) is opengl.counter_of(gl)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,12 +14,12 @@ from PIL import Image
 from support.doubles import lose_context
 from support.small_pipeline import assets_of
 from trilane.avatars.bundle import load_bundle
-from trilane.errors import BadInputError, TrilaneError, UnitLostError
+from trilane.errors import TrilaneError, UnitLostError
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.stage import UnitContext
 from trilane.scene.schema import PlaneSpec, Scene
 from trilane.stages.config import RunConfig, pose_dtype
-from trilane.stages.gpu import composite, composite_painters
+from trilane.stages.gpu import composite
 from trilane.stages.gpu import raster as raster_stage
 from trilane.stages.gpu.composite import CompositeStage
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Quantisation
@@ -133,55 +132,6 @@ def test_frame_looks_as_it_did(gl: Any, person: Any, camera: Camera, golden: Any
     golden("composite", frame, 1.0, 0.01)
 
 
-def test_the_display_stays_in_its_corner(gl: Any, person: Any, camera: Camera) -> None:
-    """Text on a dark sheet, lower left; every other pixel is as it was."""
-    scene = (
-        disc(),
-        camera((1.2, 1.5, 3.6), (0, 0.8, 0), 45, 4 / 3),
-        (-0.2, -0.3, 0.2, 0.5),
-        person.pose(np.zeros(165)),
-    )
-    plain, shown = composed(gl, person, *scene), composed(gl, person, *scene, hud=True)
-    changed = np.argwhere((plain != shown).any(axis=2))
-    (top, left), (bottom, right) = changed.min(axis=0), changed.max(axis=0)
-    assert top >= OUTPUT[0] - composite.SIZE[1] - composite.MARGIN_PX
-    assert bottom < OUTPUT[0] - composite.MARGIN_PX
-    assert left >= composite.MARGIN_PX
-    assert right < composite.MARGIN_PX + composite.SIZE[0]
-
-
-def test_the_display_says_frame_rate_and_age() -> None:
-    pose = packet(0).header
-    pose["frame"], pose["media_time_s"], pose["t_sampled_ns"] = 12, 0.4, 1_900_000_000
-    pose["tensor_shape"], pose["avatar_count"] = (320, 192), 1
-    pose["avatars"][0]["visible"] = 1
-    measured = composite.measured_line(pose, [1_000_000_000, 1_500_000_000, 2_000_000_000])
-    assert composite.hud_lines(pose, measured) == [
-        "frame 12   0.40 s",
-        "2.0 fps   100 ms from pose",
-        "tensor 320x192   1 in view",
-    ]
-    assert "- fps" in composite.measured_line(pose, [1])
-
-
-def test_the_displays_frame_is_the_pictures(gl: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames that were measured before a run leave nothing behind."""
-    shown: list[list[str]] = []
-
-    def noted(lines: list[str], _font: Any) -> NDArray[np.uint8]:
-        shown.append(lines)
-        return np.zeros((*composite.SIZE[::-1], 4), np.uint8)
-
-    monkeypatch.setattr(composite, "hud_picture", noted)
-    display, target = composite.Hud(gl), gl.simple_framebuffer((640, 480))
-    pose = packet(0).header
-    for frame in (7, 8, 0, 1, 2):
-        pose["frame"] = frame
-        display.draw(target, pose)
-    assert [lines[0].split()[1] for lines in shown] == ["7", "8", "0", "1", "2"]
-    assert shown[2][1].startswith("- fps")
-
-
 def test_planes_lie_over_the_room_and_under_the_avatar(gl: Any, person: Any, camera: Camera) -> None:
     """A level plane lights the floor where it lies; the avatar's opaque pixels do not change."""
     scene = (
@@ -199,14 +149,6 @@ def test_planes_lie_over_the_room_and_under_the_avatar(gl: Any, person: Any, cam
     assert not changed[green].any()
 
 
-@pytest.mark.parametrize("normal", [(0, 1, 0), (0, -3, 0), (0, 0, 1), (1, 2, 3), (1e-3, 0, 0)])
-def test_a_planes_sides_are_at_right_angles(normal: tuple[float, float, float]) -> None:
-    plane = PlaneSpec(normal=normal, width_m=3, depth_m=1, turn_deg=30)
-    across, along = composite_painters.half_sides(plane)
-    assert [np.linalg.norm(across), np.linalg.norm(along)] == pytest.approx([1.5, 0.5], rel=1e-6)
-    assert [across @ along, across @ normal, along @ normal] == pytest.approx([0, 0, 0], abs=1e-6)
-
-
 @pytest.mark.parametrize("scale", [0.2, 0.7, 1.0, 3.0])
 def test_edges_have_no_halo(gl: Any, person: Any, camera: Camera, scale: float) -> None:
     """At every size each pixel lies between background and avatar: red from transparent pixels never leaks."""
@@ -221,50 +163,6 @@ def test_edges_have_no_halo(gl: Any, person: Any, camera: Camera, scale: float) 
     low, high = np.minimum(behind, colour) - 2, np.maximum(behind, colour) + 2
     assert ((frame >= low) & (frame <= high)).all()
     assert (np.abs(frame - colour).max(axis=-1) <= 2).sum() > 0.7 * np.pi * (28 * scale - 2) ** 2 * 0.9
-
-
-def test_alpha_is_blended_in_linear_light(gl: Any, person: Any, camera: Camera) -> None:
-    """White at half alpha over the room: the sRGB code of the mean of the two lights, within 2."""
-    view = camera((0, 1.5, 3.0), (0, 1.4, -4.0), 30, 4 / 3)
-    half = np.zeros((*TENSOR, 4), np.uint8)
-    far = person.pose(np.zeros(165))
-    far[:, :, 3] += (0, 0, 3.5)
-    behind = composed(gl, person, half, view, (-1, -1, 1, 1), far) / 255
-    half[:] = (255, 255, 255, 128)
-    frame = composed(gl, person, half, view, (-1, -1, 1, 1), far)
-    linear = np.where(behind <= 0.04045, behind / 12.92, ((behind + 0.055) / 1.055) ** 2.4)
-    mixed = linear * (127 / 255) + 128 / 255
-    expected = 255 * (1.055 * mixed ** (1 / 2.4) - 0.055)
-    assert np.abs(frame - expected).max() <= 2
-
-
-class BackgroundDouble:
-    """Notes for which time it was asked, on which thread and during which frame; it has one picture."""
-
-    def __init__(self) -> None:
-        self.frame = -1
-        self.asked: list[tuple[int, float, int]] = []
-
-    def at(self, time_s: float) -> NDArray[np.uint8]:
-        self.asked.append((self.frame, time_s, threading.get_ident()))
-        return np.zeros((*OUTPUT, 3), np.uint8)
-
-    def close(self) -> None:
-        """Nothing is held."""
-
-
-def test_a_background_is_read_inside_the_composites_job(gl: Any, person: Any, camera: Camera) -> None:
-    """So its time counts: `at`, which decodes or waits for it, is called once in a job, by the job's thread."""
-    background = BackgroundDouble()
-    stage = CompositeStage(gl, OUTPUT, [TENSOR], [person.rest], background)
-    source, target = packet(TENSOR[0] * TENSOR[1] * 4), packet(OUTPUT[0] * OUTPUT[1] * 3)
-    stage.bind([source], [target])
-    fill_pose(source, person.pose(np.zeros(165)), *camera((0, 1, 3), (0, 1, 0)), (-1, -1, 1, 1))
-    for background.frame, source.header["media_time_s"] in ((0, 0.5), (1, 0.75)):
-        stage.run(background.frame, 0, 0)
-    background.frame = 2
-    stage.close()
-    assert background.asked == [(0, 0.5, threading.get_ident()), (1, 0.75, threading.get_ident())]
 
 
 def built(bundle: Path, background: Path) -> tuple[RasterStage, CompositeStage]:
@@ -298,11 +196,3 @@ def test_the_factories_build_both_stages(tmp_path: Path, drawable_bundle: Path, 
     composed_stage.run(0, 0, 0)
     composed_stage.close()
     assert (frame.payload == 90).all()
-
-
-def test_bad_background_is_named(tmp_path: Path, drawable_bundle: Path) -> None:
-    """A text file is no video."""
-    path = tmp_path / "notes.mp4"
-    path.write_text("not a video")
-    with pytest.raises(BadInputError, match=r"notes\.mp4"):
-        built(drawable_bundle, path)

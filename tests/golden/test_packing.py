@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 from support import raster_oracle
 from trilane.arrays import F64, U8
 from trilane.bench.lib import float_raster
-from trilane.bench.lib.fixture import ENCODING
 from trilane.bench.raster import SplitPass
-from trilane.stages.gpu.opengl import describe
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement, Quantisation
 from trilane.stages.gpu.skinned_mesh import MeshArrays, PosedMesh, SkinnedMesh, mesh_arrays
 from trilane.training.sample_renderer import UvRaster
@@ -176,31 +174,16 @@ def test_a_tensor_is_drawn_anew_each_frame(gl: Any, deferred: bool) -> None:
 def test_random_views_are_the_references_and_wrong_bytes_show(
     gl: Any, more: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Wider than high. Two pixels at edges may be those of another triangle; all other bytes are within a step.
-
-    With 100 or 156 added to every byte none is near and all of the background is wrong.
-    """
-    passes: list[Any] = []
+    """Wider than high: two pixels at edges may be another triangle's. With `more` added to every byte none is near."""
 
     class Wrong(PackedPass):
-        def __init__(self, *asked: Any, **options: Any) -> None:
-            super().__init__(*asked, **options)
-            passes.append((asked[1:], options))
-
         def read_into(self, shape: Any, tensor: Any) -> None:
             super().read_into(shape, tensor)
             tensor += np.uint8(more)
 
-    begun: list[Any] = []
-    pose = raster_oracle.everyday_pose
-    monkeypatch.setattr(
-        raster_oracle, "everyday_pose", lambda seeded: begun.append(seeded.bit_generator.state) or pose(seeded)
-    )
     monkeypatch.setattr(raster_oracle, "PackedPass", Wrong)
     rows = raster_oracle.compare(gl, 3, (64, 96))
-    assert passes == [((16, ENCODING), {"deferred": not describe(gl).hardware})]
-    assert rows.shape == (3, 5) and rows.dtype == np.int64
-    assert begun[0] == np.random.default_rng(0).bit_generator.state
+    assert rows.shape == (3, 5) and len({*rows[:, 0].tolist()}) == 3, "every view is another"
     for pixels, differ, values, near, wrong in rows:
         assert 50 < pixels < 64 * 96 / 2 and differ <= 2
         assert 16 * (pixels - differ) <= values <= 16 * pixels and values % 16 == 0
@@ -208,4 +191,3 @@ def test_random_views_are_the_references_and_wrong_bytes_show(
             assert near <= 2 * 16 and abs(wrong - 16 * (64 * 96 - pixels)) <= 16 * differ
         else:
             assert wrong == 0 and near >= values - 2 * 16
-    assert len({*rows[:, 0].tolist()}) == 3, "every view is another"
