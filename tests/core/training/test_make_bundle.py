@@ -16,6 +16,7 @@ pytest.importorskip("skimage")
 from trilane.avatars.bundle import load_bundle  # noqa: E402
 from trilane.training import make_bundle, trainable_avatar  # noqa: E402
 from trilane.training.network import UNet  # noqa: E402
+from trilane.training.quantising.quantise import Quantised  # noqa: E402
 from trilane.training.sample_files import U16, create_group  # noqa: E402
 from trilane.training.subject import Person  # noqa: E402
 from trilane.training.surface import BodyArrays  # noqa: E402
@@ -122,6 +123,34 @@ def test_the_float_network_and_its_inputs_are_written(monkeypatch, groups, tmp_p
     with torch.no_grad():
         wanted = made.network(torch.from_numpy(planes)).numpy()
     np.testing.assert_allclose(session.run(None, {"tensor": planes})[0], wanted, atol=1e-4)
+
+
+def test_the_network_is_calibrated_on_chosen_samples_of_one_shape(monkeypatch, groups):
+    asked = []
+
+    def quantise(model, frames, method):
+        asked.append((model, frames, method))
+        return Quantised(SimpleNamespace(name="made"), {"a": 1}, {})
+
+    monkeypatch.setattr(make_bundle, "CALIBRATION_SHAPE", (64, 32))
+    monkeypatch.setattr(make_bundle, "CALIBRATION_FRAMES", 4)
+    monkeypatch.setattr(make_bundle, "quantise", quantise)
+    monkeypatch.setattr(make_bundle, "export_onnx", lambda network, *shape: (network, shape))
+    monkeypatch.setattr(make_bundle, "reshaped", lambda network, *shape: (network.name, shape))
+    monkeypatch.setattr(make_bundle, "byte_texture", lambda *words: (words, "scale", None))
+    made = avatar(noise(1))
+    found = make_bundle.quantise_avatar(made, "shaped", groups, 9, "unseen")
+    assert found.network == Quantised(("made", (256, 256)), {"a": 1}, {})
+    assert (found.texture, found.scale) == ((made, "shaped", "unseen"), "scale")
+    ((model, frames, method),) = asked
+    assert model == (made.network, (64, 32)) and method == "minmax"
+    chosen = sorted(np.random.default_rng(9).permutation(7)[:4])
+    image = made.texture.image().detach()[0].permute(1, 2, 0).numpy()
+    for frame, number in zip(frames, chosen, strict=True):
+        group = groups[1]
+        wanted = read_by_hand(image, group.uv[number] / 65535) * (group.covered[number] == 1)[..., None]
+        assert frame.shape == (64, 32, CHANNELS)
+        np.testing.assert_allclose(frame, wanted, atol=1e-4)
 
 
 def test_the_manifest_says_how_the_avatar_was_made(tiny_quantised, tiny_bundle, tmp_path):

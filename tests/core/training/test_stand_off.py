@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("scipy", reason="measuring outlines needs the train extra")
 
 from trilane.body.joints import JOINTS
+from trilane.training import stand_off as module
 from trilane.training.random_views import look_at, perspective
 from trilane.training.stand_off import Outline, measured_heights, smoothed, stand_off
 
@@ -127,3 +128,18 @@ def test_between_measurements_offsets_are_harmonic_and_a_part_without_any_has_no
     faces = np.array([(0, 1, 2), (1, 3, 2), (4, 5, 6)])
     found = smoothed(np.array([1.0, 9.0, 9.0, 4.0, 0, 0, 0]), np.array([1.0, 0, 0, 1, 0, 0, 0]), faces)
     np.testing.assert_allclose(found, [4 / 2.2, 2.5, 2.5, 5 - 4 / 2.2, 0, 0, 0], atol=1e-5)
+
+
+def test_what_measuring_takes_is_said_by_four_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four of 300 took 2 s, so three rounds of all take 3 * 300 / 4 * 2 = 450 s."""
+    times, drawn = iter((10.0, 12.0)), []
+
+    def draw(_: Any, samples: Any) -> Any:
+        drawn.extend(samples)
+        return [outline((0, 0, 1)) for _ in samples]
+
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: next(times)))
+    monkeypatch.setattr(module, "outlines", draw)
+    said = module._cost(SimpleNamespace(shaped=sphere()), range(300))  # type: ignore[arg-type]
+    assert drawn == [0, 75, 150, 225]
+    assert said == "how far clothes and hair stand off: 300 views, 3 times: about 450 s (by 4 that were measured)"
