@@ -9,9 +9,9 @@ import pytest
 
 from support.small_pipeline import EDGES, OWN, STAGES, packets, pipeline
 from trilane.errors import BadInputError, TrilaneError
-from trilane.pipeline.bound_stage import BoundStage
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.stage import Skip, UnitContext
+from trilane.pipeline.unit_loop import BoundStage
 from trilane.transport.packets import header_dtype
 
 UNIT = UnitSettings(cores=(0,), threads=1)

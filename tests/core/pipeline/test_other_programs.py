@@ -11,8 +11,8 @@ import psutil
 import pytest
 
 from trilane.machine import Machine
-from trilane.pipeline import other_programs
-from trilane.pipeline.other_programs import OtherPrograms, busy_s
+from trilane.pipeline import surroundings
+from trilane.pipeline.surroundings import OtherPrograms, busy_s
 
 STEP_S = 1 / os.sysconf("SC_CLK_TCK")
 
@@ -44,8 +44,8 @@ def test_the_share_of_others_is_what_is_not_ours(tmp_path: Path, monkeypatch: py
         def cpu_times(self) -> SimpleNamespace:
             return SimpleNamespace(user=used[self._pid] - 0.1, system=0.1)
 
-    monkeypatch.setattr(other_programs, "psutil", SimpleNamespace(Process=Process))
-    monkeypatch.setattr(other_programs, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(surroundings, "psutil", SimpleNamespace(Process=Process))
+    monkeypatch.setattr(surroundings, "time", SimpleNamespace(monotonic=lambda: now[0]))
     idle = (0,) * 9
     file.write_text(stat((round(8 / STEP_S), *idle), (0, *idle)))
     others = OtherPrograms((0, 1), [77])
@@ -75,9 +75,9 @@ def test_beside_units_that_live_others_have_a_share_and_beside_a_dead_one_nobody
                 raise psutil.NoSuchProcess(12)
             return 0.5
 
-    monkeypatch.setattr(other_programs, "OtherPrograms", Others)
-    share = other_programs.beside_units((0, 1), {"cpu": 11, "gpu": 12})
+    monkeypatch.setattr(surroundings, "OtherPrograms", Others)
+    share = surroundings.beside_units((0, 1), {"cpu": 11, "gpu": 12})
     assert asked == [((0, 1), [11, 12])]
     assert (share({"cpu": 11, "gpu": 12}), share({"cpu": 11, "gpu": 14})) == (0.5, None)
-    assert other_programs.beside_units((0,), {"cpu": 13})({"cpu": 13}) is None
+    assert surroundings.beside_units((0,), {"cpu": 13})({"cpu": 13}) is None
     assert share({"cpu": 11, "gpu": 12}) is None

@@ -14,7 +14,6 @@ from support.small_pipeline import assets_of, without_bytes
 from trilane.errors import BadInputError
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.stage import Skip, UnitContext
-from trilane.pipeline.unit_loop import BoundStage
 from trilane.scene.crop import Rect
 from trilane.scene.planner import FrameWork, shown_by, work_of
 from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, Scene

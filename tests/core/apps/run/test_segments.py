@@ -6,6 +6,7 @@ import errno
 import hashlib
 import shutil
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
