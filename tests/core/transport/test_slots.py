@@ -2,34 +2,63 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilane.transport.slots import FREE, READING, READY, TRANSITIONS, WRITING, EdgeSlots, SlotError, edge_rule
+from trilane.transport.slots import (
+    FREE,
+    READING,
+    READY,
+    TRANSITIONS,
+    WRITING,
+    EdgeRule,
+    EdgeSlots,
+    SlotError,
+    edge_rule,
+)
 
 RULES = ["single", "double", "triple", "fifo:1", "fifo:5", "orphan", "orphan:4"]
 
 
-@pytest.mark.parametrize(("text", "slots"), [("single", 1), ("double", 2), ("triple", 3), ("fifo:7", 7), ("fifo", 4)])
-def test_an_edge_kind_has_its_number_of_slots(text: str, slots: int) -> None:
-    assert edge_rule(text).slots == slots
+@pytest.mark.parametrize(
+    ("text", "rule"),
+    [
+        ("single", EdgeRule("single", 1)),
+        ("double", EdgeRule("double", 2)),
+        ("triple", EdgeRule("triple", 3, mailbox=True, yields=True)),
+        ("fifo", EdgeRule("fifo", 4)),
+        ("fifo:1", EdgeRule("fifo", 1)),
+        ("fifo:64", EdgeRule("fifo", 64)),
+        ("orphan", EdgeRule("orphan", 6, yields=True)),
+        ("orphan:4", EdgeRule("orphan", 4, yields=True)),
+        ("orphan:64", EdgeRule("orphan", 64, yields=True)),
+    ],
+)
+def test_an_edge_has_its_slots_and_its_rules(text: str, rule: EdgeRule) -> None:
+    assert edge_rule(text) == rule
 
 
-@pytest.mark.parametrize("text", ["quad", "single:2", "fifo:0", "fifo:65", "fifo:x", "orphan:3", "", "fifo:4 "])
-def test_an_unknown_edge_is_named(text: str) -> None:
-    with pytest.raises(ValueError, match="found edge"):
+UNCOUNTED, FIFO, ORPHAN = (
+    "single, double, triple, fifo:N or orphan:N",
+    "fifo:N with N from 1 to 64",
+    "orphan:N with N from 4",
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        *((text, UNCOUNTED) for text in ("quad", "", "single:2", "double:", "triple:4:4")),
+        *((f"fifo:{count}", FIFO) for count in ("", "0", "65", "99999", "x", "4 ", "+4", "4:4")),
+        *((f"orphan:{count}", ORPHAN) for count in ("", "3", "65", "x")),
+    ],
+)
+def test_an_edge_that_there_is_not_is_refused_with_those_that_there_are(text: str, expected: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(f"found edge '{text}', expected {expected}")):
         edge_rule(text)
-
-
-@pytest.mark.parametrize("count", ["", "0", "65", "12345", "x", "4 ", "+4", "4:4"])
-def test_a_count_that_is_none_is_told_what_it_may_be(count: str) -> None:
-    with pytest.raises(ValueError, match="expected fifo:N with N from 1 to 64"):
-        edge_rule(f"fifo:{count}")
-    with pytest.raises(ValueError, match="expected orphan:N with N from 4 to 64"):
-        edge_rule(f"orphan:{count if count != '65' else '3'}")
-    with pytest.raises(ValueError, match="expected single, double, triple, fifo:N or orphan:N"):
-        edge_rule(f"double:{count}")
 
 
 @pytest.mark.parametrize("verb", sorted(TRANSITIONS))
@@ -55,14 +84,35 @@ def test_a_mailbox_keeps_the_newest() -> None:
     assert [edge.frame[slot] for slot in edge.ready] == [2]
 
 
-def test_an_orphan_edge_never_waits_and_gives_up_its_oldest() -> None:
+def test_an_orphan_edge_never_waits_and_gives_up_its_oldest_when_no_slot_is_free() -> None:
     edge = EdgeSlots(edge_rule("orphan:4"))
-    dropped = []
-    for frame in range(10):
-        slot, evicted = edge.claim(frame)
-        dropped.append(evicted)
-        edge.commit(slot)
-    assert dropped == [None] * 4 + list(range(6))
+    for frame in range(3):
+        edge.commit(edge.claim(frame)[0])
+    assert edge.claim(3) == (3, None)
+    assert edge.can_claim()
+    assert edge.claim(4) == (0, 0)
+    assert [edge.frame[slot] for slot in edge.ready] == [1, 2]
+    assert edge.drop(2) == 2
+    assert (edge.frame, edge.free) == ([4, 1, -1, 3], [2])
+
+
+def test_the_slots_of_a_fifo_from_claim_to_release() -> None:
+    """Step by step over two slots: which slot, which state, which frame."""
+    edge = EdgeSlots(edge_rule("fifo:2"))
+    assert (edge.state, edge.frame, edge.free, list(edge.ready), edge.epoch) == (["free"] * 2, [-1, -1], [1, 0], [], 0)
+    assert edge.claim(7) == (0, None)
+    assert edge.commit(0) == []
+    assert edge.claim(8) == (1, None)
+    assert (edge.state, edge.frame, edge.can_claim()) == (["ready", "writing"], [7, 8], False)
+    with pytest.raises(SlotError, match="no slot to claim"):
+        edge.claim(9)
+    edge.take(0)
+    edge.abandon(1)
+    assert (edge.state, edge.frame, edge.free, list(edge.ready)) == (["reading", "free"], [7, -1], [1], [])
+    with pytest.raises(SlotError, match="cannot take slot 0, which is reading"):
+        edge.take(0)
+    edge.release(0)
+    assert (edge.state, edge.frame, edge.free) == (["free"] * 2, [-1, -1], [1, 0])
 
 
 def test_a_frame_given_back_waits_in_its_old_place() -> None:
