@@ -57,11 +57,3 @@ def test_a_literal_is_read_as_it_is_imported() -> None:
     )
     with pytest.raises(AssertionError, match="NONE"):
         written_value("apps.compare.overview_page", "NONE")
-
-
-def test_what_follows_from_one_another() -> None:
-    """A unit that is asked at each ping is heard of before the scheduler takes itself for stopped."""
-    from trilane.pipeline import fork_server, realtime_clock
-
-    assert realtime_clock.LONGEST_STEP_NS > realtime_clock.PING_NS
-    assert tuple(f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL", "NUMEXPR")) == fork_server.THREAD_LIMITS
