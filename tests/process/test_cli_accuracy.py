@@ -32,9 +32,6 @@ def test_runtimes_are_compared_on_the_frames_of_a_scene(drawable_bundle: Path) -
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--frames", "0"), "--frames"),
-        (("--runtime", "ort"), "two or more"),
-        (("--runtime", "ort", "--runtime", "ort"), "two or more"),
         (("--runtime", "ort", "--runtime", "abacus"), "'abacus'"),
         (("beach",), "default"),
         (("--by-cause", "--hard-cases"), "--hard-cases"),

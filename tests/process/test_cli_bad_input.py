@@ -19,14 +19,6 @@ SHM = Path("/dev/shm")  # noqa: S108 - looked at, never written
 FRAMES, WIDTH = 4, 165
 
 
-def run_cli(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    """Exit code of the command line, run in this process."""
-    monkeypatch.setattr(sys, "argv", ["trilane", *arguments])
-    with pytest.raises(SystemExit) as left:
-        main()
-    return int(left.value.code or 0)
-
-
 def listing(folder: Path) -> list[Path]:
     return sorted(folder.rglob("*"))
 
@@ -34,6 +26,30 @@ def listing(folder: Path) -> list[Path]:
 def shared_memory() -> list[Path]:
     """What a Python program would leave in /dev/shm; other programs come and go there."""
     return sorted(path for pattern in ("*trilane*", "psm_*") for path in SHM.glob(pattern))
+
+
+Refused = Callable[[list[str], str, str], None]
+
+
+@pytest.fixture
+def refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Refused:
+    """`trilane run` in `tmp_path` ends with 2 and one line that names and says it, and leaves everything as it was."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(arguments: list[str], named: str, said: str) -> None:
+        before = listing(tmp_path), shared_memory(), psutil.Process().children(recursive=True)
+        monkeypatch.setattr(sys, "argv", ["trilane", "run", *arguments, "--json"])
+        with pytest.raises(SystemExit) as left:
+            main()
+        out, err = capsys.readouterr()
+        assert (left.value.code, out) == (2, "")
+        lines = [line for line in err.splitlines() if line.startswith("error: ")]
+        assert len(lines) == 1, err
+        assert named in lines[0] and said in lines[0]
+        assert "Traceback" not in err
+        assert (listing(tmp_path), shared_memory(), psutil.Process().children(recursive=True)) == before
+
+    return run
 
 
 def huge_npy(path: Path) -> None:
@@ -69,13 +85,11 @@ MOTIONS: dict[str, tuple[str, Callable[[Path], None] | None, str]] = {
 
 
 @pytest.mark.parametrize("case", MOTIONS)
-def test_a_bad_motion(
-    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bad_motion(case: str, tmp_path: Path, refused: Refused) -> None:
     name, make, said = MOTIONS[case]
     if make is not None:
         make(tmp_path / name)
-    refused(tmp_path, monkeypatch, capsys, ["--motion", name], name, said)
+    refused(["--motion", name], name, said)
 
 
 CAMERAS = {
@@ -91,13 +105,11 @@ CAMERAS = {
 
 
 @pytest.mark.parametrize("case", CAMERAS)
-def test_a_bad_camera(
-    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bad_camera(case: str, tmp_path: Path, refused: Refused) -> None:
     text, said = CAMERAS[case]
     if text is not None:
         (tmp_path / "c.txt").write_text(text)
-    refused(tmp_path, monkeypatch, capsys, ["--camera", "c.txt"], "c.txt", said)
+    refused(["--camera", "c.txt"], "c.txt", said)
 
 
 OPTIONS = {
@@ -147,18 +159,13 @@ OPTIONS = {
 
 
 @pytest.mark.parametrize("case", OPTIONS)
-def test_a_bad_option(
-    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments, named, said = OPTIONS[case]
-    refused(tmp_path, monkeypatch, capsys, arguments, named, said)
+def test_a_bad_option(case: str, refused: Refused) -> None:
+    refused(*OPTIONS[case])
 
 
-def test_a_background_that_is_no_picture(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_background_that_is_no_picture(tmp_path: Path, refused: Refused) -> None:
     (tmp_path / "b.png").write_bytes(b"\x89PNG\r\n\x1a\n and then nothing")
-    refused(tmp_path, monkeypatch, capsys, ["--background", "b.png"], "b.png", "no readable picture")
+    refused(["--background", "b.png"], "b.png", "no readable picture")
 
 
 def float_network(folder: Path) -> str:
@@ -198,50 +205,14 @@ AVATARS: dict[str, tuple[Callable[[Path], str], str]] = {
 
 
 @pytest.mark.parametrize("case", AVATARS)
-def test_a_bad_avatar(
-    case: str,
-    tiny_bundle: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_bad_avatar(case: str, tiny_bundle: Path, tmp_path: Path, refused: Refused) -> None:
     shutil.copytree(tiny_bundle, tmp_path / "avatar")
     spoil, said = AVATARS[case]
-    refused(tmp_path, monkeypatch, capsys, ["--avatar", "avatar"], spoil(tmp_path / "avatar"), said)
+    refused(["--avatar", "avatar"], spoil(tmp_path / "avatar"), said)
 
 
 @pytest.mark.parametrize("place", ["taken", "file/run", "/proc/run", "a" * 300])
-def test_a_place_that_cannot_be_written(
-    place: str,
-    tiny_bundle: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_place_that_cannot_be_written(place: str, tiny_bundle: Path, tmp_path: Path, refused: Refused) -> None:
     (tmp_path / "taken").mkdir()
     (tmp_path / "file").write_text("a file")
-    refused(
-        tmp_path, monkeypatch, capsys, ["--avatar", str(tiny_bundle), "--out", place], place, "choose another --out"
-    )
-
-
-def refused(
-    folder: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    arguments: list[str],
-    named: str,
-    said: str,
-) -> None:
-    """`trilane run` in `folder` ends with 2, one line that names and says it, and leaves everything as it was."""
-    monkeypatch.chdir(folder)
-    before = listing(folder), shared_memory(), psutil.Process().children(recursive=True)
-    assert run_cli(monkeypatch, "run", *arguments, "--json") == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    lines = [line for line in err.splitlines() if line.startswith("error: ")]
-    assert len(lines) == 1, err
-    assert named in lines[0]
-    assert said in lines[0]
-    assert "Traceback" not in err
-    assert (listing(folder), shared_memory(), psutil.Process().children(recursive=True)) == before
+    refused(["--avatar", str(tiny_bundle), "--out", place], place, "choose another --out")

@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from trilane.apps.cli import main as cli
-from trilane.apps.cli.bench import BENCHES, MEANINGS, bench_command, flat, meaning
+from trilane.apps.cli.bench import BENCHES, MEANINGS, bench_command, meaning
 
 #: A bench that is over in seconds.
 SHORT = ("scheduler", "--minutes", "0.02", "--rounds", "1", "--seeds", "1")
@@ -21,12 +21,6 @@ def run_here(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     with pytest.raises(SystemExit) as left:
         cli.main()
     return int(left.value.code or 0)
-
-
-def test_help_lists_every_bench(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_here(monkeypatch, "--help") == 0
-    text = capsys.readouterr().out
-    assert all(name in text for name in BENCHES)
 
 
 def parameters(name: str) -> set[str]:
@@ -55,18 +49,9 @@ def test_json_is_one_document_with_the_machine(
     assert document["machine"]["cpu"]["cores"] >= 1
 
 
-def test_a_table_for_people(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_here(monkeypatch, *SHORT) == 0
-    assert "same_traces" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize("arguments", [("nothing",), ("scheduler", "--seeds", "0"), ("scheduler", "--seeds", "many")])
 def test_bad_questions(monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...]) -> None:
     assert run_here(monkeypatch, *arguments) == 2
-
-
-def test_flat_joins_keys() -> None:
-    assert flat({"a": {"b": 1, "c": {"d": 2}}, "e": 3}) == {"a.b": 1, "a.c.d": 2, "e": 3}
 
 
 @pytest.mark.parametrize("name", BENCHES)
@@ -79,9 +64,3 @@ def test_help_says_what_is_measured(name: str) -> None:
     assert answer
     assert "Raises" not in answer
     assert all(option.help for option in command.params)
-
-
-@pytest.mark.parametrize(("bench", "least"), [("planner", "LEAST_FRAMES"), ("placement", "MIN_FRAMES")])
-def test_the_least_number_of_frames_is_in_the_help(bench: str, least: str) -> None:
-    count = getattr(importlib.import_module(f"trilane.bench.{bench}"), least)
-    assert f"at least {count}" in MEANINGS[f"{bench} frames"]

@@ -9,7 +9,6 @@ import sys
 
 import pytest
 
-from trilane import __version__
 from trilane.apps.cli import doctor
 from trilane.apps.cli import main as cli
 from trilane.errors import MissingPartError
@@ -55,20 +54,6 @@ except SystemExit:
 """
     done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=False)
     assert done.stderr == "[]\n"
-
-
-@pytest.mark.parametrize("name", cli.COMMANDS)
-def test_every_command_is_there_and_has_help_with_examples(
-    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.command_of(name) is not None
-    assert run_here(monkeypatch, name, "--help") == 0
-    assert f"Usage: trilane {name}" in capsys.readouterr().out
-
-
-def test_version(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_here(monkeypatch, "--version") == 0
-    assert capsys.readouterr().out == f"trilane {__version__}\n"
 
 
 WRONG_USAGE = {

@@ -25,8 +25,3 @@ def test_slow_frames_are_given_less_work() -> None:
     assert any(rungs.get(frame) == 1 for frame in SLOW_FRAMES)
     assert not list(replay(result.recording))
     assert 0 < result.metrics["pose"]["rung"] < 1
-
-
-def test_without_a_rate_no_work_is_left_out() -> None:
-    result = run_pipeline(stepped_pipeline(1), 8, works=STEPPED_WORKS, follow=("infer",))
-    assert (result.presented, result.rungs, result.metrics["pose"]["rung"]) == (8, {}, 0)
