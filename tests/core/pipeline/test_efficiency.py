@@ -14,6 +14,7 @@ from trilane.pipeline.reckoning import Efficiencies, Reckoned, places_of, reckon
 from trilane.scheduler.events import Settings, chain
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.places import Place
+from trilane.scheduler.shared_units import Member, simulate_beside
 from trilane.scheduler.virtual import Simulation, simulate
 
 ON_0, ON_1, ON_BOTH, FLOATS = Place((0,), 1), Place((1,), 1), Place((0, 1), 2), Place((0, 1), 1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -31,8 +31,7 @@ from trilane.pipeline.journal import (
 from trilane.pipeline.journal_values import RunValues
 from trilane.pipeline.timeline import Span, Timeline
 from trilane.pipeline.unit_history import UNEXPLAINED, IdleSlice
-from trilane.scheduler.causes import Outcome, OutcomeKind
-from trilane.scheduler.events import Dispatch, Finish, Job, JobDone, Settings, UnitReady, chain
+from trilane.scheduler.events import Dispatch, Finish, Job, JobDone, Outcome, OutcomeKind, Settings, UnitReady, chain
 from trilane.scheduler.ledger import ASSIGNED, JobRecord
 from trilane.scheduler.virtual import Simulation, simulate
 from trilane.unexpected_value import UnexpectedValue

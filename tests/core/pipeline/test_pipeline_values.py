@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 
 from support.small_pipeline import OWN, UNITS, ToldTime, packets, pipeline, spec_of
-from trilane.pipeline import bound_stage
-from trilane.pipeline.bound_stage import BoundStage
+from trilane.pipeline import unit_loop
 from trilane.pipeline.description import UnitSettings
-from trilane.pipeline.regions import edge_regions
+from trilane.pipeline.memory import edge_regions
 from trilane.pipeline.stage import UnitContext
-from trilane.pipeline.unit_spec import UnitSpec
+from trilane.pipeline.unit_loop import BoundStage, UnitSpec
 from trilane.transport.packets import Packet, header_dtype
 
 MS = 1_000_000
@@ -105,19 +104,19 @@ def test_the_first_stage_is_told_of_another_rung_before_its_frame() -> None:
 
 def test_a_hold_sleeps_until_shortly_before_its_end_and_then_watches(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = ToldTime()
-    monkeypatch.setattr(bound_stage, "time", clock)
-    bound_stage.hold_until(7 * MS)
+    monkeypatch.setattr(unit_loop, "time", clock)
+    unit_loop.hold_until(7 * MS)
     assert clock.slept == [2 * MS - 1000 - 150_000]
     assert clock.now_ns == 7 * MS
-    bound_stage.hold_until(7 * MS + 151_000)  # 150 µs are left at the first look: too short to sleep
+    unit_loop.hold_until(7 * MS + 151_000)  # 150 µs are left at the first look: too short to sleep
     assert (len(clock.slept), clock.now_ns) == (1, 7 * MS + 151_000)
-    bound_stage.hold_until(clock.now_ns + 1001)  # at the first look a nanosecond is left
+    unit_loop.hold_until(clock.now_ns + 1001)  # at the first look a nanosecond is left
     assert clock.now_ns == 7 * MS + 153_000
 
 
 def test_a_job_is_held_for_its_pace_and_one_without_a_pace_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = ToldTime()
-    monkeypatch.setattr(bound_stage, "time", clock)
+    monkeypatch.setattr(unit_loop, "time", clock)
     start = clock.now_ns
     BoundStage("present", FakeStage(), packets(OWN, 1), [], 3 * MS, context()).run(0, 0, -1, 0)
     assert clock.now_ns == start + 1000 + 3 * MS

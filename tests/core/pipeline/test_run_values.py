@@ -17,15 +17,12 @@ import pytest
 from support.small_pipeline import ToldTime, pipeline
 from trilane import machine
 from trilane.errors import BadInputError
-from trilane.pipeline import lifecycle, preconditions, run_log
-from trilane.pipeline.held_time import HeldTime
-from trilane.pipeline.lifecycle import close_units, listen_before_run, start_units
-from trilane.pipeline.requests import FrameRequestQueue
-from trilane.pipeline.result import Failure
-from trilane.pipeline.run_log import RunLog, UnitError, after_stderr
-from trilane.pipeline.signals import Interrupts
+from trilane.pipeline import result, surroundings, unit_processes
+from trilane.pipeline.controls import FrameRequestQueue, Interrupts
+from trilane.pipeline.realtime_clock import HeldTime
+from trilane.pipeline.result import Failure, RunLog, UnitError, after_stderr
 from trilane.pipeline.surroundings import prompt_answers
-from trilane.pipeline.unit_processes import UnitMessage
+from trilane.pipeline.unit_processes import UnitMessage, close_units, listen_before_run, start_units
 from trilane.scheduler.events import FrameRequest, Hold, Stop
 from trilane.transport.messages import Close, Closed, Failed, Pong, Ready
 

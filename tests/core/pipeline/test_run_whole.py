@@ -13,7 +13,7 @@ import pytest
 
 from support.small_pipeline import pipeline
 from trilane.errors import BadInputError, UnwrittenError
-from trilane.pipeline import accounts, run
+from trilane.pipeline import cpu_use, run
 from trilane.pipeline.cpu_use import CpuTimes
 from trilane.pipeline.journal import (
     Accounted,
@@ -31,9 +31,7 @@ from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import DdSketch
 from trilane.pipeline.run_metrics import metrics_of
 from trilane.pipeline.run_record import JournalFile
-from trilane.pipeline.sketch import DdSketch
-from trilane.scheduler.causes import Outcome, OutcomeKind
-from trilane.scheduler.events import Settings, StageAlone
+from trilane.scheduler.events import Outcome, OutcomeKind, Settings, StageAlone
 from trilane.scheduler.virtual import VirtualDriver
 from trilane.transport.messages import Done
 

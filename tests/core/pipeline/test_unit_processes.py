@@ -21,7 +21,8 @@ import zmq
 from trilane.errors import TrilaneError
 from trilane.pipeline import unit_processes, unit_starter
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
-from trilane.pipeline.regions import EdgeRegion
+from trilane.pipeline.memory import EdgeRegion
+from trilane.pipeline.unit_loop import UnitSpec
 from trilane.pipeline.unit_processes import UnitMessage, UnitProcesses
 from trilane.pipeline.unit_starter import StartedUnit, UnitStarter
 from trilane.transport.link import HeartbeatSocket

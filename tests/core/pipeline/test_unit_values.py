@@ -17,11 +17,10 @@ from support.small_pipeline import OWN, UNITS, packets, spec_of
 from trilane import machine
 from trilane.errors import BadInputError, MissingPartError, TrilaneError, UnitLostError
 from trilane.pipeline import unit_loop
-from trilane.pipeline.bound_stage import BoundStage
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.job_times import LOSS_NS
 from trilane.pipeline.stage import UnitContext
-from trilane.pipeline.unit_spec import UnitSpec
+from trilane.pipeline.unit_loop import BoundStage, UnitSpec
 from trilane.transport.messages import Close, Closed, Failed, MessageError, Ping, Pong, Ready, RunJob
 from trilane.transport.packets import Packet
 

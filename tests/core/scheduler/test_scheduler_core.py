@@ -12,8 +12,7 @@ import pytest
 import trilane.scheduler
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import application_graph
-from trilane.scheduler.causes import Outcome, OutcomeKind
-from trilane.scheduler.core import Core
+from trilane.scheduler.core import Core, run_loop
 from trilane.scheduler.events import (
     NEVER,
     Abort,
@@ -24,6 +23,8 @@ from trilane.scheduler.events import (
     FrameRequest,
     JobDone,
     Kill,
+    Outcome,
+    OutcomeKind,
     Pinged,
     Pong,
     SchedulerStalled,
@@ -33,7 +34,6 @@ from trilane.scheduler.events import (
     UnitReady,
     chain,
 )
-from trilane.scheduler.loop import run_loop
 from trilane.scheduler.recording import Recording, read, replay
 from trilane.scheduler.virtual import Service, Simulation, simulate
 
@@ -42,27 +42,18 @@ SERVICE_MS = {"pose": 0.3, "raster": 4.0, "infer": 16.0, "composite": 2.0, "pres
 FRAMES = 200
 PURE = (
     "assignment",
-    "bypass",
-    "causes",
-    "choice",
-    "completion",
     "core",
     "events",
     "flow",
     "frame_source",
-    "frame_times",
-    "late_frames",
     "ledger",
     "policy",
-    "samples",
     "state",
     "stats",
-    "uncertainty",
-    "unit_life",
-    "watchdog",
     "work_ladder",
 )
-PURE_BELOW = ("trilane.transport.slots", "trilane.unexpected_value")  # what of the lower layers the core may import
+#: What of the lower layers the core may import.
+PURE_BELOW = ("trilane.transport.slots", "trilane.unexpected_value", "trilane.units")
 
 
 def service(stage: str, _unit: str, _frame: int, _begin_ns: int) -> int:

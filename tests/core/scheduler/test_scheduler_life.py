@@ -35,6 +35,7 @@ from trilane.scheduler.state import (
     TABLE,
     DeadlinePassed,
     UnitLifeError,
+    UnitState,
 )
 
 HANG_NS, START_NS = 100, 50

@@ -41,7 +41,6 @@ from trilane.pipeline.journal import (
     Worked,
     journal_of,
 )
-from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.events import (
     Abort,
     Dispatch,
