@@ -65,6 +65,19 @@ def test_made_again_for_another_name_value_or_shape(name: str, source: np.ndarra
     assert make.calls == 2
 
 
+def test_each_name_and_source_has_an_entry_of_its_own(folder: Path) -> None:
+    """`ab` and `c` are not `a` and `bc`, nor is a name a source; how an array lies in memory does not count."""
+    turned = np.arange(6).reshape(2, 3).T
+    sources: list[tuple[str, list[np.ndarray | str]]] = [
+        *(("n", ["ab", "c"]), ("n", ["a", "bc"]), ("n", ["abc"]), ("nab", ["c"]), ("n", [])),
+        *(("n", [np.zeros(shape, kind)]) for shape in (2, (2, 1)) for kind in (np.int32, np.float32)),
+        *(("n", [np.ones(2, np.int32)]), ("n", [turned])),
+    ]
+    for name, given in [*sources, ("n", [turned.copy()])]:
+        cached_arrays(name, given, Maker())
+    assert len(list(folder.iterdir())) == len(sources)
+
+
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_a_damaged_entry_is_made_again_and_replaced(folder: Path, damage: str) -> None:
     make = Maker()
@@ -121,3 +134,16 @@ def test_the_cache_lies_in_the_home_of_who_has_no_other(tmp_path: Path, monkeypa
     assert cache.cache_dir("openvino") == tmp_path / "other" / "trilane" / "openvino"
     monkeypatch.setattr(cache.os, "access", lambda _path, _mode: False)
     assert cache.cache_dir("openvino") is None
+
+
+def test_a_cache_keeps_the_newest(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cache, "MAX_ENTRIES", 2)
+    seen: list[set[str]] = []
+    for number in range(4):
+        cache.cached_arrays("told 1", [f"source {number}"], lambda: {"a": np.zeros(1)})
+        for place, entry in enumerate(sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime_ns)):
+            os.utime(entry, (1000 + 10 * number + place, 1000 + 10 * number + place))
+        seen.append({entry.name for entry in folder.iterdir()})
+    assert [len(names) for names in seen] == [1, 2, 2, 2]
+    assert seen[0] < seen[1] and not seen[0] & seen[3] and len(seen[1] & seen[2]) == 1
+    assert all(name.endswith(".npz") and len(name) == 44 for names in seen for name in names)

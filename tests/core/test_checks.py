@@ -10,14 +10,12 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from support import checks
-from support.checks import Outcome, check_tests, main, said
+from support.checks import Allowed, Skip, SkipList, check_tests, load_allowed, main, not_allowed
 
-COUNTED = "tests passed, 1 skipped, in"
 TESTS = {
     "test_well.py": """
 import pytest
@@ -174,16 +172,40 @@ def test_every_check_runs_and_the_last_line_names_every_failure(
     assert capfd.readouterr().out.splitlines()[-1].startswith("no failures: 2 checks, 1 tests passed, ")
 
 
+ROW = Allowed("tests/*::test_video*", "no codec *", "a codec")
+
+
 @pytest.mark.parametrize(
-    ("outcomes", "seconds", "line"),
+    ("skip", "is_allowed"),
     [
-        (
-            [Outcome([], 7, ("a",)), Outcome([], 3)],
-            125.9,
-            "no failures: 2 checks, 10 tests passed, 1 skipped, in 2 min 5 s",
-        ),
-        ([Outcome(["mypy"]), Outcome([], 3)], 1.0, "1 failure (3 tests passed, 0 skipped, in 0 min 1 s): mypy"),
+        (Skip("tests/core/test_a.py::test_video_is_read", "no codec x264"), True),
+        (Skip("tests/core/test_a.py::test_video_is_read", "could not import 'av'"), False),
+        (Skip("tests/core/test_a.py::test_audio", "no codec x264"), False),
     ],
 )
-def test_the_last_line(outcomes: Any, seconds: float, line: str) -> None:
-    assert said(outcomes, seconds) == line
+def test_both_the_test_and_its_reason_must_match(skip: Skip, is_allowed: bool) -> None:
+    assert not_allowed([skip], [ROW]) == ([] if is_allowed else [skip])
+
+
+class Report:
+    """What pytest reports of one test."""
+
+    def __init__(self, reason: str) -> None:
+        self.skipped, self.nodeid, self.longrepr = True, "tests/a.py::test_a", ("a.py", 1, f"Skipped: {reason}")
+
+
+class Session:
+    exitstatus = 0
+
+
+@pytest.mark.parametrize(("reason", "status"), [("hard to do", 1), ("no gpu", 0)])
+def test_an_unknown_skip_fails_a_run_that_passed(reason: str, status: int) -> None:
+    plugin, session = SkipList([Allowed("*", "no gpu", "a GPU")]), Session()
+    plugin.pytest_runtest_logreport(Report(reason))
+    plugin.pytest_sessionfinish(session, 0)
+    assert plugin.skips == [Skip("tests/a.py::test_a", reason)]
+    assert session.exitstatus == status
+
+
+def test_every_row_of_the_list_says_why() -> None:
+    assert all(row.why and row.reason and row.test.startswith("tests/") for row in load_allowed())

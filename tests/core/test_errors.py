@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-import ast
 import errno
 import pickle
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from pydantic import BaseModel, ValidationError, field_validator
 
-import trilane
-from trilane.errors import BadInputError, MissingPartError, TrilaneError, UnitLostError, reason
+from trilane.errors import BadInputError, MissingPartError, TrilaneError, UnitLostError, did_you_mean, reason
 from trilane.hw_profiles.profile_files import merged_tables, parse_profile, profile_folder
-from trilane.scene.schema import scene_from
-from trilane.scheduler.events import Graph, StageSpec
-from trilane.scheduler.policy import policy_named
-from trilane.shapes import parse_shape, shape_buckets
-from trilane.transport.slots import edge_rule
 from trilane.unexpected_value import UnexpectedValue, unexpected_in
-
-PACKAGE = Path(trilane.__file__).parent
 
 
 def test_the_sentence_is_built_from_the_fields() -> None:
@@ -60,33 +50,6 @@ def test_an_error_goes_from_process_to_process_as_it_is(error: Exception) -> Non
     assert (str(copy), copy.args, vars(copy)) == (str(error), error.args, vars(error))
 
 
-RAISED: dict[str, tuple[Callable[[], object], str, str]] = {
-    "shape": (lambda: parse_shape("3 by 4"), "'3 by 4'", "HEIGHTxWIDTH such as 256x256"),
-    "side": (lambda: shape_buckets("100"), "side 100", "a multiple of 32 from 32 to 4096"),
-    "edge": (lambda: edge_rule("quad"), "edge 'quad'", "single, double, triple, fifo:N or orphan:N"),
-    "edge's count": (lambda: edge_rule("fifo:99"), "edge 'fifo:99'", "fifo:N with N from 1 to 64"),
-    "policy": (lambda: policy_named("x"), "policy 'x'", "one of sequential, pipelined, latest, deadline"),
-    "stages": (
-        lambda: Graph((StageSpec("a", "cpu"),) * 2, ("double",), "a"),
-        "stages ['a', 'a']",
-        "different names",
-    ),
-    "edges": (
-        lambda: Graph((StageSpec("a", "cpu"),), (), "b"),
-        "0 edges and latency to 'b' for stages ['a']",
-        "one edge fewer than stages, and latency to one of them",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", RAISED)
-def test_what_is_raised_without_a_place(case: str) -> None:
-    call, found, expected = RAISED[case]
-    with pytest.raises(UnexpectedValue) as raised:
-        call()
-    assert (raised.value.found, raised.value.expected) == (found, expected)
-
-
 class _Even(BaseModel):
     number: int
 
@@ -111,35 +74,6 @@ def test_pydantic_hands_the_error_on_as_it_was_raised(value: Any) -> None:
     assert unexpected is not None
     assert unexpected.found == "3, expected by nobody"
     assert (unexpected.expected, unexpected.remedy) == ("an even number", "add one")
-
-
-SCENES: dict[str, tuple[dict[str, Any], str]] = {
-    "a validator's own": (
-        {"size": "100"},
-        "s: size: found side 100, expected a multiple of 32 from 32 to 4096, or auto",
-    ),
-    "of two keys": (
-        {"camera": {"near_m": 2, "far_m": 1}},
-        "s: camera: found near_m 2 and far_m 1, expected near_m below far_m and far_m at most 1e+06 times near_m",
-    ),
-    "the schema's": ({"frames": 0}, "s: frames: found 0, expected greater than or equal to 1"),
-    "unknown key": (
-        {"size_": 1},
-        "s: size_: found an unknown key, expected a key of the scene schema; did you mean 'size'?",
-    ),
-    "key like no other": (
-        {"zzz": 1},
-        "s: zzz: found an unknown key, expected a key of the scene schema; correct its spelling or remove it",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", SCENES)
-def test_a_scene_says_the_whole_sentence(case: str) -> None:
-    values, said = SCENES[case]
-    with pytest.raises(BadInputError) as raised:
-        scene_from("s", values)
-    assert str(raised.value) == said
 
 
 def test_a_profile_says_how_much_more_is_wrong_as_the_remedy() -> None:
@@ -199,18 +133,15 @@ def test_a_missing_part_names_a_line_or_an_extra() -> None:
     assert MissingPartError("no anny", extra="anny").install.endswith("[anny]'")
 
 
-def calls(tree: ast.AST) -> list[str]:
-    """What the code says of each string that it splits, strips or formats by `found` and `expected`."""
-    wanted = {"partition", "removeprefix", "split", "startswith"}
-    nodes = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)]
-    asked = [node for node in nodes if isinstance(node.func, ast.Attribute) and node.func.attr in wanted]
-    words = [arg.value for node in asked for arg in node.args if isinstance(arg, ast.Constant)]
-    return [word for word in words if isinstance(word, str) and ("found " in word or "expected " in word)]
-
-
-def test_no_code_reads_the_parts_out_of_a_text() -> None:
-    files = [
-        file for folder in (PACKAGE, *(p for p in PACKAGE.iterdir() if p.is_dir())) for file in folder.rglob("*.py")
-    ]
-    assert len(files) > 200
-    assert {str(file): found for file in files if (found := calls(ast.parse(file.read_text(encoding="utf-8"))))} == {}
+def test_the_nearest_word_is_suggested_and_none_that_is_far() -> None:
+    """difflib's ratio is twice the letters in common over the letters of both words; 0.6 and more are near."""
+    known = ["single", "double", "triple"]
+    assert did_you_mean("tripel", known) == "did you mean 'triple'?"  # 2 * 5 / 12
+    assert did_you_mean("doub", known) == "did you mean 'double'?"  # 2 * 4 / 10
+    assert did_you_mean("dbl", known) == "did you mean 'double'?"  # 2 * 3 / 9
+    assert did_you_mean("lifo", known) == ""  # at most 2 * 1 / 10
+    assert did_you_mean("", known) == did_you_mean("single", []) == ""
+    assert did_you_mean("f", known) == did_you_mean("", ["f"]) == ""
+    assert did_you_mean("fov", ["fov_y_deg", "far_m"]) == "did you mean 'fov_y_deg'?"  # 2 * 3 / 12, but its beginning
+    assert did_you_mean("wa", ["wave-and-turn", "walk-and-turn"]) == ""  # the beginning of both
+    assert did_you_mean("fra", ["far", "orbit"], "builtin:") == "did you mean 'builtin:far'?"  # 2 * 2 / 6

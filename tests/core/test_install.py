@@ -49,24 +49,24 @@ def from_wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.metadata, "requires", lambda name: REQUIRES if name == "trilane" else None)
 
 
-def test_in_the_clone(from_clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_the_user_stands_decides_the_words(from_clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert install_line("anny") == f"{from_clone}/.venv/bin/pip install -e '{from_clone}[anny]'"
+    assert install_line() == f"{from_clone}/.venv/bin/pip install -e {from_clone}"
     monkeypatch.chdir(from_clone)
     assert install_line("anny") == ".venv/bin/pip install -e '.[anny]'"
     assert install_line() == ".venv/bin/pip install -e ."
     assert package_line("onnxruntime") == ".venv/bin/pip install onnxruntime"
-
-
-def test_beside_the_clone(from_clone: Path) -> None:
-    assert install_line("anny") == f"{from_clone}/.venv/bin/pip install -e '{from_clone}[anny]'"
-    assert install_line() == f"{from_clone}/.venv/bin/pip install -e {from_clone}"
-
-
-def test_a_clone_in_the_environment_of_another(from_clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "prefix", "/opt/other")
+    assert RUNTIMES["cuda"].install() == (
+        ".venv/bin/pip uninstall -y onnxruntime && .venv/bin/pip install onnxruntime-gpu  "
+        "# on a machine with an NVIDIA GPU"
+    )
+    (from_clone / "gone").mkdir()
+    monkeypatch.chdir(from_clone / "gone")
+    (from_clone / "gone").rmdir()
+    assert install_line("fit") == f"{from_clone}/.venv/bin/pip install -e '{from_clone}[fit]'"
+    monkeypatch.setattr(sys, "prefix", "/opt/other")  # an environment that is not the clone's own
     monkeypatch.setattr(sys, "executable", "/opt/other/bin/python")
     assert install_line("fit") == f"/opt/other/bin/python -m pip install -e '{from_clone}[fit]'"
-    monkeypatch.chdir(from_clone)
-    assert install_line("fit") == "/opt/other/bin/python -m pip install -e '.[fit]'"
 
 
 def test_a_clone_whose_path_has_a_space(from_clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -74,13 +74,6 @@ def test_a_clone_whose_path_has_a_space(from_clone: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(errors, "PACKAGE", spaced / "src" / "trilane")
     monkeypatch.setattr(sys, "prefix", str(spaced / ".venv"))
     assert shlex.split(install_line("fit")) == [f"{spaced}/.venv/bin/pip", "install", "-e", f"{spaced}[fit]"]
-
-
-def test_from_a_folder_that_was_removed(from_clone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "gone").mkdir()
-    monkeypatch.chdir(tmp_path / "gone")
-    (tmp_path / "gone").rmdir()
-    assert install_line("fit") == f"{from_clone}/.venv/bin/pip install -e '{from_clone}[fit]'"
 
 
 @pytest.mark.usefixtures("from_wheel")
@@ -103,10 +96,6 @@ def test_a_package_without_a_distribution_still_says_something(monkeypatch: pyte
     assert install_line("anny") == f"'{PYTHON}' -m pip install (the packages that Trilane's pyproject.toml lists)"
 
 
-def test_these_tests_run_from_a_clone() -> None:
-    assert clone() == ROOT
-
-
 def extras_named(file: Path) -> Iterator[str]:
     """What is given to `install_line(...)`, `partial(install_line, ...)` and `MissingPartError(extra=...)`."""
     for node in ast.walk(ast.parse(file.read_text())):
@@ -120,15 +109,8 @@ def extras_named(file: Path) -> Iterator[str]:
 
 
 def test_every_extra_that_is_named_is_one() -> None:
+    assert clone() == ROOT
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     folders = [folder for folder in (ROOT / "src" / "trilane").iterdir() if folder.is_dir()]
     named = {extra for folder in folders for file in folder.rglob("*.py") for extra in extras_named(file)}
     assert {"anny", "fit", "loadgen", "openvino", "peers", "plot", "qnn", "train"} <= named <= set(extras)
-
-
-def test_the_gpus_runtime_replaces_the_other(from_clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(from_clone)
-    assert RUNTIMES["cuda"].install() == (
-        ".venv/bin/pip uninstall -y onnxruntime && .venv/bin/pip install onnxruntime-gpu  "
-        "# on a machine with an NVIDIA GPU"
-    )

@@ -10,7 +10,6 @@ from typing import Any
 import psutil
 import pytest
 
-from trilane.cache import cache_dir
 from trilane.machine import Machine
 
 X86 = """processor\t: 0
@@ -38,18 +37,6 @@ def test_the_first_core_tells_model_and_flags(tmp_path: Path, monkeypatch: pytes
     assert (arm.cpu_model(), arm.cpu_flags()) == ("aarch64", {"asimd", "i8mm", "sve"})
     nothing = Machine(tmp_path / "none")
     assert (nothing.cpu_model(), nothing.cpu_flags(), nothing.cpu_fields()) == ("aarch64", frozenset(), {})
-
-
-def test_cores_are_ascending_and_one_at_least(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("os.sched_getaffinity", lambda pid: {4, 1, 12} if pid == 0 else set())
-    monkeypatch.setattr("os.cpu_count", lambda: None)
-    assert (Machine().cores(), Machine().core_count()) == ((1, 4, 12), 1)
-
-
-def test_memory_is_pages_times_their_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("os.sysconf", {"SC_PHYS_PAGES": 1000, "SC_PAGE_SIZE": 4096}.__getitem__)
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=7))
-    assert (Machine().memory_bytes(), Machine().free_bytes()) == (4_096_000, 7)
 
 
 @pytest.mark.parametrize(
@@ -83,20 +70,6 @@ def test_packages_and_programs_are_found_and_not_run(tmp_path: Path, monkeypatch
     assert Machine().program("some-tool", first=tmp_path) == str(program)
     monkeypatch.setenv("PATH", f"/nowhere:{tmp_path}")
     assert Machine().program("some-tool") == str(program)
-
-
-def test_a_user_without_a_home_has_no_cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
-    assert Machine().cache_home() == Path("/somewhere")
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    monkeypatch.setenv("HOME", "/home/me")
-    assert Machine().cache_home() == Path("/home/me/.cache")
-
-    def homeless() -> Path:
-        raise RuntimeError("Could not determine home directory.")
-
-    monkeypatch.setattr(Path, "home", homeless)
-    assert cache_dir("any") is None
 
 
 def test_the_date_is_in_utc_wherever_the_machine_stands(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -15,19 +12,13 @@ import pytest
 from support import machines
 from support.machines import (
     TABLE,
-    CannotRunError,
     Outcome,
     Row,
-    environment_python,
-    find_python,
-    last_line,
     load_rows,
     lowest_versions,
     outcome_of,
-    path_without,
     run_row,
 )
-from trilane import machine
 
 ROOT = Path(__file__).resolve().parents[2]
 ROW = Row("some", "a machine")
@@ -87,79 +78,10 @@ def test_what_a_row_did(told: str, code: int, outcome: Any, tmp_path: Path) -> N
     assert not file.exists()
 
 
-def test_lines() -> None:
-    passed, failed = Outcome("one", 3, 1, (), 12.4), Outcome("two", 1, 0, ("a::b", "c"), 1.0)
-    absent = Outcome("three", reason="needs taskset")
-    assert str(passed) == "one                   3 passed, 0 failed, 1 skipped  12 s"
-    assert str(failed) == "two                   1 passed, 2 failed, 0 skipped  1 s"
-    assert str(absent) == "three                 not run: needs taskset"
-    assert last_line([passed, absent]) == "1 machines tried, 1 not; 0 failed"
-    assert last_line([passed, failed, absent]) == "2 machines tried, 1 not; FAILED two: a::b; two: c"
-
-
 def test_lowest_versions() -> None:
     extras = {"openvino": ["o>=2025.0"], "metrics": [], "dev": ["p>=8", "q", "ruff>=0.9"], "other": ["r>=1"]}
     project = {"dependencies": ["numpy>=1.26"], "optional-dependencies": extras}
     assert lowest_versions(project) == ["numpy==1.26", "o==2025.0", "p==8", "q"]
-
-
-def test_programs_are_hidden_by_name_and_the_first_of_a_name_stays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for folder in ("one", "two"):
-        (tmp_path / folder).mkdir()
-        for name in ("gcc-12", "cc", "cat", folder):
-            (tmp_path / folder / name).touch()
-    monkeypatch.setenv("PATH", f"{tmp_path / 'one'}:{tmp_path / 'two'}:{tmp_path / 'none'}")
-    with path_without(["*gcc*", "cc"]) as path:
-        links = {link.name: link.readlink() for link in Path(path).iterdir()}
-    assert links == {"cat": tmp_path / "one/cat", "one": tmp_path / "one/one", "two": tmp_path / "two/two"}
-    assert not Path(path).exists()
-    with path_without([]) as path:
-        assert path == os.environ["PATH"]
-
-
-def test_a_python_that_is_not_there_or_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A program of pyenv that stands for no version fails; of several versions the newest is taken."""
-    monkeypatch.setattr(machines, "PYENV", tmp_path)
-    monkeypatch.setattr(machine.here, "program", lambda _name: None)
-    with pytest.raises(CannotRunError, match=r"no Python 3\.99 on PATH or in"):
-        find_python("3.99")
-    for version, code in (("3.99.2", 0), ("3.99.10", 0), ("3.99.11", 1)):
-        program = tmp_path / version / "bin" / "python"
-        program.parent.mkdir(parents=True)
-        program.write_text(f"#!/bin/sh\nexit {code}\n", encoding="utf-8")
-        program.chmod(0o755)
-    assert find_python("3.99") == tmp_path / "3.99.10/bin/python"
-    assert find_python("{}.{}".format(*sys.version_info)) == Path(sys.executable)
-
-
-def test_an_environment_is_made_once_and_again_for_other_packages(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ran: list[list[str]] = []
-    answers = iter(["", "", "ERROR: [Errno 101] Network is unreachable", "ERROR: no such version"])
-
-    def run(words: list[Any], **_: Any) -> subprocess.CompletedProcess[str]:
-        ran.append([str(word) for word in words])
-        (tmp_path / "low").mkdir(exist_ok=True)
-        said = next(answers) if "pip" in ran[-1] else ""
-        return subprocess.CompletedProcess(words, 1 if said else 0, "", said)
-
-    monkeypatch.setattr(machines, "KEPT", tmp_path)
-    monkeypatch.setattr(machines, "find_python", lambda _version: Path("/python"))
-    monkeypatch.setattr(subprocess, "run", run)
-    row = Row("low", "", python="3.99", lowest=True)
-    assert environment_python(row, ["a==1"]) == tmp_path / "low/bin/python"
-    assert [words[:3] for words in ran] == [["/python", "-m", "venv"], [str(tmp_path / "low/bin/python"), "-m", "pip"]]
-    assert environment_python(row, ["a==1"]) == tmp_path / "low/bin/python"
-    assert len(ran) == 2
-    environment_python(row, ["a==2"])
-    assert (len(ran), ran[-1][-1]) == (4, "a==2")
-    with pytest.raises(CannotRunError, match="no package index"):
-        environment_python(row, ["a==3"])
-    with pytest.raises(subprocess.CalledProcessError):
-        environment_python(row, ["a==3"])
 
 
 def test_a_row_without_what_it_needs_is_not_run_and_says_so() -> None:

@@ -208,11 +208,6 @@ OF_NO_READER: dict[str, tuple[Content, str]] = {
     "missing": (lambda _: None, "no such file"),
 }
 BVH_FILES: dict[str, tuple[Content, str]] = {
-    "ASCII FBX": ("; FBX 7.5.0 project file\n", "an FBX file"),
-    "GLB": (b"glTF\x02\0\0\0" + bytes(40), "a binary glTF file"),
-    "USD": ("#usda 1.0\n", "a USD file"),
-    "LFS": ("version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "Git LFS pointer"),
-    "pickle": (pickle.dumps({"poses": [1.0]}), "a Python pickle"),
     "no hierarchy": ("\n".join(ROWS[1:]), "line 1: found 'ROOT'"),
     "no motion": (BVH.partition("MOTION")[0], "expected a line MOTION"),
     "cut hierarchy": (BVH[:150], "the end of the file"),

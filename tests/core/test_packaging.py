@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import subprocess
 import tomllib
 from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
+
+import trilane
 
 ROOT = Path(__file__).resolve().parents[2]
 LINKS = sorted(path for path in (ROOT / "src" / "trilane").iterdir() if path.is_symlink())
@@ -37,3 +40,16 @@ def test_every_data_file_has_an_ending_that_is_packed_and_a_package_around_it() 
         assert path.suffix == ".py" or any(fnmatch(path.name, pattern) for pattern in patterns), path
         for folder in path.parents[:-1]:
             assert (ROOT / folder / "__init__.py").is_file(), f"{folder} holds {path.name} and is no package"
+
+
+def test_the_version_is_the_distributions(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: f"that of {name}")
+    assert trilane.__version__ == "that of trilane"
+
+    def absent(name: str) -> str:
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", absent)
+    assert trilane.__version__ == "0.0.0"
+    with pytest.raises(AttributeError, match="module 'trilane' has no attribute 'other'"):
+        trilane.other  # noqa: B018

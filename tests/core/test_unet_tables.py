@@ -8,14 +8,7 @@ import pytest
 
 from trilane.hw_profiles.reference_networks import GraphBuilder, encode
 from trilane.unet_tables import (
-    DECODER,
-    ENCODERS,
-    HEADS,
     MOBILE_ENCODERS,
-    NORM_GROUPS,
-    NORMS,
-    RESNET18_STAGES,
-    RESNET18_STEM,
     MobileEncoder,
     squeeze_channels,
 )
@@ -94,13 +87,6 @@ def test_strides_of_the_blocks() -> None:
 def test_squeezed_channels_are_multiples_of_8_near_a_quarter() -> None:
     """72 / 4 = 18 is nearest to 16, 120 / 4 = 30 to 32; 16 / 4 = 4 is raised to 8."""
     assert [squeeze_channels(count) for count in (16, 72, 120, 480, 672, 960)] == [8, 16, 32, 120, 168, 240]
-
-
-def test_resnet18_and_what_all_share() -> None:
-    assert (RESNET18_STEM, RESNET18_STAGES) == (64, ((64, 1), (128, 2), (256, 2), (512, 2)))
-    assert (DECODER, HEADS, NORM_GROUPS) == ((256, 128, 64, 64, 64), (3, 1), 8)
-    assert NORMS == ("batch", "instance", "group")
-    assert ENCODERS == ("resnet18", "mobilenetv2", "mobilenetv3", "efficientnet-lite0")
 
 
 @pytest.mark.parametrize(
