@@ -76,7 +76,7 @@ def held(request: pytest.FixtureRequest) -> Callable[[str, Any], None]:
     """Compare numbers with those that held.json has for this test: none changes unless somebody means it.
 
     Of an array its size and three sums are kept: of the values, of their magnitudes, and weighted by place, so that an
-    exchange is seen. TRILANE_WRITE_HELD=1 writes the file anew; read the difference before committing it.
+    exchange is seen. TRILANE_WRITE_HELD=1 writes the file again; read the difference before committing it.
     """
     writes = "TRILANE_WRITE_HELD" in os.environ
     test = request.node.name
@@ -121,7 +121,7 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 def check_printed() -> Callable[[str, str], None]:
     """Compare with printed/NAME.txt, line by line and word by word: how a table is framed is its library's matter.
 
-    TRILANE_WRITE_PRINTED=1 writes the file anew; read the difference before committing it.
+    TRILANE_WRITE_PRINTED=1 writes the file again; read the difference before committing it.
     """
 
     def check(name: str, text: str) -> None:
