@@ -12,7 +12,6 @@ from trilane.apps.run.pace import SLACK_NS, Pace, compare, pace_of, release_fps
 from trilane.avatars.bundle import bundle_folder
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import application_graph
-from trilane.pipeline.bound_stage import hold_until
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.unit_loop import hold_until
 from trilane.scene.schema import Scene
