@@ -22,7 +22,7 @@ from trilane.hw_profiles.profile_files import load_profile, profile_names
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
 from trilane.units import PERFORMANCE_PROFILES, SUSTAINED, UnitName
 
-FILE = Path(__file__).with_name("predictions.json")
+FILE = Path(__file__).parents[1] / "predictions.json"
 #: The host's profile is measured anew on every machine.
 CHIPS = [name for name in profile_names() if name != "host"]
 NETWORKS = {

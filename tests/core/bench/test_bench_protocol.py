@@ -21,8 +21,8 @@ import trilane.bench
 from trilane import machine
 from trilane.bench.lib.limits import LIMITS
 
-FILE = Path(__file__).with_name("printed") / "bench-protocol.txt"
-ROOT = Path(__file__).resolve().parents[2]
+FILE = Path(__file__).parents[1] / "printed/bench-protocol.txt"
+ROOT = Path(__file__).resolve().parents[3]
 #: It needs SimPy and holds no numbers.
 LEFT_OUT = {"trilane.bench.lib.simpy_models"}
 OF_THE_MACHINE = {"threads"}
