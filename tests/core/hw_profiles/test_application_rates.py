@@ -8,7 +8,7 @@ import pytest
 
 from trilane.hw_profiles import predict
 from trilane.hw_profiles.application import REFERENCE, Plan, Variant, stage_times_ms, steady
-from trilane.hw_profiles.network_time import Interval, spread_of
+from trilane.hw_profiles.network_time import Interval
 from trilane.hw_profiles.predict import (
     EDGES,
     around_frame,
@@ -17,7 +17,6 @@ from trilane.hw_profiles.predict import (
     held_to,
     least_ms,
     load_of,
-    power_of,
     unheld_times,
 )
 from trilane.hw_profiles.profile_files import load_profile
@@ -89,13 +88,6 @@ def test_the_load_is_that_of_the_stages() -> None:
     assert load.work_ms(CORNERS)["dsp"] == times["infer", "dsp"] / 2
     assert load.work_ms(CORNERS)["gpu"] == pytest.approx((times["raster", "gpu"] + times["composite", "gpu"]) / 2)
     assert load.frame_ms(CORNERS) == pytest.approx(PROFILE.application.display_ms.value or 0)
-
-
-def test_power_follows_the_busy_shares() -> None:
-    around = Interval(5.0, 8.0, ())
-    busy = steady(PROFILE, PLAN, CORNERS).busy
-    expected = device_power(PROFILE, busy, CORNERS, {"dsp": spread_of(around)})
-    assert power_of(PROFILE, PLAN, CORNERS, around) == expected
 
 
 def test_every_policy_with_every_edge_is_compared_once() -> None:

@@ -58,33 +58,38 @@ def known(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("known")
-def test_profiles_are_listed(command: Command, check_printed: Callable[..., None]) -> None:
-    rows = [
-        {"name": name, "title": f"The {name}", "units": {unit: f"{unit} of {name}" for unit in ("dsp", "gpu")}}
-        for name in ("one", "two")
-    ]
-    assert json.loads(command("profiles", "list", "--json")[0]) == {"profiles": rows}
-    check_printed("profiles-list", command("profiles", "list")[0])
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [(("list",), "profiles-list"), (("show", "one"), "profiles-show-one"), (("check",), "profiles-check-one")],
+)
+def test_profiles_are_listed_shown_and_checked(
+    words: tuple[str, ...], name: str, command: Command, check_printed: Callable[..., None]
+) -> None:
+    check_printed(name, command("profiles", *words)[0])
+    keys = ("profile", "network", "runtime", "independent", "published_ms", "predicted_ms", "error")
+    published = (
+        ("one", "unet", "tflite", False, 54.1, 55.678, 55.678 / 54.1 - 1),
+        ("one", "resnet18", "qnn_dlc", True, 0.5, 0.4, 0.4 / 0.5 - 1),
+    )
+    documents = {
+        "list": {
+            "profiles": [
+                {"name": name, "title": f"The {name}", "units": {unit: f"{unit} of {name}" for unit in ("dsp", "gpu")}}
+                for name in ("one", "two")
+            ]
+        },
+        "show": Profile(title="The one").model_dump(mode="json"),
+        "check": {
+            "valid": ["one", "form", "two"],
+            "published": [dict(zip(keys, row, strict=True)) for row in published],
+        },
+    }
+    assert json.loads(command("profiles", *words, "--json")[0]) == documents[words[0]]
 
 
 @pytest.mark.usefixtures("known")
-def test_a_profile_is_shown(command: Command, check_printed: Callable[..., None]) -> None:
-    shown = json.loads(command("profiles", "show", "one", "--json")[0])
-    assert shown == Profile(title="The one").model_dump(mode="json")
-    check_printed("profiles-show-one", command("profiles", "show", "one")[0])
-
-
-@pytest.mark.usefixtures("known")
-def test_profiles_are_checked(command: Command, check_printed: Callable[..., None]) -> None:
-    keys = ("profile", "network", "runtime", "independent", "published_ms", "predicted_ms")
-    values = (("one", "unet", "tflite", False, 54.1, 55.678), ("one", "resnet18", "qnn_dlc", True, 0.5, 0.4))
-    published = [dict(zip(keys, row, strict=True)) for row in values]
-    errors = (55.678 / 54.1 - 1, 0.4 / 0.5 - 1)
-    rows = [{**row, "error": error} for row, error in zip(published, errors, strict=True)]
-    assert json.loads(command("profiles", "check", "--json")[0]) == {"valid": ["one", "form", "two"], "published": rows}
-    check_printed("profiles-check-one", command("profiles", "check")[0])
+def test_some_profiles_are_checked(command: Command) -> None:
     assert command("profiles", "check", "two", "form") == ("2 valid: two, form\n", "")
-    assert json.loads(command("profiles", "check", "two", "--json")[0]) == {"valid": ["two"], "published": []}
 
 
 def a_fit() -> ProfileFit:

@@ -6,21 +6,18 @@ import math
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles import engine_study, published_times
+from trilane.hw_profiles import engine_study
 from trilane.hw_profiles.engine_layers import NAMES, RATES, TERMS
 from trilane.hw_profiles.engine_study import (
     BEGIN,
     END,
-    HEXAGON_OF,
     MARK,
-    PROFILE_OF,
     ChipRate,
     EngineStudy,
     Study,
@@ -41,7 +38,7 @@ from trilane.hw_profiles.fit_engines import (
     factor_prior,
     rate_prior,
 )
-from trilane.hw_profiles.published_times import Latency, layers_in, layers_of_rows, read_latencies
+from trilane.hw_profiles.published_times import Latency, read_latencies
 from trilane.hw_profiles.schema import NORMAL_80, EngineName
 
 KEYS = ("arithmetic_tmac_s", "activation_gb_s", "spill_gb_s", "weight_gb_s", "operator_us", "job_us")
@@ -89,16 +86,6 @@ def test_a_folder_without_the_tables_is_refused(folder: Path) -> None:
     (folder / "networks.csv").unlink()
     with pytest.raises(BadInputError, match=r"networks\.csv.*a CSV file that can be read"):
         read_latencies(folder)
-
-
-def test_each_network_of_the_rows_is_read_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        published_times, "read_graph", lambda path: SimpleNamespace(work=SimpleNamespace(layers=str(path)))
-    )
-    layers_in.cache_clear()
-    found = layers_of_rows(folder, read_latencies(folder))
-    assert found == {name: str(folder / "networks" / f"{name}.onnx") for name in ("more", "net")}
-    layers_in.cache_clear()
 
 
 def numbers_of(engine: EngineName, chips: Sequence[str], faster: float = 1.0) -> Fitted:
@@ -277,14 +264,6 @@ def test_what_is_written_into_profiles(tmp_path: Path) -> None:
     assert plain["factors"] == half["factors"] == {name: factor for name in NAMES if name not in UNITS_OF_RATES}
 
 
-def test_each_chip_has_the_engine_of_its_generation() -> None:
-    """As Qualcomm's product pages name them."""
-    generations = {"v68": "qcs6490 sa8295p", "v69": "8gen1", "v73": "8gen2 xelite", "v75": "8gen3", "v79": "8elite"}
-    generations["v81"] = "8elite5"
-    assert {chip: name for name, chips in generations.items() for chip in chips.split()} == HEXAGON_OF
-    assert HEXAGON_OF.keys() == PROFILE_OF.keys()
-
-
 def test_priors_by_hand() -> None:
     """The 888's sister is four times slower than the 8 Gen 2, in FP16 a quarter of that; its costs grow."""
     assert rate_prior("int8_tflite", "8gen2", "arithmetic_tmac_s") == Prior(17, 0.5)
@@ -320,10 +299,7 @@ def test_a_picture_of_the_errors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         [[2.0], pytest.approx([2.2])],
     ]
     assert [line[1] / line[0] for line in lines[2:]] == [pytest.approx([f, f]) for f in (1, 1.15, 1 / 1.15)]
-    assert {line[0].tolist() == [0.1, 200.0] for line in lines[2:]} == {True}
     assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
-    assert axes.get_xlabel() == "published, ms" and axes.get_ylabel().startswith("predicted")
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["int8_tflite", "fp16_tflite"]
     with pytest.raises(BadInputError, match=r"found the ending '\.gif', expected one of"):
         plot_errors(made_study(), tmp_path / "errors.gif")
 
@@ -344,12 +320,3 @@ def test_the_command_writes_what_is_asked_for(
     assert asked == [Path("data")]
     written = profile_texts(made_study(), profiles, "profiles fit-chips data")
     assert {path: path.read_text() for path in profiles.iterdir()} == written
-
-
-def test_the_command_draws_what_is_asked_for(
-    command: Callable[..., tuple[str, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("matplotlib.figure")
-    monkeypatch.setattr(engine_study, "study_engines", lambda _: made_study())
-    out, _ = command("profiles", "fit-chips", "data", "--plot", tmp_path / "errors.svg")
-    assert out.strip() == as_markdown(made_study()) and (tmp_path / "errors.svg").stat().st_size > 1000

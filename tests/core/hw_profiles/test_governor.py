@@ -74,19 +74,6 @@ def test_power_is_that_of_the_units_and_of_the_rest(phone: Profile) -> None:
     assert governor.power_w == pytest.approx((full + rest + sum(phone.units[u].idle_w.or_else(0) for u in UNITS)) / 2)
 
 
-def test_of_a_chip_that_names_no_rest_the_units_are_all(phone: Profile) -> None:
-    unknown = phone.thermal.base_power_w.model_copy(update={"value": None, "kind": "unknown"})
-    without = phone.model_copy(update={"thermal": phone.thermal.model_copy(update={"base_power_w": unknown})})
-    governor = Governor(without, "burst")
-    governor.begin(0)
-    governor.tick(S, dict.fromkeys(UNITS, 0))
-    assert governor.power_w == pytest.approx(sum(phone.units[unit].idle_w.or_else(0) for unit in UNITS))
-
-
-def test_equal_ticks_give_equal_events(phone: Profile) -> None:
-    assert worked(Governor(phone, "burst"), 2000) == worked(Governor(phone, "burst"), 2000)
-
-
 def test_a_capped_pipeline_is_as_slow_as_its_duty(phone: Profile) -> None:
     events = [(0, event) for event in Governor(phone, "power_saver").begin(0)]
     times = {"pose": 1, "raster": 4, "infer": 10, "composite": 3, "present": 1}

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from trilane import machine
-from trilane.hw_profiles.host import cgroup_quota, host_units, split_cores, usable_cores
+from trilane.hw_profiles.host import RATES, cgroup_quota, host_units, split_cores, usable_cores
 from trilane.machine import Machine
 
 
@@ -63,3 +63,14 @@ def test_a_quota_takes_the_last_cores_away(groups: Path, monkeypatch: pytest.Mon
     for quota, cores in (("150000", (2, 3)), ("1", (2,)), ("900000", (2, 3, 5))):
         (groups / "cpu.max").write_text(f"{quota} 100000")
         assert usable_cores() == cores
+
+
+def test_multiplications_in_a_cycle_follow_from_the_width_of_an_instruction() -> None:
+    """FP32: two fused multiply-adds a cycle of 16, 8, 8 and 4 numbers, as two such units have; half of that in scalar.
+
+    INT8: a dot product of bytes has four in the place of one FP32 number; AVX2 without it multiplies and adds in two.
+    """
+    numbers = {"avx512_vnni": 2 * 16, "avx_vnni": 2 * 8, "avx2": 2 * 8, "asimddp": 2 * 4, "": 4}
+    assert {flag: fp32 for flag, (_, fp32) in RATES.items()} == numbers
+    dot_product = {"avx512_vnni", "avx_vnni", "asimddp"}
+    assert all(int8 == fp32 * (4 if flag in dot_product else 2) for flag, (int8, fp32) in RATES.items())

@@ -123,16 +123,6 @@ def test_what_an_engine_hands_to_the_processor() -> None:
     assert seconds[0].sum() == 0 and seconds[1].sum() == pytest.approx(cost, rel=1e-3)
 
 
-def test_an_engine_has_the_memory_that_the_application_leaves() -> None:
-    memory = CHIP.memory.model_copy(update={"application_use_fraction": number(0.75)})
-    layers = Layers((EngineLayer("l", "Conv", {"weights": 1e6}, ("x",), "y"),), {"x": 1, "y": 1}, 1, 1)
-    work = Work((), 1, 1, 1, layers)
-    alone, beside = (
-        time_on(CHIP.units["dsp"], memory, work, contended=both).parts["weights"] for both in (False, True)
-    )
-    assert beside == pytest.approx(4 * alone)
-
-
 def test_the_error_of_a_job_on_an_engine_joins_those_of_its_terms() -> None:
     """Of two halves, each of another rate: half of each rate's spread and of each factor's, as independent ones."""
     engine = CHIP.units["dsp"].engine
@@ -248,15 +238,3 @@ def test_a_precision_whose_speed_nobody_states_is_said_and_less_certain() -> Non
     assert around.why[-1] == "it does not know how fast its dsp is in fp32: 0.1 TMAC/s are assumed"
     stated = relative_error(time_on(dsp, profile.memory, work), dsp)
     assert spread_of(around) == pytest.approx(math.hypot(stated, 1.0))
-
-
-def test_what_the_cpu_does_for_the_dsp_has_its_time() -> None:
-    """Each group normalisation: a fixed time and that of its elements, 64 channels at half the size for the first."""
-    work, unit = reference_network(NetworkSpec("resnet18", "group", 256, 256, 16)).work, CHIP.units["dsp"]
-    time = price(CHIP, work, "dsp", TOP)
-    each = unit.fallback_ns_per_element.or_else(0) / 1e6
-    first = next(o for o in time.operators if o.op_type == "GroupNormalization")
-    assert first.ms == pytest.approx(unit.fallback_fixed_ms.or_else(0) + 64 * 128 * 128 * each)
-    assert first.bound == "activation traffic"
-    outside = work.input_elements * unit.input_ns_per_element.or_else(0) / 1e6
-    assert time.job_ms - outside < 1, "waking the unit, and what it reads and writes"

@@ -6,11 +6,9 @@ import pytest
 
 from trilane import machine
 from trilane.errors import MissingPartError
-from trilane.hw_profiles import host
 from trilane.hw_profiles.host import fastest_runtime
 from trilane.hw_profiles.profile_files import load_profile
 from trilane.stages.dsp import runtime
-from trilane.stages.dsp.runtime import RUNTIMES
 
 
 @pytest.mark.parametrize(("flag", "fastest"), [("avx2", "openvino"), ("avx512_vnni", "openvino"), ("asimddp", "ort")])
@@ -28,11 +26,6 @@ def test_only_what_is_installed_is_taken():
 def test_nothing_to_take_says_what_to_install():
     with pytest.raises(MissingPartError, match="pip install onnxruntime"):
         fastest_runtime(load_profile("host"), ["qnn"])
-
-
-def test_the_table_knows_only_runtimes_that_there_are():
-    assert {name for speeds, *_ in host.RUNTIMES.values() for name in speeds} <= set(RUNTIMES)
-    assert set(host.RUNTIMES) == set(host.RATES)
 
 
 @pytest.mark.parametrize(
