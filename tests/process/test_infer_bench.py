@@ -45,6 +45,15 @@ def test_a_file_is_measured(file, monkeypatch):
     assert row["int8_over_fp32"] is None
 
 
+def test_whole_batches_are_run(file, monkeypatch):
+    """That a batch's time is divided by its frames is held with times that are told: test_inference_bench.py."""
+    monkeypatch.setattr(roofline, "measure", lambda _threads: {"int8_gmac_s": 100.0, "int8_instruction_gmac_s": 400.0})
+    result = infer.measure(str(file), batch=(1, 8), runtime=("ort",), threads=1, seconds=0.2, period=0.1)
+    one, eight = result["rows"]
+    assert (one["batch"], eight["batch"]) == (1, 8) and eight["frames"] % 8 == 0
+    assert all(0 < row["min_ms"] <= row["p50_ms"] <= row["max_ms"] for row in (one, eight))
+
+
 @pytest.mark.parametrize(
     ("asked", "message"), [({"runtime": ("tpu",)}, "tpu"), ({"period": 0.0}, "--period"), ({"period": 9.0}, "--period")]
 )

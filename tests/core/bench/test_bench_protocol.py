@@ -12,14 +12,18 @@ import importlib
 import inspect
 import os
 import pkgutil
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import pytest
+
 import trilane.bench
 from trilane import machine
-from trilane.bench.lib.limits import LIMITS
+from trilane.bench.lib.limits import LIMITS, check_limits
+from trilane.errors import BadInputError
 
 FILE = Path(__file__).parents[1] / "printed/bench-protocol.txt"
 ROOT = Path(__file__).resolve().parents[3]
@@ -90,3 +94,14 @@ def test_what_the_benches_measure_with_is_held() -> None:
 
 def test_threads_may_be_four_to_a_core() -> None:
     assert LIMITS["threads"] == (0, 4 * machine.here.core_count())
+
+
+@pytest.mark.parametrize("option", sorted(set(LIMITS) - {"threads"}))
+def test_both_ends_of_a_range_are_taken_and_no_more(option: str) -> None:
+    low, high = LIMITS[option]
+    step = 1 if isinstance(low, int) else 1e-4
+    check_limits({option: low})
+    check_limits({option: (low, high)})
+    for bad in (low - step, high + 1):
+        with pytest.raises(BadInputError, match=re.escape(f"expected {low:g} to {high:g}")):
+            check_limits({option: [low, bad]})

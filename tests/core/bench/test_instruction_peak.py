@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import threading
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 
 from trilane import machine
 from trilane.bench import peers, roofline
+from trilane.bench.lib import instruction_sets
 from trilane.bench.lib.instruction_sets import (
     INSTRUCTION_SETS,
     KERNELS,
@@ -13,6 +18,7 @@ from trilane.bench.lib.instruction_sets import (
     Kernel,
     clock_loop,
     instruction_set_of,
+    measure_issued,
     peak_gmac_s,
     rate_loop,
 )
@@ -121,3 +127,56 @@ def test_shares_say_which_peak_they_are_of() -> None:
     assert set(peers.PEAKS) < set(result["ratios"])
     unknown = peers.compared({**times, peers.OPENVINO: [[10.0], [10.0]]}, 1.0, 200.0, None)
     assert unknown["ratios"]["openvino_of_instruction_peak"] is None
+
+
+def test_what_cores_do_is_the_median_of_bursts_and_the_mean_of_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On core 2 the clock's loop takes 0.5 ns for each of its cycles (2 GHz), on core 5 0.25 ns; twelve instructions a
+    turn, each three cycles, and 12 a turn in 6 or 12 cycles."""
+    core, kernel = threading.local(), KERNELS["AVX-VNNI"]
+
+    class Code:
+        def __init__(self, text: bytes) -> None:
+            self._is_clock = {rate_loop(kernel): False, clock_loop(kernel): True}[text]
+
+        def __enter__(self) -> Code:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            """Nothing to end."""
+
+        def ns(self, turns: int) -> float:
+            cycles, cycle_ns = (6, 0.5) if core.number == 2 else (12, 0.25)
+            return turns * (36 if self._is_clock else cycles) * cycle_ns
+
+    monkeypatch.setattr(instruction_sets, "_Code", Code)
+    monkeypatch.setattr(instruction_sets.os, "sched_setaffinity", lambda _, cores: setattr(core, "number", *cores))
+    monkeypatch.setattr(machine.here, "architecture", lambda: "x86_64")
+    assert measure_issued("AVX-VNNI", [2, 5]) == Issued(*(pytest.approx(value) for value in (1.5, 3.0, 3.0, 3.0)))
+
+
+@pytest.mark.parametrize(("refused", "words"), [(0, ""), (1, "the tiles of AMX are refused")])
+def test_tiles_are_asked_for_where_a_set_has_them(monkeypatch: pytest.MonkeyPatch, refused: int, words: str) -> None:
+    calls: list[Any] = []
+    libc = SimpleNamespace(syscall=lambda *what: calls.append(what) or refused)
+    monkeypatch.setattr(
+        instruction_sets.ctypes, "CDLL", lambda name, use_errno: libc if (name, use_errno) == (None, True) else None
+    )
+    monkeypatch.setattr(instruction_sets, "_on_core", lambda *_: (1.0, [2.0, 4.0, 3.0]))
+    monkeypatch.setattr(machine.here, "architecture", lambda: "x86_64")
+    if refused:
+        with pytest.raises(OSError, match=words):
+            measure_issued("AMX-INT8", [0])
+    else:
+        assert measure_issued("AMX-INT8", [0]) == Issued(1.0, 3.0, 2.0, 4.0)
+    assert calls == [(158, 0x1023, 18)]
+    measure_issued("AVX2", [0])
+    assert len(calls) == 1
+
+
+@pytest.mark.skipif(machine.here.architecture() != "x86_64", reason="the loops are machine code of x86")
+def test_a_loop_runs_as_often_as_it_is_told() -> None:
+    """Machine code by hand: `imul` alone is on every x86-64 core. Three cycles of at most 10 GHz each."""
+    kernel = instruction_sets.Kernel("480fafc0", sequences=1, imuls=1, cycles=3, after="")
+    with instruction_sets._Code(instruction_sets.clock_loop(kernel)) as code:
+        assert code.ns(200_000) > 200_000 * 2 * 3 / 10
+    assert code._memory.closed

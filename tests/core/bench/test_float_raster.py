@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from trilane.bench.lib import float_raster
-from trilane.bench.lib.float_raster import ReferenceImage, rasterise, sample, tensor
+from trilane.bench.lib.float_raster import ReferenceImage, quantise, rasterise, sample, tensor
 
 SHAPE = (8, 16)
 EDGE = 1e-9  # of a share, nearer to which a sample is at an edge
@@ -114,6 +114,17 @@ def test_a_tensor_has_the_zero_point_where_there_is_no_mesh() -> None:
     image = ReferenceImage(coverage, np.zeros((2, 2), np.int64), uv, np.zeros((2, 2)))
     found = tensor(image, texture, 0.5, 100)
     assert found.tolist() == [[[104, 113], [100, 100]], [[100, 100], [108, 104]]] and found.dtype == np.uint8
+
+
+def test_bytes_of_the_reference_round_halves_to_even_and_clamp() -> None:
+    real = np.array([-99.0, -0.3, 0.25, 0.75, 1.25, 999.0])
+    assert quantise(real, 0.5, 3).tolist() == [0, 2, 3, 5, 5, 255]
+
+
+def test_the_reference_samples_between_texels_and_clamps_at_the_edge() -> None:
+    texture = np.array([[[0.0], [1.0]], [[2.0], [3.0]]])
+    uv = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.5, 0.5], [-1.0, 2.0], [0.625, 0.25]])
+    assert sample(texture, uv)[:, 0].tolist() == [0.0, 1.0, 2.0, 1.5, 2.0, 0.75]
     tall = np.arange(12.0).reshape(3, 4, 1)
     assert sample(tall, np.array([[1.0, 1.0], [0.0, 0.0], [0.375, 0.5]]))[:, 0].tolist() == [11.0, 0.0, 5.0]
     assert sample(tall, np.array([[0.5, 0.5], [0.25, 2 / 3]]))[:, 0] == pytest.approx([5.5, 6.5])
