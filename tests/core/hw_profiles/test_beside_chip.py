@@ -19,14 +19,14 @@ from support.trace_reading import read_trace
 from trilane.apps.predict import asked_pipelines as sources
 from trilane.errors import BadInputError
 from trilane.hw_profiles import shared_chip
-from trilane.hw_profiles.application import REFERENCE, Plan, Variant, stage_times_ms, steady
+from trilane.hw_profiles.application import Plan, Variant, stage_times_ms, steady
 from trilane.hw_profiles.host_model import UNMEASURED, with_network
 from trilane.hw_profiles.network_work import Network, count_work
-from trilane.hw_profiles.over_time import temperatures_of
 from trilane.hw_profiles.profile_files import load_profile
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
 from trilane.hw_profiles.schema import corners_of
 from trilane.hw_profiles.shared_chip import SKIPS, Tenant, Together, moved_bytes, predict_beside, together
+from trilane.scene.planner import FrameWork
 from trilane.units import SUSTAINED
 
 CHIP = load_profile("snapdragon-888")
@@ -131,6 +131,8 @@ def test_a_run_lasts_ten_seconds_or_64_frames_but_no_more_than_ten_minutes(fps: 
 def test_a_tenant_is_refused_for_its_unit_and_its_mean_skips_frames_without_a_network() -> None:
     with pytest.raises(BadInputError, match=r"^additions on cpu: unit: found 'cpu', expected gpu or dsp$"):
         bare("cpu")
+    with pytest.raises(BadInputError, match=r"0\.001 to 1000"):
+        bare("dsp", float("nan"))
     small, large = avatar(128), avatar(256)
     both = replace(small, networks=(*small.networks, *large.networks))
     means = [together(CHIP, [each], CORNERS).stages_ms[0]["infer"] for each in (small, large)]
@@ -218,59 +220,44 @@ def test_what_it_settles_to_is_the_last_fifth_of_the_time() -> None:
     assert shared_chip._settled_ms([], reports.__getitem__, 1) is None  # type: ignore[arg-type]
 
 
-def test_temperatures_by_hand() -> None:
-    moments: list[Any] = [SimpleNamespace(device_c=device, junction_c=80 - device) for device in (30.0, 41.0, 35.0)]
-    assert temperatures_of(moments) == {"device_end": 35.0, "device_max": 41.0, "junction_max": 50.0}
-    assert temperatures_of([]) == {}
-
-
 def test_what_is_said_of_a_machine_and_of_turns() -> None:
-    host = load_profile("host")
-    one, two = [shared_chip._notes(CHIP, [avatar()] * count, "deadline") for count in (1, 2)]
-    assert len(one) == 1 and one[0].startswith("frames are released from one instant on")
-    assert two[1:] == ["a unit that several pipelines have handed a job takes them by deadline, each job to its end"]
-    plain = shared_chip._notes(host, [avatar()] * 2, "deadline")
-    assert "divide it in equal shares" in plain[1] and plain[2].startswith(UNMEASURED)
+    host, two = load_profile("host"), [avatar()] * 2
+    (_, turns) = shared_chip._notes(CHIP, two, "deadline")
+    assert turns == "a unit that several pipelines have handed a job takes them by deadline, each job to its end"
+    (_, shares, said) = shared_chip._notes(host, two, "deadline")
+    assert "divide it in equal shares" in shares and said.startswith(UNMEASURED)
     measured = with_network(host, avatar().networks[0].work, {1: 5.0}, 0.1, "measured by a test")
-    told = shared_chip._notes(measured, [avatar()] * 2, "deadline")
-    assert told[:2] == plain[:2] and told[2].startswith("the first pipeline was measured by a test;")
-
-
-def test_pipelines_of_one_name_are_numbered() -> None:
-    assert sources._names(["a", "b", "a", "a"]) == ["a (1)", "b", "a (2)", "a (3)"]
+    assert shared_chip._notes(measured, two, "deadline")[2].startswith("the first pipeline was measured by a test;")
 
 
 def test_a_scene_is_planned_frame_by_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames of 64x96 and 32x32 with some that skip; a network for each shape and number of avatars, as they come."""
-    from trilane.scene.planner import FrameWork
+    full, reuse = FrameWork.FULL, FrameWork.REUSE
+    wide, small = (64, 96), (32, 32)
+    works: list[Any] = [
+        (full, wide, "a"),
+        (reuse, wide, "a"),
+        (full, small, "abc"),
+        (full, wide, "ab"),
+        (full, wide, "b"),
+    ]
 
-    works = [
-        (FrameWork.FULL, (64, 96), "a"), (FrameWork.REUSE, (64, 96), "a"), (FrameWork.FULL, (32, 32), "abc"),
-        (FrameWork.FULL, (64, 96), "ab"), (FrameWork.FULL, (64, 96), "b"),
-    ]  # fmt: skip
+    def decide(frame: int) -> Any:
+        work, shape, seen = works[frame % len(works)]
+        return SimpleNamespace(plan=SimpleNamespace(work=work, shape=shape, seen=seen))
+
     scene = SimpleNamespace(frames=700, fps=24.0)
-    checked: Any = SimpleNamespace(config=SimpleNamespace(scene=scene), assets="assets")
-
-    class Plans:
-        def __init__(self, config: Any, assets: str) -> None:
-            assert (config, assets) == (checked.config, "assets")
-
-        def decide(self, frame: int) -> Any:
-            work, shape, seen = works[frame % len(works)]
-            return SimpleNamespace(plan=SimpleNamespace(work=work, shape=shape, seen=seen))
-
-    asked: list[Any] = []
-    monkeypatch.setattr(sources, "configure", lambda request, _folder: asked.append(request) or checked)
+    checked = SimpleNamespace(config=SimpleNamespace(scene=scene), assets="assets")
+    monkeypatch.setattr(sources, "configure", lambda *_: checked)
     monkeypatch.setattr(sources, "network_of", lambda _: SimpleNamespace(shape=(1, 80, 112, 12)))
-    monkeypatch.setattr(sources, "ScenePlan", Plans)
+    monkeypatch.setattr(sources, "ScenePlan", lambda *_: SimpleNamespace(decide=decide))
     monkeypatch.setattr(sources, "reshaped", lambda _file, *shape: SimpleNamespace(model=shape))
     monkeypatch.setattr(sources, "count_work", lambda shape: shape)
     (found,) = sources.tenants(["home.toml@12:gpu"], Variant("deadline", "single"))
-    assert [(each.skinning, each.scene) for each in asked] == [("gpu", "home.toml")]
     assert (found.name, found.source, found.fps, found.unit) == ("home", "home.toml@12:gpu", 12.0, "gpu")
     assert (found.variant, found.is_bare) == (Variant("deadline", "single"), False)
-    assert [tuple(each) for each in found.networks] == [
-        ({"scene": "home.toml"}, *shape, 12, "packed", shape) for shape in ((64, 96), (32, 32), (64, 96))
+    assert [(each.height, each.width, each.channels) for each in found.networks] == [
+        (*s, 12) for s in (wide, small, wide)
     ]
     assert found.networks[0] is found.networks[2] and found.avatars == (1, 3, 2)
     assert found.frames == (0, SKIPS, 1, 2, 0) * 120
@@ -352,33 +339,6 @@ def test_a_network_of_one_frame_has_no_frame_time(
     onnx.save(additions(32), "add.onnx")
     row = next(line for line in command("predict", "add.onnx@0.001")[0].splitlines() if "add" in line)
     assert row.split("│")[3].strip() == "-"
-
-
-def test_too_high_a_rate_of_a_tenant_is_refused() -> None:
-    with pytest.raises(BadInputError, match=r"0\.001 to 1000"):
-        bare("dsp", float("nan"))
-
-
-def test_what_joins_the_stages_is_asked(
-    command: Callable[..., tuple[str, str]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[Any] = []
-
-    def told(chip: Any, found: Any, *over: Any) -> Any:
-        asked.append((chip.name, found, *over))
-        return predict_beside(CHIP, [bare("dsp", 10, 32), bare("gpu", 10, 32)])
-
-    monkeypatch.setattr(sources, "tenants", lambda texts, variant: (tuple(texts), variant))
-    monkeypatch.setattr(shared_chip, "predict_beside", told)
-    command("predict", "a.toml", "--beside", "b.toml", "--edge", "triple", "--turns", "deadline")
-    command("predict", "a.toml", "--policy", "pipelined", "--minutes", 3, "--governor", "step_wise")
-    command("predict", "a.toml", "--policy", "reference", "--performance-profile", "burst")
-    chip, usual = "snapdragon-888", ("sustained_high_performance", 0.0, None, "round-robin")
-    assert asked == [
-        (chip, (("a.toml", "b.toml"), Variant("latest", "triple")), *usual[:3], "deadline"),
-        (chip, (("a.toml",), Variant("pipelined", "double")), usual[0], 3.0, "step_wise", usual[3]),
-        (chip, (("a.toml",), REFERENCE), "burst", *usual[1:]),
-    ]
 
 
 def test_two_networks_as_a_table_and_as_json(

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import onnx
 import pytest
 
 from trilane.apps.cli import predict as cli
@@ -17,7 +16,6 @@ from trilane.apps.cli import predict_output
 from trilane.apps.predict import asked_prediction
 from trilane.apps.predict.predict_options import PredictOptions
 from trilane.avatars.bundle import load_bundle
-from trilane.errors import BadInputError
 from trilane.hw_profiles import over_time, plot, profile_files, reference_networks
 from trilane.hw_profiles import predict as predictions
 from trilane.hw_profiles.application import REFERENCE, Plan, Variant
@@ -35,62 +33,62 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """What the command asked of its parts, by their names."""
     found: dict[str, Any] = {}
 
-    def answer(chip: Any, plan: Plan, *others: Any) -> dict[str, Any]:
-        found["predict"] = (chip, plan, *others)
-        return {"fps": 12.5}
+    def told(name: str, answer: Any) -> Callable[..., Any]:
+        return lambda *given, **_: found.update({name: given}) or answer
 
-    def what_if(*given: Any) -> list[str]:
-        found["what_if"] = given
-        return ["alternatives"]
-
-    def draw(*given: Any) -> None:
-        found["draw"] = given
-
-    def show(answer: Any, as_json: bool) -> None:
-        found["shown"] = (answer, as_json)
-
-    monkeypatch.setattr(profile_files, "load_runnable", lambda name: found.setdefault("profile", name) and CHIP)
-    monkeypatch.setattr(predictions, "predict", answer)
-    monkeypatch.setattr(predictions, "what_if", what_if)
-    monkeypatch.setattr(cli, "draw", draw)
-    monkeypatch.setattr(cli, "show_answer", show)
+    monkeypatch.setattr(profile_files, "load_runnable", told("profile", CHIP))
+    monkeypatch.setattr(predictions, "predict", lambda *given: found.update(predict=given) or {"fps": 12.5})
+    monkeypatch.setattr(predictions, "what_if", told("what_if", ["alternatives"]))
+    monkeypatch.setattr(cli, "draw", told("draw", None))
+    monkeypatch.setattr(cli, "show_answer", told("shown", None))
     monkeypatch.setattr("trilane.hw_profiles.reference_networks.reference_network", lambda spec: spec)
     return found
 
 
-USUAL = NetworkSpec("resnet18", "batch", 512, 512, 16, "packed")
+SPEC: Any = NetworkSpec("mobilenetv2", "group", 96, 64, 4, "split")
+USUAL = Plan(NetworkSpec("resnet18", "batch", 512, 512, 16, "packed"), "dsp", REFERENCE, 0.0)  # type: ignore[arg-type]
+OWN = Plan(SPEC, "gpu", Variant("latest", "triple", 3), 0.0)
+#: Words of a command -> what is asked of the prediction, and of what else.
+ASKED: dict[tuple[str, ...], tuple[tuple[Any, ...], dict[str, Any]]] = {
+    (): ((USUAL, SUSTAINED, 0.0, None, NOTHING), {"profile": ("snapdragon-888",)}),
+    (
+        *("--profile", "mine", "--encoder", "mobilenetv2", "--norm", "group", "--size", "96x64", "--channels", "4"),
+        *("--layout", "split", "--runtime", "gpu", "--minutes", "2.5", "--policy", "latest", "--edge", "triple"),
+        *("--batch", "3", "--gpu-share", "0", "--performance-profile", "power_saver", "--governor", "step_wise"),
+        *("--what-if", "--plot", "heat.svg", "--json"),
+    ): (
+        (OWN, "power_saver", 2.5, "step_wise", NOTHING),
+        {
+            "profile": ("mine",),
+            "what_if": (CHIP, SPEC, "gpu", "power_saver", None),
+            "draw": (CHIP, OWN, "power_saver", 2.5, "step_wise", Path("heat.svg")),
+            "shown": ({"fps": 12.5, "alternatives": ["alternatives"]}, True),
+        },
+    ),
+    ("--gpu-share", "0.25"): ((replace(USUAL, gpu_share=0.25), SUSTAINED, 0.0, None, NOTHING), {}),
+    ("--plot", "heat.svg", "--policy", "pipelined"): (  # a drawing is of half an hour where no time is given
+        (replace(USUAL, variant=Variant("pipelined", "double", 1)), SUSTAINED, 0.0, None, NOTHING),
+        {
+            "draw": (
+                *(CHIP, replace(USUAL, variant=Variant("pipelined", "double", 1)), SUSTAINED, 30.0, None),
+                Path("heat.svg"),
+            )
+        },
+    ),
+    ("--fps", "24", "--power-limit-w", "3.5", "--what-if"): (
+        (USUAL, SUSTAINED, 0.0, None, Wanted(24.0, 3.5)),
+        {"what_if": (CHIP, USUAL.network, "dsp", SUSTAINED, 24.0)},
+    ),
+}
 
 
-def test_without_options(asked: dict[str, Any], command: Command) -> None:
-    command("predict")
-    assert asked["profile"] == "snapdragon-888"
-    assert asked["predict"] == (CHIP, Plan(USUAL, "dsp", REFERENCE, 0.0), SUSTAINED, 0.0, None, NOTHING)  # type: ignore[arg-type]
-    assert asked["shown"] == ({"fps": 12.5}, False)
-    assert "what_if" not in asked and "draw" not in asked
-
-
-def test_every_option_arrives_where_it_belongs(asked: dict[str, Any], command: Command) -> None:
-    command(
-        *("predict", "--profile", "mine", "--encoder", "mobilenetv2", "--norm", "group", "--size", "96x64"),
-        *("--channels", 4, "--layout", "split", "--runtime", "gpu", "--minutes", 2.5, "--policy", "latest"),
-        *("--edge", "triple", "--batch", 3, "--gpu-share", 0, "--performance-profile", "power_saver"),
-        *("--governor", "step_wise", "--what-if", "--plot", "heat.svg", "--json"),
-    )
-    spec: Any = NetworkSpec("mobilenetv2", "group", 96, 64, 4, "split")
-    plan = Plan(spec, "gpu", Variant("latest", "triple", 3), 0.0)
-    assert asked["profile"] == "mine"
-    assert asked["predict"] == (CHIP, plan, "power_saver", 2.5, "step_wise", NOTHING)
-    assert asked["what_if"] == (CHIP, spec, "gpu", "power_saver", None)
-    assert asked["draw"] == (CHIP, plan, "power_saver", 2.5, "step_wise", Path("heat.svg"))
-    assert asked["shown"] == ({"fps": 12.5, "alternatives": ["alternatives"]}, True)
-    command("predict", "--gpu-share", 0.25)
-    assert asked["predict"][1].gpu_share == 0.25
-
-
-def test_a_drawing_is_of_half_an_hour_where_no_time_is_given(asked: dict[str, Any], command: Command) -> None:
-    command("predict", "--plot", "heat.svg", "--policy", "pipelined")
-    assert asked["draw"][2:] == (SUSTAINED, 30.0, None, Path("heat.svg"))
-    assert asked["predict"][1].variant == Variant("pipelined", "double", 1)
+@pytest.mark.parametrize("words", ASKED, ids=" ".join)
+def test_every_option_arrives_where_it_belongs(words: tuple[str, ...], asked: dict[str, Any], command: Command) -> None:
+    command("predict", *words)
+    given, others = ASKED[words]
+    assert asked["predict"] == (CHIP, *given)
+    assert {name: asked[name] for name in others} == others
+    assert {"what_if", "draw"} & asked.keys() == {"what_if", "draw"} & others.keys()
 
 
 def test_this_machine_is_not_capped_unless_it_is_said(asked: dict[str, Any], command: Command) -> None:
@@ -100,15 +98,21 @@ def test_this_machine_is_not_capped_unless_it_is_said(asked: dict[str, Any], com
     assert asked["predict"][2] == SUSTAINED
 
 
+def test_a_precision_is_that_of_the_unit(asked: dict[str, Any], command: Command) -> None:
+    command("predict", "--precision", "float")
+    assert asked["predict"][0].units["dsp"].precision == "fp16" and CHIP.units["dsp"].precision == "int8"
+
+
 def test_the_network_of_an_avatar_or_a_file(tiny_bundle: Path, asked: dict[str, Any], command: Command) -> None:
     """Both are the same network; only its file is read as any graph is."""
     work = count_work(load_bundle(tiny_bundle).read_network().model)
-    file = tiny_bundle / "network.onnx"
-    command("predict", "--avatar", tiny_bundle, "--layout", "split")
-    assert asked["predict"][1].network == Network({"avatar": str(tiny_bundle)}, 64, 64, 5, "split", work)
-    command("predict", "--network", file, "--application", "--layout", "split")
-    assert asked["predict"][1].network == Network({"network": str(file)}, 64, 64, 5, "split", work)
-    assert asked["predict"][2] == SUSTAINED, "the application's, with a network of one's own too"
+    for words, facts in (
+        (("--avatar", tiny_bundle), {"avatar": str(tiny_bundle)}),
+        (("--network", tiny_bundle / "network.onnx", "--application"), {"network": f"{tiny_bundle}/network.onnx"}),
+    ):
+        command("predict", *words, "--layout", "split")
+        assert asked["predict"][1].network == Network(facts, 64, 64, 5, "split", work)
+        assert asked["predict"][2] == SUSTAINED, "the application's, with a network of one's own too"
 
 
 def test_networks_by_themselves(
@@ -136,14 +140,6 @@ def test_networks_by_themselves(
     out, err = command("predict", "--network", file, "--network", tmp_path / "cut.onnx", code=2)
     assert out == "" and err.startswith(f"error: {tmp_path / 'cut.onnx'}: found bytes that do not parse, expected")
     assert "predict" not in asked
-
-
-def test_a_rate_a_limit_and_a_precision(asked: dict[str, Any], command: Command) -> None:
-    command("predict", "--fps", 24, "--power-limit-w", 3.5, "--what-if", "--precision", "float")
-    chip, plan, *_, wanted = asked["predict"]
-    assert wanted == Wanted(24.0, 3.5) and plan.variant == REFERENCE
-    assert asked["what_if"][-1] == 24.0
-    assert chip.units["dsp"].precision == "fp16" and CHIP.units["dsp"].precision == "int8"
 
 
 @pytest.mark.parametrize(("edge", "batch"), [(None, 1), (REFERENCE.edge, 4)])
@@ -258,24 +254,6 @@ def test_a_table_of_answers(
     }
 
 
-@pytest.mark.usefixtures("asked")
-def test_a_table_has_a_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
-    from rich.console import Console
-
-    def predict_table(*arguments: Any) -> Any:
-        arguments[-1](2)
-        return iter(ROWS)
-
-    screen = io.StringIO()
-    console = Console(file=screen, force_terminal=True, width=100)
-    monkeypatch.setattr(cli, "stderr_console", lambda: console)
-    monkeypatch.setattr(reference_networks, "read_table", lambda _: [0] * 4)
-    monkeypatch.setattr(predictions, "predict_table", predict_table)
-    command("predict", "--table", "rows.csv")
-    assert "predicting" in screen.getvalue() and "50%" in screen.getvalue()
-    assert screen.getvalue().endswith("\x1b[2K")  # the bar is gone
-
-
 POWER = {
     **{"w": 3.215, "low_w": 2.115, "high_w": 4.325},
     "units": {"gpu": {"w": 0.515, "low_w": 0.415, "high_w": 0.625}, "dsp": {"w": 1.5, "low_w": 0.755, "high_w": 2.25}},
@@ -283,12 +261,7 @@ POWER = {
 }
 RATE = {"fps": 30.0, "holds": True, "words": "holds", "reserve": 0.255, "reserve_low": 0.1, "reserve_high": 0.375}
 LIMIT = {
-    "limit_w": 3.0,
-    "fps": 28.76,
-    "low_fps": 20.34,
-    "high_fps": 33.3,
-    "power_w": 2.995,
-    "limited_by": "power",
+    **{"limit_w": 3.0, "fps": 28.76, "low_fps": 20.34, "high_fps": 33.3, "power_w": 2.995, "limited_by": "power"},
     "corners": {"gpu": "svs", "dsp": "max"},
 }
 
@@ -303,55 +276,30 @@ def an_answer(**changes: Any) -> dict[str, Any]:
         },
         "network": {"gmac": 1.25, "parameters_m": 2.35, "alone_ms": 3.45, "low_ms": 3.05, "high_ms": 3.95},
         "frame_time_ms": {"mean": 4.55, "ema20_min": 4.15, "ema20_max": 5.75, "low": 4.25, "high": 4.95},
-        "latency_ms": {"mean": 6.85},
-        "fps": 219.78,
-        "fps_settled": 200.12,
-        "fps_start": 230.34,
-        "efficiency": 0.756,
-        "display_capped": False,
-        "power_w": 3.21,
-        "power": POWER,
-        "energy_mj_per_frame": 14.6,
-        "notes": [],
-        "temperature_c": None,
-        "caps": None,
-        "expected_error": 0.123,
-        "confidence": 0.877,
+        **{"latency_ms": {"mean": 6.85}, "fps": 219.78, "fps_settled": 200.12, "fps_start": 230.34},
+        **{"efficiency": 0.756, "display_capped": False, "power_w": 3.21, "power": POWER, "notes": []},
+        **{"energy_mj_per_frame": 14.6, "temperature_c": None, "caps": None},
+        **{"expected_error": 0.123, "confidence": 0.877},
         "units": {"gpu": {"busy": 0.65, "idle": idle}, "dsp": {"busy": 0.25, "idle": {"throttled": 0.755}}},
         **changes,
     }
 
 
+def alternative(name: str, policy: str, edge: str, *figures: float, holds: bool) -> dict[str, Any]:
+    keys = ("frame_ms", "fps", "latency_ms", "dropped", "power_w")
+    return {"name": name, "policy": policy, "edge": edge, "holds": holds, **dict(zip(keys, figures, strict=True))}
+
+
 def everything() -> dict[str, Any]:
     """Of an avatar for ten minutes, hot, held by the display, with notes and alternatives."""
-    config = {**an_answer()["config"], "avatar": "someone", "network": "a.onnx", "minutes": 10.0}
     return an_answer(
-        config=config,
-        display_capped=True,
-        notes=["first", "second"],
+        config={**an_answer()["config"], "avatar": "someone", "network": "a.onnx", "minutes": 10.0},
+        **{"display_capped": True, "notes": ["first", "second"], "rate": RATE, "power_limit": LIMIT},
         temperature_c={"device_max": 41.25, "junction_max": 77.75},
         caps={"throttled_share": 0.125},
-        rate=RATE,
-        power_limit=LIMIT,
         alternatives=[
-            {
-                "name": "newest",
-                "policy": "latest",
-                "edge": "triple",
-                "frame_ms": 7.77,
-                "fps": 128.7,
-                "latency_ms": 9.99,
-                **{"holds": True, "dropped": 0.125, "power_w": 4.565},
-            },
-            {
-                "name": "slow",
-                "policy": "sequential",
-                "edge": "single",
-                "frame_ms": 17.7,
-                "fps": 56.5,
-                "latency_ms": 18.8,
-                **{"holds": False, "dropped": 0.0, "power_w": 2.345},
-            },
+            alternative("newest", "latest", "triple", 7.77, 128.7, 9.99, 0.125, 4.565, holds=True),
+            alternative("slow", "sequential", "single", 17.7, 56.5, 18.8, 0.0, 2.345, holds=False),
         ],
     )
 
@@ -402,16 +350,6 @@ def test_networks_are_shown_with_their_ten_most_expensive_operators(
         },
         "networks": answers,
     }
-
-
-def test_inputs_that_may_have_another_shape_are_told_without_the_weights(tmp_path: Path) -> None:
-    ends = [(n, s) for n, s in (("image", (1, 3, 8, 8)), ("w0", (4, 3, 1, 1)), ("y", (1, 4, 8, 8)))]
-    values = [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape) for name, shape in ends]
-    graph = onnx.helper.make_graph([onnx.helper.make_node("Conv", ["image", "w0"], ["y"])], "g", values[:2], values[2:])
-    onnx.save(onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)]), tmp_path / "net.onnx")
-    with pytest.raises(BadInputError, match=r"found no input 'picture', expected one of image$"):
-        options = PredictOptions(network=(tmp_path / "net.onnx",), input_shape=("picture=1",))
-        asked_prediction.predict_networks(CHIP, options)
 
 
 def test_a_limit_below_what_an_idle_device_takes(capsys: pytest.CaptureFixture[str]) -> None:

@@ -46,7 +46,7 @@ from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.network_time import interval, price
 from trilane.hw_profiles.network_work import count_work
 from trilane.hw_profiles.profile_files import load_profile, profile_folder
-from trilane.hw_profiles.published_times import Latency, layers_in, read_latencies
+from trilane.hw_profiles.published_times import Latency, layers_of_rows, read_latencies
 from trilane.hw_profiles.reference_networks import NetworkSpec, network_work
 from trilane.hw_profiles.schema import NORMAL_80, corners_of
 from trilane.hw_profiles.unit_times import nearest
@@ -259,7 +259,9 @@ def test_two_chips_are_fitted_and_validated_in_seconds(chips_folder: Path) -> No
         for row in read_latencies(chips_folder)
         if row.engine == "int8_qnn_dlc" and row.chip in ("8gen2", "8gen3") and row.network in names
     ]
-    study = study_engine(rows, {name: layers_in(chips_folder, name) for name in names})
+    layers = layers_of_rows(chips_folder, rows)
+    assert layers.keys() == set(names)
+    study = study_engine(rows, layers)
     assert {row.row.network for row in study.left_out} == set(names) - {ALWAYS}
-    assert errors_of(predict_rows(study.fitted, rows, {n: layers_in(chips_folder, n) for n in names}))["median"] < 0.1
+    assert errors_of(predict_rows(study.fitted, rows, layers))["median"] < 0.1
     assert study.coverage >= 0.75

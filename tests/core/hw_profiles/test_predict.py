@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import copy
+import math
 from collections import Counter
+from dataclasses import astuple
 from itertools import pairwise
 from pathlib import Path
+from statistics import fmean as mean_of
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +16,7 @@ import pytest
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles import host_model
+from trilane.hw_profiles import over_time as over_time_module
 from trilane.hw_profiles.application import (
     MOST_FPS,
     REFERENCE,
@@ -21,14 +26,13 @@ from trilane.hw_profiles.application import (
     stage_times_ms,
     steady,
 )
-from trilane.hw_profiles.governor import GOVERNORS, ThermalState
+from trilane.hw_profiles.governor import GOVERNORS, ThermalState, Throttle
 from trilane.hw_profiles.host_model import on_cores, place_units
 from trilane.hw_profiles.over_time import over_time
-from trilane.hw_profiles.predict import predict, predict_table, what_if
-from trilane.hw_profiles.profile_files import load_profile
+from trilane.hw_profiles.predict import _frame_times, ema_range_ms, predict, predict_table, what_if
+from trilane.hw_profiles.profile_files import load_profile, load_tables, parse_profile
 from trilane.hw_profiles.reference_networks import NetworkSpec, read_table, reference_network
-from trilane.hw_profiles.schema import Profile, corners_of
-from trilane.scheduler.placement import Rules
+from trilane.hw_profiles.schema import CORNERS, Profile, corners_of
 from trilane.scheduler.places import Core, Place
 from trilane.units import UNITS, UnitName
 
@@ -52,7 +56,7 @@ def test_the_closed_form_of_the_fit_is_what_the_scheduler_does(runtime: UnitName
 
 
 @pytest.mark.parametrize("policy", ["sequential", "pipelined", "latest", "deadline"])
-@pytest.mark.parametrize("edge", ["single", "double", "triple", "fifo:3", "orphan"])
+@pytest.mark.parametrize("edge", ["single", "fifo:3"])
 def test_every_way_of_working_runs_and_accounts_for_its_time(policy: str, edge: str) -> None:
     profile = load_profile("snapdragon-888")
     now = steady(profile, Plan(NETWORK, "dsp", Variant(policy, edge)), corners_of(profile, SUSTAINED))
@@ -125,52 +129,6 @@ def test_throttling_has_hysteresis() -> None:
     assert 1 <= changes <= 20
 
 
-def test_the_temperature_approaches_resistance_times_power() -> None:
-    profile = load_profile("snapdragon-888")
-    thermal_state, power = ThermalState.at_rest(profile), {"cpu": 0.5, "gpu": 1.0, "dsp": 1.5}
-    thermal_state.advance(profile, power, 1e6)  # type: ignore[arg-type]
-    thermal = profile.thermal
-    total = sum(power.values()) + thermal.base_power_w.or_else(0)
-    assert thermal_state.device_c == pytest.approx(
-        thermal.ambient_c.or_else(0) + thermal.device_k_per_w.or_else(0) * total
-    )
-    assert thermal_state.junction_c["dsp"] > thermal_state.junction_c["gpu"] > thermal_state.device_c
-
-
-def test_one_long_step_is_many_short_ones() -> None:
-    """Exact for the device, whose power does not change in between."""
-    profile = load_profile("snapdragon-888")
-    power: dict[UnitName, float] = {"cpu": 0.5, "gpu": 1.0, "dsp": 1.5}
-    one, many = ThermalState.at_rest(profile), ThermalState.at_rest(profile)
-    one.advance(profile, power, 600)
-    for _ in range(600):
-        many.advance(profile, power, 1)
-    assert one.device_c == pytest.approx(many.device_c)
-
-
-def test_an_answer_has_the_keys_of_a_report() -> None:
-    answer = predict(load_profile("snapdragon-888"), Plan(NETWORK, "dsp"), minutes=2)
-    assert {"schema", "clock", "machine", "config", "frame_time_ms", "latency_ms", "fps", "stages", "units"} <= set(
-        answer
-    )
-    assert {"efficiency", "temperature_c", "caps", "confidence", "energy_mj_per_frame"} <= set(answer)
-    assert answer["clock"] == "virtual"
-    assert answer["fps"] == pytest.approx(1e3 / answer["frame_time_ms"]["mean"])
-    assert 0.6 < answer["efficiency"] < 0.8  # the reference application reached 0.67
-    assert len(answer["timeline"]) == 120
-
-
-def test_an_unknown_chip_is_less_certain_than_a_measured_one() -> None:
-    plan = Plan(NETWORK, "dsp")
-    known, guessed = (predict(load_profile(name), plan)["confidence"] for name in ("snapdragon-888", "snapdragon-865"))
-    assert guessed < known < 1
-
-
-def test_every_alternative_is_answered() -> None:
-    rows = {row["name"]: row["frame_ms"] for row in what_if(load_profile("snapdragon-888"), NETWORK, "dsp", SUSTAINED)}
-    assert rows["pipelined, two buffers"] < rows["reference application"] < rows["one frame at a time"]
-
-
 def test_a_table_keeps_its_columns_and_answers_every_row(tmp_path: Path) -> None:
     path = tmp_path / "rows.csv"
     lines = ["# a comment", "encoder,norm,params_m,size,channels,layout,mine"]
@@ -233,34 +191,10 @@ def test_half_an_hour_says_where_it_begins_and_where_it_settles() -> None:
     assert answer["fps_settled"] < 0.97 * answer["fps"] < 0.97 * answer["fps_start"]
 
 
-def test_without_minutes_the_settled_rate_is_the_rate() -> None:
-    answer = predict(load_profile("snapdragon-888"), Plan(NETWORK, "dsp"))
-    assert answer["fps_start"] == answer["fps_settled"] == pytest.approx(answer["fps"])
-
-
 def with_cores(profile: Profile, **cores: str) -> Profile:
     """`profile` with the core of each named unit."""
     units = {name: unit.model_copy(update={"core": cores.get(name, "")}) for name, unit in profile.units.items()}
     return profile.model_copy(update={"units": units})
-
-
-@pytest.mark.parametrize(("policy", "in_turns"), [("pipelined", False), ("".join(["sequ", "ential"]), True)])
-def test_units_are_placed_by_the_rules_of_the_policy(
-    monkeypatch: pytest.MonkeyPatch, policy: str, in_turns: bool
-) -> None:
-    asked: list[Any] = []
-
-    def ranked(*given: Any) -> Any:
-        asked.append(given)
-        raise StopIteration
-
-    monkeypatch.setattr(host_model, "ranked", ranked)
-    monkeypatch.setattr(host_model, "_times", lambda *given: given)
-    plan: Any = SimpleNamespace(variant=SimpleNamespace(policy=policy))
-    cores = [Core(0, 0), Core(1, 1)]
-    with pytest.raises(StopIteration):
-        place_units("profile", plan, "corners", cores)  # type: ignore[arg-type]
-    assert asked == [(cores, ("profile", plan, "corners", 2, {}), Rules("cpu", in_turns), {})]
 
 
 @pytest.mark.parametrize(("layout", "raster_ms"), [("split", 0.0252), ("packed", 0.0094)])
@@ -380,12 +314,119 @@ def test_this_machine_in_virtual_time_is_placed_as_its_times_ask(count: int, mon
     assert any("placement: cpu 0" in note for note in answer["notes"])
 
 
-def test_a_chip_with_units_of_its_own_has_no_placement() -> None:
-    assert "placement" not in predict(load_profile("snapdragon-888"), Plan(NETWORK, "dsp"))
-
-
 @pytest.mark.parametrize("fps", [0.0, 1e-300, 0.0009, 1001.0, float("nan")])
 def test_a_rate_whose_period_is_no_number_of_nanoseconds_is_refused(fps: float) -> None:
     with pytest.raises(BadInputError, match=r"^fps: found .*, expected 0\.001 to 1000$"):
         Plan(NETWORK, "dsp", Variant(fps=fps))
     assert Plan(NETWORK, "dsp", Variant(fps=0.001)).variant.fps == 0.001
+
+
+STATED = {
+    "thermal.base_power_w": 1.5,
+    "application.display_ms": 16.0,
+    "application.ema20_half_range_fraction": 0.25,
+    "thermal.ambient_c": 20.0,
+    "thermal.device_k_per_w": 4.0,
+    "thermal.device_time_s": 100.0,
+    "thermal.skin_limit_c": 40.0,
+    "thermal.junction_limit_c": 90.0,
+    "thermal.poll_s": 2.0,
+}
+
+
+def changed(changes: dict[str, float]) -> Profile:
+    """The chip snapdragon-888 with other numbers."""
+    data, path = load_tables("snapdragon-888")
+    data = copy.deepcopy(data)
+    for key, value in changes.items():
+        table, last = key.split(".")
+        data[table][last] = {"kind": "assumed", "source": "s", "value": value}
+    return parse_profile(data, path)
+
+
+@pytest.mark.parametrize("minutes", [0, 2])
+def test_an_answer_follows_from_its_moments(minutes: int) -> None:
+    """The settled state stands for the moments where no time is given."""
+    profile = load_profile("snapdragon-888")
+    plan, corners = Plan(NETWORK, "dsp", Variant("pipelined", "double", 2, 24.0)), corners_of(profile, BURST)
+    answer, now = predict(profile, plan, BURST, minutes), steady(profile, plan, corners)
+    moments = over_time(profile, plan, BURST, minutes) if minutes else []
+    frames = sorted(moment.frame_ms for moment in moments) or [now.frame_ms]
+    mean = sum(frames) / len(frames)
+    times, half = answer["frame_time_ms"], profile.application.ema20_half_range_fraction.or_else(0) * mean
+    assert (times["mean"], times["p50"], times["max"]) == pytest.approx((mean, frames[len(frames) // 2], frames[-1]))
+    least = max(profile.application.display_ms.or_else(0), mean - half)
+    assert (times["ema20_min"], times["ema20_max"]) == pytest.approx((least, mean + half))
+    assert answer["fps"] == pytest.approx(1e3 / mean) and answer["latency_ms"]["mean"] == now.latency_ms
+    base = profile.thermal.base_power_w.or_else(0)
+    watts = [base + sum(profile.units[u].power_w(c, now.busy[u]) for u, c in zip(UNITS, corners, strict=True))]
+    power = mean_of([moment.power_w for moment in moments] or watts)
+    assert (answer["power_w"], answer["energy_mj_per_frame"]) == pytest.approx((power, power * mean))
+    assert answer["xrbench"] == {"energy": pytest.approx(1 - power * mean / 1500)}
+    assert answer["efficiency"] == pytest.approx(now.stages_ms["infer"] / 2 / now.frame_ms)
+    assert {name: stage["service_ms"]["mean"] for name, stage in answer["stages"].items()} == now.stages_ms
+    assert {unit: row["busy"] for unit, row in answer["units"].items()} == now.busy
+    assert answer["network"]["gmac"] == NETWORK.work.macs / 1e9
+    assert len(answer["timeline"]) == len(moments) == 60 * minutes
+    config = answer["config"]
+    assert (config["size"], config["policy"], config["batch"], config["fps"]) == ("512x512", "pipelined", 2, 24.0)
+
+
+def test_percentiles_of_a_hundred_moments() -> None:
+    """No frame is shown before the display's interval."""
+    profile, frames = changed(STATED), [float(n) for n in range(100, 0, -1)]
+    found = _frame_times(profile, 50.5, frames)
+    assert [found[key] for key in ("p50", "p90", "p95", "p99", "max")] == [51, 91, 96, 100, 100]
+    assert ema_range_ms(profile, 18.0) == (16.0, 22.5)
+
+
+def test_heat_follows_the_power_from_poll_to_poll(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A governor that lowers the DSP at the second poll, and looks at every one."""
+    profile = changed(STATED)
+    seen: list[Any] = []
+    settled: list[Any] = []
+    busy = {"cpu": 0.1, "gpu": 0.6, "dsp": 0.8}
+    now = SimpleNamespace(frame_ms=25.0, busy=busy)
+    monkeypatch.setattr(over_time_module, "steady", lambda *asked: settled.append(asked) or now)
+
+    def govern(profile: Profile, state: ThermalState, throttle: Throttle, requested: Any, power: Any) -> None:
+        seen.append((profile.name, state.device_c, dict(requested), dict(power)))
+        if len(seen) == 2:
+            throttle.lower("dsp", requested["dsp"])
+
+    monkeypatch.setitem(GOVERNORS, profile.thermal.governor, govern)
+    found = over_time(profile, Plan(NETWORK, "dsp"), "burst", 0.13)
+    device, junction = 20.0, dict.fromkeys(UNITS, 20.0)
+    first = profile.performance_profiles["burst"]
+    assert len(found) == len(seen) == 4, "round(7.8 s / 2 s)"
+    for number, moment in enumerate(found):
+        corners: Any = [first.corner(unit) for unit in UNITS]
+        if number >= 2:
+            corners[2] = CORNERS[CORNERS.index(corners[2]) + 1]
+        power = {u: profile.units[u].power_w(c, busy[u]) for u, c in zip(UNITS, corners, strict=True)}
+        goal = 20 + 4 * (sum(power.values()) + 1.5)
+        device = goal + (device - goal) * math.exp(-2 / 100)
+        for unit in UNITS:
+            numbers = profile.units[unit]
+            above = device + (numbers.junction_k_per_w.value or 0) * power[unit]
+            junction[unit] = above + (junction[unit] - above) * math.exp(-2 / (numbers.junction_time_s.value or 0))
+        wanted = (2.0 * (number + 1), 25.0, device, max(junction.values()), sum(power.values()) + 1.5)
+        assert astuple(moment)[:5] == pytest.approx(wanted)
+        assert moment.throttled == (number >= 2) and moment.corners == tuple(corners)
+        assert seen[number][1] == pytest.approx(device) and seen[number][3] == pytest.approx(power)
+        assert seen[number][2] == {unit: CORNERS.index(first.corner(unit)) for unit in UNITS}
+    assert len(settled) == 2, "each state of the units is settled once"
+
+
+@pytest.mark.parametrize(
+    ("minutes", "governor", "message"),
+    [
+        (0.0, None, "minutes: found 0, expected above 0, at most 1440"),
+        (1440.1, None, "minutes: found 1440.1, expected above 0, at most 1440"),
+        (1.0, "ondemand", "governor: found 'ondemand', expected step_wise or power_allocator"),
+    ],
+)
+def test_times_and_governors_that_are_not_known_are_refused(minutes: float, governor: str | None, message: str) -> None:
+    with pytest.raises(BadInputError) as caught:
+        over_time(load_profile("snapdragon-888"), Plan(NETWORK, "dsp"), "burst", minutes, governor)
+    assert str(caught.value) == message
