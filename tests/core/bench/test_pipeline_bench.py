@@ -21,7 +21,7 @@ from trilane.pipeline.result import Failure
 from trilane.pipeline.run_metrics import StageTimes, TimeSummary
 from trilane.scheduler.events import Settings, chain
 from trilane.scheduler.ledger import JobRecord
-from trilane.scheduler.placement_model import SCHEDULER_NS
+from trilane.scheduler.placement import SCHEDULER_NS
 from trilane.scheduler.recording import Recording
 from trilane.scheduler.virtual import simulate
 from trilane.stages import avatar_pipeline, configure

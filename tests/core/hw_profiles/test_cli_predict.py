@@ -13,7 +13,6 @@ import pytest
 
 from trilane.apps.cli import predict as cli
 from trilane.apps.cli import predict_output
-from trilane.apps.predict import asked_prediction
 from trilane.apps.predict.predict_options import PredictOptions
 from trilane.avatars.bundle import load_bundle
 from trilane.hw_profiles import over_time, plot, profile_files, reference_networks
