@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from trilane.arrays import U8
-from trilane.errors import TrilaneError, UnitLostError
+from trilane.errors import MissingPartError, TrilaneError, UnitLostError
 from trilane.memory import shortage
 from trilane.pipeline.description import Model, PipelineStage, UnitSettings
 from trilane.pipeline.hardware_counters import HardwareCounters, NoCounters, counters_here
@@ -335,9 +335,11 @@ def _fail(link: Link, job_id: int, where: str, error: Exception) -> int:
     traceback.print_exception(error)
     known = isinstance(error, TrilaneError)
     text = str(error) if known else f"{where}: {type(error).__name__}: {error}"
-    if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
-        text = f"{where}: memory is short: {shortage() or error}"
     code = error.exit_code if isinstance(error, TrilaneError) else 1
+    is_of_memory = isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
+    if (is_of_memory or job_id == BUILDING) and (short := shortage()):
+        said = error.what if isinstance(error, MissingPartError) else text
+        text, code = f"{where}: memory is short: {short}; it failed with: {said}", 1
     sentence = " ".join(text.split()).encode(errors="replace")  # a file's name may hold bytes that are no text
     link.job_pipe.send(Failed(job_id, code, sentence[:MAX_TEXT].decode(errors="ignore")))
     return code

@@ -331,15 +331,11 @@ def listen_before_run(processes: UnitProcesses, interrupts: Interrupts) -> list[
     if interrupts.count:
         raise KeyboardInterrupt
     for unit, message in messages:
-        if message is not None and not isinstance(message, Failed):
-            continue
-        if short := shortage():
-            end = "ended before the run began" if message is None else "could not start"
-            said = "" if message is None else f"; it said: {message.message}"
-            raise UnitError(f"unit {unit} {end}; memory is short: {short}{said}")
+        if isinstance(message, Failed):
+            raise UnitError(message.message, message.exit_code)
         if message is None:
-            raise UnitError(f"unit {unit} ended before the run began{processes.why_ended(unit)}")
-        raise UnitError(message.message, message.exit_code)
+            why = f"; memory is short: {short}" if (short := shortage()) else processes.why_ended(unit)
+            raise UnitError(f"unit {unit} ended before the run began{why}")
     return messages
 
 

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import errno
 import resource
 import subprocess
 import sys
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from trilane import machine, memory
 from trilane.apps.cli.main import _describe
-from trilane.errors import MissingPartError, TrilaneError
+from trilane.errors import BadInputError, MissingPartError, TrilaneError
 from trilane.machine import Machine
+from trilane.pipeline import unit_loop
+from trilane.pipeline.lifecycle import listen_before_run
 from trilane.stages.configure import required_machine
+from trilane.transport.messages import BUILDING, Failed
 
 MB = 1 << 20
 GIGABYTE = str(1 << 30)
@@ -68,6 +74,53 @@ def test_no_opengl_context_is_no_missing_package_where_memory_is_short(plenty: p
         required_machine(lambda: None)
     assert str(raised.value).startswith("no OpenGL context could be made; memory is short: each process may have 600")
     assert raised.value.exit_code == 1
+
+
+@dataclass
+class Sent:
+    """A link that keeps what a unit says."""
+
+    told: list[Failed] = field(default_factory=list)
+
+    @property
+    def job_pipe(self) -> Sent:
+        return self
+
+    def send(self, message: Failed) -> None:
+        self.told.append(message)
+
+
+@pytest.mark.parametrize(
+    ("job", "error", "is_told"),
+    [
+        (BUILDING, MissingPartError("no OpenGL", "apt-get"), True),
+        (BUILDING, BadInputError("net", "Unable to read the model", "one"), True),
+        (7, MemoryError("x"), True),
+        (7, OSError(errno.ENOMEM, "x"), True),
+        (7, BadInputError("net", "no", "one"), False),
+    ],
+)
+def test_a_unit_that_fails_where_memory_is_short_says_so(
+    plenty: pytest.MonkeyPatch, job: int, error: Exception, is_told: bool
+) -> None:
+    """With what it failed with, but not with a package to install; a job's own error stays itself."""
+    link = Sent()
+    assert unit_loop._fail(link, job, "unit gpu", error) == getattr(error, "exit_code", 1)  # type: ignore[arg-type]
+    assert "memory is short" not in link.told.pop().message
+    plenty.setattr(resource, "getrlimit", lambda _kind: (600 * MB, 600 * MB))
+    unit_loop._fail(link, job, "unit gpu", error)  # type: ignore[arg-type]
+    message = link.told.pop().message
+    assert message.startswith("unit gpu: memory is short: each process may have 600 MB") == is_told
+    assert "apt-get" not in message
+
+
+def test_a_unit_that_ends_before_the_run_where_memory_is_short_says_so(plenty: pytest.MonkeyPatch) -> None:
+    processes = SimpleNamespace(listen=lambda _ms: [("gpu", None)], why_ended=lambda _unit: "; it wrote last: x")
+    with pytest.raises(TrilaneError, match=r"^unit gpu ended before the run began; it wrote last: x$"):
+        listen_before_run(processes, SimpleNamespace(count=0))  # type: ignore[arg-type]
+    plenty.setattr(machine.here, "oom_kills", lambda: memory._KILLS + 1)
+    with pytest.raises(TrilaneError, match=r"^unit gpu ended before the run began; memory is short: the system has"):
+        listen_before_run(processes, SimpleNamespace(count=0))  # type: ignore[arg-type]
 
 
 def test_an_unexpected_error_is_no_defect_where_memory_is_short(plenty: pytest.MonkeyPatch) -> None:
