@@ -1,11 +1,13 @@
 """The camera in the scene: places a recorded one so that it films the avatars, and lets a person steer it.
 
 The recording is moved as one rigid, upright piece: it is turned about the vertical and shifted; its movement from frame
-to frame never changes. A fixed grid of places is searched, coarse and then finer. The best place shows whole bodies at
-the most moments; among equals the one where they are larger wins. At first the camera is in front of the avatars, in
-the direction that a heading of 0 faces. Over a drawn background the camera is also tilted by one constant angle, so
-that it does not look down on people. The moments are those of the scene's first seconds, however many frames a run
-shows and at whatever rate: a frame of a scene is the same picture in every run.
+to frame never changes. The best place shows whole bodies at the most moments; among equals the one where they are
+larger wins. Places are searched where the camera looks: along rays through its pictures, at distances from one that
+fills the picture with a body to many times the length of the path. So the search has no scale of its own. The best of
+them climb from there, in steps that are shares of the distance. At first the camera is in front of the avatars, in the
+direction that a heading of 0 faces. Over a drawn background the camera is also tilted by one constant angle, so that it
+does not look down on people, unless that hides them. The moments are those of the scene's first seconds, however many
+frames a run shows and at whatever rate: a frame of a scene is the same picture in every run.
 
 A person turns the view about the vertical through a pivot, then about the level axis that runs to the camera's right.
 The camera stays upright, above the floor and off the pole; where the scene's own camera is beyond that, it is not
@@ -25,7 +27,7 @@ from trilane.body.kinematics import Skeleton
 from trilane.scene.camera.path import CameraPath, view_from_pose
 from trilane.scene.mover import Mover, outline
 from trilane.scene.rotations import about, quat_from_matrix, quat_multiply
-from trilane.scene.schema import Scene
+from trilane.scene.schema import MAX_DEPTH_RATIO, CameraSpec, Scene
 from trilane.shapes import Shape
 
 
@@ -96,24 +98,33 @@ def _turn(arm: F64, azimuth_deg: float, elevation_deg: float) -> F64:
 #: Number of moments at which a place is scored, evenly spread over the first SCORED_S seconds of the scene. A shorter
 #: motion or recording is repeated as in a run; what a longer one shows later does not count.
 SCORED_MOMENTS, SCORED_S = 48, 10.0
-#: The grid of places, metres: level up to REACH_M each way from the camera and EYE_HEIGHTS_M below it, first in steps
-#: of COARSE_M, then in those of FINER_M around the best place so far.
-REACH_M, COARSE_M = 7.0, 0.5
-EYE_HEIGHTS_M: F64 = np.arange(0.8, 3.61, 0.2)
-FINER_M = (0.25, 0.12, 0.06)
+#: Moments whose pictures rays go through: one of RAYS_EVERY. Where they go through a picture, as shares of its
+#: half width and half height.
+RAYS_EVERY, RAYS_AT = 4, (-0.8, -0.4, 0.0, 0.4, 0.8)
+#: Nearest distance on a ray, in distances at which the tallest box of the bodies fills the picture; the farthest, in
+#: these distances and in lengths of the path added; factor from one distance to the next. Far off a path of any length
+#: is a pan.
+NEAREST, FARTHEST, FARTHEST_OF_PATH, FARTHER = 0.7, 30.0, 10.0, 1.25
+#: Number of places that climb, and least distance between them in the beginning, as a share of that from the camera.
+CLIMBERS, APART = 24, 0.15
+#: Steps of a climb, as shares of the distance from the camera.
+STEPS = tuple(0.3 * 0.7**k for k in range(15))
 #: Least height of the camera above the floor.
 LOWEST_EYE_M = 0.3
 #: Share of the picture's half width and half height within which a body counts as whole in the picture.
 MARGIN = 0.97
-#: Share of the moments with whole bodies below which the run warns.
-ENOUGH_WHOLE = 0.5
 #: Range of the camera's median line of sight, degrees above the horizon; beyond it the camera is tilted to its end.
 SIGHT_DEG = (-24.0, 0.0)
 LARGEST_TILT_DEG = 40.0
 SYNTHETIC_BACKGROUNDS = ("room",)
-#: Score of the bodies' share of the picture's height, up to ENOUGH_SIZE; whole bodies at all moments score 1.
-SIZE_WEIGHT, ENOUGH_SIZE = 0.12, 0.75
+#: Score of the bodies' share of the picture's height, up to ENOUGH_SIZE; whole bodies at all moments score 1. No gain
+#: in size is worth a twentieth of the moments.
+SIZE_WEIGHT, ENOUGH_SIZE = 0.05, 0.75
+#: Score of bodies that are nearly in the picture: less than a moment's, it leads a climb to the next moment.
+NEARLY_WEIGHT = 0.01
 NEAREST_M = 0.3
+#: Share by which the far clip plane is beyond the farthest that a body can be from the camera.
+BEYOND = 1.1
 #: Number of places that are scored together: so few that the arrays stay in the processor's cache.
 PLACES_AT_ONCE = 256
 
@@ -124,13 +135,14 @@ class _Footage:
 
     `views` (F, 3, 4): matrices from the path's world to the camera. `eyes` (F, 3): places of the camera in the path's
     world. `boxes` (F, 8, 3): corners of a box around the bodies in the scene's world. `lenses` (F, 2, 2): factor and
-    addend of x and of y, where ndc = factor * x / depth + addend.
+    addend of x and of y, where ndc = factor * x / depth + addend. `nearest_m`: depth from which on a body is seen.
     """
 
     views: F32
     eyes: F64
     boxes: F64
     lenses: F64
+    nearest_m: float = NEAREST_M
 
 
 def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> PlacedCamera:
@@ -141,42 +153,47 @@ def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies
     `movers`: avatars of the scene.
     `bodies`: bodies of these avatars, in the same order.
     """
+    if path.recorded and scene.camera.place == "auto":
+        return _placed(path, scene, movers, bodies)
+    return PlacedCamera(path, np.eye(3), np.zeros(3), np.eye(3), ())
+
+
+def _placed(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> PlacedCamera:
+    """Return the recorded camera of `path` at its best place."""
     times = np.linspace(0.0, SCORED_S, SCORED_MOMENTS)
-    if not path.recorded:
-        return PlacedCamera(path, np.eye(3), np.zeros(3), np.eye(3), ())
-    if scene.camera.place == "none":
-        footage = _footage(path, np.eye(3), times, scene, movers, bodies)
-        whole, size = _filmed(footage, footage.boxes.astype(np.float32).transpose(2, 1, 0)[:, :, None])
-        return PlacedCamera(path, np.eye(3), np.zeros(3), np.eye(3), _seen_notes(whole[0], size[0]))
     levelled, level, middle = _from_the_middle(path)
-    tilt = _tilt_deg(path, times) if scene.background in SYNTHETIC_BACKGROUNDS else 0.0
-    mount = about(0, np.radians(tilt))
-    footage = _footage(levelled, mount, times, scene, movers, bodies)
-    places = _coarse_grid(footage)
-    best = _best(footage, places)
-    for step in FINER_M:
-        best = _best(footage, _finer_grid(best, step))
-    whole, size = _visibility(footage, best[None])
+    bounds = _bounds(times, movers, bodies)
+    tilts = [_tilt_deg(path, times), 0.0] if scene.background in SYNTHETIC_BACKGROUNDS else [0.0]
+    found = []
+    for tilt in dict.fromkeys(tilts):
+        mount = about(0, np.radians(tilt))
+        footage = _footage(levelled, mount, times, scene, bounds)
+        best = _climbed(footage, _seeds(footage))
+        found.append((_score(*_visibility(footage, best[None]))[0], tilt, mount, footage, best))
+    _, tilt, mount, footage, best = max(found, key=lambda one: one[0])
     turn, shift = _transform(footage, best)
     eye = best[1] * -1 + footage.eyes[:, 1].mean()
-    tilted = (f"camera tilted by {tilt:+.0f} degrees on its mount",) if tilt else ()
+    far_m, far_notes = _far(levelled.places, footage.boxes @ turn + best, scene.camera)
     notes = (
-        *tilted,
+        *((f"camera tilted by {tilt:+.0f} degrees on its mount",) if tilt else ()),
         f"camera set down {_distance(footage, best):.1f} m from the avatar, {eye:.1f} m over the floor on average",
-        *_seen_notes(whole[0], size[0]),
+        *far_notes,
     )
-    return PlacedCamera(path, turn @ level, shift - turn @ level @ middle, mount, notes)
+    seeing = replace(path, optics=replace(path.optics, far_m=far_m))
+    return PlacedCamera(seeing, turn @ level, shift - turn @ level @ middle, mount, notes)
 
 
-def _seen_notes(whole: float, size: float) -> tuple[str, ...]:
-    """Say how much of the bodies is filmed, with a warning where it is little."""
-    seen = f"whole body in the picture in {whole:.0%} of the first {SCORED_S:g} s, {size:.0%} of its height on average"
-    if whole >= ENOUGH_WHOLE:
-        return (seen,)
-    return seen, (
-        f"warning: the body is whole in less than {ENOUGH_WHOLE:.0%} of them; if the picture lies on its side or looks "
-        "past the body, state camera.up_axis or another camera.place"
-    )
+def _far(places: F64, boxes: F64, spec: CameraSpec) -> tuple[float, tuple[str, ...]]:
+    """Return the distance of the far clip plane, at which no body in `boxes` is cut off, and a note where it grows.
+
+    `places` (N, 3): places of the camera, in the world of `boxes` (F, 8, 3).
+    """
+    corners = boxes.reshape(-1, 3)
+    low, high = np.minimum(places.min(axis=0), corners.min(axis=0)), np.maximum(places.max(axis=0), corners.max(axis=0))
+    needed = min(BEYOND * float(np.linalg.norm(high - low)), MAX_DEPTH_RATIO * spec.near_m)
+    if needed <= spec.far_m:
+        return spec.far_m, ()
+    return needed, (f"far clip plane at {needed:.0f} m in place of {spec.far_m:g} m, beyond the body",)
 
 
 def _from_the_middle(path: CameraPath) -> tuple[CameraPath, F64, F64]:
@@ -197,17 +214,17 @@ def _tilt_deg(path: CameraPath, times: F64) -> float:
     return float(np.clip(np.clip(sight, *SIGHT_DEG) - sight, -LARGEST_TILT_DEG, LARGEST_TILT_DEG))
 
 
-def _footage(
-    path: CameraPath, mount: F64, times: F64, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]
-) -> _Footage:
+def _footage(path: CameraPath, mount: F64, times: F64, scene: Scene, bounds: tuple[F64, F64]) -> _Footage:
+    """Return the recording at `times` (F,); `bounds`: result of `_bounds`."""
     poses = [path.pose(float(t)) for t in times]
     views = np.stack([view_from_pose(turn @ mount, place)[:3] for turn, place in poses]).astype(np.float32)
-    lows, highs = _bounds(times, movers, bodies)
+    lows, highs = bounds
     pick = np.array([[(k >> axis) & 1 for axis in range(3)] for k in range(8)], dtype=bool)
     boxes = np.where(pick[None], highs[:, None], lows[:, None])
     clips = np.stack([path.projection(float(t), (scene.output.height, scene.output.width)) for t in times])
     lenses = np.stack([[clips[:, k, k], -clips[:, k, 2]] for k in range(2)]).transpose(2, 0, 1)
-    return _Footage(views, np.stack([place for _, place in poses]), boxes, lenses)
+    nearest = max(NEAREST_M, scene.camera.near_m)
+    return _Footage(views, np.stack([place for _, place in poses]), boxes, lenses, nearest)
 
 
 def _bounds(times: F64, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> tuple[F64, F64]:
@@ -222,29 +239,109 @@ def _bounds(times: F64, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -
     return lows, highs
 
 
-def _coarse_grid(footage: _Footage) -> F64:
-    """Return places (S, 3) to try for the scene's origin, in the path's world."""
-    middle = footage.eyes.mean(axis=0)
-    level = np.arange(-REACH_M, REACH_M + COARSE_M / 2, COARSE_M)
-    x, height, z = np.meshgrid(level, EYE_HEIGHTS_M, level, indexing="ij")
-    return np.asarray(middle + np.stack([x.ravel(), -height.ravel(), z.ravel()], axis=1))
+def _seeds(footage: _Footage) -> F64:
+    """Return places (S, 3) to try for the scene's origin, in the path's world: where the camera looks."""
+    picked = slice(None, None, RAYS_EVERY)
+    x, y = (axis.ravel() for axis in np.meshgrid(RAYS_AT, RAYS_AT))
+    lenses, turns, eyes = footage.lenses[picked], footage.views[picked, :, :3].astype(np.float64), footage.eyes[picked]
+    across = [(at - lenses[:, k, 1, None]) / lenses[:, k, 0, None] for k, at in enumerate((x, y))]
+    rays = np.stack([*across, -np.ones_like(across[0])], axis=-1) @ turns  # view to world is the transpose
+    heights = np.ptp(footage.boxes[:, :, 1], axis=1)
+    fills = float((heights * footage.lenses[:, 1, 0] / 2).max())
+    far = FARTHEST * fills + FARTHEST_OF_PATH * float(np.linalg.norm(np.ptp(footage.eyes, axis=0)))
+    depths = NEAREST * fills * FARTHER ** np.arange(np.log(far / (NEAREST * fills)) / np.log(FARTHER) + 1)
+    points = (eyes[:, None, None] + rays[:, :, None] * depths[:, None]).reshape(-1, 3)
+    points = np.concatenate([points, _looked_at(footage)[None]])
+    # The middle of the bodies comes to each point; they face the camera as they would with the origin there.
+    middles = footage.boxes.mean(axis=1)
+    middle = np.repeat(middles[picked], len(RAYS_AT) ** 2 * len(depths), axis=0)
+    middle = np.concatenate([middle, middles.mean(axis=0)[None]])
+    angle = _facing(footage, points)
+    cos, sin = np.cos(angle), np.sin(angle)
+    offsets = np.stack(
+        [cos * middle[:, 0] + sin * middle[:, 2], middle[:, 1], cos * middle[:, 2] - sin * middle[:, 0]], axis=1
+    )
+    places = points - offsets
+    places[:, 1] = np.minimum(places[:, 1], _highest_floor(footage))
+    return np.asarray(places)
 
 
-def _finer_grid(place: F64, step: float) -> F64:
-    offsets = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], dtype=np.float64)
-    return np.asarray(np.concatenate([place[None], place + step * offsets]))
+def _looked_at(footage: _Footage) -> F64:
+    """Return the point (3,) nearest to all lines of sight; of several, the one nearest to the middle of the eyes.
+
+    The point solves the normal equations of the distances: sum (1 - d d') (x - p) = 0 for places p and directions d.
+    """
+    ahead = -footage.views[:, 2, :3].astype(np.float64)
+    across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
+    offsets = footage.eyes - footage.eyes.mean(axis=0)
+    point = np.linalg.lstsq(across.sum(axis=0), (across @ offsets[:, :, None]).sum(axis=0)[:, 0], rcond=1e-6)[0]
+    return np.asarray(point + footage.eyes.mean(axis=0))
+
+
+def _highest_floor(footage: _Footage) -> float:
+    return float(footage.eyes[:, 1].min()) - LOWEST_EYE_M
+
+
+def _climbed(footage: _Footage, seeds: F64) -> F64:
+    """Return the best place (3,) to which the best of `seeds` (S, 3) climb."""
+    scores = _in_parts(footage, seeds)
+    climbers = _apart(footage, seeds[np.argsort(-scores, kind="stable")])
+    offsets = np.array([(x, y, z) for x in (0, -1, 1) for y in (0, -1, 1) for z in (0, -1, 1)], dtype=np.float64)
+    for step in STEPS:
+        lengths = step * _distances(footage, climbers)
+        tried = climbers[:, None] + lengths[:, None, None] * offsets
+        scores = _in_parts(footage, tried.reshape(-1, 3)).reshape(len(climbers), -1)
+        climbers = tried[np.arange(len(climbers)), scores.argmax(axis=1)]
+    return _best(footage, climbers)
+
+
+def _apart(footage: _Footage, places: F64) -> F64:
+    """Return the first CLIMBERS of `places` (S, 3) that are not near an earlier one."""
+    apart = APART * _distances(footage, places)
+    kept: list[int] = []
+    for k in range(len(places)):
+        if not kept or np.linalg.norm(places[kept] - places[k], axis=1).min() > apart[k]:
+            kept.append(k)
+        if len(kept) == CLIMBERS:
+            break
+    return np.asarray(places[kept])
+
+
+def _distances(footage: _Footage, places: F64) -> F64:
+    """Return the median distance of the eyes from each of `places` (S, 3)."""
+    return np.asarray(np.median(np.linalg.norm(footage.eyes[None] - places[:, None], axis=2), axis=1))
+
+
+def _in_parts(footage: _Footage, places: F64) -> F64:
+    """Return the scores (S,) of places for a climb."""
+    parts = np.split(places, range(PLACES_AT_ONCE, len(places), PLACES_AT_ONCE))
+    scores = []
+    for part in parts:
+        whole, size, nearly = _seen(footage, part)
+        scores.append(_score(whole, size) + NEARLY_WEIGHT * nearly)
+    return np.where(places[:, 1] <= _highest_floor(footage), np.concatenate(scores), -1.0)
+
+
+def _score(whole: F64, size: F64) -> F64:
+    return np.asarray(whole + SIZE_WEIGHT * np.minimum(size, ENOUGH_SIZE))
 
 
 def _best(footage: _Footage, places: F64) -> F64:
-    parts = np.split(places, range(PLACES_AT_ONCE, len(places), PLACES_AT_ONCE))
-    whole, size = (np.concatenate(values) for values in zip(*(_visibility(footage, p) for p in parts), strict=True))
-    score = whole + SIZE_WEIGHT * np.minimum(size, ENOUGH_SIZE)
-    score = np.where(footage.eyes[:, 1].min() - places[:, 1] >= LOWEST_EYE_M, score, -1.0)
+    score = np.where(places[:, 1] <= _highest_floor(footage), _score(*_visibility(footage, places)), -1.0)
     return np.asarray(places[int(score.argmax())])
 
 
 def _visibility(footage: _Footage, places: F64) -> tuple[F64, F64]:
-    """Return the share of moments with whole bodies, and their mean share of the picture's height; both (S,)."""
+    """Return the share of moments with whole bodies, and their mean share of the picture's height; both (S,).
+
+    A body that is not whole counts for nothing.
+    """
+    whole, size, _ = _seen(footage, places)
+    return whole, size
+
+
+def _seen(footage: _Footage, places: F64) -> tuple[F64, F64, F64]:
+    """Return the result of `_visibility`, and how nearly bodies are in the picture, 0 to 1 on average; all (S,)."""
     angle = _facing(footage, places)
     cos, sin = (f(angle).astype(np.float32)[:, None] for f in (np.cos, np.sin))
     by_axis = footage.boxes.astype(np.float32).transpose(2, 1, 0)  # the corners' axis comes first: faster to reduce
@@ -253,20 +350,16 @@ def _visibility(footage: _Footage, places: F64) -> tuple[F64, F64]:
     x = cos * corners[0] + sin * corners[2] + places32[:, 0]
     y = corners[1] + places32[:, 1]
     z = cos * corners[2] - sin * corners[0] + places32[:, 2]
-    return _filmed(footage, (x, y, z))
-
-
-def _filmed(footage: _Footage, corners: Sequence[F32] | F32) -> tuple[F64, F64]:
-    """Return the result of `_visibility` for boxes with `corners` x, y, z, each (8, S, F), in the path's world."""
-    x, y, z = corners
     right, up, back = (_row(footage.views[:, k], x, y, z) for k in range(3))
-    depth = np.maximum(-back, NEAREST_M)
-    in_front = (-back > NEAREST_M).all(axis=0)
+    depth = np.maximum(-back, footage.nearest_m)
+    in_front = (-back > footage.nearest_m).all(axis=0)
     (x_scale, x_add), (y_scale, y_add) = footage.lenses.astype(np.float32).transpose(1, 2, 0)
     x_ndc, y_ndc = right * x_scale / depth + x_add, up * y_scale / depth + y_add
-    inside = (np.abs(x_ndc) < MARGIN).all(axis=0) & (np.abs(y_ndc) < MARGIN).all(axis=0)
-    tall = (np.clip(y_ndc.max(axis=0), -1, 1) - np.clip(y_ndc.min(axis=0), -1, 1)) / 2
-    return (in_front & inside).mean(axis=1), np.where(in_front, tall, 0.0).mean(axis=1)
+    outermost = np.maximum(np.abs(x_ndc).max(axis=0), np.abs(y_ndc).max(axis=0))
+    is_whole = in_front & (outermost < MARGIN)
+    tall = (y_ndc.max(axis=0) - y_ndc.min(axis=0)) / 2
+    nearly = np.where(in_front, np.clip(1 + MARGIN - outermost, 0, 1), 0.0)
+    return is_whole.mean(axis=1), np.where(is_whole, tall, 0.0).mean(axis=1), nearly.mean(axis=1)
 
 
 def _row(row: F32, x: F32, y: F32, z: F32) -> F32:

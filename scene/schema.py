@@ -107,14 +107,47 @@ class AvatarSpec(Table):
         return self
 
 
+#: Directions of a camera, right-handed: x right, y up, z back.
+DIRECTIONS = {
+    "right": (1, 0, 0),
+    "left": (-1, 0, 0),
+    "up": (0, 1, 0),
+    "down": (0, -1, 0),
+    "back": (0, 0, 1),
+    "forward": (0, 0, -1),
+}
+AXES_EXPECTED = (
+    "directions of x, y and z joined by hyphens, right-handed, such as right-down-forward (cameras), forward-left-up "
+    "(robots) or forward-right-down (aircraft)"
+)
+
+
+def axes_of(text: str) -> tuple[tuple[int, int, int], ...] | None:
+    """Return the directions of x, y and z, as DIRECTIONS has them; None unless they are right-handed axes."""
+    words = text.split("-")
+    if len(words) != 3 or not set(words) <= set(DIRECTIONS):
+        return None
+    x, y, z = (DIRECTIONS[word] for word in words)
+    cross = tuple(x[(k + 1) % 3] * y[(k + 2) % 3] - x[(k + 2) % 3] * y[(k + 1) % 3] for k in range(3))
+    return (x, y, z) if cross == z else None
+
+
+def _camera_axes(text: str) -> str:
+    if text != AUTO and axes_of(text) is None:
+        raise UnexpectedValue(repr(text), f"{AUTO}, or {AXES_EXPECTED}")
+    return text
+
+
 class CameraSpec(Table):
     """The camera.
 
     `source`: `builtin:NAME`, a file or a folder. `fov_y_deg`: field of view over the picture's height; None for that of
     the file, or the usual one of its format. `up_axis`: axis that is up in the file's world. `metres_per_unit`: unit of
     its lengths in metres; None for what the file says or what is likely. `rate_hz`: frames a second of a file without
-    times. `near_m`, `far_m`: distances of the clip planes. `place`: whether a recorded camera is placed in the scene
-    (`auto`) or stays where it was recorded (`none`).
+    times. `axes`: directions of x, y and z of a pose, such as `forward-left-up`; `auto` for those of the format.
+    `near_m`, `far_m`: distances of the clip planes; the far one is moved beyond a body that a placed camera films from
+    farther off. `place`: whether a camera is placed in the scene (`auto`: a recorded one where it films the avatars, a
+    built-in one goes along with them) or stays where it is (`none`).
     """
 
     source: str = "builtin:orbit"
@@ -123,6 +156,7 @@ class CameraSpec(Table):
     up_axis: Literal["auto", "x", "-x", "y", "-y", "z", "-z"] = "auto"
     metres_per_unit: float | None = Field(default=None, gt=0, le=1e6, allow_inf_nan=False)
     rate_hz: float | None = Field(default=None, ge=1e-3, le=1000, allow_inf_nan=False)
+    axes: Annotated[str, AfterValidator(_camera_axes)] = AUTO
     near_m: float = Field(default=0.05, gt=0, allow_inf_nan=False)
     far_m: float = Field(default=100.0, gt=0, allow_inf_nan=False)
     place: Literal["auto", "none"] = "auto"

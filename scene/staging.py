@@ -26,6 +26,7 @@ from trilane.scene.motion.files import load_motion
 from trilane.scene.motion.motion import Motion, Wrap
 from trilane.scene.mover import Mover, make_mover
 from trilane.scene.schema import Scene
+from trilane.scene.visibility import seen_notes
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,9 @@ def stage_scene(scene: Scene, bodies: Sequence[ShapedBody], base: Path, footage:
     path, seen = filmed(load_camera(scene.camera, base), footage, output)
     camera = place_camera(path, scene, movers, bodies)
     notes = [f"motion: {note}" for mover in movers for note in (*mover.motion.notes, *mover.notes)]
-    notes += [f"camera: {note}" for note in (*path.notes, *((path.course,) if path.recorded else ()), *camera.notes)]
+    shown = seen_notes(camera, scene, movers, bodies)
+    courses = (path.course,) if path.recorded else ()
+    notes += [f"camera: {note}" for note in (*path.notes, *courses, *camera.notes, *shown)]
     notes += [f"background: {note}" for note in seen]
     return Staged(movers, camera, tuple(notes))
 

@@ -25,6 +25,7 @@ from trilane.hw_profiles.profile_files import HOST, load_profile
 from trilane.memory import shortage
 from trilane.pipeline.memory import Assets
 from trilane.scene.footage import Footage
+from trilane.scene.missing_person import require_person
 from trilane.scene.planner import TensorBudget
 from trilane.scene.schema import Scene, find_scene, load_scene, located, scene_from
 from trilane.scene.staging import Staged, stage_scene
@@ -116,6 +117,8 @@ def configure(options: RunOptions, out_dir: Path, gl: GlFacts = gl_facts) -> Che
     require_one_tensor(list(avatars.values()))
     bodies = [avatars[folder].shaped for folder in folders]
     staged = stage_scene(scene, bodies, Path.cwd(), footage)
+    if not options.allow_empty:
+        require_person(scene, staged, bodies, Path.cwd(), footage)
     _check_pictures(scene, staged)
     network = avatars[folders[0]].network
     cuts = requested_cuts(options.split, network)

@@ -118,6 +118,9 @@ class RunOptions(Options):
     size: Annotated[Text | None, Option(offered=("auto", "96", "128", "192", "256", "384", "512"))] = Field(
         default=None, description=f"{SIZE_HELP} auto: planned, as the network paints best."
     )
+    allow_empty: Annotated[bool, Option("--allow-empty")] = Field(
+        default=False, description="Run also where a recorded camera shows nobody in half of its first 10 s."
+    )
     hud: bool | None = Field(default=None, description="Write frame, rate and age on the picture.")
     policy: Annotated[str, one_of(*POLICIES), Option(words=tuple(POLICIES), offered=tuple(POLICIES))] = Field(
         default="pipelined",

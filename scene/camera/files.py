@@ -54,7 +54,7 @@ from trilane.scene.camera.trajectories import (
     load_tum,
 )
 from trilane.scene.rotations import matrix_from_quat, normalised
-from trilane.scene.schema import BUILT_IN_PREFIX, CameraSpec
+from trilane.scene.schema import BUILT_IN_PREFIX, CameraSpec, axes_of
 
 EXPECTED = (
     "a camera: an ARKit log, a TUM, KITTI or EuRoC trajectory, a transforms.json, odometry.csv of Stray Scanner, "
@@ -105,10 +105,10 @@ OTHERS = {
 }
 
 
-def detect(path: Path, up_axis: str = AUTO) -> Guess:
+def detect(path: Path, up_axis: str = AUTO, axes: str = AUTO) -> Guess:
     """Return the format of `path`. Raises BadInputError when it is none, or may be two.
 
-    `up_axis`: axis that is up, from the scene.
+    `up_axis`: axis that is up, from the scene. `axes`: axes of a pose, from the scene.
     """
     if path.is_dir():
         return _of_folder(path)
@@ -117,7 +117,7 @@ def detect(path: Path, up_axis: str = AUTO) -> Guess:
         return Guess("colmap", "a file of a COLMAP model")
     if path.suffix.lower() == ".json" or read_text(path, EXPECTED).lstrip()[:1] == "{":
         return _of_json(path)
-    return _of_table(path, layout_of(path, EXPECTED), up_axis)
+    return _of_table(path, layout_of(path, EXPECTED), up_axis, axes)
 
 
 def _of_json(path: Path) -> Guess:
@@ -140,7 +140,7 @@ def _of_folder(path: Path) -> Guess:
     )
 
 
-def _of_table(path: Path, layout: TableLayout, up_axis: str) -> Guess:
+def _of_table(path: Path, layout: TableLayout, up_axis: str, axes: str) -> Guess:
     columns = layout.columns
     if layout.has_pose and "frame" in layout.names:
         return Guess("stray", "column names with a frame, a place and a quaternion")
@@ -150,13 +150,13 @@ def _of_table(path: Path, layout: TableLayout, up_axis: str) -> Guess:
         return Guess("euroc" if scalar_first and layout.is_ns else "tum", reason)
     _require_pose(path, layout)
     if columns in (MATRIX, MATRIX + 1):
-        return _of_matrices(path, head_of(path, columns, EXPECTED), up_axis)
+        return _of_matrices(path, head_of(path, columns, EXPECTED), up_axis, axes)
     if columns >= TUM_COLUMNS and layout.has_commas and layout.is_ns:
-        _require_one_order(path, head_of(path, columns, EXPECTED), EUROC_NAMES)
+        _require_one_order(path, head_of(path, columns, EXPECTED), EUROC_NAMES, _axes("euroc", axes))
         reason = f"{columns} columns with commas and times in ns: the quaternion's scalar is taken to be first"
         return Guess("euroc", reason)
     if columns == TUM_COLUMNS:
-        _require_one_order(path, head_of(path, columns, EXPECTED), TUM_NAMES)
+        _require_one_order(path, head_of(path, columns, EXPECTED), TUM_NAMES, _axes("tum", axes))
         return Guess("tum", f"{columns} columns: the quaternion's scalar is taken to be last")
     counts = f"{TUM_COLUMNS} (TUM, EuRoC), {MATRIX} (KITTI) or {MATRIX + 1} (ARKit), or column names"
     raise BadInputError(path, f"{columns} columns", counts, OTHERS.get(columns, ""))
@@ -192,10 +192,10 @@ def _unevenness(column: F64) -> float:
     return float(np.median(np.abs(steps - middle))) / middle
 
 
-def _of_matrices(path: Path, numbers: F64, up_axis: str) -> Guess:
+def _of_matrices(path: Path, numbers: F64, up_axis: str, axes: str) -> Guess:
     """Return the format of a table (N, 12 or 13) of matrices.
 
-    KITTI's and ARKit's cameras look along opposite axes.
+    KITTI's and ARKit's cameras look along opposite axes, unless the scene states `axes`.
     """
     matrices = numbers[:, -MATRIX:].reshape(-1, 3, 4)
     rows = numbers[sound := are_rotations(matrices[:, :, :3])]
@@ -212,7 +212,7 @@ def _of_matrices(path: Path, numbers: F64, up_axis: str) -> Guess:
         if has_time:
             _require_clock(path, rows, (4, 8, 12))
         signs = _signs(matrices[sound], _ups(up_axis, has_time=has_time))
-        if signs["kitti" if has_time else "arkit"] or not (has_time or signs["kitti"]):
+        if axes == AUTO and (signs["kitti" if has_time else "arkit"] or not (has_time or signs["kitti"])):
             why = " and ".join((*signs["kitti"], *signs["arkit"])) or "which do not tell where the camera looks"
             raise BadInputError(path, f"{columns}3x4 matrices, {why}", "what fits one format", WHICH_MATRIX)
     return Guess(usual, f"{columns}a 3x4 matrix{'' if numbers.shape[1] > MATRIX else ' without a time'}")
@@ -251,11 +251,12 @@ def _signs(matrices: F64, ups: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
     return {kind: tuple(why for why, holds in of.items() if holds) for kind, of in said.items()}
 
 
-def _require_one_order(path: Path, numbers: F64, names: tuple[str, ...]) -> None:
+def _require_one_order(path: Path, numbers: F64, names: tuple[str, ...], axes: F64) -> None:
     """Raise BadInputError where the quaternion's parts may be in another order than `names` of a table's columns.
 
     This holds where another order makes cameras more level, or where the other usual one (scalar first or last) makes
-    them as level. A map of SLAM that begins without a turn has the 1 where its scalar is.
+    them as level. A map of SLAM that begins without a turn has the 1 where its scalar is. `axes` (3, 3): camera's axes
+    in those of a pose.
     """
     at = names.index("qw"), names.index("qx"), names.index("qy"), names.index("qz")
     first_of = min(at)
@@ -271,7 +272,7 @@ def _require_one_order(path: Path, numbers: F64, names: tuple[str, ...]) -> None
     own = tuple(k - first_of for k in at)
     one = np.abs(np.abs(quats[0]) - 1) < EXACT
     some = quats[:: len(quats) // 100 + 1]
-    prices = {order: _price(some, order) for order in permutations(range(4)) if not one.any() or one[order[0]]}
+    prices = {order: _price(some, order, axes) for order in permutations(range(4)) if not one.any() or one[order[0]]}
     other = (3, 0, 1, 2) if own[0] == 0 else (0, 1, 2, 3)
     mine = prices.get(own, np.inf)
     if not (mine < min(prices.values()) + MUCH_DEARER and mine < prices.get(other, np.inf) - AS_DEAR):
@@ -288,9 +289,9 @@ def _has_digits(numbers: F64) -> bool:
     return bool((np.abs(numbers - np.round(numbers, 3)) > EXACT).any())
 
 
-def _price(quats: F64, order: tuple[int, ...]) -> float:
+def _price(quats: F64, order: tuple[int, ...], axes: F64) -> float:
     """Return how far from level a camera is whose w, x, y, z are the columns `order` of `quats` (N, 4)."""
-    return price_of(matrix_from_quat(normalised(quats[:, order])) @ OPENGL_FROM_OPTICAL, "z")
+    return price_of(matrix_from_quat(normalised(quats[:, order])) @ axes, "z")
 
 
 #: Reader of each format, called with a path and the scene's rate.
@@ -308,6 +309,26 @@ _READERS: dict[str, Callable[[Path, float | None], RawCamera]] = {
 FOLDERS = ("colmap", "nerf", "record3d", "stray")
 
 
+#: Formats whose poses have OpenGL axes; those of the others are optical.
+OPENGL_KINDS = ("arkit", "nerf", "record3d")
+
+
+def _axes(kind: str, stated: str) -> F64:
+    """Return the camera's OpenGL axes as columns (3, 3) in the axes of a pose of the format, or in those `stated`."""
+    axes = axes_of(stated)
+    if axes is None:
+        return np.eye(3) if kind in OPENGL_KINDS else OPENGL_FROM_OPTICAL
+    return np.array(axes, dtype=np.float64)  # row k: direction of the pose's axis k in the camera
+
+
+def _with_axes(raw: RawCamera, kind: str, stated: str) -> RawCamera:
+    """Return `raw` with the axes that the scene states in place of those of the format."""
+    if stated == AUTO:
+        return raw
+    turns = raw.turns @ _axes(kind, AUTO).T @ _axes(kind, stated)
+    return replace(raw, turns=turns, notes=(*raw.notes, f"axes of a pose: {stated}, as given"))
+
+
 def load_camera(spec: CameraSpec, base: Path) -> CameraPath:
     """Load the camera that `spec.source` names; a relative path starts at `base`.
 
@@ -321,11 +342,11 @@ def load_camera(spec: CameraSpec, base: Path) -> CameraPath:
             raise BadInputError("camera", repr(spec.source), f"{BUILT_IN_PREFIX}{{{names}}} or a file", near)
         return built_in
     path = base / spec.source
-    guess = detect(path, spec.up_axis) if spec.format == "auto" else Guess(spec.format, "")
+    guess = detect(path, spec.up_axis, spec.axes) if spec.format == "auto" else Guess(spec.format, "")
     if not (path.is_dir() and guess.kind in FOLDERS):
         require_file(path, EXPECTED)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # non-finite values are left out later
-        raw = _READERS[guess.kind](path, spec.rate_hz)
+        raw = _with_axes(_READERS[guess.kind](path, spec.rate_hz), guess.kind, spec.axes)
         camera = path_from_recording(raw, str(path), spec)
     reason = guess.reason or "as given"
     taken = f"taken for {camera.detected.format}: {reason}"

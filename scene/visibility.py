@@ -1,0 +1,103 @@
+"""How much of the avatars a camera shows: over the frames of a run, or at moments.
+
+A body is given by its outline. It is whole in a frame when all points of the outline are in the picture and between the
+clip planes. Nobody is seen when all points of every body are beyond one side of the picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from trilane.arrays import F64
+from trilane.body.body import ShapedBody
+from trilane.body.kinematics import Skeleton
+from trilane.scene.mover import Mover, outline
+from trilane.scene.schema import Scene
+from trilane.shapes import Shape
+
+#: Number of frames that are looked at; of a longer run as many, evenly spread.
+MOST_FRAMES = 300
+
+
+class Camera(Protocol):
+    """A camera in the scene."""
+
+    def sample(self, t_s: float) -> F64:
+        """Return the matrix (4, 4) from world to camera at `t_s`."""
+
+    def projection(self, t_s: float, output: Shape) -> F64:
+        """Return the OpenGL clip matrix (4, 4) at `t_s` for a picture of `output` (height, width)."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a camera shows at F moments.
+
+    `whole` (F,): whether all bodies are whole in the picture. `nobody` (F,): whether nothing of any body is in it.
+    `height` (F,): share of the picture's height between the lowest and the highest visible point.
+    """
+
+    whole: F64
+    nobody: F64
+    height: F64
+
+
+def seen_at(times_s: F64, camera: Camera, movers: Sequence[Mover], bodies: Sequence[ShapedBody], output: Shape) -> Seen:
+    """Return what `camera` shows of the `movers` with `bodies` at `times_s` (F,).
+
+    `output`: (height, width) of the picture.
+    """
+    actors = [
+        (mover, Skeleton(body.joints, body.body.parents), outline(body))
+        for mover, body in zip(movers, bodies, strict=True)
+    ]
+    rows = []
+    for t_s in map(float, times_s):
+        clip = (camera.projection(t_s, output) @ camera.sample(t_s)).T
+        shown = []
+        for mover, skeleton, shape in actors:
+            pose, translation = mover.sample(t_s)
+            points = shape.posed(skeleton.pose(pose, translation, mover.world).matrices)
+            shown.append(_shown(np.column_stack([points, np.ones(len(points))]) @ clip))
+        rows.append(
+            (
+                all(whole for whole, _, _ in shown),
+                all(high <= low for _, low, high in shown),
+                max((max(high for _, _, high in shown) - min(low for _, low, _ in shown)) / 2, 0.0),
+            )
+        )
+    whole, nobody, height = np.array(rows, dtype=np.float64).T
+    return Seen(whole, nobody, height)
+
+
+def _shown(clip: F64) -> tuple[bool, float, float]:
+    """Return whether points (K, 4) in clip space are all in the picture, and the lowest and highest visible y.
+
+    With nothing in the picture the lowest is 1 and the highest -1.
+    """
+    w = clip[:, 3]
+    beyond = np.concatenate([clip[:, :3] > w[:, None], clip[:, :3] < -w[:, None]], axis=1)
+    if beyond.all(axis=0).any():
+        return False, 1.0, -1.0
+    # Points behind the near plane have no place in the picture; a body that passes through it reaches every border.
+    y = np.clip(clip[:, 1] / w, -1, 1) if (clip[:, 2] >= -w).all() else np.array([-1.0, 1.0])
+    return not beyond.any(), float(y.min()), float(y.max())
+
+
+def seen_notes(camera: Camera, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> tuple[str, ...]:
+    """Say in how many of the run's frames the bodies are whole in the picture, in how many nobody is, and how large."""
+    count = min(scene.frames, MOST_FRAMES)
+    frames = np.arange(count) * scene.frames // count
+    seen = seen_at(frames / scene.fps, camera, movers, bodies, (scene.output.height, scene.output.width))
+    of = f"the {count} frames" if count == scene.frames else f"{count} of the {scene.frames} frames, evenly spread"
+    whole, nobody = float(seen.whole.mean()), float(seen.nobody.mean())
+    height = float(seen.height[seen.nobody == 0].mean()) if nobody < 1 else 0.0
+    parts = [f"whole body in the picture in {whole:.0%} of {of}"]
+    parts += [f"a part of it in {1 - whole - nobody:.0%}"] if round(1 - whole - nobody, 9) else []
+    parts += [f"nobody in {nobody:.0%}"] if nobody else []
+    parts += [f"{height:.0%} of its height on average"] if nobody < 1 else []
+    return (", ".join(parts),)

@@ -1,0 +1,83 @@
+"""A recorded camera that shows nobody is refused, and the key that would show the person is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from support.camera_files import OPTICAL, write_tum
+from trilane.arrays import F64
+from trilane.body.body import ShapedBody
+from trilane.errors import BadInputError
+from trilane.scene.camera.path import axes_towards
+from trilane.scene.missing_person import require_person
+from trilane.scene.rotations import about
+from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
+from trilane.scene.staging import stage_scene
+
+Z_UP: F64 = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+IDLE = (AvatarSpec(motion="builtin:idle"),)
+
+
+def refused(source: Path, body: ShapedBody, **spec: Any) -> str:
+    """What the refusal says; empty where the camera is taken."""
+    scene = Scene(camera=CameraSpec(source=str(source), **spec), avatars=IDLE, background="film.mp4")
+    staged = stage_scene(scene, [body], Path("/"))
+    try:
+        require_person(scene, staged, [body], Path("/"))
+    except BadInputError as error:
+        return str(error)
+    return ""
+
+
+def ring(radius: float) -> tuple[F64, F64]:
+    """A whole circle that looks inwards, Y up."""
+    angle = np.linspace(0, 2 * np.pi, 90)
+    places = radius * np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=1)
+    return axes_towards(places, np.zeros(3)), places
+
+
+def test_a_ring_in_the_wrong_unit_asks_for_the_unit(tmp_path: Path, body: ShapedBody) -> None:
+    """A ring of 0.6 m has no place for a person of 1.7 m; one of 6 m has."""
+    turns, places = ring(0.6)
+    path = write_tum(tmp_path, Z_UP @ turns, places @ Z_UP.T)
+    said = refused(path, body)
+    assert said.startswith(f"camera {path}: found the whole person in the picture in ")
+    assert "camera.metres_per_unit = 10 would show it in 100%, if it is true" in said
+    assert said.endswith("--allow-empty runs it as it is")
+    assert refused(path, body, metres_per_unit=10.0) == ""
+
+
+def test_poses_of_a_robot_ask_for_the_axes(tmp_path: Path, body: ShapedBody) -> None:
+    """A robot that goes round a person and faces the person: z is its up, so a camera with these axes sees the sky."""
+    turns, places = ring(4.0)
+    robot = turns @ np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]).T
+    path = write_tum(tmp_path, Z_UP @ robot @ OPTICAL, places @ Z_UP.T)
+    said = refused(path, body, up_axis="z")
+    assert "in the picture in 0% of the first 10 s at the best place" in said
+    assert 'camera.axes = "forward-left-up" would show it in 100%' in said
+    assert refused(path, body, up_axis="z", axes="forward-left-up") == ""
+
+
+def test_a_camera_that_stays_is_asked_for_its_place(tmp_path: Path, body: ShapedBody) -> None:
+    """Where it was recorded it is 30 m off and looks away; a part of a person in view is enough there."""
+    looks = about(1, np.linspace(0.0, 0.2, 60))
+    path = write_tum(tmp_path, Z_UP @ looks, np.tile([30.0, -7.0, 1.5], (60, 1)))
+    said = refused(path, body, place="none")
+    assert "found a part of the person in the picture in 0% of the first 10 s where it was recorded" in said
+    assert 'camera.place = "auto" would show it in 100%' in said
+    near = write_tum(tmp_path, Z_UP @ looks, np.tile([0.0, -1.0, 1.4], (60, 1)))  # head and shoulders
+    assert refused(near, body, place="none") == ""
+
+
+def test_a_built_in_camera_is_never_refused(body: ShapedBody) -> None:
+    scene = Scene(avatars=(AvatarSpec(position=(500.0, 0.0, 0.0)),), camera=CameraSpec(place="none"))
+    require_person(scene, stage_scene(scene, [body], Path("/")), [body], Path("/"))
+
+
+def test_a_camera_that_turns_round_finds_no_key(tmp_path: Path, body: ShapedBody) -> None:
+    turns = about(1, np.linspace(0, 4 * np.pi, 90))
+    path = write_tum(tmp_path, Z_UP @ turns, np.zeros((90, 3)))
+    assert "no single key would show it: check camera.axes, " in refused(path, body)
