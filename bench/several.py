@@ -21,7 +21,7 @@ from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError
 from trilane.figure_sources import MEASURED
 from trilane.scene.crop import crop_projection
-from trilane.scene.schema import AvatarSpec, Scene
+from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
 from trilane.scene.staging import stage_scene
 from trilane.scene.tensor_layout import MARGIN_PX, TensorLayout, lay_out
 from trilane.shapes import Shape, shape_buckets
@@ -148,7 +148,7 @@ def _views(fixture: _CrowdFixture, avatars: int, views: int, size: str, margin: 
     specs = tuple(
         AvatarSpec(position=((k - (avatars - 1) / 2) * STEP_M, 0.0, -BACK_M * (k % 2))) for k in range(avatars)
     )
-    scene = Scene(avatars=specs)
+    scene = Scene(avatars=specs, camera=CameraSpec(place="none"))
     staged = stage_scene(scene, [fixture.shaped] * avatars, Path.cwd())
     skeleton = Skeleton(fixture.shaped.joints, fixture.shaped.body.parents)
     bounds = MeshBounds(fixture.shaped, standoff_m=CLOTHES_STANDOFF_M)

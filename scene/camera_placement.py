@@ -25,9 +25,11 @@ from trilane.arrays import F32, F64
 from trilane.body.body import ShapedBody
 from trilane.body.kinematics import Skeleton
 from trilane.scene.camera.path import CameraPath, view_from_pose
+from trilane.scene.follow import Way, way_cycle_s, way_of
 from trilane.scene.mover import Mover, outline
 from trilane.scene.rotations import about, quat_from_matrix, quat_multiply
 from trilane.scene.schema import MAX_DEPTH_RATIO, CameraSpec, Scene
+from trilane.scene.visibility import seen_at
 from trilane.shapes import Shape
 
 
@@ -36,7 +38,8 @@ class PlacedCamera:
     """A camera in the scene.
 
     `turn` (3, 3), `shift` (3,): transform from the path's world to the scene's. `mount` (3, 3): turn from the camera's
-    axes to those of the path. `notes`: what was decided, for people.
+    axes to those of the path. `notes`: what was decided, for people. `ways`: ways that the camera goes along with, by
+    their mean; none for a camera that goes its own way.
     """
 
     path: CameraPath
@@ -44,16 +47,24 @@ class PlacedCamera:
     shift: F64
     mount: F64
     notes: tuple[str, ...]
+    ways: tuple[Way, ...] = ()
 
     def sample(self, t_s: float) -> F64:
         """Return the matrix (4, 4) from world to camera at `t_s`; the world is the scene's."""
         turn, place = self.path.pose(t_s)
-        return view_from_pose(self.turn @ turn @ self.mount, self.turn @ place + self.shift)
+        at = self.turn @ place + self.shift
+        if self.ways:
+            at = at + np.mean([way.at(t_s) for way in self.ways], axis=0)
+        return view_from_pose(self.turn @ turn @ self.mount, at)
 
     def reach(self) -> tuple[F64, F64]:
-        """Return the lowest and highest coordinates (3,) of all places of the camera in the scene."""
+        """Return the lowest and highest coordinates (3,) of all places of the camera in the scene, and of its ways."""
         places = self.path.places @ self.turn.T + self.shift
-        return places.min(axis=0), places.max(axis=0)
+        low, high = places.min(axis=0), places.max(axis=0)
+        if self.ways:
+            own = np.concatenate([way.places for way in self.ways])
+            low, high = np.minimum(low, 0) + own.min(axis=0), np.maximum(high, 0) + own.max(axis=0)
+        return low, high
 
     def projection(self, t_s: float, output: Shape) -> F64:
         """Return the OpenGL clip matrix (4, 4) at `t_s` for a picture of `output` (height, width)."""
@@ -125,6 +136,10 @@ NEARLY_WEIGHT = 0.01
 NEAREST_M = 0.3
 #: Share by which the far clip plane is beyond the farthest that a body can be from the camera.
 BEYOND = 1.1
+#: A built-in camera is judged at moments so far apart, over so long at most.
+JUDGED_EVERY_S, JUDGED_S = 0.25, 120.0
+#: Least gain in the share of the bodies in the picture, on average, for which a built-in camera goes along with them.
+LEAST_GAIN = 0.02
 #: Number of places that are scored together: so few that the arrays stay in the processor's cache.
 PLACES_AT_ONCE = 256
 
@@ -146,16 +161,44 @@ class _Footage:
 
 
 def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> PlacedCamera:
-    """Place the camera of a scene; a built-in one, and one whose spec has `place = "none"`, stays where it is.
+    """Place the camera of a scene: a recorded one where it films the avatars, a built-in one along with them.
+
+    One whose spec has `place = "none"` stays where it is.
 
     `path`: path of the camera.
     `scene`: scene, which states the background, the picture's size, and whether the camera is placed.
     `movers`: avatars of the scene.
     `bodies`: bodies of these avatars, in the same order.
     """
-    if path.recorded and scene.camera.place == "auto":
+    camera = PlacedCamera(path, np.eye(3), np.zeros(3), np.eye(3), ())
+    if scene.camera.place == "none":
+        return camera
+    if path.recorded:
         return _placed(path, scene, movers, bodies)
-    return PlacedCamera(path, np.eye(3), np.zeros(3), np.eye(3), ())
+    return _going_along(camera, scene, movers, bodies)
+
+
+def _going_along(
+    camera: PlacedCamera, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]
+) -> PlacedCamera:
+    """Return the built-in `camera`, going along with people who would leave its picture otherwise.
+
+    It is judged over one cycle of camera and motions. It stays as it is where the bodies are whole throughout, or where
+    going along shows hardly more of them: a close-up never shows a whole body.
+    """
+    cycles = (way_cycle_s(mover) for mover in movers)
+    times = np.arange(0.0, min(max(camera.path.duration_s, JUDGED_EVERY_S, *cycles), JUDGED_S), JUDGED_EVERY_S)
+    output = (scene.output.height, scene.output.width)
+    stays = seen_at(times, camera, movers, bodies, output)
+    if stays.whole.all():
+        return camera
+    ways = tuple(way_of(mover, body) for mover, body in zip(movers, bodies, strict=True))
+    along = replace(camera, ways=ways)
+    goes = seen_at(times, along, movers, bodies, output)
+    if goes.share.mean() - stays.share.mean() < LEAST_GAIN:
+        return camera
+    whole = f"whole body in the picture in {goes.whole.mean():.0%} of a cycle in place of {stays.whole.mean():.0%}"
+    return replace(along, notes=(f"goes along with the person over the floor: {whole}",))
 
 
 def _placed(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> PlacedCamera:

@@ -20,6 +20,7 @@ from trilane.body.body import ShapedBody
 from trilane.scene.camera.files import load_camera
 from trilane.scene.camera.path import CameraPath, Optics
 from trilane.scene.camera_placement import PlacedCamera, place_camera
+from trilane.scene.follow import Way
 from trilane.scene.footage import Footage, filmed
 from trilane.scene.lens import Known, Lens
 from trilane.scene.motion.files import load_motion
@@ -147,7 +148,13 @@ def _camera_arrays(camera: PlacedCamera) -> Arrays:
         "turn": camera.turn,
         "shift": camera.shift,
         "mount": camera.mount,
+        "ways": np.array(len(camera.ways)),
+        **{f"way.{index}.{key}": value for index, way in enumerate(camera.ways) for key, value in _way(way).items()},
     }
+
+
+def _way(way: Way) -> Arrays:
+    return {"times_s": way.times_s, "places": way.places, "wrap": np.array(WRAPS.index(way.wrap))}
 
 
 def _camera(arrays: Arrays) -> PlacedCamera:
@@ -165,7 +172,9 @@ def _camera(arrays: Arrays) -> PlacedCamera:
         repeat_s=float(arrays["repeat_s"]),
         began_s=float(arrays["began_s"]) if "began_s" in arrays else None,
     )
-    return PlacedCamera(path, arrays["turn"], arrays["shift"], arrays["mount"], ())
+    parts = (_below(arrays, f"way.{index}.") for index in range(int(arrays["ways"])))
+    ways = tuple(Way(part["times_s"], part["places"], WRAPS[int(part["wrap"])]) for part in parts)
+    return PlacedCamera(path, arrays["turn"], arrays["shift"], arrays["mount"], (), ways)
 
 
 def _optics(arrays: Arrays) -> Optics:

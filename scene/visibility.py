@@ -38,11 +38,13 @@ class Seen:
     """What a camera shows at F moments.
 
     `whole` (F,): whether all bodies are whole in the picture. `nobody` (F,): whether nothing of any body is in it.
-    `height` (F,): share of the picture's height between the lowest and the highest visible point.
+    `share` (F,): share of all outlines' points that are in it. `height` (F,): share of the picture's height between the
+    lowest and the highest visible point.
     """
 
     whole: F64
     nobody: F64
+    share: F64
     height: F64
 
 
@@ -65,27 +67,27 @@ def seen_at(times_s: F64, camera: Camera, movers: Sequence[Mover], bodies: Seque
             shown.append(_shown(np.column_stack([points, np.ones(len(points))]) @ clip))
         rows.append(
             (
-                all(whole for whole, _, _ in shown),
+                all(share == 1.0 for share, _, _ in shown),
                 all(high <= low for _, low, high in shown),
+                float(np.mean([share for share, _, _ in shown])),
                 max((max(high for _, _, high in shown) - min(low for _, low, _ in shown)) / 2, 0.0),
             )
         )
-    whole, nobody, height = np.array(rows, dtype=np.float64).T
-    return Seen(whole, nobody, height)
+    return Seen(*np.array(rows, dtype=np.float64).T)
 
 
-def _shown(clip: F64) -> tuple[bool, float, float]:
-    """Return whether points (K, 4) in clip space are all in the picture, and the lowest and highest visible y.
+def _shown(clip: F64) -> tuple[float, float, float]:
+    """Return the share of points (K, 4) in clip space that are in the picture, and the lowest and highest visible y.
 
     With nothing in the picture the lowest is 1 and the highest -1.
     """
     w = clip[:, 3]
     beyond = np.concatenate([clip[:, :3] > w[:, None], clip[:, :3] < -w[:, None]], axis=1)
     if beyond.all(axis=0).any():
-        return False, 1.0, -1.0
+        return 0.0, 1.0, -1.0
     # Points behind the near plane have no place in the picture; a body that passes through it reaches every border.
     y = np.clip(clip[:, 1] / w, -1, 1) if (clip[:, 2] >= -w).all() else np.array([-1.0, 1.0])
-    return not beyond.any(), float(y.min()), float(y.max())
+    return 1.0 - float(beyond.any(axis=1).mean()), float(y.min()), float(y.max())
 
 
 def seen_notes(camera: Camera, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> tuple[str, ...]:

@@ -26,7 +26,7 @@ frames = 6
 fps = 0.33333333
 size = "auto"
 output = {{width = 96, height = 72}}
-camera = {{source = "builtin:static"}}
+camera = {{source = "builtin:static", place = "none"}}
 [[avatars]]
 bundle = "{bundle}"
 motion = "builtin:there-and-back"

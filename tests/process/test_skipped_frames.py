@@ -24,7 +24,7 @@ FRAMES, KILL_AT = 50, 12
 SCENE = """
 size = "64x64"
 output = {{ width = 96, height = 64 }}
-camera = {{ source = "builtin:static" }}
+camera = {{ source = "builtin:static", place = "none" }}
 [[avatars]]
 motion = "builtin:t-pose"
 position = {position}

@@ -18,7 +18,7 @@ from trilane.errors import TrilaneError
 from trilane.pipeline.description import UnitSettings
 from trilane.scene.crop import Rect, choose_bucket, grow
 from trilane.scene.planner import TensorBudget, plan_tensor
-from trilane.scene.schema import AvatarSpec, OutputSpec, Scene
+from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, Scene
 from trilane.scene.tensor_layout import lay_out
 from trilane.shapes import shape_buckets
 from trilane.stages.avatar_assets import shaped_body, staged_of
@@ -188,7 +188,8 @@ def test_a_planned_packet_is_what_the_planner_says_of_the_avatars_on_the_screen(
 
 
 def test_with_nobody_in_view_the_tensor_is_the_smallest(tiny_bundle: Path, tmp_path: Path) -> None:
-    config = configured(tiny_bundle, tmp_path, avatars=(AvatarSpec(position=(0, 0, 40.0)),), size="256")
+    off, stays = (AvatarSpec(position=(0, 0, 40.0)),), CameraSpec(place="none")
+    config = configured(tiny_bundle, tmp_path, avatars=off, camera=stays, size="256")
     stage, slot = PoseStage(config, assets_of(config)), packet(1)
     stage._buckets = [(64, 64), (20, 100), (50, 50)]
     stage.bind([], [slot])

@@ -21,7 +21,7 @@ from trilane.scene.planner import (
     ideal_shape,
     larger_shapes,
 )
-from trilane.scene.schema import AvatarSpec, OutputSpec, Scene
+from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, Scene
 from trilane.scene.staging import Staged, stage_scene
 from trilane.shapes import shape_buckets
 from trilane.stages.avatar_assets import AvatarData, load_avatar
@@ -93,7 +93,8 @@ def test_changes_are_foreseen_where_looks_are_half_a_second_apart(
 
 
 def test_with_nobody_in_view_one_least_shape_is_made_ready(avatar: AvatarData) -> None:
-    scene = Scene(size="auto", frames=50, avatars=(AvatarSpec(position=(0.0, 0.0, 40.0)),))
+    off, stays = AvatarSpec(position=(0.0, 0.0, 40.0)), CameraSpec(place="none")
+    scene = Scene(size="auto", frames=50, avatars=(off,), camera=stays)
     found = foresee(scene, staged(scene, avatar), [avatar.shaped], avatar.network, [OWN])
     assert (found.shapes.shapes, found.seen) == (((32, 32),), 0)
 

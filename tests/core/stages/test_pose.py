@@ -57,11 +57,12 @@ def test_a_frame_is_the_same_whatever_came_before(tiny_bundle: Path, tmp_path: P
 
 def test_an_avatar_out_of_the_picture_is_not_visible(tiny_bundle: Path, tmp_path: Path) -> None:
     spec = AvatarSpec(position=(0.0, 0.0, 40.0))
-    stage = pose_stage(config(tiny_bundle, tmp_path, avatars=(AvatarSpec(), spec)))
+    stays = CameraSpec(place="none")
+    stage = pose_stage(config(tiny_bundle, tmp_path, avatars=(AvatarSpec(), spec), camera=stays))
     packet = bound(stage, 2)
     assert stage.run(0, None, 0)["visible"] == 1.0
     assert packet.header["avatars"]["visible"].tolist() == [1, 0]
-    only_hidden = pose_stage(config(tiny_bundle, tmp_path, avatars=(spec,)))
+    only_hidden = pose_stage(config(tiny_bundle, tmp_path, avatars=(spec,), camera=stays))
     packet = bound(only_hidden)
     assert without_bytes(only_hidden.run(0, None, 0)) == {"visible": 0.0}
     assert tuple(packet.header["tensor_shape"]) in shape_buckets("256")
@@ -153,7 +154,7 @@ def test_margins_shrink_before_avatars_are_left_out() -> None:
 
 
 UNITS = {unit: UnitSettings(cores=(0,), threads=1) for unit in ("cpu", "gpu", "dsp")}
-STATIC = CameraSpec(source="builtin:static")
+STATIC = CameraSpec(source="builtin:static", place="none")
 
 
 def never() -> bool:
