@@ -17,7 +17,7 @@ from trilane.apps.cli.main import _describe
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
 from trilane.machine import Machine
 from trilane.pipeline import unit_loop
-from trilane.pipeline.lifecycle import listen_before_run
+from trilane.pipeline.unit_processes import listen_before_run
 from trilane.stages.configure import required_machine
 from trilane.transport.messages import BUILDING, Failed
 
