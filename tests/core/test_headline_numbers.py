@@ -324,7 +324,9 @@ def seen_from(tiny_bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Ca
         camera, scene = folder / "camera.txt", folder / "scene.toml"
         camera.write_text("\n".join(" ".join(map(str, row)) for row in rows), encoding="utf-8")
         scene.write_text(SCENE.format(camera=camera, bundle=tiny_bundle), encoding="utf-8")
-        checked = configure(RunOptions(scene=str(scene), runtime="ort"), folder, lambda: {"hardware": False})
+        checked = configure(
+            RunOptions(scene=str(scene), runtime="ort", allow_empty=True), folder, lambda: {"hardware": False}
+        )
         planned = ScenePlan(checked.config, checked.assets)
         decided, (_, heights_m, depths_m) = planned.decide(0), planned._exact(0, 0).T
         top_m = heights_m.max() - EYE_M

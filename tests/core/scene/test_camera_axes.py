@@ -45,7 +45,7 @@ def test_a_robot_s_table_without_names_is_told_by_its_stated_axes(tmp_path: Path
     body = z_up @ TURNS @ np.array(BY_HAND["forward-left-up"], dtype=float).T
     path = WRITERS["tum"](tmp_path, body @ OPTICAL.T, PLACES)
     path.write_text("".join(path.read_text().splitlines(keepends=True)[1:]))
-    with pytest.raises(BadInputError, match="quaternions whose order is not told"):
+    with pytest.raises(BadInputError, match="quaternions whose order does not follow"):
         load(path)
     camera = load(path, axes="forward-left-up")
     assert matrix_from_quat(camera.quats) == pytest.approx(TURNS, abs=1e-6)
