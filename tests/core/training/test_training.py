@@ -144,16 +144,17 @@ def test_activation_noise_is_as_large_as_stated_and_only_where_a_relu_is_open():
 @pytest.mark.parametrize("encoder", ENCODERS)
 @pytest.mark.parametrize("norm", NORMS)
 def test_networks_compute_what_they_did(held, encoder, norm):
+    """In float64: a norm over few pixels amplifies float32's rounding, which differs between processors."""
     torch.manual_seed(0)
-    network = UNet(encoder, norm, width=16, channels=4, input_skip=norm == "batch").eval()
+    network = UNet(encoder, norm, width=16, channels=4, input_skip=norm == "batch").double().eval()
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.copy_(torch.sin(torch.arange(parameter.numel()) * 1.3).reshape(parameter.shape) * 0.3)
-        picture = network(torch.cos(torch.arange(4 * 64 * 32) * 0.9).reshape(1, 4, 64, 32))
-        held("features", [feature.abs().mean() for feature in network.encoder(torch.ones(1, 4, 64, 32))])
+        picture = network(torch.cos(torch.arange(4 * 64 * 32).double() * 0.9).reshape(1, 4, 64, 32))
+        held("features", [feature.abs().mean() for feature in network.encoder(torch.ones(1, 4, 64, 32).double())])
     held("parameters", [p.numel() for p in network.parameters()])
     assert picture.shape == (1, 4, 64, 32)
-    held("picture", picture.round(decimals=4))
+    held("picture", picture)
 
 
 def test_a_group_norm_is_pytorchs():
