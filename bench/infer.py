@@ -21,7 +21,7 @@ from trilane import machine
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import read_network
 from trilane.bench import roofline
-from trilane.bench.lib.interleaved_processes import Variant, runners
+from trilane.bench.lib.interleaved_processes import ProcessVariant, runners
 from trilane.bench.lib.networks import NetworkFixture, fixture_of_file, untrained, untrained_float
 from trilane.errors import BadInputError
 from trilane.shapes import parse_shape
@@ -97,13 +97,13 @@ def _fixtures(
 
 def _variants(
     folder: Path, fixture: NetworkFixture, plain: onnx.ModelProto | None, names: list[str], threads: int, spin: bool
-) -> dict[str, Variant]:
+) -> dict[str, ProcessVariant]:
     integer = folder / "integer.onnx"
     onnx.save(fixture.integer.model, integer)
-    variants = {name: Variant("runtime", integer, name, threads, spin) for name in names}
+    variants = {name: ProcessVariant("runtime", integer, name, threads, spin) for name in names}
     if plain is not None:
         onnx.save(plain, folder / "float.onnx")
-        variants[FP32] = Variant("ort", folder / "float.onnx", threads=threads)
+        variants[FP32] = ProcessVariant("ort", folder / "float.onnx", threads=threads)
     return variants
 
 
@@ -121,7 +121,7 @@ def _cache(folder: Path) -> Iterator[None]:
             os.environ[CACHE] = before
 
 
-def _measure_periods(variants: dict[str, Variant], seconds: float, period: float) -> dict[str, dict[str, Any]]:
+def _measure_periods(variants: dict[str, ProcessVariant], seconds: float, period: float) -> dict[str, dict[str, Any]]:
     """Return start-up times of each variant, and the times of its runs in each period, ms."""
     with runners(variants) as by_name:
         cold = {name: runner.startup_ms for name, runner in by_name.items()}

@@ -19,7 +19,7 @@ import onnx
 
 from trilane import machine
 from trilane.bench import roofline
-from trilane.bench.lib.interleaved_processes import Variant, runners
+from trilane.bench.lib.interleaved_processes import ProcessVariant, runners
 from trilane.bench.lib.networks import untrained, untrained_float
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
 from trilane.scheduler.stats import median_interval
@@ -107,18 +107,18 @@ def compared(
     }
 
 
-def _variants(integer: Path, plain: Path, threads: int) -> dict[str, Variant]:
+def _variants(integer: Path, plain: Path, threads: int) -> dict[str, ProcessVariant]:
     return {
-        ORT: Variant("runtime", integer, "ort", threads),
-        OPENVINO: Variant("runtime", integer, "openvino", threads),
-        FP32: Variant("ort", plain),
-        "onnxruntime int8": Variant("ort", integer),
-        "openvino int8": Variant("openvino", integer),
+        ORT: ProcessVariant("runtime", integer, "ort", threads),
+        OPENVINO: ProcessVariant("runtime", integer, "openvino", threads),
+        FP32: ProcessVariant("ort", plain),
+        "onnxruntime int8": ProcessVariant("ort", integer),
+        "openvino int8": ProcessVariant("openvino", integer),
     }
 
 
 def _measure_rounds(
-    variants: dict[str, Variant], integer: Path, threads: int, rounds: int, seconds: int
+    variants: dict[str, ProcessVariant], integer: Path, threads: int, rounds: int, seconds: int
 ) -> dict[str, list[list[float]]]:
     """Return milliseconds of each variant's runs, by round; for `benchmark_app`, the median that it printed."""
     times: dict[str, list[list[float]]] = {name: [] for name in (*variants, APP)}

@@ -28,7 +28,7 @@ from trilane.pipeline.run_metrics import RunMetrics
 from trilane.pipeline.trial import Round
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.placement import Ranked, Rules, frame_ns, ranked, worth_trying
-from trilane.scheduler.places import Core, Placement
+from trilane.scheduler.places import CpuCore, Placement
 from trilane.scheduler.stats import median_interval
 from trilane.stages import PRELOAD
 from trilane.stages.avatar_assets import network_of
@@ -110,7 +110,7 @@ def _check(counts: Sequence[int], frames: int, rounds: int, finalists: int, furt
 class _Trial:
     """Tries all placements of one scene on some cores."""
 
-    def __init__(self, checked: Checked, cores: Sequence[Core], starter: UnitStarter) -> None:
+    def __init__(self, checked: Checked, cores: Sequence[CpuCore], starter: UnitStarter) -> None:
         self._checked, self._starter = checked, starter
         begin_s = time.monotonic()
         where = rule_placement(tuple(core.number for core in cores))
@@ -230,7 +230,7 @@ def _virtual(checked: Checked, avatar: str, count: int) -> Mapping[str, Any]:
     work = Network({"avatar": avatar}, height, width, channels, "packed", count_work(network.model))
     profile, plan = load_profile(HOST), Plan(work, "dsp", Variant(POLICY, EDGE))
     corners = corners_of(profile, BURST)
-    placed = place_units(profile, plan, corners, [Core(number, number) for number in range(count)])
+    placed = place_units(profile, plan, corners, [CpuCore(number, number) for number in range(count)])
 
     def frame_ms(placement: Placement) -> float:
         return steady(on_cores(profile, placement), plan, corners).frame_ms

@@ -19,7 +19,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from trilane import machine
 from trilane.bench.lib.instruction_sets import instruction_set_of, measure_issued, peak_gmac_s
-from trilane.bench.lib.interleaved_processes import Variant, runners
+from trilane.bench.lib.interleaved_processes import ProcessVariant, runners
 from trilane.errors import reason
 from trilane.stages.dsp.runtime import installed
 from trilane.stages.machine_facts import cpu_facts
@@ -97,7 +97,7 @@ def _int8_rows(threads: int) -> list[dict[str, Any]]:
             onnx.save(_layers(side, channels, kernel), path)
             for name in names:
                 key = f"{name} {side}x{side}x{channels} {kernel}x{kernel}"
-                variants[key] = Variant(name, path, threads=threads)
+                variants[key] = ProcessVariant(name, path, threads=threads)
                 work[key] = LAYERS * (side * channels * kernel) ** 2
         return [{"kernel": key, "gmac_s": work[key] / 1e6 / ms} for key, ms in _best_ms(variants).items()]
 
@@ -106,10 +106,10 @@ def _best_fp32(threads: int) -> float:
     with tempfile.TemporaryDirectory(prefix="trilane-roofline-") as folder:
         path = Path(folder) / "product.onnx"
         onnx.save(_product(), path)
-        return MATRIX**3 / 1e6 / _best_ms({"fp32": Variant("ort", path, threads=threads)})["fp32"]
+        return MATRIX**3 / 1e6 / _best_ms({"fp32": ProcessVariant("ort", path, threads=threads)})["fp32"]
 
 
-def _best_ms(variants: dict[str, Variant]) -> dict[str, float]:
+def _best_ms(variants: dict[str, ProcessVariant]) -> dict[str, float]:
     with runners(variants) as by_name:
         best = dict.fromkeys(variants, float("inf"))
         for _ in range(ROUNDS):

@@ -19,7 +19,7 @@ from trilane.errors import BadInputError, MissingPartError, did_you_mean, packag
 from trilane.hw_profiles.schema import Profile
 from trilane.pipeline.description import UnitSettings
 from trilane.scheduler.placement import Ranked
-from trilane.scheduler.places import FULL, Core, Place, Placement, has_own_cores
+from trilane.scheduler.places import FULL, CpuCore, Place, Placement, has_own_cores
 from trilane.units import NS_PER_MS, UNITS
 
 CORES = "UNIT=LIST, such as dsp=0,1 or dsp=2-5"
@@ -138,7 +138,7 @@ def _listed(text: str, listed: str) -> tuple[int, ...]:
     return tuple(sorted(cores))
 
 
-def host_cores(numbers: Sequence[int]) -> tuple[Core, ...]:
+def host_cores(numbers: Sequence[int]) -> tuple[CpuCore, ...]:
     """What the kernel says of the cores with these numbers: which are siblings, and how fast each type is.
 
     Where it says nothing, a core counts as a physical one that is as fast as the others.
@@ -152,7 +152,7 @@ def host_cores(numbers: Sequence[int]) -> tuple[Core, ...]:
             break
     fastest = max(speed.values())
     return tuple(
-        Core(number, siblings[number], round(FULL * speed[number] / fastest) if min(speed.values()) else FULL)
+        CpuCore(number, siblings[number], round(FULL * speed[number] / fastest) if min(speed.values()) else FULL)
         for number in numbers
     )
 

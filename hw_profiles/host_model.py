@@ -20,8 +20,8 @@ from trilane.hw_profiles.reference_networks import CHANNELS_PER_PASS
 from trilane.hw_profiles.schema import Corners, Measured, Profile, Quantity, Unit
 from trilane.hw_profiles.unit_times import time_on
 from trilane.scheduler.placement import SCHEDULER_NS, Ranked, Rules, chosen, frame_ns, ranked
-from trilane.scheduler.places import Core, Place, Placement, Times, shared_cores
-from trilane.scheduler.places import Work as FrameWork
+from trilane.scheduler.places import CpuCore, Place, Placement, Times, shared_cores
+from trilane.scheduler.places import UnitWork as FrameWork
 from trilane.units import BEFORE_INFER, NS_PER_MS, UNITS, UnitName
 
 NETWORK: UnitName = "dsp"
@@ -71,7 +71,7 @@ def place_units(
     profile: Profile,
     plan: Plan,
     corners: Corners,
-    cores: Sequence[Core],
+    cores: Sequence[CpuCore],
     asked: Mapping[str, tuple[int, ...]] | None = None,
 ) -> Placed:
     """Place the units of `profile` for `plan`, at these `corners`, on `cores`, by the times that the model predicts.

@@ -30,7 +30,7 @@ CLOSE_ON_EXEC: Final = 8
 HARDWARE: Final = 0
 
 
-class Counted(NamedTuple):
+class CounterReading(NamedTuple):
     """An event to count.
 
     `name`: name of the figure.
@@ -55,7 +55,7 @@ class Reading(NamedTuple):
     running_ns: int
 
 
-KINDS: Final = (Counted("instructions", HARDWARE, 1), Counted("cache_misses", HARDWARE, 3))
+KINDS: Final = (CounterReading("instructions", HARDWARE, 1), CounterReading("cache_misses", HARDWARE, 3))
 
 
 class HardwareCounters:
@@ -64,7 +64,7 @@ class HardwareCounters:
     Raises OSError when none of `kinds` can be counted.
     """
 
-    def __init__(self, kinds: Sequence[Counted] = KINDS) -> None:
+    def __init__(self, kinds: Sequence[CounterReading] = KINDS) -> None:
         self._files: dict[str, int] = {}
         self._before: dict[str, Reading] = {}
         refused: OSError | None = None
@@ -154,7 +154,7 @@ def availability() -> str:
         return f"absent: {_reason(error)}"
 
 
-def _open(kind: Counted) -> int:
+def _open(kind: CounterReading) -> int:
     """Open a counter and return its file; raises OSError."""
     flags = INHERIT | EXCLUDE_KERNEL | EXCLUDE_HYPERVISOR
     attributes = ATTR.pack(kind.kind, ATTR.size, kind.config, 0, 0, ENABLED_TIME | RUNNING_TIME, flags, 0, 0, 0)

@@ -50,7 +50,7 @@ PING_NS = 500_000_000
 LONGEST_STEP_NS = PING_NS + 250_000_000  # between two steps, unless this process was stopped
 
 
-class Governor(Protocol):
+class ClockGovernor(Protocol):
     """Holds the units to shares of the time. `due_ns`: time at which `tick` is to be called next."""
 
     due_ns: int
@@ -78,7 +78,7 @@ class RealtimeClock:
         interrupts: Interrupts,
         log: RunLog,
         requests: FrameRequestQueue | None,
-        governor: Governor | None,
+        governor: ClockGovernor | None,
         on_progress: Callable[[int, int], None] | None,
         sketch: Callable[[], Sketch] | None = None,
     ) -> None:
@@ -245,7 +245,7 @@ class RealtimeClock:
         if isinstance(message, Ready):
             self._processes.connected(unit)
             return UnitReady(unit)
-        if isinstance(message, messages.Pong):
+        if isinstance(message, messages.PongMessage):
             return Pong(unit)
         if message is None:
             self._open = {number: held for number, held in self._open.items() if held[0].unit != unit}

@@ -17,7 +17,7 @@ from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.places import Place, Placement, busiest_core_ns
 
 
-class Efficiencies:
+class RunEfficiencies:
     """How much of the time between the first and the last presented frame was work of jobs; no share can pass 1.
 
     Jobs are added in the order of their ends. A job may begin before that time or end after it. Then it counts only the
@@ -110,7 +110,7 @@ class Reckoning:
         self._budget = Budget(self.paths, self.sharing)
         # as if each unit had a core of its own
         own = {unit: Place((-1 - number,), 1) for number, unit in enumerate(graph.units)}
-        self._efficiencies = Efficiencies({**own, **places})
+        self._efficiencies = RunEfficiencies({**own, **places})
         self._unit_of = {stage.name: stage.unit for stage in graph.stages}
 
     @property

@@ -22,7 +22,7 @@ from trilane.pipeline.result import UnitError
 from trilane.pipeline.unit_processes import START_S, UnitProcesses, listen_before_run, start_units
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.events import Graph, StageAlone
-from trilane.scheduler.places import Times, Work
+from trilane.scheduler.places import Times, UnitWork
 from trilane.transport.messages import Done, RunJob
 from trilane.transport.slots import edge_rule
 
@@ -158,7 +158,7 @@ def timed(chain: Chain, frames: Sequence[int]) -> list[dict[str, Done]]:
     return done
 
 
-def works_of(pipeline: Pipeline, done: Sequence[Mapping[str, Done]]) -> dict[str, Work]:
+def works_of(pipeline: Pipeline, done: Sequence[Mapping[str, Done]]) -> dict[str, UnitWork]:
     """Return the work of each unit for a frame: the sum over its stages of the median times in `done`."""
     works = {}
     for unit, settings in pipeline.units.items():
@@ -166,7 +166,7 @@ def works_of(pipeline: Pipeline, done: Sequence[Mapping[str, Done]]) -> dict[str
         took_ns = [median(_took_ns(each[name]) for each in done) for name in names]
         cpu_ns = [median(each[name].cpu_ns for each in done) / settings.threads for name in names]
         core_ns = sum(map(min, cpu_ns, took_ns))
-        works[unit] = Work(round(sum(took_ns)), round(core_ns), len(names))
+        works[unit] = UnitWork(round(sum(took_ns)), round(core_ns), len(names))
     return works
 
 

@@ -20,7 +20,7 @@ from trilane.pipeline.controls import FrameRequestQueue, Interrupts, RunControls
 from trilane.pipeline.cpu_use import add_accounts
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.memory import BYTES, Assets, add_bytes
-from trilane.pipeline.realtime_clock import Governor, RealtimeClock
+from trilane.pipeline.realtime_clock import ClockGovernor, RealtimeClock
 from trilane.pipeline.rehearsal import Chain, on_rungs
 from trilane.pipeline.result import RunLog, RunResult
 from trilane.pipeline.run_metrics import RunMetrics, metrics_of
@@ -69,7 +69,7 @@ HANG_NS = 10_000_000_000
 FRAMES_ON_RUNGS = 4  # on each rung; the first frame warms up
 
 
-class ReportingGovernor(Governor, Protocol):
+class ReportingGovernor(ClockGovernor, Protocol):
     """A governor of a whole run, which also reports what it did."""
 
     @property

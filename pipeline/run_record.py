@@ -60,7 +60,7 @@ class JournalFile:
     sensors: Callable[[], Mapping[str, float]] = dict
 
 
-class Source(Protocol):
+class JobSource(Protocol):
     """The clock of the run (`trilane.pipeline.realtime_clock.RealtimeClock`)."""
 
     @property
@@ -71,7 +71,7 @@ class Source(Protocol):
         """Return the jobs that ended since the last call; None stands for a job of a lost frame."""
 
 
-class Caps(Protocol):
+class CapReadings(Protocol):
     """The part of a run's governor that is recorded."""
 
     @property
@@ -92,7 +92,7 @@ class RunRecord(Protocol):
     @property
     def failure(self) -> UnwrittenError | None: ...
 
-    def begin(self, source: Source, pids: Callable[[], Mapping[str, int]]) -> None:
+    def begin(self, source: JobSource, pids: Callable[[], Mapping[str, int]]) -> None:
         """Note that the loop begins. `pids`: function that returns the process id of each unit at any time."""
 
     def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
@@ -118,9 +118,9 @@ class _KeptRun:
         self.recording = Recording(graph, settings)
         self.jobs: list[JobRecord] = []
         self.failure = None
-        self._source: Source | None = None
+        self._source: JobSource | None = None
 
-    def begin(self, source: Source, pids: Callable[[], Mapping[str, int]]) -> None:  # noqa: ARG002 - a `RunRecord`
+    def begin(self, source: JobSource, pids: Callable[[], Mapping[str, int]]) -> None:  # noqa: ARG002 - a `RunRecord`
         """Keep the source; jobs are read when the run is over, because units share the scheduler's core."""
         self._source = source
 
@@ -152,12 +152,12 @@ class _JournaledRun:
     """
 
     def __init__(
-        self, file: JournalFile, writer: JournalWriter, graph: Graph, settings: Settings, caps: Caps | None
+        self, file: JournalFile, writer: JournalWriter, graph: Graph, settings: Settings, caps: CapReadings | None
     ) -> None:
         self.recording = Recording(graph, settings)
         self.jobs: list[JobRecord] = []
         self._file, self._writer, self._caps = file, writer, caps
-        self._source: Source | None = None
+        self._source: JobSource | None = None
         self._pids: Callable[[], Mapping[str, int]] = dict
         self._accounts = dict.fromkeys(graph.units, -1)
         self._steps: list[_Step] = []
@@ -166,7 +166,7 @@ class _JournaledRun:
         self._writer.add(Begun(SCHEMA, graph, settings, facts))
         self._writer.flush()
 
-    def begin(self, source: Source, pids: Callable[[], Mapping[str, int]]) -> None:
+    def begin(self, source: JobSource, pids: Callable[[], Mapping[str, int]]) -> None:
         self._source, self._pids = source, pids
 
     @property
@@ -250,7 +250,9 @@ class _JournaledRun:
 
 
 @contextmanager
-def recorded(file: JournalFile | None, graph: Graph, settings: Settings, caps: Caps | None) -> Iterator[RunRecord]:
+def recorded(
+    file: JournalFile | None, graph: Graph, settings: Settings, caps: CapReadings | None
+) -> Iterator[RunRecord]:
     """Yield the record of one run, which goes to `file`, or stays in memory without one.
 
     What was noted until the end of the run is in the file, whatever becomes of the run. Raises BadInputError when the

@@ -80,7 +80,7 @@ class Gone(NamedTuple):
     cause: str
 
 
-class Done(NamedTuple):
+class EndedJob(NamedTuple):
     """A job that has ended, as the scheduler has heard."""
 
     handed: Handed
@@ -133,8 +133,8 @@ class Down(NamedTuple):
     end_ns: int
 
 
-#: What a record means. A `Done` comes from the step that heard of the end, an `ExplainedJob` from the job's own record.
-Fact = Done | Presented | Gone | ExplainedJob | IdleSlice
+#: What a record means. An `EndedJob` comes from the step that heard of the end, an `ExplainedJob` from its record.
+Fact = EndedJob | Presented | Gone | ExplainedJob | IdleSlice
 
 
 class Timeline:
@@ -329,7 +329,7 @@ class Timeline:
         # The scheduler's own record computes the latency, so that it is defined once.
         frame.end_stage(self._positions[job.stage], self._latency_position, event.t_sampled_ns, event.t_end_ns)
         frame.skips |= event.skips
-        yield Done(handed, event)
+        yield EndedJob(handed, event)
         presented = None
         if job.stage == self._last:
             yield (presented := self._present(job.frame, frame, event.t_end_ns))

@@ -40,7 +40,7 @@ from trilane.transport.messages import (
     JobPipeEnd,
     MessageError,
     Ping,
-    Pong,
+    PongMessage,
     Ready,
     RunJob,
 )
@@ -242,7 +242,7 @@ def _answer(spec: UnitSpec, link: Link, counters: HardwareCounters | NoCounters)
         if isinstance(message, RunJob):
             _run_job(link, stages[message.stage], message, clock, counters)
         elif isinstance(message, Ping):
-            link.send_heartbeat(Pong())
+            link.send_heartbeat(PongMessage())
         elif isinstance(message, Close):
             return _close(spec.unit, link, stages)
         elif link.job_pipe.ended:

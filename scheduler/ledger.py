@@ -20,7 +20,7 @@ from itertools import accumulate
 from typing import Any, Final, NamedTuple
 
 from trilane.scheduler.events import NEVER, Drop, Graph, Job, Loss
-from trilane.scheduler.stats import FrameTimes, Lateness, Samples, Sketch
+from trilane.scheduler.stats import FrameTimeSamples, Lateness, Samples, Sketch
 from trilane.units import NS_PER_S
 
 ASSIGNED: Final = 0
@@ -135,7 +135,7 @@ class Ledger:
         self.presented_frames: list[int] = []
         self._rung = -1
         self._first_ns = self._last_ns = 0
-        self._frame_times, self._latency, self._lateness = FrameTimes(sketch), Samples(sketch), Lateness()
+        self._frame_times, self._latency, self._lateness = FrameTimeSamples(sketch), Samples(sketch), Lateness()
 
     def start(self, now_ns: int) -> None:
         self.start_ns = now_ns

@@ -3,8 +3,8 @@
 Rule: measured times alone decide, by one formula; nothing is tried here. The formula is not exact. Where real frames
 can be had, they decide between the few placements that it cannot tell apart.
 
-A placement gives each unit cores and threads. Its frame time is predicted from `Work`: the time that the unit needs for
-a frame, and the time for which it takes each of its cores. Let T be the frame time. In a pipelined run these hold:
+A placement gives each unit cores and threads. Its frame time is predicted from `UnitWork`: the time that the unit needs
+for a frame, and the time for which it takes each of its cores. Let T be the frame time. In a pipelined run these hold:
 
 - *A unit does one job at a time.* Its jobs of a frame take at most T.
 - *A core does one thing at a time.* What the units need of it is at most T. A unit with one thread and several cores
@@ -33,11 +33,11 @@ from typing import Final, NamedTuple
 
 from trilane.scheduler.places import (
     FULL,
-    Core,
+    CpuCore,
     Place,
     Placement,
     Times,
-    Work,
+    UnitWork,
     has_own_cores,
     placements,
     share_ns,
@@ -70,7 +70,7 @@ class Rules(NamedTuple):
     sequential: bool = False
 
 
-def frame_ns(placement: Placement, cores: Sequence[Core], times: Times, rules: Rules) -> int:
+def frame_ns(placement: Placement, cores: Sequence[CpuCore], times: Times, rules: Rules) -> int:
     """Return the predicted time from a frame to the next, in ns."""
     model = _Model(placement, cores, times, rules)
     return model.sum_ns() if rules.sequential else model.pipelined_ns()
@@ -114,7 +114,7 @@ def _settled(placement: Placement) -> Placement:
 class _Model:
     """The model of one placement."""
 
-    def __init__(self, placement: Placement, cores: Sequence[Core], times: Times, rules: Rules) -> None:
+    def __init__(self, placement: Placement, cores: Sequence[CpuCore], times: Times, rules: Rules) -> None:
         self._speed = {core.number: core.permille / FULL for core in cores}
         self._physical = {core.number: core.physical for core in cores}
         works = {unit: times[unit][place.threads] for unit, place in placement.items()}
@@ -130,7 +130,7 @@ class _Model:
         taken_ns = self._scheduler_ns / min(self._speed[core] for core in where)
         self._loads = [*self._units, _Load(where, 0.0, taken_ns, taken_ns, len(where) > 1)]
 
-    def _load(self, place: Place, work: Work, cost_ns: int) -> _Load:
+    def _load(self, place: Place, work: UnitWork, cost_ns: int) -> _Load:
         """Return the unit's needs on its cores: the slowest core decides, and siblings that are both used are slower.
 
         `cost_ns`: cost in ns of sharing the cores with others.
@@ -235,7 +235,7 @@ class Ranked(NamedTuple):
     frame_ns: int
 
 
-def ranked(cores: Sequence[Core], times: Times, rules: Rules, fixed: Placement | None = None) -> list[Ranked]:
+def ranked(cores: Sequence[CpuCore], times: Times, rules: Rules, fixed: Placement | None = None) -> list[Ranked]:
     """Return all placements, the smallest frame time first.
 
     Ties go to fewer shared cores, then less floating work, less time in all stages (latency), lower core numbers.

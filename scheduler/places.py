@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 FULL: Final = 1000
 
 
-class Core(NamedTuple):
+class CpuCore(NamedTuple):
     """A core.
 
     `number`: number by which the system counts it.
@@ -26,7 +26,7 @@ class Core(NamedTuple):
     permille: int = FULL
 
 
-class Work(NamedTuple):
+class UnitWork(NamedTuple):
     """The work of a unit for a frame, on cores of full speed that the unit has to itself.
 
     `serial_ns`: time of the unit's jobs.
@@ -53,7 +53,7 @@ class Place(NamedTuple):
 #: The place of each unit.
 Placement = Mapping[str, Place]
 #: The work of each unit by number of threads; a unit can have no other number of threads.
-Times = Mapping[str, Mapping[int, Work]]
+Times = Mapping[str, Mapping[int, UnitWork]]
 
 
 def shared_cores(placement: Placement) -> set[int]:
@@ -99,7 +99,7 @@ def share_ns(cores: tuple[int, ...], core_ns: float, floats: bool, these: frozen
 MOST_FLOATING: Final = 4
 
 
-def placements(cores: Sequence[Core], times: Times, fixed: Placement) -> Iterator[Placement]:
+def placements(cores: Sequence[CpuCore], times: Times, fixed: Placement) -> Iterator[Placement]:
     """Yield every way to place the units of `times`, one for all that differ only by an exchange of equal cores.
 
     Two cores are equal when they have the same speed and the same users, and equal siblings. Of equal cores the lowest
@@ -122,7 +122,7 @@ def placements(cores: Sequence[Core], times: Times, fixed: Placement) -> Iterato
         yield {unit: placed[unit] for unit in times}
 
 
-def _forms(works: Mapping[int, Work], most: int) -> Iterator[tuple[int, int]]:
+def _forms(works: Mapping[int, UnitWork], most: int) -> Iterator[tuple[int, int]]:
     """Yield the threads and cores that a unit may have."""
     for threads in works:
         if threads <= most:
@@ -131,7 +131,7 @@ def _forms(works: Mapping[int, Work], most: int) -> Iterator[tuple[int, int]]:
         yield 1, 2
 
 
-def _equally_fast(cores: Sequence[Core], chosen: Sequence[int]) -> bool:
+def _equally_fast(cores: Sequence[CpuCore], chosen: Sequence[int]) -> bool:
     return len({core.permille for core in cores if core.number in chosen}) == 1
 
 
@@ -143,7 +143,7 @@ _Signature = tuple[tuple[_CoreSignature, ...], ...]
 
 
 def _choices(
-    cores: Sequence[Core], users: _Users, unit: str, count: int
+    cores: Sequence[CpuCore], users: _Users, unit: str, count: int
 ) -> Iterator[tuple[dict[int, frozenset[str]], tuple[int, ...]]]:
     """Yield the users after `unit` was given `count` cores, and those cores, once for each choice that differs."""
     states = [dict(users)]
@@ -157,7 +157,7 @@ def _choices(
         yield after, tuple(sorted(core for core, of in after.items() if unit in of))
 
 
-def _with_one_more(cores: Sequence[Core], users: _Users, unit: str) -> Iterator[dict[int, frozenset[str]]]:
+def _with_one_more(cores: Sequence[CpuCore], users: _Users, unit: str) -> Iterator[dict[int, frozenset[str]]]:
     seen = set()
     for core in cores:
         kind = (_own_signature(core, users), _siblings(cores, core, users))
@@ -166,17 +166,17 @@ def _with_one_more(cores: Sequence[Core], users: _Users, unit: str) -> Iterator[
             yield {**users, core.number: users[core.number] | {unit}}
 
 
-def _own_signature(core: Core, users: _Users) -> _CoreSignature:
+def _own_signature(core: CpuCore, users: _Users) -> _CoreSignature:
     return core.permille, tuple(sorted(users[core.number]))
 
 
-def _siblings(cores: Sequence[Core], core: Core, users: _Users) -> tuple[_CoreSignature, ...]:
+def _siblings(cores: Sequence[CpuCore], core: CpuCore, users: _Users) -> tuple[_CoreSignature, ...]:
     return tuple(
         sorted(_own_signature(other, users) for other in cores if other.physical == core.physical and other != core)
     )
 
 
-def _signature(cores: Sequence[Core], users: _Users) -> _Signature:
+def _signature(cores: Sequence[CpuCore], users: _Users) -> _Signature:
     """Return what stays the same when equal cores are exchanged: the multiset of physical cores."""
     groups: dict[int, list[_CoreSignature]] = {}
     for core in cores:

@@ -224,7 +224,7 @@ WEIGHT: Final = 2 / (SPAN + 1)
 MOST_BLOCKS: Final = 2048
 
 
-class FrameTimes:
+class FrameTimeSamples:
     """The times between presented frames. `samples`: the times in ns."""
 
     def __init__(self, sketch: Callable[[], Sketch] | None = None) -> None:

@@ -23,7 +23,7 @@ from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline
 from trilane.pipeline.trial import SLICE, Group, Round, try_in_turns
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.scheduler.places import Core, Place, Placement
+from trilane.scheduler.places import CpuCore, Place, Placement
 from trilane.shapes import Shape
 from trilane.stages import FACTORIES, PRELOAD
 from trilane.stages.avatar_assets import network_of
@@ -102,7 +102,7 @@ def thread_counts(cores: int, rule: Placement) -> dict[str, list[int]]:
     return {unit: sorted(count for count in of if count > 1) for unit, of in counts.items()}
 
 
-def measured_times(checked: Checked, cores: Sequence[Core], rule: Placement, starter: UnitStarter) -> Rehearsed:
+def measured_times(checked: Checked, cores: Sequence[CpuCore], rule: Placement, starter: UnitStarter) -> Rehearsed:
     """Measure what each unit needs for a frame.
 
     `checked`: run to measure. `cores`: available cores. `rule`: placement whose numbers of threads are measured too.

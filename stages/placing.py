@@ -36,7 +36,7 @@ from trilane.pipeline.rehearsal import Rehearsed
 from trilane.pipeline.surroundings import OtherPrograms
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.placement import Ranked, Rules, chosen, fastest, frame_ns, ranked, typical, worth_trying
-from trilane.scheduler.places import Core, Place, Placement, Times, Work
+from trilane.scheduler.places import CpuCore, Place, Placement, Times, UnitWork
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.avatar_pipeline import measured_times, thread_counts, tried
 from trilane.stages.configure import Checked
@@ -97,7 +97,7 @@ def placed(
     return _with(checked, best.placement, facts)
 
 
-def considered(cores: Sequence[Core], asked: Placement) -> list[Core]:
+def considered(cores: Sequence[CpuCore], asked: Placement) -> list[CpuCore]:
     """Return the cores to place units on: all of them, or fewer where there are more than MOST_LOGICAL.
 
     Fewer means one of each physical core, and the first MOST_CORES of these: placements on more are too many to list.
@@ -121,7 +121,7 @@ def times_rows(times: Times) -> list[dict[str, Any]]:
     ]
 
 
-def _why_not(checked: Checked, cores: Sequence[Core]) -> str:
+def _why_not(checked: Checked, cores: Sequence[CpuCore]) -> str:
     """Say why nothing is measured; empty when it is."""
     if len(checked.asked_cores) == len(UNITS):
         return "as asked"
@@ -169,7 +169,7 @@ def rehearsed(
 
 def _kept(
     checked: Checked,
-    cores: Sequence[Core],
+    cores: Sequence[CpuCore],
     rule: Placement,
     starter: UnitStarter,
     made_from: Sequence[str],
@@ -189,15 +189,15 @@ def _kept(
         return {"works": np.array(rows, np.int64), "at_s": np.array(time.time(), np.int64), **took_ns}
 
     made = cached_arrays(CACHE, made_from, measured)
-    times: dict[str, dict[int, Work]] = {unit: {} for unit in UNITS}
+    times: dict[str, dict[int, UnitWork]] = {unit: {} for unit in UNITS}
     for unit, threads, *work in made["works"].tolist():
-        times[UNITS[unit]][threads] = Work(*work)
+        times[UNITS[unit]][threads] = UnitWork(*work)
     took_ns = {key.partition(" ")[2]: ns.tolist() for key, ns in made.items() if key.startswith("stage ")}
     at = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(int(made["at_s"])))
     return Rehearsed(times, took_ns), at
 
 
-def _made_from(checked: Checked, cores: Sequence[Core], rule: Placement) -> list[str]:
+def _made_from(checked: Checked, cores: Sequence[CpuCore], rule: Placement) -> list[str]:
     """Return everything that the times depend on."""
     config = checked.config
     said = config.model_dump_json(exclude={"out_dir", "units", "scene", "pace_ns"})

@@ -56,7 +56,7 @@ class RunJob(NamedTuple):
 
 
 class Ping(NamedTuple):
-    """To a unit that has no job: answer with `Pong`."""
+    """To a unit that has no job: answer with `PongMessage`."""
 
 
 class Close(NamedTuple):
@@ -107,7 +107,7 @@ class Failed(NamedTuple):
     message: str
 
 
-class Pong(NamedTuple):
+class PongMessage(NamedTuple):
     """From a unit, as a heartbeat: the answer to `Ping`."""
 
 
@@ -115,13 +115,13 @@ class Closed(NamedTuple):
     """From a unit: the answer to `Close`."""
 
 
-Heartbeat = Ready | Pong
-Message = RunJob | Ping | Close | Ready | Done | Failed | Pong | Closed
+Heartbeat = Ready | PongMessage
+Message = RunJob | Ping | Close | Ready | Done | Failed | PongMessage | Closed
 #: `Failed.id` of an error outside a job: while stages are built, and while they are closed.
 BUILDING, CLOSING = -1, -2
 
 #: A message's place here is its first byte.
-_KINDS: tuple[Any, ...] = (RunJob, Ping, Close, Ready, Done, Failed, Pong, Closed)
+_KINDS: tuple[Any, ...] = (RunJob, Ping, Close, Ready, Done, Failed, PongMessage, Closed)
 _PACKER = msgpack.Packer()  # one for the process: making one costs more than packing
 
 

@@ -1,6 +1,6 @@
 """What `trilane top` shows of a moment: a screen for a terminal, a line for anything else.
 
-Rule: every figure is one of `Figures`; how wrong the avatar's pictures are stands with every speed, and where the
+Rule: every figure is one of `MomentFigures`; how wrong the avatar's pictures are stands with every speed, and where the
 figures come from stands below them.
 """
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from trilane.apps.cli.run_table import DASH, NEEDED, TOO_FEW, accuracy_line
 from trilane.apps.explain.reasons import bound_text
-from trilane.apps.watch.figures import Figures, Moved, UnitFigures
+from trilane.apps.watch.figures import MomentFigures, Moved, UnitFigures
 from trilane.apps.watch.followed_run import RunState
 from trilane.apps.watch.live_figures import LEAST, RunLook
 
@@ -80,12 +80,12 @@ def ending(look: RunLook) -> str:
     return f"run {look.name}: {ENDINGS[look.state]}"
 
 
-def errors(figures: Figures) -> list[str]:
+def errors(figures: MomentFigures) -> list[str]:
     """Return a line for each avatar: how wrong its pictures are, or why that is not known."""
     return [accuracy_line(name, facts) for name, facts in figures.accuracy.items()] or [NO_ERROR]
 
 
-def dropped(figures: Figures) -> int:
+def dropped(figures: MomentFigures) -> int:
     """Return the number of frames dropped on all edges."""
     return sum(drop.frames for drop in figures.frames.dropped)
 
@@ -115,7 +115,7 @@ def _rate(look: RunLook) -> str:
     return f"{figures.run_fps if look.state is RunState.FINISHED else figures.fps:.1f} fps"
 
 
-def _units(figures: Figures) -> Table:
+def _units(figures: MomentFigures) -> Table:
     table = _table("unit", "busy", "%", "run %", "idle, %", "does")
     for name, unit in figures.units.items():
         filled = round(BAR * unit.window.busy)
@@ -152,7 +152,7 @@ def _doing(unit: UnitFigures, state: str) -> str:
     return (f"{unit.stage} of frame {unit.frame}" if unit.stage else "nothing") + restarts
 
 
-def _times(figures: Figures) -> Table:
+def _times(figures: MomentFigures) -> Table:
     table = _table("of the last 5 s, ms", "mean", *PERCENTILES, "max", "samples")
     for name, times in (("frame time", figures.frame_time_ms), ("latency", figures.latency_ms)):
         values = [_time(times, key) for key in ("mean", *PERCENTILES, "max")]
@@ -171,7 +171,7 @@ def _time(times: Mapping[str, float], key: str) -> str:
     return f"{times[key]:.1f}{TOO_FEW if times['samples'] < NEEDED.get(key, 0) else ''}"
 
 
-def _stages(figures: Figures) -> Table:
+def _stages(figures: MomentFigures) -> Table:
     table = _table("stage", "unit", "waiting", "ms", "MiB a job", "least")
     for name, stage in figures.stages.items():
         moved, least = _moved(stage.bytes)
@@ -188,7 +188,7 @@ def _moved(kinds: Mapping[str, Moved]) -> tuple[str, str]:
     return f"{sum(shown.values()):.2f} ({', '.join(f'{kind} {value:.2f}' for kind, value in shown.items())})", least
 
 
-def _frames(figures: Figures) -> str:
+def _frames(figures: MomentFigures) -> str:
     frames = figures.frames
     lost = _listed((cause, count) for cause, count in frames.lost.items())
     left_out = _listed((f"{drop.edge} {drop.cause}", drop.frames) for drop in frames.dropped)
@@ -216,13 +216,13 @@ def _percent(share: float) -> str:
     return f"{100 * share:.0f}"
 
 
-def _short_bound(figures: Figures) -> str:
+def _short_bound(figures: MomentFigures) -> str:
     """Return the unit, and its share of the path; empty where it is not known."""
     unit = (figures.bound or {}).get("unit")
     return f"bound {unit['name']} {unit['share']:.0%}" if unit else ""
 
 
-def _short_error(figures: Figures) -> str:
+def _short_error(figures: MomentFigures) -> str:
     """Return the PSNR of each avatar in the band of zoom in which it is worst."""
     known = {
         name: min(facts["psnr_db_by_band"].values())
@@ -232,7 +232,7 @@ def _short_error(figures: Figures) -> str:
     return ", ".join(f"{name} at worst {value:.1f} dB" for name, value in known.items()) or "error not known"
 
 
-def _sources(figures: Figures) -> str:
+def _sources(figures: MomentFigures) -> str:
     """Say where the figures come from; only a run that has temperatures has a source of them."""
     said = [f"figures: {figures.sources['fps']}"]
     for place in figures.temperature_c:

@@ -33,7 +33,7 @@ from trilane.apps.experiments.reference_path import (
 )
 from trilane.apps.experiments.scene_pictures import region, spread
 from trilane.arrays import F64, U8
-from trilane.bench.lib.layers import Box, Layer, laid_over
+from trilane.bench.lib.layers import Box, RasterLayer, laid_over
 from trilane.bench.lib.picture_error import psnr_db
 from trilane.errors import BadInputError
 from trilane.figure_sources import MEASURED
@@ -203,7 +203,7 @@ class _Split:
         self._remainder.add(own, end)
         self._show(moment.number, WHOLE, own, reference)
 
-    def add_truth(self, moment: ReferenceMoment, true: Sequence[Layer]) -> None:
+    def add_truth(self, moment: ReferenceMoment, true: Sequence[RasterLayer]) -> None:
         """Count a frame against its ground truth, which is laid over the frame's background."""
         box = region(moment.boxes, self._output)
         picture, cover = laid_over(moment.background, true)

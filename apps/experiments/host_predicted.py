@@ -20,7 +20,7 @@ from trilane.apps.predict.predict_options import PredictOptions
 from trilane.apps.run.asked_run import run_asked
 from trilane.apps.run.run_job import Hooks
 from trilane.avatars.bundle import load_bundle
-from trilane.bench.lib.interleaved_processes import Variant, runners
+from trilane.bench.lib.interleaved_processes import ProcessVariant, runners
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host_model import NETWORK
 from trilane.hw_profiles.profile_files import HOST, load_runnable
@@ -95,7 +95,7 @@ def _of_network(file: Path) -> Predicted:
 
 def _calls(file: Path, seconds: float) -> float:
     runtime, _ = requested_runtime("auto")
-    variant = Variant("runtime", file, runtime, load_runnable(HOST).units[NETWORK].threads)
+    variant = ProcessVariant("runtime", file, runtime, load_runnable(HOST).units[NETWORK].threads)
     with runners({ALONE: variant}) as by_name:
         return median(by_name[ALONE].run_for(seconds))
 

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F32, F64, U8, Mask
 from trilane.avatars.network_file import Affine, NetworkFile, reshaped
-from trilane.bench.lib.cast import Cast, Seen
+from trilane.bench.lib.cast import Cast, CastView
 from trilane.bench.lib.float_raster import quantise
 from trilane.bench.lib.full_network import Paint, as_written, float_network
 from trilane.bench.lib.full_picture import SAMPLES, FullBody, fineness, supersampled
-from trilane.bench.lib.layers import Box, Layer, enlarged, grown, laid_over, placed, premultiplied, shrunk
+from trilane.bench.lib.layers import Box, RasterLayer, enlarged, grown, laid_over, placed, premultiplied, shrunk
 from trilane.bench.lib.stage_chain import AvatarFrames
 from trilane.body.body import Body
 from trilane.body.joints import JOINTS, POSE_FEATURES
@@ -116,7 +116,7 @@ class RunBody:
         self._full: dict[Detail, FullBody] = {}
         self._skinners: dict[Detail, FrameSkinner] = {}
 
-    def vertices(self, seen: Seen, level: int | None, causes: Causes) -> F64:
+    def vertices(self, seen: CastView, level: int | None, causes: Causes) -> F64:
         """Return the vertices (V,3), metres, in the world.
 
         `seen`: the avatar in a frame. `level`: index into `DETAILS` by the run's plan; None where the run does not show
@@ -256,7 +256,7 @@ class ReferenceMoment:
         """Return projection @ view (4,4) of the whole picture."""
         return self._path.cast.projection(self.number) @ self.seen[index].view
 
-    def _layers(self, causes: Causes) -> list[Layer]:
+    def _layers(self, causes: Causes) -> list[RasterLayer]:
         if Cause.CROP not in causes:
             return [self._own_layer(seen, causes) for seen in self.seen.values()]
         cells = self._cells()
@@ -268,7 +268,7 @@ class ReferenceMoment:
             for seen, rect, (top, left, height, width) in cells
         ]
 
-    def _own_layer(self, seen: Seen, causes: Causes) -> Layer:
+    def _own_layer(self, seen: CastView, causes: Causes) -> RasterLayer:
         """Return the layer of an avatar with a tensor of its own, on the picture's grid, as in the plan `full`."""
         avatar = self._path.avatars[seen.folder]
         times = fineness(seen.box.shape, avatar.area)
@@ -278,9 +278,9 @@ class ReferenceMoment:
         (clip,) = _rounded(causes, crop_projection(projection, box.within(seen.box)) @ view)
         tensor = self._drawn(seen, clip, (height, width), causes)
         painted = premultiplied(self._paint(avatar, avatar.packed(tensor, causes), causes))
-        return Layer(box, seen.depth, enlarged(shrunk(painted, times.numerator), times.denominator))
+        return RasterLayer(box, seen.depth, enlarged(shrunk(painted, times.numerator), times.denominator))
 
-    def _cells(self) -> list[tuple[Seen, Rect, Cell]]:
+    def _cells(self) -> list[tuple[CastView, Rect, Cell]]:
         """Return the avatars in the run's tensor, each with its crop rectangle and its part of the tensor."""
         if int(self._header["work"]) != FrameWork.FULL:
             return []
@@ -305,7 +305,7 @@ class ReferenceMoment:
             tensor[top : top + high, left : left + wide] = self._drawn(seen, clip, (high, wide), causes)
         return avatar.packed(tensor, causes)
 
-    def _drawn(self, seen: Seen, clip: F64, shape: Shape, causes: Causes) -> F64:
+    def _drawn(self, seen: CastView, clip: F64, shape: Shape, causes: Causes) -> F64:
         """Return one avatar (h,w,C) by the float64 rasteriser."""
         avatar = self._path.avatars[seen.folder]
         vertices, texture = self.vertices(seen.index, causes), avatar.texture

@@ -123,7 +123,7 @@ class Note:
 
 
 @dataclass(frozen=True)
-class Figures:
+class MomentFigures:
     """Figures at one moment.
 
     `t_ms`: time since the first step. `window_s`, `run_s`: lengths of the window and of the run.

@@ -14,8 +14,8 @@ from typing import Any, Final, NamedTuple
 
 from trilane.apps.watch.figures import (
     DropCount,
-    Figures,
     FrameFigures,
+    MomentFigures,
     Moved,
     Note,
     Shares,
@@ -28,7 +28,7 @@ from trilane.errors import BadInputError
 from trilane.figure_sources import COMPUTED, MEASURED
 from trilane.pipeline.journal import Accounted, Begun, Counted, Ended, Record, Said, Sampled, Stepped, Worked
 from trilane.pipeline.reckoning import Reckoning, places_of
-from trilane.pipeline.timeline import Done, ExplainedJob, Presented, Timeline
+from trilane.pipeline.timeline import EndedJob, ExplainedJob, Presented, Timeline
 from trilane.pipeline.unit_history import BUSY, IDLE_CAUSES, NAMES, OVERHEAD, PREEMPTED
 from trilane.scheduler.events import NEVER, Finish, JobDone, Start
 from trilane.scheduler.ledger import STARVED
@@ -109,7 +109,7 @@ class LiveFigures:
         facts = self._timeline.add(record)
         self._adders[type(record)](record)
         for fact in facts:
-            if isinstance(fact, Done):
+            if isinstance(fact, EndedJob):
                 self._jobs[fact.handed.job.unit] += 1
                 self._times[fact.handed.job.unit].add_job(fact.event)
             elif isinstance(fact, Presented):
@@ -117,7 +117,7 @@ class LiveFigures:
             elif isinstance(fact, ExplainedJob) and self._reckoning is not None:
                 self._reckoning.add(fact)
 
-    def now(self, now_ns: int | None = None, state: RunState | None = None) -> Figures:
+    def now(self, now_ns: int | None = None, state: RunState | None = None) -> MomentFigures:
         """Return the figures at `now_ns`, of the run's clock; at the last record where it is None or earlier.
 
         `state`: what has become of the run, which the journal of a killed run does not say; None to take it from the
@@ -131,7 +131,7 @@ class LiveFigures:
         clock = str(self._facts.get("clock", ""))
         state = state or (RunState.FINISHED if self._is_over else RunState.GOES_ON)
         goes_on = state is RunState.GOES_ON and not self._is_over
-        return Figures(
+        return MomentFigures(
             t_ms=self._since_first_ms(now_ns),
             window_s=window_s,
             run_s=(now_ns - start_ns) / NS_PER_S,
@@ -257,10 +257,10 @@ class RunLook(NamedTuple):
 
     name: str
     state: RunState
-    figures: Figures
+    figures: MomentFigures
 
     def as_json(self) -> dict[str, Any]:
-        """Return `run`, and the names of `Figures`."""
+        """Return `run`, and the names of `MomentFigures`."""
         return {"run": self.name, **self.figures.as_json()}
 
 

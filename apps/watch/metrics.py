@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 from prometheus_client import metrics_core as families
 from prometheus_client.openmetrics.exposition import CONTENT_TYPE_LATEST, generate_latest
 
-from trilane.apps.watch.figures import Figures, Histogram
+from trilane.apps.watch.figures import Histogram, MomentFigures
 from trilane.apps.watch.followed_run import RunState
 from trilane.apps.watch.live_figures import LEAST, LEAST_KEY
 
@@ -25,7 +25,7 @@ CONTENT_TYPE: Final[str] = CONTENT_TYPE_LATEST
 Row = tuple[tuple[str, ...], float]
 
 
-def openmetrics(figures: Figures) -> bytes:
+def openmetrics(figures: MomentFigures) -> bytes:
     """Write `figures` as a document of type `CONTENT_TYPE`, in UTF-8."""
     document: bytes = generate_latest(_Collected(figures))
     return document
@@ -34,7 +34,7 @@ def openmetrics(figures: Figures) -> bytes:
 class _Collected:
     """Hands a run's metrics to prometheus_client, whose registry holds the metrics of its own process."""
 
-    def __init__(self, figures: Figures) -> None:
+    def __init__(self, figures: MomentFigures) -> None:
         self._figures = figures
 
     def collect(self) -> Iterator[families.Metric]:
@@ -46,7 +46,7 @@ class _Collected:
         yield _sources(self._figures)
 
 
-def _histogram(times: Times, figures: Figures, created: float | None) -> families.Metric:
+def _histogram(times: Times, figures: MomentFigures, created: float | None) -> families.Metric:
     histogram = times.times(figures)
     names = [*map(str, histogram.bounds_s), "+Inf"]
     buckets = list(zip(names, map(float, accumulate(histogram.counts)), strict=True))
@@ -56,21 +56,21 @@ def _histogram(times: Times, figures: Figures, created: float | None) -> familie
     return family
 
 
-def _counter(metric: Metric, figures: Figures, created: float | None) -> families.Metric:
+def _counter(metric: Metric, figures: MomentFigures, created: float | None) -> families.Metric:
     family = families.CounterMetricFamily(metric.name, metric.help, labels=metric.labels, unit=metric.unit)
     for labels, value in metric.rows(figures):
         family.add_metric(labels, value, created)
     return family
 
 
-def _gauge(metric: Metric, figures: Figures) -> families.Metric:
+def _gauge(metric: Metric, figures: MomentFigures) -> families.Metric:
     family = families.GaugeMetricFamily(metric.name, metric.help, labels=metric.labels, unit=metric.unit)
     for labels, value in metric.rows(figures):
         family.add_metric(labels, value)
     return family
 
 
-def _sources(figures: Figures) -> families.Metric:
+def _sources(figures: MomentFigures) -> families.Metric:
     family = families.InfoMetricFamily(SOURCE.name, SOURCE.help, labels=("metric",))
     every: tuple[Times | Metric, ...] = (*HISTOGRAMS, *COUNTERS, *GAUGES)
     for metric in every:
@@ -79,7 +79,7 @@ def _sources(figures: Figures) -> families.Metric:
     return family
 
 
-def _sources_of(figures: Figures, key: str) -> Iterator[tuple[str, str]]:
+def _sources_of(figures: MomentFigures, key: str) -> Iterator[tuple[str, str]]:
     """Yield "" and the source of `key`, then each place or avatar below it that has a source of its own."""
     for name, source in figures.sources.items():
         if key and (name == key or (name.startswith(f"{key}.") and "*" not in name)):
@@ -96,7 +96,7 @@ class Metric(NamedTuple):
     unit: str
     help: str
     labels: tuple[str, ...]
-    rows: Callable[[Figures], Iterable[Row]]
+    rows: Callable[[MomentFigures], Iterable[Row]]
     source: str = ""
 
 
@@ -105,26 +105,26 @@ class Times(NamedTuple):
 
     name: str
     help: str
-    times: Callable[[Figures], Histogram]
+    times: Callable[[MomentFigures], Histogram]
     source: str
 
 
-def _bytes_moved(figures: Figures) -> Iterator[Row]:
+def _bytes_moved(figures: MomentFigures) -> Iterator[Row]:
     for name, stage in figures.stages.items():
         yield from (((name, kind), moved.total) for kind, moved in stage.bytes.items() if kind != LEAST)
 
 
-def _bytes_needed(figures: Figures) -> Iterator[Row]:
+def _bytes_needed(figures: MomentFigures) -> Iterator[Row]:
     for name, stage in figures.stages.items():
         yield from (((name,), moved.total) for kind, moved in stage.bytes.items() if kind == LEAST)
 
 
-def _idle(figures: Figures) -> Iterator[Row]:
+def _idle(figures: MomentFigures) -> Iterator[Row]:
     for name, unit in figures.units.items():
         yield from (((name, cause), share) for cause, share in unit.window.idle.items())
 
 
-def _psnr(figures: Figures) -> Iterator[Row]:
+def _psnr(figures: MomentFigures) -> Iterator[Row]:
     for name, facts in figures.accuracy.items():
         yield from (((name, band), value) for band, value in facts.get("psnr_db_by_band", {}).items())
 

@@ -23,7 +23,7 @@ from trilane.stages.cpu.mesh_bounds import MeshBounds
 
 
 @dataclass(frozen=True)
-class Seen:
+class CastView:
     """One avatar in one frame.
 
     `index`: number of the avatar in the scene. `folder`: folder of its bundle. `pose` (55,3), `translation` (3,),
@@ -76,7 +76,7 @@ class Cast:
             for index, (folder, mover) in enumerate(zip(folders, staged.movers, strict=True))
         ]
 
-    def seen(self, frame: int) -> list[Seen]:
+    def seen(self, frame: int) -> list[CastView]:
         """Return the avatars that are on the screen in frame number `frame`."""
         t_s = frame / self._fps
         view, whole = self._camera.sample(t_s), self.projection(frame)
@@ -91,7 +91,7 @@ class Cast:
         """Return the projection (4,4) of the whole picture in frame number `frame`."""
         return self._camera.projection(frame / self._fps, self._output)
 
-    def _seen(self, actor: _Actor, t_s: float, view: F64, whole: F64) -> Seen | None:
+    def _seen(self, actor: _Actor, t_s: float, view: F64, whole: F64) -> CastView | None:
         pose, translation = actor.mover.sample(t_s)
         world = actor.mover.world
         posed = actor.skeleton.pose(pose, translation, world)
@@ -103,7 +103,7 @@ class Cast:
         projection = crop_projection(whole, box.rect(self._output))
         depth = float(view[2] @ pelvis)
         joints = posed.matrices.copy()
-        return Seen(actor.index, actor.folder, pose, translation, world, joints, box, depth, view, projection)
+        return CastView(actor.index, actor.folder, pose, translation, world, joints, box, depth, view, projection)
 
 
 def _skeleton(data: AvatarData) -> Skeleton:

@@ -24,9 +24,9 @@ import numpy as np
 from trilane.arrays import F32, F64, U8
 from trilane.avatars.bundle import BUILT_IN, bundle_folder
 from trilane.bench.lib import float_raster
-from trilane.bench.lib.cast import Cast, Seen
+from trilane.bench.lib.cast import Cast, CastView
 from trilane.bench.lib.full_network import Paint, float_network
-from trilane.bench.lib.layers import Layer, blended, enlarged, grown, premultiplied, shrunk
+from trilane.bench.lib.layers import RasterLayer, blended, enlarged, grown, premultiplied, shrunk
 from trilane.body.body import Body
 from trilane.body.joints import JOINTS
 from trilane.body.kinematics import rodrigues
@@ -134,7 +134,7 @@ class FullPictures:
         """Return frame `number` over its `background` (h,w,3): (h,w,3) uint8, sRGB."""
         return blended(background, [self._layer(seen) for seen in self._cast.seen(number)])
 
-    def _layer(self, seen: Seen) -> Layer:
+    def _layer(self, seen: CastView) -> RasterLayer:
         avatar = self._avatars[seen.folder]
         times = fineness(seen.box.shape, avatar.area)
         box = grown(seen.box, BUCKET_STEP * times.denominator)
@@ -143,7 +143,7 @@ class FullPictures:
         clip = crop_projection(seen.projection, box.within(seen.box)) @ seen.view
         tensor = supersampled(vertices, avatar.mesh, clip, (height, width), avatar.texture)
         painted = premultiplied(avatar.paint(tensor))
-        return Layer(box, seen.depth, enlarged(shrunk(painted, times.numerator), times.denominator))
+        return RasterLayer(box, seen.depth, enlarged(shrunk(painted, times.numerator), times.denominator))
 
 
 def fineness(shape: Shape, area: int) -> Fraction:
@@ -206,12 +206,12 @@ class TruePictures:
         """Return frame `number` over its `background` (h,w,3): (h,w,3) uint8, sRGB."""
         return blended(background, self.layers(number))
 
-    def layers(self, number: int) -> list[Layer]:
+    def layers(self, number: int) -> list[RasterLayer]:
         """Return the layers of those who are seen in frame `number`, on the picture's grid."""
         layers = []
         for seen in self._cast.seen(number):
             rgba = self._clothed[seen.folder].render(seen.joints, seen.view, seen.projection, seen.box.shape) / 255.0
-            layers.append(Layer(seen.box, seen.depth, premultiplied(rgba)))
+            layers.append(RasterLayer(seen.box, seen.depth, premultiplied(rgba)))
         return layers
 
 

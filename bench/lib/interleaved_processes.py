@@ -62,7 +62,7 @@ def asked_processes() -> Iterator[Callable[[Callable[..., None], Any], Connectio
 
 
 @dataclass(frozen=True)
-class Variant:
+class ProcessVariant:
     """One way to infer.
 
     `kind`: key of `KINDS`.
@@ -105,7 +105,7 @@ class Runner:
 
 
 @contextmanager
-def runners(variants: Mapping[str, Variant]) -> Iterator[dict[str, Runner]]:
+def runners(variants: Mapping[str, ProcessVariant]) -> Iterator[dict[str, Runner]]:
     """Start a waiting process for each variant; they end with the block.
 
     Raises TrilaneError when one does not start.
@@ -114,7 +114,7 @@ def runners(variants: Mapping[str, Variant]) -> Iterator[dict[str, Runner]]:
         yield {name: Runner(start(serve, variant), name) for name, variant in variants.items()}
 
 
-def serve(pipe: Connection, variant: Variant) -> None:
+def serve(pipe: Connection, variant: ProcessVariant) -> None:
     """Run the child: load, send the start-up time, then run as often as each message says, until `pipe` closes."""
     try:
         begin = time.perf_counter()
@@ -139,7 +139,7 @@ def _timed(run: Callable[[], object], count: int) -> list[float]:
     return times
 
 
-def _runtime(variant: Variant) -> Callable[[], object]:
+def _runtime(variant: ProcessVariant) -> Callable[[], object]:
     """Return a call as Trilane runs a network: arrays are bound once."""
     from trilane.avatars.network_file import read_network
     from trilane.bench.lib.networks import random_tensor
@@ -151,7 +151,7 @@ def _runtime(variant: Variant) -> Callable[[], object]:
     return session.bind([random_tensor(network)], [image]).run
 
 
-def _ort_default(variant: Variant) -> Callable[[], object]:
+def _ort_default(variant: ProcessVariant) -> Callable[[], object]:
     """Return a call as in ONNX Runtime's first example: a session with defaults, `run` with an array."""
     import onnxruntime
 
@@ -168,7 +168,7 @@ def _ort_default(variant: Variant) -> Callable[[], object]:
     return lambda: session.run(None, {source.name: feed})
 
 
-def _openvino_default(variant: Variant) -> Callable[[], object]:
+def _openvino_default(variant: ProcessVariant) -> Callable[[], object]:
     """Return a call as in OpenVINO's first example: compile a file, call the model with an array."""
     from trilane.stages.dsp.runtime import quiet_openvino
 
@@ -180,7 +180,7 @@ def _openvino_default(variant: Variant) -> Callable[[], object]:
     return lambda: request.infer({0: feed})
 
 
-KINDS: dict[str, Callable[[Variant], Callable[[], object]]] = {
+KINDS: dict[str, Callable[[ProcessVariant], Callable[[], object]]] = {
     "runtime": _runtime,
     "ort": _ort_default,
     "openvino": _openvino_default,

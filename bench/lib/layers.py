@@ -46,7 +46,7 @@ class Box(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Layer:
+class RasterLayer:
     """A layer of a picture.
 
     `light` (h,w,4): linear light times alpha, then alpha, 0..1. `depth`: camera z; the least is the farthest.
@@ -106,7 +106,7 @@ def _enlarged_down(light: F64, factor: int) -> F64:
     return np.asarray((1 - share) * light[above] + share * light[below])
 
 
-def placed(light: F64, rect: Rect, output: Shape, depth: float) -> Layer:
+def placed(light: F64, rect: Rect, output: Shape, depth: float) -> RasterLayer:
     """Read `light` (h,w,C), which fills `rect` of a picture of `output` (height, width), at the picture's pixels.
 
     Each pixel whose centre lies in `rect` is the mean of as many bilinear reads as the composite takes, evenly over the
@@ -120,7 +120,7 @@ def placed(light: F64, rect: Rect, output: Shape, depth: float) -> Layer:
     first_column, columns = _reads(left, right, width, output[1], taps)
     box = Box(first_row, first_column, first_row + len(rows), first_column + len(columns))
     across = np.einsum("xw,hwc->hxc", columns, light, optimize=True)
-    return Layer(box, depth, np.asarray(np.einsum("yh,hxc->yxc", rows, across, optimize=True)))
+    return RasterLayer(box, depth, np.asarray(np.einsum("yh,hxc->yxc", rows, across, optimize=True)))
 
 
 def _reads(begin: float, end: float, count: int, side: int, taps: int) -> tuple[int, F64]:
@@ -142,12 +142,12 @@ def _reads(begin: float, end: float, count: int, side: int, taps: int) -> tuple[
     return first, weights
 
 
-def blended(background: U8, layers: Iterable[Layer]) -> U8:
+def blended(background: U8, layers: Iterable[RasterLayer]) -> U8:
     """Blend `layers` over `background`, both sRGB, (h,w,3) uint8; the farthest layer first."""
     return np.asarray(np.rint(laid_over(background, layers)[0] * 255), np.uint8)
 
 
-def laid_over(background: U8, layers: Iterable[Layer]) -> tuple[F64, F64]:
+def laid_over(background: U8, layers: Iterable[RasterLayer]) -> tuple[F64, F64]:
     """Blend as `blended`, without rounding: (h,w,3) in 0..1, and how much of each pixel (h,w) the layers cover."""
     output = (background.shape[0], background.shape[1])
     light, seen_through = to_light(background / 255.0), np.ones(output)

@@ -15,7 +15,7 @@ from trilane.avatars.bundle import BUILT_IN, CLOTHES_STANDOFF_M
 from trilane.bench.lib import full_picture
 from trilane.bench.lib.cast import Cast
 from trilane.bench.lib.full_picture import SAMPLES, FullPictures, true_pictures
-from trilane.bench.lib.layers import Box, Layer, blended, premultiplied, to_light
+from trilane.bench.lib.layers import Box, RasterLayer, blended, premultiplied, to_light
 from trilane.bench.lib.stage_chain import AvatarFrames
 from trilane.body.body import load_body
 from trilane.stages.configure import Checked, configure
@@ -61,7 +61,7 @@ def test_blending_is_what_the_painter_does_on_the_same_grid(gl: Any) -> None:
     below.draw()
     avatar.draw(target, box.shape, tuple(box.rect(output)), (0, 0, *box.shape))
     drawn = np.frombuffer(target.read(components=3, alignment=1), np.uint8).reshape(*output, 3)
-    own = blended(background, [Layer(box, -1.0, premultiplied(rgba / 255.0))])
+    own = blended(background, [RasterLayer(box, -1.0, premultiplied(rgba / 255.0))])
     assert np.abs(drawn.astype(int) - own).max() <= 1
     for picture in (own, drawn):
         changed = (picture != background).any(axis=-1)

@@ -8,7 +8,7 @@ import onnx
 import pytest
 
 from trilane.bench import infer, roofline
-from trilane.bench.lib.interleaved_processes import Variant, runners
+from trilane.bench.lib.interleaved_processes import ProcessVariant, runners
 from trilane.errors import BadInputError, TrilaneError
 
 
@@ -20,7 +20,9 @@ def file(tiny_quantised, tmp_path):
 
 
 def test_variants_run_interleaved_and_leave_no_process(file):
-    with runners({"ours": Variant("runtime", file, "ort", 1), "plain": Variant("ort", file, threads=1)}) as by_name:
+    with runners(
+        {"ours": ProcessVariant("runtime", file, "ort", 1), "plain": ProcessVariant("ort", file, threads=1)}
+    ) as by_name:
         assert {name: len(runner.run(3)) for name, runner in by_name.items()} == {"ours": 3, "plain": 3}
         assert all(runner.startup_ms > 0 for runner in by_name.values())
     assert not multiprocessing.active_children()
@@ -29,7 +31,7 @@ def test_variants_run_interleaved_and_leave_no_process(file):
 def test_a_variant_that_fails_says_why(tmp_path):
     with (
         pytest.raises(TrilaneError, match=r"ours.*nothing\.onnx"),
-        runners({"ours": Variant("runtime", tmp_path / "nothing.onnx", "ort")}),
+        runners({"ours": ProcessVariant("runtime", tmp_path / "nothing.onnx", "ort")}),
     ):
         pass
 

@@ -121,7 +121,7 @@ class CaptureRenderer:
         number = self._numbers[int(rng.integers(len(self._numbers)))]
         view, screen = self.capture.views[number], screen_shape(rng)
         posed = self._raster.posed(self.capture.fits[number])
-        camera = Camera(view, self._projection, self._lens)
+        camera = SampleCamera(view, self._projection, self._lens)
         by = zoomed_view(rng, band, posed, camera, self._centres, self._rule, screen)
         if by is None:
             return None
@@ -394,7 +394,7 @@ class ViewRule:
 
 
 @dataclass(frozen=True)
-class Camera:
+class SampleCamera:
     """A frame's camera.
 
     `view`, `projection`: matrices (4,4).
@@ -416,7 +416,13 @@ def screen_shape(rng: np.random.Generator) -> Shape:
 
 
 def zoomed_view(
-    rng: np.random.Generator, band: str, posed: Posed, camera: Camera, centres: Centres, rule: ViewRule, screen: Shape
+    rng: np.random.Generator,
+    band: str,
+    posed: Posed,
+    camera: SampleCamera,
+    centres: Centres,
+    rule: ViewRule,
+    screen: Shape,
 ) -> F64 | None:
     """Return a random map (3,3) of `band` from the frame to a screen; None when its centre is not in the frame.
 

@@ -22,7 +22,7 @@ from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import read_network
 from trilane.bench import infer, peers, roofline
 from trilane.bench.lib.instruction_sets import Issued
-from trilane.bench.lib.interleaved_processes import Variant
+from trilane.bench.lib.interleaved_processes import ProcessVariant
 from trilane.bench.lib.networks import NetworkFixture, fixture_of_file
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
 
@@ -35,10 +35,10 @@ class ToldRunners:
 
     def __init__(self, ms: Callable[[str, int], list[float]]) -> None:
         self._ms, self._turns = ms, dict[str, int]()
-        self.variants: list[dict[str, Variant]] = []
+        self.variants: list[dict[str, ProcessVariant]] = []
 
     @contextmanager
-    def __call__(self, variants: Mapping[str, Variant]) -> Iterator[dict[str, Any]]:
+    def __call__(self, variants: Mapping[str, ProcessVariant]) -> Iterator[dict[str, Any]]:
         self.variants.append(dict(variants))
         yield {name: self._runner(name, place) for place, name in enumerate(variants)}
 
@@ -193,11 +193,11 @@ def test_peers_run_interleaved_on_the_same_files(
     assert not integer.parent.exists()
     assert told.variants == [
         {
-            "trilane ort": Variant("runtime", integer, "ort", 4),
-            "trilane openvino": Variant("runtime", integer, "openvino", 4),
-            "onnxruntime fp32": Variant("ort", plain),
-            "onnxruntime int8": Variant("ort", integer),
-            "openvino int8": Variant("openvino", integer),
+            "trilane ort": ProcessVariant("runtime", integer, "ort", 4),
+            "trilane openvino": ProcessVariant("runtime", integer, "openvino", 4),
+            "onnxruntime fp32": ProcessVariant("ort", plain),
+            "onnxruntime int8": ProcessVariant("ort", integer),
+            "openvino int8": ProcessVariant("openvino", integer),
         }
     ]
     assert notes.read_text().startswith(f"-m {integer} -d CPU -hint none -api sync -nthreads 4 -nstreams 1 -t 1 ")

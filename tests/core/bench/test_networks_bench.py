@@ -15,7 +15,7 @@ import pytest
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import read_network
 from trilane.bench.lib import interleaved_processes, networks
-from trilane.bench.lib.interleaved_processes import KINDS, Runner, Variant
+from trilane.bench.lib.interleaved_processes import KINDS, ProcessVariant, Runner
 from trilane.errors import MissingPartError, TrilaneError
 
 
@@ -70,10 +70,10 @@ def test_a_runner_that_does_not_answer_says_so(answers: list[Any], message: str)
 
 def test_a_child_loads_warms_up_and_runs_as_often_as_it_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     """The clock stands still but for loading (2 s) and each run (its number in ms)."""
-    ran: list[Variant] = []
+    ran: list[ProcessVariant] = []
     now = [0]
 
-    def load(variant: Variant) -> Any:
+    def load(variant: ProcessVariant) -> Any:
         now[0] += 2_000_000_000
 
         def run() -> None:
@@ -85,7 +85,7 @@ def test_a_child_loads_warms_up_and_runs_as_often_as_it_is_asked(monkeypatch: py
     clock = SimpleNamespace(perf_counter=lambda: now[0] / 1e9, perf_counter_ns=lambda: now[0])
     monkeypatch.setattr(interleaved_processes, "time", clock)
     monkeypatch.setitem(KINDS, "told", load)
-    variant = Variant("told", Path("n.onnx"))
+    variant = ProcessVariant("told", Path("n.onnx"))
     pipe = Pipe(2, 3, EOFError())
     interleaved_processes.serve(pipe, variant)  # type: ignore[arg-type]
     assert pipe.sent == [2000.0, [4.0, 5.0], [6.0, 7.0, 8.0]]
@@ -112,11 +112,11 @@ def test_every_kind_infers_the_same_bytes(network: Path, tiny_float: onnx.ModelP
     plain = onnxruntime.InferenceSession(str(network), providers=["CPUExecutionProvider"])
     expected = plain.run(None, {plain.get_inputs()[0].name: source})[0]
     for threads in (1, None):
-        (found,) = KINDS["ort"](Variant("ort", network, threads=threads))()  # type: ignore[misc]
+        (found,) = KINDS["ort"](ProcessVariant("ort", network, threads=threads))()  # type: ignore[misc]
         assert np.array_equal(found, expected)
-        assert KINDS["runtime"](Variant("runtime", network, "ort", threads))() is None
+        assert KINDS["runtime"](ProcessVariant("runtime", network, "ort", threads))() is None
     onnx.save(tiny_float, tmp_path / "float.onnx")
-    (found,) = KINDS["ort"](Variant("ort", tmp_path / "float.onnx"))()  # type: ignore[misc]
+    (found,) = KINDS["ort"](ProcessVariant("ort", tmp_path / "float.onnx"))()  # type: ignore[misc]
     real = np.random.default_rng(1).normal(size=(1, 5, 64, 64)).astype(np.float32)
     plain = onnxruntime.InferenceSession(str(tmp_path / "float.onnx"), providers=["CPUExecutionProvider"])
     np.testing.assert_allclose(found, plain.run(None, {"tensor": real})[0], atol=1e-6)
@@ -126,8 +126,8 @@ def test_every_kind_infers_the_same_bytes(network: Path, tiny_float: onnx.ModelP
 def test_openvino_infers_nearly_the_same(network: Path, threads: int | None) -> None:
     """Its sums round elsewhere: few bytes are off, by a step or two."""
     pytest.importorskip("openvino")
-    (ours,) = KINDS["ort"](Variant("ort", network))()  # type: ignore[misc]
-    (theirs,) = KINDS["openvino"](Variant("openvino", network, threads=threads))().values()  # type: ignore[attr-defined]
+    (ours,) = KINDS["ort"](ProcessVariant("ort", network))()  # type: ignore[misc]
+    (theirs,) = KINDS["openvino"](ProcessVariant("openvino", network, threads=threads))().values()  # type: ignore[attr-defined]
     steps = np.abs(np.asarray(theirs).astype(int) - ours)
     assert (steps > 0).mean() < 0.05 and steps.max() <= 4
 

@@ -10,7 +10,7 @@ import pytest
 from trilane.bench.lib.full_picture import fineness
 from trilane.bench.lib.layers import (
     Box,
-    Layer,
+    RasterLayer,
     blended,
     box_around,
     enlarged,
@@ -26,8 +26,8 @@ from trilane.scene.crop import Rect
 CODES = np.arange(256, dtype=np.uint8)
 
 
-def layer(box: Box, rgba: tuple[float, float, float, float], depth: float = -1.0) -> Layer:
-    return Layer(box, depth, premultiplied(np.tile(np.array(rgba), (*box.shape, 1))))
+def layer(box: Box, rgba: tuple[float, float, float, float], depth: float = -1.0) -> RasterLayer:
+    return RasterLayer(box, depth, premultiplied(np.tile(np.array(rgba), (*box.shape, 1))))
 
 
 def test_a_box_is_whole_pixels_around_the_rectangle_in_multiples_of_32() -> None:

@@ -14,7 +14,7 @@ from trilane.errors import BadInputError
 from trilane.pipeline.rehearsal import Rehearsed
 from trilane.pipeline.trial import Round
 from trilane.scheduler.placement import Ranked
-from trilane.scheduler.places import Core, Place, Work
+from trilane.scheduler.places import CpuCore, Place, UnitWork
 from trilane.stages.placing import TriedPlacement
 
 HERE = {"cpu": Place((0,), 1), "gpu": Place((1,), 1)}
@@ -54,7 +54,9 @@ def trial(monkeypatch: pytest.MonkeyPatch) -> Any:
 
     found = [Ranked(each, ms * 1_000_000) for each, ms in ((A, 9), (B, 10), (C, 11))]
     monkeypatch.setattr(placement, "rule_placement", lambda cores: RULE if cores == (0, 1) else {})
-    monkeypatch.setattr(placement, "measured_times", lambda *_: Rehearsed({"cpu": {1: Work(2_000_000, 1_500_000)}}, {}))
+    monkeypatch.setattr(
+        placement, "measured_times", lambda *_: Rehearsed({"cpu": {1: UnitWork(2_000_000, 1_500_000)}}, {})
+    )
     monkeypatch.setattr(placement, "ranked", lambda *_: list(found))
     monkeypatch.setattr(placement, "frame_ns", lambda *_: 15_000_000)
     monkeypatch.setattr(placement, "worth_trying", lambda ranking, rule: [ranking[1], ranking[0], rule])
@@ -62,7 +64,7 @@ def trial(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setattr(placement, "tried", tried)
     monkeypatch.setattr(placement, "time", SimpleNamespace(monotonic=iter([5.0, 7.5]).__next__))
     monkeypatch.setattr(placement._Trial, "_run", run)
-    made = placement._Trial(None, [Core(0, 0), Core(1, 1)], None)  # type: ignore[arg-type]
+    made = placement._Trial(None, [CpuCore(0, 0), CpuCore(1, 1)], None)  # type: ignore[arg-type]
     return SimpleNamespace(made=made, asked=asked)
 
 

@@ -25,7 +25,7 @@ from trilane.hw_profiles.rates import Wanted
 from trilane.hw_profiles.reference_networks import ConfigurationRow, NetworkSpec, reference_network
 from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.hw_profiles.unit_times import time_on
-from trilane.scheduler.places import Core
+from trilane.scheduler.places import CpuCore
 from trilane.units import BURST
 
 NETWORK = reference_network(NetworkSpec("resnet18", "batch", 64, 96, 10))
@@ -161,7 +161,7 @@ def test_a_network_by_itself_has_its_measured_time_or_no_interval() -> None:
 
 def test_units_are_placed_by_the_measured_times() -> None:
     """Two threads that are slower than one are not taken, and a number that was not measured is none to choose from."""
-    cores, plan = [Core(number, number) for number in range(4)], Plan(NETWORK, "dsp", PIPELINED)
+    cores, plan = [CpuCore(number, number) for number in range(4)], Plan(NETWORK, "dsp", PIPELINED)
 
     def threads(**ms: float) -> set[int]:
         profile = measured(**ms)

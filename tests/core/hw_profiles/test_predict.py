@@ -33,7 +33,7 @@ from trilane.hw_profiles.predict import _frame_times, ema_range_ms, predict, pre
 from trilane.hw_profiles.profile_files import load_profile, load_tables, parse_profile
 from trilane.hw_profiles.reference_networks import NetworkSpec, read_table, reference_network
 from trilane.hw_profiles.schema import CORNERS, Profile, corners_of
-from trilane.scheduler.places import Core, Place
+from trilane.scheduler.places import CpuCore, Place
 from trilane.units import UNITS, UnitName
 
 NETWORK = reference_network(NetworkSpec("resnet18", "batch", 512, 512, 16))
@@ -303,7 +303,7 @@ def test_this_machine_in_virtual_time_is_placed_as_its_times_ask(count: int, mon
         monkeypatch.setattr(f"trilane.hw_profiles.{module}.usable_cores", lambda: cores)
     profile, plan = load_profile("host"), Plan(NETWORK, "dsp", Variant("pipelined", "double"))
     corners = corners_of(profile, SUSTAINED)
-    placed = place_units(profile, plan, corners, [Core(number, number) for number in cores])
+    placed = place_units(profile, plan, corners, [CpuCore(number, number) for number in cores])
     frames = {each.frame_ns: steady(on_cores(profile, each.placement), plan, corners).frame_ms for each in placed.found}
     chosen = steady(on_cores(profile, placed.best.placement), plan, corners).frame_ms
     assert chosen <= 1.05 * min(frames.values())

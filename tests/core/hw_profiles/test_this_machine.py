@@ -25,7 +25,7 @@ from trilane.machine import Machine
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.rehearsal import Rehearsed
 from trilane.pipeline.stage import UnitContext
-from trilane.scheduler.places import Work
+from trilane.scheduler.places import UnitWork
 from trilane.stages import machine_facts
 from trilane.stages.dsp import bare_calls
 from trilane.units import BURST
@@ -239,7 +239,7 @@ def rehearsed(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, A
     asked: dict[str, Any] = {}
     one = [1_000_000] * 3
     took_ns = {"pose": one, "raster": one, "infer": [5_000_000] * 3, "composite": one, "present": one}
-    times = {"dsp": {1: Work(5_000_000, 5_000_000), 2: Work(3_000_000, 3_000_000)}}
+    times = {"dsp": {1: UnitWork(5_000_000, 5_000_000), 2: UnitWork(3_000_000, 3_000_000)}}
 
     def configure(request: Any, _: Path) -> Any:
         asked["request"] = request

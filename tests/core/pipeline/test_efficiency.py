@@ -10,7 +10,7 @@ import pytest
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
 from trilane.pipeline.job_times import lost_in_job
 from trilane.pipeline.journal import Begun, records_of
-from trilane.pipeline.reckoning import Efficiencies, Reckoned, places_of, reckoned
+from trilane.pipeline.reckoning import Reckoned, RunEfficiencies, places_of, reckoned
 from trilane.scheduler.events import Settings, chain
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.places import Place
@@ -28,7 +28,7 @@ def job(unit: str, begin_ns: int, end_ns: int, cpu_ns: int, **lost: int) -> JobR
 
 def figures(places: Mapping[str, Place], jobs: list[tuple[JobRecord, bool]]) -> tuple[float | None, ...]:
     """Efficiency of the slowest unit, of the fullest cores, of the machine."""
-    told = Efficiencies(places)
+    told = RunEfficiencies(places)
     for one, presents in jobs:
         told.add(one, presents=presents)
     return tuple(told.close().values())

@@ -19,7 +19,7 @@ from trilane.pipeline.hardware_counters import (
     ATTR,
     KINDS,
     ROW,
-    Counted,
+    CounterReading,
     HardwareCounters,
     NoCounters,
     absence,
@@ -29,7 +29,7 @@ from trilane.pipeline.hardware_counters import (
 )
 
 SOFTWARE, PAGE_FAULTS, MINOR_FAULTS = 1, 2, 5
-FAULTS = (Counted("faults", SOFTWARE, PAGE_FAULTS), Counted("minor", SOFTWARE, MINOR_FAULTS))
+FAULTS = (CounterReading("faults", SOFTWARE, PAGE_FAULTS), CounterReading("minor", SOFTWARE, MINOR_FAULTS))
 PAGES = 200
 
 

@@ -209,7 +209,7 @@ def test_what_units_say_becomes_events_in_order(monkeypatch: pytest.MonkeyPatch)
     world.said.clear()
     job_error = Failed(1, 3, "dark")
     world.inbox = [
-        [("gpu", Done(0, 5, 9, 6, 1, 2, 3, 1, 7, 8, {})), ("cpu", messages.Pong()), ("cpu", Closed())],
+        [("gpu", Done(0, 5, 9, 6, 1, 2, 3, 1, 7, 8, {})), ("cpu", messages.PongMessage()), ("cpu", Closed())],
         [("gpu", job_error), ("cpu", None), ("cpu", Ready(8)), ("gpu", Failed(-1, 1, "unbuilt"))],
     ]
     assert clock.wait(NEVER)[1] == (JobDone("gpu", 0, 5, 9, 6, 1, 2, 3, True), Pong("cpu"))

@@ -13,9 +13,9 @@ from trilane.pipeline.rehearsal import Chain, on_rungs, timed, works_of
 from trilane.pipeline.result import UnitError
 from trilane.scheduler.events import StageAlone, chain
 from trilane.scheduler.placement import Ranked
-from trilane.scheduler.places import Core, Place, Work
+from trilane.scheduler.places import CpuCore, Place, UnitWork
 from trilane.stages.placing import MEASURED, _reason, considered, thread_counts
-from trilane.transport.messages import Done, Pong, RunJob
+from trilane.transport.messages import Done, PongMessage, RunJob
 
 STAGES = (("pose", "cpu"), ("raster", "gpu"), ("infer", "dsp"), ("present", "cpu"))
 GRAPH = chain(STAGES, "double", "present")
@@ -50,7 +50,7 @@ class Units:
         times = {"preempted_ns": 100_000, "asleep_ns": 0, "preempted_before_ns": 0, "skips": 0}
         own = {"t_begin_ns": 5, "t_end_ns": 5 + own_ns + 100_000, "t_sampled_ns": 5, "metrics": {}}
         done = Done(id=job.id, cpu_ns=cpu_ns, cpu_before_ns=0, **own, **times)
-        return [("gpu" if unit != "gpu" else "cpu", done._replace(t_end_ns=5)), (unit, Pong()), (unit, done)]
+        return [("gpu" if unit != "gpu" else "cpu", done._replace(t_end_ns=5)), (unit, PongMessage()), (unit, done)]
 
     def chain(self, *, whole: bool = True) -> Chain:
         processes: Any = dict.fromkeys(("cpu", "gpu", "dsp"), self)
@@ -71,17 +71,17 @@ def test_works_are_medians_over_the_frames_that_do_not_warm_up(units: Units) -> 
     units.more_us |= {("infer", 2, 0): 10, ("infer", 3, 0): 70, ("infer", 4, 0): 20}
     works = works_of(PIPELINE, timed(units.chain(), [0, 1, 2, 3, 4]))
     assert works == {
-        "cpu": Work(4_000_000, 2_000_000, 2),
-        "gpu": Work(2_000_000, 1_000_000, 1),
-        "dsp": Work(4_020_000, 4_020_000 // 4, 1),  # half of it is CPU time, of two threads
+        "cpu": UnitWork(4_000_000, 2_000_000, 2),
+        "gpu": UnitWork(2_000_000, 1_000_000, 1),
+        "dsp": UnitWork(4_020_000, 4_020_000 // 4, 1),  # half of it is CPU time, of two threads
     }
 
 
 def test_cpu_time_is_never_more_than_the_time_it_took(units: Units) -> None:
     units.cpu = 3.0
     works = works_of(PIPELINE, timed(units.chain(), [0]))
-    assert works["gpu"] == Work(2_000_000, 2_000_000, 1)
-    assert works["dsp"] == Work(4_000_000, 4_000_000, 1)  # 3 / 2 of it for each thread
+    assert works["gpu"] == UnitWork(2_000_000, 2_000_000, 1)
+    assert works["dsp"] == UnitWork(4_000_000, 4_000_000, 1)  # 3 / 2 of it for each thread
 
 
 def test_what_a_stage_takes_on_each_rung_is_its_median_over_the_frames_after_the_first(units: Units) -> None:
@@ -117,7 +117,7 @@ def test_the_network_is_measured_with_every_number_of_threads_that_it_may_have()
 
 def test_of_many_cores_one_of_each_physical_is_considered() -> None:
     """Up to eight all; of more, the first sibling of each, sixteen of them; those that were asked for stay."""
-    siblings = [Core(number, number // 2) for number in range(40)]
+    siblings = [CpuCore(number, number // 2) for number in range(40)]
     assert considered(siblings[:8], {}) == siblings[:8]
     assert considered(siblings[:10], {}) == siblings[:10:2]
     assert considered(siblings, {}) == siblings[:32:2]

@@ -24,7 +24,7 @@ from trilane.pipeline.result import Failure, RunLog, UnitError, after_stderr
 from trilane.pipeline.surroundings import prompt_answers
 from trilane.pipeline.unit_processes import UnitMessage, close_units, listen_before_run, start_units
 from trilane.scheduler.events import FrameRequest, Hold, Stop
-from trilane.transport.messages import Close, Closed, Failed, Pong, Ready
+from trilane.transport.messages import Close, Closed, Failed, PongMessage, Ready
 
 S = 1_000_000_000
 
@@ -181,8 +181,8 @@ def test_what_goes_wrong_before_the_run_is_raised() -> None:
         listen_before_run(FakeProcesses([[("left", None)]]), NOBODY)  # type: ignore[arg-type]
     with pytest.raises(KeyboardInterrupt):
         listen_before_run(FakeProcesses([[]]), SimpleNamespace(count=1))  # type: ignore[arg-type]
-    messages = listen_before_run(FakeProcesses([[("left", Pong())]]), NOBODY)  # type: ignore[arg-type]
-    assert messages == [("left", Pong())]
+    messages = listen_before_run(FakeProcesses([[("left", PongMessage())]]), NOBODY)  # type: ignore[arg-type]
+    assert messages == [("left", PongMessage())]
 
 
 def closed(script: Sequence[Any], interrupts: Any = NOBODY) -> tuple[FakeProcesses, RunLog]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from trilane.pipeline.journal import Counted, Record, Stepped
-from trilane.pipeline.timeline import Done, Fact, Gone, Presented, Timeline
+from trilane.pipeline.timeline import EndedJob, Fact, Gone, Presented, Timeline
 from trilane.scheduler.events import (
     Dispatch,
     Event,
@@ -33,7 +33,7 @@ def job(number: int, stage: str, frame: int, rung: int = 0) -> Dispatch:
 
 
 def told(timeline: Timeline, records: Iterable[Record]) -> list[Fact]:
-    return [fact for record in records for fact in timeline.add(record) if not isinstance(fact, Done)]
+    return [fact for record in records for fact in timeline.add(record) if not isinstance(fact, EndedJob)]
 
 
 def test_a_frame_is_told_with_its_times_and_its_work() -> None:

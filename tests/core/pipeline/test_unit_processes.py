@@ -26,7 +26,7 @@ from trilane.pipeline.unit_loop import UnitSpec
 from trilane.pipeline.unit_processes import UnitMessage, UnitProcesses
 from trilane.pipeline.unit_starter import StartedUnit, UnitStarter
 from trilane.transport.link import HeartbeatSocket
-from trilane.transport.messages import Done, JobPipe, JobPipeEnd, Ping, Pong, Ready
+from trilane.transport.messages import Done, JobPipe, JobPipeEnd, Ping, PongMessage, Ready
 from trilane.transport.packets import header_dtype
 
 PIPELINE = Pipeline(
@@ -130,8 +130,8 @@ def test_heartbeats_come_in_and_the_name_of_their_socket_goes(started: Started) 
     processes.connected("left")
     processes.connected("nobody")
     assert not folder.exists()
-    beats.send(Pong())
-    assert heard(processes, 1) == [UnitMessage("left", Pong())]
+    beats.send(PongMessage())
+    assert heard(processes, 1) == [UnitMessage("left", PongMessage())]
     beats.socket.send(b"\xffno")
     with pytest.raises(TrilaneError, match=r"^unit left sent bytes that are not a message: unknown message"):
         heard(processes, 1)

@@ -21,7 +21,7 @@ from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.job_times import LOSS_NS
 from trilane.pipeline.stage import UnitContext
 from trilane.pipeline.unit_loop import BoundStage, UnitSpec
-from trilane.transport.messages import Close, Closed, Failed, MessageError, Ping, Pong, Ready, RunJob
+from trilane.transport.messages import Close, Closed, Failed, MessageError, Ping, PongMessage, Ready, RunJob
 from trilane.transport.packets import Packet
 
 
@@ -136,7 +136,7 @@ def test_a_unit_answers_every_message_once(monkeypatch: pytest.MonkeyPatch) -> N
     assert one[4:10] == (2, wall_ns - 102, 0, 0, 100, 100)
     assert two[4:10] == (2, 0, 2, 0, 100, 200)  # held to a pace: the chip worked
     assert [(meter.others, meter.looks) for meter in meters] == [(others, 3)]  # at the start, after a job
-    assert link.beats == [Ready(os.getpid()), Pong()]
+    assert link.beats == [Ready(os.getpid()), PongMessage()]
     assert (first.runs, second.runs) == ([(5, None, 1)], [(6, 1, None)])
     assert [int(packet.header["epoch"]) for packet in outputs] == [9, 2]
     assert first.closed and second.closed
@@ -145,7 +145,7 @@ def test_a_unit_answers_every_message_once(monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_unit_ends_when_its_pipe_does_and_refuses_what_is_not_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     assert served(monkeypatch, FakeLink(), []) == 1
     with pytest.raises(MessageError, match=r"Pong\(\) is not for a unit"):
-        served(monkeypatch, FakeLink(Pong()), [])
+        served(monkeypatch, FakeLink(PongMessage()), [])
 
 
 @pytest.mark.parametrize(

@@ -12,11 +12,11 @@ from random import Random
 import pytest
 
 from trilane.scheduler.placement import Ranked, Rules, ranked, worth_trying
-from trilane.scheduler.places import Core, Placement, Times, Work
+from trilane.scheduler.places import CpuCore, Placement, Times, UnitWork
 
 STEP_MS, SLICE_MS, SLOTS, FRAMES, WARM = 0.1, 1.0, 2, 40, 10
 SPREAD = 0.05  # of a job's time
-CORES = [Core(0, 0), Core(1, 1)]
+CORES = [CpuCore(0, 0), CpuCore(1, 1)]
 FIRST = Rules("cpu")
 RULE = "[(0,), (0,), (1,)]"
 #: Unit of each stage, and its part of the unit's time.
@@ -110,7 +110,9 @@ def cores_of(each: Ranked) -> str:
 
 
 def of_one_thread(ms: dict[str, float]) -> Times:
-    return {unit: {1: Work(round(1e6 * own), round(1e6 * own), 1 if unit == "dsp" else 2)} for unit, own in ms.items()}
+    return {
+        unit: {1: UnitWork(round(1e6 * own), round(1e6 * own), 1 if unit == "dsp" else 2)} for unit, own in ms.items()
+    }
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 from trilane.pipeline.run import RELATIVE_ERROR, DdSketch
 from trilane.scheduler.events import NEVER, chain
 from trilane.scheduler.ledger import Books, Ledger
-from trilane.scheduler.stats import MOST_BLOCKS, MOST_EXACT, MOVED_AT_ONCE, FrameTimes, Samples, summary_ms
+from trilane.scheduler.stats import MOST_BLOCKS, MOST_EXACT, MOVED_AT_ONCE, FrameTimeSamples, Samples, summary_ms
 
 RANKS = (50, 90, 95, 99)
 
@@ -77,7 +77,7 @@ def test_values_move_into_the_sketch_a_few_at_a_time_and_none_is_lost() -> None:
 def test_the_interval_of_a_long_run_is_that_of_all_its_frames() -> None:
     """30,000 frames are 1,875 blocks of 16: each of the ten batches begins at most five of them later or earlier."""
     values = times(30_000)
-    bounded, whole = FrameTimes(DdSketch), FrameTimes()
+    bounded, whole = FrameTimeSamples(DdSketch), FrameTimeSamples()
     for value in values:
         bounded.add(value)
         whole.add(value)
@@ -96,7 +96,7 @@ def test_the_interval_of_a_long_run_is_that_of_all_its_frames() -> None:
 
 def test_blocks_are_joined_in_pairs() -> None:
     """When there are 2,048 of one frame, 1 2 3 4 ... becomes 1.5 3.5 ...; then a block has two frames."""
-    row = FrameTimes()
+    row = FrameTimeSamples()
     for value in range(1, MOST_BLOCKS + 4):
         row.add(value)
     assert (row._blocks[:2], len(row._blocks), row._open_frames) == ([1.5, 3.5], MOST_BLOCKS // 2 + 1, 1)

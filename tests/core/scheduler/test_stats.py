@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from trilane.scheduler.stats import (
     SPAN,
-    FrameTimes,
+    FrameTimeSamples,
     Lateness,
     energy_score,
     median_interval,
@@ -26,7 +26,7 @@ TIMES = st.lists(st.integers(0, 10**12), min_size=1, max_size=60)
 
 
 def row_of(values: list[int]) -> dict[str, Any]:
-    times = FrameTimes()
+    times = FrameTimeSamples()
     for value in values:
         times.add(value)
     return times.row()

@@ -17,7 +17,7 @@ from trilane.hw_profiles.host import asked_cores, host_cores, rule_placement, se
 from trilane.machine import Machine
 from trilane.scheduler import placement, places
 from trilane.scheduler.placement import Ranked, Rules, chosen, fastest, frame_ns, ranked, typical, worth_trying
-from trilane.scheduler.places import Core, Place, Placement, Times, Work, busiest_core_ns, placements
+from trilane.scheduler.places import CpuCore, Place, Placement, Times, UnitWork, busiest_core_ns, placements
 
 MS = 1_000_000
 FIRST = Rules("cpu")
@@ -31,12 +31,12 @@ def without_costs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(placement, "ROOM_USED", 1.0)
 
 
-def equal(count: int) -> list[Core]:
-    return [Core(number, number) for number in range(count)]
+def equal(count: int) -> list[CpuCore]:
+    return [CpuCore(number, number) for number in range(count)]
 
 
-def work(ms: float, jobs: int = 1) -> Work:
-    return Work(round(ms * MS), round(ms * MS), jobs)
+def work(ms: float, jobs: int = 1) -> UnitWork:
+    return UnitWork(round(ms * MS), round(ms * MS), jobs)
 
 
 def times(cpu: float, gpu: float, dsp: float | Mapping[int, float]) -> Times:
@@ -51,7 +51,7 @@ def on(
     return {"cpu": Place(cpu, 1), "gpu": Place(gpu, 1), "dsp": Place(dsp, threads)}
 
 
-def ms(where: Placement, of: Times, cores: list[Core], rules: Rules = FIRST) -> float:
+def ms(where: Placement, of: Times, cores: list[CpuCore], rules: Rules = FIRST) -> float:
     return frame_ns(where, cores, of, rules) / MS
 
 
@@ -110,16 +110,16 @@ def test_one_frame_at_a_time_is_the_sum_and_sharing_costs_nothing() -> None:
 
 
 def test_siblings_together_do_a_quarter_more_than_one() -> None:
-    one_core = [Core(0, 0), Core(1, 0)]
+    one_core = [CpuCore(0, 0), CpuCore(1, 0)]
     assert ms(on(0, 1, 1), times(10, 5, 5), one_core) == 20 / 1.25
-    two_cores = [*one_core, Core(2, 2), Core(3, 2)]
+    two_cores = [*one_core, CpuCore(2, 2), CpuCore(3, 2)]
     best = ranked(two_cores, times(1, 10, 10), FIRST)[0]
     physical = {core.number: core.physical for core in two_cores}
     assert physical[best.placement["gpu"].cores[0]] != physical[best.placement["dsp"].cores[0]]
 
 
 def test_two_threads_on_one_physical_core_are_slower_than_on_two() -> None:
-    cores = [Core(0, 0), Core(1, 0), Core(2, 2), Core(3, 2), Core(4, 4), Core(5, 4)]
+    cores = [CpuCore(0, 0), CpuCore(1, 0), CpuCore(2, 2), CpuCore(3, 2), CpuCore(4, 4), CpuCore(5, 4)]
     of = times(1, 1, {2: 10})
     assert ms(on(2, 3, (0, 4), 2), of, cores) == 10
     assert ms(on(2, 3, (0, 1), 2), of, cores) == 16
@@ -127,7 +127,7 @@ def test_two_threads_on_one_physical_core_are_slower_than_on_two() -> None:
 
 
 def test_the_slowest_unit_has_the_fastest_core() -> None:
-    cores = [Core(0, 0, 500), Core(1, 1, 500), Core(2, 2, 1000)]
+    cores = [CpuCore(0, 0, 500), CpuCore(1, 1, 500), CpuCore(2, 2, 1000)]
     best = ranked(cores, times(4, 5, 20), FIRST)[0]
     assert best == Ranked(on(0, 1, 2), 20 * MS)
     assert ms(on(2, 1, 0), times(4, 5, 20), cores) == 40
@@ -142,7 +142,7 @@ def test_units_that_float_between_different_cores_share_what_these_can_do() -> N
 
 
 def test_a_device_needs_its_core_only_to_be_told() -> None:
-    of = {**times(6, 0, 12), "gpu": {1: Work(20 * MS, 2 * MS, 2)}}
+    of = {**times(6, 0, 12), "gpu": {1: UnitWork(20 * MS, 2 * MS, 2)}}
     assert ms(on(0, 0, 1), of, equal(2)) == 20
     assert ms(on(0, 0, 0), of, equal(2)) == 20
     assert ms(on(0, 0, 0), {**of, "dsp": {1: work(15)}}, equal(2)) == 23
@@ -232,11 +232,11 @@ OF_SIBLINGS = [(a, b, c, d) for a, b, c, d in permutations(range(4)) if {a, b} i
         (equal(1), list(permutations(range(1))), {1: 8}),
         (equal(2), list(permutations(range(2))), {1: 8, 2: 5}),
         (equal(3), list(permutations(range(3))), {1: 8, 2: 5, 3: 4}),
-        ([Core(0, 0), Core(1, 0), Core(2, 2), Core(3, 2)], OF_SIBLINGS, {1: 8}),
+        ([CpuCore(0, 0), CpuCore(1, 0), CpuCore(2, 2), CpuCore(3, 2)], OF_SIBLINGS, {1: 8}),
     ],
 )
 def test_every_placement_is_there_once(
-    cores: list[Core], exchanges: list[tuple[int, ...]], network: dict[int, float]
+    cores: list[CpuCore], exchanges: list[tuple[int, ...]], network: dict[int, float]
 ) -> None:
     """Against all of them, without a thought for symmetry; the predictions of equal ones are equal."""
     of, count = times(3, 5, network), len(cores)
@@ -265,17 +265,17 @@ POSITIVE = st.integers(1, 200)
 
 
 @st.composite
-def machines(draw: st.DrawFn) -> tuple[list[Core], Times]:
+def machines(draw: st.DrawFn) -> tuple[list[CpuCore], Times]:
     count = draw(st.sampled_from([1, 2, 3, 4]))
     siblings = draw(st.booleans()) and count % 2 == 0
-    cores = [Core(n, n // 2 if siblings else n, draw(st.sampled_from([500, 1000]))) for n in range(count)]
+    cores = [CpuCore(n, n // 2 if siblings else n, draw(st.sampled_from([500, 1000]))) for n in range(count)]
     network = {n: draw(POSITIVE) for n in {1, max(1, count - 2), *draw(st.sets(st.integers(1, count)))}}
     return cores, times(draw(POSITIVE), draw(POSITIVE), network)
 
 
 @settings(max_examples=25)
 @given(machines(), st.booleans())
-def test_what_is_chosen_is_never_predicted_worse_than_the_rule(machine: tuple[list[Core], Times], one: bool) -> None:
+def test_what_is_chosen_is_never_predicted_worse_than_the_rule(machine: tuple[list[CpuCore], Times], one: bool) -> None:
     cores, of = machine
     where, rules = rule_placement(tuple(core.number for core in cores)), Rules("cpu", one)
     rule = Ranked(where, frame_ns(where, cores, of, rules))
@@ -287,12 +287,12 @@ def test_what_is_chosen_is_never_predicted_worse_than_the_rule(machine: tuple[li
 @settings(max_examples=25)
 @given(machines(), st.randoms(use_true_random=False), st.booleans())
 def test_which_number_a_core_has_changes_no_prediction(
-    machine: tuple[list[Core], Times], random: Random, one: bool
+    machine: tuple[list[CpuCore], Times], random: Random, one: bool
 ) -> None:
     cores, of = machine
     numbers = [core.number for core in cores]
     random.shuffle(numbers)
-    exchanged = [Core(number, core.physical, core.permille) for core, number in zip(cores, numbers, strict=True)]
+    exchanged = [CpuCore(number, core.physical, core.permille) for core, number in zip(cores, numbers, strict=True)]
     before, after = (ranked(these, of, Rules("cpu", one)) for these in (cores, sorted(exchanged)))
     assert [each.frame_ns for each in before] == [each.frame_ns for each in after]
 
@@ -300,13 +300,13 @@ def test_which_number_a_core_has_changes_no_prediction(
 @settings(max_examples=25)
 @given(machines(), st.sampled_from(["cpu", "gpu", "dsp"]), st.integers(1, 50), st.booleans())
 def test_more_work_never_makes_a_frame_shorter(
-    machine: tuple[list[Core], Times], unit: str, more: int, one: bool
+    machine: tuple[list[CpuCore], Times], unit: str, more: int, one: bool
 ) -> None:
     cores, of = machine
     rules = Rules("cpu", one)
     larger = {
         **of,
-        unit: {n: Work(w.serial_ns + more * MS, w.core_ns + more * MS, w.jobs) for n, w in of[unit].items()},
+        unit: {n: UnitWork(w.serial_ns + more * MS, w.core_ns + more * MS, w.jobs) for n, w in of[unit].items()},
     }
     for where in placements(cores, of, {}):
         assert frame_ns(where, cores, larger, rules) >= frame_ns(where, cores, of, rules)
@@ -377,8 +377,8 @@ def test_what_the_kernel_says_of_cores(tmp_path: Path, monkeypatch: pytest.Monke
         (tmp_path / f"cpu{number}" / "topology").mkdir(parents=True)
         (tmp_path / f"cpu{number}" / "topology" / "thread_siblings_list").write_text(f"{siblings}\n")
         (tmp_path / f"cpu{number}" / "cpu_capacity").write_text(f"{capacity}\n")
-    assert host_cores((0, 1, 2)) == (Core(0, 0, 500), Core(1, 1, 1000), Core(2, 0, 500))
-    assert host_cores((7, 8)) == (Core(7, 7, 1000), Core(8, 8, 1000))
+    assert host_cores((0, 1, 2)) == (CpuCore(0, 0, 500), CpuCore(1, 1, 1000), CpuCore(2, 0, 500))
+    assert host_cores((7, 8)) == (CpuCore(7, 7, 1000), CpuCore(8, 8, 1000))
     for number, clock in enumerate((3_000_000, 4_000_000)):
         (tmp_path / f"cpu{number}" / "cpu_capacity").write_text("1024\n")
         (tmp_path / f"cpu{number}" / "cpufreq").mkdir()

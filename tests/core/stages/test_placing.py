@@ -11,12 +11,12 @@ import pytest
 
 from trilane.pipeline.trial import Round
 from trilane.scheduler.placement import Ranked
-from trilane.scheduler.places import Core, Place
+from trilane.scheduler.places import CpuCore, Place
 from trilane.stages import placing
 from trilane.stages.placing import TriedPlacement, choice
 
 ANY: Any = None
-CORES = (Core(0, 0), Core(1, 1))
+CORES = (CpuCore(0, 0), CpuCore(1, 1))
 
 
 def asked(frames: int = 100, pace_ns: Any = (), **cores: tuple[int, ...]) -> Any:

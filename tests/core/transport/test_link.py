@@ -15,7 +15,7 @@ import zmq
 from trilane import machine
 from trilane.transport import link
 from trilane.transport.link import LOCK, HeartbeatSocket, Link, SocketFolder, context_on_cores, remove_abandoned
-from trilane.transport.messages import Done, Failed, JobPipe, Message, Pong, Ready, RunJob, job_pipe_pair
+from trilane.transport.messages import Done, Failed, JobPipe, Message, PongMessage, Ready, RunJob, job_pipe_pair
 
 
 @pytest.fixture
@@ -56,8 +56,8 @@ def test_the_folder_is_private_and_goes_while_the_link_lives(
     assert received(parent) == [Ready(1)]
     folder.remove()
     assert not list(tmp_path.iterdir())
-    child.send_heartbeat(Pong())
-    assert received(parent) == [Pong()] and parent.heartbeats() == []
+    child.send_heartbeat(PongMessage())
+    assert received(parent) == [PongMessage()] and parent.heartbeats() == []
 
 
 def test_jobs_go_over_the_job_pipe_and_heartbeats_over_zeromq(links: tuple[Link, Link], tmp_path: Path) -> None:
@@ -68,11 +68,11 @@ def test_jobs_go_over_the_job_pipe_and_heartbeats_over_zeromq(links: tuple[Link,
     job, done = RunJob(1, 0, 7, 0, 1, 0, 0, 0), Done(1, 2, 3, 4, 5, 6, 7, 0, 8, 9, {"inferred": 1.0})
     parent.job_pipe.send(job)
     assert child.job_pipe.receive() == job
-    child.send_heartbeat(Pong())
+    child.send_heartbeat(PongMessage())
     child.job_pipe.send(done)
     child.job_pipe.send(Failed(2, 2, "no such thing"))
     assert [parent.job_pipe.receive() for _ in range(3)] == [done, Failed(2, 2, "no such thing"), None]
-    assert received(parent) == [Pong()]
+    assert received(parent) == [PongMessage()]
     child.heartbeat_socket.socket.send(bytes(1 << 17), zmq.DONTWAIT)
     assert not parent.heartbeat_socket.socket.poll(300)
 
@@ -81,7 +81,7 @@ def test_every_heartbeat_that_came_is_received_in_order(context: zmq.Context, tm
     one, other = HeartbeatSocket(context), HeartbeatSocket(context)
     one.socket.bind(f"ipc://{tmp_path}/h")
     other.socket.connect(f"ipc://{tmp_path}/h")
-    beats = [*(Ready(pid) for pid in range(5)), Pong()]
+    beats = [*(Ready(pid) for pid in range(5)), PongMessage()]
     for beat in beats:
         other.send(beat)
     found: list[Message] = []
@@ -97,7 +97,7 @@ def test_a_heartbeat_socket_holds_little_takes_no_large_message_and_is_closed_at
     options = (zmq.TYPE, zmq.LINGER, zmq.MAXMSGSIZE, zmq.SNDHWM, zmq.RCVHWM)
     assert [one.socket.getsockopt(option) for option in options] == [zmq.PAIR, 0, 4096, 64, 64]
     assert one.fileno() == one.socket.getsockopt(zmq.FD)
-    one.send(Pong())  # nobody is connected: it is dropped, and nobody waits
+    one.send(PongMessage())  # nobody is connected: it is dropped, and nobody waits
     one.close()
     assert one.socket.closed
 

@@ -26,7 +26,7 @@ from trilane.transport.messages import (
     JobPipe,
     MessageError,
     Ping,
-    Pong,
+    PongMessage,
     Ready,
     RunJob,
     job_pipe_pair,
@@ -49,7 +49,7 @@ BYTES = [
     (Done(*range(10), {"a": 1.5}), b"\4" + words(*range(10)) + b"\x81\xa1a\xcb\x3f\xf8" + bytes(6)),
     (Failed(-1, 2, "no"), b"\5" + words(-1, 2) + b"\xa2no"),
     (Failed(-2, 2, ""), b"\5" + words(-2, 2)),
-    (Pong(), b"\6"),
+    (PongMessage(), b"\6"),
     (Closed(), b"\7"),
 ]
 
@@ -160,10 +160,10 @@ def test_sending_to_an_end_that_is_closed_or_full_does_nothing() -> None:
 
 def test_messages_sent_before_an_end_closed_with_work_unread_are_received() -> None:
     ours, theirs = (JobPipe(end) for end in job_pipe_pair())
-    theirs.send(Pong())
+    theirs.send(PongMessage())
     ours.send(Ping())
     theirs.close()
-    assert ours.receive() == Pong() and not ours.ended
+    assert ours.receive() == PongMessage() and not ours.ended
     assert ours.receive() is None and ours.ended
     ours.close()
 

@@ -29,7 +29,7 @@ from trilane.arrays import F64
 from trilane.avatars.bundle import bundle_folder, load_bundle
 from trilane.avatars.network_file import check_network, reshaped
 from trilane.bench.lib.full_network import as_written
-from trilane.bench.lib.layers import Box, Layer
+from trilane.bench.lib.layers import Box, RasterLayer
 from trilane.body.body import load_body
 from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import DETAILS
@@ -129,7 +129,7 @@ def test_the_truth_is_laid_over_the_frame_s_background() -> None:
     moment.background = np.zeros((*OUTPUT, 3), np.uint8)
     light = np.full((6, 6, 4), 0.5)
     split = error_by_cause._Split(OUTPUT, None)
-    split.add_truth(moment, [Layer(Box(2, 3, 8, 9), -1.0, light)])
+    split.add_truth(moment, [RasterLayer(Box(2, 3, 8, 9), -1.0, light)])
     split.add(moment)
     found = split.document()["truth"]
     half_light = 1.055 * 0.5 ** (1 / 2.4) - 0.055

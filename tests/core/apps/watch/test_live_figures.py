@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from support.told_journal import told_journal
-from trilane.apps.watch.figures import Figures, Moved, Shares
+from trilane.apps.watch.figures import MomentFigures, Moved, Shares
 from trilane.apps.watch.live_figures import LiveFigures
 from trilane.pipeline.journal import SCHEMA, Accounted, Begun, Counted, Ended, Record, Stepped, Worked, journal_of
 from trilane.scheduler.core import Core
@@ -273,7 +273,7 @@ def held_bytes(root: object) -> int:
     return sum(map(sys.getsizeof, seen.values()))
 
 
-def assert_frames(now: Figures, core: Core) -> None:
+def assert_frames(now: MomentFigures, core: Core) -> None:
     """Where frames are and what units do, beside the slots and queues of the scheduler."""
     assert now.frames.in_flight == len(core.frames)
     counts = (now.frames.presented, now.frames.in_flight, now.frames.not_begun, core.ledger.left_out)
@@ -288,7 +288,7 @@ def assert_frames(now: Figures, core: Core) -> None:
         assert sum((now.units[name].window.busy, *now.units[name].window.idle.values())) in (0, pytest.approx(1))
 
 
-def assert_shares(now: Figures, report: dict[str, Any]) -> None:
+def assert_shares(now: MomentFigures, report: dict[str, Any]) -> None:
     for unit, row in report["units"].items():
         own = now.units[unit]
         assert (own.run.busy, own.run.idle) == (pytest.approx(row["busy"]), pytest.approx(row["idle"]))

@@ -23,9 +23,9 @@ from trilane.training.capture.capture import Capture, open_capture
 from trilane.training.capture.capture_samples import (
     Augmentation,
     BodyRaster,
-    Camera,
     CaptureRenderer,
     JointCentres,
+    SampleCamera,
     VertexCentres,
     ViewRule,
     augmented_projection,
@@ -102,7 +102,7 @@ def test_a_view_frames_as_many_metres_as_its_band_says(body: ShapedBody) -> None
     """Two points that are so many metres apart, one above the other at the centre's depth, by the view's map."""
     posed = Skeleton(body.joints, body.body.parents).pose(np.zeros((55, 3)), (0.0, 0.3, -3.0))
     lens = Lens(4000, 3000, 2600.0, 3000.0, 1900.0, 1600.0)
-    camera = Camera(np.eye(4), lens.projection(0.05, 100.0), lens)
+    camera = SampleCamera(np.eye(4), lens.projection(0.05, 100.0), lens)
     rule = ViewRule(turn_deg=0, shift=0.0, most_enlarged=1e6)
     for band, (names, least, most) in BANDS.items():
         heights = []
@@ -123,7 +123,7 @@ def test_a_view_is_enlarged_by_so_much_at_most_and_keeps_its_centre_in_the_frame
     skeleton = Skeleton(body.joints, body.body.parents)
     posed = skeleton.pose(np.zeros((55, 3)), (0.0, 0.3, -3.0))
     lens = Lens(200, 150, 130.0, 150.0, 95.0, 80.0)
-    camera = Camera(np.eye(4), lens.projection(0.05, 100.0), lens)
+    camera = SampleCamera(np.eye(4), lens.projection(0.05, 100.0), lens)
     rule = replace(WIDE, most_enlarged=2.0)
     for seed in range(20):
         by = zoomed_view(np.random.default_rng(seed), "face", posed, camera, JointCentres(), rule, (480, 640))
