@@ -144,7 +144,7 @@ def test_a_unit_answers_every_message_once(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_a_unit_ends_when_its_pipe_does_and_refuses_what_is_not_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     assert served(monkeypatch, FakeLink(), []) == 1
-    with pytest.raises(MessageError, match=r"Pong\(\) is not for a unit"):
+    with pytest.raises(MessageError, match=r"PongMessage\(\) is not for a unit"):
         served(monkeypatch, FakeLink(PongMessage()), [])
 
 
