@@ -18,14 +18,14 @@ from trilane.errors import BadInputError
 from trilane.scene.camera.files import load_camera
 from trilane.scene.camera.path import CameraPath
 from trilane.scene.camera.recorded import UP
-from trilane.scene.camera_placement import SCORED_MOMENTS, SCORED_S, PlacedCamera, place_camera
+from trilane.scene.camera_placement import SCORED_MOMENTS, PlacedCamera, place_camera
 from trilane.scene.footage import Footage, filmed
 from trilane.scene.mover import Mover
 from trilane.scene.schema import CameraSpec, Scene
 from trilane.scene.staging import Staged
 from trilane.scene.visibility import seen_at
 
-#: Least share of the moments at which a recorded camera has to show the person.
+#: Least share of the frames in which a recorded camera has to show the person.
 ENOUGH = 0.5
 #: Score of the person's share of the picture's height beside the share of moments: it only breaks ties.
 HEIGHT_WEIGHT = 0.01
@@ -41,8 +41,8 @@ def require_person(
 ) -> None:
     """Raise BadInputError where the recorded camera of `staged` does not show the person; it names a key that helps.
 
-    A camera that was placed has to show whole bodies, any other a part of one, at half of the moments that places are
-    scored at. The parameters are those of `stage_scene`, and its result.
+    A camera that was placed has to show whole bodies, any other a part of one, in half of the frames, of which
+    some are looked at. The parameters are those of `stage_scene`, and its result.
     """
     if not staged.camera.path.recorded:
         return
@@ -51,7 +51,7 @@ def require_person(
         return
     is_placed = scene.camera.place == "auto"
     what = "the whole person" if is_placed else "a part of the person"
-    found = f"{what} in the picture in {share:.0%} of the first {SCORED_S:g} s"
+    found = f"{what} in the picture in {share:.0%} of the run's frames"
     where = " at the best place" if is_placed else " where it was recorded"
     expected = f"at least {ENOUGH:.0%}"
     remedy = _remedy(scene, staged, bodies, base, footage)
@@ -61,8 +61,8 @@ def require_person(
 def _shares(
     camera: PlacedCamera, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]
 ) -> tuple[float, float]:
-    """Return the share of the moments at which the camera shows the bodies, and their mean share of its height."""
-    times = np.linspace(0.0, SCORED_S, SCORED_MOMENTS)
+    """Return the share of the frames in which the camera shows the bodies, and their mean share of its height."""
+    times = np.linspace(0.0, (scene.frames - 1) / scene.fps, min(SCORED_MOMENTS, scene.frames))
     seen = seen_at(times, camera, movers, bodies, (scene.output.height, scene.output.width))
     share = seen.whole.mean() if scene.camera.place == "auto" else 1 - seen.nobody.mean()
     return float(share), float(seen.height.mean())

@@ -98,8 +98,11 @@ def _output(text: str) -> dict[str, int]:
     return {"width": int(match[1]), "height": int(match[2])}
 
 
-def configure(options: RunOptions, out_dir: Path, gl: GlFacts = gl_facts) -> Checked:
-    """Check every part of what the options ask for. Raises BadInputError or MissingPartError."""
+def configure(options: RunOptions, out_dir: Path, gl: GlFacts = gl_facts, *, needs_person: bool = False) -> Checked:
+    """Check every part of what the options ask for. Raises BadInputError or MissingPartError.
+
+    `needs_person`: whether to refuse a recorded camera that does not show the person in half of the frames.
+    """
     scene = requested_scene(options)
     if scene.plan == "full":
         raise BadInputError(
@@ -117,7 +120,7 @@ def configure(options: RunOptions, out_dir: Path, gl: GlFacts = gl_facts) -> Che
     require_one_tensor(list(avatars.values()))
     bodies = [avatars[folder].shaped for folder in folders]
     staged = stage_scene(scene, bodies, Path.cwd(), footage)
-    if not options.allow_empty:
+    if needs_person:
         require_person(scene, staged, bodies, Path.cwd(), footage)
     _check_pictures(scene, staged)
     network = avatars[folders[0]].network

@@ -119,7 +119,8 @@ class RunOptions(Options):
         default=None, description=f"{SIZE_HELP} auto: planned, as the network paints best."
     )
     allow_empty: Annotated[bool, Option("--allow-empty")] = Field(
-        default=False, description="Run also where a recorded camera shows nobody in half of its first 10 s."
+        default=False,
+        description="Run also where a recorded camera shows the whole person in less than half of the frames.",
     )
     hud: bool | None = Field(default=None, description="Write frame, rate and age on the picture.")
     policy: Annotated[str, one_of(*POLICIES), Option(words=tuple(POLICIES), offered=tuple(POLICIES))] = Field(

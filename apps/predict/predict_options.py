@@ -7,14 +7,15 @@ chip's model are read when they are checked, because importing it takes long.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Annotated, Final
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from trilane.errors import BadInputError
-from trilane.options import Finite, Option, Options, Text, Texts
+from trilane.options import Finite, Option, Options, Text, Texts, one_of
+from trilane.scheduler.policy import POLICIES
 from trilane.stages.run_options import AVATARS_HELP, PROFILE_HELP
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import BURST, PERFORMANCE_PROFILES, SUSTAINED, UnitName
@@ -84,7 +85,9 @@ def _turns() -> tuple[str, ...]:
 def _paths(value: object) -> object:
     """Turn one file, or several, into paths."""
     several = [value] if isinstance(value, str | PurePath) else value
-    return tuple(Path(each) if isinstance(each, str) else each for each in several) if several else ()  # type: ignore[attr-defined]
+    if not isinstance(several, Iterable):
+        return value
+    return tuple(Path(each) if isinstance(each, str) else each for each in several)
 
 
 def _path(value: object) -> object:
@@ -164,7 +167,7 @@ class PredictOptions(Options):
         default="dsp", description="Unit of the network: gpu or dsp; cpu too for a --network by itself."
     )
     minutes: Finite = Field(default=0.0, description="Virtual minutes with heat; 0: settled, without heat.")
-    policy: Annotated[str | None, Option(synonyms=("--pipelining",))] = Field(
+    policy: Annotated[str | None, one_of("reference", *POLICIES), Option(synonyms=("--pipelining",))] = Field(
         default=None,
         description="reference (if not given), or sequential, pipelined (if not given, on host), latest, deadline.",
     )
@@ -267,6 +270,13 @@ class PredictOptions(Options):
     def check_together(self) -> None:
         """Raise BadInputError for options that leave another one without effect, or that lack another."""
         given = self.model_fields_set
+        if self.beside and self.scene is None:
+            raise BadInputError("options", "--beside without a scene", "a scene, such as `trilane predict default`")
+        if self.scene is not None and (useless := given - OF_A_SCENE):
+            found = f"{self._spelt(useless)} beside a scene"
+            raise BadInputError("options", found, "none of them", "a scene has networks and stages of its own")
+        if self.scene is None and "turns" in given:
+            raise BadInputError("options", "--turns without a scene", "a scene with --beside, whose jobs take turns")
         for option, others in IGNORED.items():
             if option in given and (useless := given & others):
                 found = f"{self._spelt(useless)} beside --{option}"
@@ -284,11 +294,6 @@ class PredictOptions(Options):
             raise BadInputError("options", found, "one --network", remedy)
         if self.input_shape and not self.network:
             raise BadInputError("options", "--input-shape without --network", "a network whose input it is")
-        if self.beside and self.scene is None:
-            raise BadInputError("options", "--beside without a scene", "a scene, such as `trilane predict default`")
-        if self.scene is not None and (useless := given - OF_A_SCENE):
-            found = f"{self._spelt(useless)} beside a scene"
-            raise BadInputError("options", found, "none of them", "the scene says so itself")
 
     def _spelt(self, names: set[str]) -> str:
         return ", ".join(sorted(map(self.spelling, names)))

@@ -54,7 +54,7 @@ def prepare(options: RunOptions, gl: GlFacts, command: tuple[str, ...] = ()) -> 
     from trilane.stages.configure import configure
 
     requested, said = _with_remade_avatar(options) if options.remakes_avatar else (options, ())
-    checked = configure(requested, Path.cwd(), gl)
+    checked = configure(requested, Path.cwd(), gl, needs_person=not requested.allow_empty)
     if said:
         checked = replace(checked, notes=(*said, *checked.notes))
     if options.check:

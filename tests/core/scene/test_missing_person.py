@@ -11,6 +11,7 @@ from support.camera_files import OPTICAL, write_tum
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody
 from trilane.errors import BadInputError
+from trilane.scene.camera.files import load_camera
 from trilane.scene.camera.path import axes_towards
 from trilane.scene.missing_person import require_person
 from trilane.scene.rotations import about
@@ -21,9 +22,10 @@ Z_UP: F64 = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 IDLE = (AvatarSpec(motion="builtin:idle"),)
 
 
-def refused(source: Path, body: ShapedBody, **spec: Any) -> str:
+def refused(source: Path, body: ShapedBody, frames: int = 300, **spec: Any) -> str:
     """What the refusal says; empty where the camera is taken."""
-    scene = Scene(camera=CameraSpec(source=str(source), **spec), avatars=IDLE, background="film.mp4")
+    camera = CameraSpec(source=str(source), **spec)
+    scene = Scene(camera=camera, avatars=IDLE, background="film.mp4", frames=frames)
     staged = stage_scene(scene, [body], Path("/"))
     try:
         require_person(scene, staged, [body], Path("/"))
@@ -56,7 +58,7 @@ def test_poses_of_a_robot_ask_for_the_axes(tmp_path: Path, body: ShapedBody) -> 
     robot = turns @ np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]).T
     path = write_tum(tmp_path, Z_UP @ robot @ OPTICAL, places @ Z_UP.T)
     said = refused(path, body, up_axis="z")
-    assert "in the picture in 0% of the first 10 s at the best place" in said
+    assert "in the picture in 0% of the run's frames at the best place" in said
     assert 'camera.axes = "forward-left-up" would show it in 100%' in said
     assert refused(path, body, up_axis="z", axes="forward-left-up") == ""
 
@@ -66,10 +68,19 @@ def test_a_camera_that_stays_is_asked_for_its_place(tmp_path: Path, body: Shaped
     looks = about(1, np.linspace(0.0, 0.2, 60))
     path = write_tum(tmp_path, Z_UP @ looks, np.tile([30.0, -7.0, 1.5], (60, 1)))
     said = refused(path, body, place="none")
-    assert "found a part of the person in the picture in 0% of the first 10 s where it was recorded" in said
+    assert "found a part of the person in the picture in 0% of the run's frames where it was recorded" in said
     assert 'camera.place = "auto" would show it in 100%' in said
     near = write_tum(tmp_path, Z_UP @ looks, np.tile([0.0, -1.0, 1.4], (60, 1)))  # head and shoulders
     assert refused(near, body, place="none") == ""
+
+
+def test_the_frames_of_the_run_are_judged(tmp_path: Path, body: ShapedBody) -> None:
+    """A camera that looks away for a third of its time shows nobody in a run of that third."""
+    turns = about(1, np.where(np.arange(90) < 30, np.pi, 0.0))
+    path = write_tum(tmp_path, Z_UP @ turns, np.tile([0.0, -1.0, 1.4], (90, 1)))
+    away_s = load_camera(CameraSpec(source=str(path)), Path("/")).times_s[29]
+    assert "in 0% of the run's frames" in refused(path, body, int(away_s * 30), place="none")
+    assert refused(path, body, int(away_s * 30 * 3), place="none") == ""
 
 
 def test_a_built_in_camera_is_never_refused(body: ShapedBody) -> None:
