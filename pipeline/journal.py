@@ -319,7 +319,7 @@ def config_of(begun: Begun) -> Mapping[str, Any]:
 
 #: The fields of a record as written, for records whose fields are not written as they are.
 _FIELDS: dict[type[Any], Callable[[Any], list[Any]]] = {
-    Begun: lambda record: [record.schema, asdict(record.graph), asdict(record.settings), record.facts],
+    Begun: lambda record: [record.schema, record.graph.written(), asdict(record.settings), record.facts],
     Stepped: lambda record: [record.now_ns, [*map(row_of, record.events)], [*map(row_of, record.actions)]],
 }
 

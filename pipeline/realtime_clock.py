@@ -257,10 +257,9 @@ class RealtimeClock:
 
     def _done(self, unit: str, message: Done) -> Event:
         job, dispatch_ns = self._open.pop(message.id)
-        frame = self._core.frames.get(job.frame)
         # `ended` books the job later, so that the next one is sent first.
-        self._unbooked.append((job, dispatch_ns, None if frame is None else frame.ready_ns, message))
-        if frame is not None and self._requests is not None and job.stage == self._last_stage:
+        self._unbooked.append((job, dispatch_ns, self._core.ready_ns(job), message))
+        if job.frame in self._core.frames and self._requests is not None and job.stage == self._last_stage:
             self._requests.answered(job.frame)
         return JobDone(unit, *message[:7], message.skips > 0)
 

@@ -160,8 +160,7 @@ class Timeline:
         names = [stage.name for stage in graph.stages]
         self._explains, self._kept = waits, kept
         self._first, self._last, self._bypass = names[0], names[-1], graph.bypass
-        self._positions = {name: place for place, name in enumerate(names)}
-        self._latency_position = self._positions[graph.latency_to]
+        self._latency_to = graph.latency_to
         self._next = dict(pairwise(names))
         self.units = {unit: UnitHistory(unit, kept if waits else 0) for unit in graph.units}
         self.frames: dict[int, FrameState] = {}
@@ -327,7 +326,8 @@ class Timeline:
         self._heard_ns[job.frame] = self._now_ns
         frame = self._frame(job.frame)
         # The scheduler's own record computes the latency, so that it is defined once.
-        frame.end_stage(self._positions[job.stage], self._latency_position, event.t_sampled_ns, event.t_end_ns)
+        sampled_ns = event.t_sampled_ns if job.stage == self._first else None
+        frame.end_stage(sampled_ns, event.t_end_ns, job.stage == self._latency_to)
         frame.skips |= event.skips
         yield EndedJob(handed, event)
         presented = None

@@ -11,6 +11,8 @@ the truth if service times stay what they were lately, so no frame is given up t
 older frames go first. So a frame begins at a stage after the older frames' work there, or after its own work at the
 stages before, whichever ends later. With a bypass, a frame that has not come to its beginning is taken to do what the
 last frame there did.
+
+Where branches meet, a frame is stale only before any branch that it must go through has begun it (flow.py).
 """
 
 from __future__ import annotations
@@ -20,49 +22,47 @@ from collections.abc import Mapping, Sequence
 from trilane.scheduler.events import NEVER, Action, Dispatch, DropCause, Settings
 from trilane.scheduler.flow import Bypass, Flow, next_slot, side_of, stale_slot
 from trilane.scheduler.frame_source import Source
-from trilane.scheduler.ledger import ASSIGNED, BLOCKED, STARVED, THROTTLED, Ledger
+from trilane.scheduler.ledger import ASSIGNED, BLOCKED, JOIN, STARVED, THROTTLED, Ledger
 from trilane.scheduler.policy import Candidate, Policy
 from trilane.scheduler.state import READY, FrameState, StageState, UnitState
-from trilane.transport.slots import READING
+from trilane.transport.slots import READING, EdgeSlots
 
 
 def earliest_completion_ns(
     now_ns: int,
     frame: int,
-    position: int,
     stages: Sequence[StageState],
     frames: Mapping[int, FrameState],
-    bypass: tuple[int, int] = (0, 0),
+    todo: int,
+    bypass: Bypass | None = None,
 ) -> int:
     """Return the earliest end of the last stage of `frame`, in ns.
 
-    It is now + max over s >= position of [ max(own work before s, work of older frames at s) + own work from s on ].
+    A stage ends its work on the frame at max(end of the stages before it, end of its older work) + its own time.
 
     `now_ns`: present time in ns.
     `frame`: number of the frame; frames with smaller numbers are older.
-    `position`: position of its next stage in the chain.
-    `stages`: stages of the chain, with the estimates of service times.
+    `stages`: all stages, with the estimates of service times.
     `frames`: frames in flight, by number.
-    `bypass`: positions of two stages; a frame that has yet to do the first skips the stages between them.
+    `todo`: bits of the stages that the frame has yet to do.
+    `bypass`: bypass that a frame takes which has yet to come to its beginning; None: no frame does.
     """
-    older = [0] * len(stages)
-    for number, state in frames.items():
-        if number < frame:
-            older[state.position] += 1
-    begin, end = bypass
-    skipping = sum(older[: begin + 1])
-    before, own, latest = sum(older[:position]), 0, 0
-    rest = sum(stage.estimate_ns for stage in stages[position:] if position > begin or not begin < stage.position < end)
-    for stage in stages[position:]:
-        before += older[stage.position]
-        is_skipped = begin < stage.position < end
-        count = before - skipping if is_skipped else before
-        backlog = count * stage.estimate_ns - _done_of_running(now_ns, stage) if count else 0
-        latest = max(latest, max(own, backlog) + rest)
-        if position > begin or not is_skipped:
-            own += stage.estimate_ns
-            rest -= stage.estimate_ns
-    return now_ns + latest
+    older = [state.todo for number, state in frames.items() if number < frame]
+    skipped, skips = 0, 0
+    if bypass is not None:
+        skipped = sum(stage.bit for stage in stages if bypass.begin.position < stage.position < bypass.end.position)
+        skips = bypass.begin.bit
+    ends: list[int] = []
+    for stage in stages:
+        if not todo & stage.bit:
+            ends.append(0)
+            continue
+        end = max([ends[place] for place in stage.after], default=0)
+        count = sum(1 for left in older if left & stage.bit and not (stage.bit & skipped and left & skips))
+        if count:
+            end = max(end, count * stage.estimate_ns - _done_of_running(now_ns, stage))
+        ends.append(end if stage.bit & skipped and todo & skips else end + stage.estimate_ns)
+    return now_ns + max(ends)
 
 
 def _done_of_running(now_ns: int, stage: StageState) -> int:
@@ -76,26 +76,11 @@ def _done_of_running(now_ns: int, stage: StageState) -> int:
 class Choice:
     """A view of the core's own stages, source and frames."""
 
-    def __init__(
-        self,
-        settings: Settings,
-        policy: Policy,
-        stages: list[StageState],
-        source: Source,
-        frames: dict[int, FrameState],
-        bypass: Bypass | None,
-    ) -> None:
-        """Take what the choice depends on.
-
-        `settings`, `policy`: settings and policy of the run.
-        `stages`: stages of the chain.
-        `source`: source of its frames.
-        `frames`: frames in flight, by number.
-        `bypass`: bypass of the chain, or None.
-        """
-        self._bypass = bypass
-        self._policy, self._stages, self._source, self._frames = policy, stages, source, frames
-        self._stage_named = {stage.name: stage for stage in stages}
+    def __init__(self, settings: Settings, policy: Policy, source: Source, flow: Flow) -> None:
+        """Take what the choice depends on: the run's settings and policy, its source and its frames in flight."""
+        self._policy, self._source, self._flow = policy, source, flow
+        self._stages, self._frames, self._bypass = flow.stages, flow.frames, flow.bypass
+        self._stage_named, stages = flow.stage_named, flow.stages
         self._deadline_ns, self._latch_ns = settings.deadline_ns, settings.latch_ns
         self._in_flight = min([limit for limit in (settings.in_flight, policy.in_flight) if limit], default=0)
         self.latches = settings.latch_ns > 0 and len(stages) > 1
@@ -106,9 +91,24 @@ class Choice:
         if source is None:
             if self._source.is_empty or self.is_full() or (self.latches and now_ns < self.latch_from_ns(now_ns)):
                 return False
-        elif not source.ready and (stage.bypassed is None or next_slot(stage, self._frames) < 0):
+        elif not stage.waiting and (stage.bypassed is None or next_slot(stage, self._frames) < 0):
             return False
-        return sink is None or bool(sink.free) or sink.can_claim()
+        for line in stage.others:
+            if not line:
+                return False
+        return sink is None or bool(sink.free) or self.can_claim(stage, sink)
+
+    def can_claim(self, stage: StageState, sink: EdgeSlots) -> bool:
+        """Whether the stage may write to one of its slots."""
+        if self._flow.is_chain:
+            return sink.can_claim()
+        return sink.can_claim(lambda frame: self._flow.must_stay(stage, frame))
+
+    def slot_to_take(self, stage: StageState) -> int:
+        """Return the slot of the frame that the stage would do next, as `next_slot` does; -1 if it has none to do."""
+        if stage.bypassed is not None:
+            return next_slot(stage, self._frames)
+        return stage.waiting[0] if stage.waiting else -1
 
     def preferred(self, runnable: Sequence[StageState], now_ns: int) -> StageState:
         """Return the stage of `runnable` whose job the policy chooses for the unit."""
@@ -139,9 +139,10 @@ class Choice:
         waiting = self._candidate(stage, now_ns)
         if waiting.deadline_ns == NEVER:
             return False
-        bypass = self._bypass
-        ends = (bypass.begin.position, bypass.end.position) if bypass is not None and bypass.was_taken else (0, 0)
-        end_ns = earliest_completion_ns(now_ns, waiting.frame, waiting.position, self._stages, self._frames, ends)
+        bypass = self._bypass if self._bypass is not None and self._bypass.was_taken else None
+        state = self._frames.get(waiting.frame)
+        todo = (1 << len(self._stages)) - 1 if state is None else state.todo
+        end_ns = earliest_completion_ns(now_ns, waiting.frame, self._stages, self._frames, todo, bypass)
         return end_ns > waiting.deadline_ns
 
     def deadline_from_ns(self, release_ns: int) -> int:
@@ -159,9 +160,14 @@ class Choice:
                     continue
                 if self.is_full() or (self.latches and now_ns < self.latch_from_ns(now_ns)):
                     return BLOCKED
-            elif not stage.input.ready and (stage.bypassed is None or next_slot(stage, self._frames) < 0):
+            elif stage.others:
+                there = [bool(line) for line in (stage.waiting, *stage.others)]
+                if not all(there):
+                    account = JOIN if any(there) else account
+                    continue
+            elif not stage.waiting and (stage.bypassed is None or next_slot(stage, self._frames) < 0):
                 continue
-            if stage.output and not stage.output.can_claim():
+            if stage.output and not self.can_claim(stage, stage.output):
                 return BLOCKED
             account = THROTTLED
         return account
@@ -173,7 +179,7 @@ class Choice:
             frame, release_ns = self._source.head(now_ns)
             return Candidate(frame, stage.position, self.deadline_from_ns(release_ns))
         if stage.bypassed is None:
-            slot = edge.ready[0]
+            slot = stage.waiting[0]
         else:
             edge, slot = side_of(stage, next_slot(stage, self._frames))
         frame = edge.frame[slot]
@@ -199,13 +205,29 @@ class _LateFrames:
                 self._drop_at_source(stage, now_ns)
             return
         if self._policy.newest:
-            while len(edge.ready) > 1:
-                self._flow.drop_waiting(stage, edge.ready[0], DropCause.STALE)
+            self._drop_stale(stage)
             while stage.bypassed is not None and (slot := stale_slot(stage, self._flow.frames)) >= 0:
                 self._flow.drop_waiting(stage, slot, DropCause.STALE)
-        if self._policy.drop_late:
-            while (slot := next_slot(stage, self._flow.frames)) >= 0 and self._choice.is_late(stage, now_ns):
+        if self._policy.drop_late and stage.is_main:
+            while (slot := self._choice.slot_to_take(stage)) >= 0 and self._choice.is_late(stage, now_ns):
                 self._flow.drop_waiting(stage, slot, DropCause.LATE)
+
+    def _drop_stale(self, stage: StageState) -> None:
+        """Drop the frames that could go to the stage, but for the newest and for those that another branch has begun."""
+        line, edge, flow = stage.waiting, stage.input, self._flow
+        if flow.is_chain or edge is None:
+            while len(line) > 1:
+                flow.drop_waiting(stage, line[0], DropCause.STALE)
+            return
+        if len(line) > 1:
+            complete = [slot for slot in line if self._is_complete(stage, edge.frame[slot])]
+            for slot in complete[:-1]:
+                if not stage.is_main or not flow.is_held(stage, edge.frame[slot]):
+                    flow.drop_waiting(stage, slot, DropCause.STALE)
+
+    def _is_complete(self, stage: StageState, frame: int) -> bool:
+        """Whether all inputs of the stage have the frame."""
+        return all(any(inlet.edge.frame[slot] == frame for slot in inlet.waiting) for inlet in stage.inlets)
 
     def _drop_at_source(self, first: StageState, now_ns: int) -> None:
         if self._policy.newest:
@@ -260,7 +282,21 @@ class Assignment:
                 self._ledger.enter(unit.name, unit.account_ns, account)
         dirty.clear()
 
+    def _feed(self, now_ns: int) -> None:
+        """Put frames in flight for stages without inputs, if there are several.
+
+        A source without a rate has a frame for the first of these stages that waits for one.
+        """
+        source, lines = self._source, self._flow.source_lines
+        while not source.is_empty and not self._choice.is_full():
+            if not source.queue and all([line.ready for _, line in lines]):
+                return
+            frame, release_ns = source.take(now_ns)
+            self._flow.admit(frame, release_ns, self._choice.deadline_from_ns(release_ns))
+
     def _next_stage(self, unit: UnitState, now_ns: int) -> StageState | None:
+        if self._flow.source_lines:
+            self._feed(now_ns)
         if self._lead_ns and unit.queue and now_ns < unit.expected_end_ns() - self._lead_ns:
             return None
         runnable: list[StageState] = []
@@ -280,13 +316,13 @@ class Assignment:
             frame, release_ns = self._source.take(now_ns)
             self._flow.admit(frame, release_ns, self._choice.deadline_from_ns(release_ns))
         elif stage.bypassed is None:
-            slot_in = edge.ready[0]
+            slot_in = stage.waiting[0]
             frame = edge.frame[slot_in]
         else:
             slot_in = next_slot(stage, self._flow.frames)
             edge, slot = side_of(stage, slot_in)
             frame = edge.frame[slot]
-        job = self._flow.begin(stage, frame, slot_in)
+        job = self._flow.begin(stage, frame, slot_in, now_ns)
         if not unit.queue:
             unit.head_since_ns = now_ns
             unit.deadline_ns = now_ns + self._hang_ns

@@ -104,15 +104,16 @@ class Core:
         self.flow = Flow(graph, self.ledger, policy.newest or policy.drop_late)
         self.stages, self.units, self.frames = self.flow.stages, self.flow.units, self.flow.frames
         self.bypass = self.flow.bypass
-        self.choice = Choice(settings, policy, self.stages, self.source, self.frames, self.bypass)
+        self.choice = Choice(settings, policy, self.source, self.flow)
         self.assignment = Assignment(policy, settings.hang_ns, self.flow, self.source, self.choice, self.ledger)
         self.actions: list[Action] = []
         self.now_ns = self.alarm_ns = 0
         self.started = self.finished = self.stopping = False
         self.outcome: Outcome | None = None
         self._stage_named = self.flow.stage_named
-        self._latency_position = self._stage_named[graph.latency_to].position
-        self._bypass_end = self.bypass.end.position if self.bypass is not None else 0
+        self._latency_stage = self._stage_named[graph.latency_to]
+        if not graph.is_chain and (settings.latch_ns or settings.works):
+            raise ValueError("latching and a ladder of work need a chain of stages")
         self._hang_ns, self._lead_ns, self._latches = settings.hang_ns, policy.lead_ns, self.choice.latches
         self._estimates = self._lead_ns > 0 or policy.drop_late or self._latches
         self.ladder: WorkLadder | None = None
@@ -225,11 +226,13 @@ class Core:
         job = unit.queue.popleft()
         self._begin_next(unit)
         unit.failures = 0
-        stage, frame = self._stage_named[job.stage], self.frames[job.frame]
+        stage = self._stage_named[job.stage]
+        frame = self.frames.get(job.frame) or self.flow.gone[job.frame]
         service_ns = end_ns - begin_ns
         if skips:
             self._on_skip(stage, frame)
-        self.ledger.job(job, frame.ready_ns, begin_ns, end_ns, preempted_ns, asleep_ns, preempted_before_ns)
+        ready_ns = frame.ready_ns[stage.position]
+        self.ledger.job(job, ready_ns, begin_ns, end_ns, preempted_ns, asleep_ns, preempted_before_ns)
         if self._estimates:
             stage.learn(service_ns)
         if self.ladder is not None and not frame.skips:
@@ -238,11 +241,20 @@ class Core:
             unit.hold_until_ns = end_ns + service_ns * (FULL_DUTY - unit.duty) // unit.duty
             unit.update_queue_capacity()
             self._reset_alarm()
-        frame.end_stage(stage.position, self._latency_position, pose_ns, end_ns)
+        sampled_ns = None if stage.before else frame.release_ns if self.graph.from_release else pose_ns
+        frame.end_stage(sampled_ns, end_ns, stage is self._latency_stage)
+        if self.flow.is_chain and stage.output is not None:
+            frame.position = stage.position + 1
+            frame.ready_ns[frame.position] = end_ns
         if skips:
-            frame.position = self._bypass_end
+            self.flow.skip(frame)
         self.flow.mark_dirty(unit)
         self.flow.pass_on(stage, job, end_ns)
+
+    def ready_ns(self, job: Job) -> int | None:
+        """Return the time at which the inputs of a job were there; None when its frame is gone."""
+        frame = self.frames.get(job.frame) or self.flow.gone.get(job.frame)
+        return None if frame is None else frame.ready_ns[self._stage_named[job.stage].position]
 
     def _on_skip(self, stage: StageState, frame: FrameState) -> None:
         """Note that the frame takes the bypass; raises ValueError if none begins at `stage`."""
@@ -270,7 +282,8 @@ class Core:
         job = unit.queue.popleft()
         self._begin_next(unit)
         self.flow.free_slots(job)
-        self.flow.mark_lost(job.frame, Loss(LossKind.FAILED, job.stage))
+        if job.frame in self.frames:
+            self.flow.mark_lost(job.frame, Loss(LossKind.FAILED, job.stage))
         self.flow.mark_dirty(unit)
         self._on_stop(Stop())
 

@@ -10,10 +10,10 @@ a string. `str()` of each is its key in the report and in messages.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
 from enum import StrEnum
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from trilane.unexpected_value import UnexpectedValue
 
@@ -76,6 +76,7 @@ class DropCause(StrEnum):
     - POOL: an edge had no other slot.
     - QUEUE_FULL: it was turned away before the first stage.
     - TIMEOUT: it waited too long before the first stage.
+    - EVERY: no stage at an end of the graph takes it, by `StageSpec.every`.
     """
 
     STALE = "stale"
@@ -83,10 +84,14 @@ class DropCause(StrEnum):
     POOL = "pool"
     QUEUE_FULL = "queue_full"
     TIMEOUT = "timeout"
+    EVERY = "every"
 
 
 class Drop(NamedTuple):
-    """A reason to drop a frame. `edge`: place of the drop, as `producer->consumer`."""
+    """A reason to drop a frame.
+
+    `edge`: place of the drop, as `producer->consumer`; names of the last stages for EVERY.
+    """
 
     edge: str
     cause: DropCause
@@ -105,8 +110,8 @@ NEVER: Final = (1 << 62) - 1  # ns, later than any time
 class Job(NamedTuple):
     """One stage of one frame on one unit, from an input slot to an output slot.
 
-    `slot_in`: index of the input slot; where a bypass ends at the stage, the slots of the bypassed edge follow those of
-    the input edge.
+    `slot_in`: index of the input slot; of several inputs, `packed`. Where a bypass ends at the stage, the slots of the
+    bypassed edge follow those of the input edge.
     `fresh`: whether the stage must ignore what earlier frames left behind; set for the stage at which the bypass
     begins.
     `rung`: rung of the frame's work (work_ladder.py).
@@ -278,36 +283,102 @@ class Decision(NamedTuple):
 
 
 @dataclass(frozen=True)
+class Input:
+    """What a stage reads: the stream that another stage writes.
+
+    `stage`: name of the stage that writes it.
+    `latest`: whether the stage takes the newest frame that there is, of whatever number. Otherwise it takes the same
+    frame as from its other inputs.
+    `max_age_ns`: age from which on the newest frame counts as absent; 0: no such age.
+    """
+
+    stage: str
+    latest: bool = False
+    max_age_ns: int = 0
+
+
+@dataclass(frozen=True)
 class StageSpec:
-    """A stage and the unit that it runs on."""
+    """A stage and the unit that it runs on.
+
+    `inputs`: what the stage reads; None for a stage of a chain, which reads what the stage before it writes.
+    `every`: distance between the frames that the stage takes: 3 for the first, the fourth and so on.
+    """
 
     name: str
     unit: str
+    inputs: tuple[Input, ...] | None = None
+    every: int = 1
+
+
+MOST_INPUTS: Final = 7  # of one stage, so that the slots of a job fit into one number of a message
+NO_SLOT: Final = 255
+
+
+def packed(slots: Sequence[int]) -> int:
+    """Return the slots of a job's inputs as one number, a byte for each, the first input lowest; -1 without inputs.
+
+    `slots`: slot of each input; -1 for an input of the newest frame where there is none yet.
+    """
+    if len(slots) == 1:
+        return slots[0] if slots[0] >= 0 else NO_SLOT
+    code = 0
+    for slot in reversed(slots):
+        code = code << 8 | (slot if slot >= 0 else NO_SLOT)
+    return code if slots else -1
+
+
+def unpacked(code: int, count: int) -> list[int]:
+    """Return the slots of `count` inputs that `packed` made `code` of."""
+    slots = [code >> 8 * place & NO_SLOT for place in range(count)]
+    return [slot if slot != NO_SLOT else -1 for slot in slots]
 
 
 @dataclass(frozen=True)
 class Graph:
-    """A chain of stages.
+    """The stages of a run and how frames go through them, in an order in which each stage follows those that it reads.
 
-    `edges`: rule of each edge; `edges[i]` lies between stages i and i + 1.
+    `edges`: rule of each edge. In a chain `edges[i]` lies between stages i and i + 1. Elsewhere it is the rule of the
+    stream of each stage that has a reader, in the order of the stages.
     `latency_to`: stage at whose end the latency ends.
-    `bypass`: names of two stages; a frame for which the first says so skips the stages between them (flow.py).
+    `bypass`: names of two stages of a chain; a frame for which the first says so skips the stages between them
+    (flow.py).
+    `from_release`: whether the latency begins with the frame's release, not with the pose that its first stage samples.
     """
 
     stages: tuple[StageSpec, ...]
     edges: tuple[str, ...]
     latency_to: str
     bypass: tuple[str, str] | None = None
+    from_release: bool = False
 
     def __post_init__(self) -> None:
         names = [stage.name for stage in self.stages]
         if len(set(names)) != len(names) or not names:
             raise UnexpectedValue(f"stages {names}", "different names")
-        if len(self.edges) != len(names) - 1 or self.latency_to not in names:
+        if not self.is_chain:
+            self._check_inputs()
+        if len(self.edges) != len(self.streams) or self.latency_to not in names:
             found = f"{len(self.edges)} edges and latency to {self.latency_to!r} for stages {names}"
-            raise UnexpectedValue(found, "one edge fewer than stages, and latency to one of them")
+            raise UnexpectedValue(found, f"{len(self.streams)} edges, and latency to one of the stages")
         if self.bypass is not None:
+            if not self.is_chain:
+                raise UnexpectedValue(f"bypass {self.bypass}", "none, as the stages are no chain")
             self._check_bypass(names, self.bypass)
+
+    def _check_inputs(self) -> None:
+        """Raise UnexpectedValue for inputs that cannot be."""
+        known: set[str] = set()
+        for stage in self.stages:
+            if stage.inputs is None:
+                raise UnexpectedValue(f"stage {stage.name} without a list of inputs", "one, as other stages have it")
+            read = [each.stage for each in stage.inputs]
+            if not set(read) <= known or len(set(read)) != len(read) or len(read) > MOST_INPUTS:
+                expected = f"at most {MOST_INPUTS} different stages that come before it"
+                raise UnexpectedValue(f"stage {stage.name} with inputs {', '.join(read)}", expected)
+            if stage.every < 1:
+                raise UnexpectedValue(f"stage {stage.name} with every {stage.every}", "1 or more")
+            known.add(stage.name)
 
     def _check_bypass(self, names: list[str], bypass: tuple[str, str]) -> None:
         """Raise UnexpectedValue for a bypass that skips no stage, or the stage at which the latency ends."""
@@ -316,6 +387,11 @@ class Graph:
         if self.latency_to in self.bypassed:
             found = f"latency to {self.latency_to!r}, which bypass {bypass} skips"
             raise UnexpectedValue(found, "latency to a stage that every frame meets")
+
+    @property
+    def is_chain(self) -> bool:
+        """Whether each stage reads what the stage before it writes."""
+        return all(stage.inputs is None and stage.every == 1 for stage in self.stages)
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -329,8 +405,33 @@ class Graph:
         names = [stage.name for stage in self.stages]
         return tuple(names[names.index(self.bypass[0]) + 1 : names.index(self.bypass[1])])
 
+    def inputs_of(self, index: int) -> tuple[Input, ...]:
+        """Return what stage `index` reads, in a chain too."""
+        given = self.stages[index].inputs
+        if given is not None:
+            return given
+        return (Input(self.stages[index - 1].name),) if index else ()
+
+    @property
+    def streams(self) -> dict[str, tuple[str, ...]]:
+        """The readers of each stage that has any, by its name."""
+        readers: dict[str, list[str]] = {stage.name: [] for stage in self.stages}
+        for index, stage in enumerate(self.stages):
+            for each in self.inputs_of(index):
+                readers[each.stage].append(stage.name)
+        return {name: tuple(found) for name, found in readers.items() if found}
+
     def edge_name(self, index: int) -> str:
-        return f"{self.stages[index].name}->{self.stages[index + 1].name}"
+        """Return `FROM->TO` of the edge that `edges[index]` is the rule of; several readers are joined by commas."""
+        name, readers = list(self.streams.items())[index]
+        return f"{name}->{','.join(readers)}"
+
+    def written(self) -> dict[str, Any]:
+        """Return the graph as JSON values, which `recording.graph_of` reads; a chain has no inputs in it."""
+        if self.is_chain and not self.from_release:
+            stages = [{"name": stage.name, "unit": stage.unit} for stage in self.stages]
+            return {"stages": stages, "edges": self.edges, "latency_to": self.latency_to, "bypass": self.bypass}
+        return asdict(self)
 
 
 def chain(stages: Iterable[tuple[str, str]], edge: str, latency_to: str) -> Graph:

@@ -2,9 +2,20 @@
 
 It moves frames and slots as it is told, and notes which units the change concerns (`mark_dirty`).
 
-A bypass is the way past some stages. A frame on it overtakes none, and its slot goes back to the edge that it came
-from. The stage at which the bypass begins says of each frame whether it skips (`JobDone.skips`). The slot of such a
-frame waits in `EdgeSlots.passing` of the edge behind that stage, for the stage at which the bypass ends. That stage
+Several readers. What a stage writes waits in one slot for all who read it; nothing is copied. A stage with several
+inputs begins a frame when each of them has it. Frames keep their order on every edge, so the oldest of each line is
+then the same frame.
+
+Dropped everywhere. A frame that is dropped or lost leaves all lines, because a stage that joins branches would wait for
+it in vain. A job that has begun it goes on, and what the job writes is thrown away. A frame that one branch has begun
+is not dropped as stale on another, or two branches would choose different frames, and hardly any pair would meet.
+
+Side work. Only inputs of the newest frame take the work of some stages, so no picture waits for it. A frame that such a
+stage leaves out is dropped there alone, and is not counted.
+
+A bypass is the way past some stages of a chain. A frame on it overtakes none, and its slot goes back to the edge that
+it came from. The stage at which the bypass begins says of each frame whether it skips (`JobDone.skips`). The slot of
+such a frame waits in the second line of the edge behind that stage, for the stage at which the bypass ends. That stage
 takes frames from two sides. It takes the oldest frame, and a frame that skips only when no older frame is still before
 it.
 
@@ -17,10 +28,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from trilane.scheduler.events import Drop, DropCause, Graph, Job, Loss
+from trilane.scheduler.events import Drop, DropCause, Graph, Job, Loss, packed, unpacked
 from trilane.scheduler.ledger import Ledger
-from trilane.scheduler.state import FrameState, StageState, UnitState, build
+from trilane.scheduler.state import FrameState, Inlet, NewestInlet, SourceLine, StageState, UnitState, build
 from trilane.transport.slots import EdgeSlots
+
+SKIPPING = 1  # line of the frames that skip, on the edge at which a bypass begins
 
 
 class Bypass:
@@ -47,16 +60,16 @@ def next_slot(stage: StageState, frames: Mapping[int, FrameState]) -> int:
     """
     own, bypassed = stage.input, stage.bypassed
     assert own is not None
-    if bypassed is None or not bypassed.passing:
+    if bypassed is None or not bypassed.lines[SKIPPING]:
         return own.ready[0] if own.ready else -1
-    slot = bypassed.passing[0]
+    slot = bypassed.lines[SKIPPING][0]
     frame = bypassed.frame[slot]
     if own.ready:
         if own.frame[own.ready[0]] < frame:
             return own.ready[0]
     elif _is_older_before(stage, frame, frames):
         return -1
-    return len(own.state) + slot
+    return own_slots(stage) + slot
 
 
 def _is_older_before(stage: StageState, frame: int, frames: Mapping[int, FrameState]) -> bool:
@@ -69,13 +82,19 @@ def _is_older_before(stage: StageState, frame: int, frames: Mapping[int, FrameSt
     return False
 
 
-def side_of(stage: StageState, slot_in: int) -> tuple[EdgeSlots, int]:
-    """Return the edge and the slot that `slot_in` of a job of `stage` refers to; the stage must have an input."""
+def own_slots(stage: StageState) -> int:
+    """Return the number of slots of the stage's own edge, after which those of the bypassed edge are counted."""
+    assert isinstance(stage.input, EdgeSlots)
+    return len(stage.input.state)
+
+
+def side_of(stage: StageState, slot_in: int) -> tuple[EdgeSlots | SourceLine, int]:
+    """Return the edge and the slot that `slot_in` of a job of `stage` refers to; the stage must have one input."""
     own = stage.input
     assert own is not None
-    if stage.bypassed is None or slot_in < len(own.state):
+    if stage.bypassed is None or slot_in < own_slots(stage):
         return own, slot_in
-    return stage.bypassed, slot_in - len(own.state)
+    return stage.bypassed, slot_in - own_slots(stage)
 
 
 def stale_slot(stage: StageState, frames: Mapping[int, FrameState]) -> int:
@@ -85,19 +104,18 @@ def stale_slot(stage: StageState, frames: Mapping[int, FrameState]) -> int:
     does, which may need it. The slot counts as `Job.slot_in` does.
     """
     own, bypassed = stage.input, stage.bypassed
-    if own is None or bypassed is None or not bypassed.passing:
+    if own is None or bypassed is None or not bypassed.lines[SKIPPING]:
         return -1
-    slot = bypassed.passing[0]
-    frame = bypassed.frame[slot]
+    passing = bypassed.lines[SKIPPING]
+    frame = bypassed.frame[passing[0]]
     newest = own.frame[own.ready[-1]] if own.ready else -1
-    if newest > frame or (len(bypassed.passing) > 1 and not _parts(stage, frame, bypassed, frames)):
-        return len(own.state) + slot
+    if newest > frame or (len(passing) > 1 and not _parts(stage, frame, bypassed.frame[passing[1]], frames)):
+        return own_slots(stage) + passing[0]
     return -1
 
 
-def _parts(stage: StageState, frame: int, bypassed: EdgeSlots, frames: Mapping[int, FrameState]) -> bool:
-    """Return whether a frame between the two oldest that wait to skip is still on its way to the stage."""
-    newer = bypassed.frame[bypassed.passing[1]]
+def _parts(stage: StageState, frame: int, newer: int, frames: Mapping[int, FrameState]) -> bool:
+    """Return whether a frame between `frame` and `newer`, which wait to skip, is still on its way to the stage."""
     return any(frame < number < newer and state.position < stage.position for number, state in frames.items())
 
 
@@ -107,6 +125,8 @@ class Flow:
     `dirty`: units that a step must look at, in the order in which they were marked; a unit may appear twice.
     `bypass`: bypass of the chain, or None.
     `rung`: rung of the work of frames that are admitted from now on.
+    `gone`: frames that were dropped or lost while jobs worked on them, until these end.
+    `source_lines`: where frames wait for each stage without inputs, if there are several such stages.
     """
 
     def __init__(self, graph: Graph, ledger: Ledger, drops: bool) -> None:
@@ -117,10 +137,20 @@ class Flow:
         self.stages, self.units, self.edges = build(graph)
         self.stage_named = {stage.name: stage for stage in self.stages}
         self.frames: dict[int, FrameState] = {}
+        self.gone: dict[int, FrameState] = {}
         self.dirty: list[UnitState] = []
-        self._graph, self._ledger, self._drops = graph, ledger, drops
-        self._jobs = 0
+        self.is_chain = graph.is_chain
+        self._ledger, self._drops = ledger, drops
+        self._jobs = self._admitted = 0
         self.rung = 0
+        self._count = len(self.stages)
+        self._all = (1 << self._count) - 1
+        self._ends = sum(stage.bit for stage in self.stages if stage.output is None)
+        self._every = any(stage.period > 1 for stage in self.stages)
+        self._roots = [stage for stage in self.stages if not stage.before]
+        self.source_lines = [(each, each.input) for each in self._roots if isinstance(each.input, SourceLine)]
+        self._main = sum(stage.bit for stage in self.stages if stage.is_main)
+        self._samples: dict[tuple[int, int], tuple[int, int]] = {}  # of the slots behind a stage with newest readers
         self.bypass: Bypass | None = None
         if graph.bypass is not None:
             begin, end = graph.bypass
@@ -132,149 +162,333 @@ class Flow:
 
     def admit(self, frame: int, release_ns: int, deadline_ns: int) -> None:
         """Put the frame in flight."""
-        self.frames[frame] = FrameState(release_ns, deadline_ns, self.rung)
+        number = self._admitted
+        self._admitted += 1
+        todo = self._all
+        if self._every:
+            todo = sum(stage.bit for stage in self.stages if not number % stage.period)
+        self.frames[frame] = FrameState(release_ns, deadline_ns, self.rung, number, todo, self._count)
+        for stage, line in self.source_lines:
+            if todo & stage.bit:
+                line.ready.append(frame)
+                self.mark_dirty(stage.unit)
+        if not todo:
+            self._leave(frame)
 
-    def begin(self, stage: StageState, frame: int, slot_in: int) -> Job:
-        """Return the stage's job for `frame`, which was just admitted or waits for the stage in `slot_in`."""
-        source, sink = stage.input, stage.output
+    def begin(self, stage: StageState, frame: int, slot_in: int, now_ns: int) -> Job:
+        """Return the stage's job for `frame`, which was just admitted or waits for the stage.
+
+        `slot_in`: slot in which it waits, as `Job.slot_in` counts, for a stage that joins nothing.
+        """
+        source, sink, state = stage.input, stage.output, self.frames[frame]
         slot_out = -1
-        if source is not None:
+        if stage.joins or self.source_lines:
+            slot_in = self._take_all(stage, state, now_ns)
+        elif source is not None:
             if stage.bypassed is None:
-                source.take(slot_in)
+                source.take(slot_in, stage.inlets[0].line)
             else:
                 edge, slot = side_of(stage, slot_in)
-                edge.take(slot)
+                edge.take(slot, SKIPPING if edge is stage.bypassed else 0)
+        state.begun |= stage.bit
+        state.jobs += 1
         if sink is not None:
-            slot_out, evicted = sink.claim(frame)
+            if self.is_chain:
+                slot_out, evicted = sink.claim(frame)
+            else:
+                slot_out, evicted = sink.claim(frame, lambda other: self.must_stay(stage, other))
             if evicted is not None:
-                self.drop([evicted], stage.position, DropCause.STALE if sink.rule.mailbox else DropCause.POOL)
+                self.drop([evicted], stage, DropCause.STALE if sink.rule.mailbox else DropCause.POOL)
         pool = sink or source
         epoch = pool.epoch if pool else 0
         bypass, fresh = self.bypass, False
         if bypass is not None and stage is bypass.begin:
             fresh, bypass.must_be_fresh = bypass.must_be_fresh, False
-        slots = (slot_in, slot_out, epoch, fresh, self.frames[frame].rung)
-        job = Job(self._jobs, stage.unit.name, stage.name, frame, *slots)
+        job = Job(self._jobs, stage.unit.name, stage.name, frame, slot_in, slot_out, epoch, fresh, state.rung)
         self._jobs += 1
         return job
 
+    def _take_all(self, stage: StageState, state: FrameState, now_ns: int) -> int:
+        """Take the slots of all inputs of a stage, and return them `packed`."""
+        for inlet in stage.inlets:
+            if inlet.producer is None:
+                inlet.edge.take(inlet.waiting[0])
+        slots = []
+        for side in stage.slots_of:
+            if isinstance(side, Inlet):
+                slots.append(side.waiting[0])
+                side.edge.take(slots[-1], side.line)
+                continue
+            held = side.edge.newest[side.reader]
+            slots.append(-1)
+            if held >= 0:
+                sampled_ns, number = self._samples[side.producer.position, held]
+                if not 0 < side.max_age_ns < now_ns - sampled_ns:
+                    slots[-1] = side.edge.take_newest(side.reader)
+                    self._ledger.newest(side.producer.name, now_ns - sampled_ns, state.number - number)
+        return packed(slots)
+
+    def must_stay(self, behind: StageState, frame: int) -> bool:
+        """Whether a frame behind a stage is not dropped for a newer one, because another branch has begun it."""
+        state = self.frames.get(frame)
+        return state is not None and bool(state.begun & self._main & ~(behind.before | behind.bit))
+
+    def is_held(self, before: StageState, frame: int) -> bool:
+        """Whether a frame that waits for a stage is not dropped as stale, because another branch has begun it."""
+        return bool(self.frames[frame].begun & self._main & ~before.before)
+
     def pass_on(self, stage: StageState, job: Job, end_ns: int) -> None:
-        """Note that the job is done: its frame waits for the next stage, or is presented."""
-        source, sink, bypass = stage.input, stage.output, self.bypass
-        if source is not None:
-            if stage.bypassed is None:
-                if not source.free:
-                    self.mark_dirty(self.stages[stage.position - 1].unit)
-                source.release(job.slot_in)
-            else:
-                self._release(stage, job.slot_in)
-        if sink is not None:
-            if bypass is not None and stage is bypass.begin and self._take(bypass, job):
+        """Note that the job is done: its frame waits for the next stages, or is presented."""
+        state = self.frames.get(job.frame)
+        if state is None:
+            self.free_slots(job)
+            return
+        self._release(stage, job)
+        state.jobs -= 1
+        state.todo &= ~stage.bit
+        sink, bypass = stage.output, self.bypass
+        if sink is None:
+            self._present(job.frame, state, end_ns)
+        elif self.is_chain:
+            if bypass is not None and stage is bypass.begin and self._take_bypass(bypass, job):
                 return
             replaced = sink.commit(job.slot_out)
             if replaced:
-                self.drop(replaced, stage.position, DropCause.STALE)
+                self.drop(replaced, stage, DropCause.STALE)
             if len(sink.ready) == 1 or self._drops:
                 self.mark_dirty(self.stages[stage.position + 1].unit)
         else:
-            frame = self.frames.pop(job.frame)
-            self._ledger.presented(job.frame, end_ns, frame.latency_ns, frame.deadline_ns, frame.skips, frame.rung)
-            self.mark_dirty(self.stages[0].unit)
+            self._commit(stage, sink, job.slot_out, state, end_ns)
+            if not state.todo:
+                self._leave(job.frame)
 
-    def _take(self, bypass: Bypass, job: Job) -> bool:
+    def _commit(self, stage: StageState, sink: EdgeSlots, slot: int, state: FrameState, end_ns: int) -> None:
+        """Let the slot wait for the readers of its frame."""
+        readers = [(line, reader) for line, reader in enumerate(stage.readers) if state.todo & reader.bit]
+        if sink.newest:
+            self._samples[stage.position, slot] = (state.pose_ns, state.number)
+        replaced = sink.commit(slot, [line for line, _ in readers], lambda other: self.must_stay(stage, other))
+        for _, reader in readers:
+            state.ready_ns[reader.position] = max(state.ready_ns[reader.position], end_ns)
+            self.mark_dirty(reader.unit)
+        if sink.newest:
+            self.mark_dirty(stage.unit)  # the newest frame before it may have left its slot
+        if replaced:
+            self.drop(replaced, stage, DropCause.STALE)
+
+    def _present(self, frame: int, state: FrameState, end_ns: int) -> None:
+        """Note that a stage without readers has done the frame; the last of them presents it."""
+        if not state.todo & self._ends:
+            state.is_presented = True
+            self._ledger.presented(frame, end_ns, state.latency_ns, state.deadline_ns, state.skips, state.rung)
+        if not state.todo:
+            self._leave(frame)
+
+    def _leave(self, frame: int) -> None:
+        """Note that nothing is left to do for the frame."""
+        if not self.frames.pop(frame).is_presented:
+            ends = [stage.name for stage in self.stages if stage.output is None]
+            self._ledger.dropped[Drop(",".join(ends), DropCause.EVERY)] += 1
+        for root in self._roots:
+            self.mark_dirty(root.unit)
+
+    def skip(self, frame: FrameState) -> None:
+        """Let the frame, for which the stage at the bypass's begin has ended, go past the stages between."""
+        if self.bypass is not None:
+            frame.position = self.bypass.end.position
+            frame.ready_ns[frame.position] = frame.ready_ns[self.bypass.begin.position + 1]
+            between = self.stages[self.bypass.begin.position + 1 : frame.position]
+            frame.todo &= ~sum(stage.bit for stage in between)
+
+    def _take_bypass(self, bypass: Bypass, job: Job) -> bool:
         """Return whether the frame takes the bypass; if so, it waits for the stage at the bypass's end."""
         bypass.was_taken = self.frames[job.frame].skips
         if bypass.was_taken:
-            self.drop(bypass.edge.commit(job.slot_out, skips=True), bypass.begin.position, DropCause.STALE)
+            self.drop(bypass.edge.commit(job.slot_out, (SKIPPING,)), bypass.begin, DropCause.STALE)
             self.mark_dirty(bypass.end.unit)
         return bypass.was_taken
 
-    def _release(self, stage: StageState, slot_in: int) -> None:
-        """Free the slot from which the stage at a bypass's end took its frame."""
-        edge, slot = side_of(stage, slot_in)
-        if not edge.free:
-            self.mark_dirty(self._producer(stage, edge).unit)
-        edge.release(slot)
+    def _release(self, stage: StageState, job: Job) -> None:
+        """Free the slots that a job has read."""
+        if stage.bypassed is not None:
+            edge, slot = side_of(stage, job.slot_in)
+            if not edge.free:
+                self.mark_dirty(self._producer(stage, edge).unit)
+            edge.release(slot)
+        elif stage.joins:
+            for side, slot in zip(stage.slots_of, unpacked(job.slot_in, len(stage.slots_of)), strict=True):
+                if slot >= 0 and side.producer is not None:
+                    self.mark_dirty(side.producer.unit)
+                    side.edge.release(slot)
+        elif job.slot_in >= 0:
+            inlet = stage.inlets[-1]
+            assert inlet.producer is not None
+            if not inlet.edge.free:
+                self.mark_dirty(inlet.producer.unit)
+            inlet.edge.release(job.slot_in)
 
-    def _producer(self, stage: StageState, edge: EdgeSlots) -> StageState:
-        """Return the stage that fills `edge`, from which `stage` takes frames."""
+    def _producer(self, stage: StageState, edge: EdgeSlots | SourceLine) -> StageState:
+        """Return the stage that fills `edge`, from which `stage` takes frames; the stage has one input."""
         if edge is not stage.input and self.bypass is not None:
             return self.bypass.begin
-        return self.stages[stage.position - 1]
+        producer = stage.inlets[0].producer
+        assert producer is not None
+        return producer
 
-    def drop(self, frames: list[int], edge: int, cause: DropCause) -> None:
-        """Drop frames whose slots on the edge behind stage `edge` were given to others, and count them."""
+    def drop(self, frames: list[int], behind: StageState, cause: DropCause, before: StageState | None = None) -> None:
+        """Drop frames that waited behind a stage, and count them.
+
+        `before`: stage that they waited for; None: all readers of what the stage `behind` writes.
+        """
         for frame in frames:
-            self._count_drop(frame, edge, cause)
-            self.mark_dirty(self.stages[edge].unit)
-            self.mark_dirty(self.stages[0].unit)
+            self._count_drop(frame, behind, before, cause)
+            self.mark_dirty(behind.unit)
+            for root in self._roots:
+                self.mark_dirty(root.unit)
 
     def drop_waiting(self, stage: StageState, slot_in: int, cause: DropCause) -> None:
-        """Drop the frame that waits for the stage in `slot_in`, and free its slot."""
+        """Drop the frame that waits for the stage in `slot_in`."""
         edge, slot = side_of(stage, slot_in)
-        self.drop([edge.drop(slot)], self._producer(stage, edge).position, cause)
+        if self.is_chain:
+            assert isinstance(edge, EdgeSlots)
+            self.drop([edge.drop(slot)], self._producer(stage, edge), cause)
+            return
+        frame = edge.frame[slot]
+        if not stage.is_main:
+            self._leave_out(stage, frame)
+        else:
+            self.drop([frame], stage.inlets[0].producer or stage, cause, stage)
+
+    def _leave_out(self, stage: StageState, frame: int) -> None:
+        """Let a stage of side work, and those that read it, leave out a frame."""
+        state = self.frames[frame]
+        for each in self.stages:
+            if each is stage or each.before & stage.bit:
+                state.todo &= ~each.bit
+                for inlet in each.inlets:
+                    inlet.edge.pass_by(frame, inlet.line)
+        if not state.todo:
+            self._leave(frame)
+        self._mark_all_dirty()
 
     def mark_lost(self, frame: int, loss: Loss) -> None:
-        """Count a frame in flight as lost; its slots, if it has any, are not freed here."""
+        """Count a frame in flight as lost, if it is not yet presented; its slots, if it has any, are not freed here."""
         state = self.frames.pop(frame)
-        self._ledger.lost[loss] += 1
-        self.mark_dirty(self.stages[0].unit)
+        if not state.is_presented:
+            self._ledger.lost[loss] += 1
+        self._forget(frame, state)
+        for root in self._roots:
+            self.mark_dirty(root.unit)
         self._tell_bypass(state)
 
     def reclaim(self, unit: UnitState, loss: Loss) -> None:
         """Give the slots of a unit whose process is gone back to their edges, under a new epoch.
 
-        The frame that the unit worked on is lost. Its other frames wait again, but those for the chain's first stage
-        are lost.
+        The frame that the unit worked on is lost. Its other frames wait again, but those for the only first stage are
+        lost.
         """
         jobs = list(unit.queue)
         unit.queue.clear()
         for job in jobs[:1]:
             self.free_slots(job)
-            self.mark_lost(job.frame, loss)
+            if job.frame in self.frames:
+                self.mark_lost(job.frame, loss)
         for job in reversed(jobs[1:]):
             self._put_back(job, loss)
         for stage in unit.stages:
-            for edge in (stage.input, stage.output, stage.bypassed):
+            for edge in (*(side.edge for side in stage.slots_of), stage.output, stage.bypassed):
                 if edge is not None:
                     edge.epoch += 1
             if stage.bypassed is not None and self.bypass is not None:
                 self.bypass.must_be_fresh = True
 
     def free_slots(self, job: Job) -> None:
-        """Free both slots of a job that will not end."""
+        """Free all slots of a job whose frame does not go on."""
         stage = self.stage_named[job.stage]
-        if stage.input:
-            edge, slot = side_of(stage, job.slot_in)
-            edge.release(slot)
-            self.mark_dirty(self._producer(stage, edge).unit)
+        self._release(stage, job)
+        for side in stage.slots_of:
+            if side.producer is not None:
+                self.mark_dirty(side.producer.unit)
         if stage.output:
             stage.output.abandon(job.slot_out)
             self.mark_dirty(stage.unit)
+        self._end_job(job)
+
+    def _end_job(self, job: Job) -> None:
+        """Note that no unit holds the job any more."""
+        state = self.frames.get(job.frame) or self.gone[job.frame]
+        state.jobs -= 1
+        if not state.jobs:
+            self.gone.pop(job.frame, None)
 
     def _put_back(self, job: Job, loss: Loss) -> None:
         """Let the job's frame wait for its stage again."""
         stage = self.stage_named[job.stage]
+        if stage.input is None or job.frame in self.gone:
+            is_gone = job.frame in self.gone
+            self.free_slots(job)
+            if not is_gone:
+                self.mark_lost(job.frame, loss)
+            return
         if stage.output:
             stage.output.abandon(job.slot_out)
-        if stage.input is None:
-            self.mark_lost(job.frame, loss)
-            return
+        self._end_job(job)
+        self.frames[job.frame].begun &= ~stage.bit
         if job.fresh and self.bypass is not None:
             self.bypass.must_be_fresh = True
-        edge, slot = side_of(stage, job.slot_in)
-        producer = self._producer(stage, edge)
-        for frame in edge.give_back(slot, skips=edge is not stage.input):
-            self._count_drop(frame, producer.position, DropCause.STALE)
+        if stage.bypassed is not None:
+            edge, slot = side_of(stage, job.slot_in)
+            producer = self._producer(stage, edge)
+            self._give_back(edge, slot, SKIPPING if edge is not stage.input else 0, producer)
+        else:
+            self._give_back_all(stage, job)
+
+    def _give_back_all(self, stage: StageState, job: Job) -> None:
+        """Let the job's frame wait in all lines in which it waited."""
+        for inlet in stage.inlets:
+            if inlet.producer is None:
+                inlet.edge.give_back(job.frame)
+        slots = unpacked(job.slot_in, len(stage.slots_of)) if stage.joins else [job.slot_in]
+        for side, slot in zip(stage.slots_of, slots, strict=True):
+            if isinstance(side, NewestInlet):
+                if slot >= 0:
+                    side.edge.release(slot)
+            elif side.producer is not None:
+                self._give_back(side.edge, slot, side.line, side.producer)
+        if not self.is_chain:
+            self._mark_all_dirty()
+
+    def _give_back(self, edge: EdgeSlots | SourceLine, slot: int, line: int, producer: StageState) -> None:
+        for frame in edge.give_back(slot, line):
+            self._count_drop(frame, producer, None, DropCause.STALE)
         self.mark_dirty(producer.unit)
 
-    def _count_drop(self, frame: int, edge: int, cause: DropCause) -> None:
+    def _count_drop(self, frame: int, behind: StageState, before: StageState | None, cause: DropCause) -> None:
         state, bypass = self.frames.pop(frame), self.bypass
-        name = self._graph.edge_name(edge)
-        if bypass is not None and state.skips and edge == bypass.begin.position:
-            name = f"{bypass.begin.name}->{bypass.end.name}"
-        self._ledger.dropped[Drop(name, cause)] += 1
+        if bypass is not None and state.skips and behind is bypass.begin:
+            readers = bypass.end.name
+        elif before is not None:
+            readers = before.name
+        else:
+            readers = ",".join(reader.name for reader in behind.readers)
+        self._ledger.dropped[Drop(f"{behind.name}->{readers}", cause)] += 1
+        self._forget(frame, state)
         self._tell_bypass(state)
+
+    def _forget(self, frame: int, state: FrameState) -> None:
+        """Take a frame that is gone out of all lines; in a chain it waits in one alone, and has left that."""
+        if self.is_chain:
+            return
+        if state.jobs:
+            self.gone[frame] = state
+        for stage in self.stages:
+            for inlet in stage.inlets:
+                inlet.edge.pass_by(frame, inlet.line)
+        self._mark_all_dirty()
+
+    def _mark_all_dirty(self) -> None:
+        for unit in self.units.values():
+            self.mark_dirty(unit)
 
     def _tell_bypass(self, gone: FrameState) -> None:
         """Update the bypass after a frame in flight was dropped or lost."""
@@ -283,5 +497,5 @@ class Flow:
             return
         if not gone.skips and gone.position <= bypass.end.position:
             bypass.must_be_fresh = True
-        if gone.skips or bypass.edge.passing:
+        if gone.skips or bypass.edge.lines[SKIPPING]:
             self.mark_dirty(bypass.end.unit)  # the frame waited there, or what waits there may have waited for it alone

@@ -1,4 +1,4 @@
-"""Accounts for the time of the units: each nanosecond is busy or idle for one stated cause, and the six sum to the run.
+"""Accounts for the time of the units: each nanosecond is busy or idle for one stated cause, and these sum to the run.
 
 - busy: a job runs.
 - starved: the unit has no input.
@@ -6,6 +6,7 @@
 - throttled: the cap holds the unit.
 - preempted: the unit has a job, but no core.
 - overhead: a job is assigned but does not run (messages, scheduling, sleep), or the unit is down.
+- join: the unit has some inputs of a frame, but not all; only in a graph where branches meet.
 
 On the virtual clock no unit is preempted here: units on one core are one unit to the scheduler, and
 trilane.hw_profiles.application divides its share.
@@ -27,6 +28,7 @@ ASSIGNED: Final = 0
 STARVED: Final = 1
 BLOCKED: Final = 2
 THROTTLED: Final = 3
+JOIN: Final = 4
 
 
 class JobRecord(NamedTuple):
@@ -51,11 +53,26 @@ class JobRecord(NamedTuple):
     cpu_ns: int = 0
 
 
+class _NewestBook:
+    """How old the frames were that inputs of the newest frame took from one stream."""
+
+    def __init__(self, sketch: Callable[[], Sketch] | None) -> None:
+        self.age, self.behind = Samples(sketch), Counter[int]()
+
+    def row(self) -> dict[str, Any]:
+        taken = sum(self.behind.values())
+        frames = sum(behind * count for behind, count in self.behind.items())
+        return {
+            "age_ms": self.age.summary_ms(),
+            "frames_behind": {"mean": frames / taken if taken else 0.0, "max": max(self.behind, default=0)},
+        }
+
+
 class _UnitBook:
     def __init__(self) -> None:
         self.state = STARVED
         self.since_ns = 0
-        self.totals = [0, 0, 0, 0]
+        self.totals = [0, 0, 0, 0, 0]
         self.busy_ns = self.preempted_ns = 0
         self.last_end_ns = 0
         self.jobs = 0
@@ -73,15 +90,17 @@ class _UnitBook:
             self.preempted_ns += min(preempted_ns, ran_ns)
             self.busy_ns += ran_ns - min(preempted_ns + asleep_ns, ran_ns)
 
-    def shares(self) -> dict[str, Any]:
+    def shares(self, joins: bool) -> dict[str, Any]:
+        """Return the unit's row of the report. `joins`: whether one of its stages has several inputs."""
         total = sum(self.totals) or 1
-        assigned, starved, blocked, throttled = self.totals
+        assigned, starved, blocked, throttled, join = self.totals
         idle = {
             "starved": starved,
             "blocked": blocked,
             "throttled": throttled,
             "preempted": self.preempted_ns,
             "overhead": assigned - self.busy_ns - self.preempted_ns,
+            **({"join": join} if joins else {}),
         }
         return {
             "busy": self.busy_ns / total,
@@ -125,6 +144,9 @@ class Ledger:
         sketch = self._books.sketch
         self._units = {unit: _UnitBook() for unit in graph.units}
         self._stages = {stage.name: _StageBook(sketch) for stage in graph.stages}
+        reads = [(stage, graph.inputs_of(place)) for place, stage in enumerate(graph.stages)]
+        self._joining = {stage.unit for stage, inputs in reads if sum(not each.latest for each in inputs) > 1}
+        self._newest = {each.stage: _NewestBook(sketch) for _, inputs in reads for each in inputs if each.latest}
         self.start_ns = self.end_ns = 0
         self.lost: Counter[Loss] = Counter()
         self.dropped: Counter[Drop] = Counter()
@@ -168,6 +190,16 @@ class Ledger:
         stage.wait.add(begin_ns - ready_ns)
         self._units[job.unit].add_job(begin_ns, end_ns, preempted_ns, asleep_ns, preempted_before_ns)
 
+    def newest(self, stream: str, age_ns: int, behind: int) -> None:
+        """Book that a job takes the newest frame of a stream.
+
+        `age_ns`: time since that frame was sampled.
+        `behind`: number of frames by which it is older than the job's frame.
+        """
+        book = self._newest[stream]
+        book.age.add(age_ns)
+        book.behind[behind] += 1
+
     @property
     def busy_ns(self) -> dict[str, int]:
         """How many ns each unit has worked so far, in jobs that have ended."""
@@ -181,6 +213,7 @@ class Ledger:
     ) -> None:
         """Book a presented frame.
 
+        `latency_ns`: its latency; below 0 for a frame that the stage at which the latency ends does not take.
         `deadline_ns`: time of its deadline; NEVER without one.
         `skipped`: whether it took the bypass.
         `rung`: rung of its work.
@@ -198,7 +231,8 @@ class Ledger:
             self._first_ns = end_ns
         self._last_ns = end_ns
         self.presented_count += 1
-        self._latency.add(latency_ns)
+        if latency_ns >= 0:
+            self._latency.add(latency_ns)
         if deadline_ns != NEVER and not target_ns:
             self._lateness.add(end_ns - deadline_ns)
         if self._books.sketch is None:
@@ -244,6 +278,7 @@ class Ledger:
     def report(self, *, clock: str, requested: int, not_begun: int) -> dict[str, Any]:
         """Return the keys of report.json. `not_begun`: number of requested frames that never left the source."""
         intervals, span_ns = max(self.presented_count - 1, 0), self._last_ns - self._first_ns
+        streams = {name: book.row() for name, book in self._newest.items()}
         return {
             "clock": clock,
             "frames": {
@@ -267,7 +302,8 @@ class Ledger:
                 "energy": None,  # a caller that knows the power fills it in
             },
             "stages": {stage.name: self._stage_row(stage.name, stage.unit) for stage in self._graph.stages},
-            "units": {unit: book.shares() for unit, book in self._units.items()},
+            "units": {unit: book.shares(unit in self._joining) for unit, book in self._units.items()},
+            **({"streams": streams} if streams else {}),
         }
 
     def _stage_row(self, name: str, unit: str) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from trilane.scheduler.events import (
     Event,
     Finish,
     Graph,
+    Input,
     Job,
     Outcome,
     Settings,
@@ -75,7 +76,7 @@ class Recording:
 
 def header_line(graph: Graph, settings: Settings) -> str:
     """Return the first line of a recording: `schema`, `graph`, `settings`."""
-    return json.dumps({"schema": SCHEMA, "graph": asdict(graph), "settings": asdict(settings)}) + "\n"
+    return json.dumps({"schema": SCHEMA, "graph": graph.written(), "settings": asdict(settings)}) + "\n"
 
 
 def step_line(now_ns: int, events: Iterable[Event], actions: Iterable[Action]) -> str:
@@ -193,7 +194,14 @@ def graph_of(data: Mapping[str, Any]) -> Graph:
     """Return the graph that was written as `data`; raises KeyError or TypeError for data that are none."""
     bypass = data["bypass"]
     ends = None if bypass is None else (bypass[0], bypass[1])
-    return Graph(tuple(StageSpec(**stage) for stage in data["stages"]), tuple(data["edges"]), data["latency_to"], ends)
+    stages = tuple(_stage_of(stage) for stage in data["stages"])
+    return Graph(stages, tuple(data["edges"]), data["latency_to"], ends, data.get("from_release", False))
+
+
+def _stage_of(data: Mapping[str, Any]) -> StageSpec:
+    inputs = data.get("inputs")
+    read = None if inputs is None else tuple(Input(**each) for each in inputs)
+    return StageSpec(**{**data, "inputs": read})
 
 
 def settings_of(data: Mapping[str, Any]) -> Settings:

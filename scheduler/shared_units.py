@@ -291,7 +291,7 @@ class BesideDriver:
         begin_ns, before_ns = running.begin_ns, running.preempted_before_ns
         preempted_ns = now_ns - begin_ns - running.had // ONE
         if line.recording is not None and job.frame in line.core.frames:
-            ready_ns = line.core.frames[job.frame].ready_ns
+            ready_ns = line.core.ready_ns(job) or 0
             cpu_ns = now_ns - begin_ns - preempted_ns
             times = (ready_ns, running.waited.dispatch_ns, begin_ns, now_ns, preempted_ns, 0, before_ns, cpu_ns)
             line.jobs.append(JobRecord(job.stage, job.unit, job.frame, *times))

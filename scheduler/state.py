@@ -16,12 +16,15 @@ A unit has one deadline, and its state says what happens when the deadline passe
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from math import lcm
 from typing import Final
 
-from trilane.scheduler.events import NEVER, Graph, Job, JobDone, JobFailed, Pinged, Pong, UnitDied, UnitReady
+from trilane.scheduler.events import NEVER, Graph, Input, Job, JobDone, JobFailed, Pinged, Pong, UnitDied, UnitReady
 from trilane.scheduler.ledger import STARVED
 from trilane.transport.slots import EdgeSlots, edge_rule
+from trilane.unexpected_value import UnexpectedValue
 
 DOWN: Final = 0
 STARTING: Final = 1
@@ -151,21 +154,126 @@ class UnitState:
         raise KeyError(name)
 
 
+class SourceLine:
+    """The frames that wait for a stage without inputs, in place of slots; for several such stages, or one with `every`.
+
+    A slot's number is the number of its frame.
+    """
+
+    def __init__(self) -> None:
+        self.ready: deque[int] = deque()
+        self.lines = (self.ready,)
+        self.frame = range(NEVER)  # each slot's frame
+        self.free = True
+        self.epoch = 0
+
+    def take(self, slot: int, _line: int = 0) -> None:
+        self.ready.remove(slot)
+
+    def release(self, slot: int) -> None:
+        """Do nothing: no memory was held."""
+
+    def forget(self, frame: int) -> None:
+        """Let the stage not wait for `frame` any more."""
+        if frame in self.ready:
+            self.ready.remove(frame)
+
+    def pass_by(self, frame: int, _line: int) -> None:
+        self.forget(frame)
+
+    def give_back(self, slot: int, _line: int = 0) -> list[int]:
+        """Let a taken frame wait again in its old place."""
+        place = sum(frame < slot for frame in self.ready)
+        self.ready.insert(place, slot)
+        return []
+
+
+@dataclass(frozen=True)
+class Inlet:
+    """One input of a stage that takes frame by frame.
+
+    `edge`: slots that it reads.
+    `line`: index of its line of waiting slots.
+    `producer`: stage that fills them; None for frames from the source.
+    """
+
+    edge: EdgeSlots | SourceLine
+    line: int
+    producer: StageState | None
+
+    @property
+    def waiting(self) -> deque[int]:
+        return self.edge.lines[self.line]
+
+
+@dataclass(frozen=True)
+class NewestInlet:
+    """One input of a stage that takes the newest frame.
+
+    `edge`: slots that it reads.
+    `reader`: index of what it holds in `edge.newest`.
+    `max_age_ns`: age from which on the frame counts as absent; 0: no such age.
+    """
+
+    edge: EdgeSlots
+    reader: int
+    producer: StageState
+    max_age_ns: int
+
+
 class StageState:
     """The state of one stage.
 
     `estimate_ns`: running mean of its service time in ns (weight 1/8); 0 before the first job.
+    `inlets`: inputs that take frame by frame; `input` is the first one's edge, and `waiting` its line.
+    `others`: lines of the further ones.
+    `slots_of`: inputs whose slots a job names, in the order of `Job.slot_in`.
+    `joins`: whether a job names other slots than that of one frame.
     `bypassed`: for the stage at which a bypass ends, the edge whose frames may skip to it.
+    `readers`: stages that read its output frame by frame, in the order of the output's lines.
+    `period`: distance between the frames that it does.
+    `bit`: 1 shifted by its position.
+    `after`: positions of the stages that it reads frame by frame.
+    `before`: bits of the stages that a frame must have done before it.
+    `is_main`: whether a stage without readers waits for its work, or it is one itself. The others do side work, which
+    only inputs of the newest frame take.
     """
 
-    __slots__ = ("bypassed", "estimate_ns", "input", "name", "output", "position", "unit")
+    __slots__ = (
+        "after",
+        "before",
+        "bit",
+        "bypassed",
+        "estimate_ns",
+        "inlets",
+        "input",
+        "is_main",
+        "joins",
+        "name",
+        "others",
+        "output",
+        "period",
+        "position",
+        "readers",
+        "slots_of",
+        "unit",
+        "waiting",
+    )
 
     def __init__(self, name: str, unit: UnitState, position: int) -> None:
         self.name, self.unit, self.position = name, unit, position
-        self.input: EdgeSlots | None = None
+        self.input: EdgeSlots | SourceLine | None = None
         self.output: EdgeSlots | None = None
         self.bypassed: EdgeSlots | None = None
+        self.inlets: tuple[Inlet, ...] = ()
+        self.slots_of: tuple[Inlet | NewestInlet, ...] = ()
+        self.others: tuple[deque[int], ...] = ()
+        self.waiting: deque[int] = deque()
+        self.readers: list[StageState] = []
+        self.after: list[int] = []
+        self.joins, self.is_main = False, True
         self.estimate_ns = 0
+        self.period, self.bit, self.before = 1, 1 << position, 0
 
     def learn(self, service_ns: int) -> None:
         """Take one more measured service time into the estimate."""
@@ -178,50 +286,116 @@ class StageState:
         """
         self.estimate_ns -= self.estimate_ns >> 4
 
+    def set_inlets(self, inlets: Sequence[Inlet], slots_of: Sequence[Inlet | NewestInlet]) -> None:
+        """Set the inputs.
+
+        `slots_of`: inputs that have slots, those of the newest frame among them, in the order of the graph.
+        """
+        self.inlets, self.slots_of = tuple(inlets), tuple(slots_of)
+        if inlets:
+            self.input, self.waiting = inlets[0].edge, inlets[0].waiting
+            self.others = tuple(inlet.waiting for inlet in inlets[1:])
+        self.after = [inlet.producer.position for inlet in inlets if inlet.producer is not None]
+        self.joins = tuple(slots_of) != tuple(inlets) or len(slots_of) > 1
+
 
 class FrameState:
     """The state of one frame in flight.
 
-    `position`: position of its next stage.
+    `position`: position of its next stage in a chain.
     `release_ns`: time of its release.
-    `ready_ns`: time at which its last stage ended.
-    `latency_ns`: time from the pose to the composited frame, once known.
+    `ready_ns`: time at which the inputs of each stage were there, by the stage's position.
+    `latency_ns`: time from the pose to the end of the stage at which the latency ends, once known; else -1.
     `skips`: whether it takes the bypass.
     `rung`: rung of its work.
+    `number`: how many frames were put in flight before it.
+    `todo`, `begun`: bits of the stages that it has yet to end, and of those that have begun it.
+    `jobs`: number of its jobs that units hold.
+    `is_presented`: whether all stages without readers have done it; what is left is side work.
     """
 
-    __slots__ = ("deadline_ns", "latency_ns", "pose_ns", "position", "ready_ns", "release_ns", "rung", "skips")
+    __slots__ = (
+        "begun",
+        "deadline_ns",
+        "is_presented",
+        "jobs",
+        "latency_ns",
+        "number",
+        "pose_ns",
+        "position",
+        "ready_ns",
+        "release_ns",
+        "rung",
+        "skips",
+        "todo",
+    )
 
-    def __init__(self, release_ns: int, deadline_ns: int, rung: int = 0) -> None:
-        self.position, self.release_ns, self.ready_ns = 0, release_ns, release_ns
+    def __init__(
+        self, release_ns: int, deadline_ns: int, rung: int = 0, number: int = 0, todo: int = 0, stages: int = 1
+    ) -> None:
+        self.position, self.release_ns, self.ready_ns = 0, release_ns, [release_ns] * stages
         self.deadline_ns, self.rung = deadline_ns, rung
-        self.pose_ns = self.latency_ns = 0
-        self.skips = False
+        self.pose_ns = self.latency_ns = -1
+        self.number, self.todo = number, todo
+        self.begun = self.jobs = 0
+        self.skips = self.is_presented = False
 
-    def end_stage(self, position: int, latency_position: int, pose_ns: int, end_ns: int) -> None:
-        """Note that the stage at `position` has ended; latency ends with the stage at `latency_position`.
+    def end_stage(self, sampled_ns: int | None, end_ns: int, ends_latency: bool) -> None:
+        """Note the times of a stage's end.
 
-        `pose_ns`: time at which the first stage sampled the pose.
+        `sampled_ns`: time at which a stage without inputs sampled the frame; None from other stages.
+        `ends_latency`: whether the latency ends with the stage.
         """
-        self.position, self.ready_ns = position + 1, end_ns
-        if position == 0:
-            self.pose_ns = pose_ns
-        if position == latency_position:
+        if sampled_ns is not None:
+            self.pose_ns = sampled_ns if self.pose_ns < 0 else min(self.pose_ns, sampled_ns)
+        if ends_latency:
             self.latency_ns = end_ns - self.pose_ns
 
 
 def build(graph: Graph) -> tuple[list[StageState], dict[str, UnitState], list[EdgeSlots]]:
     """Return the joined states of a graph's stages, units and edges; raises ValueError for an unknown edge."""
     units = {name: UnitState(name) for name in graph.units}
-    edges = [EdgeSlots(edge_rule(text)) for text in graph.edges]
-    stages = []
-    for position, spec in enumerate(graph.stages):
-        stage = StageState(spec.name, units[spec.unit], position)
-        stage.input = edges[position - 1] if position else None
-        stage.output = edges[position] if position < len(edges) else None
-        units[spec.unit].stages.append(stage)
-        stages.append(stage)
+    stages = [StageState(spec.name, units[spec.unit], position) for position, spec in enumerate(graph.stages)]
+    named = {stage.name: stage for stage in stages}
+    read = {stage.name: graph.inputs_of(stage.position) for stage in stages}
+    edges = []
+    for (name, readers), text in zip(graph.streams.items(), graph.edges, strict=True):
+        producer = named[name]
+        by_frame = [reader for reader in readers if not _input(read[reader], name).latest]
+        producer.readers = [named[reader] for reader in by_frame]
+        lines = len(by_frame) + (graph.bypass is not None and graph.bypass[0] == name)
+        producer.output = EdgeSlots(edge_rule(text), lines, len(readers) - len(by_frame))
+        if producer.output.newest and producer.output.rule.slots < 2:
+            raise UnexpectedValue(f"edge {text!r} behind {name}", "two slots or more", "one holds the newest frame")
+        edges.append(producer.output)
+    roots = [stage for stage in stages if all(each.latest for each in read[stage.name])]
+    held = dict.fromkeys(named, 0)
+    for stage, spec in zip(stages, graph.stages, strict=True):
+        stage.unit.stages.append(stage)
+        is_fed = stage in roots and (len(roots) > 1 or spec.every > 1)
+        inlets: list[Inlet] = [Inlet(SourceLine(), 0, None)] if is_fed else []
+        slots_of: list[Inlet | NewestInlet] = []
+        stage.period = spec.every
+        for each in read[spec.name]:
+            producer = named[each.stage]
+            assert producer.output is not None
+            if each.latest:
+                slots_of.append(NewestInlet(producer.output, held[each.stage], producer, each.max_age_ns))
+                held[each.stage] += 1
+                continue
+            inlets.append(Inlet(producer.output, producer.readers.index(stage), producer))
+            slots_of.append(inlets[-1])
+            stage.before |= producer.before | producer.bit
+            stage.period = lcm(stage.period, producer.period)
+        stage.set_inlets(inlets, slots_of)
+    for stage in reversed(stages):
+        stage.is_main = stage.output is None or any(reader.is_main for reader in stage.readers)
     return stages, units, edges
+
+
+def _input(inputs: Sequence[Input], stage: str) -> Input:
+    """Return the one of `inputs` that reads `stage`."""
+    return next(each for each in inputs if each.stage == stage)
 
 
 #: Verdicts: leave the unit alone, kill its process, start it again, let it work after a hold, see if it takes a job.

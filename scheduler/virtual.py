@@ -182,8 +182,7 @@ class VirtualDriver:
         self._sequence += 1
         heappush(self._heap, (end_ns + self._message_delay_ns, EVENT, self._sequence, done, unit.epoch))
         if self.recording is not None:
-            ready_ns = self.core.frames[frame].ready_ns
-            times = (ready_ns, now_ns, begin_ns, end_ns, 0, 0, 0, end_ns - begin_ns)
+            times = (self.core.ready_ns(job) or 0, now_ns, begin_ns, end_ns, 0, 0, 0, end_ns - begin_ns)
             self._begun[job_id] = JobRecord(stage, name, frame, *times)
 
     def _start(self, now_ns: int, action: Start) -> None:

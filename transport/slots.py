@@ -2,14 +2,16 @@
 
     FREE --claim--> WRITING --commit--> READY --take--> READING --release--> FREE
 
-WRITING belongs to the producer's unit, READING to the consumer's, FREE and READY to nobody. The module is pure: it
-knows neither memory nor a clock.
+WRITING belongs to the producer's unit, READING to the units of its readers, FREE and READY to nobody. A slot that one
+of several readers has released is READY again while no other reads it. The module is pure: it knows neither memory nor
+a clock.
 """
 
 from __future__ import annotations
 
 import re
 from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -79,37 +81,61 @@ def edge_rule(text: str) -> EdgeRule:
     return EdgeRule(name, int(count), rule.mailbox, rule.yields)
 
 
+#: Says of a frame whether it must stay where it waits.
+Keeps = Callable[[int], bool]
+FIRST_LINE: Final = (0,)
+
+
+def _keeps_none(_frame: int) -> bool:
+    return False
+
+
 class EdgeSlots:
-    """The slots of one edge.
+    """The slots behind one stage: of the edge to the next stage, or of a stream with several readers.
+
+    A reader takes frame by frame and has a line of waiting slots, or it takes the newest frame alone and holds that
+    frame's slot until a newer one comes. A slot is free when the last of its readers has released it.
 
     `frame`: frame in each slot; -1 without one.
-    `ready`: slots that wait for the edge's consumer, oldest first.
-    `passing`: slots that wait for the stage at which a bypass of this edge ends.
+    `lines`: slots that wait for each reader that takes frame by frame, oldest first.
+    `ready`: the first of the lines.
+    `newest`: slot that each reader of the newest frame holds; -1 before the first frame.
     `epoch`: number that grows at each fault.
     """
 
-    def __init__(self, rule: EdgeRule) -> None:
+    def __init__(self, rule: EdgeRule, lines: int = 1, newest: int = 0) -> None:
+        """Begin with free slots.
+
+        `lines`: number of readers that take frame by frame.
+        `newest`: number of readers that take the newest frame.
+        """
         self.rule = rule
         self.state = [FREE] * rule.slots
         self.frame = [-1] * rule.slots
         self.free = list(range(rule.slots - 1, -1, -1))
-        self.ready: deque[int] = deque()
-        self.passing: deque[int] = deque()
+        self.lines: tuple[deque[int], ...] = tuple(deque() for _ in range(lines))
+        self.ready = self.lines[0] if lines else deque()
+        self.newest = [-1] * newest
         self.epoch = 0
+        self._left = [0] * rule.slots  # readers that have yet to release the slot
+        self._reading = [0] * rule.slots  # jobs that read the slot
 
-    def can_claim(self) -> bool:
-        """Whether a slot is free, or may be taken from the oldest waiting frame."""
-        return bool(self.free) or (self.rule.yields and bool(self.ready or self.passing))
+    def can_claim(self, keeps: Keeps = _keeps_none) -> bool:
+        """Whether a slot is free, or may be taken from the oldest waiting frame.
 
-    def claim(self, frame: int) -> tuple[int, int | None]:
+        `keeps`: function that says which frames must not be evicted.
+        """
+        return bool(self.free) or (self.rule.yields and self._evictable(keeps) >= 0)
+
+    def claim(self, frame: int, keeps: Keeps = _keeps_none) -> tuple[int, int | None]:
         """Claim a slot for `frame`; return the slot and the waiting frame that was evicted from it, or None.
 
-        A frame on the bypass is evicted before any other, because no frame can need it. Raises SlotError when no slot
-        is free and none may be evicted.
+        A frame in the last line is evicted first: frames on a bypass wait there, and no frame can need them. Raises
+        SlotError when no slot is free and none may be evicted.
         """
         dropped = None
-        if not self.free and self.rule.yields and (self.ready or self.passing):
-            dropped = self.drop((self.passing or self.ready)[0])
+        if not self.free and self.rule.yields and (oldest := self._evictable(keeps)) >= 0:
+            dropped = self.drop(oldest)
         if not self.free:
             raise SlotError("no slot to claim")
         # The slot that was given back last: its memory may still be in the caches.
@@ -118,26 +144,62 @@ class EdgeSlots:
         self.frame[slot] = frame
         return slot, dropped
 
-    def commit(self, slot: int, skips: bool = False) -> list[int]:
+    def commit(self, slot: int, to: Sequence[int] = FIRST_LINE, keeps: Keeps = _keeps_none) -> list[int]:
         """Mark the slot's frame as complete, and return the frames that it replaces.
 
-        `skips`: whether it takes the bypass.
+        The slot is free again at once if no reader takes its frame.
+
+        `to`: lines in which the slot waits from now on.
+        `keeps`: function that says which frames must not be replaced.
         """
         self._move("commit", slot)
-        line = self.passing if skips else self.ready
-        replaced = [self.drop(old) for old in list(line)] if self.rule.mailbox else []
-        line.append(slot)
+        replaced = []
+        if self.rule.mailbox:
+            for line in to:
+                old = [each for each in self.lines[line] if not self._reading[each] and not keeps(self.frame[each])]
+                replaced += [self.drop(each) for each in old]
+        for line in to:
+            self.lines[line].append(slot)
+        self._left[slot] = len(to) + len(self.newest)
+        for reader, held in enumerate(self.newest):
+            self.newest[reader] = slot
+            if held >= 0:
+                self._leave(held)
+        if not self._left[slot]:
+            self._move("drop", slot)
+            self._empty(slot)
         return replaced
 
-    def take(self, slot: int) -> None:
-        """Let the unit of the stage that the slot waits for read it from now on."""
-        self._move("take", slot)
-        self._line_of(slot).remove(slot)
+    def take(self, slot: int, line: int = 0) -> None:
+        """Let the unit of the stage that the slot waits for in `line` read it from now on."""
+        if not self._reading[slot]:
+            self._move("take", slot)
+        self._reading[slot] += 1
+        self.lines[line].remove(slot)
+
+    def take_newest(self, reader: int) -> int:
+        """Let a job read what `reader` holds, and return its slot; -1 before the first frame."""
+        slot = self.newest[reader]
+        if slot >= 0:
+            if not self._reading[slot]:
+                self._move("take", slot)
+            self._reading[slot] += 1
+            self._left[slot] += 1
+        return slot
 
     def release(self, slot: int) -> None:
-        """Free the slot, which the unit that took it has read."""
-        self._move("release", slot)
-        self._empty(slot)
+        """Note that a job has read the slot, which is free when no other reader needs it."""
+        if self._reading[slot] == 1 == self._left[slot]:  # most slots have one reader
+            self._reading[slot] = self._left[slot] = 0
+            self._move("release", slot)
+            self._empty(slot)
+            return
+        if not self._reading[slot]:
+            raise SlotError(f"cannot release slot {slot}, which is {self.state[slot]}")
+        self._reading[slot] -= 1
+        if not self._reading[slot]:
+            self._move("give_back", slot)
+        self._leave(slot)
 
     def abandon(self, slot: int) -> None:
         """Free the slot, which the producer's unit will not complete."""
@@ -145,27 +207,60 @@ class EdgeSlots:
         self._empty(slot)
 
     def drop(self, slot: int) -> int:
-        """Take a waiting frame out of its slot, and return its number."""
+        """Take a waiting frame, which no job reads, out of its slot, and return its number."""
         self._move("drop", slot)
-        self._line_of(slot).remove(slot)
+        for line in self.lines:
+            if slot in line:
+                line.remove(slot)
+        for reader, held in enumerate(self.newest):
+            if held == slot:
+                self.newest[reader] = -1
         frame = self.frame[slot]
+        self._left[slot] = 0
         self._empty(slot)
         return frame
 
-    def give_back(self, slot: int, skips: bool = False) -> list[int]:
+    def forget(self, frame: int) -> None:
+        """Let no reader wait for `frame` any more, as it was dropped or lost; who reads or holds its slot keeps it."""
+        for line in range(len(self.lines)):
+            self.pass_by(frame, line)
+
+    def pass_by(self, frame: int, line: int) -> None:
+        """Take `frame` out of one line, if it waits there; the other readers keep it."""
+        for slot in self.lines[line]:
+            if self.frame[slot] == frame:
+                self.lines[line].remove(slot)
+                self._leave(slot)
+                return
+
+    def give_back(self, slot: int, line: int = 0) -> list[int]:
         """Let a taken frame wait again in its old place; return it if a newer frame waits in a mailbox."""
-        self._move("give_back", slot)
-        line = deque(sorted([*(self.passing if skips else self.ready), slot], key=self.frame.__getitem__))
-        if skips:
-            self.passing = line
-        else:
-            self.ready = line
+        self._reading[slot] -= 1
+        if not self._reading[slot]:
+            self._move("give_back", slot)
+        waiting = self.lines[line]
+        waiting.append(slot)
+        ordered = sorted(waiting, key=self.frame.__getitem__)
+        waiting.clear()
+        waiting.extend(ordered)
         if not self.rule.mailbox:
             return []
-        return [self.drop(old) for old in list(line)[:-1]]
+        return [self.drop(old) for old in ordered[:-1] if not self._reading[old]]
 
-    def _line_of(self, slot: int) -> deque[int]:
-        return self.passing if self.passing and slot in self.passing else self.ready
+    def _evictable(self, keeps: Keeps) -> int:
+        """Return the slot whose frame a claim may evict; -1: none."""
+        for line in reversed(self.lines):
+            for slot in line:
+                if not self._reading[slot] and slot not in self.newest and not keeps(self.frame[slot]):
+                    return slot
+        return -1
+
+    def _leave(self, slot: int) -> None:
+        """Note that one reader of the slot needs it no more."""
+        self._left[slot] -= 1
+        if not self._left[slot]:
+            self._move("drop", slot)
+            self._empty(slot)
 
     def _move(self, verb: str, slot: int) -> None:
         before, after = TRANSITIONS[verb]

@@ -133,11 +133,11 @@ def test_the_bound_on_a_frame_that_will_skip_is_that_of_its_own_way() -> None:
     for stage in core.stages:
         stage.estimate_ns = TIMES[stage.name]
     for number, position in enumerate((1, 0, 0)):
-        core.frames[number] = FrameState(0, 0)
+        core.frames[number] = FrameState(0, 0, todo=0b111 >> position << position)
         core.frames[number].position = position
-    assert earliest_completion_ns(0, 2, 0, core.stages, core.frames, (0, 2)) == 8 * MS
-    assert earliest_completion_ns(0, 2, 0, core.stages, core.frames) == 22 * MS
-    assert earliest_completion_ns(0, 0, 1, core.stages, core.frames, (0, 2)) == 8 * MS
+    assert earliest_completion_ns(0, 2, core.stages, core.frames, 0b111, core.bypass) == 8 * MS
+    assert earliest_completion_ns(0, 2, core.stages, core.frames, 0b111) == 22 * MS
+    assert earliest_completion_ns(0, 0, core.stages, core.frames, 0b110, core.bypass) == 8 * MS
 
 
 def test_frames_at_and_before_the_stage_at_which_a_bypass_begins_are_taken_to_skip() -> None:
@@ -152,11 +152,11 @@ def test_frames_at_and_before_the_stage_at_which_a_bypass_begins_are_taken_to_sk
     for stage in core.stages:
         stage.estimate_ns = times[stage.name]
     for number, position in enumerate((2, 1, 0)):
-        core.frames[number] = FrameState(0, 0)
+        core.frames[number] = FrameState(0, 0, todo=0b1111 >> position << position)
         core.frames[number].position = position
-    assert earliest_completion_ns(0, 2, 0, core.stages, core.frames, (1, 3)) == 21 * MS
-    assert earliest_completion_ns(0, 2, 0, core.stages, core.frames) == 61 * MS
-    assert earliest_completion_ns(0, 1, 1, core.stages, core.frames, (1, 3)) == 21 * MS
+    assert earliest_completion_ns(0, 2, core.stages, core.frames, 0b1111, core.bypass) == 21 * MS
+    assert earliest_completion_ns(0, 2, core.stages, core.frames, 0b1111) == 61 * MS
+    assert earliest_completion_ns(0, 1, core.stages, core.frames, 0b1110, core.bypass) == 21 * MS
 
 
 def test_a_frame_that_skips_where_no_bypass_begins_is_a_drivers_defect() -> None:
@@ -176,25 +176,25 @@ def test_a_bypass_skips_a_stage_at_least(bypass: tuple[str, str]) -> None:
 
 def test_slots_of_frames_that_skip_wait_apart() -> None:
     """Four of a pool: two skip, one waits for the consumer, one is read. The oldest that skips is evicted first."""
-    edge = EdgeSlots(edge_rule("orphan:4"))
-    for frame, skips in ((0, False), (1, False), (2, True), (3, True)):
+    edge = EdgeSlots(edge_rule("orphan:4"), lines=2)
+    for frame, line in ((0, 0), (1, 0), (2, 1), (3, 1)):
         slot, _ = edge.claim(frame)
-        edge.commit(slot, skips)
+        edge.commit(slot, (line,))
     edge.take(0)
-    assert (list(edge.ready), list(edge.passing)) == ([1], [2, 3])
+    assert (list(edge.ready), list(edge.lines[1])) == ([1], [2, 3])
     assert edge.claim(4) == (2, 2)
-    edge.take(3)
+    edge.take(3, 1)
     assert edge.claim(5) == (1, 1)
     assert not edge.can_claim()
-    edge.give_back(3, skips=True)
-    assert list(edge.passing) == [3] and edge.can_claim()
+    edge.give_back(3, 1)
+    assert list(edge.lines[1]) == [3] and edge.can_claim()
 
 
 def test_a_mailbox_keeps_the_newest_of_each_line() -> None:
-    edge = EdgeSlots(edge_rule("triple"))
+    edge = EdgeSlots(edge_rule("triple"), lines=2)
     replaced = []
-    for frame, skips in ((0, False), (1, True), (2, True), (3, False)):
+    for frame, line in ((0, 0), (1, 1), (2, 1), (3, 0)):
         slot, evicted = edge.claim(frame)
         assert evicted is None
-        replaced.append(edge.commit(slot, skips))
+        replaced.append(edge.commit(slot, (line,)))
     assert replaced == [[], [], [1], [0]]
