@@ -213,7 +213,7 @@ class _LateFrames:
                 self._flow.drop_waiting(stage, slot, DropCause.LATE)
 
     def _drop_stale(self, stage: StageState) -> None:
-        """Drop the frames that could go to the stage, but for the newest and for those that another branch has begun."""
+        """Drop the frames that could go to the stage, but the newest and those that another branch has begun."""
         line, edge, flow = stage.waiting, stage.input, self._flow
         if flow.is_chain or edge is None:
             while len(line) > 1:

@@ -49,6 +49,7 @@ from trilane.scheduler.events import (
     FrameRequest,
     Graph,
     Hold,
+    Job,
     JobDone,
     JobFailed,
     Kill,
