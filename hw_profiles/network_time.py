@@ -32,7 +32,6 @@ from trilane.hw_profiles.over_time import (
     timeline_of,
     warm_up,
 )
-from trilane.hw_profiles.profile_files import HOST
 from trilane.hw_profiles.rates import NOTHING, FrameInterval, FrameLoad, Wanted, answers, device_power
 from trilane.hw_profiles.schema import NORMAL_80, Corners, EngineRuntime, Profile, Unit, corners_of
 from trilane.hw_profiles.unit_times import (
@@ -45,7 +44,7 @@ from trilane.hw_profiles.unit_times import (
     relative_error,
     time_on,
 )
-from trilane.units import BURST, UNITS, UnitName
+from trilane.units import BURST, HOST, UNITS, UnitName
 
 #: Relative error from which a term is named that alone makes the time so uncertain.
 NAMED_FROM = 0.05

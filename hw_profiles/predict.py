@@ -36,7 +36,6 @@ from trilane.hw_profiles.over_time import (
     timeline_of,
     unit_power_w,
 )
-from trilane.hw_profiles.profile_files import HOST
 from trilane.hw_profiles.rates import NOTHING, FrameInterval, FrameLoad, Wanted, answers, device_power
 from trilane.hw_profiles.reference_networks import ConfigurationRow, reference_network
 from trilane.hw_profiles.schema import Corners, Profile, corners_of
@@ -45,7 +44,7 @@ from trilane.scheduler.placement import Ranked
 from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.stats import energy_score
 from trilane.scheduler.virtual import Simulation
-from trilane.units import NS_PER_MS, SUSTAINED, UNITS, UnitName
+from trilane.units import HOST, NS_PER_MS, SUSTAINED, UNITS, UnitName
 
 #: Rows of `what_if`: name, how the stages are joined, share of the network on the GPU. All release frames as
 #: often as the display can show them, because they are compared with each other.

@@ -19,8 +19,8 @@ from trilane.errors import BadInputError
 from trilane.hw_profiles.host import host_tables
 from trilane.hw_profiles.schema import Profile
 from trilane.unexpected_value import unexpected_in
+from trilane.units import HOST
 
-HOST = "host"
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 8
 #: Keys of a quantity. An extending profile replaces a quantity as a whole, never its value or its source alone.

@@ -28,13 +28,12 @@ from trilane.hw_profiles.engine_times import numbers_of, spilled
 from trilane.hw_profiles.host_model import UNMEASURED
 from trilane.hw_profiles.network_work import Network
 from trilane.hw_profiles.over_time import Moment, last_fifth, temperatures_of, unit_power_w, warm_up
-from trilane.hw_profiles.profile_files import HOST
 from trilane.hw_profiles.schema import Corners, Profile, Unit, corners_of
 from trilane.scheduler.events import Graph, Settings, Stop, chain
 from trilane.scheduler.policy import POLICIES, run_settings
 from trilane.scheduler.shared_units import ONE, ROUND_ROBIN, Member, Runs, simulate_beside
 from trilane.scheduler.virtual import Service, Simulation, Skips
-from trilane.units import BYPASS, INFER, NS_PER_MS, NS_PER_S, SUSTAINED, UNITS, UnitName
+from trilane.units import BYPASS, HOST, INFER, NS_PER_MS, NS_PER_S, SUSTAINED, UNITS, UnitName
 
 MOST_TENANTS = 8
 #: Share of the bandwidth that others can take at most: something is always left.

@@ -13,7 +13,7 @@ from typing import Annotated, Final
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from trilane.errors import BadInputError, did_you_mean
-from trilane.options import NOTHING, Finite, Option, Options, Text, Texts, one_of, texts_of
+from trilane.options import NOTHING, Finite, Option, Options, Text, Texts, texts_of
 from trilane.scheduler.policy import POLICIES
 from trilane.transport.slots import RULES, edge_rule
 from trilane.unexpected_value import UnexpectedValue
@@ -123,7 +123,7 @@ class RunOptions(Options):
         description="Run also where a recorded camera shows the whole person in less than half of the frames.",
     )
     hud: bool | None = Field(default=None, description="Write frame, rate and age on the picture.")
-    policy: Annotated[str, one_of(*POLICIES), Option(words=tuple(POLICIES), offered=tuple(POLICIES))] = Field(
+    policy: Annotated[str, Option(words=tuple(POLICIES), offered=tuple(POLICIES))] = Field(
         default="pipelined",
         description="pipelined: highest rate; sequential: one frame at a time; latest: newest pose wins; "
         "deadline: frames that would be late are dropped.",
@@ -163,7 +163,6 @@ class RunOptions(Options):
     )
     performance_profile: Annotated[
         str | None,
-        one_of(*PERFORMANCE_PROFILES),
         Option(words=PERFORMANCE_PROFILES, offered=(NOTHING, *PERFORMANCE_PROFILES)),
     ] = Field(default=None, description="Which power and speed the units ask for, by SNPE's names.")
     baseline_frames: Annotated[int, Option("--baseline", unit="frames")] = Field(

@@ -31,8 +31,9 @@ def predict_pipelines(options: PredictOptions, as_json: bool) -> None:
     Raises BadInputError for what is wrong in one of them.
     """
     from trilane.apps.predict.asked_pipelines import tenants
-    from trilane.hw_profiles.profile_files import HOST, load_runnable
+    from trilane.hw_profiles.profile_files import load_runnable
     from trilane.hw_profiles.shared_chip import predict_beside
+    from trilane.units import HOST
 
     scene = str(options.scene)
     chip, variant = load_runnable(options.profile), _variant(options.policy or "", options.edge)

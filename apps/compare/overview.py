@@ -24,9 +24,9 @@ from trilane.errors import BadInputError, MissingPartError
 from trilane.figure_sources import COMPUTED, MEASURED, NO_FIGURES
 from trilane.files import instead_of_file, require_file
 from trilane.scene.schema import Scene
+from trilane.units import HOST_CLOCK
 from trilane.writing import write_atomically
 
-HOST = "host"
 #: What an error belongs to, and what an interval of the frame time holds.
 OF_RUN, OF_AVATAR = "errors of the runs themselves", "errors of the avatars' validations"
 BY_SCATTER, BY_MODEL = "95 %, scatter of the run's frames", "80 %, of the model"
@@ -121,7 +121,7 @@ def _trial(folder: Path, trial: Mapping[str, Any]) -> Entry:
     result = trial.get("result")
     document = dict(result) if isinstance(result, dict) else {}
     document["made"] = {**_dict(document.get("made")), "command": trial.get("command")}
-    document.setdefault("clock", trial.get("clock", "host"))
+    document.setdefault("clock", trial.get("clock", HOST_CLOCK))
     document.setdefault("machine", trial.get("host"))
     if trial.get("status") != "done":
         error = trial.get("error")
@@ -181,7 +181,7 @@ class Entry:
     @property
     def speed_source(self) -> str:
         """Origin of the speed; empty without a speed."""
-        return "" if self.frame_ms is None else MEASURED if self.clock == HOST else COMPUTED
+        return "" if self.frame_ms is None else MEASURED if self.clock == HOST_CLOCK else COMPUTED
 
     @property
     def group(self) -> tuple[str, str, str, str]:
@@ -203,7 +203,7 @@ def entry_of(
     low, high = _interval(times)
     return Entry(
         _text(name),
-        str(document.get("clock", HOST)),
+        str(document.get("clock", HOST_CLOCK)),
         _machine_line(machine),
         dict(_settings(config)) | dict(_settings(options or {})),
         tuple(map(_text, _sequence(made.get("command")))),

@@ -28,6 +28,7 @@ from trilane.apps.compare.difference import (
 )
 from trilane.apps.compare.run_frames import INSTRUCTION_TIME, INSTRUCTIONS, Key
 from trilane.apps.compare.sides import ComparedRun, RunKind, Side, changes
+from trilane.units import HOST_CLOCK
 
 Z_80: Final = 1.281552
 FRAME_TIME, LATENCY, WORK, SERVICE, WAIT, BUSY, IDLE = (
@@ -55,7 +56,6 @@ UNITS: Final = {
 }
 #: Statistics of a summary whose uncertainty is about that of a mean.
 LIKE_THE_MEAN: Final = ("mean", "p50")
-_HOST: Final = "host"
 #: Standard deviations of one run's figure, of its logarithm or of a share of the time, and how many runs these numbers
 #: are worth (docs/decisions/comparing-runs.md has the measurements): of a stage's typical time on its core, of other
 #: times on the clock, of shares, and of counted instructions.
@@ -328,7 +328,7 @@ def noise_between(base: Documents, other: Documents, effects: Mapping[str, float
     times on its core.
     """
     runs = [*base, *other]
-    if all(run["clock"] != _HOST for run in runs):
+    if all(run["clock"] != HOST_CLOCK for run in runs):
         return Noise(is_real=False)
     first, second = ([run.get("other_programs") or 0.0 for run in side] for side in (base, other))
     more = abs(fmean(second) - fmean(first))
@@ -379,7 +379,7 @@ def remarks(reports: Mapping[str, Mapping[str, Any]]) -> list[str]:
     said = []
     for name, report in reports.items():
         others = report.get("other_programs")
-        if report["clock"] == _HOST and others is None:
+        if report["clock"] == HOST_CLOCK and others is None:
             said.append(f"{name}: what other programs had of its cores is not known; they are taken to have had none")
         elif others is not None and others > BUSY_MACHINE:
             longer = 1 / max(1 - others, LEAST_LEFT) - 1

@@ -23,10 +23,11 @@ from trilane.avatars.bundle import load_bundle
 from trilane.bench.lib.interleaved_processes import ProcessVariant, runners
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host_model import NETWORK
-from trilane.hw_profiles.profile_files import HOST, load_runnable
+from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import NORMAL_80
 from trilane.stages.configure import requested_runtime
 from trilane.stages.run_options import RunOptions
+from trilane.units import HOST
 
 RUN, ALONE = "run", "network"
 MIN_FRAMES = 100  # frames of a run that is placed by its times

@@ -23,11 +23,10 @@ from trilane.pipeline.journal import NAME, Begun, Ended, Record, Worked, config_
 from trilane.pipeline.reckoning import Reckoning, places_of
 from trilane.pipeline.timeline import ExplainedJob, Timeline
 from trilane.pipeline.unit_history import PREEMPTED
-from trilane.units import NS_PER_MS
+from trilane.units import HOST_CLOCK, NS_PER_MS
 from trilane.writing import write_atomically
 
 SCHEMA = 1
-HOST = "host"
 GOES_ON = "the run still goes on: what follows is of its frames so far"
 #: Column -> its type, and its value for a job. Times are ns of the run's clock, durations ns; docs/explain.md explains
 #: each column.
@@ -117,7 +116,7 @@ class RunExplanation:
         slowest, usual = self._slow.close()
         unit_of = {stage.name: stage.unit for stage in self._begun.graph.stages}
         intervals = max(self._frames - 1, 1)
-        clock = str(self._begun.facts.get("clock", HOST))
+        clock = str(self._begun.facts.get("clock", HOST_CLOCK))
         frame_ms = (self._last_ns - self._first_ns) / intervals / NS_PER_MS if self._frames > 1 else None
         rows = _budget_rows(budget, unit_of, intervals)
         shared = [self._shared(stage, row) for stage, row in taken.items() if row.preempted_ns]
@@ -140,7 +139,7 @@ class RunExplanation:
             "slowest": [_slow_row(shown, usual) for shown in slowest],
             "advice": advice(rows, self._begun.settings.policy, self._spare_cores(unit_of)),
             "sources": {
-                "frames, waits_ms, service_ms, preempted_ms": MEASURED if clock == HOST else COMPUTED,
+                "frames, waits_ms, service_ms, preempted_ms": MEASURED if clock == HOST_CLOCK else COMPUTED,
                 "efficiency, core_efficiency, machine_efficiency, cores": "CPU time of the run's own jobs",
                 "budget, bound": "the same times along the path that ends with the last frame",
                 "taken_ms": "computed: whose jobs ran then on the same cores",

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from trilane.apps.predict.predict_options import HOST, PredictOptions
+from trilane.apps.predict.predict_options import PredictOptions
 from trilane.errors import BadInputError
-from trilane.units import INFER
+from trilane.units import HOST, INFER
 
 if TYPE_CHECKING:
     from trilane.hw_profiles.application import Plan

@@ -18,7 +18,7 @@ from trilane.options import Finite, Option, Options, Text, Texts, one_of
 from trilane.scheduler.policy import POLICIES
 from trilane.stages.run_options import AVATARS_HELP, PROFILE_HELP
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import BURST, PERFORMANCE_PROFILES, SUSTAINED, UnitName
+from trilane.units import BURST, HOST, PERFORMANCE_PROFILES, SUSTAINED, UnitName
 
 if TYPE_CHECKING:
     from trilane.hw_profiles.application import Variant
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 ENCODER_HELP: Final = "resnet18, mobilenetv2, mobilenetv3 or efficientnet-lite0."
 NORM_HELP: Final = "batch, instance or group."
 FIXED_SIZE_HELP: Final = "Tensor size in pixels: one side, or HEIGHTxWIDTH."
-HOST: Final = "host"
 #: How people call precisions -> as a hardware profile does.
 PRECISIONS: Final = {"w8a8": "int8", "int8": "int8", "float": "fp16", "fp16": "fp16", "fp32": "fp32"}
 OF_A_FILE: Final = {"encoder", "norm", "size", "channels"}
@@ -182,8 +181,8 @@ class PredictOptions(Options):
         default=None, description="Also the highest rate within so many watts of the device."
     )
     gpu_share: Finite = Field(default=0.0, description="Share of the network that the GPU does for the DSP.")
-    performance_profile: Annotated[str, _either(lambda: PERFORMANCE_PROFILES), Option(words=PERFORMANCE_PROFILES)] = (
-        Field(default=SUSTAINED, description="Which power and speed the units ask for, by SNPE's names.")
+    performance_profile: Annotated[str, Option(words=PERFORMANCE_PROFILES)] = Field(
+        default=SUSTAINED, description="Which power and speed the units ask for, by SNPE's names."
     )
     governor: Annotated[str | None, _either(_governors)] = Field(
         default=None, description="step_wise or power_allocator; the profile's if not given."
@@ -208,9 +207,10 @@ class PredictOptions(Options):
 
     @property
     def cap(self) -> str:
-        """Return the performance profile.
+        """Return the performance profile that was given, or the usual one.
 
-        If none was given, a network by itself has that of published latencies, and a run on this machine has no cap.
+        `burst` is usual for a network by itself, because published latencies are measured with it, and on this
+        machine, where a run has no cap. All others have `sustained_high_performance`.
         """
         if "performance_profile" in self.model_fields_set:
             return self.performance_profile

@@ -37,6 +37,7 @@ from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.configure import Checked
 from trilane.stages.placing import placed
 from trilane.stages.run_options import RunOptions
+from trilane.units import HOST
 
 if TYPE_CHECKING:
     from trilane.apps.experiments.picture_errors import ErrorFigures
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
     from trilane.avatars.bundle import Bundle
 
 BASELINE_POLICY = "sequential"
-HOST = "host"
 INTERRUPTED = 130
 NO_VIDEO = "no video, no contact sheet and no checksum: the frames were presented without, as was asked for"
 TRUTH = "the truth: the clothed body that the avatar was trained on"
