@@ -1,4 +1,4 @@
-"""How long from the producer's last byte written until the consumer, another process, can read them all, and has?
+"""How soon after the producer's last write can the consumer process read all bytes, and when has it read them?
 
 Rule: one definition holds for every variant, and all run interleaved; the producer writes every byte again, then reads
 the clock. The variant that is judged and compared with the peers is a real run through the scheduler. Its units form a
@@ -158,7 +158,7 @@ def produce(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[in
 
 
 def consume(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[int, ...], written: int) -> None:
-    """Run the process that reads; it answers with the instants, ns, at which bytes could be and had been read."""
+    """Run the reading process, which answers with two times in ns: all bytes could be read, and all had been read."""
     with _child(pipe, cores):
         end = channel.consumer()
         pipe.send("ready")

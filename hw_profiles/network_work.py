@@ -149,7 +149,7 @@ def count_work(model: Any) -> Work:
 
 
 def _picture_tensors(graph: Any, inputs: list[str]) -> int:
-    """Number of tensors that a picture comes in: all inputs, where nothing but one concatenation reads them."""
+    """Return the number of tensors of a picture: all inputs, where nothing but one concatenation reads them."""
     given, readers = set(inputs), []
     for node in graph.node:
         if given.intersection(node.input):
@@ -167,7 +167,7 @@ def graph_facts(model: Any) -> dict[str, Any]:
 
 
 def constant_tensors(graph: Any) -> set[str]:
-    """Names of the tensors that do not depend on the network's input: weights, and what follows from them.
+    """Return the names of the tensors that do not depend on the network's input: weights, and what follows from them.
 
     In a graph without weights these are the inputs named `w<n>`, and every input of a layer after its first.
     """
@@ -248,7 +248,10 @@ def _live_counts(graph: Any, shapes: Shapes, constants: set[str]) -> list[int]:
 
 
 def _operator(node: Any, shapes: Shapes, constants: set[str], read: set[str]) -> Operator:
-    """Counts of `node`. `constants`: tensors that do not depend on the input. `read`: tensors that somebody reads."""
+    """Return counts of `node`.
+
+    `constants`: tensors that do not depend on the input. `read`: tensors that somebody reads.
+    """
     known = has_rule(node.op_type, node.domain)
     weighted = node.op_type in WEIGHTED and known
     own = node.input[:SCALE_AND_SHIFT] if node.op_type == "BatchNormalization" else node.input
@@ -268,7 +271,7 @@ def _operator(node: Any, shapes: Shapes, constants: set[str], read: set[str]) ->
 
 
 def _convolution(node: Any, shapes: Shapes, plain: Operator) -> Operator:
-    """Counts of a convolution. `plain`: counts of its movement and its weights."""
+    """Return counts of a convolution. `plain`: counts of its movement and its weights."""
     groups = next((a.i for a in node.attribute if a.name == "group"), 1)
     weight, source, result = (
         shapes[name] for name in (node.input[CONVOLUTIONS[node.op_type]], node.input[0], node.output[0])

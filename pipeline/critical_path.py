@@ -61,7 +61,7 @@ class Sharing:
         self._sums: dict[str, Taken] = {}
 
     def add(self, job: JobRecord) -> None:
-        """Take the next job that has ended."""
+        """Count a job; jobs come in the order of their ends."""
         if self._beside.get(job.unit):
             of_unit = self._jobs[job.unit]
             of_unit.append(job)

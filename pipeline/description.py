@@ -237,7 +237,7 @@ class Pipeline(Described):
         }
 
     def stages_of(self, unit: str) -> tuple[PipelineStage, ...]:
-        """The unit's stages, in the order of the chain."""
+        """Return the unit's stages, in the order of the chain."""
         return tuple(stage for stage in self.stages if stage.unit == unit)
 
     def with_rule(self, rule: str) -> Pipeline:

@@ -98,7 +98,7 @@ class EdgeSlots:
         self.epoch = 0
 
     def can_claim(self) -> bool:
-        """Whether a slot is free, or may be taken from the oldest waiting frame."""
+        """Return whether a slot is free, or may be taken from the oldest waiting frame."""
         return bool(self.free) or (self.rule.yields and bool(self.ready or self.passing))
 
     def claim(self, frame: int) -> tuple[int, int | None]:

@@ -96,8 +96,9 @@ def split(
     size: FixedSizeOption = "256",
     json: JsonOption = False,
 ) -> None:
-    """Cut an avatar's network; the parts one after the other give the same bytes.
+    """Cut an avatar's network into parts.
 
+    In sequence, the parts give the same bytes as the whole network.
     `trilane run --split TENSOR=UNIT` runs the parts as stages of their own.
     """
     from trilane.avatars.bundle import load_bundle
@@ -123,7 +124,7 @@ def export(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Compile an avatar's network for a Snapdragon, without one."""
+    """Compile an avatar's network for a Snapdragon."""
     from trilane.avatars.bundle import load_bundle
     from trilane.avatars.network_file import reshaped
     from trilane.stages.dsp.runtime import resolve

@@ -1,6 +1,6 @@
-"""Commands of `trilane avatar` that make an avatar good: `train` and `validate`.
+"""Commands of `trilane avatar` that train and validate an avatar.
 
-Rule: this file talks to the person; the work is done in `trilane.training.train` and `trilane.training.validate`.
+Rule: this file talks to the person; `trilane.training.train` and `trilane.training.validate` do the work.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def train(
 
     Without a capture, the settings name a look of the default body.
 
-    A command that was ended goes on where it was when it is given again.
+    After an interruption, the same command continues the training where it stopped.
     """
     from trilane.training.training_settings import parsed_settings, read_settings
 
@@ -119,7 +119,7 @@ def train(
 
 
 def _require_torch() -> None:
-    """Raises MissingPartError with the lines that install what training needs."""
+    """Raise MissingPartError with the lines that install what training needs."""
     missing = [name for name in ("torch", "scipy", "skimage") if not machine.here.has_package(name)]
     if "torch" in missing:
         lines = f"{package_line('torch')} --index-url {CPU_INDEX} (CPU) or {package_line('torch')} (NVIDIA GPU)"
@@ -144,7 +144,7 @@ def _shown(log: EventLog | None) -> Iterator[_ShownTraining]:
 
 
 class _ShownTraining:
-    """Shows what a training says; a `train.Listener`."""
+    """Shows the progress of a training; a `train.Listener`."""
 
     def __init__(self, console: Console, progress: Progress, log: EventLog | None) -> None:
         self._console, self._progress, self._log = console, progress, log
@@ -178,7 +178,7 @@ class _ShownTraining:
 class EventLog:
     """Writes the losses of a training into `folder` as a log for TensorBoard; the first step makes its file.
 
-    A training that goes on takes back what was logged after its state.
+    A continued training removes the entries after its saved state.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -200,7 +200,7 @@ class EventLog:
 
 
 def _writer(folder: Path, step: int) -> Any:
-    """Return a writer that takes back what `folder` has from `step` on."""
+    """Return a writer to `folder`, after removing its entries from `step` on."""
     from torch.utils.tensorboard import SummaryWriter
 
     return SummaryWriter(str(folder), purge_step=step, flush_secs=FLUSH_S)
@@ -234,7 +234,7 @@ def validate(
 ) -> None:
     """Measure an avatar's image error on held-out views, and write it into the manifest with digests of the files.
 
-    What the manifest said before is replaced.
+    It replaces an earlier validation.
     """
     from trilane.apps.run.asked_run import made_facts
     from trilane.avatars.bundle import load_bundle, require_writable_manifest
@@ -296,7 +296,7 @@ def _band_table(validation: Validation) -> Table:
 
 
 def _validate(bundle: Bundle, plan: ValidationPlan, float_network: Path | None, sheet: Path | None) -> Bundle:
-    """Validate `bundle`, write its manifest and, where asked, the sheet; returns the bundle as it is then."""
+    """Validate `bundle`, write its manifest and, where asked, the sheet. Return the bundle as it was written."""
     from rich.progress import Progress
 
     from trilane.training import validate as work
@@ -320,7 +320,7 @@ def _validate(bundle: Bundle, plan: ValidationPlan, float_network: Path | None, 
 
 
 def _add_sizes(bundle: Bundle, plan: ValidationPlan) -> Bundle:
-    """Measure `bundle` at several tensor sizes and add the figures to its validation, which must be of its files."""
+    """Measure `bundle` at several tensor sizes and add the figures to its validation, which must fit its files."""
     from rich.progress import Progress
 
     from trilane.avatars.validation import VALIDATE, name_of, refused

@@ -1,4 +1,4 @@
-"""`trilane explain`: what is modelled of a scene, as a database explains a query; where the time of a run went.
+"""`trilane explain`: the plan of a scene, as a database explains a query, and the use of time in a run.
 
 Rule: this module reads options and shows results; everything is decided and computed elsewhere.
 """
@@ -86,8 +86,8 @@ def explain(
 ) -> None:
     """Explain the plan of a scene: what is modelled, what is left out, the error it costs and the work it saves.
 
-    With a run folder instead: which stage or wait bounded the frame time, why jobs waited, and why the slowest frames
-    were slow (docs/explain.md).
+    With a run folder, explain the time instead: the stage or wait that bounded the frame time, why jobs waited, and why
+    the slowest frames were slow (docs/explain.md).
     """
     folder = run_folder(scene)
     _refuse_options(given(ctx), of_a_run=folder is not None)
@@ -216,8 +216,7 @@ def _totals(totals: dict[str, Any], config: dict[str, Any]) -> list[str]:
 def run_folder(name: str) -> Path | None:
     """Return the run folder that `trilane explain NAME` means, found as `trilane top` finds it; None for a scene.
 
-    A name that one of Trilane's scenes has means that scene. Raises BadInputError for a folder whose journal is a link
-    to nothing.
+    The name of a bundled scene means that scene. Raises BadInputError for a folder whose journal is a broken link.
     """
     from trilane.apps.watch.followed_run import EXPECTED, follow, without_journal
     from trilane.pipeline.journal import NAME
@@ -237,7 +236,7 @@ def run_folder(name: str) -> Path | None:
 
 
 def _refuse_options(typed: set[str], *, of_a_run: bool) -> None:
-    """Raises BadInputError for options that only the other kind of `trilane explain` has."""
+    """Raise BadInputError for options that only the other kind of `trilane explain` has."""
     useless = typed - OF_A_RUN if of_a_run else typed & NOT_OF_A_SCENE
     if useless:
         names = ", ".join(sorted(f"--{name.replace('_', '-')}" for name in useless))
@@ -343,7 +342,7 @@ def _budget(document: Mapping[str, Any]) -> Table:
 
 
 def _shared(rows: list[dict[str, Any]]) -> Iterator[str]:
-    """Say for each stage whose unit lacked a core for a noticeable time who had the core."""
+    """Name the stages that had the core while the unit of another stage lacked it for a noticeable time."""
     for row in rows:
         if row["preempted_ms"] < LEAST_SHARE * row["service_ms"]:
             continue

@@ -121,7 +121,7 @@ def _mean(times: Mapping[str, float]) -> str:
 
 
 def _idle(answer: dict[str, Any]) -> Table:
-    """Return a table of each unit: the busy time of all, then each pipeline's own and why the unit was idle for it."""
+    """Return a table of each unit: its busy time for all, and its busy time and idle causes per pipeline."""
     from rich.table import Table
 
     table = Table("unit", "pipeline", "busy", *IDLE)

@@ -55,7 +55,7 @@ class TrialPair:
 
 @dataclass(frozen=True)
 class SweepComparison:
-    """`other` beside `base`.
+    """The comparison of the sweep `other` with the sweep `base`.
 
     `over_all`: mean frame time of all pairs. `left_out`: configurations without a partner, by reason. `changes`:
     changes that every pair has. `notes`: what makes the comparison less sure.

@@ -128,7 +128,7 @@ class Comparison:
         return Finding.SAME if self.verdict == NO_DIFFERENCE else Finding.UNKNOWN
 
     def outcome(self, figure: Figure) -> Finding:
-        """Return what holds for one of the `rows`."""
+        """Return the finding for one of the `rows`."""
         row = self.rows[figure]
         return row.outcome(differs=figure in self.differing, margin=margin_of(figure, row))
 
@@ -305,7 +305,7 @@ def _programs(found: Rows) -> Iterator[str]:
 
 
 def _heads(found: Rows) -> Iterator[str]:
-    """Yield the frame time; where its mean is unchanged its first percentile that differs, or else the latency."""
+    """Yield the frame time, its first percentile that differs if the mean does not, or else the latency."""
     for measure in (FRAME_TIME, LATENCY):
         mine = {figure: row for figure, row in found.items() if figure.measure == measure}
         of_mean = [figure for figure in mine if figure.statistic == "mean"] or [*mine][:1]

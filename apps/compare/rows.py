@@ -1,7 +1,7 @@
-"""The figures of two sides as rows, each with the chance that alters it. Rule: a table names each measure's statistics.
+"""The figures of two sides as rows, each with its random variation. Rule: a table names each measure's statistics.
 
-Of runs with a journal every figure comes from their frames. A report alone or a prediction has summaries; each is as
-uncertain as the mean frame time, because nothing else is known.
+In runs with a journal, every figure comes from the frames. A report alone or a prediction only has summaries. Each
+counts as uncertain as the mean frame time, because nothing else is known.
 
 `Noise` says how much a figure differs between runs of one kind beyond what their frames show. Each number has its
 source beside it.
@@ -342,7 +342,7 @@ def noise_between(base: Documents, other: Documents, effects: Mapping[str, float
 def _left(others: float) -> float:
     """Return the logarithm of the share of the cores that other programs left.
 
-    On full cores frames take longer by as much.
+    On full cores, frames take longer by this factor.
     """
     return log1p(-min(others, 1 - LEAST_LEFT))
 
@@ -352,10 +352,10 @@ def _held(report: Mapping[str, Any]) -> frozenset[str]:
 
 
 def _slower_cores(base: Mapping[str, Any], other: Mapping[str, Any], effects: Mapping[str, float]) -> dict[str, float]:
-    """Return for each stage the least change, as a logarithm, of all stages on its cores if all went in one direction.
+    """Return for each stage the change that the speed of its cores explains, as a logarithm.
 
-    On one machine with one placement the cores' own speed explains that much: another machine beside this one, its
-    clock, its temperature. A single stage on its cores says nothing of them.
+    It is the smallest change of all stages on these cores, if all changed in one direction. Causes are another machine
+    beside this one, its clock, or its temperature. A single stage on its cores shows nothing about them.
     """
     if any(not change.key.startswith(SAME_CORES) for change in changes(base, other)):
         return {}

@@ -90,7 +90,7 @@ def frames_of(records: Iterable[Record]) -> RunFrames | None:
 
 
 class _Story:
-    """What the records of a journal tell, gathered."""
+    """The facts gathered from the records of a journal."""
 
     def __init__(self) -> None:
         self.jobs: list[JobRecord] = []

@@ -49,7 +49,10 @@ class FlickerRow:
         self._errors: list[float] = []
 
     def add(self, error: F64, part: tuple[slice, slice]) -> None:
-        """Count the next frame. `error`: its error (h,w,3). `part`: where avatars of it and of the last frame are."""
+        """Count the next frame.
+
+        `error`: its error (h,w,3). `part`: where avatars of it and of the last frame are.
+        """
         if self._before is not None:
             self.changes.append(flicker(self._before[part], error[part]))
         self._errors.append(float(np.abs(error[part]).mean() * STEPS))

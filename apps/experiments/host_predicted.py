@@ -1,7 +1,7 @@
-"""Is what `trilane predict --profile host` says true: of runs of an avatar, and of networks by themselves?
+"""Are the predictions of `trilane predict --profile host` right, for runs of an avatar and for single networks?
 
-Rule: each prediction comes first, then its subject runs as it always does: a whole `trilane run` in processes of its
-own; calls of the network in a process that the prediction did not start. No measured time enters a prediction.
+Rule: each prediction is made before its measurement. A run is a whole `trilane run` in processes of its own; a network
+is called in a process that the prediction did not start. No measured time enters a prediction.
 """
 
 from __future__ import annotations

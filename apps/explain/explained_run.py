@@ -1,8 +1,8 @@
 """Where the time of a run went, as a document and as a table of its jobs.
 
-Rule: the figures come from the run's journal in one reading, in memory that does not grow with the run, whether or not
-it still goes on; the report of one that has ended says how it ended. The table is written as it is read. It needs two
-readings: the first finds the names of the figures that stages report, which are the last columns.
+Rule: the figures come from one pass over the journal of a live or finished run, in bounded memory. The report of a
+finished run says how it ended. The table is written during a second pass, because the first pass finds the figures that
+stages report, which are the last columns.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def open_journal(folder: Path) -> tuple[Begun, Iterator[Record]]:
 
 
 class RunExplanation:
-    """Takes the records of a journal after the first; `document` says what follows from them.
+    """Takes the records of a journal after the first; `document` is the explanation.
 
     `begun`: first record of the journal. `report`: report of the run, None while it goes on. `slowest`: number of
     frames to name.
@@ -148,7 +148,7 @@ class RunExplanation:
         }
 
     def _of_run(self) -> dict[str, Any]:
-        """Return what the run said of itself before its first frame, and how it ended."""
+        """Return the facts of the run from before its first frame, and how it ended."""
         facts, report = self._begun.facts, self._report
         return {
             "scene": config_of(self._begun).get("scene", {}).get("name"),
@@ -175,7 +175,7 @@ class RunExplanation:
         }
 
     def _of_cores(self, frame_ms: float | None, efficiency: float | None) -> dict[str, Any] | None:
-        """Return the CPU time of all jobs per frame beside what the run's cores had; None where either is unknown."""
+        """Return the CPU time of all jobs per frame, and the time of the run's cores; None if either is unknown."""
         cores = sorted({core for place in self._places.values() for core in place.cores})
         if frame_ms is None or efficiency is None or not cores or len(self._places) < len(self._begun.graph.units):
             return None
@@ -183,7 +183,7 @@ class RunExplanation:
         return {"numbers": cores, "cpu_ms": efficiency * had_ms, "had_ms": had_ms}
 
     def _spare_cores(self, unit_of: Mapping[str, str]) -> int:
-        """Return how many cores the run might have used beyond one for each unit; below 0 units must share."""
+        """Return the number of cores that the run had beyond one for each unit; below 0, units share cores."""
         cpu = self._begun.facts.get("machine", {}).get("cpu", {})
         return len(cpu.get("cores_allowed", ())) - len(set(unit_of.values()))
 

@@ -1,7 +1,7 @@
-"""The options of a prediction, each as one field: `trilane predict` and `trilane.predict` have theirs from here.
+"""The options of a prediction, each as one field, for `trilane predict` and `trilane.predict`.
 
-Rule: what is wrong with one option is found by its field, what does not go together by `check_together`. Words of a
-chip's model are read when they are checked, because importing it takes long.
+Rule: a field checks its own value, and `check_together` checks combinations. Words of a chip's model are imported only
+when they are checked, because the import takes long.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ OF_A_SCENE: Final = {"scene", "beside", "turns", "profile", "minutes", "policy",
 
 
 def _either(read_words: Callable[[], tuple[str, ...]], expected: str = "") -> AfterValidator:
-    """Return a validator of words that are read when a value comes. `expected`: what an error says of them."""
+    """Return a validator that calls `read_words` when a value comes. `expected`: the words as an error names them."""
 
     def known(text: str | None) -> str | None:
         if text is not None and text not in (words := read_words()):
@@ -235,7 +235,7 @@ class PredictOptions(Options):
 
     @property
     def unit(self) -> UnitName:
-        """Return the unit of the network. Raises BadInputError for none that it can be."""
+        """Return the unit of the network. Raises BadInputError for any other word."""
         units: tuple[UnitName, ...] = ("cpu", "gpu", "dsp") if self.is_bare else ("gpu", "dsp")
         for unit in units:
             if unit == self.runtime:
@@ -251,9 +251,10 @@ class PredictOptions(Options):
 
     @property
     def variant(self) -> Variant:
-        """Return how stages are joined. Without a policy: as in the published application, on this machine as in a run.
+        """Return how stages are joined.
 
-        Raises BadInputError for an edge that the published application does not have.
+        Without a policy they are joined as in the published application, or on this machine as in a run. Raises
+        BadInputError for an edge that the published application does not have.
         """
         from trilane.hw_profiles.application import REFERENCE, Variant
 

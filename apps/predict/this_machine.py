@@ -1,7 +1,8 @@
-"""The profile `host` with what was measured of this machine: a network's own calls, and the stages of an avatar's run.
+"""The profile `host` with measurements of this machine: calls of a network, and the stages of an avatar's run.
 
-Rule: a measurement takes at most half a minute, which is said before, happens once, and is kept with the machine's
-facts. What cannot be measured is said, and the profile stays as it is: then nothing that it predicts has an interval.
+Rule: a measurement is announced, takes at most half a minute, and is kept with the machine's facts, so that it happens
+once. If something cannot be measured, a message says so; the profile stays as it is, and its predictions have no
+interval.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ class Queries:
     `size`: number of frames in a query, which is answered with the last of them.
     `asked_s`, `answered_s`: monotonic seconds of the queries that count.
     `over`: whether nothing more counts: the run has ended, or a frame was dropped or lost.
-    `why`: in the second case, a sentence.
+    `why`: sentence about the dropped or lost frame.
     `changed`: condition that is notified with every answer and when it is over.
     """
 

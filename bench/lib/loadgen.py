@@ -48,7 +48,7 @@ class LoadGenPlayer:
     """Lets LoadGen ask a run for frames.
 
     `load`: pattern and its limits, which LoadGen gets.
-    `queries`: times that are told about the frames too, and know when the run is over early.
+    `queries`: times of the same frames, which also show an early end of the run.
     `verdict`: LoadGen's verdict, which `play` fills in.
     """
 

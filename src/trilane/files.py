@@ -327,7 +327,10 @@ def read_header(where: Path | str, file: IO[bytes]) -> tuple[tuple[int, ...], bo
 
 
 def _header(file: IO[bytes], version: tuple[int, int]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, Fortran order and type by the header that comes next in `file`. Raises one of DAMAGED on a broken one."""
+    """Return the shape, Fortran order and type by the header that comes next in `file`.
+
+    Raises one of DAMAGED on a broken one.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of headers written by Python 2

@@ -130,15 +130,15 @@ class Machine:
         return platform.platform()
 
     def python(self) -> str:
-        """The version of this Python."""
+        """Return the version of this Python."""
         return platform.python_version()
 
     def host_name(self) -> str:
-        """The machine's name in its network."""
+        """Return the machine's name in its network."""
         return platform.node()
 
     def program(self, name: str, first: Path | None = None) -> str | None:
-        """The path of a program in the folder `first` or on PATH; None where there is none."""
+        """Return the path of a program in the folder `first` or on PATH; None where there is none."""
         path = os.environ.get("PATH", os.defpath)
         return shutil.which(name, path=path if first is None else f"{first}{os.pathsep}{path}")
 

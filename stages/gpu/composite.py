@@ -230,9 +230,8 @@ class CompositeStage:
 
         Figures: 1 or 0 for `nobody` (nobody is on the screen), `reused` (the picture of an earlier frame is the right
         one), `stale` (the right one never came, so an earlier one is shown), and `copied` (the frame was copied from an
-        earlier one, not drawn); and the bytes moved.
-        The least bytes: what is new of the background, and of the network's picture in the cells of avatars in view;
-        and the frame, unless a slot holds it already.
+        earlier one, not drawn); and the bytes moved. The least bytes count the new parts of the background and of the
+        network's picture, in the cells of visible avatars. They also count the frame, unless a slot holds it already.
         """
         if slot_in is None or slot_out is None:
             raise ValueError("composite needs an input and an output slot")
