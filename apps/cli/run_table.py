@@ -162,7 +162,7 @@ def _service_and_wait(times: StageTimes | None) -> str:
 
 
 def _byte_rows(runs: Sequence[PolicyMetrics]) -> Rows:
-    """Yield rows of the bytes that each stage moves for a frame, and their sum beside the least; none if not counted."""
+    """Yield rows of the bytes that each stage moves for a frame, and of their sum beside the least; else none."""
     if not any(run.bytes for run in runs):
         return
     counting = [stage for stage, times in runs[0].stages.items() if times.bytes]
