@@ -45,13 +45,13 @@ def accuracy(
     avatar: SceneAvatarOption = None,
     size: SceneSizeOption = None,
     frames: Annotated[
-        int | None, typer.Option(help="How many frames, evenly spread over the scene.  [default: 8; by cause: 2]")
+        int | None, typer.Option(help="Number of frames, evenly spread over the scene.  [default: 8; by cause: 2]")
     ] = None,
     runtime: Annotated[
         list[str] | None,
         typer.Option(
-            help="ort, openvino, qnn or cuda, once for each; all that are installed if none, on hard cases but the "
-            "emulator qnn, which takes minutes."
+            help="ort, openvino, qnn or cuda, once for each; all installed ones if not given. Hard cases then leave "
+            "out the emulator qnn, which takes minutes."
         ),
     ] = None,
     hard_cases: Annotated[
@@ -74,7 +74,7 @@ def accuracy(
     ] = None,
     lpips_weights: Annotated[
         Path | None,
-        typer.Option(help="With --by-cause: a file of LPIPS' weights, which is said then.", show_default=False),
+        typer.Option(help="With --by-cause: a file of LPIPS' weights, to measure LPIPS too.", show_default=False),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -117,7 +117,10 @@ def split(
 def export(
     name: AvatarArgument,
     out: OutFileOption,
-    qnn: Annotated[bool, typer.Option("--qnn", help="As an HTP context binary, the only format there is.")] = False,
+    qnn: Annotated[
+        bool,
+        typer.Option("--qnn", help="Write an HTP context binary; there is no other format, so the option is required."),
+    ] = False,
     soc: Annotated[str, typer.Option(help="Qualcomm's name of the chip.")] = "sm8350",
     size: Annotated[
         str | None, typer.Option(help="HEIGHTxWIDTH of the tensor; the avatar's own when not given.")
@@ -246,12 +249,12 @@ def calibrations(
         Path | None, typer.Argument(help="Float network (.onnx) with the input N x C x H x W; with --frames.")
     ] = None,
     frames: Annotated[
-        Path | None, typer.Option(help="Real inputs: .npy (N, H, W, C) of floats; pictures of the last 5 are compared.")
+        Path | None, typer.Option(help="Real inputs: .npy (N, H, W, C) of floats; the last 5 are for the comparison.")
     ] = None,
     avatar: Annotated[
         str | None,
         typer.Option(
-            help="Instead: the avatar's float network, on views drawn as the training's; 24 others are compared."
+            help="Use the avatar's float network, on views drawn as in training; 24 more views are for the comparison."
         ),
     ] = None,
     method: Annotated[list[str] | None, typer.Option(help=f"{METHOD_HELP} Repeat it; all if none.")] = None,

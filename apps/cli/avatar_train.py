@@ -63,21 +63,24 @@ def train(
         Path | None, typer.Argument(help="Folder of a capture; none if the settings have a look.")
     ] = None,
     work: Annotated[
-        Path | None, typer.Option(help="Folder of samples, state and sheets; OUT-work if none. Training goes on there.")
+        Path | None,
+        typer.Option(help="Folder of samples, state and sheets; OUT-work if not given. Training continues from there."),
     ] = None,
     config: Annotated[
-        Path | None, typer.Option(help="Settings (training.toml), such as an avatar's own; options go before them.")
+        Path | None, typer.Option(help="Settings (training.toml), such as an avatar's own; options override them.")
     ] = None,
     minutes: Annotated[float, typer.Option(help="Time of training; the samples before it take some more.")] = 60.0,
-    steps: Annotated[int | None, typer.Option(help="Steps of training, in place of a time.")] = None,
+    steps: Annotated[int | None, typer.Option(help="Number of training steps, in place of a time.")] = None,
     samples: Annotated[int, typer.Option(help="Views of the frames to train on.")] = 4000,
-    seed: Annotated[int, typer.Option(help="Of all random numbers.")] = 1,
-    threads: Annotated[int, typer.Option(help="Of PyTorch, and processes that draw; only 1 repeats to the bit.")] = 1,
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda; auto takes an NVIDIA GPU that is there.")] = "auto",
+    seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 1,
+    threads: Annotated[
+        int, typer.Option(help="Threads of PyTorch, and processes that draw; only 1 gives the same bits again.")
+    ] = 1,
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda; auto is an NVIDIA GPU if there is one.")] = "auto",
     start: Annotated[
         str, typer.Option(help="Network to train further, of avatar default or hiker; new: random weights.")
     ] = "default",
-    width: Annotated[int, typer.Option(help="Of a new network; 64 is full.")] = 16,
+    width: Annotated[int, typer.Option(help="Width of a new network; 64 is full.")] = 16,
     loss: Annotated[
         str, typer.Option(help="default: the default avatar's; thesis: L1, Dice, perceptual, GAN.")
     ] = "default",
@@ -210,7 +213,7 @@ def validate(
     name: AvatarArgument,
     held_out: Annotated[
         list[str] | None,
-        typer.Option(help="Motion that no training had: builtin:NAME or a file. Repeat it; walk-wave-turn if none."),
+        typer.Option(help="Motion that no training used: builtin:NAME or a file. Repeat it; walk-wave-turn if none."),
     ] = None,
     seed: Annotated[
         list[int] | None, typer.Option(min=0, help="Seed of views and poses. Repeat it; 1 to 8 if none.")

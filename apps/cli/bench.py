@@ -41,7 +41,7 @@ BENCHES = {
     "planner": ("trilane.bench.planner", "Planned work against a fixed square: speed and image error."),
     "predict": (
         "trilane.apps.experiments.host_predicted",
-        "What is predicted of this machine, beside real runs and calls.",
+        "Predictions for this machine, beside real runs and calls.",
     ),
     "sizes": ("trilane.apps.experiments.error_by_size", "What a speed costs in image error, by size and runtime."),
     "flicker": (
@@ -153,7 +153,7 @@ app = Commands(
     cls=BenchGroup,
     no_args_is_help=True,
     epilog=EPILOG,
-    help="Measure this machine; results carry its facts.",
+    help="Measure this machine; each result includes facts about it.",
 )
 
 

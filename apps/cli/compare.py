@@ -39,7 +39,7 @@ BaseArgument = Annotated[
     str, typer.Argument(metavar="BASE", help="A run folder, its report.json, a prediction, or a sweep's folder.")
 ]
 OthersArgument = Annotated[
-    list[str], typer.Argument(metavar="OTHER", help="What is compared with it. Runs of one kind: A1,A2,A3.")
+    list[str], typer.Argument(metavar="OTHER", help="Runs to compare with the base. Runs of one kind: A1,A2,A3.")
 ]
 HtmlOption = Annotated[Path | None, typer.Option("--html", help="Write a page that needs nothing else here.")]
 AllOption = Annotated[bool, typer.Option("--all", help="Show every figure, not only those that differ.")]
@@ -47,7 +47,7 @@ SlowerOption = Annotated[
     str | None,
     typer.Option(
         "--fail-if-slower",
-        help="Exit with 1 where frames surely take longer by more than so much, as 5%; with 3 where it cannot be told.",
+        help="Exit with 1 if frames certainly take longer by more than this, such as 5%; with 3 if uncertain.",
     ),
 ]
 

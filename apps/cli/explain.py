@@ -46,14 +46,14 @@ READ_PLAN_SO = (
     "in the first of them"
 )
 RECTANGLES = "in blue how far each reaches with its clothes, in orange what the tensor shows"
-ChipOption = Annotated[str, typer.Option("--profile", help=f"{PROFILE_HELP} Its times are those that are saved.")]
+ChipOption = Annotated[str, typer.Option("--profile", help=f"{PROFILE_HELP} The saved time is computed for it.")]
 PictureOption = Annotated[Path | None, typer.Option(help=f"Draw bodies, {RECTANGLES}, here (.png).")]
 CapOption = Annotated[PerformanceProfile, PerformanceProfileOption]
 SceneOrRunArgument = Annotated[str, typer.Argument(help="A scene, by file (TOML) or name; or the folder of a run.")]
 SlowestOption = Annotated[
-    int, typer.Option(min=1, max=MOST_SLOWEST, help="Of a run: how many of the slowest frames are explained.")
+    int, typer.Option(min=1, max=MOST_SLOWEST, help="For a run: number of the slowest frames to explain.")
 ]
-JobsOption = Annotated[Path | None, typer.Option(help="Of a run: write every job here (.csv, .parquet).")]
+JobsOption = Annotated[Path | None, typer.Option(help="For a run: file for a table of all jobs (.csv, .parquet).")]
 #: Options of a run that its plan depends on.
 OF_A_PLAN = frozenset({"motion", "camera", "avatar", "frames", "fps", "output", "size", "skinning", "cores"})
 #: Options that mean something with a run folder.

@@ -59,22 +59,24 @@ WordsArgument = Annotated[
     list[str],
     typer.Argument(
         metavar="FILE|COMMAND",
-        help="A sweep file (TOML), or run, predict, accuracy or bench NAME with its own arguments and options, "
-        "of which one that is given several times is an axis.",
+        help="A sweep file (TOML), or run, predict, accuracy or bench NAME with its own arguments and options. "
+        "An option that is given several times is an axis.",
     ),
 ]
 
-EngineOption = Annotated[EngineName, typer.Option(help="local: this machine; ray: those of the Ray cluster.")]
+EngineOption = Annotated[EngineName, typer.Option(help="local: this machine; ray: the machines of a Ray cluster.")]
 
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on with a sweep that was interrupted or killed.")]
 
 FolderOption = Annotated[Path | None, typer.Option("--out", help="Folder of the sweep; sweeps/NAME-HASH if none.")]
 
-ListOption = Annotated[bool, typer.Option("--list", help="Take the axes side by side, first with first.")]
+ListOption = Annotated[
+    bool, typer.Option("--list", help="Combine the first values of all axes, then the second ones, and so on.")
+]
 
 RandomOption = Annotated[int | None, typer.Option("--random", min=1, help="Draw so many of the combinations.")]
 
-SeedOption = Annotated[int | None, typer.Option(help="Of --random; 0 if none.")]
+SeedOption = Annotated[int | None, typer.Option(help="Seed of --random; 0 if not given.")]
 
 DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Print the trials and run none.")]
 

@@ -39,12 +39,12 @@ NewestRunArgument = Annotated[
     Path | None,
     typer.Argument(help="Run folder, its journal, or its name below runs/; the newest below runs/ if none is given."),
 ]
-OnceOption = Annotated[bool, typer.Option("--once", help="Look once, whether the run goes on or not.")]
+OnceOption = Annotated[bool, typer.Option("--once", help="Print the figures once, even if the run goes on.")]
 LooksOption = Annotated[
     bool, typer.Option("--json", help="Print a JSON document in a line for each look; with --once, one document.")
 ]
 OpenMetricsOption = Annotated[
-    bool, typer.Option("--openmetrics", help="Look once and print the figures as `/metrics` of the dashboard has them.")
+    bool, typer.Option("--openmetrics", help="Print the figures once, in the form of the dashboard's `/metrics`.")
 ]
 WaitOption = Annotated[bool, typer.Option("--wait", help="Wait for a run that has not begun.")]
 IntervalOption = Annotated[float, typer.Option(min=0.1, max=3600, help="Seconds between two looks.")]
