@@ -255,7 +255,8 @@ def predict(
     `trilane.apps.predict.predict_options.PredictOptions` in `PREDICTED`; `trilane predict --help` explains them.
     `avatar`: the application with this avatar's network. `network`: an ONNX file by itself, or with `application` in
     the avatar's application. Without either, the application with a network of `encoder`, `norm`, `size`, `channels`.
-    `on_message(text)`: is told before the profile `host`, this machine, is measured, which may take half a minute.
+    `on_message(text)`: function that is called before this machine is measured for the profile `host`, which may take
+    half a minute.
     Raises BadInputError.
     """
     from trilane.apps.predict import asked_prediction as asked

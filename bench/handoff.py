@@ -316,7 +316,7 @@ class HandoffStage:
         self._inputs, self._outputs = inputs, outputs
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
-        """`pose` pauses, `raster` writes, `infer` reads. Raises TrilaneError for wrong bytes."""
+        """Run a job: `pose` pauses, `raster` writes, `infer` reads. Raises TrilaneError for wrong bytes."""
         if self._name == STAGES[0][0]:
             time.sleep(PAUSE_S)
         elif self._name == WRITER and slot_out is not None:

@@ -152,10 +152,7 @@ def _network_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple[st
 
 
 def split_work(work: Work, share: float) -> tuple[Work, Work]:
-    """`work` in two parts, cut after the first operators that together have `share` of the products.
-
-    The elements that are live at the cut are the output of the first part and the input of the second.
-    """
+    """Return `work` in two parts, cut after the first operators that together have `share` of the products."""
     macs, cut = 0, 0
     for cut, operator in enumerate(work.operators, 1):  # noqa: B007
         macs += operator.macs
@@ -250,7 +247,7 @@ def simulated(profile: Profile, plan: Plan, corners: Corners) -> Simulation:
 
 
 def _rounded(profile: Profile, plan: Plan, corners: Corners) -> StageTimes:
-    """Nanoseconds of a job of each stage, with the units as the scheduler sees them."""
+    """Return the nanoseconds of a job of each stage, with the units as the scheduler sees them."""
     worker = workers_of(profile)
     times = stage_times_ms(profile, plan, corners)
     return tuple((name, worker[unit], round(ms * NS_PER_MS)) for (name, unit), ms in times.items())

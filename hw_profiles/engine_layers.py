@@ -325,12 +325,12 @@ def _products(node: Any, shapes: Shapes) -> Iterator[tuple[str, float]]:
 
 
 def _padding(count: int, block: int) -> float:
-    """Channels rounded up to whole blocks, over channels."""
+    """Return the number of channels rounded up to whole blocks, over the number of channels."""
     return _up(count, block) / count
 
 
 def _convolution(node: Any, source: Shape, weight: Shape, out: Shape, moved: int) -> Iterator[tuple[str, float]]:
-    """Terms of a convolution. `moved`: elements that it reads and writes."""
+    """Return the terms of a convolution. `moved`: elements that it reads and writes."""
     attributes = {a.name: a for a in node.attribute}
     groups = attributes["group"].i if "group" in attributes else 1
     yield "moved_depthwise" if groups == source[1] > 1 else "moved", moved

@@ -203,7 +203,7 @@ def middle(chips: Sequence[Mapping[str, ChipRate]]) -> dict[str, Prior]:
 
 
 def errors_of(rows: Sequence[LeftOut]) -> dict[str, float]:
-    """`rows`, `median` and `p90` of the absolute errors, `close`: share within 15 %, `bias`: median of the errors."""
+    """Return `rows`, `median` and `p90` of the absolute errors, `close` (share within 15 %), `bias` (median)."""
     errors = np.array([row.error for row in rows])
     return {
         "rows": len(rows),

@@ -82,7 +82,10 @@ class ProfileFit:
         return tuple(dict.fromkeys(r.column for r in self.residuals))
 
     def median_error(self, column: str, *, left_out: bool = False) -> float:
-        """Median absolute relative error of `column`. `left_out`: take the fits that had not seen the measurement."""
+        """Return the median absolute relative error of `column`.
+
+        `left_out`: whether to take the fits that had not seen the measurement.
+        """
         errors = [abs(r.left_out_error if left_out else r.error) for r in self.residuals if r.column == column]
         return median(errors) if errors else 0.0
 

@@ -87,7 +87,7 @@ def split_cores(cores: tuple[int, ...]) -> dict[str, tuple[int, ...]]:
 
 
 def rule_placement(cores: tuple[int, ...], asked: Mapping[str, tuple[int, ...]] | None = None) -> Placement:
-    """`split_cores` with a thread for each core of a unit. `asked`: cores of the units that the user chose them for."""
+    """Return `split_cores` with a thread for each core of a unit. `asked`: cores that the user chose for units."""
     split = {**split_cores(cores), **(asked or {})}
     return {unit: Place(own, len(own)) for unit, own in split.items()}
 
@@ -112,7 +112,7 @@ def settings_of(placement: Placement) -> dict[str, UnitSettings]:
 
 
 def asked_cores(texts: Sequence[str]) -> dict[str, tuple[int, ...]]:
-    """`UNIT=LIST` texts as the cores of each unit, ascending. Raises BadInputError naming what is wrong."""
+    """Return the cores of each unit, ascending, from `UNIT=LIST` texts. Raises BadInputError naming what is wrong."""
     asked: dict[str, tuple[int, ...]] = {}
     usable = machine.here.cores()
     for text in texts:
@@ -247,7 +247,7 @@ def _cores(place: Place) -> str:
 
 
 def unit_rows(placement: Placement) -> dict[str, Any]:
-    """`cores` and `threads` of each unit, as JSON takes them."""
+    """Return `cores` and `threads` of each unit for JSON."""
     return {unit: {"cores": list(place.cores), "threads": place.threads} for unit, place in placement.items()}
 
 

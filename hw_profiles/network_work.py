@@ -161,7 +161,10 @@ def _picture_tensors(graph: Any, inputs: list[str]) -> int:
 
 
 def graph_facts(model: Any) -> dict[str, Any]:
-    """`parameters`: those of the layers, as in the file. `gmac`: of one pass. Raises as `count_work` does."""
+    """Return the facts of a network for reports; raises as `count_work` does.
+
+    Keys: `parameters`, those of the layers, as in the file; `gmac`, products of one pass, 1e9.
+    """
     work = count_work(model)
     return {"parameters": work.weights, "gmac": work.macs / 1e9}
 
@@ -211,7 +214,7 @@ def _size(shapes: Shapes, name: str) -> int:
 
 
 def _lone_normalisations(graph: Any) -> set[str]:
-    """Results of batch normalisations that follow no product which could absorb them."""
+    """Return the results of batch normalisations that no product before them can absorb."""
     maker = {name: node.op_type for node in graph.node for name in node.output}
     reads = Counter(name for node in graph.node for name in node.input)
     return {
@@ -231,7 +234,7 @@ def _costs_nothing(node: Any, constants: set[str]) -> bool:
 
 
 def _live_counts(graph: Any, shapes: Shapes, constants: set[str]) -> list[int]:
-    """After each node: elements of all results so far that later nodes, or the caller, still need."""
+    """Return, after each node, the elements of all results so far that later nodes or the caller still need."""
     last_use = {name: index for index, node in enumerate(graph.node) for name in node.input if name not in constants}
     last_use |= {output.name: len(graph.node) for output in graph.output}
     freed: dict[int, int] = {}

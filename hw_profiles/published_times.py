@@ -107,7 +107,7 @@ def _double(b: GraphBuilder, x: TensorRef, width: int) -> TensorRef:
 
 @lru_cache(maxsize=1)
 def resnet18_work() -> Work:
-    """ResNet18 as a classifier of 224x224 pictures, which it normalises, into 1000 classes."""
+    """Return the work of ResNet18 as a classifier of 224x224 pictures, which it normalises, into 1000 classes."""
     b = GraphBuilder("batch")
     picture = b.same("Sub", b.input("image", 3, 224, 224), b.weight((1, 3, 1, 1)))
     x = resnet18(b, b.same("Div", picture, b.weight((1, 3, 1, 1))))[-1]

@@ -153,7 +153,7 @@ def _allowed(requested: Corners, load: FrameLoad) -> list[Corners]:
 def answers(
     profile: Profile, load: FrameLoad, corners: Corners, wanted: Wanted, times: FrameInterval
 ) -> dict[str, Any]:
-    """`rate` and `power_limit`, each only where it is wanted.
+    """Return `rate` and `power_limit`, each only where it is wanted.
 
     `profile`: hardware profile of the chip.
     `load`: what runs, as work and least frame time.

@@ -120,7 +120,7 @@ def _network_input(b: GraphBuilder, spec: NetworkSpec) -> TensorRef:
 
 
 def _decoder(b: GraphBuilder, features: list[TensorRef]) -> TensorRef:
-    """Features at full size, from the encoder's smallest up, each joined with the encoder's of the same size."""
+    """Return the features at full size: from the smallest up, each is joined with the encoder's of its size."""
     x, skips = features[-1], [*reversed(features[:-1]), None]
     for width, skip in zip(DECODER, skips, strict=True):
         x = b.upsampled(x)
@@ -230,12 +230,12 @@ def _number(text: str) -> float | None:
 
 
 def encode(b: GraphBuilder, x: TensorRef, encoder: str) -> list[TensorRef]:
-    """Features of `x` at strides 2, 4, 8, 16 and 32 by `encoder`, one of ENCODERS."""
+    """Return the features of `x` at strides 2, 4, 8, 16 and 32 by `encoder`, one of ENCODERS."""
     return resnet18(b, x) if encoder == "resnet18" else _inverted_encoder(b, x, MOBILE_ENCODERS[encoder])
 
 
 def resnet18(b: GraphBuilder, x: TensorRef) -> list[TensorRef]:
-    """Features at strides 2, 4, 8, 16, 32."""
+    """Return features at strides 2, 4, 8, 16, 32."""
     x = b.unit(x, RESNET18_STEM, 7, stride=2)
     features = [x]
     pooled = (RESNET18_STEM, x.height // 2, x.width // 2)
@@ -254,7 +254,7 @@ def _basic_block(b: GraphBuilder, x: TensorRef, width: int, stride: int) -> Tens
 
 
 def _squeeze(b: GraphBuilder, x: TensorRef) -> TensorRef:
-    """Squeeze-and-excitation: mean over the picture, two 1x1 convolutions, gate."""
+    """Append squeeze-and-excitation: mean over the picture, two 1x1 convolutions, gate."""
     inner = squeeze_channels(x.channels)
     pooled = b.op("GlobalAveragePool", [x.name], (x.channels, 1, 1))
     hidden = b.same("Relu", b.conv(pooled, inner, 1, bias=True))
@@ -273,7 +273,7 @@ def _inverted_block(b: GraphBuilder, x: TensorRef, row: MobileBlock) -> TensorRe
 
 
 def _inverted_encoder(b: GraphBuilder, x: TensorRef, encoder: MobileEncoder) -> list[TensorRef]:
-    """Features before each halving and at the end: strides 2, 4, 8, 16, 32."""
+    """Return the features before each halving and at the end: strides 2, 4, 8, 16, 32."""
     x = b.unit(x, encoder.stem, 3, ACTIVATIONS[encoder.activation], stride=2)
     features: list[TensorRef] = []
     for row in encoder.rows:

@@ -157,7 +157,7 @@ def _busy_s(run: Simulation, unit: str) -> float:
 
 
 def _seconds(tenants: Sequence[Tenant], costs: _Costs) -> float:
-    """Virtual seconds that the run lasts."""
+    """Return the virtual seconds that the run lasts."""
     slowest = max(
         max(1 / tenant.fps, sum(means.values()) / 1e3) for tenant, means in zip(tenants, costs.mean_ms, strict=True)
     )
@@ -165,7 +165,7 @@ def _seconds(tenants: Sequence[Tenant], costs: _Costs) -> float:
 
 
 class _Job(NamedTuple):
-    """A network: number of its tenant, and its place among the networks of that tenant."""
+    """The network of a job, by the number of its tenant and its place among the tenant's networks."""
 
     tenant: int
     kind: int
@@ -184,7 +184,7 @@ class _Costs:
         self.mean_ms = tuple(self._means(number) for number in range(len(tenants)))
 
     def skips(self, number: int) -> Skips:
-        """Which frames of a tenant take the bypass."""
+        """Return the rule by which frames of a tenant take the bypass."""
         tenant = self._tenants[number]
         return lambda frame, _fresh: tenant.kind(frame) == SKIPS
 

@@ -131,7 +131,10 @@ def nearest(engine: Engine, shares: F64) -> tuple[float, str]:
 
 
 def _apart(own: Mapping[str, float], others: Mapping[str, float]) -> float:
-    """Half the sum of absolute differences of two networks' shares. A term that `others` do not name counts as 0."""
+    """Return half the sum of absolute differences of two networks' shares.
+
+    A term that `others` do not name counts as 0.
+    """
     return (1 + sum([abs(own[name] - share) - own[name] for name, share in others.items()])) / 2
 
 
@@ -231,6 +234,6 @@ def _operator_seconds(
 
 
 def _padding_factor(channels: NDArray[np.float64], block: float) -> NDArray[np.float64]:
-    """Channels rounded up to whole blocks, over `channels`; 1 for an operator without products."""
+    """Return `channels` rounded up to whole blocks, over `channels`; 1 for an operator without products."""
     known = np.maximum(channels, 1.0)
     return np.ceil(known / block) * block / known

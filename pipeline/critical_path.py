@@ -401,7 +401,7 @@ class Budget:
         blocks = [(_by_name(block, name_of), max(sum(block.values()), 1)) for block in self._blocks]
 
         def half_width(other: str | None) -> float | None:
-            """Half the interval of the share, or of the difference to the share of `other`."""
+            """Return half the interval of the share, or of the difference to the share of `other`."""
             return batch_interval([(ns.get(name, 0) - (ns.get(other, 0) if other else 0)) / of for ns, of in blocks])
 
         share, half = sums[name] / whole, half_width(None)

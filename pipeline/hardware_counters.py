@@ -1,6 +1,6 @@
 """Counts instructions and cache misses of a unit's jobs through perf_event_open.
 
-Rule: the processor counts, or the figure is said to be absent. Counts are of user mode. They cover the thread that
+Rule: a figure is the processor's count, or is reported as absent. Counts are of user mode. They cover the thread that
 opens them and all threads that it and its threads begin later, which the kernel adds up (`inherit`). A processor with
 fewer counters than events counts each for a part of the time; such counts are scaled to the whole time.
 

@@ -1,6 +1,6 @@
 """Moves frames through the slots. Rule: each frame leaves here once, counted as presented, dropped or lost.
 
-It moves frames and slots as it is told, and notes which units the change concerns (`mark_dirty`).
+It moves frames and slots on request, and notes which units each change concerns (`mark_dirty`).
 
 A bypass is the way past some stages. A frame on it overtakes none, and its slot goes back to the edge that it came
 from. The stage at which the bypass begins says of each frame whether it skips (`JobDone.skips`). The slot of such a

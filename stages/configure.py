@@ -195,7 +195,7 @@ def _check_pictures(scene: Scene, staged: Staged) -> None:
 
 
 def _accuracy(avatars: Sequence[AvatarData], drawn: DrawnAs) -> dict[str, Any]:
-    """Return the error of each avatar's pictures by its name; avatars with the same name are told apart by folders."""
+    """Return the error of each avatar's pictures by its name; equal names get their folders."""
     bundles = [avatar.bundle for avatar in avatars]
     names = Counter(bundle.manifest.name for bundle in bundles)
     return {

@@ -160,7 +160,7 @@ app.command(epilog=avatar_network.EPILOG_EXPORT)(avatar_network.export)
 
 
 def _checked(capture: Capture, picture: Path) -> dict[str, Any]:
-    """Write the sheet of `capture` to `picture`; returns what is said of the capture."""
+    """Write the sheet of `capture` to `picture`, and return the facts about the capture."""
     from trilane.training.capture.capture_samples import BodyRaster
     from trilane.training.capture.check import (
         bad_frames,

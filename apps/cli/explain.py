@@ -174,7 +174,7 @@ def _saved(saved: dict[str, float]) -> str:
 
 
 def _left_out(phases: list[dict[str, Any]]) -> list[str]:
-    """Return a line for each way in which avatars are modelled: what it leaves out of them."""
+    """Return a line for each way in which avatars are modelled, with the parts that it leaves out."""
     rows = [row for phase in phases for row in phase["avatars"]]
     lines = {}
     for row in rows:

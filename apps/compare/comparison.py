@@ -70,7 +70,7 @@ IN_THOUSANDS: Final = 10_000
 
 
 class Bounds(NamedTuple):
-    """What bounded each run of either side, as in report.json; None where nobody knows.
+    """The `bound` of each run of either side, as in report.json; None where it is unknown.
 
     `outcome` says whether the bounding unit changed. Only that unit's share of the path is known, so another unit's
     share may be as large unless this one is surely more than a half.
@@ -422,7 +422,7 @@ def change_of(row: Difference, unit: str) -> str:
 
 
 def interval_of(row: Difference, unit: str) -> str:
-    """Return the 95 % interval of the change; a dash where nobody knows it."""
+    """Return the 95 % interval of the change; a dash if it is unknown."""
     if row.low is None or row.high is None:
         return DASH
     return f"{_scaled(row.low, row, unit, with_unit=False)} to {_scaled(row.high, row, unit, with_unit=False)}"

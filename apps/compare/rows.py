@@ -109,7 +109,7 @@ def named(rows: Rows) -> list[Figure]:
     """Return the figures that a verdict rests on; all others are there to explain them.
 
     Counted instructions stand for a stage's program, and the time of one instruction for the machine. Without counts
-    its time on the core stands for the program, or its service time where nobody knows that.
+    its time on the core stands for the program, or its service time where that is unknown.
     """
     counted, worked = ({figure.of for figure in rows if figure.measure == each} for each in (INSTRUCTION_TIME, WORK))
 
@@ -299,7 +299,7 @@ class Noise(NamedTuple):
         return self._chance(TAILS.get(statistic, 1.0) * WALL_DEVIATION, explained=self.others[0])
 
     def of_wait(self, statistic: str) -> Chance:
-        """Return the chance of a wait in ms, which may be almost 0; nobody knows what explains its growth."""
+        """Return the chance of a wait in ms, which may be almost 0; no known cause explains its growth."""
         return self._chance(TAILS.get(statistic, 1.0) * (WALL_DEVIATION + self.others[0]), WAIT_FLOOR_MS)
 
     def of_share(self) -> Chance:

@@ -161,7 +161,7 @@ class _Moved:
 
 
 def _pixels(vertices: F64, clip: F64, output: Shape) -> tuple[F64, Any]:
-    """Return where `vertices` (V,3) are on the picture, (V,2) pixels, and which are on it, (V,)."""
+    """Return the place of each of `vertices` (V,3) on the picture, (V,2) pixels, and whether it is inside, (V,)."""
     x, y, _, w = (np.c_[vertices, np.ones(len(vertices))] @ clip.T).T
     in_front = w > 0
     place = np.stack([x, y], axis=1) / np.where(in_front, w, 1.0)[:, None]

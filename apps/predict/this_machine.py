@@ -41,8 +41,8 @@ Say = Callable[[str], None]
 def with_avatar(chip: Profile, avatar: str, say: Say) -> tuple[Profile, Network]:
     """Return `chip`, this machine, with the times by which a run of `avatar` is placed, and its usual network.
 
-    The network is that of the run's usual tensor. `say`: function that is told what takes time and what cannot be
-    measured. Raises BadInputError for what is no avatar.
+    The network is that of the run's usual tensor. `say`: function that gets messages on what takes time and what cannot
+    be measured. Raises BadInputError for what is no avatar.
     """
     measured, network = _with_run(chip, RunOptions(avatar=avatar), say)
     return measured, network._replace(facts={"avatar": avatar})

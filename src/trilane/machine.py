@@ -80,7 +80,7 @@ class Machine:
         return max(values) if values else None
 
     def memory_bytes(self) -> int:
-        """Physical memory in bytes."""
+        """Return the physical memory in bytes."""
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
     def free_bytes(self) -> int:
@@ -159,7 +159,7 @@ class Machine:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 
     def now(self) -> datetime:
-        """Date and time in UTC."""
+        """Return date and time in UTC."""
         return datetime.now(UTC)
 
 
