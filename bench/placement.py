@@ -191,7 +191,7 @@ class _Trial:
         }
 
     def times(self) -> list[dict[str, Any]]:
-        """Return what the units were measured to need."""
+        """Return the measured needs of the units."""
         return times_rows(self._times)
 
     def _tried_ms(self) -> list[float]:

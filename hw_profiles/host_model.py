@@ -197,10 +197,7 @@ def _measured(value: float, source: str) -> Quantity:
 
 
 def with_known_intervals(profile: Profile, unit: UnitName, answer: dict[str, Any]) -> dict[str, Any]:
-    """Return `answer`, a prediction for `unit` of this machine, with null for the intervals of what was not measured.
-
-    No power of this machine is ever measured. Without measured times the words of a rate say only whether it holds.
-    """
+    """Return `answer`, a prediction for `unit` of this machine, with null for the intervals of unmeasured figures."""
     if profile.units[unit].measured is not None:
         return _without(answer, OF_POWER)
     known = _without(answer, OF_POWER | OF_TIMES)

@@ -17,7 +17,7 @@ from trilane.units import UNITS, UnitName
 
 
 class Wanted(NamedTuple):
-    """What a user wants of a chip. `fps`: frames a second. `power_limit_w`: watts of the whole device."""
+    """The rate and the limit of power that a user wants to know about."""
 
     fps: float | None = None
     power_limit_w: float | None = None

@@ -184,7 +184,7 @@ class Engine(ProfileTable):
 
 
 class Measured(ProfileTable):
-    """What was measured of a network on a unit of this machine.
+    """The measurement of a network on a unit of this machine.
 
     `slower`: by number of threads, the measured time over the time by the unit's numbers. `error`: relative error of a
     time that follows from it. `said`: sentence that tells how it was measured.

@@ -172,7 +172,7 @@ class _Job(NamedTuple):
 
 
 class _Costs:
-    """What the jobs of the pipelines take on the chip, and how they slow each other."""
+    """The times of the pipelines' jobs on the chip, and how these jobs slow each other."""
 
     def __init__(self, profile: Profile, tenants: Sequence[Tenant], corners: Corners) -> None:
         self._profile, self._tenants, self._corners = profile, tenants, corners

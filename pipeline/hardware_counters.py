@@ -146,7 +146,7 @@ def absence() -> str | None:
 
 
 def availability() -> str:
-    """Return what is counted, or that nothing is and why, as a fact of the machine."""
+    """Return the counted events as a fact of the machine, or that nothing is counted, and why."""
     try:
         with closing(HardwareCounters()) as counters:
             return ", ".join(counters.names)
@@ -181,7 +181,7 @@ def paranoid_level() -> int | None:
 
 
 def remedy(why: str) -> str:
-    """Return the command that fixes what `absence` found, or what it takes."""
+    """Return the command, or the condition, that removes the reason from `absence`."""
     if "perf_event_paranoid" in why:
         return f"sysctl kernel.perf_event_paranoid={MOST_PARANOID}"
     return "needs a machine of its own" if "virtual" in why else "allow perf_event_open"

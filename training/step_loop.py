@@ -242,7 +242,7 @@ class _Masked(torch.optim.Optimizer):
         return loss
 
     def _kept(self, parameter: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Return `parameter`, the places without a gradient, and what the parameter and its moments hold there.
+        """Return `parameter`, the places without a gradient, and the values of the parameter and its moments there.
 
         Moments that do not exist yet begin at 0.
         """

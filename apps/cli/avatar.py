@@ -191,7 +191,7 @@ def _checked(capture: Capture, picture: Path) -> dict[str, Any]:
 
 
 def _state_cost(capture: SyntheticCapture, recipe: Recipe) -> None:
-    """Say on stderr what all frames will take, as measured by drawing one."""
+    """Estimate on stderr the cost of all frames, from the measured cost of one."""
     import psutil
 
     from trilane.training.capture.synthetic import measured_cost

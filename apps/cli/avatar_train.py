@@ -197,7 +197,7 @@ class EventLog:
             self._writer.add_scalar(f"terms/{name}", value, step)
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the remaining entries."""
         if self._writer is not None:
             self._writer.close()
 

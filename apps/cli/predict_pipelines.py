@@ -1,7 +1,7 @@
 """`trilane predict SCENE --beside …`: several pipelines on one chip, as options and as tables.
 
-Rule: nothing is computed here; `apps/predict/asked_pipelines.py` reads what the pipelines are, and
-`hw_profiles/shared_chip.py` answers.
+Rule: nothing is computed here; `apps/predict/asked_pipelines.py` reads the pipelines, and `hw_profiles/shared_chip.py`
+answers.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 def predict_pipelines(options: PredictOptions, as_json: bool) -> None:
     """Print how the scene of `options` and the pipelines beside it do on one chip.
 
-    Raises BadInputError for what is wrong in one of them.
+    Raises BadInputError for a fault in one of them.
     """
     from trilane.apps.predict.asked_pipelines import tenants
     from trilane.hw_profiles.profile_files import load_runnable

@@ -189,7 +189,7 @@ def _require_checks(trials: Sequence[Trial]) -> None:
 
 
 def _default_folder(name: str, trials: Sequence[Trial]) -> Path:
-    """Return the same folder for the same trials, so that a rerun finds what is done."""
+    """Return the same folder for the same trials, so that a rerun finds the finished ones."""
     digest = hashlib.sha256("".join(sorted(trial.id for trial in trials)).encode()).hexdigest()
     return Path("sweeps") / f"{name}-{digest[:8]}"
 

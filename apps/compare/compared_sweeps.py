@@ -214,7 +214,7 @@ def _told(row: Difference) -> dict[str, Any]:
 
 
 def _notes(documents: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield what a person should know of the machine while the trials ran."""
+    """Yield remarks on the machine while the trials ran."""
     shares = [share for document in documents if (share := document.get("other_programs") or 0.0) > BUSY_MACHINE]
     if shares:
         runs = f"{len(shares)} of {len(documents)} runs"

@@ -205,7 +205,7 @@ def _notes(base: Side, other: Side) -> list[str]:
 
 
 def _about(told: ComparedRun) -> Iterator[str]:
-    """Yield what a person should know of the data of a run."""
+    """Yield remarks on the data of a run."""
     if told.kind is RunKind.REPORT:
         yield "a report without a journal, so only summaries are compared, each as uncertain as the mean frame time"
     if told.kind is RunKind.PREDICTION:

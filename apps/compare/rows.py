@@ -375,7 +375,7 @@ def _stages_by_cores(report: Mapping[str, Any]) -> Iterable[list[str]]:
 
 
 def remarks(reports: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return what a person should know of the machine. `reports`: reports by the names of their runs."""
+    """Return remarks on the machine."""
     said = []
     for name, report in reports.items():
         others = report.get("other_programs")

@@ -54,7 +54,7 @@ ALWAYS_DIFFERENT: Final = ("made.at", "made.command")
 
 
 class RunKind(StrEnum):
-    """What is known of a run. RUN: every frame; REPORT: summaries; PREDICTION: summaries that a model computed."""
+    """The known data of a run. RUN: every frame; REPORT: summaries; PREDICTION: summaries that a model computed."""
 
     RUN = "run"
     REPORT = "report"

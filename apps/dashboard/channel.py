@@ -144,8 +144,8 @@ def channel_pair() -> tuple[ChannelEnd, socket.socket]:
 class ServerLink:
     """The run's end of a server at `place` for pictures of `height` x `width`.
 
-    `hear`: function that a thread of its own calls with what the page asks for. `tell`: function that is told a
-    sentence for a person.
+    `hear`: function that gets each request of the page, on a thread of its own. `tell`: function that gets sentences
+    for a person.
     """
 
     def __init__(

@@ -142,7 +142,7 @@ class _FinishedRun:
                 self._keep_figures()
 
     def end(self, state: RunState) -> None:
-        """Complete the tables after the last record. `state`: what has become of the run."""
+        """Complete the tables after the last record. `state`: state of the run at its end."""
         self._timeline.end()
         self._keep()
         self._keep_figures()

@@ -237,7 +237,7 @@ class _LiveView:
         return None if folder is None else folder / "trace.pftrace"
 
     async def _read_on(self) -> None:
-        """Read what the run has written since the last call, as far as there is time for it."""
+        """Read the new records of the run, as far as there is time for it."""
         if self._followed is None and self._folder is not None and (self._folder / NAME).is_file():
             self._followed = FollowedRun(self._folder)
         if self._followed is None:

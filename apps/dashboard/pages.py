@@ -147,7 +147,7 @@ class ControlSaid(_PageMessage):
 
 
 class Seek(_PageMessage):
-    """The page wants what a finished run did from `span_ms` before `t_ms` until as long after."""
+    """The page requests the part of a finished run from `span_ms` before `t_ms` to `span_ms` after it."""
 
     type: Literal["seek"]
     t_ms: Finite = Field(ge=0)
@@ -162,7 +162,7 @@ class MalformedError(ValueError):
 
 
 def heard(data: bytes) -> PictureAsked | ControlSaid | Seek:
-    """Read what a client said with `data`. Raises MalformedError."""
+    """Read a client's message `data`. Raises MalformedError."""
     if data[:1] != bytes([JSON_KIND]):
         raise MalformedError("a kind that no client sends")
     try:

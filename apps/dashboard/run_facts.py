@@ -122,7 +122,7 @@ def facts_of_checked(name: str, checked: Checked, options: RunOptions, machine: 
 
 
 def facts_of_report(name: str, report: Report) -> RunFacts:
-    """Return what the report of a finished run says."""
+    """Return the facts in the report of a finished run."""
     document = report.as_json()
     scene = document["config"]["scene"]
     caps = document["caps"]

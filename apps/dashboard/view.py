@@ -114,7 +114,7 @@ class TimelineRows:
 
 
 def described(graph: Graph) -> dict[str, Any]:
-    """Return the part of the hello that says what a timeline's numbers mean."""
+    """Return the part of the hello that explains a timeline's numbers."""
     return {
         "stages": [{"name": stage.name, "unit": stage.unit} for stage in graph.stages],
         "units": list(graph.units),

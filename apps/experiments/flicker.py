@@ -33,7 +33,7 @@ STEPS = 255
 def flicker(before: F64, now: F64) -> float:
     """Return the mean change of the error of two successive frames, in steps of 1/255.
 
-    `before`, `now`: errors of the frames, picture minus what it should be; equal shapes, pictures in 0..1.
+    `before`, `now`: errors of the frames, picture minus its reference; equal shapes, pictures in 0..1.
     """
     return float(np.abs(now - before).mean() * STEPS)
 

@@ -70,7 +70,7 @@ class ScenePictures:
         return self._picture(packet), times
 
     def background(self, number: int) -> U8:
-        """Return what is under the avatars of the frame, their shadows too, (h,w,3) uint8."""
+        """Return the background under the frame's avatars, with their shadows, (h,w,3) uint8."""
         self._chain.run(number, len(self._names) - 2).payload[:] = 0
         return self._picture(self._chain.go_on(number))
 

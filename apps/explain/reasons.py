@@ -116,7 +116,7 @@ class SlowFrames:
             self._look(self._waiting.popleft())
 
     def close(self) -> tuple[list[Shown], Usual]:
-        """Return the slowest frames, the slowest first, and what is usual. Call it after the last job."""
+        """Return the slowest frames, the slowest first, and the usual lengths of parts. Call it after the last job."""
         while self._waiting:
             self._look(self._waiting.popleft())
         slowest = [shown for _, _, shown in sorted(self._slowest, reverse=True)]

@@ -41,7 +41,7 @@ class AskedPipeline(NamedTuple):
 
 
 def asked(text: str) -> AskedPipeline:
-    """Read what was typed. Raises BadInputError.
+    """Read a pipeline from the command line. Raises BadInputError.
 
     An @ belongs to the file's name unless a rate follows it, so that a file may have one in its name.
     """

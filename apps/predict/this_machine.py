@@ -71,7 +71,7 @@ def _with_run(chip: Profile, request: RunOptions, say: Say) -> tuple[Profile, Ne
 
 
 def with_first(chip: Profile, text: str, say: Say) -> Profile:
-    """Return `chip`, this machine, with what was measured of the first of several pipelines, as it was typed."""
+    """Return `chip`, this machine, with measurements of the first of several pipelines, as it was typed."""
     what = asked(text).what
     if what.endswith(NETWORK_ENDING):
         return with_file(chip, read_graph(Path(what)), {}, say)

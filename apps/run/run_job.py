@@ -182,7 +182,7 @@ class _Job:
         self._hooks, self._starter, self._watched = hooks, starter, watched
 
     def run(self, folder: Path, facts: Mapping[str, Any]) -> RunResult:
-        """Run what was asked for and write its journal, which begins with `facts`.
+        """Run the prepared run and write its journal, which begins with `facts`.
 
         Raises TrilaneError when the run ended before any frame was presented.
         """

@@ -219,7 +219,7 @@ def canonical(command: tuple[str, ...], options: Options, repeat: int = 1) -> st
 
 @dataclass(frozen=True)
 class SweepFile:
-    """What a file says. Values of options are as the file has them."""
+    """The content of a sweep file."""
 
     command: tuple[str, ...]
     kind: SweepKind = SweepKind.GRID

@@ -147,7 +147,7 @@ def perform(trial: Trial, place: TrialPlace, children: Children) -> Record:
 
 
 def about(trial: Trial) -> Record:
-    """Return what is known of a trial before it is done."""
+    """Return the facts of a trial before it is done."""
     return {
         "schema": 1,
         "id": trial.id,
@@ -279,7 +279,7 @@ def _run_on(ray: Any, place: TrialPlace, trials: Sequence[Trial]) -> Generator[R
 
 
 def _resources(ray: Any, clock: TrialClock) -> dict[str, int]:
-    """Return what a trial takes besides a core. Raises BadInputError when no machine has it."""
+    """Return the resources that a trial takes besides a core. Raises BadInputError when no machine has them."""
     if clock is TrialClock.VIRTUAL:
         return {}
     if RESOURCE not in ray.cluster_resources():

@@ -66,7 +66,7 @@ class FollowedRun:
 
     @property
     def state(self) -> RunState:
-        """Return what has become of the run until now."""
+        """Return the state of the run now."""
         self._find_again()
         if not self.folder.is_dir():
             return RunState.REMOVED
@@ -135,7 +135,7 @@ def _is_alive(pid: int) -> bool:
 
 
 def folder_of(given: Path) -> Path | None:
-    """Return the folder of the run that has begun and that `given` means (`follow`), or what is there in its place."""
+    """Return the folder of the run that `given` means (`follow`), if it has begun, else a text on what is there."""
     if given.name == NAME:
         return given.parent
     places = [given] if given.is_absolute() or len(given.parts) > 1 else [given, RUNS / given]

@@ -31,9 +31,9 @@ RASTER = 1
 
 
 def units_of(pipeline: Pipeline, assets: Assets) -> Units:
-    """Return what the stages of each unit share.
+    """Return the shared objects of each unit's stages.
 
-    Chains that draw in one process must share it too: one OpenGL context.
+    Chains that draw in one process must share them too: one OpenGL context.
     """
     return {name: UnitContext(name, settings, assets) for name, settings in pipeline.units.items()}
 

@@ -122,7 +122,7 @@ class Machine:
         return file
 
     def read_counter(self, file: int, size: int) -> bytes:
-        """Return what the kernel says of an opened counter. Raises OSError."""
+        """Return the kernel's reading of an opened counter."""
         return os.read(file, size)
 
     def system(self) -> str:

@@ -62,7 +62,7 @@ Drawing = tuple[int, int, bytes, bytes]
 
 
 class DrawnFrames:
-    """Remembers what was drawn in each slot."""
+    """Remembers the drawing in each slot."""
 
     def __init__(self) -> None:
         self._slots: dict[int, tuple[Drawing | None, int]] = {}
@@ -268,7 +268,7 @@ class CompositeStage:
         self._draw(pose)
 
     def _take(self, pose: NDArray[np.void], image: NDArray[np.uint8]) -> None:
-        """Upload what is new in this frame: the background's picture, and for a full frame the avatars' picture."""
+        """Upload the new parts of this frame: the background's picture, and for a full frame the avatars' picture."""
         if self._background is not None and self._picture is not None:
             picture = self._background.at(float(pose["media_time_s"]))
             if picture is not None:
@@ -288,7 +288,7 @@ class CompositeStage:
         return self._held is not None and int(self._held["picture"]) == picture
 
     def _drawing(self, pose: NDArray[np.void]) -> Drawing | None:
-        """Return what the frame's bytes depend on; None when it is like no other."""
+        """Return the inputs of the frame's bytes; None for a frame like no other."""
         if self._hud is not None:
             return None
         nobody = self._held is None or int(pose["work"]) == FrameWork.NONE
