@@ -414,7 +414,7 @@ class Budget:
         return {"name": name, "share": share, "share_low": low, "share_high": high, "rivals": rivals}
 
     def _cut(self, ends_ns: Sequence[int], *, is_whole: bool = True) -> None:
-        """Count the path from what is counted already to the last of `ends_ns`, in blocks that end with each of them.
+        """Count the path from its counted part to the last of `ends_ns`, in blocks that end with each of them.
 
         `is_whole`: whether the last block has as many frames as the others.
         """

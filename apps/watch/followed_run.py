@@ -135,7 +135,7 @@ def _is_alive(pid: int) -> bool:
 
 
 def folder_of(given: Path) -> Path | None:
-    """Return the folder of the run that `given` means (`follow`), if it has begun, else a text on what is there."""
+    """Return the folder of the run that `given` means (see `follow`), or the place itself if it exists; else None."""
     if given.name == NAME:
         return given.parent
     places = [given] if given.is_absolute() or len(given.parts) > 1 else [given, RUNS / given]
