@@ -1,8 +1,8 @@
-"""Trilane for programs and notebooks: `run`, `predict`, `load_run`, and what they hand back (docs/python.md).
+"""Trilane for programs and notebooks: `run`, `predict`, `load_run`, and their results (docs/python.md).
 
-Rule: the same functions work here and below the command line. Nothing is printed and nothing ends the program: what
-goes wrong is a TrilaneError, what a person might want to read is in the report or comes through a callback. A notebook
-shows a run and a prediction as a table of HTML, in which every value is escaped.
+Rule: the command line uses the same functions. Nothing here prints or ends the program: a failure raises a
+TrilaneError, and messages for people are in the report or go to a callback. A notebook shows a run or a prediction as
+an HTML table, in which every value is escaped.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ TOO_SHORT = "too short to tell"
 
 
 class Run:
-    """A run that has ended. It keeps what it reads of its journal; `records` reads without keeping.
+    """A finished run. It keeps the parts of its journal that it has read; `records` reads without keeping.
 
     `folder`: run folder. `report`: report.json (docs/report.md), with the machine and the avatars' error.
     """
@@ -87,12 +87,12 @@ class Run:
 
     @cached_property
     def events(self) -> list[tuple[int, Event]]:
-        """What the scheduler was told: (ns, event) in order, named tuples of `trilane.scheduler.events`."""
+        """The events that the scheduler received: (ns, event) in order, named tuples of `trilane.scheduler.events`."""
         return [(step.now_ns, event) for step in self.records() if isinstance(step, Stepped) for event in step.events]
 
     @cached_property
     def idle(self) -> list[IdleSlice]:
-        """The times in which units did no job, in the order of their ends, and how long of each they had no core."""
+        """The idle slices of all units in the order of their ends, each with its time without a core."""
         begun, records = open_journal(self.folder)
         timeline = Timeline(begun.graph, begun.settings, idle=True)
         facts = [fact for record in records for fact in timeline.add(record)]
@@ -198,7 +198,7 @@ run.__signature__ = _signature(run, RunOptions, RunOptions.model_fields, DEFAULT
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a hardware profile says of an application or a network; every figure is computed.
+    """A hardware profile's prediction for an application or a network; every figure is computed.
 
     `document`: keys of `trilane predict --json`.
     `frame_ms`: frame time; `low_ms`, `high_ms`: interval that holds it with a probability of 80 %, None where nothing
@@ -255,7 +255,8 @@ def predict(
     `trilane.apps.predict.predict_options.PredictOptions` in `PREDICTED`; `trilane predict --help` explains them.
     `avatar`: the application with this avatar's network. `network`: an ONNX file by itself, or with `application` in
     the avatar's application. Without either, the application with a network of `encoder`, `norm`, `size`, `channels`.
-    `on_message(text)`: is told before the profile `host`, this machine, is measured, which may take half a minute.
+    `on_message(text)`: function that is called before this machine is measured for the profile `host`, which may take
+    half a minute.
     Raises BadInputError.
     """
     from trilane.apps.predict import asked_prediction as asked
@@ -283,7 +284,7 @@ predict.__signature__ = _signature(predict, PredictOptions, PREDICTED)  # type: 
 
 
 def _place(where: str, given: str | Path) -> Path:
-    """Return `given` as a path; an empty name is refused, because Path makes the working directory of it."""
+    """Return `given` as a path; an empty name is refused, because Path would turn it into the working directory."""
     if isinstance(given, str) and not given.strip():
         raise BadInputError(where, repr(given), "the name of a folder")
     return Path(given)

@@ -62,18 +62,18 @@ class Bundle:
         return self.folder / self.manifest.network.file
 
     def read_body(self) -> Body:
-        """The body with the offsets of the bundle, if any. Raises BadInputError."""
+        """Return the body with the offsets of the bundle, if any. Raises BadInputError."""
         body = load_body(self.body_path)
         if self.offsets_path is None:
             return body
         return replace(body, offsets=read_offsets(self.offsets_path, len(body.v_template)))
 
     def shaped_body(self) -> ShapedBody:
-        """The avatar at rest. Raises BadInputError."""
+        """Return the avatar at rest. Raises BadInputError."""
         return self.read_body().shape(self.manifest.betas, self.manifest.expression)
 
     def read_texture(self) -> NDArray[np.float32]:
-        """The neural texture, (H, W, C) float32, row 0 at v = 0. Raises BadInputError."""
+        """Return the neural texture, (H, W, C) float32, row 0 at v = 0. Raises BadInputError."""
         return read_texture(self.texture_path, self.manifest.network.channels)
 
     def read_levels(self) -> NDArray[np.float32] | None:
@@ -130,7 +130,7 @@ def load_bundle(name: str | Path) -> Bundle:
 
 
 def _what_it_is(file: Path) -> tuple[str, str, str]:
-    """Say what a file is that stands where an avatar's folder should, what is expected, and what to do."""
+    """Describe a file that lies where an avatar's folder should: what it is, what is expected, and what to do."""
     try:
         is_body = bool(read_npz(file, ("v_template",), "a body"))
     except BadInputError:

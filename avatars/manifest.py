@@ -1,6 +1,6 @@
 """The manifest of an avatar: name, files, scale and zero point of the network's bytes, training and validation.
 
-Rule: every number has a range and every key is known, so what is read needs no further check.
+Rule: every number has a range and every key is known, so the read values need no further check.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Decides which figures of accuracy are an avatar's own, and what is said in place of the others.
+"""Decides which accuracy figures are valid for an avatar, and explains why others are not shown.
 
-Rule: a figure is shown only where bytes, constants and the way of drawing are those of its measurement. Everything else
-is a sentence that names what differs and the command that measures it.
+Rule: a figure is shown only if bytes, constants and the way of drawing are those of its measurement. Otherwise a
+sentence names the difference and the command that measures the figure.
 """
 
 from __future__ import annotations

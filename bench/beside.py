@@ -118,7 +118,7 @@ def overlapping_ms(runs: Sequence[Sequence[JobRecord]]) -> list[float]:
 def computed_ms(
     isolated: Sequence[Isolated], seats: Sequence[Mapping[str, str]], asked: Sequence[Asked]
 ) -> list[float]:
-    """Return the mean virtual time between frames of each pipeline, ms, all at once on cores that they divide."""
+    """Return the mean virtual frame time of each pipeline in ms, when all run at once and divide the cores."""
     stop = (round(SECONDS * 1e9), Stop())
     members = [
         Member(

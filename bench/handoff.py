@@ -1,4 +1,4 @@
-"""How long from the producer's last byte written until the consumer, another process, can read them all, and has?
+"""How soon after the producer's last write can the consumer process read all bytes, and when has it read them?
 
 Rule: one definition holds for every variant, and all run interleaved; the producer writes every byte again, then reads
 the clock. The variant that is judged and compared with the peers is a real run through the scheduler. Its units form a
@@ -158,7 +158,7 @@ def produce(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[in
 
 
 def consume(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[int, ...], written: int) -> None:
-    """Run the process that reads; it answers with the instants, ns, at which bytes could be and had been read."""
+    """Run the reading process, which answers with two times in ns: all bytes could be read, and all had been read."""
     with _child(pipe, cores):
         end = channel.consumer()
         pipe.send("ready")
@@ -316,7 +316,7 @@ class HandoffStage:
         self._inputs, self._outputs = inputs, outputs
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
-        """`pose` pauses, `raster` writes, `infer` reads. Raises TrilaneError for wrong bytes."""
+        """Run a job: `pose` pauses, `raster` writes, `infer` reads. Raises TrilaneError for wrong bytes."""
         if self._name == STAGES[0][0]:
             time.sleep(PAUSE_S)
         elif self._name == WRITER and slot_out is not None:

@@ -1,4 +1,4 @@
-"""Are Trilane's runtimes as fast as the libraries themselves, and how far from what the machine can do?
+"""Are Trilane's runtimes as fast as the libraries themselves, and how near are they to the machine's peak?
 
 Rule: the libraries run as in their first examples, Trilane's runtimes on as many threads; all run interleaved.
 """

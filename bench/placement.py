@@ -22,7 +22,7 @@ from trilane.hw_profiles.application import Plan, Variant, steady
 from trilane.hw_profiles.host import described, host_cores, rule_placement, settings_of, usable_cores
 from trilane.hw_profiles.host_model import on_cores, place_units
 from trilane.hw_profiles.network_work import Network, count_work
-from trilane.hw_profiles.profile_files import HOST, load_profile
+from trilane.hw_profiles.profile_files import load_profile
 from trilane.hw_profiles.schema import corners_of
 from trilane.pipeline.run_metrics import RunMetrics
 from trilane.pipeline.trial import Round
@@ -36,7 +36,7 @@ from trilane.stages.avatar_pipeline import measured_times, run_avatar, tried
 from trilane.stages.configure import Checked, configure
 from trilane.stages.placing import FIRST, choice, considered, times_rows
 from trilane.stages.run_options import RunOptions
-from trilane.units import BURST, NS_PER_MS
+from trilane.units import BURST, HOST, NS_PER_MS
 
 MIN_FRAMES = 20
 VIRTUAL_CORES = (1, 2, 3, 4, 8)
@@ -191,7 +191,7 @@ class _Trial:
         }
 
     def times(self) -> list[dict[str, Any]]:
-        """Return what the units were measured to need."""
+        """Return the measured needs of the units."""
         return times_rows(self._times)
 
     def _tried_ms(self) -> list[float]:

@@ -74,7 +74,7 @@ def measure(size: int = 512, channels: int = 16, repeats: int = 40, threads: int
 def _variants(
     ctx: Any, fixture: Fixture, tensors: dict[str, Any], shape: tuple[int, int], deferred: bool
 ) -> dict[str, Callable[[], object]]:
-    """Return every variant; those of `COMPARED` write to their own of `tensors`."""
+    """Return every variant; each of `COMPARED` writes to its own one of `tensors`."""
     draws = (
         packed_variant(ctx, fixture, shape, deferred),
         packed_variant(ctx, fixture, shape, not deferred),

@@ -35,10 +35,10 @@ COPY_BYTES = 128 << 20
 def measure(threads: int = 0) -> dict[str, Any]:
     """Best rates with `threads` threads; 0: one for each core that this process may use.
 
-    Keys: `int8_gmac_s`: of the best layer of the runtimes, and `fp32_gmac_s` likewise (1e9 multiply-accumulates a
-    second); `int8_instruction_gmac_s`: of the instruction set, null where it is not known; `layer_of_instruction`: the
-    first over the last; `memory_gb_s` (bytes read and written by one thread); `instructions`: how the peak of the
-    instruction set follows, or why it is not known; `rows`: the rate of each INT8 layer that was tried.
+    Keys: `int8_gmac_s` and `fp32_gmac_s`: rate of the best layer of the runtimes, in 1e9 multiply-accumulates a second;
+    `int8_instruction_gmac_s`: peak of the instruction set, null where it is not known; `layer_of_instruction`:
+    `int8_gmac_s` over this peak; `memory_gb_s`: 1e9 bytes a second, read and written by one thread; `instructions`: how
+    the peak of the instruction set follows, or why it is not known; `rows`: the rate of each INT8 layer that was tried.
     """
     threads = threads or len(machine.here.cores())
     rows = _int8_rows(threads)

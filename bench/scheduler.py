@@ -38,7 +38,7 @@ Run = Callable[[], list[int]]
 
 
 def measure(minutes: float = 15.0, rounds: int = 7, seeds: int = 10, events: str = "") -> dict[str, Any]:
-    """The speed of both, and whether equal inputs give equal runs.
+    """The speed of Trilane's scheduler and of SimPy, and whether equal inputs give equal runs.
 
     `minutes`: of the avatar's pipeline at 60 frames a second, policy `pipelined`, edges `double`.
     `rounds`: runs of each, interleaved.
@@ -50,14 +50,15 @@ def measure(minutes: float = 15.0, rounds: int = 7, seeds: int = 10, events: str
     accounts and know no faults, policies or drops.
 
     Rows: `way`, `frames`, median CPU `seconds` and the 95 % interval of that median (`seconds_low`, `seconds_high`;
-    with fewer than six rounds the least and largest), `events_per_s` (an event: a frame's release or a job's end, the
-    same number in all), `processed` (by the way's own count; SimPy takes several to a job).
-    `over_trilane`: seconds of each way over those of `trilane` in the same round, median and interval: below 1 is
-    faster than Trilane. `over_simpy`, `over_simpy_lean`: how many times as fast as each Trilane is, from the same.
-    `agree`: frames that all present at the same nanosecond. `same_traces`: for how many seeds 10 repeats of a run in
-    which a unit dies give one trace; `different_traces`: traces between the seeds. `replay`: of `events`, the `steps`
-    and how many are answered differently.
-    Raises BadInputError when `events` is not a recording, TrilaneError when SimPy disagrees.
+    with fewer than six rounds the least and largest), `events_per_s` (an event is a frame's release or a job's end;
+    their number is the same in all ways), `processed` (events by the way's own count; SimPy takes several for a job).
+    `over_trilane`: seconds of each way over those of `trilane` in the same round, median and interval; below 1, the way
+    is faster than Trilane. `over_simpy`, `over_simpy_lean`: how many times as fast as each Trilane is, from the same
+    rounds.
+    `agree`: number of frames that all ways present at the same nanosecond. `same_traces`: number of seeds for which 10
+    repeats of a run, in which a unit dies, give one trace. `different_traces`: number of different traces over the
+    seeds. `replay`: `steps` of the replayed `events`, and how many are answered differently. Raises BadInputError when
+    `events` is not a recording, TrilaneError when SimPy disagrees.
     """
     if minutes <= 0 or rounds < 1 or seeds < 1:
         found = f"minutes {minutes:g}, rounds {rounds}, seeds {seeds}"

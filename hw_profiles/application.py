@@ -87,7 +87,7 @@ class Plan:
 
 
 def isolated_job_time(profile: Profile, network: Network, runtime: UnitName, corners: Corners) -> JobTime:
-    """Time of one frame's job when the network runs continuously and nothing else does, as in a benchmark.
+    """Return the time of one frame's job when the network runs continuously and nothing else does, as in a benchmark.
 
     `profile`: hardware profile of the chip.
     `network`: network that runs.
@@ -100,7 +100,7 @@ def isolated_job_time(profile: Profile, network: Network, runtime: UnitName, cor
 def _job(
     profile: Profile, work: Work, unit: UnitName, corners: Corners, *, contended: bool = True, batch: int = 1
 ) -> JobTime:
-    """Time of a job with the operators of `work`.
+    """Return the time of a job with the operators of `work`.
 
     `profile`: hardware profile of the chip.
     `work`: work of one frame.
@@ -114,9 +114,10 @@ def _job(
 
 
 def stage_times_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple[str, UnitName], float]:
-    """Milliseconds of one job of each (stage, unit), in data-flow order. A job has `plan.variant.batch` frames.
+    """Return the milliseconds of one job of each (stage, unit), in data-flow order.
 
-    Joints and vertices are those of each avatar in view, pixels those of the tensor that all of them share.
+    A job has `plan.variant.batch` frames. Joints and vertices are those of each avatar in view, pixels those of the
+    tensor that all of them share.
     """
     app, network, batch = profile.application, plan.network, plan.variant.batch
     cpu, gpu = (profile.units[u].clock(corners[UNITS.index(u)]) for u in ("cpu", "gpu"))
@@ -151,10 +152,7 @@ def _network_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple[st
 
 
 def split_work(work: Work, share: float) -> tuple[Work, Work]:
-    """`work` in two parts, cut after the first operators that together have `share` of the products.
-
-    The elements that are live at the cut are the output of the first part and the input of the second.
-    """
+    """Return `work` in two parts, cut after the first operators that together have `share` of the products."""
     macs, cut = 0, 0
     for cut, operator in enumerate(work.operators, 1):  # noqa: B007
         macs += operator.macs
@@ -188,13 +186,13 @@ class Steady:
 
 
 def application_graph(edge: str = "double", infer: Iterable[tuple[str, str]] = (INFER,)) -> Graph:
-    """The avatar's pipeline with the same rule on every edge. `infer`: the network's stages and their units."""
+    """Return the avatar's pipeline with the same rule on every edge. `infer`: the network's stages and their units."""
     return chain((*BEFORE_INFER, *infer, *AFTER_INFER), edge, LATENCY_TO)
 
 
 @lru_cache(maxsize=4096)
 def _settled(times: StageTimes, variant: Variant, display_ns: int, quick: bool) -> tuple[Any, bool]:
-    """The report of a run, and whether the display limits its rate.
+    """Return the report of a run, and whether the display limits its rate.
 
     `times`: stage, unit and nanoseconds of a job.
     `variant`: how the stages are joined.
@@ -210,14 +208,14 @@ def _settled(times: StageTimes, variant: Variant, display_ns: int, quick: bool) 
 
 
 def _frames_of(variant: Variant, quick: bool) -> int:
-    """How many frames are simulated. `quick`: as in `_settled`."""
+    """Return how many frames are simulated. `quick`: as in `_settled`."""
     if variant.edge not in ("single", "double") or POLICIES[variant.policy].paced:
         return FRAMES_WITH_DROPS
     return QUICK_FRAMES if quick and variant.edge == "single" else FRAMES
 
 
 def settings_of(variant: Variant, frames: int, display_ns: int, *, held: bool = False) -> Settings:
-    """The scheduler's settings of a simulated run.
+    """Return the scheduler's settings of a simulated run.
 
     `variant`: its policy and the scene's rate. `frames`: how many jobs of each stage. `display_ns`: the shortest time
     between two of them. `held`: whether the display holds every policy to its rate.
@@ -227,7 +225,7 @@ def settings_of(variant: Variant, frames: int, display_ns: int, *, held: bool = 
 
 
 def _simulated(times: StageTimes, variant: Variant, settings: Settings, *, keep: bool = False) -> Simulation:
-    """A run of jobs that take `times`. Raises BadInputError for an unknown edge."""
+    """Return a run of jobs that take `times`. Raises BadInputError for an unknown edge."""
     service = {name: ns for name, _, ns in times}
     try:
         graph = chain(((name, unit) for name, unit, _ in times), variant.edge, LATENCY_TO)
@@ -249,24 +247,24 @@ def simulated(profile: Profile, plan: Plan, corners: Corners) -> Simulation:
 
 
 def _rounded(profile: Profile, plan: Plan, corners: Corners) -> StageTimes:
-    """Nanoseconds of a job of each stage, with the units as the scheduler sees them."""
+    """Return the nanoseconds of a job of each stage, with the units as the scheduler sees them."""
     worker = workers_of(profile)
     times = stage_times_ms(profile, plan, corners)
     return tuple((name, worker[unit], round(ms * NS_PER_MS)) for (name, unit), ms in times.items())
 
 
 def _display_ms(profile: Profile, plan: Plan) -> float:
-    """The shortest time between two shown frames."""
+    """Return the shortest time between two shown frames."""
     return max(profile.application.display_ms.or_else(0), 1e3 / (plan.most_fps or math.inf))
 
 
 def _display_ns(profile: Profile, plan: Plan) -> int:
-    """The shortest time between two jobs that are shown."""
+    """Return the shortest time between two jobs that are shown."""
     return round(plan.variant.batch * _display_ms(profile, plan) * NS_PER_MS)
 
 
 def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = False) -> Steady:
-    """Frame time, latency and shares of time, by the scheduler in virtual time.
+    """Return frame time, latency and shares of time, by the scheduler in virtual time.
 
     `profile`: hardware profile of the chip.
     `plan`: application that runs on it.
@@ -307,7 +305,7 @@ def _shares(
     times: Mapping[tuple[str, UnitName], float],
     units: Mapping[str, Any],
 ) -> tuple[float, dict[str, float]]:
-    """Busy share of `unit` and shares of its idle time by cause.
+    """Return busy share of `unit` and shares of its idle time by cause.
 
     `worker`: result of `workers_of`. Units behind one worker divide its busy time in proportion to their jobs.
     `times`: milliseconds of a job of each stage and unit.
@@ -326,7 +324,7 @@ def _shares(
 
 
 def reference_frame_ms(profile: Profile, plan: Plan, corners: Corners) -> float:
-    """Mean frame time of the variant `REFERENCE` without a run of the scheduler, for fitting.
+    """Return the mean frame time of the variant `REFERENCE` without a run of the scheduler, for fitting.
 
     With one buffer between stages, raster, network and composite follow each other, so that their times add up. A test
     compares the result with the scheduler in virtual time.

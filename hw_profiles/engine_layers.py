@@ -153,7 +153,7 @@ class Layers:
         return table
 
     def since(self, name: str, crossing: int) -> Layers:
-        """The layers from the one called `name` on. `crossing`: elements that the layers before it hand over."""
+        """Return the layers from the one called `name` on. `crossing`: elements that the layers before it hand over."""
         first = next((i for i, layer in enumerate(self.layers) if layer.name == name), len(self.layers))
         return Layers(self.layers[first:], self.sizes, crossing, self.output)
 
@@ -164,7 +164,7 @@ Shapes = Mapping[str, Shape]
 
 
 class _Graph:
-    """A graph without operators that only rename: the name and the reads of each tensor, and which ones are given."""
+    """A graph without renaming operators: original names of tensors, their readers, and inputs apart from weights."""
 
     def __init__(self, graph: Any, shapes: Shapes, constants: set[str]) -> None:
         self.shapes, self.constants = shapes, constants
@@ -181,40 +181,43 @@ class _Graph:
         self._renamed[name] = original
 
     def name_of(self, name: str) -> str:
-        """The original name of the tensor `name`."""
+        """Return the original name of the tensor `name`."""
         while name in self._renamed:
             name = self._renamed[name]
         return name
 
     def given(self, node: Any) -> tuple[str, ...]:
-        """The tensors that `node` reads, without its weights."""
+        """Return the tensors that `node` reads, without its weights."""
         return tuple(self.name_of(name) for name in node.input if name and name not in self.constants)
 
     def more(self, node: Any) -> tuple[str, ...]:
-        """The results of `node` after the first that somebody needs."""
+        """Return the results of `node` after the first that somebody needs."""
         others = (name for name in node.output if name and name != first_result(node))
         return tuple(name for name in others if self.reads[name] or name in self._ends)
 
 
 def first_result(node: Any) -> str:
-    """The first result that `node` makes. A recurrent layer may leave out the one that comes first in the list."""
+    """Return the first result that `node` makes.
+
+    A recurrent layer may leave out the one that comes first in the list.
+    """
     name: str = next(name for name in node.output if name)
     return name
 
 
 def _kind(node: Any) -> str:
-    """Type of the operator of floats that does the same work; empty for a domain whose operators nobody knows."""
+    """Return the type of the float operator that does the same work; empty for an unknown domain."""
     return PLAIN.get(node.op_type, node.op_type) if node.domain in DOMAINS else ""
 
 
 def _renames(node: Any) -> bool:
-    """Whether `node` moves nothing."""
+    """Return whether `node` moves nothing."""
     kind = _kind(node)
     return kind in RENAMES or (kind == "Transpose" and any(tuple(a.ints) in LAYOUT_CHANGES for a in node.attribute))
 
 
 def layers_of(graph: Any, shapes: Shapes, constants: set[str]) -> Layers:
-    """The layers of an ONNX graph.
+    """Return the layers of an ONNX graph.
 
     `graph`: ONNX graph of a model.
     `shapes`: shape of each tensor, by name.
@@ -253,7 +256,7 @@ def _folds(before: EngineLayer, names: _Graph) -> bool:
 
 
 def _takes_up(before: EngineLayer, names: _Graph) -> bool:
-    """Whether a batch normalisation behind `before` becomes part of its weights."""
+    """Return whether a batch normalisation behind `before` becomes part of its weights."""
     return before.kind in PLAIN_PRODUCTS and names.reads[before.writes] == 1
 
 
@@ -262,7 +265,7 @@ def _clip(node: Any, shapes: Shapes) -> dict[str, float]:
 
 
 def _is_swish(node: Any, before: EngineLayer, names: _Graph) -> bool:
-    """Whether `node` multiplies a tensor with its own sigmoid, which is `before`."""
+    """Return whether `node` multiplies a tensor with its own sigmoid, which is `before`."""
     if _kind(node) != "Mul" or before.kind != "Sigmoid":
         return False
     return set(names.given(node)) == {*before.reads, before.writes} and names.reads[before.writes] == 1
@@ -283,7 +286,7 @@ def _layer(node: Any, names: _Graph, kind: str, reads: tuple[str, ...]) -> Engin
 
 
 def _movement(node: Any, kind: str, moved: int, names: _Graph) -> Iterator[tuple[str, float]]:
-    """The term of a layer without products. `kind`: its type. `moved`: elements that it reads and writes."""
+    """Return the term of a layer without products. `kind`: its type. `moved`: elements that it reads and writes."""
     if kind == "Resize":
         mode = next((a.s for a in node.attribute if a.name == "mode"), b"nearest")
         yield "nearest" if mode == b"nearest" else "bilinear", moved
@@ -295,7 +298,7 @@ def _movement(node: Any, kind: str, moved: int, names: _Graph) -> Iterator[tuple
 
 
 def _padded(shape: tuple[int, ...], block: int) -> int:
-    """Elements of a tensor with its channels, the second axis, rounded up to whole blocks."""
+    """Return elements of a tensor with its channels, the second axis, rounded up to whole blocks."""
     if len(shape) != 4:
         return prod(shape)
     return shape[0] * _up(shape[1], block) * shape[2] * shape[3]
@@ -306,7 +309,7 @@ def _up(count: int, block: int) -> int:
 
 
 def _products(node: Any, shapes: Shapes) -> Iterator[tuple[str, float]]:
-    """Products, and what is moved for them; nothing for an operator that multiplies no tensors."""
+    """Return products, and what is moved for them; nothing for an operator that multiplies no tensors."""
     if node.op_type not in WITH_PRODUCTS:
         return
     source, out = shapes[node.input[0]], shapes[first_result(node)]
@@ -322,12 +325,12 @@ def _products(node: Any, shapes: Shapes) -> Iterator[tuple[str, float]]:
 
 
 def _padding(count: int, block: int) -> float:
-    """Channels rounded up to whole blocks, over channels."""
+    """Return the number of channels rounded up to whole blocks, over the number of channels."""
     return _up(count, block) / count
 
 
 def _convolution(node: Any, source: Shape, weight: Shape, out: Shape, moved: int) -> Iterator[tuple[str, float]]:
-    """Terms of a convolution. `moved`: elements that it reads and writes."""
+    """Return the terms of a convolution. `moved`: elements that it reads and writes."""
     attributes = {a.name: a for a in node.attribute}
     groups = attributes["group"].i if "group" in attributes else 1
     yield "moved_depthwise" if groups == source[1] > 1 else "moved", moved
@@ -346,7 +349,7 @@ def _convolution(node: Any, source: Shape, weight: Shape, out: Shape, moved: int
 
 
 def _grouped(places: int, c_in: int, c_out: int, groups: int, stride: int) -> Iterator[tuple[str, float]]:
-    """A convolution in groups. `places`: output positions times the kernel's. `c_in`, `c_out`: of all groups."""
+    """Return a convolution in groups. `places`: output positions times the kernel's. `c_in`, `c_out`: of all groups."""
     if c_in > groups:
         yield "grouped", places * _up(c_in // groups, INPUT_BLOCK) * _up(c_out, OUTPUT_BLOCK)
         return

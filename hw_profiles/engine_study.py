@@ -1,8 +1,8 @@
-"""The whole fit of tensor engines: numbers of every chip, what cross-validation says of them, and how both are shown.
+"""The whole fit of tensor engines: the numbers of every chip, their cross-validation, and how both are shown.
 
-Whatever is said of an error is of a row whose network no number had seen. A chip without a row of an engine has the
-numbers of a relative, times what the two differ by where both are known; they are `assumed`. The head of a chip's
-profile is written by hand and stays; everything from MARK on is written here.
+Every stated error is that of a row whose network was left out of the fit. A chip without a row of an engine gets the
+numbers of a related chip, times the ratio of the two chips where both are known; they are `assumed`. The head of a
+chip's profile is written by hand and stays; everything from MARK on is written here.
 """
 
 from __future__ import annotations
@@ -122,13 +122,17 @@ class Study:
 
 
 def misses_of(rows: Sequence[LeftOut]) -> tuple[F64, F64, F64]:
-    """Absolute logarithms of predicted over published, what the numbers leave open, and how unlike each is (rows,)."""
+    """Return the errors of `rows` and what explains them, as three arrays (rows,).
+
+    They are the absolute logarithm of the predicted over the published time, the error that the fit's numbers leave,
+    and how unlike each network is to those of the fit.
+    """
     misses = [abs(math.log(row.predicted_ms / row.row.ms)) for row in rows]
     return np.array(misses), np.array([row.unsure for row in rows]), np.array([row.unlike for row in rows])
 
 
 def own_error(rows: Sequence[LeftOut]) -> float:
-    """The least error of the model with which intervals around `rows` cover COVERED of them.
+    """Return the least error of the model with which intervals around `rows` cover COVERED of them.
 
     It grows in proportion to how unlike a network is to those of the fit.
     """
@@ -169,7 +173,7 @@ def _known(fitted: Fitted, chip: str) -> dict[str, ChipRate]:
 def _assumed(
     rates: Mapping[tuple[str, EngineName], Mapping[str, ChipRate]], engines: Sequence[EngineName]
 ) -> dict[tuple[str, EngineName], dict[str, ChipRate]]:
-    """The numbers of chips for engines of which they have no row."""
+    """Return the numbers of chips for engines of which they have no row."""
     found = {}
     for chip, relative in RELATIVE.items():
         for engine in engines:
@@ -186,7 +190,10 @@ def _assumed(
 
 
 def middle(chips: Sequence[Mapping[str, ChipRate]]) -> dict[str, Prior]:
-    """The geometric mean of chips' numbers. Its spread joins the differences of the chips and the spread of each."""
+    """Return the geometric mean of chips' numbers.
+
+    Its spread joins the differences of the chips and the spread of each.
+    """
     result = {}
     for key in chips[0]:
         logs = np.log([chip[key].value for chip in chips])
@@ -196,7 +203,7 @@ def middle(chips: Sequence[Mapping[str, ChipRate]]) -> dict[str, Prior]:
 
 
 def errors_of(rows: Sequence[LeftOut]) -> dict[str, float]:
-    """`rows`, `median` and `p90` of the absolute errors, `close`: share within 15 %, `bias`: median of the errors."""
+    """Return `rows`, `median` and `p90` of the absolute errors, `close` (share within 15 %), `bias` (median)."""
     errors = np.array([row.error for row in rows])
     return {
         "rows": len(rows),
@@ -208,7 +215,7 @@ def errors_of(rows: Sequence[LeftOut]) -> dict[str, float]:
 
 
 def as_markdown(study: Study) -> str:
-    """Two tables: errors by engine, and those of USUAL by family and chip."""
+    """Return two tables: errors by engine, and those of USUAL by family and chip."""
     return "\n".join([*_by_engine(study), "", *_by_family(study.engines[USUAL].left_out)])
 
 
@@ -281,7 +288,7 @@ def profile_texts(study: Study, folder: Path, command: str) -> dict[Path, str]:
 
 
 def head_of(path: Path) -> str:
-    """The part of a profile that is written by hand. Raises BadInputError without one."""
+    """Return the part of a profile that is written by hand. Raises BadInputError without one."""
     return read_text(path, "a chip's profile, its head written by hand").partition(MARK)[0].rstrip() + "\n\n"
 
 

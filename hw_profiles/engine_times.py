@@ -61,7 +61,7 @@ class EngineTime:
 
 
 def numbers_of(engine: Engine, clock_fraction: float = 1.0, memory_fraction: float = 1.0) -> EngineNumbers:
-    """The numbers of an engine.
+    """Return the numbers of an engine.
 
     `engine`: tensor engine of a profile.
     `clock_fraction`: fraction of its highest clock, above 0 to 1; it slows everything that happens on the engine.
@@ -74,7 +74,7 @@ def numbers_of(engine: Engine, clock_fraction: float = 1.0, memory_fraction: flo
 
 
 def amounts(network: Layers, room: int) -> F64:
-    """Amounts of each term (layers + 1, terms): a row for each layer with its spill, and a last row for the job."""
+    """Return amounts of each term (layers + 1, terms): a row for each layer with its spill, and one for the job."""
     table = np.vstack([network.table, np.zeros(len(NAMES))])
     table[:-1, INDEX["spill"]] = spilled(network, room)
     for name, amount in (("input", network.input), ("output", network.output), ("job", 1)):
@@ -83,7 +83,7 @@ def amounts(network: Layers, room: int) -> F64:
 
 
 def engine_time(network: Layers, engine: EngineNumbers, batch: int = 1) -> EngineTime:
-    """Time of one job of `batch` frames. Weights and fixed costs count once per job.
+    """Return the time of one job of `batch` frames. Weights and fixed costs count once per job.
 
     `network`: layers of the network.
     `engine`: numbers of the engine.
@@ -115,7 +115,7 @@ def join(costs: F64) -> tuple[F64, F64]:
 
 @lru_cache(maxsize=512)
 def spilled(network: Layers, room: int) -> tuple[int, ...]:
-    """Elements that each layer reads from or sends to the main memory when `room` elements fit on the chip.
+    """Return elements that each layer reads from or sends to the main memory when `room` elements fit on the chip.
 
     The network's input comes from the main memory, and its results go there. A layer's result stays on the chip until
     its last reader. Where room is short, the tensor that is read last goes out, in part if a part is enough. A
@@ -141,11 +141,11 @@ class _Chip:
                 self._readers[name].append(index)
 
     def _read(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        """The tensors behind `names`, each once; a concatenation stands for its parts."""
+        """Return the tensors behind `names`, each once; a concatenation stands for its parts."""
         return tuple(dict.fromkeys(part for name in names for part in self._parts.get(name, (name,))))
 
     def _next(self, name: str, index: int) -> int:
-        """The next layer after `index` that reads the tensor, or one past the last."""
+        """Return the next layer after `index` that reads the tensor, or one past the last."""
         return next((reader for reader in self._readers[name] if reader > index), len(self._layers))
 
     def run(self, index: int) -> int:

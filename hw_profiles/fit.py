@@ -82,13 +82,16 @@ class ProfileFit:
         return tuple(dict.fromkeys(r.column for r in self.residuals))
 
     def median_error(self, column: str, *, left_out: bool = False) -> float:
-        """Median absolute relative error of `column`. `left_out`: take the fits that had not seen the measurement."""
+        """Return the median absolute relative error of `column`.
+
+        `left_out`: whether to take the fits that had not seen the measurement.
+        """
         errors = [abs(r.left_out_error if left_out else r.error) for r in self.residuals if r.column == column]
         return median(errors) if errors else 0.0
 
 
 def measurements(rows: Sequence[ConfigurationRow], step: Step) -> list[Measurement]:
-    """The measurements of `step` in `rows`. The middle of its range stands for an application's frame time."""
+    """Return the measurements of `step` in `rows`. The middle of its range stands for an application's frame time."""
     result = []
     for row in rows:
         for column in step.columns:
@@ -103,7 +106,7 @@ def measurements(rows: Sequence[ConfigurationRow], step: Step) -> list[Measureme
 
 
 def predicted_ms(profile: Profile, measured: Measurement) -> float:
-    """Milliseconds that `profile` predicts for `measured`, under the performance profile MEASURED_UNDER."""
+    """Return the milliseconds that `profile` predicts for `measured`, under the performance profile MEASURED_UNDER."""
     corners, unit = corners_of(profile, MEASURED_UNDER), UNIT_OF_COLUMN[measured.column]
     network = reference_network(measured.row.spec)
     if measured.column.startswith("bench"):
@@ -151,7 +154,7 @@ def fit(data: Mapping[str, Any], path: Path, rows: Sequence[ConfigurationRow]) -
 
 
 def _from_residuals(residuals: Sequence[Residual], rows: Sequence[ConfigurationRow]) -> dict[str, tuple[float, float]]:
-    """The model's own error, from errors on measurements left out, and the spread of frame times, from their ranges."""
+    """Return the model's own error, from left-out measurements, and the spread of frame times, from their ranges."""
     numbers = {}
     for unit in ("dsp", "gpu"):
         errors = [abs(r.left_out_error) for r in residuals if r.column == f"bench_{unit}_ms"]
@@ -163,7 +166,7 @@ def _from_residuals(residuals: Sequence[Residual], rows: Sequence[ConfigurationR
 
 
 def _solve(data: Mapping[str, Any], path: Path, step: Step, measured: Sequence[Measurement]) -> tuple[F64, F64]:
-    """Factors on the priors of `step.free`, and the spread of each after the fit.
+    """Return factors on the priors of `step.free`, and the spread of each after the fit.
 
     `data`: tables of the profile with the priors.
     `path`: file of these tables, for messages.
@@ -192,7 +195,7 @@ def _least_squares() -> Callable[..., Any]:
 
 
 def with_factors(data: Mapping[str, Any], free: Sequence[Keys], factors: Sequence[float] | F64) -> dict[str, Any]:
-    """A copy of the tables `data` with the values of each group of keys multiplied by its factor."""
+    """Return a copy of the tables `data` with the values of each group of keys multiplied by its factor."""
     copied = copy.deepcopy(dict(data))
     for keys, factor in zip(free, factors, strict=True):
         for key in keys:
@@ -210,7 +213,7 @@ def _at(data: Mapping[str, Any], key: str) -> dict[str, Any]:
 
 
 def as_toml(result: ProfileFit, name: str, title: str, extends: str, command: str) -> str:
-    """The text of a TOML file with the fitted numbers.
+    """Return the text of a TOML file with the fitted numbers.
 
     `result`: result of the fit.
     `name`: name of the new profile.

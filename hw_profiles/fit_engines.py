@@ -62,11 +62,11 @@ class Fitted:
     seen: Mapping[str, F64] = field(default_factory=dict)
 
     def unlike(self, shares: F64) -> float:
-        """How far `shares` (terms,) are from those of the nearest network of the fit, 0 to 1."""
+        """Return how far `shares` (terms,) are from those of the nearest network of the fit, 0 to 1."""
         return min((float(np.abs(shares - others).sum()) / 2 for others in self.seen.values()), default=1.0)
 
     def rates_of(self, chip: str) -> dict[str, Prior]:
-        """The six numbers of `chip`, as profiles state them, with their spreads."""
+        """Return the six numbers of `chip`, as profiles state them, with their spreads."""
         row = self.chips.index(chip)
         values, spreads = self.numbers.rates[row], self.spreads.rates[row]
         return {
@@ -76,7 +76,7 @@ class Fitted:
 
 
 def as_stated(engine: EngineName, rate: str, seconds: float) -> float:
-    """A rate as profiles state it, from seconds per unit."""
+    """Return a rate as profiles state it, from seconds per unit."""
     unit = KEY_OF_RATE[rate][1]
     return seconds / unit if rate in COSTS else _bytes(engine, rate) / (seconds * unit)
 
@@ -104,7 +104,7 @@ class _Rows:
         self.row = np.repeat(np.arange(len(rows)), [len(table) for table, _ in tables])
 
     def predict(self, numbers: Numbers) -> tuple[F64, F64]:
-        """Milliseconds of each row (rows,), and each term's share in their growth (rows, terms)."""
+        """Return the milliseconds of each row (rows,), and each term's share in their growth (rows, terms)."""
         seconds = np.exp(numbers.factors + numbers.rates[self.chip][:, RATE_OF_TERM])
         costs = self.table * seconds[self.row]
         joined, slopes = join(costs)
@@ -113,7 +113,7 @@ class _Rows:
         return 1e3 * whole, grown / whole[:, None]
 
     def slopes(self, shares: F64, chips: int) -> F64:
-        """How the logarithm of each row's time grows with the logarithm of each number (rows, numbers)."""
+        """Return how the logarithm of each row's time grows with the logarithm of each number (rows, numbers)."""
         by_rate = np.stack([shares[:, rate == RATE_OF_TERM].sum(axis=1) for rate in range(len(RATES))], axis=1)
         of_chips = np.zeros((len(shares), chips, len(RATES)))
         of_chips[np.arange(len(shares)), self.chip] = by_rate
@@ -128,7 +128,7 @@ _tables: dict[tuple[Layers, int], tuple[F64, F64]] = {}
 
 
 def _distinct(layers: Layers, room: int) -> tuple[F64, F64]:
-    """Amounts of layers that differ, and how often each of them occurs."""
+    """Return the amounts of layers that differ, and how often each of them occurs."""
     if (layers, room) not in _tables:
         table, count = np.unique(amounts(layers, room), axis=0, return_counts=True)
         _tables[layers, room] = table, count.astype(np.float64)
@@ -136,7 +136,7 @@ def _distinct(layers: Layers, room: int) -> tuple[F64, F64]:
 
 
 def priors(engine: EngineName, chips: Sequence[str]) -> tuple[Numbers, Numbers]:
-    """Values and spreads before the fit."""
+    """Return the values and spreads before the fit."""
     factors = [factor_prior(engine, name) for name in NAMES]
     rates = [[rate_prior(engine, chip, KEY_OF_RATE[rate][0]) for rate in RATES] for chip in chips]
     values = [[math.log(_seconds(engine, r, p.value)) for r, p in zip(RATES, row, strict=True)] for row in rates]
@@ -192,7 +192,7 @@ def _cost(at: F64, data: _Rows, mean: F64, spread: F64) -> float:
 
 
 def _derivatives(at: F64, data: _Rows, mean: F64, spread: F64, chips: int) -> tuple[F64, F64]:
-    """Half the gradient of `_cost`, and half its curvature as if `predict` were linear."""
+    """Return half the gradient of `_cost`, and half its curvature as if `predict` were linear."""
     ms, shares = data.predict(_from_flat(at))
     misses = np.log(ms / data.ms) / NOISE
     weights = (NU + 1) / (NU + misses**2)
@@ -244,7 +244,7 @@ def cross_validate(
 
 
 def predict_rows(fitted: Fitted, rows: Sequence[Latency], layers: Mapping[str, Layers]) -> list[LeftOut]:
-    """Each of `rows` beside the prediction of `fitted`."""
+    """Return each of `rows` beside the prediction of `fitted`."""
     known = [row for row in rows if row.chip in fitted.chips]
     data = _Rows(known, layers, fitted.chips)
     ms, shares = data.predict(fitted.numbers)
@@ -334,14 +334,14 @@ STEP = Prior(1.25, 0.15)
 
 
 def rate_prior(engine: EngineName, chip: str, key: str) -> Prior:
-    """The prior of the rate `key` of `chip`. A slower chip has lower rates and higher costs."""
+    """Return the prior of the rate `key` of `chip`. A slower chip has lower rates and higher costs."""
     value = RATES_OF_8_GEN_2[key] * (FP16_OVER_INT8.get(key, 1) if engine.startswith("fp16") else 1)
     slower = SLOWER.get(chip, 1)
     return Prior(value * slower if key in ("operator_us", "job_us") else value / slower, RATE_SPREAD)
 
 
 def factor_prior(engine: EngineName, term: str) -> Prior:
-    """The prior of a term's factor."""
+    """Return the prior of a term's factor."""
     if term in UNITS_OF_RATES:
         return Prior(1, 1e-6)
     return (FP16_FACTORS if engine.startswith("fp16") else FACTORS)[term]

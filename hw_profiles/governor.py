@@ -39,7 +39,7 @@ class ThermalState:
 
     @classmethod
     def at_rest(cls, profile: Profile) -> ThermalState:
-        """A device that has been off for long: everything is at ambient temperature."""
+        """Return a device that has been off for long: everything is at ambient temperature."""
         ambient = profile.thermal.ambient_c.or_else(25.0)
         return cls(ambient, dict.fromkeys(UNITS, ambient))
 
@@ -60,7 +60,7 @@ def _approach(value: float, goal: float, seconds: float, time_constant: float) -
 
 
 def headroom_k(profile: Profile, thermal_state: ThermalState) -> float:
-    """Degrees that are left to the nearer of the two limits (skin, junction); negative beyond it."""
+    """Return the degrees that are left to the nearer of the two limits (skin, junction); negative beyond it."""
     thermal = profile.thermal
     skin = thermal.skin_limit_c.or_else(45.0) - thermal_state.device_c
     return min(skin, thermal.junction_limit_c.or_else(95.0) - max(thermal_state.junction_c.values()))
@@ -73,7 +73,7 @@ class Throttle:
     steps: dict[UnitName, int] = field(default_factory=lambda: dict.fromkeys(UNITS, 0))
 
     def corner_index(self, unit: UnitName, requested: int) -> int:
-        """Index into CORNERS at which `unit` runs when its performance profile requests `requested`."""
+        """Return the index into CORNERS at which `unit` runs when its performance profile requests `requested`."""
         return min(requested + self.steps[unit], len(CORNERS) - 1)
 
     def lower(self, unit: UnitName, requested: int) -> None:
@@ -149,7 +149,7 @@ def power_allocator(
 
 
 def _next_step_w(profile: Profile, throttle: Throttle, name: UnitName, requested: int, power_w: float) -> float:
-    """Additional watts that the unit `name` would take one corner higher, at the same share of busy time.
+    """Return additional watts that the unit `name` would take one corner higher, at the same share of busy time.
 
     `profile`: hardware profile of the chip.
     `throttle`: how far its units are lowered now.
@@ -173,9 +173,10 @@ class Governor:
     """
 
     def __init__(self, profile: Profile, performance_profile: str, governor: str | None = None) -> None:
-        """For a chip's `profile` and the name of one of its performance profiles; `governor` None: the profile's own.
+        """Prepare the governor of a chip's `profile`.
 
-        Raises BadInputError for an unknown performance profile or governor.
+        `performance_profile`: name of one of its performance profiles. `governor`: name in GOVERNORS; None for the
+        profile's own. Raises BadInputError for an unknown performance profile or governor.
         """
         self.name = governor or profile.thermal.governor
         if self.name not in GOVERNORS:
@@ -234,7 +235,7 @@ class Governor:
         return {"device": self._thermal_state.device_c, **junctions}
 
     def report(self) -> dict[str, Any]:
-        """The keys `caps` and `temperature_c` of report.json."""
+        """Return the keys `caps` and `temperature_c` of report.json."""
         ticks = max(self._ticks, 1)
         caps = {
             "how": HOW,
@@ -262,7 +263,7 @@ class Governor:
         return CORNERS[self._throttle.corner_index(unit, self._requested[unit])]
 
     def _power_w(self, unit: UnitName, busy_ns: int, now_ns: int) -> float:
-        """Mean power of `unit` since the last tick, in watts. `busy_ns`: time that it worked since then.
+        """Return the mean power of `unit` since the last tick, in watts. `busy_ns`: time that it worked since then.
 
         A duty stands for a clock, so the busy share counts only the time in which the duty let the unit work.
         """
@@ -281,7 +282,7 @@ class Governor:
         self._hottest["junction"] = max(self._hottest["junction"], *self._thermal_state.junction_c.values())
 
     def _changed(self) -> list[SetDuty]:
-        """Events for the units whose duty is no longer the one that was set last."""
+        """Return events for the units whose duty has changed since it was last set."""
         events = []
         for unit in UNITS:
             clock = self._profile.units[unit].clock(self._corner(unit))

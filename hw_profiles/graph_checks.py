@@ -40,12 +40,12 @@ _KINDS = {"sequence_type": "a sequence", "map_type": "a map", "optional_type": "
 
 
 def type_name(kind: int) -> str:
-    """Name of an element type, as ONNX writes it in small letters."""
+    """Return the name of an element type, as ONNX writes it in small letters."""
     return str(TensorProto.DataType.Name(kind)).lower() if kind in TensorProto.DataType.values() else f"type {kind}"
 
 
 def bytes_of(shape: tuple[int, ...], kind: int) -> int:
-    """Bytes of a tensor. Raises UnexpectedValue when its elements are no numbers."""
+    """Return bytes of a tensor. Raises UnexpectedValue when its elements are no numbers."""
     if kind not in _BITS:
         remedy = "leave the part of the graph that handles text to the program"
         raise UnexpectedValue(f"elements of type {type_name(kind)}", "numbers", remedy)
@@ -53,7 +53,7 @@ def bytes_of(shape: tuple[int, ...], kind: int) -> int:
 
 
 def is_ordinary(shape: tuple[int, ...], kind: int) -> bool:
-    """Whether `check_size` would let a tensor pass: its elements are numbers and it is not too large."""
+    """Return whether `check_size` would let a tensor pass: its elements are numbers and it is not too large."""
     return prod(shape) * _BITS.get(kind, 8 * MAX_TENSOR_BYTES + 1) <= 8 * MAX_TENSOR_BYTES
 
 
@@ -109,7 +109,7 @@ def _check_length(tensor: TensorProto, claimed: int, what: str) -> None:
 
 
 def _entries(tensor: TensorProto, size: int) -> int:
-    """Numbers in the lists of a tensor of `size` bytes: half-bytes share one, complex numbers have two."""
+    """Return the numbers in the lists of a tensor of `size` bytes: half-bytes share one, complex numbers have two."""
     bits = _BITS[tensor.data_type]
     pairs = tensor.data_type in (TensorProto.COMPLEX64, TensorProto.COMPLEX128)
     return size if bits < 8 else prod(tensor.dims) * (2 if pairs else 1)
@@ -133,7 +133,7 @@ def _forget(tensor: TensorProto) -> None:
 
 
 def called(node: onnx.NodeProto) -> str:
-    """What messages call an operator."""
+    """Return what messages call an operator."""
     kind = f"{node.domain}:{node.op_type}" if node.domain not in ("", "ai.onnx") else node.op_type
     return f"{kind} {node.name!r}" if node.name else f"{kind} that makes {next(iter(node.output), '')!r}"
 
@@ -170,7 +170,7 @@ def _check_kinds(graph: onnx.GraphProto) -> None:
 
 
 def _made(graph: onnx.GraphProto) -> Iterator[str]:
-    """Names of all tensors, each as often as it is made. A weight may be declared as an input too."""
+    """Return the names of all tensors, each as often as it is made. A weight may be declared as an input too."""
     weights = [tensor.name for tensor in graph.initializer]
     yield from weights
     yield from (value.name for value in graph.input if value.name not in set(weights))

@@ -151,7 +151,7 @@ def _tensors(model: onnx.ModelProto) -> Iterator[TensorProto]:
 
 
 def _numbers(model: onnx.ModelProto) -> NumberFormat:
-    """Number format of the graph: integers where layers read dequantised activations, or are layers of integers."""
+    """Return the graph's number format: integers if its layers are integer ones or read dequantised activations."""
     graph, constants = model.graph, constant_tensors(model.graph)
     dequantised = {
         name

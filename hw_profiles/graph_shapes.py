@@ -85,7 +85,7 @@ def with_shapes(model: onnx.ModelProto, given: Mapping[str, Shape]) -> onnx.Mode
 def _known(
     graph: onnx.GraphProto, inputs: Sequence[onnx.ValueInfoProto], inferred: Mapping[str, onnx.ValueInfoProto]
 ) -> dict[str, Shape]:
-    """The static shapes of all tensors that have one, by name."""
+    """Return the static shapes of all tensors that have one, by name."""
     shapes = {tensor.name: tuple(tensor.dims) for tensor in graph.initializer}
     values = (*inputs, *inferred.values())
     return shapes | {value.name: sizes for value in values if (sizes := _sizes(value, least=0)) is not None}
@@ -118,7 +118,7 @@ def _check_input(value: onnx.ValueInfoProto) -> None:
 
 
 def _inferred(model: onnx.ModelProto) -> dict[str, onnx.ValueInfoProto]:
-    """The inferred value of each tensor, by name."""
+    """Return the inferred value of each tensor, by name."""
     looked_at = model
     if any((node.domain, node.op_type) in STAND_INS for node in model.graph.node):
         looked_at = onnx.ModelProto()
@@ -158,7 +158,7 @@ def _check_all(
 
 
 def _check_convolutions(graph: onnx.GraphProto, shapes: Mapping[str, Shape]) -> None:
-    """What ONNX does not look at: whether the weight has as many channels as what it is given and what comes out."""
+    """Check what ONNX does not: whether a weight's channels fit the input and the output of its convolution."""
     for node in graph.node:
         if node.op_type not in CONVOLUTIONS:
             continue
@@ -174,7 +174,10 @@ def _check_convolutions(graph: onnx.GraphProto, shapes: Mapping[str, Shape]) -> 
 
 
 def _channels_fit(transposed: bool, source: Shape, weight: Shape, result: Shape, groups: int) -> bool:
-    """Whether a convolution can be. `weight`: (out, in, ...), or (in, out, ...) of a transposed one, by group."""
+    """Return whether the channels of a convolution fit.
+
+    `weight`: (out, in, ...), or (in, out, ...) of a transposed one, by group.
+    """
     if not (groups > 0 and len(source) == len(weight) == len(result) > 2):
         return False
     if transposed:
@@ -196,7 +199,7 @@ def _unknown(
 
 
 def _keeps_sizes_outside(graph: onnx.GraphProto) -> bool:
-    """Whether another file has the data of a small tensor of integers, such as sizes and axes."""
+    """Return whether another file has the data of a small tensor of integers, such as sizes and axes."""
     return any(
         tensor.data_type == TensorProto.INT64 and 0 < prod(tensor.dims) <= KEPT_ELEMENTS
         for tensor in graph.initializer
@@ -209,7 +212,7 @@ def _has_schema(node: onnx.NodeProto) -> bool:
 
 
 def _sizes(value: onnx.ValueInfoProto, least: int = 1) -> Shape | None:
-    """Static shape of a tensor whose sizes are at least `least`; None when it has none."""
+    """Return the static shape of a tensor whose sizes are at least `least`; None when it has none."""
     kind = value.type.tensor_type
     if not kind.HasField("shape"):
         return None
@@ -258,7 +261,7 @@ def _keep(known: Values, names: Sequence[str], values: Sequence[NDArray[np.gener
 
 
 def _read(tensor: onnx.TensorProto) -> list[NDArray[np.generic]]:
-    """The values of a small tensor; nothing when they were forgotten or are kept outside the file."""
+    """Return the values of a small tensor; nothing when they were forgotten or are kept outside the file."""
     try:
         return [numpy_helper.to_array(tensor)]
     except _FAILURES:
@@ -271,7 +274,7 @@ def _results(
     shapes: Mapping[str, tuple[int, ...]],
     opsets: Sequence[onnx.OperatorSetIdProto],
 ) -> list[NDArray[np.generic]]:
-    """The values that `node` makes; nothing where it must not be evaluated."""
+    """Return the values that `node` makes; nothing where it must not be evaluated."""
     if node.domain not in ("", "ai.onnx"):
         return []
     if node.op_type in OF_SHAPES and node.input and node.input[0] in shapes:
@@ -299,7 +302,7 @@ def _of_shape(node: onnx.NodeProto, shape: tuple[int, ...]) -> list[NDArray[np.g
 
 
 def _is_small(node: onnx.NodeProto, values: Sequence[NDArray[np.generic]]) -> bool:
-    """Whether the result of `node` for `values` is bounded, and small."""
+    """Return whether the result of `node` for `values` is bounded, and small."""
     if node.op_type == "Constant":
         return all(prod(a.t.dims) <= KEPT_ELEMENTS for a in node.attribute if a.name == "value")
     if node.op_type == "Range" and len(values) == 3 and all(value.size == 1 for value in values):

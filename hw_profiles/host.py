@@ -36,7 +36,7 @@ FALLBACK_GHZ = 2.5
 ZEN_5 = "ResNet18 of width 64 at 512x512 on four Zen 5 cores"
 ZEN_3 = "ResNet18 of width 64 at 512x512 on four Zen 3 cores, docs/networks.md"
 #: CPU flag -> how many times faster each runtime is than ONNX Runtime in FP32, kind of these numbers, their source.
-#: `cuda` and `qnn` have none: neither was measured beside the others, and their speed is that of a device.
+#: `cuda` and `qnn` are missing: they run on a device of their own, and neither was measured beside the others.
 RUNTIMES: dict[str, tuple[dict[str, float], str, str]] = {
     "avx512_vnni": ({"openvino": 3.7, "ort": 2.2}, "measured", ZEN_5),
     "avx_vnni": ({"openvino": 3.7, "ort": 2.2}, "assumed", f"like {ZEN_5}"),
@@ -49,14 +49,14 @@ SHOWN = 8  # placements, beside the one that was taken
 
 
 def usable_cores() -> tuple[int, ...]:
-    """Numbers of the cores in the affinity mask, ascending, at most as many as the control group's quota allows."""
+    """Return the usable cores' numbers, ascending: those of the affinity mask, within the control group's quota."""
     cores = machine.here.cores()
     quota = cgroup_quota()
     return cores if quota is None else cores[: max(1, math.ceil(quota))]
 
 
 def cgroup_quota() -> float | None:
-    """How many CPUs' time the control group allows; None when it sets no limit."""
+    """Return how many CPUs' time the control group allows; None when it sets no limit."""
     root = machine.here.sys / "fs/cgroup"
     try:
         limit, period = (root / "cpu.max").read_text().split()
@@ -74,7 +74,7 @@ def cgroup_quota() -> float | None:
 
 
 def split_cores(cores: tuple[int, ...]) -> dict[str, tuple[int, ...]]:
-    """Cores of each unit: one for the CPU (and the scheduler), one for the GPU, the rest for the DSP.
+    """Return the cores of each unit: one for the CPU (and the scheduler), one for the GPU, the rest for the DSP.
 
     With eight cores or more, the GPU has a quarter of them. With two, CPU and GPU share one; with one, all share it.
     """
@@ -87,18 +87,24 @@ def split_cores(cores: tuple[int, ...]) -> dict[str, tuple[int, ...]]:
 
 
 def rule_placement(cores: tuple[int, ...], asked: Mapping[str, tuple[int, ...]] | None = None) -> Placement:
-    """`split_cores` with a thread for each core of a unit. `asked`: cores of the units that the user chose them for."""
+    """Return `split_cores` with a thread for each core of a unit. `asked`: cores that the user chose for units."""
     split = {**split_cores(cores), **(asked or {})}
     return {unit: Place(own, len(own)) for unit, own in split.items()}
 
 
 def host_units(cores: tuple[int, ...] | None = None) -> dict[str, UnitSettings]:
-    """Settings of the three units by `split_cores`. `cores`: cores of this machine; None for all usable ones."""
+    """Return the settings of the three units by `split_cores`.
+
+    `cores`: cores of this machine; None for all usable ones.
+    """
     return settings_of(rule_placement(cores or usable_cores()))
 
 
 def settings_of(placement: Placement) -> dict[str, UnitSettings]:
-    """Settings of the units of a placement. Threads spin between jobs only on cores that no other unit shares."""
+    """Return the settings of the units of a placement.
+
+    Threads spin between jobs only on cores that no other unit shares.
+    """
     return {
         unit: UnitSettings(cores=place.cores, threads=place.threads, spin=has_own_cores(unit, placement))
         for unit, place in placement.items()
@@ -106,7 +112,7 @@ def settings_of(placement: Placement) -> dict[str, UnitSettings]:
 
 
 def asked_cores(texts: Sequence[str]) -> dict[str, tuple[int, ...]]:
-    """`UNIT=LIST` texts as the cores of each unit, ascending. Raises BadInputError naming what is wrong."""
+    """Return the cores of each unit, ascending, from `UNIT=LIST` texts. Raises BadInputError naming what is wrong."""
     asked: dict[str, tuple[int, ...]] = {}
     usable = machine.here.cores()
     for text in texts:
@@ -126,7 +132,7 @@ def asked_cores(texts: Sequence[str]) -> dict[str, tuple[int, ...]]:
 
 
 def _listed(text: str, listed: str) -> tuple[int, ...]:
-    """The numbers of a list such as `0,2-5`."""
+    """Return the numbers of a list such as `0,2-5`."""
     cores: list[int] = []
     for part in listed.split(","):
         ends = re.fullmatch(r"(\d{1,5})(?:-(\d{1,5}))?", part.strip())
@@ -139,9 +145,9 @@ def _listed(text: str, listed: str) -> tuple[int, ...]:
 
 
 def host_cores(numbers: Sequence[int]) -> tuple[CpuCore, ...]:
-    """What the kernel says of the cores with these numbers: which are siblings, and how fast each type is.
+    """Return the kernel's facts about the cores with these numbers: which are siblings, and how fast each type is.
 
-    Where it says nothing, a core counts as a physical one that is as fast as the others.
+    Without such facts, a core counts as a physical one that is as fast as the others.
     """
     root = machine.here.sys / "devices/system/cpu"
     siblings = {number: _number(root / f"cpu{number}/topology/thread_siblings_list", number) for number in numbers}
@@ -158,7 +164,7 @@ def host_cores(numbers: Sequence[int]) -> tuple[CpuCore, ...]:
 
 
 def _number(file: Path, otherwise: int) -> int:
-    """The first number in a file; `otherwise` without one."""
+    """Return the first number in a file; `otherwise` without one."""
     try:
         found = re.match(r"\d+", file.read_text())
     except OSError:
@@ -167,7 +173,7 @@ def _number(file: Path, otherwise: int) -> int:
 
 
 def host_tables() -> dict[str, Any]:
-    """Tables that are laid over those of `host.toml`: title, peak rates of the units, speeds of the runtimes."""
+    """Return tables that are laid over those of `host.toml`: title, peak rates of the units, speeds of the runtimes."""
     cores = len(usable_cores())
     ghz = machine.here.clock_ghz()
     known_ghz = ghz if ghz > 0 else FALLBACK_GHZ
@@ -192,7 +198,7 @@ def host_tables() -> dict[str, Any]:
 
 
 def network_threads() -> int:
-    """Number of cores whose rates the DSP unit of the profile `host` has."""
+    """Return the number of cores whose rates the DSP unit of the profile `host` has."""
     return max(1, len(usable_cores()) - 2)
 
 
@@ -229,7 +235,7 @@ def fastest_runtime(profile: Profile, installed: Sequence[str]) -> tuple[str, st
 
 
 def described(placement: Placement) -> str:
-    """Text of a placement, such as `cpu 0, gpu 1, dsp 0,1 (2 threads)`."""
+    """Return the text of a placement, such as `cpu 0, gpu 1, dsp 0,1 (2 threads)`."""
     return ", ".join(f"{unit} {_cores(place)}" for unit, place in placement.items())
 
 
@@ -241,17 +247,17 @@ def _cores(place: Place) -> str:
 
 
 def unit_rows(placement: Placement) -> dict[str, Any]:
-    """`cores` and `threads` of each unit, as JSON takes them."""
+    """Return `cores` and `threads` of each unit for JSON."""
     return {unit: {"cores": list(place.cores), "threads": place.threads} for unit, place in placement.items()}
 
 
 def placement_of(rows: Mapping[str, Any]) -> Placement:
-    """The placement that `unit_rows` made `rows` of."""
+    """Return the placement that `unit_rows` made `rows` of."""
     return {unit: Place(tuple(row["cores"]), row["threads"]) for unit, row in rows.items()}
 
 
 def predictions(best: Ranked, rule: Ranked, found: Sequence[Ranked]) -> dict[str, Any]:
-    """Computed keys of a placement in a report: frame times in ms of the best, of the rule's and of the next best."""
+    """Return a placement's computed keys in a report: frame times in ms of the best, the rule's and the next best."""
     others = [each for each in found if each.placement != best.placement][:SHOWN]
     return {
         "predicted_ms": best.frame_ns / NS_PER_MS,

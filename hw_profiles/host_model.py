@@ -106,7 +106,7 @@ def _can_be_simulated(placement: Placement) -> bool:
 
 
 def _times(profile: Profile, plan: Plan, corners: Corners, cores: int, given: Placement) -> Times:
-    """The model's times of a frame, by unit and number of threads.
+    """Return the model's times of a frame, by unit and number of threads.
 
     The network's unit may have as many threads as there are cores.
     `cores`: number of cores.
@@ -141,7 +141,7 @@ def with_threads(unit: Unit, threads: int) -> Unit:
 
 
 def error_of(took: Sequence[float]) -> float:
-    """Relative error of what follows from measured times: their scatter and `MODEL_ERROR`.
+    """Return the relative error of what follows from measured times: their scatter and `MODEL_ERROR`.
 
     `took`: measured times, each above 0; a single one has no scatter.
     """
@@ -197,10 +197,7 @@ def _measured(value: float, source: str) -> Quantity:
 
 
 def with_known_intervals(profile: Profile, unit: UnitName, answer: dict[str, Any]) -> dict[str, Any]:
-    """Return `answer`, a prediction for `unit` of this machine, with null for the intervals of what was not measured.
-
-    No power of this machine is ever measured. Without measured times the words of a rate say only whether it holds.
-    """
+    """Return `answer`, a prediction for `unit` of this machine, with null for the intervals of unmeasured figures."""
     if profile.units[unit].measured is not None:
         return _without(answer, OF_POWER)
     known = _without(answer, OF_POWER | OF_TIMES)

@@ -32,7 +32,6 @@ from trilane.hw_profiles.over_time import (
     timeline_of,
     warm_up,
 )
-from trilane.hw_profiles.profile_files import HOST
 from trilane.hw_profiles.rates import NOTHING, FrameInterval, FrameLoad, Wanted, answers, device_power
 from trilane.hw_profiles.schema import NORMAL_80, Corners, EngineRuntime, Profile, Unit, corners_of
 from trilane.hw_profiles.unit_times import (
@@ -45,7 +44,7 @@ from trilane.hw_profiles.unit_times import (
     relative_error,
     time_on,
 )
-from trilane.units import BURST, UNITS, UnitName
+from trilane.units import BURST, HOST, UNITS, UnitName
 
 #: Relative error from which a term is named that alone makes the time so uncertain.
 NAMED_FROM = 0.05
@@ -85,12 +84,12 @@ class Interval(NamedTuple):
 
 
 def spread_of(around: Interval) -> float:
-    """The standard deviation of the time's logarithm."""
+    """Return the standard deviation of the time's logarithm."""
     return math.log(around.high_ms / around.low_ms) / 2 / NORMAL_80
 
 
 def price(profile: Profile, work: Work, unit: UnitName, corners: Corners) -> NetworkTime:
-    """The time of one job of the network when nothing else runs.
+    """Return the time of one job of the network when nothing else runs.
 
     `profile`: hardware profile of the chip.
     `work`: work of the network, which may have several hundred operators.
@@ -133,7 +132,7 @@ def _by_roofline(operator: Operator, machine: UnitNumbers) -> OperatorTime:
 
 
 def interval(profile: Profile, work: Work, time: NetworkTime) -> Interval:
-    """The 80 % interval around `time`: the model's own error, and what its numbers leave open for this network.
+    """Return the 80 % interval around `time`: the model's own error, and what its numbers leave open for this network.
 
     `profile`: hardware profile of the chip.
     `work`: work of the network.
@@ -171,7 +170,7 @@ def _likeness(job: JobTime) -> str:
 
 
 def _ill_known(work: Work, unit: Unit) -> list[tuple[str, float, float]]:
-    """The terms that make the time uncertain: name, share of the time, relative spread of their cost."""
+    """Return the terms that make the time uncertain: name, share of the time, relative spread of their cost."""
     assert unit.engine is not None
     factors = unit.engine.factors
     shares = engine_time(work.layers, numbers_of(unit.engine)).shares
@@ -234,8 +233,8 @@ def predict_network(
     `performance_profile`: its name; published latencies are taken to be under `burst`.
     `minutes`: virtual time from a cold start, at the wanted rate or as fast as it can; 0 for none.
     `governor`: name in GOVERNORS; None for the profile's own.
-    `wanted`: a rate that may hold or not, and a limit of power.
-    Raises BadInputError for an unknown name, a time out of range, and operators that cannot be counted.
+    `wanted`: rate to judge, and limit of power. Raises BadInputError for an unknown name, a time out of range, and
+    operators that cannot be counted.
     """
     work, corners = graph.work, corners_of(profile, performance_profile)
     time = price(profile, work, unit, corners)
@@ -293,7 +292,7 @@ def _times(time: NetworkTime, around: Interval) -> dict[str, Any]:
 
 
 def operator_rows(work: Work, time: NetworkTime) -> list[dict[str, Any]]:
-    """The operators in the order of the file, with what bounds each and its share of the network's time.
+    """Return the operators in the order of the file, with what bounds each and its share of the network's time.
 
     An operator that the unit's runtime folds into another one is missing, as it is in `time`.
     """
@@ -314,7 +313,7 @@ def operator_rows(work: Work, time: NetworkTime) -> list[dict[str, Any]]:
 
 
 def without_rule(work: Work) -> list[dict[str, Any]]:
-    """Types of operators without a rule: how many there are, and their share of all moved elements."""
+    """Return the types of operators without a rule: how many there are, and their share of all moved elements."""
     moved = Counter[str]()
     for operator in work.operators:
         if not operator.ruled:

@@ -149,7 +149,7 @@ def count_work(model: Any) -> Work:
 
 
 def _picture_tensors(graph: Any, inputs: list[str]) -> int:
-    """Number of tensors that a picture comes in: all inputs, where nothing but one concatenation reads them."""
+    """Return the number of tensors of a picture: all inputs, where nothing but one concatenation reads them."""
     given, readers = set(inputs), []
     for node in graph.node:
         if given.intersection(node.input):
@@ -161,13 +161,16 @@ def _picture_tensors(graph: Any, inputs: list[str]) -> int:
 
 
 def graph_facts(model: Any) -> dict[str, Any]:
-    """`parameters`: those of the layers, as in the file. `gmac`: of one pass. Raises as `count_work` does."""
+    """Return the facts of a network for reports; raises as `count_work` does.
+
+    Keys: `parameters`, those of the layers, as in the file; `gmac`, products of one pass, 1e9.
+    """
     work = count_work(model)
     return {"parameters": work.weights, "gmac": work.macs / 1e9}
 
 
 def constant_tensors(graph: Any) -> set[str]:
-    """Names of the tensors that do not depend on the network's input: weights, and what follows from them.
+    """Return the names of the tensors that do not depend on the network's input: weights, and what follows from them.
 
     In a graph without weights these are the inputs named `w<n>`, and every input of a layer after its first.
     """
@@ -211,7 +214,7 @@ def _size(shapes: Shapes, name: str) -> int:
 
 
 def _lone_normalisations(graph: Any) -> set[str]:
-    """Results of batch normalisations that follow no product which could absorb them."""
+    """Return the results of batch normalisations that no product before them can absorb."""
     maker = {name: node.op_type for node in graph.node for name in node.output}
     reads = Counter(name for node in graph.node for name in node.input)
     return {
@@ -231,7 +234,7 @@ def _costs_nothing(node: Any, constants: set[str]) -> bool:
 
 
 def _live_counts(graph: Any, shapes: Shapes, constants: set[str]) -> list[int]:
-    """After each node: elements of all results so far that later nodes, or the caller, still need."""
+    """Return, after each node, the elements of all results so far that later nodes or the caller still need."""
     last_use = {name: index for index, node in enumerate(graph.node) for name in node.input if name not in constants}
     last_use |= {output.name: len(graph.node) for output in graph.output}
     freed: dict[int, int] = {}
@@ -248,7 +251,10 @@ def _live_counts(graph: Any, shapes: Shapes, constants: set[str]) -> list[int]:
 
 
 def _operator(node: Any, shapes: Shapes, constants: set[str], read: set[str]) -> Operator:
-    """Counts of `node`. `constants`: tensors that do not depend on the input. `read`: tensors that somebody reads."""
+    """Return counts of `node`.
+
+    `constants`: tensors that do not depend on the input. `read`: tensors that somebody reads.
+    """
     known = has_rule(node.op_type, node.domain)
     weighted = node.op_type in WEIGHTED and known
     own = node.input[:SCALE_AND_SHIFT] if node.op_type == "BatchNormalization" else node.input
@@ -268,7 +274,7 @@ def _operator(node: Any, shapes: Shapes, constants: set[str], read: set[str]) ->
 
 
 def _convolution(node: Any, shapes: Shapes, plain: Operator) -> Operator:
-    """Counts of a convolution. `plain`: counts of its movement and its weights."""
+    """Return counts of a convolution. `plain`: counts of its movement and its weights."""
     groups = next((a.i for a in node.attribute if a.name == "group"), 1)
     weight, source, result = (
         shapes[name] for name in (node.input[CONVOLUTIONS[node.op_type]], node.input[0], node.output[0])

@@ -96,7 +96,7 @@ Shape = tuple[int, ...]
 
 
 def has_rule(op_type: str, domain: str = "") -> bool:
-    """Whether the tables know the ONNX operator `op_type` of `domain`."""
+    """Return whether the tables know the ONNX operator `op_type` of `domain`."""
     return domain in DOMAINS and op_type in _KNOWN
 
 
@@ -143,7 +143,10 @@ def _recurrent(shapes: list[Shape]) -> Product:
 
 
 def _einsum(node: Any, shapes: list[Shape]) -> Product | None:
-    """Count one product for every combination of all indices. An equation with an ellipsis is not looked into."""
+    """Count one product for every combination of all indices.
+
+    An equation with an ellipsis is not looked into.
+    """
     equation = next((a.s.decode() for a in node.attribute if a.name == "equation"), "").replace(" ", "")
     sources, _, result = equation.partition("->")
     terms = sources.split(",")

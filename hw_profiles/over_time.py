@@ -1,7 +1,7 @@
-"""What runs on a chip, over minutes: it warms up, the governor throttles it, and reports sum the moments up.
+"""A chip over minutes: it warms up, the governor throttles it, and reports sum up the moments.
 
-Between two polls of the governor the application is in its settled state at the corners of that time; nothing else
-changes the power. What reports say of the moments models nothing more.
+Between two polls of the governor the application stays in the settled state of its corners; nothing else changes the
+power. A report only sums up moments; it models nothing more.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def warm_up(
     minutes: float,
     governor: str | None = None,
 ) -> list[Moment]:
-    """Do the same as `over_time` for whatever settles as `at` says.
+    """Do the same as `over_time` for any load whose settled state `at` gives.
 
     `at`: returns the settled state at given corners; it is called once for each combination.
     """
@@ -100,30 +100,30 @@ def warm_up(
 
 
 def unit_power_w(profile: Profile, now: Settled, corners: Corners) -> dict[UnitName, float]:
-    """Mean power of each unit in watts in the settled state `now`, with the units at `corners`."""
+    """Return the mean power of each unit in watts in the settled state `now`, with the units at `corners`."""
     return {
         name: profile.units[name].power_w(corner, now.busy[name]) for name, corner in zip(UNITS, corners, strict=True)
     }
 
 
 def last_fifth(moments: Sequence[Moment]) -> Sequence[Moment]:
-    """The moments to which a run settles: the last fifth of them, at least one; empty without moments."""
+    """Return the moments to which a run settles: the last fifth of them, at least one; empty without moments."""
     return moments[-max(1, len(moments) // 5) :]
 
 
 def ends_of(moments: Sequence[Moment]) -> dict[str, float]:
-    """Frames a second at the start, and those to which it settles: the mean of the last fifth of the time."""
+    """Return frames a second at the start, and those to which it settles: the mean of the last fifth of the time."""
     last = last_fifth(moments)
     return {"fps_start": 1e3 / moments[0].frame_ms, "fps_settled": 1e3 / (sum(m.frame_ms for m in last) / len(last))}
 
 
 def settled_corners(moments: Sequence[Moment]) -> Corners:
-    """The corners at which the units mostly are in the last fifth of the time."""
+    """Return the corners at which the units mostly are in the last fifth of the time."""
     return Counter(moment.corners for moment in last_fifth(moments)).most_common(1)[0][0]
 
 
 def temperatures_of(moments: Sequence[Moment]) -> dict[str, float]:
-    """Degrees Celsius of the device and of its hottest junction; empty without moments."""
+    """Return the degrees Celsius of the device and of its hottest junction; empty without moments."""
     if not moments:
         return {}
     return {
@@ -134,7 +134,7 @@ def temperatures_of(moments: Sequence[Moment]) -> dict[str, float]:
 
 
 def caps_of(moments: Sequence[Moment]) -> dict[str, Any]:
-    """Share of the time in which a unit was lowered for heat, and the first second of it."""
+    """Return the share of the time in which a unit was lowered for heat, and the first second of it."""
     throttled_s = [m.t_s for m in moments if m.throttled]
     return {
         "throttled_share": len(throttled_s) / len(moments) if moments else 0.0,
@@ -143,7 +143,7 @@ def caps_of(moments: Sequence[Moment]) -> dict[str, Any]:
 
 
 def timeline_of(moments: Sequence[Moment]) -> list[dict[str, Any]]:
-    """The moments as plain data, thinned."""
+    """Return the moments as plain data, thinned."""
     return [_shown(m) for m in moments[:: max(1, len(moments) // MOST_SHOWN)]]
 
 

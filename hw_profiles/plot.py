@@ -17,7 +17,7 @@ SUFFIXES = (".png", ".svg", ".pdf")
 
 
 def figure_for(path: Path, inches: tuple[float, float]) -> Any:
-    """An empty `matplotlib.figure.Figure`, `inches` wide and high, that can be drawn into the file.
+    """Return an empty `matplotlib.figure.Figure`, `inches` wide and high, that can be drawn into the file.
 
     `path`: path of the file; its ending is one of SUFFIXES.
     Raises MissingPartError without Matplotlib, BadInputError for another ending.

@@ -1,8 +1,8 @@
 """Predictions for a chip: one configuration over minutes or at a rate, its alternatives, or a table of many.
 
 Every number is on the virtual clock and comes with the relative error to expect of it. `confidence` is one minus that
-error, and zero when the error is as large as the number. A rate holds the application as a display of that rate would;
-policies that release frames at a rate have it themselves.
+error, and zero when the error is as large as the number. A rate limits the application as a display of that rate would;
+policies that release frames at a rate use it themselves.
 """
 
 from __future__ import annotations
@@ -36,7 +36,6 @@ from trilane.hw_profiles.over_time import (
     timeline_of,
     unit_power_w,
 )
-from trilane.hw_profiles.profile_files import HOST
 from trilane.hw_profiles.rates import NOTHING, FrameInterval, FrameLoad, Wanted, answers, device_power
 from trilane.hw_profiles.reference_networks import ConfigurationRow, reference_network
 from trilane.hw_profiles.schema import Corners, Profile, corners_of
@@ -45,7 +44,7 @@ from trilane.scheduler.placement import Ranked
 from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.stats import energy_score
 from trilane.scheduler.virtual import Simulation
-from trilane.units import NS_PER_MS, SUSTAINED, UNITS, UnitName
+from trilane.units import HOST, NS_PER_MS, SUSTAINED, UNITS, UnitName
 
 #: Rows of `what_if`: name, how the stages are joined, share of the network on the GPU. All release frames as
 #: often as the display can show them, because they are compared with each other.
@@ -126,7 +125,7 @@ def predict(
 def predicted_run(
     profile: Profile, plan: Plan, performance_profile: str = SUSTAINED, wanted: Wanted = NOTHING
 ) -> Simulation:
-    """Return the run in virtual time, at constant temperature, that `predict` takes its shares of time from.
+    """Return the run in virtual time, at constant temperature, from which `predict` takes its shares of time.
 
     Parameters and errors: as in `predict`.
     """
@@ -194,7 +193,7 @@ def _settled_on(
 
 
 def _notes(profile: Profile, plan: Plan, placed: Placed | None) -> list[str]:
-    """What a reader of the figures must know of the profile, the policy and the placement."""
+    """Return what a reader of the figures must know of the profile, the policy and the placement."""
     notes, variant, measured = [], plan.variant, profile.units[plan.runtime].measured
     if POLICIES[variant.policy].paced:
         notes.append(
@@ -271,7 +270,7 @@ def _frame_times(profile: Profile, mean_ms: float, frames: Sequence[float]) -> d
 
 
 def ema_range_ms(profile: Profile, mean_ms: float) -> tuple[float, float]:
-    """Least and greatest exponential average over 20 frames, in ms; never below the display's interval."""
+    """Return the least and greatest exponential average over 20 frames, in ms; never below the display's interval."""
     half = profile.application.ema20_half_range_fraction.or_else(0) * mean_ms
     return max(profile.application.display_ms.or_else(0), mean_ms - half), mean_ms + half
 
@@ -296,7 +295,7 @@ def _row_predictions(profile: Profile, network: Network, corners: Corners, varia
 
 
 def _cells(row: ConfigurationRow) -> dict[str, Any]:
-    """The cells of the row as text, whole numbers as integers."""
+    """Return the cells of the row as text, whole numbers as integers."""
     return {key: int(text) if text.isdecimal() else text for key, text in row.cells.items()}
 
 
@@ -314,7 +313,7 @@ def _unheld(plan: Plan) -> Plan:
 
 
 def unheld_times(profile: Profile, plan: Plan, corners: Corners, around: Interval, network_ms: float) -> FrameInterval:
-    """Times of a frame when neither the display nor a rate holds the application.
+    """Return the times of a frame when neither the display nor a rate holds the application.
 
     A frame's times follow from the network's. Where the other stages were measured with it, they have its relative
     error.
@@ -334,13 +333,13 @@ def unheld_times(profile: Profile, plan: Plan, corners: Corners, around: Interva
 
 
 def least_ms(profile: Profile, plan: Plan) -> float:
-    """Least milliseconds between frames that the display, or the rate, allows."""
+    """Return the least milliseconds between frames that the display, or the rate, allows."""
     fps = plan.variant.fps if POLICIES[plan.variant.policy].paced else plan.most_fps
     return max(profile.application.display_ms.or_else(0), 1e3 / fps if fps else 0.0)
 
 
 def around_frame(frame_ms: float, times: FrameInterval, least: float) -> dict[str, float]:
-    """The 80 % interval of a mean frame time, from that of the network.
+    """Return the 80 % interval of a mean frame time, from that of the network.
 
     `frame_ms`: mean frame time.
     `times`: times of a frame when nothing holds the application.
@@ -351,7 +350,7 @@ def around_frame(frame_ms: float, times: FrameInterval, least: float) -> dict[st
 
 
 def load_of(profile: Profile, plan: Plan) -> FrameLoad:
-    """The application as fast as it can be, but no faster than the display."""
+    """Return the load of the application when only the display limits its rate."""
 
     def work_ms(corners: Corners) -> dict[UnitName, float]:
         times = stage_times_ms(profile, plan, corners)
@@ -361,7 +360,7 @@ def load_of(profile: Profile, plan: Plan) -> FrameLoad:
 
 
 def power_of(profile: Profile, plan: Plan, corners: Corners, around: Interval) -> dict[str, Any]:
-    """Power of the settled application, as `device_power` returns it.
+    """Return the power of the settled application, as `device_power` returns it.
 
     `profile`: hardware profile of the chip.
     `plan`: application that runs on it.
@@ -373,7 +372,7 @@ def power_of(profile: Profile, plan: Plan, corners: Corners, around: Interval) -
 
 
 def _settled_power_w(profile: Profile, now: Steady, corners: Corners) -> float:
-    """Mean power of the whole device in watts, its base included."""
+    """Return the mean power of the whole device in watts, its base included."""
     return sum(unit_power_w(profile, now, corners).values()) + profile.thermal.base_power_w.or_else(0)
 
 
@@ -384,7 +383,7 @@ def every_variant() -> Iterator[Variant]:
 
 
 def at_rate(profile: Profile, plan: Plan, corners: Corners, fps: float) -> dict[str, Any]:
-    """One row of the comparison at a rate: whether the rate holds, the share of dropped frames, and the power.
+    """Return one row of the comparison at a rate: whether the rate holds, the share of dropped frames, and the power.
 
     `profile`: hardware profile of the chip.
     `plan`: application that runs on it.

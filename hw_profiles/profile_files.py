@@ -19,8 +19,8 @@ from trilane.errors import BadInputError
 from trilane.hw_profiles.host import host_tables
 from trilane.hw_profiles.schema import Profile
 from trilane.unexpected_value import unexpected_in
+from trilane.units import HOST
 
-HOST = "host"
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 8
 #: Keys of a quantity. An extending profile replaces a quantity as a whole, never its value or its source alone.
@@ -29,17 +29,17 @@ UNIT_HINT = "units of measure end the name"
 
 
 def profile_folder() -> Path:
-    """The folder of the profiles that come with Trilane."""
+    """Return the folder of the profiles that come with Trilane."""
     return Path(str(resources.files("trilane.hw_profiles")))
 
 
 def profile_names() -> list[str]:
-    """The names of the profiles that come with Trilane, templates included."""
+    """Return the names of the profiles that come with Trilane, templates included."""
     return sorted(path.stem for path in profile_folder().glob("*.toml"))
 
 
 def load_profile(name: str | Path) -> Profile:
-    """The profile `name`: one that comes with Trilane, or a path to a TOML file.
+    """Return the profile `name`: one that comes with Trilane, or a path to a TOML file.
 
     Raises BadInputError when there is none or something in it is wrong.
     """
@@ -51,7 +51,10 @@ def load_profile(name: str | Path) -> Profile:
 
 
 def load_runnable(name: str | Path) -> Profile:
-    """The profile `name`. Raises BadInputError as `load_profile`, and for a template, which describes no chip."""
+    """Return the profile `name`.
+
+    Raises BadInputError as `load_profile`, and for a template, which describes no chip.
+    """
     profile = load_profile(name)
     if profile.template:
         chips = [other for other in profile_names() if not load_profile(other).template]
@@ -60,7 +63,10 @@ def load_runnable(name: str | Path) -> Profile:
 
 
 def load_tables(name: str | Path) -> tuple[dict[str, Any], Path]:
-    """The merged tables of the profile `name`, before the schema is checked, and its path. Raises BadInputError."""
+    """Return the merged tables of the profile `name`, before the schema is checked, and its path.
+
+    Raises BadInputError.
+    """
     path = _find(str(name), Path())
     return merged_tables(path), path
 
@@ -74,7 +80,7 @@ def parse_profile(data: Mapping[str, Any], path: Path) -> Profile:
 
 
 def merged_tables(path: Path, seen: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """The tables of `path` laid over those of the profile that it extends; `seen`: files that extend this one.
+    """Return the tables of `path` laid over those of the profile that it extends; `seen`: files that extend this one.
 
     Raises BadInputError for a cycle or an unreadable file.
     """
@@ -167,7 +173,7 @@ def _short(value: Any) -> str:
 
 
 def _siblings(keys: Sequence[str]) -> Iterator[str]:
-    """The keys that the schema allows beside the last of `keys`."""
+    """Return the keys that the schema allows beside the last of `keys`."""
     model: Any = Profile
     for key in keys[:-1]:
         fields = getattr(model, "model_fields", {})
@@ -176,6 +182,6 @@ def _siblings(keys: Sequence[str]) -> Iterator[str]:
 
 
 def _model_of(annotation: Any) -> Any:
-    """The model that `dict[str, Model]` holds, or the annotation itself."""
+    """Return the model that `dict[str, Model]` holds, or the annotation itself."""
     arguments = getattr(annotation, "__args__", ())
     return arguments[-1] if arguments else annotation

@@ -85,7 +85,7 @@ class PublishedTime(NamedTuple):
 
 @lru_cache(maxsize=1)
 def unet_work() -> Work:
-    """The work of the published U-Net."""
+    """Return the work of the published U-Net."""
     b = GraphBuilder("batch")
     x = _double(b, b.input("image", 3, *UNET_SIZE), UNET_WIDTHS[0])
     skips = []
@@ -107,7 +107,7 @@ def _double(b: GraphBuilder, x: TensorRef, width: int) -> TensorRef:
 
 @lru_cache(maxsize=1)
 def resnet18_work() -> Work:
-    """ResNet18 as a classifier of 224x224 pictures, which it normalises, into 1000 classes."""
+    """Return the work of ResNet18 as a classifier of 224x224 pictures, which it normalises, into 1000 classes."""
     b = GraphBuilder("batch")
     picture = b.same("Sub", b.input("image", 3, 224, 224), b.weight((1, 3, 1, 1)))
     x = resnet18(b, b.same("Div", picture, b.weight((1, 3, 1, 1))))[-1]
@@ -119,7 +119,7 @@ WORK = {"unet": unet_work, "resnet18": resnet18_work}
 
 
 def check_published(name: str, profile: Profile) -> list[PublishedTime]:
-    """Published times of the chip `name` beside those that `profile` predicts under `burst`; empty where none is known.
+    """Return published times of the chip `name` beside those that `profile` predicts under `burst`; empty for none.
 
     A runtime for which the profile has no numbers of the tensor engine is left out.
     """
@@ -149,7 +149,7 @@ class Latency(NamedTuple):
 
 
 def read_latencies(folder: Path) -> list[Latency]:
-    """The rows of `chip_rows.csv` that tell something of the engine. Raises BadInputError."""
+    """Return the rows of `chip_rows.csv` that tell something of the engine. Raises BadInputError."""
     families = {row["name"]: row["family"] for row in _table(folder / "networks.csv") if row["split"] != "extra"}
     rows = _table(folder / "chip_rows.csv")
     if not rows or set(COLUMNS) - rows[0].keys():
@@ -179,10 +179,10 @@ def _table(path: Path) -> list[dict[str, str]]:
 
 @lru_cache(maxsize=128)
 def layers_in(folder: Path, network: str) -> Layers:
-    """The layers of a network of the folder."""
+    """Return the layers of a network of the folder."""
     return read_graph(folder / "networks" / f"{network}.onnx").work.layers
 
 
 def layers_of_rows(folder: Path, rows: Sequence[Latency]) -> dict[str, Layers]:
-    """The layers of every network that `rows` name."""
+    """Return the layers of every network that `rows` name."""
     return {name: layers_in(folder, name) for name in sorted({row.network for row in rows})}

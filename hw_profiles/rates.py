@@ -17,7 +17,7 @@ from trilane.units import UNITS, UnitName
 
 
 class Wanted(NamedTuple):
-    """What a user wants of a chip. `fps`: frames a second. `power_limit_w`: watts of the whole device."""
+    """The rate and the limit of power that a user wants to know about."""
 
     fps: float | None = None
     power_limit_w: float | None = None
@@ -70,10 +70,10 @@ class FrameLoad(NamedTuple):
 
 
 def within_power(profile: Profile, requested: Corners, load: FrameLoad, limit_w: float) -> dict[str, Any]:
-    """The highest rate at which the device takes at most `limit_w`, and the corners of its units there.
+    """Return the highest rate at which the device takes at most `limit_w`, and the corners of its units there.
 
     `limited_by` is `speed` where the requested corners reach that rate, `power` otherwise. `low_fps` and `high_fps` are
-    the rates if the device takes as much more or less than expected as the 80 % interval of its power says.
+    the rates at the two ends of the 80 % interval of the device's power.
 
     Each unit may be at any corner up to the `requested` one. For given corners the power is linear in the rate: the
     power of idle units, plus the energy of the work for each frame.
@@ -101,7 +101,7 @@ def within_power(profile: Profile, requested: Corners, load: FrameLoad, limit_w:
 
 
 def _best(profile: Profile, requested: Corners, load: FrameLoad, limit_w: float) -> tuple[_Choice, float]:
-    """The choice of corners with the highest rate, and the rate."""
+    """Return the choice of corners with the highest rate, and the rate."""
     choices = sorted(
         (_by_power(profile, corners, load, limit_w) for corners in _allowed(requested, load)),
         key=lambda choice: -choice.most_fps,
@@ -140,7 +140,7 @@ def _by_power(profile: Profile, corners: Corners, load: FrameLoad, limit_w: floa
 
 
 def _allowed(requested: Corners, load: FrameLoad) -> list[Corners]:
-    """All corners up to the requested ones; only the requested one for a unit that does nothing."""
+    """Return all corners up to the requested ones; only the requested one for a unit that does nothing."""
     working = load.work_ms(requested)
 
     def up_to(unit: UnitName, corner: Corner) -> tuple[Corner, ...]:
@@ -153,7 +153,7 @@ def _allowed(requested: Corners, load: FrameLoad) -> list[Corners]:
 def answers(
     profile: Profile, load: FrameLoad, corners: Corners, wanted: Wanted, times: FrameInterval
 ) -> dict[str, Any]:
-    """`rate` and `power_limit`, each only where it is wanted.
+    """Return `rate` and `power_limit`, each only where it is wanted.
 
     `profile`: hardware profile of the chip.
     `load`: what runs, as work and least frame time.
@@ -180,7 +180,7 @@ class _Watts(NamedTuple):
 def device_power(
     profile: Profile, busy: Mapping[str, float], corners: Corners, busy_error: Mapping[UnitName, float]
 ) -> dict[str, Any]:
-    """Power of the whole device, of each unit, and of the base, which is no unit (memory, screen, radio).
+    """Return the power of the whole device, of each unit, and of the base, which is no unit (memory, screen, radio).
 
     `profile`: hardware profile of the chip.
     `busy`: share of the time in which each unit works.
@@ -201,7 +201,7 @@ def device_power(
 
 
 def _unit(profile: Profile, name: UnitName, corners: Corners, busy: float, busy_error: float) -> tuple[float, float]:
-    """Mean and standard deviation of the power of a unit, in watts."""
+    """Return the mean and standard deviation of the power of a unit, in watts."""
     unit, corner = profile.units[name], corners[UNITS.index(name)]
     active, idle = unit.power_w(corner, 1.0), unit.power_w(corner, 0.0)
     exponent = unit.power_exponent.or_else(3.0) * unit.power_exponent.relative_error
@@ -215,7 +215,7 @@ def _unit(profile: Profile, name: UnitName, corners: Corners, busy: float, busy_
 
 
 def _watts(mean: float, deviation: float) -> _Watts:
-    """The interval of a log-normal distribution of this mean and standard deviation."""
+    """Return the interval of a log-normal distribution of this mean and standard deviation."""
     if not mean:
         return _Watts(0.0, 0.0, 0.0)
     variance = math.log1p((deviation / mean) ** 2)

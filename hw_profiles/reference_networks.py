@@ -79,19 +79,19 @@ class NetworkSpec:
 
 
 def reference_network(spec: NetworkSpec) -> Network:
-    """The network of `spec`, with its work and the facts that reports name it by."""
+    """Return the network of `spec`, with its work and the facts that reports name it by."""
     facts = {"encoder": spec.encoder, "norm": spec.norm}
     return Network(facts, spec.height, spec.width, spec.channels, spec.layout, network_work(spec))
 
 
 @lru_cache(maxsize=4096)
 def network_work(spec: NetworkSpec) -> Work:
-    """The work of the network of `spec`."""
+    """Return the work of the network of `spec`."""
     return count_work(build_network(spec))
 
 
 def build_network(spec: NetworkSpec) -> Any:
-    """The network as an `onnx.ModelProto` (opset 21, NCHW, batch 1) whose weights are inputs named `w<n>`."""
+    """Return the network as an `onnx.ModelProto` (opset 21, NCHW, batch 1) whose weights are inputs named `w<n>`."""
     b = GraphBuilder(spec.norm)
     x = _network_input(b, spec)
     body = _decoder(b, encode(b, x, spec.encoder))
@@ -106,7 +106,7 @@ def _require_one_of(key: str, value: str, known: tuple[str, ...]) -> None:
 
 
 def _network_input(b: GraphBuilder, spec: NetworkSpec) -> TensorRef:
-    """The input as the raster stage makes it.
+    """Return the input as the raster stage makes it.
 
     `packed`: one tensor. `split`: one tensor per raster pass, joined and permuted before the first convolution.
     """
@@ -120,7 +120,7 @@ def _network_input(b: GraphBuilder, spec: NetworkSpec) -> TensorRef:
 
 
 def _decoder(b: GraphBuilder, features: list[TensorRef]) -> TensorRef:
-    """Features at full size, from the encoder's smallest up, each joined with the encoder's of the same size."""
+    """Return the features at full size: from the smallest up, each is joined with the encoder's of its size."""
     x, skips = features[-1], [*reversed(features[:-1]), None]
     for width, skip in zip(DECODER, skips, strict=True):
         x = b.upsampled(x)
@@ -131,7 +131,7 @@ def _decoder(b: GraphBuilder, features: list[TensorRef]) -> TensorRef:
 
 
 def parameters(model: Any) -> int:
-    """Number of weights and biases of a model made by `build_network`."""
+    """Return the number of weights and biases of a model made by `build_network`."""
     shapes = [_shape(info) for info in model.graph.input if info.name.startswith("w")]
     return sum(prod(shape) for shape in shapes)
 
@@ -149,7 +149,10 @@ class ConfigurationRow:
     spec: NetworkSpec
 
     def number(self, column: str) -> float | None:
-        """The measured value, above 0; None where the cell is blank or the column absent. Raises BadInputError."""
+        """Return the measured value, above 0; None where the cell is blank or the column absent.
+
+        Raises BadInputError.
+        """
         text = self.cells.get(column, "")
         if not text:
             return None
@@ -159,7 +162,7 @@ class ConfigurationRow:
         return value
 
     def range(self, column: str) -> tuple[float, float] | None:
-        """The values of `column`_min and `column`_max; None when one of them is blank. Raises BadInputError."""
+        """Return the values of `column`_min and `column`_max; None when one of them is blank. Raises BadInputError."""
         low, high = self.number(f"{column}_min"), self.number(f"{column}_max")
         if low is None or high is None:
             return None
@@ -203,7 +206,7 @@ def _row(place: str, header: list[str], cells: list[str]) -> ConfigurationRow:
 
 
 def spec_of(cells: dict[str, str], place: str) -> NetworkSpec:
-    """The network that the cells `KEYS` describe; `size` is one side or HEIGHTxWIDTH. Raises BadInputError."""
+    """Return the network that the cells `KEYS` describe; `size` is one side or HEIGHTxWIDTH. Raises BadInputError."""
     size = cells["size"]
     try:
         height, width = parse_shape(size if "x" in size else f"{size}x{size}")
@@ -227,12 +230,12 @@ def _number(text: str) -> float | None:
 
 
 def encode(b: GraphBuilder, x: TensorRef, encoder: str) -> list[TensorRef]:
-    """Features of `x` at strides 2, 4, 8, 16 and 32 by `encoder`, one of ENCODERS."""
+    """Return the features of `x` at strides 2, 4, 8, 16 and 32 by `encoder`, one of ENCODERS."""
     return resnet18(b, x) if encoder == "resnet18" else _inverted_encoder(b, x, MOBILE_ENCODERS[encoder])
 
 
 def resnet18(b: GraphBuilder, x: TensorRef) -> list[TensorRef]:
-    """Features at strides 2, 4, 8, 16, 32."""
+    """Return features at strides 2, 4, 8, 16, 32."""
     x = b.unit(x, RESNET18_STEM, 7, stride=2)
     features = [x]
     pooled = (RESNET18_STEM, x.height // 2, x.width // 2)
@@ -251,7 +254,7 @@ def _basic_block(b: GraphBuilder, x: TensorRef, width: int, stride: int) -> Tens
 
 
 def _squeeze(b: GraphBuilder, x: TensorRef) -> TensorRef:
-    """Squeeze-and-excitation: mean over the picture, two 1x1 convolutions, gate."""
+    """Append squeeze-and-excitation: mean over the picture, two 1x1 convolutions, gate."""
     inner = squeeze_channels(x.channels)
     pooled = b.op("GlobalAveragePool", [x.name], (x.channels, 1, 1))
     hidden = b.same("Relu", b.conv(pooled, inner, 1, bias=True))
@@ -270,7 +273,7 @@ def _inverted_block(b: GraphBuilder, x: TensorRef, row: MobileBlock) -> TensorRe
 
 
 def _inverted_encoder(b: GraphBuilder, x: TensorRef, encoder: MobileEncoder) -> list[TensorRef]:
-    """Features before each halving and at the end: strides 2, 4, 8, 16, 32."""
+    """Return the features before each halving and at the end: strides 2, 4, 8, 16, 32."""
     x = b.unit(x, encoder.stem, 3, ACTIVATIONS[encoder.activation], stride=2)
     features: list[TensorRef] = []
     for row in encoder.rows:
@@ -391,16 +394,16 @@ class GraphBuilder:
         return self.op("Resize", [x.name, "", self.twice.name], shape, mode="nearest")
 
     def model(self, name: str, outputs: list[TensorRef]) -> Any:
-        """Everything so far as an `onnx.ModelProto`, opset 21."""
+        """Return everything so far as an `onnx.ModelProto`, opset 21."""
         results = [value_info(out.name, (1, *out[1:])) for out in outputs]
         graph = helper.make_graph(self.nodes, name, self.inputs, results, [self.twice], value_info=self.infos)
         return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 21)])
 
     def add(self, x: TensorRef, y: TensorRef) -> TensorRef:
-        """The sum of two tensors of one size."""
+        """Return the sum of two tensors of one size."""
         return self.op("Add", [x.name, y.name], x[1:])
 
 
 def value_info(name: str, shape: tuple[int, ...]) -> Any:
-    """The `onnx.ValueInfoProto` of a FLOAT tensor."""
+    """Return the `onnx.ValueInfoProto` of a FLOAT tensor."""
     return helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)

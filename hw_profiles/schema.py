@@ -57,7 +57,7 @@ class Quantity(ProfileTable):
         return SPREAD_OF_KIND[self.kind] if self.spread is None else self.spread
 
     def or_else(self, default: float) -> float:
-        """The value, or `default` when it is unknown."""
+        """Return the value, or `default` when it is unknown."""
         return default if self.value is None else self.value
 
 
@@ -171,11 +171,11 @@ class Engine(ProfileTable):
         return self
 
     def factor(self, term: str) -> float:
-        """How many times dearer `term` is than a plain convolution's."""
+        """Return how many times dearer `term` is than a plain convolution's."""
         return self.factors[term].or_else(1.0) if term in self.factors else 1.0
 
     def seconds_per_unit(self, rate: str) -> float:
-        """Seconds of one product, of one element of an activation or weight, of one operator, or of one job."""
+        """Return the seconds of a product, of an element of an activation or weight, of an operator, or of a job."""
         key, unit = KEY_OF_RATE[rate]
         value: float = getattr(self.rates, key).or_else(1.0)
         if rate in ("operator", "job"):
@@ -184,7 +184,7 @@ class Engine(ProfileTable):
 
 
 class Measured(ProfileTable):
-    """What was measured of a network on a unit of this machine.
+    """The measurement of a network on a unit of this machine.
 
     `slower`: by number of threads, the measured time over the time by the unit's numbers. `error`: relative error of a
     time that follows from it. `said`: sentence that tells how it was measured.
@@ -246,11 +246,11 @@ class Unit(ProfileTable):
         return self
 
     def clock(self, corner: Corner) -> float:
-        """The clock at `corner` as a fraction of the highest."""
+        """Return the clock at `corner` as a fraction of the highest."""
         return self.corners[corner].or_else(1.0)
 
     def power_w(self, corner: Corner, busy: float) -> float:
-        """Mean power in watts at `corner` when the unit works for a share `busy` of the time."""
+        """Return the mean power in watts at `corner` when the unit works for a share `busy` of the time."""
         active: float = self.power_max_w.or_else(1.0) * self.clock(corner) ** self.power_exponent.or_else(3.0)
         return busy * active + (1 - busy) * self.idle_w.or_else(0.0)
 
@@ -312,7 +312,7 @@ class PerformanceSettings(ProfileTable):
     sleep_latency_us: Cost
 
     def corner(self, unit: UnitName) -> Corner:
-        """The corner of `unit`."""
+        """Return the corner of `unit`."""
         corner: Corner = getattr(self, unit)
         return corner
 
@@ -361,7 +361,7 @@ class Profile(ProfileTable):
 
 
 def corners_of(profile: Profile, performance_profile: str) -> Corners:
-    """Corners of cpu, gpu and dsp. Raises BadInputError for a name that is no performance profile."""
+    """Return corners of cpu, gpu and dsp. Raises BadInputError for a name that is no performance profile."""
     for name, settings in profile.performance_profiles.items():
         if name == performance_profile:
             return settings.cpu, settings.gpu, settings.dsp

@@ -28,13 +28,12 @@ from trilane.hw_profiles.engine_times import numbers_of, spilled
 from trilane.hw_profiles.host_model import UNMEASURED
 from trilane.hw_profiles.network_work import Network
 from trilane.hw_profiles.over_time import Moment, last_fifth, temperatures_of, unit_power_w, warm_up
-from trilane.hw_profiles.profile_files import HOST
 from trilane.hw_profiles.schema import Corners, Profile, Unit, corners_of
 from trilane.scheduler.events import Graph, Settings, Stop, chain
 from trilane.scheduler.policy import POLICIES, run_settings
 from trilane.scheduler.shared_units import ONE, ROUND_ROBIN, Member, Runs, simulate_beside
 from trilane.scheduler.virtual import Service, Simulation, Skips
-from trilane.units import BYPASS, INFER, NS_PER_MS, NS_PER_S, SUSTAINED, UNITS, UnitName
+from trilane.units import BYPASS, HOST, INFER, NS_PER_MS, NS_PER_S, SUSTAINED, UNITS, UnitName
 
 MOST_TENANTS = 8
 #: Share of the bandwidth that others can take at most: something is always left.
@@ -84,7 +83,10 @@ class Tenant:
         return replace(application_graph(self.variant.edge, [(name, self.unit)]), bypass=BYPASS)
 
     def settings(self, display_ns: int) -> Settings:
-        """Settings of its core: frames without end, at its rate. `display_ns`: an avatar is not shown more often."""
+        """Return the settings of its scheduler: frames without end, at its rate.
+
+        `display_ns`: shortest time between two shown frames of an avatar.
+        """
         policy = self.variant.policy
         limits: dict[str, Any] = {"in_queue": 0 if POLICIES[policy].newest else 1, "hang_ns": ENDLESS}
         period_ns = round(NS_PER_S / self.fps)
@@ -94,11 +96,11 @@ class Tenant:
         return run_settings(policy, ENDLESS, shown_ns, shown_ns, **limits)
 
     def plan(self, kind: int) -> Plan:
-        """What runs in a frame with the network at place `kind`."""
+        """Return what runs in a frame with the network at place `kind`."""
         return Plan(self.networks[kind], self.unit, self.variant, avatars=self.avatars[kind] if self.avatars else 1)
 
     def kind(self, frame: int) -> int:
-        """The place of the frame's network, or SKIPS."""
+        """Return the place of the frame's network, or SKIPS."""
         return self.frames[frame % len(self.frames)]
 
 
@@ -155,7 +157,7 @@ def _busy_s(run: Simulation, unit: str) -> float:
 
 
 def _seconds(tenants: Sequence[Tenant], costs: _Costs) -> float:
-    """Virtual seconds that the run lasts."""
+    """Return the virtual seconds that the run lasts."""
     slowest = max(
         max(1 / tenant.fps, sum(means.values()) / 1e3) for tenant, means in zip(tenants, costs.mean_ms, strict=True)
     )
@@ -163,14 +165,14 @@ def _seconds(tenants: Sequence[Tenant], costs: _Costs) -> float:
 
 
 class _Job(NamedTuple):
-    """A network: number of its tenant, and its place among the networks of that tenant."""
+    """The network of a job, by the number of its tenant and its place among the tenant's networks."""
 
     tenant: int
     kind: int
 
 
 class _Costs:
-    """What the jobs of the pipelines take on the chip, and how they slow each other."""
+    """The times of the pipelines' jobs on the chip, and how these jobs slow each other."""
 
     def __init__(self, profile: Profile, tenants: Sequence[Tenant], corners: Corners) -> None:
         self._profile, self._tenants, self._corners = profile, tenants, corners
@@ -182,12 +184,12 @@ class _Costs:
         self.mean_ms = tuple(self._means(number) for number in range(len(tenants)))
 
     def skips(self, number: int) -> Skips:
-        """Which frames of a tenant take the bypass."""
+        """Return the rule by which frames of a tenant take the bypass."""
         tenant = self._tenants[number]
         return lambda frame, _fresh: tenant.kind(frame) == SKIPS
 
     def service(self, number: int) -> Service:
-        """Service times of a tenant when no other one runs."""
+        """Return service times of a tenant when no other one runs."""
         tenant = self._tenants[number]
 
         def service(stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
@@ -196,7 +198,7 @@ class _Costs:
         return service
 
     def speed(self, job: Runs, others: Sequence[Runs]) -> int:
-        """Speed of a job beside `others`: for a network, by the bandwidth that they leave; `ONE` for any other job."""
+        """Return the speed of a job beside `others`: a network's by the bandwidth that they leave, `ONE` for others."""
         if job.stage != INFER[0]:
             return ONE
         beside = [other for other in others if self._competes(job, other)]
@@ -217,14 +219,14 @@ class _Costs:
         return _Job(runs.member, max(self._tenants[runs.member].kind(runs.frame), 0))
 
     def _demand(self, job: _Job) -> float:
-        """The share of the bandwidth that a network takes while it runs."""
+        """Return the share of the bandwidth that a network takes while it runs."""
         tenant = self._tenants[job.tenant]
         bytes_s = moved_bytes(tenant.networks[job.kind], self._profile.units[tenant.unit])
         bytes_s /= self._infer_ms(job, self._always) / 1e3
         return bytes_s / (self._profile.memory.bandwidth_gb_s.or_else(10.0) * 1e9)
 
     def _network_ms(self, job: _Job, use: float) -> float:
-        """Milliseconds of a network while the share `use` of the bandwidth is taken."""
+        """Return the milliseconds of a network while the share `use` of the bandwidth is taken."""
         return self._stages_ms(job, use)[INFER[0]]
 
     def _stages_ms(self, job: _Job, use: float) -> dict[str, float]:
@@ -239,21 +241,21 @@ class _Costs:
         return {stage: round(ms * NS_PER_MS) for stage, ms in self._stages_ms(job, self._always).items()}
 
     def _means(self, number: int) -> dict[str, float]:
-        """Mean milliseconds by stage over the frames that have a network; of the first network where none has one."""
+        """Return the mean milliseconds by stage over the frames with a network; the first network's if none has one."""
         kinds = [kind for kind in self._tenants[number].frames if kind != SKIPS] or [0]
         each = [self._times(_Job(number, kind)) for kind in kinds]
         return {stage: sum(times[stage] for times in each) / len(each) / NS_PER_MS for stage in each[0]}
 
 
 def _used(profile: Profile, use: float) -> Profile:
-    """The chip while others take the share `use` of its memory's bandwidth."""
+    """Return the chip while others take the share `use` of its memory's bandwidth."""
     fraction = profile.memory.application_use_fraction.model_copy(update={"value": use})
     memory = profile.memory.model_copy(update={"application_use_fraction": fraction})
     return profile.model_copy(update={"memory": memory})
 
 
 def moved_bytes(network: Network, unit: Unit) -> float:
-    """Bytes that a network reads and writes in a job on `unit`: the elements of every operator, and the weights once.
+    """Return the bytes that a network moves in a job on `unit`: the elements of every operator, and the weights once.
 
     A tensor engine moves only what does not stay on the chip.
     """
@@ -341,7 +343,7 @@ def _row(
 
 
 def _kept(report: Mapping[str, Any]) -> dict[str, Any]:
-    """The part of a run's report that is told both of a run among others and of one alone.
+    """Return the part of a run's report that is shown both for a run beside others and for a run alone.
 
     `in_time`: share of the released frames that were presented in time.
     """
@@ -358,7 +360,7 @@ def _kept(report: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _settled_ms(moments: Sequence[Moment], at: Callable[[Corners], Together], number: int) -> float | None:
-    """Mean frame time of a pipeline in the last fifth of the time; None where no time passes."""
+    """Return the mean frame time of a pipeline in the last fifth of the time; None where no time passes."""
     last = last_fifth(moments)
     return _mean([at(each.corners).runs[number].report["frame_time_ms"]["mean"] for each in last]) or None
 

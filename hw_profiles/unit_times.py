@@ -49,7 +49,7 @@ class JobTime:
 def time_on(
     unit: Unit, memory: Memory, work: Work, clock_fraction: float = 1.0, *, contended: bool = False, batch: int = 1
 ) -> JobTime:
-    """Time of one job.
+    """Return the time of one job.
 
     `unit`, `memory`: unit and memory of one profile.
     `work`: work of one frame.
@@ -72,7 +72,7 @@ def time_on(
 
 
 def relative_error(job: JobTime, unit: Unit) -> float:
-    """Relative error to expect of the time of `job` on `unit`; the measured one where the unit was measured.
+    """Return the relative error to expect of the time of `job` on `unit`; the measured one where the unit was measured.
 
     Otherwise it joins the errors of the numbers behind each part of the time with the error of the model itself.
     """
@@ -97,7 +97,7 @@ def relative_error(job: JobTime, unit: Unit) -> float:
 def layer_times(
     unit: Unit, memory: Memory, work: Work, clock_fraction: float = 1.0, *, contended: bool = False, batch: int = 1
 ) -> EngineTime:
-    """Seconds of each layer on the engine of `unit`, 0 for a layer that falls back to the CPU.
+    """Return the seconds of each layer on the engine of `unit`, 0 for a layer that falls back to the CPU.
 
     Parameters: as in `time_on`.
     """
@@ -109,18 +109,18 @@ def layer_times(
 
 
 def fallback_ms(unit: Unit, work: Work, batch: int = 1) -> list[tuple[str, float]]:
-    """Name and milliseconds of each operator that the unit hands to the CPU."""
+    """Return the name and milliseconds of each operator that the unit hands to the CPU."""
     fixed, each = unit.fallback_fixed_ms.or_else(0.0), unit.fallback_ns_per_element.or_else(0.0) / 1e6
     return [(o.name, fixed + batch * o.out * each) for o in work.operators if o.op_type in unit.fallback]
 
 
 def _permutes_ms(unit: Unit, work: Work) -> float:
-    """Milliseconds that a picture in several tensors costs."""
+    """Return the milliseconds that a picture in several tensors costs."""
     return unit.permute_fixed_ms.or_else(0.0) if work.input_tensors > 1 else 0.0
 
 
 def nearest(engine: Engine, shares: F64) -> tuple[float, str]:
-    """How unlike a network is to the nearest one that the engine's numbers were fitted to, and the name of that one.
+    """Return how unlike a network is to the nearest one of the fit of the engine's numbers, and the name of that one.
 
     The distance is the total variation of both networks' shares: the part of the time that goes into other terms, 0 to
     1. An engine that names no networks gives 1 and "".
@@ -131,12 +131,18 @@ def nearest(engine: Engine, shares: F64) -> tuple[float, str]:
 
 
 def _apart(own: Mapping[str, float], others: Mapping[str, float]) -> float:
-    """Half the sum of absolute differences of two networks' shares. A term that `others` do not name counts as 0."""
+    """Return half the sum of absolute differences of two networks' shares.
+
+    A term that `others` do not name counts as 0.
+    """
     return (1 + sum([abs(own[name] - share) - own[name] for name, share in others.items()])) / 2
 
 
 def unsure(engine: Engine, shares: F64) -> float:
-    """Relative error that the engine's numbers leave of a job. `shares`: share of each term in its time (terms,)."""
+    """Return the relative error that the engine's numbers leave of a job.
+
+    `shares`: share of each term in its time (terms,).
+    """
     of_rates = [sum(s for n, s in zip(NAMES, shares, strict=True) if TERMS[n] == rate) for rate in RATES]
     spreads = [getattr(engine.rates, KEY_OF_RATE[rate][0]).relative_error for rate in RATES]
     known = [engine.factors[name].relative_error if name in engine.factors else 0.0 for name in NAMES]
@@ -170,7 +176,7 @@ class UnitNumbers:
 
 
 def machine_of(unit: Unit, memory: Memory, clock_fraction: float = 1.0, contended: bool = False) -> UnitNumbers:
-    """The numbers of a unit, all of them slower by the factor that was measured of it.
+    """Return the numbers of a unit, all of them slower by the factor that was measured of it.
 
     `unit`: unit of a profile.
     `memory`: memory of the same profile.
@@ -199,7 +205,7 @@ def machine_of(unit: Unit, memory: Memory, clock_fraction: float = 1.0, contende
 
 
 def job_time(work: Work, machine: UnitNumbers, batch: int = 1) -> JobTime:
-    """Time of one job of `batch` frames. The fixed costs and the weights count once per job."""
+    """Return the time of one job of `batch` frames. The fixed costs and the weights count once per job."""
     classes, counts = work.classes, work.table
     on_cpu = np.array([o.op_type in machine.fallback for o in work.operators], dtype=bool)
     seconds = np.where(on_cpu, 0.0, _operator_seconds(counts, classes, machine))
@@ -218,7 +224,7 @@ def job_time(work: Work, machine: UnitNumbers, batch: int = 1) -> JobTime:
 def _operator_seconds(
     counts: NDArray[np.float64], classes: NDArray[np.int64], machine: UnitNumbers
 ) -> NDArray[np.float64]:
-    """Seconds of each operator (operators,): the larger of its arithmetic and its traffic."""
+    """Return the seconds of each operator (operators,): the larger of its arithmetic and its traffic."""
     macs, moved, c_in, c_out = counts[:, 0], counts[:, 1], counts[:, 2], counts[:, 3]
     padded = macs * _padding_factor(c_in, machine.block) * _padding_factor(c_out, machine.block)
     arithmetic = np.where(classes == CLASSES.index("depthwise"), macs, padded) / machine.arithmetic[classes]
@@ -228,6 +234,6 @@ def _operator_seconds(
 
 
 def _padding_factor(channels: NDArray[np.float64], block: float) -> NDArray[np.float64]:
-    """Channels rounded up to whole blocks, over `channels`; 1 for an operator without products."""
+    """Return `channels` rounded up to whole blocks, over `channels`; 1 for an operator without products."""
     known = np.maximum(channels, 1.0)
     return np.ceil(known / block) * block / known

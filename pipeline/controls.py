@@ -1,7 +1,7 @@
-"""What somebody asks of a run while it goes on: controls, frames on request, and signals.
+"""Requests to a live run: controls, frames on request, and signals.
 
-Rule: any thread may ask; the run does it between two of its steps, on its own thread. A signal interrupts nothing: its
-handler only counts.
+Rule: any thread may send a request; the run handles it between two of its steps, on its own thread. A signal interrupts
+nothing: its handler only counts.
 
 A request becomes an event of the scheduler, so the recording holds it and a replay does the same. A kill becomes an
 event when the unit's end is heard. Frames that were asked for are answered in the order in which they were presented.

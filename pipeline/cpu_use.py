@@ -108,7 +108,7 @@ def add_accounts(report: dict[str, Any], pipeline: Pipeline, cpu: CpuTimes, log:
 
     `pipeline`: pipeline that ran.
     `cpu`: CPU time of its units and stages.
-    `log`: log for what was not measured, and what contradicts itself.
+    `log`: log for messages about missing or contradictory figures.
     """
     for unit, row in report["units"].items():
         row.update(cpu_s=cpu.of_unit_s(unit), cpu_in_jobs_s=cpu.in_jobs_ns[unit] / NS_PER_S)

@@ -61,7 +61,7 @@ class Sharing:
         self._sums: dict[str, Taken] = {}
 
     def add(self, job: JobRecord) -> None:
-        """Take the next job that has ended."""
+        """Count a job; jobs come in the order of their ends."""
         if self._beside.get(job.unit):
             of_unit = self._jobs[job.unit]
             of_unit.append(job)
@@ -401,7 +401,7 @@ class Budget:
         blocks = [(_by_name(block, name_of), max(sum(block.values()), 1)) for block in self._blocks]
 
         def half_width(other: str | None) -> float | None:
-            """Half the interval of the share, or of the difference to the share of `other`."""
+            """Return half the interval of the share, or of the difference to the share of `other`."""
             return batch_interval([(ns.get(name, 0) - (ns.get(other, 0) if other else 0)) / of for ns, of in blocks])
 
         share, half = sums[name] / whole, half_width(None)
@@ -414,7 +414,7 @@ class Budget:
         return {"name": name, "share": share, "share_low": low, "share_high": high, "rivals": rivals}
 
     def _cut(self, ends_ns: Sequence[int], *, is_whole: bool = True) -> None:
-        """Count the path from what is counted already to the last of `ends_ns`, in blocks that end with each of them.
+        """Count the path from its counted part to the last of `ends_ns`, in blocks that end with each of them.
 
         `is_whole`: whether the last block has as many frames as the others.
         """

@@ -67,10 +67,7 @@ HeaderDtype = Annotated[
 
 
 class Described(Model):
-    """Base class of what a person writes to describe a pipeline.
-
-    For a mistake it raises a BadInputError that names the field.
-    """
+    """Base class of the parts of a pipeline's description, which a person writes."""
 
     @model_validator(mode="wrap")
     @classmethod
@@ -95,7 +92,7 @@ def _bad_input(what: str, error: ValidationError) -> BadInputError:
 
 
 class UnitSettings(Described):
-    """What a unit may use of the host.
+    """The part of the host that a unit may use.
 
     `cores`: cores of this machine.
     `threads`: number of threads, from 1.
@@ -185,7 +182,7 @@ class Pipeline(Described):
             raise UnexpectedValue(f"different headers of edges {', '.join(names)}", "one, as a bypass joins them")
 
     def graph(self) -> Graph:
-        """Return what the scheduler knows of the pipeline."""
+        """Return the graph of the pipeline for the scheduler."""
         stages = tuple(StageSpec(stage.name, stage.unit) for stage in self.stages)
         rules = tuple(edge.rule for edge in self.edges)
         return Graph(stages, rules, self.latency_to or self.stages[-1].name, self.bypass)
@@ -237,7 +234,7 @@ class Pipeline(Described):
         }
 
     def stages_of(self, unit: str) -> tuple[PipelineStage, ...]:
-        """The unit's stages, in the order of the chain."""
+        """Return the unit's stages, in the order of the chain."""
         return tuple(stage for stage in self.stages if stage.unit == unit)
 
     def with_rule(self, rule: str) -> Pipeline:

@@ -1,6 +1,6 @@
 """Counts instructions and cache misses of a unit's jobs through perf_event_open.
 
-Rule: the processor counts, or the figure is said to be absent. Counts are of user mode. They cover the thread that
+Rule: a figure is the processor's count, or is reported as absent. Counts are of user mode. They cover the thread that
 opens them and all threads that it and its threads begin later, which the kernel adds up (`inherit`). A processor with
 fewer counters than events counts each for a part of the time; such counts are scaled to the whole time.
 
@@ -146,7 +146,7 @@ def absence() -> str | None:
 
 
 def availability() -> str:
-    """Return what is counted, or that nothing is and why, as a fact of the machine."""
+    """Return the counted events as a fact of the machine, or that nothing is counted, and why."""
     try:
         with closing(HardwareCounters()) as counters:
             return ", ".join(counters.names)
@@ -181,7 +181,7 @@ def paranoid_level() -> int | None:
 
 
 def remedy(why: str) -> str:
-    """Return the command that fixes what `absence` found, or what it takes."""
+    """Return the command, or the condition, that removes the reason from `absence`."""
     if "perf_event_paranoid" in why:
         return f"sysctl kernel.perf_event_paranoid={MOST_PARANOID}"
     return "needs a machine of its own" if "virtual" in why else "allow perf_event_open"

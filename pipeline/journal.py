@@ -55,7 +55,7 @@ class Begun(NamedTuple):
 
 
 class Stepped(NamedTuple):
-    """A step of the scheduler at `now_ns`: the events it was told and the actions it answered with."""
+    """A step of the scheduler at `now_ns`: the events that it received and its actions."""
 
     now_ns: int
     events: tuple[Event, ...]

@@ -188,7 +188,7 @@ class ByteCounter:
         self.written += count
 
     def figures(self) -> dict[str, float]:
-        """Return what the stage reports of its job."""
+        """Return the figures of the stage's job."""
         return {
             "bytes_read": self.read,
             "bytes_written": self.written,

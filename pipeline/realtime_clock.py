@@ -292,7 +292,7 @@ class RealtimeClock:
 
 
 class HeldTime:
-    """Takes what somebody asked of the run. A hold that lets some frames through lasts until the run goes on."""
+    """Takes the requests to the run. A hold that lets some frames through lasts until the run goes on."""
 
     def __init__(self) -> None:
         self._total_ns = 0

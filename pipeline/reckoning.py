@@ -39,7 +39,10 @@ class RunEfficiencies:
         self._unsettled: list[JobRecord] = []  # jobs since the last presented frame
 
     def add(self, job: JobRecord, *, presents: bool) -> None:
-        """Take the next job that has ended. `presents`: whether its end is that of a presented frame."""
+        """Count a job; jobs come in the order of their ends.
+
+        `presents`: whether this job presents a frame.
+        """
         self._unsettled.append(job)
         if not presents:
             return
@@ -119,7 +122,7 @@ class Reckoning:
         return self._budget.bound(self._unit_of).get("bound")
 
     def add(self, explained: ExplainedJob) -> None:
-        """Take the next job that has ended."""
+        """Count a job; jobs come in the order of their ends."""
         self.paths.add(explained)
         self.sharing.add(explained.job)
         presents = explained.presented is not None

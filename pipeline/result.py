@@ -1,4 +1,4 @@
-"""What a run tells: its messages and its failure while it goes on, and its result.
+"""The output of a run: its messages and its failure while it goes on, and its result.
 
 Rule: the first failure stands; the report also has every message. A result is plain data; a recording is written only
 where the caller asks for it.

@@ -182,7 +182,7 @@ def run_pipeline(
 
 
 def _add_caps(report: dict[str, Any], governor: ReportingGovernor | None) -> None:
-    """Add what the governor says of the run, and the score of the energy that it modelled."""
+    """Add the governor's figures of the run, and the score of the energy that it modelled."""
     if governor is None:
         return
     report.update(governor.report())

@@ -280,7 +280,7 @@ class Temperature(Record):
 class PathShare(Record):
     """The largest part of the critical path (`trilane.pipeline.critical_path`).
 
-    `name`: name of the unit or the stage, or of what the path was instead.
+    `name`: name of the unit or stage, or of time that is neither's, such as `overhead`.
     `share`: its share of the path.
     `share_low`, `share_high`: bounds of the 95 % interval of `share`, from the scatter of this run's frames; null for
     fewer than 51 frames.

@@ -194,7 +194,7 @@ class _JournaledRun:
             self._sample(now_ns, core)
 
     def _write(self) -> None:
-        """Write what was noted since the last call; raises UnwrittenError when it cannot be written."""
+        """Write the notes since the last call; raises UnwrittenError when they cannot be written."""
         add, told = self._writer.add, 0
         jobs = self._source.ended() if self._source is not None else []
         for step, follows, ended in self._steps:
@@ -255,8 +255,8 @@ def recorded(
 ) -> Iterator[RunRecord]:
     """Yield the record of one run, which goes to `file`, or stays in memory without one.
 
-    What was noted until the end of the run is in the file, whatever becomes of the run. Raises BadInputError when the
-    file cannot be made.
+    Everything up to the end of the run is in the file, however the run ends. Raises BadInputError when the file cannot
+    be made.
     """
     if file is None:
         yield _KeptRun(graph, settings)

@@ -65,7 +65,7 @@ class SkippingStage(Stage, Protocol):
 
 @dataclass(frozen=True)
 class UnitContext:
-    """What the stages of one unit share in its process.
+    """The objects that the stages of one unit share in its process.
 
     `name`: name of the unit.
     `settings`: cores and threads of the unit.

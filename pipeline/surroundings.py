@@ -1,7 +1,7 @@
-"""What a run needs around it: checks before it, cores and processes to undo afterwards, and the share of others.
+"""Prepares the surroundings of a run: checks before it, cores and processes to restore, and other programs' share.
 
 Rule: a check that raises has started nothing, so nothing has to be undone. Whatever happens, cores, memory and
-processes are as before. What is not ours is other programs', by the kernel's counts.
+processes are as before. By the kernel's counts, all CPU time that is not the run's own is that of other programs.
 """
 
 from __future__ import annotations

@@ -190,7 +190,7 @@ class Timeline:
         }
 
     def add(self, record: Record) -> list[Fact]:
-        """Return what the next record after the first means."""
+        """Return the facts that the next record, after the first, adds."""
         if isinstance(record, Stepped):
             return self._step(record)
         if isinstance(record, Counted):

@@ -144,7 +144,8 @@ class CameraSpec(Table):
     `source`: `builtin:NAME`, a file or a folder. `fov_y_deg`: field of view over the picture's height; None for that of
     the file, or the usual one of its format. `up_axis`: axis that is up in the file's world. `metres_per_unit`: unit of
     its lengths in metres; None for what the file says or what is likely. `rate_hz`: frames a second of a file without
-    times. `axes`: directions of x, y and z of a pose, such as `forward-left-up`; `auto` for those of the format.
+    times. `axes`: directions in which x, y and z of each pose point, such as `forward-left-up`; `auto`: as the format
+    defines them.
     `near_m`, `far_m`: distances of the clip planes; the far one is moved beyond a body that a placed camera films from
     farther off. `place`: whether a camera is placed in the scene (`auto`: a recorded one where it films the avatars, a
     built-in one goes along with them) or stays where it is (`none`).

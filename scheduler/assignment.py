@@ -77,7 +77,7 @@ class Choice:
     """A view of the core's own stages, source and frames."""
 
     def __init__(self, settings: Settings, policy: Policy, source: Source, flow: Flow) -> None:
-        """Take what the choice depends on: the run's settings and policy, its source and its frames in flight."""
+        """Keep what the choice depends on: the run's settings and policy, its source and its frames in flight."""
         self._policy, self._source, self._flow = policy, source, flow
         self._stages, self._frames, self._bypass = flow.stages, flow.frames, flow.bypass
         self._stage_named, stages = flow.stage_named, flow.stages
@@ -86,7 +86,7 @@ class Choice:
         self.latches = settings.latch_ns > 0 and len(stages) > 1
 
     def can_begin(self, stage: StageState, now_ns: int) -> bool:
-        """Whether the stage has a frame to take and a slot to put it in."""
+        """Return whether the stage has a frame to take and a slot to put it in."""
         source, sink = stage.input, stage.output
         if source is None:
             if self._source.is_empty or self.is_full() or (self.latches and now_ns < self.latch_from_ns(now_ns)):
@@ -115,7 +115,7 @@ class Choice:
         return self._stages[self._policy.choose([self._candidate(stage, now_ns) for stage in runnable]).position]
 
     def is_full(self) -> bool:
-        """Whether the number of frames in flight has reached its limit."""
+        """Return whether the number of frames in flight has reached its limit."""
         return 0 < self._in_flight <= len(self._frames)
 
     def latch_from_ns(self, now_ns: int) -> int:
@@ -135,7 +135,7 @@ class Choice:
         return free_ns - first.estimate_ns - self._latch_ns
 
     def is_late(self, stage: StageState, now_ns: int) -> bool:
-        """Whether the frame that the stage would do next must miss its deadline."""
+        """Return whether the frame that the stage would do next must miss its deadline."""
         waiting = self._candidate(stage, now_ns)
         if waiting.deadline_ns == NEVER:
             return False

@@ -1,6 +1,6 @@
 """Moves frames through the slots. Rule: each frame leaves here once, counted as presented, dropped or lost.
 
-It moves frames and slots as it is told, and notes which units the change concerns (`mark_dirty`).
+It moves frames and slots on request, and notes which units each change concerns (`mark_dirty`).
 
 Several readers. What a stage writes waits in one slot for all who read it; nothing is copied. A stage with several
 inputs begins a frame when each of them has it. Frames keep their order on every edge, so the oldest of each line is

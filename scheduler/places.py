@@ -1,7 +1,7 @@
-"""The words of placement (cores, places, what units need of them), and a list of every way to place units.
+"""The words of placement (cores, places, needs of units), and a list of every way to place units.
 
-Rule: plain data, and what follows from it. In the list, one placement stands for all that differ only by an exchange of
-equal cores.
+Rule: plain data, and values that follow from it. In the list, one placement stands for all that differ only by an
+exchange of equal cores.
 """
 
 from __future__ import annotations

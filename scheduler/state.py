@@ -1,6 +1,7 @@
 """The core's memory of units, stages and frames. Rule: it holds fields and what follows from them; core.py decides.
 
-A time that is not set is NEVER. A unit moves by a table alone. An event that the table refuses is a driver's defect.
+A time that is not set is NEVER. Only a table changes the state of a unit. An event that the table refuses is a driver's
+defect.
 
     down --back-off over--> starting --UnitReady--> ready --too slow--> stopping --UnitDied--> down
 

@@ -185,6 +185,6 @@ def _spinning(placement: Placement, cores: int) -> dict[str, Any]:
 
 
 def one_shape(config: RunConfig) -> Shape:
-    """Return the tensor shape nearest to a square, among those that are not for stepping down when frames are late."""
+    """Return the tensor shape nearest to a square, apart from those that are only used when frames are late."""
     large = [shape for shape in config.buckets if 2 * shape[0] * shape[1] > config.max_tensor_pixels]
     return min(large, key=lambda shape: (abs(shape[0] - shape[1]), shape))

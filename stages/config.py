@@ -84,7 +84,7 @@ def posed_vertices(payload: U8, counts: Sequence[int]) -> list[F32]:
 
 
 def posed_vertices_bytes(counts: Sequence[int]) -> int:
-    """Bytes that `posed_vertices` needs."""
+    """Return bytes that `posed_vertices` needs."""
     return sum(counts) * 3 * np.dtype(np.float32).itemsize
 
 

@@ -21,7 +21,7 @@ from trilane.avatars.network_split import split
 from trilane.avatars.validation import DrawnAs, SizeLoss, accuracy_of, size_loss
 from trilane.errors import EGL_LINE, BadInputError, MissingPartError, TrilaneError, did_you_mean
 from trilane.hw_profiles.host import asked_cores, fastest_runtime, rule_placement, settings_of, usable_cores
-from trilane.hw_profiles.profile_files import HOST, load_profile
+from trilane.hw_profiles.profile_files import load_profile
 from trilane.memory import shortage
 from trilane.pipeline.memory import Assets
 from trilane.scene.footage import Footage
@@ -35,6 +35,7 @@ from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve
 from trilane.stages.foresee import foresee, tensor_works
 from trilane.stages.machine_facts import gl_facts, machine_facts
 from trilane.stages.run_options import RunOptions
+from trilane.units import HOST
 
 ROOM = "room"
 COMMAND_LINE = "command line"
@@ -194,7 +195,7 @@ def _check_pictures(scene: Scene, staged: Staged) -> None:
 
 
 def _accuracy(avatars: Sequence[AvatarData], drawn: DrawnAs) -> dict[str, Any]:
-    """Return the error of each avatar's pictures by its name; avatars with the same name are told apart by folders."""
+    """Return the error of each avatar's pictures by its name; equal names get their folders."""
     bundles = [avatar.bundle for avatar in avatars]
     names = Counter(bundle.manifest.name for bundle in bundles)
     return {

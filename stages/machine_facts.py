@@ -1,4 +1,4 @@
-"""Facts about the machine that made a measurement; they stand beside every number that is reported.
+"""Facts about the machine that made a measurement; every reported number has them beside it.
 
 Rule: only what was read or tried on this machine is stated; what could not be read is absent, never guessed.
 """

@@ -13,7 +13,7 @@ from typing import Annotated, Final
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from trilane.errors import BadInputError, did_you_mean
-from trilane.options import NOTHING, Finite, Option, Options, Text, Texts, one_of, texts_of
+from trilane.options import NOTHING, Finite, Option, Options, Text, Texts, texts_of
 from trilane.scheduler.policy import POLICIES
 from trilane.transport.slots import RULES, edge_rule
 from trilane.unexpected_value import UnexpectedValue
@@ -21,9 +21,9 @@ from trilane.units import PERFORMANCE_PROFILES
 
 AVATARS_HELP: Final = "`default`, `hiker`, or the folder of an avatar."
 PROFILE_HELP: Final = "Hardware profile: a name or a TOML file."
-RUNTIME_HELP: Final = "auto, ort, openvino, qnn or cuda; auto is the fastest that is installed."
+RUNTIME_HELP: Final = "auto, ort, openvino, qnn or cuda; auto is the fastest installed one."
 SIZE_HELP: Final = "Tensor size in pixels: HEIGHTxWIDTH, or a side S for areas up to SxS."
-WIDTH_HELP: Final = "Width of the network: 64 is full, every channel count scales with it."
+WIDTH_HELP: Final = "Width of the network: 64 is full; all channel counts scale with it."
 
 #: Word for the calibration of the network in the avatar's own file.
 AS_IT_IS: Final = "as-it-is"
@@ -99,31 +99,31 @@ class RunOptions(Options):
     background: Text | None = Field(default=None, description="room, or a video, image folder or picture.")
     avatar: Annotated[Text | None, Option(offered=())] = Field(default=None, description=AVATARS_HELP)
     width: int | None = Field(
-        default=None, ge=1, le=256, description=f"{WIDTH_HELP} Of another width than the avatar's it is untrained."
+        default=None, ge=1, le=256, description=f"{WIDTH_HELP} A width other than the avatar's is untrained."
     )
     channels: Annotated[int | None, AfterValidator(_known_channels)] = Field(
         default=None,
-        description="Of the neural texture: 4, 8, 12, 16; of others than the avatar's: untrained.",
+        description="Channels of the neural texture: 4, 8, 12 or 16. A number other than the avatar's is untrained.",
     )
     calibration: Annotated[str | None, AfterValidator(_known_calibration)] = Field(
         default=None,
-        description="Quantise the avatar's network again: minmax, percentile or entropy, or METHOD:VIEWS; "
-        "5 views if none.",
+        description="Quantise the avatar's network again: minmax, percentile or entropy, or METHOD:VIEWS "
+        "(5 views if not given).",
     )
     frames: Annotated[int | None, Option(unit="frames")] = Field(
-        default=None, description="How many frames; the scene's if none."
+        default=None, description="Number of frames; the scene's if not given."
     )
     fps: Finite | None = Field(default=None, description="Frames a second of the scene's time, and of the video.")
     output: str | None = Field(default=None, description="Size of the picture in pixels: WIDTHxHEIGHT.")
     size: Annotated[Text | None, Option(offered=("auto", "96", "128", "192", "256", "384", "512"))] = Field(
-        default=None, description=f"{SIZE_HELP} auto: planned, as the network paints best."
+        default=None, description=f"{SIZE_HELP} auto: the size at which the network paints best."
     )
     allow_empty: Annotated[bool, Option("--allow-empty")] = Field(
         default=False,
         description="Run also where a recorded camera shows the whole person in less than half of the frames.",
     )
     hud: bool | None = Field(default=None, description="Write frame, rate and age on the picture.")
-    policy: Annotated[str, one_of(*POLICIES), Option(words=tuple(POLICIES), offered=tuple(POLICIES))] = Field(
+    policy: Annotated[str, Option(words=tuple(POLICIES), offered=tuple(POLICIES))] = Field(
         default="pipelined",
         description="pipelined: highest rate; sequential: one frame at a time; latest: newest pose wins; "
         "deadline: frames that would be late are dropped.",
@@ -136,38 +136,38 @@ class RunOptions(Options):
         "(docs/policies-and-edges.md).",
     )
     runtime: Annotated[str, Option(offered=())] = Field(
-        default="auto", description=f"What runs the network: {RUNTIME_HELP}"
+        default="auto", description=f"Runtime of the network: {RUNTIME_HELP}"
     )
     skinning: str = Field(
-        default="auto", description="Which unit poses the vertices: cpu, gpu; auto: cpu when OpenGL is software."
+        default="auto", description="Unit that poses the vertices: cpu, gpu or auto; auto is cpu if OpenGL is software."
     )
     split: Texts = Field(
         default=(),
-        description="TENSOR=UNIT: cut the network there, the rest runs on UNIT. `trilane avatar split` lists.",
+        description="TENSOR=UNIT: cut the network at TENSOR and run the rest on UNIT. `trilane avatar split` lists "
+        "the tensors.",
     )
     cores: Annotated[tuple[str, ...], BeforeValidator(_cores)] = Field(
         default=(),
-        description="UNIT=LIST: the unit's cores, such as dsp=0,1; once for each. Else they follow from measured "
-        "times.",
+        description="UNIT=LIST: the unit's cores, such as dsp=0,1; once for each unit. If not given, measured "
+        "times decide.",
     )
-    profile: Text | None = Field(default=None, description=f"{PROFILE_HELP} With --pace.")
+    profile: Text | None = Field(default=None, description=f"{PROFILE_HELP} For --pace.")
     pace: Annotated[bool, Option("--pace")] = Field(
         default=False, description="Hold each job until its modelled time has passed."
     )
-    slow_motion: Finite = Field(default=1.0, description="With --pace: times slower than the chip.")
+    slow_motion: Finite = Field(default=1.0, description="With --pace: how many times slower than the chip.")
     latch_ms: Annotated[Finite, Option("--latch", unit="milliseconds")] = Field(
         default=0.0,
         ge=0,
         le=1000,
-        description="Sample poses late: ready so many ms before the raster; 0: at once.",
+        description="Sample poses late, so that they are ready this many ms before the raster; 0: at once.",
     )
     performance_profile: Annotated[
         str | None,
-        one_of(*PERFORMANCE_PROFILES),
         Option(words=PERFORMANCE_PROFILES, offered=(NOTHING, *PERFORMANCE_PROFILES)),
-    ] = Field(default=None, description="Which power and speed the units ask for, by SNPE's names.")
+    ] = Field(default=None, description="Power and speed of the units, by SNPE's names.")
     baseline_frames: Annotated[int, Option("--baseline", unit="frames")] = Field(
-        default=60, ge=0, description="Frames of the `sequential` run of the same scene that follows; 0: none."
+        default=60, ge=0, description="Frames of the `sequential` run that follows for comparison; 0: no such run."
     )
     check: Annotated[int, Option(unit="frames")] = Field(
         default=0,
@@ -176,9 +176,9 @@ class RunOptions(Options):
         description="Frames to compare with the truth or the float path when the run is over; 0: none.",
     )
     out: Annotated[Path | None, BeforeValidator(_folder)] = Field(
-        default=None, description="Run folder to write; runs/TIME-SCENE if none."
+        default=None, description="Run folder to write; runs/TIME-SCENE if not given."
     )
-    video: bool = Field(default=True, description="Encode the frames; not for runs that last.")
+    video: bool = Field(default=True, description="Encode the frames to a video; switch this off for long runs.")
 
     @property
     def remakes_avatar(self) -> bool:

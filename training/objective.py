@@ -330,7 +330,7 @@ BETAS = (0.9, 0.999)
 
 
 class Judged(NamedTuple):
-    """What a discriminator finds.
+    """The findings of a discriminator.
 
     `features`: features of each level, (N, C, H, W). `score` (N,): log odds that the picture is a true one.
     """

@@ -223,14 +223,14 @@ MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 class _Masked(torch.optim.Optimizer):
-    """What masking adds to a class of Adam.
+    """The addition of masking to a class of Adam.
 
     In groups of parameters with `masked`, numbers whose gradient is exactly 0 take no part in a step. The count of
     steps, which corrects the moments' bias, goes on for all of them, as in `torch.optim.SparseAdam`.
     """
 
     def step(self, closure: Callable[[], float] | None = None) -> Any:
-        """Do a step as the class behind this one does, without the masked numbers."""
+        """Do a step of the Adam class that this class extends, but leave the masked numbers as they are."""
         groups = [group for group in self.param_groups if group.get(MASKED)]
         kept = [
             self._kept(parameter) for group in groups for parameter in group["params"] if parameter.grad is not None
@@ -242,7 +242,7 @@ class _Masked(torch.optim.Optimizer):
         return loss
 
     def _kept(self, parameter: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Return `parameter`, the places without a gradient, and what the parameter and its moments hold there.
+        """Return `parameter`, the places without a gradient, and the values of the parameter and its moments there.
 
         Moments that do not exist yet begin at 0.
         """

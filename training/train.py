@@ -88,7 +88,7 @@ class Places:
 
 
 class Listener(Protocol):
-    """A listener, which is told how the work goes."""
+    """Receives messages about the progress of the work."""
 
     def say(self, line: str) -> None:
         """Take a line about what was found, or what the next part of the work costs."""

@@ -1,4 +1,4 @@
-"""What is trained: a neural texture and a network, which turn a UV image into a picture.
+"""The trained parts: a neural texture and a network, which turn a UV image into a picture.
 
 Rule: in training, the network's input is rounded to as many steps as its bytes have in the pipeline. Noise, if any,
 acts in training mode alone.
@@ -278,7 +278,7 @@ def network_of(bundle: Bundle, groups: list[ShapeGroup], seed: int) -> UNet:
 
 
 def _inputs(bundle: Bundle, groups: list[ShapeGroup], seed: int) -> Iterator[Tensor]:
-    """Yield what the network of `bundle` reads of some samples, (N,C,H,W)."""
+    """Yield the inputs of the network of `bundle` for some samples, (N,C,H,W)."""
     texture = torch.from_numpy(bundle.read_texture()).permute(2, 0, 1)[None]
     for group, index in islice(batches(groups, BATCH, np.random.default_rng(seed)), BATCHES):
         uv, covered, _ = load_batch(group, index)

@@ -132,7 +132,7 @@ Look = Callable[[int, Evaluated], None]
 
 @dataclass(frozen=True)
 class ValidationPlan:
-    """What an avatar is evaluated on.
+    """The plan of an avatar's evaluation.
 
     `held_out`: motions that poses come from, `builtin:NAME` or files. `seeds`: seeds of the samples. `per_band`:
     samples of each band for each seed. `runtimes`: names of runtimes; the first one's figures are the avatar's, the

@@ -41,7 +41,7 @@ class SocketFolder:
         fcntl.flock(self._lock, fcntl.LOCK_EX)
 
     def endpoint(self, name: str) -> str:
-        """The ZeroMQ address of the socket `name` in this folder."""
+        """Return the ZeroMQ address of the socket `name` in this folder."""
         return f"ipc://{self.path / name}"
 
     def remove(self) -> None:

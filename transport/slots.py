@@ -121,7 +121,7 @@ class EdgeSlots:
         self._reading = [0] * rule.slots  # jobs that read the slot
 
     def can_claim(self, keeps: Keeps = _keeps_none) -> bool:
-        """Whether a slot is free, or may be taken from the oldest waiting frame.
+        """Return whether a slot is free, or may be taken from the oldest waiting frame.
 
         `keeps`: function that says which frames must not be evicted.
         """

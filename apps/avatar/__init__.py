@@ -1,4 +1,4 @@
-"""Avatars that are made of others, and what an avatar's files hold.
+"""Assembles avatars from parts of others, and describes an avatar's files.
 
 It may use every lower folder, but no other folder of apps/.
 """

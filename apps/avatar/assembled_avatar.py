@@ -1,8 +1,7 @@
-"""What an avatar's files hold, and an avatar put together of another one's files and some that a person brings.
+"""Describes an avatar's files, and assembles an avatar from those of another one and files that a person brings.
 
-Rule: what is said of an avatar is of its own parts, read from the files or from the manifest, which says how it was
-measured. Figures and words about a part that was replaced stay behind, and a validation stays only where nothing that
-it is of has changed.
+Rule: every fact about an avatar comes from its own files or its manifest. When a part is replaced, the figures and
+words about it are dropped. A validation is kept only if none of the validated files has changed.
 """
 
 from __future__ import annotations
@@ -83,9 +82,9 @@ class Parts:
 
 
 def assemble(base: Bundle, parts: Parts, out: Path) -> dict[str, Any]:
-    """Write to the folder `out` an avatar that has `parts` and all else of `base`; returns facts about it.
+    """Write an avatar to the folder `out`: its `parts`, and all other files from `base`. Return facts about it.
 
-    Raises BadInputError when a part is wrong in itself or does not fit the others; then nothing is written.
+    Raises BadInputError when a part is wrong or does not fit the others; nothing is written then.
     """
     if not parts.files():
         raise BadInputError("avatar create", "no part", "--network, --texture or --body, at least one of them")
@@ -141,7 +140,7 @@ def _texture(source: Path, network: NetworkFile, parts: Parts) -> NDArray[np.flo
 
 
 def _check_body(base: Bundle, body: Body, parts: Parts) -> None:
-    """Raises BadInputError where the texture is laid out for another body than `body`."""
+    """Raise BadInputError where the texture is laid out for another body than `body`."""
     own = load_body(base.body_path)
     pairs = ((own.uv, body.uv), (own.uv_faces, body.uv_faces))
     same = all(one.shape == other.shape and np.allclose(one, other, atol=1e-6) for one, other in pairs)
@@ -170,7 +169,7 @@ def _manifest(base: Bundle, parts: Parts, network: NetworkFile, name: str) -> Ma
 
 
 def _provenance(own: Manifest, parts: Parts) -> dict[str, Any]:
-    """Say where the parts come from. Words about the person or the weights stay where these parts stay."""
+    """Return the origin of each part. Words about the person or the weights stay only if these parts stay."""
     stays = {"body": (parts.body, CAPTURED), "weights": (parts.network, UNTRAINED)}
     kept = {key: word for key, (part, word) in stays.items() if part is None and own.provenance.get(key) == word}
     kept |= {LOOK: own.provenance[LOOK]} if parts.body is None and LOOK in own.provenance else {}

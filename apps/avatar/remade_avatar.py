@@ -1,8 +1,8 @@
-"""A scene's avatar made again for a run: its network has another calibration, width or number of channels.
+"""Makes a scene's avatar again for a run, with another calibration, width or number of channels of its network.
 
-Rule: calibrating quantises the avatar's own float network, so its pictures count. A network of another width or number
-of channels is untrained: its times count and its pictures do not, and its manifest says so. What was made is kept below
-the cache, named by a digest of all that it follows from.
+Rule: a new calibration quantises the avatar's own float network, so its pictures are valid. A network of another width
+or number of channels is untrained: only its times are valid, and its manifest says so. The result is cached under a
+digest of all its inputs.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ VERSION = 1
 
 @dataclass(frozen=True)
 class _Recipe:
-    """What the new avatar differs in. `trained`: whether width and channels are the avatar's own."""
+    """The differences of the new avatar. `trained`: whether width and channels are the avatar's own."""
 
     width: int
     channels: int

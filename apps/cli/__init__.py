@@ -1,4 +1,4 @@
-"""The `trilane` command: a module for a command or a few small ones, options that commands share, what they print with.
+"""The `trilane` command: the modules of its commands, their shared options, and their output.
 
-It may use every folder; a module imports what is slow to import only when its command runs.
+It may use every folder. A module imports slow packages only when its command runs.
 """

@@ -1,4 +1,4 @@
-"""`trilane accuracy`: how far runtimes are from each other on a scene; what is left of numbers on hard cases.
+"""`trilane accuracy`: differences between runtimes on a scene, and errors of hard cases beside their bounds.
 
 Rule: this module reads options and shows results; every figure comes from `trilane.apps.experiments`.
 """
@@ -45,13 +45,13 @@ def accuracy(
     avatar: SceneAvatarOption = None,
     size: SceneSizeOption = None,
     frames: Annotated[
-        int | None, typer.Option(help="How many frames, evenly spread over the scene.  [default: 8; by cause: 2]")
+        int | None, typer.Option(help="Number of frames, evenly spread over the scene.  [default: 8; by cause: 2]")
     ] = None,
     runtime: Annotated[
         list[str] | None,
         typer.Option(
-            help="ort, openvino, qnn or cuda, once for each; all that are installed if none, on hard cases but the "
-            "emulator qnn, which takes minutes."
+            help="ort, openvino, qnn or cuda, once for each; all installed ones if not given. Hard cases then leave "
+            "out the emulator qnn, which takes minutes."
         ),
     ] = None,
     hard_cases: Annotated[
@@ -74,14 +74,14 @@ def accuracy(
     ] = None,
     lpips_weights: Annotated[
         Path | None,
-        typer.Option(help="With --by-cause: a file of LPIPS' weights, which is said then.", show_default=False),
+        typer.Option(help="With --by-cause: a file of LPIPS' weights, to measure LPIPS too.", show_default=False),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compare the runtimes with each other on a scene's frames, or hard cases with their bounds.
 
-    Exit code 1 when a figure is out of its bound, or when a wrong picture would keep a hard network's bound: one of a
-    single colour, one shifted by 8 pixels, or one with red and blue exchanged.
+    The exit code is 1 when a figure exceeds its bound. It is also 1 when the bound of a hard network is too wide to
+    detect a wrong picture: a single colour, a shift by 8 pixels, or red and blue exchanged.
     """
     from trilane.stages.dsp.runtime import installed
 
@@ -105,14 +105,14 @@ def accuracy(
 
 
 def _refuse_without_by_cause(options: dict[str, Path | None]) -> None:
-    """Raises BadInputError for options that only --by-cause knows."""
+    """Raise BadInputError for options that only --by-cause knows."""
     for name, value in options.items():
         if value is not None:
             raise BadInputError(name, str(value), "it beside --by-cause", "the other comparisons do not use it")
 
 
 def _refuse_other_comparisons(hard_cases: bool, runtimes: list[str]) -> None:
-    """Raises BadInputError for options that cannot stand beside --by-cause, which looks at one run."""
+    """Raise BadInputError for options that cannot stand beside --by-cause, which looks at one run."""
     if hard_cases:
         raise BadInputError("--by-cause", "--hard-cases beside it", "one of them")
     if len(runtimes) > 1:
@@ -121,7 +121,7 @@ def _refuse_other_comparisons(hard_cases: bool, runtimes: list[str]) -> None:
 
 
 def _refuse_a_scene(scene: str, options: dict[str, object]) -> None:
-    """Raises BadInputError for options that hard cases would leave aside, because they bring their own inputs."""
+    """Raise BadInputError for options that hard cases ignore, because they bring their own inputs."""
     asked = [name for name, value in options.items() if value is not None]
     if scene != SCENE or asked:
         found = ", ".join(asked) or scene

@@ -64,7 +64,7 @@ def inspect(name: AvatarArgument, json: JsonOption = False) -> None:
 @app.command(epilog=EPILOG_CREATE)
 def create(
     out: Annotated[Path, typer.Option("--out", help="Folder of the avatar to write.")],
-    name: Annotated[str, typer.Argument(help="The avatar whose other parts stay: its name or folder.")] = "default",
+    name: Annotated[str, typer.Argument(help="Name or folder of the avatar that gives all other parts.")] = "default",
     network: Annotated[
         Path | None, typer.Option(help="Integer network (.onnx), as `trilane avatar quantise` writes it.")
     ] = None,
@@ -98,7 +98,7 @@ def create_data(
         float, typer.Option(min=0, max=50, help="Move the outline of masks by up to so many pixels.")
     ] = 0.0,
     look: Annotated[
-        str, typer.Option(help="Who is drawn: default, or hiker, of another build in other clothes.")
+        str, typer.Option(help="Person to draw: default, or hiker, who has another build and other clothes.")
     ] = "default",
     json: JsonOption = False,
 ) -> None:
@@ -160,7 +160,7 @@ app.command(epilog=avatar_network.EPILOG_EXPORT)(avatar_network.export)
 
 
 def _checked(capture: Capture, picture: Path) -> dict[str, Any]:
-    """Write the sheet of `capture` to `picture`; returns what is said of the capture."""
+    """Write the sheet of `capture` to `picture`, and return the facts about the capture."""
     from trilane.training.capture.capture_samples import BodyRaster
     from trilane.training.capture.check import (
         bad_frames,
@@ -191,7 +191,7 @@ def _checked(capture: Capture, picture: Path) -> dict[str, Any]:
 
 
 def _state_cost(capture: SyntheticCapture, recipe: Recipe) -> None:
-    """Say on stderr what all frames will take, as measured by drawing one."""
+    """Estimate on stderr the cost of all frames, from the measured cost of one."""
     import psutil
 
     from trilane.training.capture.synthetic import measured_cost

@@ -96,8 +96,9 @@ def split(
     size: FixedSizeOption = "256",
     json: JsonOption = False,
 ) -> None:
-    """Cut an avatar's network; the parts one after the other give the same bytes.
+    """Cut an avatar's network into parts.
 
+    In sequence, the parts give the same bytes as the whole network.
     `trilane run --split TENSOR=UNIT` runs the parts as stages of their own.
     """
     from trilane.avatars.bundle import load_bundle
@@ -116,14 +117,17 @@ def split(
 def export(
     name: AvatarArgument,
     out: OutFileOption,
-    qnn: Annotated[bool, typer.Option("--qnn", help="As an HTP context binary, the only format there is.")] = False,
+    qnn: Annotated[
+        bool,
+        typer.Option("--qnn", help="Write an HTP context binary; there is no other format, so the option is required."),
+    ] = False,
     soc: Annotated[str, typer.Option(help="Qualcomm's name of the chip.")] = "sm8350",
     size: Annotated[
         str | None, typer.Option(help="HEIGHTxWIDTH of the tensor; the avatar's own when not given.")
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Compile an avatar's network for a Snapdragon, without one."""
+    """Compile an avatar's network for a Snapdragon."""
     from trilane.avatars.bundle import load_bundle
     from trilane.avatars.network_file import reshaped
     from trilane.stages.dsp.runtime import resolve
@@ -245,12 +249,12 @@ def calibrations(
         Path | None, typer.Argument(help="Float network (.onnx) with the input N x C x H x W; with --frames.")
     ] = None,
     frames: Annotated[
-        Path | None, typer.Option(help="Real inputs: .npy (N, H, W, C) of floats; pictures of the last 5 are compared.")
+        Path | None, typer.Option(help="Real inputs: .npy (N, H, W, C) of floats; the last 5 are for the comparison.")
     ] = None,
     avatar: Annotated[
         str | None,
         typer.Option(
-            help="Instead: the avatar's float network, on views drawn as the training's; 24 others are compared."
+            help="Use the avatar's float network, on views drawn as in training; 24 more views are for the comparison."
         ),
     ] = None,
     method: Annotated[list[str] | None, typer.Option(help=f"{METHOD_HELP} Repeat it; all if none.")] = None,

@@ -1,6 +1,6 @@
-"""Commands of `trilane avatar` that make an avatar good: `train` and `validate`.
+"""Commands of `trilane avatar` that train and validate an avatar.
 
-Rule: this file talks to the person; the work is done in `trilane.training.train` and `trilane.training.validate`.
+Rule: this file talks to the person; `trilane.training.train` and `trilane.training.validate` do the work.
 """
 
 from __future__ import annotations
@@ -63,21 +63,24 @@ def train(
         Path | None, typer.Argument(help="Folder of a capture; none if the settings have a look.")
     ] = None,
     work: Annotated[
-        Path | None, typer.Option(help="Folder of samples, state and sheets; OUT-work if none. Training goes on there.")
+        Path | None,
+        typer.Option(help="Folder of samples, state and sheets; OUT-work if not given. Training continues from there."),
     ] = None,
     config: Annotated[
-        Path | None, typer.Option(help="Settings (training.toml), such as an avatar's own; options go before them.")
+        Path | None, typer.Option(help="Settings (training.toml), such as an avatar's own; options override them.")
     ] = None,
     minutes: Annotated[float, typer.Option(help="Time of training; the samples before it take some more.")] = 60.0,
-    steps: Annotated[int | None, typer.Option(help="Steps of training, in place of a time.")] = None,
+    steps: Annotated[int | None, typer.Option(help="Number of training steps, in place of a time.")] = None,
     samples: Annotated[int, typer.Option(help="Views of the frames to train on.")] = 4000,
-    seed: Annotated[int, typer.Option(help="Of all random numbers.")] = 1,
-    threads: Annotated[int, typer.Option(help="Of PyTorch, and processes that draw; only 1 repeats to the bit.")] = 1,
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda; auto takes an NVIDIA GPU that is there.")] = "auto",
+    seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 1,
+    threads: Annotated[
+        int, typer.Option(help="Threads of PyTorch, and processes that draw; only 1 gives the same bits again.")
+    ] = 1,
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda; auto is an NVIDIA GPU if there is one.")] = "auto",
     start: Annotated[
         str, typer.Option(help="Network to train further, of avatar default or hiker; new: random weights.")
     ] = "default",
-    width: Annotated[int, typer.Option(help="Of a new network; 64 is full.")] = 16,
+    width: Annotated[int, typer.Option(help="Width of a new network; 64 is full.")] = 16,
     loss: Annotated[
         str, typer.Option(help="default: the default avatar's; thesis: L1, Dice, perceptual, GAN.")
     ] = "default",
@@ -91,7 +94,7 @@ def train(
 
     Without a capture, the settings name a look of the default body.
 
-    A command that was ended goes on where it was when it is given again.
+    After an interruption, the same command continues the training where it stopped.
     """
     from trilane.training.training_settings import parsed_settings, read_settings
 
@@ -119,7 +122,7 @@ def train(
 
 
 def _require_torch() -> None:
-    """Raises MissingPartError with the lines that install what training needs."""
+    """Raise MissingPartError with the lines that install what training needs."""
     missing = [name for name in ("torch", "scipy", "skimage") if not machine.here.has_package(name)]
     if "torch" in missing:
         lines = f"{package_line('torch')} --index-url {CPU_INDEX} (CPU) or {package_line('torch')} (NVIDIA GPU)"
@@ -144,7 +147,7 @@ def _shown(log: EventLog | None) -> Iterator[_ShownTraining]:
 
 
 class _ShownTraining:
-    """Shows what a training says; a `train.Listener`."""
+    """Shows the progress of a training; a `train.Listener`."""
 
     def __init__(self, console: Console, progress: Progress, log: EventLog | None) -> None:
         self._console, self._progress, self._log = console, progress, log
@@ -178,7 +181,7 @@ class _ShownTraining:
 class EventLog:
     """Writes the losses of a training into `folder` as a log for TensorBoard; the first step makes its file.
 
-    A training that goes on takes back what was logged after its state.
+    A continued training removes the entries after its saved state.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -194,13 +197,13 @@ class EventLog:
             self._writer.add_scalar(f"terms/{name}", value, step)
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the remaining entries."""
         if self._writer is not None:
             self._writer.close()
 
 
 def _writer(folder: Path, step: int) -> Any:
-    """Return a writer that takes back what `folder` has from `step` on."""
+    """Return a writer to `folder`, after removing its entries from `step` on."""
     from torch.utils.tensorboard import SummaryWriter
 
     return SummaryWriter(str(folder), purge_step=step, flush_secs=FLUSH_S)
@@ -210,7 +213,7 @@ def validate(
     name: AvatarArgument,
     held_out: Annotated[
         list[str] | None,
-        typer.Option(help="Motion that no training had: builtin:NAME or a file. Repeat it; walk-wave-turn if none."),
+        typer.Option(help="Motion that no training used: builtin:NAME or a file. Repeat it; walk-wave-turn if none."),
     ] = None,
     seed: Annotated[
         list[int] | None, typer.Option(min=0, help="Seed of views and poses. Repeat it; 1 to 8 if none.")
@@ -234,7 +237,7 @@ def validate(
 ) -> None:
     """Measure an avatar's image error on held-out views, and write it into the manifest with digests of the files.
 
-    What the manifest said before is replaced.
+    It replaces an earlier validation.
     """
     from trilane.apps.run.asked_run import made_facts
     from trilane.avatars.bundle import load_bundle, require_writable_manifest
@@ -296,7 +299,7 @@ def _band_table(validation: Validation) -> Table:
 
 
 def _validate(bundle: Bundle, plan: ValidationPlan, float_network: Path | None, sheet: Path | None) -> Bundle:
-    """Validate `bundle`, write its manifest and, where asked, the sheet; returns the bundle as it is then."""
+    """Validate `bundle`, write its manifest and, where asked, the sheet. Return the bundle as it was written."""
     from rich.progress import Progress
 
     from trilane.training import validate as work
@@ -320,7 +323,7 @@ def _validate(bundle: Bundle, plan: ValidationPlan, float_network: Path | None, 
 
 
 def _add_sizes(bundle: Bundle, plan: ValidationPlan) -> Bundle:
-    """Measure `bundle` at several tensor sizes and add the figures to its validation, which must be of its files."""
+    """Measure `bundle` at several tensor sizes and add the figures to its validation, which must fit its files."""
     from rich.progress import Progress
 
     from trilane.avatars.validation import VALIDATE, name_of, refused

@@ -1,8 +1,8 @@
-"""`trilane bench`: the questions about speed and exactness that this machine can answer, by name.
+"""`trilane bench`: measurements of this machine's speed and exactness, by name.
 
-Rule: a bench is one module of `trilane.bench` with a `measure`, and one line of `BENCHES`. The parameters of `measure`
-are the command's options, with types from their defaults; its docstring and the module's question are the help. An
-option means the same in every bench, or has a line of its own in `MEANINGS` for the bench where it does not.
+Rule: a bench is a module of `trilane.bench` with a `measure`, and a line of `BENCHES`. The parameters of `measure` are
+the command's options, with types from their defaults. Its docstring and the module's question are the help. An option
+has one meaning in all benches, or a line of its own in `MEANINGS`.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ BENCHES = {
     "planner": ("trilane.bench.planner", "Planned work against a fixed square: speed and image error."),
     "predict": (
         "trilane.apps.experiments.host_predicted",
-        "What is predicted of this machine, beside real runs and calls.",
+        "Predictions for this machine, beside real runs and calls.",
     ),
     "sizes": ("trilane.apps.experiments.error_by_size", "What a speed costs in image error, by size and runtime."),
     "flicker": (
@@ -153,13 +153,13 @@ app = Commands(
     cls=BenchGroup,
     no_args_is_help=True,
     epilog=EPILOG,
-    help="Measure this machine; results carry its facts.",
+    help="Measure this machine; each result includes facts about it.",
 )
 
 
 @app.callback()
 def bench() -> None:
-    """Measure this machine; results carry its facts."""
+    """Measure this machine; each result includes facts about it."""
 
 
 def bench_command(name: str) -> Any:

@@ -137,7 +137,7 @@ def _write_vertices(out: Path, shaped: ShapedBody, frames: NDArray[np.float64]) 
 
 
 def _check_place(path: Path, size: int) -> None:
-    """Raises BadInputError when no file of `size` bytes can be at `path`."""
+    """Raise BadInputError when no file of `size` bytes can be at `path`."""
     if path.is_dir():
         raise BadInputError(path, "a folder", "a file in a folder", OTHER_OUT)
     if not path.parent.is_dir():

@@ -1,8 +1,8 @@
-"""What modules of commands are made of: the Typer application, and the options that several commands share.
+"""The Typer application of the commands, and the options that several commands share.
 
-Rule: an option that takes one value is given at most once; a second value would silently replace the first. What is
-wrong with a value is said as everywhere: what was found, what was expected. An option of a run is a field of
-`RunOptions`; another one that two commands have stands here. Each is spelt and explained alike in all commands.
+Rule: an option with one value is given at most once, because a second value would silently replace the first. Errors
+about a value state what was found and what was expected. Options of a run are fields of `RunOptions`; other shared
+options are defined here. Each has one spelling and one explanation in all commands.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class OnceCommand(TyperCommand):
     """A command whose options take one value each, but for those that collect several."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Raises BadInputError naming an option that is given twice or has a value of another kind or range.
+        """Raise BadInputError naming an option that is given twice or has a value of another kind or range.
 
         Its other spelling (`--no-hud`) is the same option.
         """
@@ -67,7 +67,7 @@ def _wrong_value(parameter: Any, error: ValidationError) -> BadInputError:
 
 
 def _may_be_repeated(option: TyperOption) -> bool:
-    """Say whether the option collects values, or is a flag that can only say the same thing again."""
+    """Return whether the option may be repeated: it collects values, or it is a flag without an opposite."""
     return option.multiple or option.count or (option.is_flag and not option.secondary_opts)
 
 

@@ -39,7 +39,7 @@ BaseArgument = Annotated[
     str, typer.Argument(metavar="BASE", help="A run folder, its report.json, a prediction, or a sweep's folder.")
 ]
 OthersArgument = Annotated[
-    list[str], typer.Argument(metavar="OTHER", help="What is compared with it. Runs of one kind: A1,A2,A3.")
+    list[str], typer.Argument(metavar="OTHER", help="Runs to compare with the base. Runs of one kind: A1,A2,A3.")
 ]
 HtmlOption = Annotated[Path | None, typer.Option("--html", help="Write a page that needs nothing else here.")]
 AllOption = Annotated[bool, typer.Option("--all", help="Show every figure, not only those that differ.")]
@@ -47,7 +47,7 @@ SlowerOption = Annotated[
     str | None,
     typer.Option(
         "--fail-if-slower",
-        help="Exit with 1 where frames surely take longer by more than so much, as 5%; with 3 where it cannot be told.",
+        help="Exit with 1 if frames certainly take longer by more than this, such as 5%; with 3 if uncertain.",
     ),
 ]
 
@@ -63,9 +63,10 @@ def compare(
 ) -> None:
     """Say what differs between runs, by how much, how sure that is, and the likely cause.
 
-    Every figure of OTHER stands beside that of BASE with a 95 % interval. Exit code 0 also when they differ, and when
-    it cannot be told; with --fail-if-slower 1 where frames surely take longer by more, 3 where that cannot be told.
-    Of two sweeps, trials of equal configuration stand beside each other. docs/compare.md says how it is told.
+    Every figure of OTHER is shown beside that of BASE with a 95 % interval. The exit code is 0 even if the runs differ
+    or the difference is uncertain. With --fail-if-slower it is 1 if frames certainly take longer by more than that, and
+    3 if this is uncertain. Two sweeps are compared by trials of equal configuration. docs/compare.md explains the
+    method.
     """
     limit = _share(fail_if_slower)
     if _are_sweeps([base, *others]):

@@ -1,4 +1,4 @@
-"""What `trilane compare` prints for people. Rule: the verdict first, then what it rests on, then what is unsure."""
+"""Prints a comparison for people. Rule: the verdict comes first, then its evidence, then the uncertain figures."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def _trial_table(pairs: Sequence[TrialPair]) -> Table:
 
 
 def _left_out(comparison: Comparison, shown: Sequence[Figure]) -> Iterator[str]:
-    """Say how many figures the table leaves out: those that do not differ, then those that cannot be told."""
+    """Say how many figures the table leaves out: figures without a difference, then uncertain ones."""
     left = [comparison.outcome(figure) for figure in comparison.rows if figure not in shown]
     unknown = left.count(Finding.UNKNOWN)
     if alike := len(left) - unknown:

@@ -1,4 +1,4 @@
-"""What every command writes with: data on stdout, messages on stderr, JSON as one document.
+"""The output of all commands: data on stdout, messages on stderr, JSON as one document.
 
 Rule: nothing but a command's result goes to stdout, so that `trilane ... --json | jq` always works.
 """
@@ -21,7 +21,7 @@ _WRITTEN_OUT = {code: repr(chr(code))[1:-1] for code in (*range(0x20), *range(0x
 
 
 class _Kept:
-    """Wraps a stream: what is written to a terminal that is gone is lost, and is no error."""
+    """A stream whose terminal may close; later writes are then lost without an error."""
 
     def __init__(self, stream: IO[str]) -> None:
         self._stream = stream
@@ -70,7 +70,7 @@ def say(text: str) -> None:
 
 @contextmanager
 def stdout_kept() -> Iterator[None]:
-    """Send what libraries write to file descriptor 1 inside the block to stderr: it is not a result."""
+    """Redirect file descriptor 1 to stderr inside the block, because the output of libraries is not a result."""
     sys.stdout.flush()
     stdout_copy = os.dup(1)
     os.dup2(2, 1)
@@ -94,9 +94,9 @@ def spinner(text: str) -> Iterator[None]:
 
 
 def without_controls(value: Any) -> Any:
-    """Write out the control characters of a file's texts, because a terminal would obey them.
+    """Escape the control characters in a file's texts, because a terminal would obey them.
 
-    `value`: text, or mappings and lists of texts and numbers; everything but texts stays as it is.
+    `value`: text, or mappings and lists of texts and numbers; everything except texts stays as it is.
     """
     if isinstance(value, str):
         return value.translate(_WRITTEN_OUT)

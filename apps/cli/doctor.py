@@ -1,6 +1,6 @@
 """`trilane doctor`: what this machine has, what is missing, and the line that installs it.
 
-Rule: a part is said to work only after it was tried here.
+Rule: a part counts as working only after it has been tried here.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ EPILOG = "\b\nExamples:\n  trilane doctor\n  trilane doctor --json"
 class PartCheck:
     """The check of one part that a run uses.
 
-    `name`: name of the part. `found`: what is here of it.
+    `name`: name of the part. `found`: description of what was found.
     `works`: whether it was tried and works. `needed`: whether a run needs it.
     `install`: line that fixes it.
     """
@@ -118,7 +118,7 @@ def _dev_shm() -> PartCheck:
 
 
 def _wakeup() -> PartCheck:
-    """Check whether cores stay awake; not needed: without it a message to a sleeping core takes some 50 us longer."""
+    """Check whether cores stay awake. This is optional: a message to a sleeping core takes some 50 us longer."""
     from trilane.transport.wakeup import AWAKE, LATENCY_FILE, awake
 
     install = f'apt-get install acl; setfacl -m "u:$USER:w" {LATENCY_FILE}'
@@ -136,7 +136,7 @@ def _counters() -> PartCheck:
 
 
 def checks(gl: dict[str, Any] | None) -> list[PartCheck]:
-    """Return every check, in the order in which they are shown. `gl`: what `gl_facts` said."""
+    """Return every check, in the order in which they are shown. `gl`: result of `gl_facts`."""
     machine = [_python(), _cpu(), _int8(), _counters(), _memfd(), _dev_shm(), _wakeup(), _gl(gl)]
     return [*machine, _runtimes(), *_packages()]
 

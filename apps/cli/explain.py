@@ -1,4 +1,4 @@
-"""`trilane explain`: what is modelled of a scene, as a database explains a query; where the time of a run went.
+"""`trilane explain`: the plan of a scene, as a database explains a query, and the use of time in a run.
 
 Rule: this module reads options and shows results; everything is decided and computed elsewhere.
 """
@@ -46,14 +46,14 @@ READ_PLAN_SO = (
     "in the first of them"
 )
 RECTANGLES = "in blue how far each reaches with its clothes, in orange what the tensor shows"
-ChipOption = Annotated[str, typer.Option("--profile", help=f"{PROFILE_HELP} Its times are those that are saved.")]
+ChipOption = Annotated[str, typer.Option("--profile", help=f"{PROFILE_HELP} The saved time is computed for it.")]
 PictureOption = Annotated[Path | None, typer.Option(help=f"Draw bodies, {RECTANGLES}, here (.png).")]
 CapOption = Annotated[PerformanceProfile, PerformanceProfileOption]
 SceneOrRunArgument = Annotated[str, typer.Argument(help="A scene, by file (TOML) or name; or the folder of a run.")]
 SlowestOption = Annotated[
-    int, typer.Option(min=1, max=MOST_SLOWEST, help="Of a run: how many of the slowest frames are explained.")
+    int, typer.Option(min=1, max=MOST_SLOWEST, help="For a run: number of the slowest frames to explain.")
 ]
-JobsOption = Annotated[Path | None, typer.Option(help="Of a run: write every job here (.csv, .parquet).")]
+JobsOption = Annotated[Path | None, typer.Option(help="For a run: file for a table of all jobs (.csv, .parquet).")]
 #: Options of a run that its plan depends on.
 OF_A_PLAN = frozenset({"motion", "camera", "avatar", "frames", "fps", "output", "size", "skinning", "cores"})
 #: Options that mean something with a run folder.
@@ -86,8 +86,8 @@ def explain(
 ) -> None:
     """Explain the plan of a scene: what is modelled, what is left out, the error it costs and the work it saves.
 
-    With a run folder instead: which stage or wait bounded the frame time, why jobs waited, and why the slowest frames
-    were slow (docs/explain.md).
+    With a run folder, explain the time instead: the stage or wait that bounded the frame time, why jobs waited, and why
+    the slowest frames were slow (docs/explain.md).
     """
     folder = run_folder(scene)
     _refuse_options(given(ctx), of_a_run=folder is not None)
@@ -174,7 +174,7 @@ def _saved(saved: dict[str, float]) -> str:
 
 
 def _left_out(phases: list[dict[str, Any]]) -> list[str]:
-    """Return a line for each way in which avatars are modelled: what it leaves out of them."""
+    """Return a line for each way in which avatars are modelled, with the parts that it leaves out."""
     rows = [row for phase in phases for row in phase["avatars"]]
     lines = {}
     for row in rows:
@@ -216,8 +216,7 @@ def _totals(totals: dict[str, Any], config: dict[str, Any]) -> list[str]:
 def run_folder(name: str) -> Path | None:
     """Return the run folder that `trilane explain NAME` means, found as `trilane top` finds it; None for a scene.
 
-    A name that one of Trilane's scenes has means that scene. Raises BadInputError for a folder whose journal is a link
-    to nothing.
+    The name of a bundled scene means that scene. Raises BadInputError for a folder whose journal is a broken link.
     """
     from trilane.apps.watch.followed_run import EXPECTED, follow, without_journal
     from trilane.pipeline.journal import NAME
@@ -237,7 +236,7 @@ def run_folder(name: str) -> Path | None:
 
 
 def _refuse_options(typed: set[str], *, of_a_run: bool) -> None:
-    """Raises BadInputError for options that only the other kind of `trilane explain` has."""
+    """Raise BadInputError for options that only the other kind of `trilane explain` has."""
     useless = typed - OF_A_RUN if of_a_run else typed & NOT_OF_A_SCENE
     if useless:
         names = ", ".join(sorted(f"--{name.replace('_', '-')}" for name in useless))
@@ -343,7 +342,7 @@ def _budget(document: Mapping[str, Any]) -> Table:
 
 
 def _shared(rows: list[dict[str, Any]]) -> Iterator[str]:
-    """Say for each stage whose unit lacked a core for a noticeable time who had the core."""
+    """Name the stages that had the core while the unit of another stage lacked it for a noticeable time."""
     for row in rows:
         if row["preempted_ms"] < LEAST_SHARE * row["service_ms"]:
             continue

@@ -77,7 +77,7 @@ def _draw(found: Any, out: Path | None) -> Path | None:
 
 
 def lines(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what a person reads of the document."""
+    """Yield the document as lines for people."""
     yield f"{document['file']}: {document['what']}"
     rows = {
         "not usable": document["problem"],

@@ -1,7 +1,7 @@
 """Entry point of the `trilane` command: the table of commands, the global options and the exit codes.
 
-Rule: a command is in a module with a Typer `app`, named by one line of `COMMANDS` and imported when it is called;
-an error that a person can cause ends here as one sentence on stderr and an exit code, never as a traceback.
+Rule: each line of `COMMANDS` names a module with a Typer `app`, which is imported when its command is called. An error
+that a person can cause becomes one sentence on stderr and an exit code, never a traceback.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ Exit codes:
 def command_of(name: str) -> Any:
     """Import the module of command `name` and return the command.
 
-    A module's `app` holds one command, one group, or several small commands; then the name picks one.
+    A module's `app` is a command, a group, or a set of small commands from which the name selects one.
     """
     require_memory(part=2)  # with less, NumPy's import or the kernel would end the process
     command = typer.main.get_command(importlib.import_module(COMMANDS[name][0]).app)
@@ -146,7 +146,10 @@ def _describe(error: Exception) -> tuple[str, int]:
 
 
 def _is_of_stdout(error: OSError) -> bool:
-    """Say whether stdout takes no more, which writing one more byte shows; for another error nothing is tried."""
+    """Return whether stdout caused `error`.
+
+    If the error may be that of a full disk, one more byte is written as a test.
+    """
     if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
         return False
     try:
@@ -157,7 +160,7 @@ def _is_of_stdout(error: OSError) -> bool:
 
 
 def _call(arguments: list[str]) -> None:
-    """Call the command and flush its output. A reader that has left is no error; a full disk is."""
+    """Call the command and flush its output. A full disk is an error; a reader that has left is none."""
     try:
         app(args=arguments, prog_name="trilane")
     except SystemExit:
@@ -181,7 +184,7 @@ def main() -> None:
 
 
 def entry() -> NoReturn:
-    """Call `main` and end the process without taking every module down, which would take 0.1 s."""
+    """Call `main`, and end the process without Python's clean-up, which would take 0.1 s."""
     code: object = 0
     try:
         main()

@@ -50,8 +50,8 @@ def predict(options: PredictOptions, *, json: JsonOption = False) -> None:
 
     Without --network, or with --application: the avatar's application. With --network: each network by itself.
 
-    The performance profile is burst, if none is given, for a network by itself, as published latencies are, and for the
-    profile `host`, this machine, where a run has no cap.
+    Without --performance-profile, a network by itself has the profile burst, because published latencies have it. So
+    has the profile `host` (this machine), because a run here has no cap.
     """
     from trilane.hw_profiles.profile_files import load_runnable
 
@@ -76,7 +76,7 @@ def predict(options: PredictOptions, *, json: JsonOption = False) -> None:
 
 
 def _write_trace(chip: Profile, plan: Plan, options: PredictOptions, answer: dict[str, Any], target: Path) -> None:
-    """Write the simulated run, from which the prediction has its shares of time, as a trace."""
+    """Write the simulated run behind the predicted shares of time as a trace."""
     from trilane.apps.explain.trace import write_predicted
     from trilane.hw_profiles.predict import predicted_run
 

@@ -70,7 +70,7 @@ def draw(chip: Profile, plan: Plan, asked: str, minutes: float, governor: str | 
 
 
 def show_networks(chip: Profile, options: PredictOptions, answers: list[dict[str, Any]], as_json: bool) -> None:
-    """Print what is predicted of networks by themselves.
+    """Print the predictions for networks by themselves.
 
     `chip`: hardware profile of the chip.
     `options`: options of the prediction. `answers`: answers of `predict_network`.

@@ -1,7 +1,7 @@
 """`trilane predict SCENE --beside …`: several pipelines on one chip, as options and as tables.
 
-Rule: nothing is computed here; `apps/predict/asked_pipelines.py` reads what the pipelines are, and
-`hw_profiles/shared_chip.py` answers.
+Rule: nothing is computed here; `apps/predict/asked_pipelines.py` reads the pipelines, and `hw_profiles/shared_chip.py`
+answers.
 """
 
 from __future__ import annotations
@@ -28,11 +28,12 @@ if TYPE_CHECKING:
 def predict_pipelines(options: PredictOptions, as_json: bool) -> None:
     """Print how the scene of `options` and the pipelines beside it do on one chip.
 
-    Raises BadInputError for what is wrong in one of them.
+    Raises BadInputError for a fault in one of them.
     """
     from trilane.apps.predict.asked_pipelines import tenants
-    from trilane.hw_profiles.profile_files import HOST, load_runnable
+    from trilane.hw_profiles.profile_files import load_runnable
     from trilane.hw_profiles.shared_chip import predict_beside
+    from trilane.units import HOST
 
     scene = str(options.scene)
     chip, variant = load_runnable(options.profile), _variant(options.policy or "", options.edge)
@@ -120,7 +121,7 @@ def _mean(times: Mapping[str, float]) -> str:
 
 
 def _idle(answer: dict[str, Any]) -> Table:
-    """Return a table of each unit: the busy time of all, then each pipeline's own and why the unit was idle for it."""
+    """Return a table of each unit: its busy time for all, and its busy time and idle causes per pipeline."""
     from rich.table import Table
 
     table = Table("unit", "pipeline", "busy", *IDLE)

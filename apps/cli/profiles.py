@@ -85,7 +85,7 @@ def _quantities(data: Any, key: str) -> list[tuple[str, dict[str, Any]]]:
 @app.command(epilog="\b\nExamples:\n  trilane profiles check\n  trilane profiles check mine.toml")
 def check(
     names: Annotated[
-        list[str] | None, typer.Argument(help="Profiles or TOML files; all that are here if none.")
+        list[str] | None, typer.Argument(help="Profiles or TOML files; all bundled ones if not given.")
     ] = None,
     json: JsonOption = False,
 ) -> None:

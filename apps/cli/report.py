@@ -50,11 +50,11 @@ def report(
     parquet: ParquetOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Write one page of many runs, predictions and trials: who is on the frontier of frame time against error.
+    """Write one page of many runs, predictions and trials, with the frontier of frame time against error.
 
-    The page needs nothing else: it has the table, which sorts and filters, pictures to lay over each other, the
-    machines and the command of each entry. An error is that of the run itself where it has one (`run --check`), else
-    of its avatar's validation; the table says which.
+    The page is one self-contained file: a table to sort and filter, pictures to lay over each other, the machines, and
+    the command of each entry. An error comes from the run itself (`run --check`), else from its avatar's validation;
+    the table names the source.
     """
     from trilane.apps.compare.overview import read_entries, table_rows, write_csv, write_parquet
     from trilane.apps.compare.overview_page import page

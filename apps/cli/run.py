@@ -1,6 +1,6 @@
 """`trilane run`: a scene through the three units, to a run folder and a table.
 
-Rule: this file talks to the person; what is done is in `trilane.apps.run.asked_run`.
+Rule: this file talks to the person; `trilane.apps.run.asked_run` does the work.
 """
 
 from __future__ import annotations

@@ -162,7 +162,7 @@ def _service_and_wait(times: StageTimes | None) -> str:
 
 
 def _byte_rows(runs: Sequence[PolicyMetrics]) -> Rows:
-    """Yield what every stage moved for a frame, and all of it beside the least; nothing where no run counted it."""
+    """Yield rows of the bytes that each stage moves for a frame, and of their sum beside the least; else none."""
     if not any(run.bytes for run in runs):
         return
     counting = [stage for stage, times in runs[0].stages.items() if times.bytes]
@@ -244,7 +244,7 @@ def _skipped(report: Report) -> str:
 
 
 def _of_several(run: PolicyMetrics, value: float) -> float | None:
-    """Return a time between frames, or a latency; None with one frame, which is no statistic."""
+    """Return a frame time or a latency; None for a single frame, which gives no statistic."""
     return value if run.frames.presented > 1 else None
 
 

@@ -1,7 +1,7 @@
-"""`trilane sweep`: many configurations of one command, each tried once, in a folder that remembers what is done.
+"""`trilane sweep`: tries many configurations of one command, each once, and keeps the results in a folder.
 
-Rule: this file talks to the person; `trilane.apps.sweep` says what a sweep is, and runs it. While it goes on, a
-terminal has one bar with the time left, anything else a line for each trial that ended; both on stderr.
+Rule: this file talks to the person; `trilane.apps.sweep` defines and runs sweeps. A terminal shows a bar with the
+remaining time; any other stderr gets a line for each trial that ended.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ ERRORS = {"PSNR, dB": ("check", "psnr_db"), "worst": ("check", "worst_psnr_db"),
 
 
 class EngineName(StrEnum):
-    """Where the trials are done: on this machine, or on those of a Ray cluster."""
+    """The place where trials are done: this machine, or the machines of a Ray cluster."""
 
     LOCAL = "local"
     RAY = "ray"
@@ -59,22 +59,24 @@ WordsArgument = Annotated[
     list[str],
     typer.Argument(
         metavar="FILE|COMMAND",
-        help="A sweep file (TOML), or run, predict, accuracy or bench NAME with its own arguments and options, "
-        "of which one that is given several times is an axis.",
+        help="A sweep file (TOML), or run, predict, accuracy or bench NAME with its own arguments and options. "
+        "An option that is given several times is an axis.",
     ),
 ]
 
-EngineOption = Annotated[EngineName, typer.Option(help="local: this machine; ray: those of the Ray cluster.")]
+EngineOption = Annotated[EngineName, typer.Option(help="local: this machine; ray: the machines of a Ray cluster.")]
 
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on with a sweep that was interrupted or killed.")]
 
 FolderOption = Annotated[Path | None, typer.Option("--out", help="Folder of the sweep; sweeps/NAME-HASH if none.")]
 
-ListOption = Annotated[bool, typer.Option("--list", help="Take the axes side by side, first with first.")]
+ListOption = Annotated[
+    bool, typer.Option("--list", help="Combine the first values of all axes, then the second ones, and so on.")
+]
 
 RandomOption = Annotated[int | None, typer.Option("--random", min=1, help="Draw so many of the combinations.")]
 
-SeedOption = Annotated[int | None, typer.Option(help="Of --random; 0 if none.")]
+SeedOption = Annotated[int | None, typer.Option(help="Seed of --random; 0 if not given.")]
 
 DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Print the trials and run none.")]
 
@@ -93,9 +95,9 @@ def sweep(
 ) -> None:
     """Try many configurations of run, predict, accuracy or a bench, and keep every result.
 
-    Every combination of the axes is a trial, a process of its own; its line in trials.jsonl has the command's whole
-    --json document. Trials on the host clock run one at a time, predictions on all cores. What is done is not done
-    again. docs/sweeps.md says more.
+    Every combination of the axes is a trial, which is a process. Its line in trials.jsonl has the command's whole
+    --json document. Trials on the host clock run one at a time, predictions on all cores. Finished trials are not
+    repeated. docs/sweeps.md says more.
     """
     if words[0].endswith(ENDING):
         name, definition, command = _of_file(words, as_list, random, seed)
@@ -170,9 +172,9 @@ def _trials(first: str, definition: Definition, command: SweptCommand) -> list[T
 
 
 def _require_checks(trials: Sequence[Trial]) -> None:
-    """Raises MissingPartError, before the first trial, where runs are to be checked and cannot be.
+    """Raise MissingPartError, before the first trial, if the runs cannot be checked as asked.
 
-    A trial says by itself what else is wrong with it.
+    Each trial reports its other faults itself.
     """
     from trilane.apps.run.run_job import require_parts
     from trilane.avatars.bundle import load_bundle
@@ -187,7 +189,7 @@ def _require_checks(trials: Sequence[Trial]) -> None:
 
 
 def _default_folder(name: str, trials: Sequence[Trial]) -> Path:
-    """Return the same folder for the same trials, so that a rerun finds what is done."""
+    """Return the same folder for the same trials, so that a rerun finds the finished ones."""
     digest = hashlib.sha256("".join(sorted(trial.id for trial in trials)).encode()).hexdigest()
     return Path("sweeps") / f"{name}-{digest[:8]}"
 
@@ -195,7 +197,7 @@ def _default_folder(name: str, trials: Sequence[Trial]) -> Path:
 def _run(
     trials: Sequence[Trial], folder: Path, definition: Definition, engine: EngineName, resume: bool, as_json: bool
 ) -> bool:
-    """Run what is left and print how it ended; returns whether a trial is not done."""
+    """Do the remaining trials and print how they ended. Return whether any trial is not done."""
     from trilane.apps.run.asked_run import made_facts
     from trilane.apps.sweep.store import Store, is_ended, run_sweep, summary
 
@@ -270,7 +272,7 @@ def seconds_left(elapsed_s: float, ended: int, left: int) -> float:
 
 @contextmanager
 def _progress(left: int, whole: int) -> Iterator[Callable[[Mapping[str, Any]], None]]:
-    """Yield a function that is told of each trial that ended. `left`: number of the `whole` that are not done yet."""
+    """Yield a function to call for each trial that ended. `left`: number of the `whole` trials that are not done."""
     console = stderr_console()
     if not console.is_terminal:
         yield _plain(console, left, whole)

@@ -1,6 +1,6 @@
 """The options of the commands that a sweep can try, found in the commands themselves.
 
-Rule: no second list of options. What a name, a spelling or a value is, the command's own parser says.
+Rule: no second list of options exists. The command's own parser interprets names, spellings and values.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class SweptCommand:
         self._parameters = {_name(each): each for each in self._command.params if _name(each) not in NOT_SWEPT}
 
     def values_of(self, tokens: Sequence[str]) -> dict[str, list[Value]]:
-        """Return by name the values that were given, one after the other. Raises BadInputError.
+        """Return the given values by name, in order. Raises BadInputError.
 
-        `tokens`: what a person typed after the command.
+        `tokens`: words of the command line after the command.
         """
         found: dict[str, list[Value]] = {}
         arguments = [name for name, each in self._parameters.items() if each.param_type_name == "argument"]

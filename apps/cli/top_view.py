@@ -1,7 +1,7 @@
-"""What `trilane top` shows of a moment: a screen for a terminal, a line for anything else.
+"""Shows one moment of a run in `trilane top`: a screen for a terminal, a line for anything else.
 
-Rule: every figure is one of `MomentFigures`; how wrong the avatar's pictures are stands with every speed, and where the
-figures come from stands below them.
+Rule: every figure is a field of `MomentFigures`. Each speed is shown with the error of the avatar's pictures, and the
+sources of the figures stand below.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def line(look: RunLook) -> str:
 
 
 def heading(look: RunLook) -> str:
-    """Return what stands above the lines."""
+    """Return the heading above the lines."""
     of_fps = "between the first frame and the last" if look.state is RunState.FINISHED else "of the last 5 s"
     how = f"fps {of_fps}, p50 / p95 / p99 of the last 5 s;{FEW}"
     return "\n".join([f"run {look.name}: {look.state}; {how}", *errors(look.figures), _sources(look.figures)])
@@ -180,7 +180,7 @@ def _stages(figures: MomentFigures) -> Table:
 
 
 def _moved(kinds: Mapping[str, Moved]) -> tuple[str, str]:
-    """Return MiB of a job in all and by kind, and the least that would do; dashes where the stage counts none."""
+    """Return the MiB that a job moved, by kind and in all, and the least possible; dashes if the stage counts none."""
     shown = {kind: moved.per_job / MIB for kind, moved in kinds.items() if kind != LEAST and moved.total}
     least = f"{kinds[LEAST].per_job / MIB:.2f}" if LEAST in kinds else "–"
     if not shown:
@@ -217,7 +217,7 @@ def _percent(share: float) -> str:
 
 
 def _short_bound(figures: MomentFigures) -> str:
-    """Return the unit, and its share of the path; empty where it is not known."""
+    """Return the bounding unit and its share of the critical path; empty if unknown."""
     unit = (figures.bound or {}).get("unit")
     return f"bound {unit['name']} {unit['share']:.0%}" if unit else ""
 
@@ -233,7 +233,7 @@ def _short_error(figures: MomentFigures) -> str:
 
 
 def _sources(figures: MomentFigures) -> str:
-    """Say where the figures come from; only a run that has temperatures has a source of them."""
+    """Name the sources of the figures; temperatures have one only in a run that has temperatures."""
     said = [f"figures: {figures.sources['fps']}"]
     for place in figures.temperature_c:
         source = figures.sources.get(f"temperature_c.{place}", figures.sources["temperature_c"])

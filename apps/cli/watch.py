@@ -1,4 +1,4 @@
-"""`trilane top`, `trilane dashboard` and `trilane trace`: one run, looked at while it goes on or when it is over.
+"""`trilane top`, `trilane dashboard` and `trilane trace`: views of one run, during it or after it.
 
 Rule: this file reads options and shows; the figures come from `trilane.apps.watch`, the page from
 `trilane.apps.dashboard`, the trace from `trilane.apps.tracing`.
@@ -39,12 +39,12 @@ NewestRunArgument = Annotated[
     Path | None,
     typer.Argument(help="Run folder, its journal, or its name below runs/; the newest below runs/ if none is given."),
 ]
-OnceOption = Annotated[bool, typer.Option("--once", help="Look once, whether the run goes on or not.")]
+OnceOption = Annotated[bool, typer.Option("--once", help="Print the figures once, even if the run goes on.")]
 LooksOption = Annotated[
     bool, typer.Option("--json", help="Print a JSON document in a line for each look; with --once, one document.")
 ]
 OpenMetricsOption = Annotated[
-    bool, typer.Option("--openmetrics", help="Look once and print the figures as `/metrics` of the dashboard has them.")
+    bool, typer.Option("--openmetrics", help="Print the figures once, in the form of the dashboard's `/metrics`.")
 ]
 WaitOption = Annotated[bool, typer.Option("--wait", help="Wait for a run that has not begun.")]
 IntervalOption = Annotated[float, typer.Option(min=0.1, max=3600, help="Seconds between two looks.")]
@@ -75,8 +75,8 @@ def top(
 ) -> None:
     """Show how busy the units of a run are, its frame time and latency, queues, drops, heat and error.
 
-    It ends with the run; Ctrl-C ends it before. A finished run is shown as it ended. Where stdout is no terminal, each
-    look is a line.
+    It ends with the run, or with Ctrl-C. A finished run is shown as it ended. If stdout is no terminal, each update is
+    a line.
     """
     from trilane.apps.watch.followed_run import follow
     from trilane.apps.watch.live_figures import looks
@@ -138,8 +138,8 @@ def _show(first: RunLook, rest: Iterator[RunLook]) -> None:
 def dashboard(run: FolderArgument, port: PortOption = None) -> None:
     """Show a finished run in a browser: its pictures, timeline and figures at any moment.
 
-    The page is at the address that is printed, on this machine alone, until the command is interrupted. A run that
-    goes on is shown by `trilane run --dashboard`.
+    The page is at the printed address, for this machine alone, until the command is interrupted. For a live run, use
+    `trilane run --dashboard`.
     """
     import asyncio
 

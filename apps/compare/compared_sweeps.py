@@ -55,7 +55,7 @@ class TrialPair:
 
 @dataclass(frozen=True)
 class SweepComparison:
-    """`other` beside `base`.
+    """The comparison of the sweep `other` with the sweep `base`.
 
     `over_all`: mean frame time of all pairs. `left_out`: configurations without a partner, by reason. `changes`:
     changes that every pair has. `notes`: what makes the comparison less sure.
@@ -214,7 +214,7 @@ def _told(row: Difference) -> dict[str, Any]:
 
 
 def _notes(documents: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield what a person should know of the machine while the trials ran."""
+    """Yield remarks on the machine while the trials ran."""
     shares = [share for document in documents if (share := document.get("other_programs") or 0.0) > BUSY_MACHINE]
     if shares:
         runs = f"{len(shares)} of {len(documents)} runs"

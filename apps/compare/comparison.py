@@ -70,7 +70,7 @@ IN_THOUSANDS: Final = 10_000
 
 
 class Bounds(NamedTuple):
-    """What bounded each run of either side, as in report.json; None where nobody knows.
+    """The `bound` of each run of either side, as in report.json; None where it is unknown.
 
     `outcome` says whether the bounding unit changed. Only that unit's share of the path is known, so another unit's
     share may be as large unless this one is surely more than a half.
@@ -128,7 +128,7 @@ class Comparison:
         return Finding.SAME if self.verdict == NO_DIFFERENCE else Finding.UNKNOWN
 
     def outcome(self, figure: Figure) -> Finding:
-        """Return what holds for one of the `rows`."""
+        """Return the finding for one of the `rows`."""
         row = self.rows[figure]
         return row.outcome(differs=figure in self.differing, margin=margin_of(figure, row))
 
@@ -205,7 +205,7 @@ def _notes(base: Side, other: Side) -> list[str]:
 
 
 def _about(told: ComparedRun) -> Iterator[str]:
-    """Yield what a person should know of the data of a run."""
+    """Yield remarks on the data of a run."""
     if told.kind is RunKind.REPORT:
         yield "a report without a journal, so only summaries are compared, each as uncertain as the mean frame time"
     if told.kind is RunKind.PREDICTION:
@@ -305,7 +305,7 @@ def _programs(found: Rows) -> Iterator[str]:
 
 
 def _heads(found: Rows) -> Iterator[str]:
-    """Yield the frame time; where its mean is unchanged its first percentile that differs, or else the latency."""
+    """Yield the frame time, its first percentile that differs if the mean does not, or else the latency."""
     for measure in (FRAME_TIME, LATENCY):
         mine = {figure: row for figure, row in found.items() if figure.measure == measure}
         of_mean = [figure for figure in mine if figure.statistic == "mean"] or [*mine][:1]
@@ -422,7 +422,7 @@ def change_of(row: Difference, unit: str) -> str:
 
 
 def interval_of(row: Difference, unit: str) -> str:
-    """Return the 95 % interval of the change; a dash where nobody knows it."""
+    """Return the 95 % interval of the change; a dash if it is unknown."""
     if row.low is None or row.high is None:
         return DASH
     return f"{_scaled(row.low, row, unit, with_unit=False)} to {_scaled(row.high, row, unit, with_unit=False)}"

@@ -1,10 +1,11 @@
-"""How much a statistic differs between runs, and how sure that is. Rule: what is not known widens the interval.
+"""How much a statistic differs between runs, and how sure that is. Rule: lack of knowledge widens the interval.
 
 Two things make runs of one kind differ by chance. Frames scatter and drift within a run; a jackknife over stretches of
-frames measures that (Künsch, Annals of Statistics 17 (1989)). Each run also meets another machine: several runs a side
-show it, and the deviations in `rows.py` count as so many more runs. A normal prior's conjugate joins both, so Student's
-t applies (Gelman et al., Bayesian Data Analysis, section 3.2; Smyth, Statistical Applications in Genetics and Molecular
-Biology 3 (2004)). A change that has a known cause is no chance: up to that much counts as nothing.
+frames measures that (Künsch, Annals of Statistics 17 (1989)). The state of the machine also differs from run to run:
+several runs on each side show it, and the deviations in `rows.py` count as further runs. A conjugate normal prior joins
+both, so Student's t applies (Gelman et al., Bayesian Data Analysis, section 3.2; Smyth, Statistical Applications in
+Genetics and Molecular Biology 3 (2004)). A change with a known cause is not chance, so a change of up to that size
+counts as nothing.
 """
 
 from __future__ import annotations
@@ -36,7 +37,10 @@ ALPHA = 0.01
 
 
 class Finding(StrEnum):
-    """What holds for a figure. SAME: its change is surely below `MATTERS`. UNKNOWN: it may be more, or nothing."""
+    """The finding about a figure.
+
+    SAME: its change is certainly below `MATTERS`. UNKNOWN: its change may be more, or zero.
+    """
 
     DIFFERS = "differs"
     SAME = "no difference"
@@ -103,7 +107,7 @@ class Difference(NamedTuple):
         return log1p(self.change) if self.is_ratio else self.change
 
     def outcome(self, *, differs: bool, margin: float = MATTERS) -> Finding:
-        """Return what holds for this difference.
+        """Return the finding about this difference.
 
         `differs`: whether the test of all figures together calls it different. `margin`: the least change that matters,
         in the unit of `change`.
@@ -234,7 +238,7 @@ def _told(
     *,
     is_ratio: bool,
 ) -> Difference:
-    """Return the difference with this `effect` and deviation; None stands for a deviation that is unknown."""
+    """Return the difference with this `effect` and deviation; None means that the deviation is unknown."""
     base, other = values
     if deviation is None:
         return Difference(base, other, _change(effect, is_ratio), None, None, None, is_ratio)
@@ -250,9 +254,9 @@ def _change(effect: float, is_ratio: bool) -> float:
 
 
 def _least_frames(statistic: str) -> int:
-    """Return the frames that a statistic needs.
+    """Return the number of frames that a statistic needs.
 
-    For a percentile each stretch has, in the mean, a frame beyond it: without one the jackknife sees no scatter.
+    For a percentile, each stretch has on average one frame beyond it; otherwise the jackknife sees no scatter.
     """
     share = int(statistic[1:]) / 100 if statistic in ("p50", "p90", "p99") else 0.5
     return max(LEAST_FRAMES, ceil(STRETCHES / (1 - share)))
@@ -275,7 +279,7 @@ def _common(runs: Sequence[Series]) -> I64 | None:
 
 
 def _left_out(series: Series, reduce: Reduce, is_ratio: bool) -> F64:
-    """Return the statistic of all frames, then without each stretch, (1 + `STRETCHES`,); for a ratio its logarithm."""
+    """Return the statistic of all frames, then that without each stretch, (1 + `STRETCHES`,); ratios as logarithms."""
     edges = np.linspace(0, len(series.values), STRETCHES + 1).astype(int)
     places = np.arange(len(series.values))
     kept = [places, *(np.delete(places, slice(low, high)) for low, high in pairwise(edges))]

@@ -1,8 +1,8 @@
-"""Many runs, predictions and trials as one table: what was asked, speed, error, and where each comes from.
+"""Many runs, predictions and trials as one table: options, speed, error, and the source of each.
 
-Rule: a figure is taken from a document as it stands there; nothing is measured or guessed, and no speed stands without
-its error or the word that there is none. Page, CSV and Parquet have the same columns and numbers. Each file is opened
-with its size checked; one that cannot be read is refused by name before anything is written.
+Rule: figures are copied from documents, never measured or guessed. Every speed has its error beside it, or a note that
+there is none. Page, CSV and Parquet have the same columns and numbers. The size of each file is checked first. An
+unreadable file is refused by name before anything is written.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from trilane.errors import BadInputError, MissingPartError
 from trilane.figure_sources import COMPUTED, MEASURED, NO_FIGURES
 from trilane.files import instead_of_file, require_file
 from trilane.scene.schema import Scene
+from trilane.units import HOST_CLOCK
 from trilane.writing import write_atomically
 
-HOST = "host"
 #: What an error belongs to, and what an interval of the frame time holds.
 OF_RUN, OF_AVATAR = "errors of the runs themselves", "errors of the avatars' validations"
 BY_SCATTER, BY_MODEL = "95 %, scatter of the run's frames", "80 %, of the model"
@@ -121,7 +121,7 @@ def _trial(folder: Path, trial: Mapping[str, Any]) -> Entry:
     result = trial.get("result")
     document = dict(result) if isinstance(result, dict) else {}
     document["made"] = {**_dict(document.get("made")), "command": trial.get("command")}
-    document.setdefault("clock", trial.get("clock", "host"))
+    document.setdefault("clock", trial.get("clock", HOST_CLOCK))
     document.setdefault("machine", trial.get("host"))
     if trial.get("status") != "done":
         error = trial.get("error")
@@ -181,7 +181,7 @@ class Entry:
     @property
     def speed_source(self) -> str:
         """Origin of the speed; empty without a speed."""
-        return "" if self.frame_ms is None else MEASURED if self.clock == HOST else COMPUTED
+        return "" if self.frame_ms is None else MEASURED if self.clock == HOST_CLOCK else COMPUTED
 
     @property
     def group(self) -> tuple[str, str, str, str]:
@@ -203,7 +203,7 @@ def entry_of(
     low, high = _interval(times)
     return Entry(
         _text(name),
-        str(document.get("clock", HOST)),
+        str(document.get("clock", HOST_CLOCK)),
         _machine_line(machine),
         dict(_settings(config)) | dict(_settings(options or {})),
         tuple(map(_text, _sequence(made.get("command")))),
@@ -233,9 +233,10 @@ def _interval(times: Mapping[str, Any]) -> tuple[float | None, float | None]:
 
 
 def _shows(scene: Mapping[str, Any]) -> str:
-    """Return what the frames of `scene` show, in words; a smaller tensor or another network shows the same.
+    """Return the content of the frames of `scene` in words.
 
-    Whatever is unusual is named by its key, so two scenes with the same words show the same pictures.
+    The size of the tensor and the network do not change these words. Unusual content is named by its key, so two scenes
+    with the same words show the same pictures.
     """
     output, camera = _mapping(scene, "output"), _mapping(scene, "camera")
     bodies = [body for body in _sequence(scene.get("avatars")) if isinstance(body, Mapping)]
@@ -343,8 +344,8 @@ class Scored(Protocol):
 def frontier(entries: Sequence[Scored]) -> list[bool]:
     """Return for each entry whether it is on the frontier of frame time against error: no other entry beats it.
 
-    An entry beats another if it is at least as quick and at least as near to the truth, and better in one of both.
-    Equal ones do not beat each other. One without a speed or an error is on no frontier.
+    An entry beats another if it is at least as quick and at least as near to the truth, and better in one of these.
+    Equal entries do not beat each other. An entry without a speed or an error is not on the frontier.
     """
     on = [False] * len(entries)
     for group in {entry.group for entry in entries}:

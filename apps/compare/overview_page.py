@@ -1,7 +1,7 @@
-"""The overview as one HTML file that asks nothing of any other place: a drawing, the table, and stills of the videos.
+"""The overview as one self-contained HTML file: a drawing, the table, and stills of the videos.
 
-Rule: all text is escaped; the one script is of this folder and named by its digest in the page's policy. A video that
-cannot be read gives no still. The drawing shows numbers of the table, and never tells two things apart by colour alone.
+Rule: all text is escaped. The only script is a file of this folder, and the page's policy names its digest. An
+unreadable video gives no still. The drawing shows the table's numbers, and never distinguishes things by colour alone.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""The comparison as one HTML file. Rule: it asks nothing of any other place, runs no script, and all text is escaped.
+"""The comparison as one HTML file. Rule: it loads nothing, runs no script, and all text is escaped.
 
-Each change is also drawn: a dot with its 95 % interval, on one scale for what is measured alike.
+Each change is also drawn: a dot with its 95 % interval, on one scale for figures of the same kind.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The figures of two sides as rows, each with the chance that alters it. Rule: a table names each measure's statistics.
+"""The figures of two sides as rows, each with its random variation. Rule: a table names each measure's statistics.
 
-Of runs with a journal every figure comes from their frames. A report alone or a prediction has summaries; each is as
-uncertain as the mean frame time, because nothing else is known.
+In runs with a journal, every figure comes from the frames. A report alone or a prediction only has summaries. Each
+counts as uncertain as the mean frame time, because nothing else is known.
 
 `Noise` says how much a figure differs between runs of one kind beyond what their frames show. Each number has its
 source beside it.
@@ -28,6 +28,7 @@ from trilane.apps.compare.difference import (
 )
 from trilane.apps.compare.run_frames import INSTRUCTION_TIME, INSTRUCTIONS, Key
 from trilane.apps.compare.sides import ComparedRun, RunKind, Side, changes
+from trilane.units import HOST_CLOCK
 
 Z_80: Final = 1.281552
 FRAME_TIME, LATENCY, WORK, SERVICE, WAIT, BUSY, IDLE = (
@@ -55,7 +56,6 @@ UNITS: Final = {
 }
 #: Statistics of a summary whose uncertainty is about that of a mean.
 LIKE_THE_MEAN: Final = ("mean", "p50")
-_HOST: Final = "host"
 #: Standard deviations of one run's figure, of its logarithm or of a share of the time, and how many runs these numbers
 #: are worth (docs/decisions/comparing-runs.md has the measurements): of a stage's typical time on its core, of other
 #: times on the clock, of shares, and of counted instructions.
@@ -109,7 +109,7 @@ def named(rows: Rows) -> list[Figure]:
     """Return the figures that a verdict rests on; all others are there to explain them.
 
     Counted instructions stand for a stage's program, and the time of one instruction for the machine. Without counts
-    its time on the core stands for the program, or its service time where nobody knows that.
+    its time on the core stands for the program, or its service time where that is unknown.
     """
     counted, worked = ({figure.of for figure in rows if figure.measure == each} for each in (INSTRUCTION_TIME, WORK))
 
@@ -299,7 +299,7 @@ class Noise(NamedTuple):
         return self._chance(TAILS.get(statistic, 1.0) * WALL_DEVIATION, explained=self.others[0])
 
     def of_wait(self, statistic: str) -> Chance:
-        """Return the chance of a wait in ms, which may be almost 0; nobody knows what explains its growth."""
+        """Return the chance of a wait in ms, which may be almost 0; no known cause explains its growth."""
         return self._chance(TAILS.get(statistic, 1.0) * (WALL_DEVIATION + self.others[0]), WAIT_FLOOR_MS)
 
     def of_share(self) -> Chance:
@@ -328,7 +328,7 @@ def noise_between(base: Documents, other: Documents, effects: Mapping[str, float
     times on its core.
     """
     runs = [*base, *other]
-    if all(run["clock"] != _HOST for run in runs):
+    if all(run["clock"] != HOST_CLOCK for run in runs):
         return Noise(is_real=False)
     first, second = ([run.get("other_programs") or 0.0 for run in side] for side in (base, other))
     more = abs(fmean(second) - fmean(first))
@@ -342,7 +342,7 @@ def noise_between(base: Documents, other: Documents, effects: Mapping[str, float
 def _left(others: float) -> float:
     """Return the logarithm of the share of the cores that other programs left.
 
-    On full cores frames take longer by as much.
+    On full cores, frames take longer by this factor.
     """
     return log1p(-min(others, 1 - LEAST_LEFT))
 
@@ -352,10 +352,10 @@ def _held(report: Mapping[str, Any]) -> frozenset[str]:
 
 
 def _slower_cores(base: Mapping[str, Any], other: Mapping[str, Any], effects: Mapping[str, float]) -> dict[str, float]:
-    """Return for each stage the least change, as a logarithm, of all stages on its cores if all went in one direction.
+    """Return for each stage the change that the speed of its cores explains, as a logarithm.
 
-    On one machine with one placement the cores' own speed explains that much: another machine beside this one, its
-    clock, its temperature. A single stage on its cores says nothing of them.
+    It is the smallest change of all stages on these cores, if all changed in one direction. Causes are another machine
+    beside this one, its clock, or its temperature. A single stage on its cores shows nothing about them.
     """
     if any(not change.key.startswith(SAME_CORES) for change in changes(base, other)):
         return {}
@@ -375,11 +375,11 @@ def _stages_by_cores(report: Mapping[str, Any]) -> Iterable[list[str]]:
 
 
 def remarks(reports: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return what a person should know of the machine. `reports`: reports by the names of their runs."""
+    """Return remarks on the machine."""
     said = []
     for name, report in reports.items():
         others = report.get("other_programs")
-        if report["clock"] == _HOST and others is None:
+        if report["clock"] == HOST_CLOCK and others is None:
             said.append(f"{name}: what other programs had of its cores is not known; they are taken to have had none")
         elif others is not None and others > BUSY_MACHINE:
             longer = 1 / max(1 - others, LEAST_LEFT) - 1

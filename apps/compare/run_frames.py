@@ -90,7 +90,7 @@ def frames_of(records: Iterable[Record]) -> RunFrames | None:
 
 
 class _Story:
-    """What the records of a journal tell, gathered."""
+    """The facts gathered from the records of a journal."""
 
     def __init__(self) -> None:
         self.jobs: list[JobRecord] = []
@@ -184,7 +184,10 @@ def _unit(
 
 
 def _within(pieces: Sequence[tuple[int, int, Mapping[str, int]]], state: str, edges_ns: I64) -> F64:
-    """Return the ms of `state` between neighbouring edges, (edges - 1,), spread evenly over each piece that has it."""
+    """Return the ms of `state` between neighbouring edges, (edges - 1,).
+
+    The time of `state` in a piece counts as spread evenly over the piece.
+    """
     places, totals, total = [0.0], [0.0], 0
     for begin_ns, end_ns, states in pieces:
         places += [begin_ns, end_ns]

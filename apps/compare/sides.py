@@ -54,7 +54,7 @@ ALWAYS_DIFFERENT: Final = ("made.at", "made.command")
 
 
 class RunKind(StrEnum):
-    """What is known of a run. RUN: every frame; REPORT: summaries; PREDICTION: summaries that a model computed."""
+    """The known data of a run. RUN: every frame; REPORT: summaries; PREDICTION: summaries that a model computed."""
 
     RUN = "run"
     REPORT = "report"
@@ -163,10 +163,10 @@ def _document(path: Path) -> Mapping[str, Any]:
 
 
 def _journal_document(frames: RunFrames, path: Path) -> dict[str, Any]:
-    """Return what a journal alone tells of its run, with the keys of a report that a comparison reads.
+    """Return the facts of a run from its journal alone, under the report's keys that a comparison reads.
 
-    Settings come from the first record, and figures from the frames. For a run that ended the rest comes from its last
-    record; else it is what bounded the run until then.
+    Settings come from the first record, and figures from the frames. If the run has ended, the rest comes from its last
+    record; else the rest is what bounded the run until then.
 
     `frames`: frames of the journal at `path`. Raises BadInputError for facts that no run has.
     """
@@ -248,7 +248,7 @@ class Change(NamedTuple):
 
 
 def changes(base: Mapping[str, Any], other: Mapping[str, Any]) -> list[Change]:
-    """Return every key in which two runs were not made alike, and no other. `base`, `other`: reports as JSON."""
+    """Return every setting and fact of the machine that differs between two runs. `base`, `other`: reports as JSON."""
     first, second = _settings(base), _settings(other)
     found = dict.fromkeys([*first, *second])
     known = [part for part in PARTS if part not in (*base.get(NOT_KNOWN, ()), *other.get(NOT_KNOWN, ()))]

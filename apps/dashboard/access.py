@@ -1,9 +1,9 @@
-"""Where a server listens, and who may ask it for anything. Rule: nothing is refused in silence.
+"""Where a server listens, and who may send it requests. Rule: no request is refused silently.
 
-This machine alone may ask, under this address, with the token of this run. A page of another site that knows the port
-gets nothing: its Origin is not ours, and a name that it lets point here is not in the Host header that is expected. The
-page's own files hold nothing secret and need no token. The socket listens before the server starts, so the address that
-is printed can be asked at once.
+Only this machine may send requests, to this address, with the token of this run. A page of another site that knows the
+port is refused: its Origin is foreign, and a host name that it points here is not in the expected Host header. The
+page's own files hold no secret and need no token. The socket listens before the server starts, so the printed address
+accepts requests at once.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ Asgi = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 
 class Refusal(StrEnum):
-    """Why the server did not do what it was asked to; the values are labels of a metric."""
+    """The reason why the server refused a request; the values are labels of a metric."""
 
     WRONG_TOKEN = "wrong_token"  # noqa: S105 - the name of a count
     FOREIGN_HOST = "foreign_host"
@@ -83,7 +83,7 @@ class ServerAddress:
 
 
 def require_server() -> None:
-    """Raises MissingPartError when a package of the extra is missing."""
+    """Raise MissingPartError when a package of the extra is missing."""
     for package in PACKAGES:
         if not machine.here.has_package(package):
             raise MissingPartError(f"the dashboard needs the package {package}", install_line("dashboard"))
@@ -115,17 +115,17 @@ class Refusals:
         self._counts[why] += 1
 
     def as_json(self) -> dict[str, int]:
-        """Return the count by name."""
+        """Return the counts by name."""
         return {why.value: count for why, count in self._counts.items()}
 
 
 def hosts(port: int) -> tuple[str, str]:
-    """Return what the Host header may say."""
+    """Return the accepted values of the Host header."""
     return f"{ADDRESS}:{port}", f"localhost:{port}"
 
 
 def headers(port: int) -> dict[str, str]:
-    """Return the headers of every answer: nothing from elsewhere, nothing inline, nothing kept, nothing told on."""
+    """Return the headers of every answer: no foreign or inline content, no caching, no referrer."""
     sockets = " ".join(f"ws://{host}" for host in hosts(port))
     policy = (
         "default-src 'none'; script-src 'self'; style-src 'self'; font-src 'self'; img-src 'self' blob:; "

@@ -1,7 +1,7 @@
 """The server's answers: the page's files, one WebSocket, metrics and the trace. Rule: it decides nothing about the run.
 
-Pictures are pulled: a client that asked gets the newest picture that it has not had, and none before it asks again.
-Everything else is told to all clients as it happens. The system gives up what a client does not take or say in time.
+Pictures are pulled: a client that asks gets the newest picture that it has not seen, and no other until it asks again.
+Everything else is sent to all clients as it happens. The system gives up what a client does not take or send in time.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class DashboardApp:
         self.asgi: Asgi = Guard(app, port, token, self.refusals)
 
     async def finish(self) -> None:
-        """Tell all clients what is still untold, and give them a moment to take it."""
+        """Send all clients the remaining messages, and give them a moment to receive these."""
         await self._tell_newest()
         await asyncio.sleep(LAST_S)
 
@@ -117,7 +117,7 @@ class DashboardApp:
             await socket.close(1008)
 
     async def _listen(self, socket: WebSocket, client: Client) -> None:
-        """Do what the client says until it leaves or has said too much that is malformed."""
+        """Obey the client until it leaves or has sent too many malformed messages."""
         while client.faults < MOST_FAULTS:
             event = await socket.receive()
             if event["type"] == "websocket.disconnect":

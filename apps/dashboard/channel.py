@@ -1,8 +1,8 @@
-"""What passes between a run and the server that shows it, two processes. Rule: msgpack, and nothing but this table.
+"""The messages between a run and its server, which are two processes. Rule: msgpack, and only those of this table.
 
 A message is an array of its place in MESSAGES and its fields. It goes as one packet over a pair of sockets that only
-these two processes have. Neither process waits for the other: what cannot be sent at once is left out. `ServerLink`
-starts the server's process and ends it; when that process ends by itself, the run goes on without it.
+these two processes have. Neither process waits for the other: a message that cannot be sent at once is left out.
+`ServerLink` starts the server's process and ends it; if that process ends by itself, the run goes on without it.
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ class StateIs(NamedTuple):
 
 
 class Refused(NamedTuple):
-    """To the server: what the control was asked to do cannot be done."""
+    """A message to the server: the requested change of a control is refused."""
 
     control: str
     why: str
 
 
 class ControlAsked(NamedTuple):
-    """To the run: somebody wants the control to have the value."""
+    """A message to the run: somebody requests that the control gets the value."""
 
     control: str
     value: str | float | None
@@ -144,8 +144,8 @@ def channel_pair() -> tuple[ChannelEnd, socket.socket]:
 class ServerLink:
     """The run's end of a server at `place` for pictures of `height` x `width`.
 
-    `hear`: function that a thread of its own calls with what the page asks for. `tell`: function that is told a
-    sentence for a person.
+    `hear`: function that gets each request of the page, on a thread of its own. `tell`: function that gets sentences
+    for a person.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
-"""A run that is over, as a server shows it: any moment of it, from its journal and its video.
+"""A finished run as a server shows it: any moment of it, from its journal and its video.
 
-Rule: the journal is read once; what is kept of it lies in temporary files without a name, so a run may have lasted for
-days. A picture is decoded when it is asked for, and none is kept.
+Rule: the journal is read once, into temporary files without a name, because a run may last for days. A picture is
+decoded on request, and none is kept.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def _read_run(folder: Path) -> _FinishedRun:
 
 
 class _FinishedRun:
-    """What is known of a finished run, and where it lies; `_read_run` makes it.
+    """Facts about a finished run and its place on disk; `_read_run` makes it.
 
     `end_ms`: time of its last step.
     """
@@ -142,7 +142,7 @@ class _FinishedRun:
                 self._keep_figures()
 
     def end(self, state: RunState) -> None:
-        """Complete the tables after the last record. `state`: what has become of the run."""
+        """Complete the tables after the last record. `state`: state of the run at its end."""
         self._timeline.end()
         self._keep()
         self._keep_figures()
@@ -212,7 +212,7 @@ class _RunPictures:
         return self._frames is None
 
     def jpeg(self, frame: int) -> bytes | None:
-        """Return what was shown with frame `frame`; None where there is no picture."""
+        """Return the picture that was shown with frame `frame`; None if there is none."""
         with self._lock:
             return None if self._frames is None else self._frames.jpeg(frame)
 
@@ -249,7 +249,7 @@ class TimeTable:
             self.complete()
 
     def complete(self) -> None:
-        """Write the rows that were added; from now on they are found."""
+        """Write the added rows, so that they can be found."""
         if self._fresh:
             rows = np.array(self._fresh, self._dtype)
             offset = self._file.seek(0, os.SEEK_END)
@@ -329,7 +329,7 @@ class _VideoFrames:
         self._fps = fps
 
     def jpeg(self, frame: int) -> bytes | None:
-        """Return what was shown when frame `frame` was; None when the video does not reach so far."""
+        """Return the picture that was shown with frame `frame`; None if the video ends before it."""
         at = Fraction(frame) / Fraction(self._fps).limit_denominator(1001)
         pts = int(at / self._stream.time_base)
         self._container.seek(pts, stream=self._stream, backward=True)

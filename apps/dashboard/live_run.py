@@ -1,8 +1,8 @@
-"""A run under a dashboard: `trilane run`'s own code, again whenever the page asks for another configuration.
+"""A run under a dashboard: `trilane run`'s own code, repeated whenever the page requests another configuration.
 
-Rule: this process runs the pipeline and answers the page's server, which is a process of its own; neither waits for the
-other. What can be changed while the run goes on is. For the rest the run is ended cleanly and starts again, once the
-change was checked as a command line is; each of these runs leaves a folder of its own.
+Rule: this process runs the pipeline; the page's server is another process, and neither waits for the other. Some
+settings change during the run. Any other change is checked as a command line is; then the run ends cleanly, and a new
+run starts with a folder of its own.
 """
 
 from __future__ import annotations
@@ -42,12 +42,11 @@ MOST_AVATARS: Final = 20
 def run_live(
     options: RunOptions, hooks: OpenHooks, command: tuple[str, ...], port: int | None, tell: Callable[[str], None]
 ) -> RunOutcome:
-    """Run what the options ask for, then what the page asks for, until an interrupt; returns the last run's outcome.
+    """Run the options, then each configuration that the page requests, until an interrupt; return the last outcome.
 
     `options`: options of the first run; with a number of frames, each run ends after so many.
     `hooks`, `command`: as `run_asked` takes them. `port`: as `listen` takes it.
-    `tell`: function that is given the page's address, and sentences for a person.
-    Raises what `run_asked` raises.
+    `tell`: function that is given the page's address, and sentences for a person. Raises what `run_asked` raises.
     """
     with early_processes() as (starter, gl):
         first = prepare(options.changed(baseline_frames=0), gl, command)
@@ -115,12 +114,12 @@ class _Runs:
 
 
 def _numbered(folder: Path, number: int) -> Path:
-    """Return the folder of run `number` under one page: the first has the name that was asked for."""
+    """Return the folder of run `number` under one page; the first run has the name that the user gave."""
     return folder if number == 1 else folder.with_name(f"{folder.name}-{number}")
 
 
 class Director:
-    """Directs the runs under one page, one after the other. Another thread than the rest calls `do`.
+    """Directs the successive runs under one page. Another thread calls `do` than all other methods.
 
     `prepare`: function that checks a run. `send`: function that hands a message to the server.
     """
@@ -149,13 +148,13 @@ class Director:
         self._send(StateIs(RUNNING, ""))
 
     def take_next(self) -> Prepared | None:
-        """Return, once, the run that was asked for in place of the one that has ended."""
+        """Return, once, the run that shall follow the one that has ended."""
         with self._lock:
             taken, self._next = self._next, None
             return taken
 
     def do(self, asked: ControlAsked) -> None:
-        """Do what the page asks for; its server has looked at name and value."""
+        """Carry out a request of the page, whose server has already checked name and value."""
         with self._lock:
             controls = self._controls
         if controls is None:
@@ -185,7 +184,7 @@ class Director:
 
 
 def choices_of(config: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
-    """Return what each control of a new run may be set to; `config` is in force and always among it."""
+    """Return the choices of each control for a new run; the value in `config`, which is in force, is among them."""
     found = {"runtime": installed(), "avatar": (*BUILT_IN, *_neighbours(str(config["avatar"])))}
     choices = {}
     for name in OF_A_NEW_RUN:

@@ -1,8 +1,8 @@
-"""The process that shows a run that goes on: its journal as it grows, its newest picture, its controls.
+"""The process that shows a live run: its growing journal, its newest picture, its controls.
 
-Rule: nothing here makes the run wait. The journal is read behind it, pictures are pulled through the window, requests
-are handed over to the run, and its answers are told to all pages. The process yields to whoever has work, and ends with
-the run's. It starts with three descriptors: the listening socket, its end of the channel and the window.
+Rule: nothing here makes the run wait. This process follows the journal, pulls pictures through the window, passes
+requests to the run, and sends the run's answers to all pages. It yields the cores to other work, and ends with the
+run's process. It starts with three descriptors: the listening socket, its end of the channel and the window.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def main() -> None:
 
 
 class _Course:
-    """What is known of one run since its journal began."""
+    """The known facts of one run since its journal began."""
 
     def __init__(self, begun: Begun) -> None:
         self.begun = begun
@@ -134,9 +134,9 @@ class _Course:
 
 
 class _LiveView:
-    """The `RunView` of the runs that `hear` tells of, one after the other.
+    """The `RunView` of successive runs, which `hear` announces.
 
-    `window`: window into them. `ask`: function that hands a request to the run and says whether it could.
+    `window`: window into them. `ask`: function that hands a request to the run and returns whether it could.
     """
 
     def __init__(self, window: LiveWindow, ask: Callable[[ControlAsked], bool]) -> None:
@@ -237,7 +237,7 @@ class _LiveView:
         return None if folder is None else folder / "trace.pftrace"
 
     async def _read_on(self) -> None:
-        """Read what the run has written since the last call, as far as there is time for it."""
+        """Read the new records of the run, as far as there is time for it."""
         if self._followed is None and self._folder is not None and (self._folder / NAME).is_file():
             self._followed = FollowedRun(self._folder)
         if self._followed is None:
@@ -277,7 +277,7 @@ class _LiveView:
         return {**facts.config, "orbit": [camera.azimuth_deg, camera.elevation_deg], "zoom": camera.zoom}
 
     def _steer(self, name: str, value: Value) -> None:
-        """Move the camera: a drag to the right brings it to the left, as the picture moves; one down lifts it."""
+        """Move the camera: a drag to the right moves it left, so the picture follows the drag; a drag down lifts it."""
         azimuth, elevation, zoom = self._steering
         if isinstance(value, list):
             azimuth = (azimuth - value[0] + 180.0) % 360.0 - 180.0
@@ -289,7 +289,7 @@ class _LiveView:
         self._is_news = True
 
     def _now_ns(self) -> int | None:
-        """Return the time of the figures: now; None, the last record's, when the run is over or not read so far."""
+        """Return the time of the figures: now, or None for the last record's if the run is over or not fully read."""
         return None if self._is_behind or self._state in ("ended", "failed") else time.monotonic_ns()
 
 

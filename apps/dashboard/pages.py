@@ -1,7 +1,7 @@
-"""The pages that look at a run: what passes between one and its server, and how much it may leave unsent.
+"""The pages that show a run: the messages between a page and its server, and the limit of unsent ones.
 
-Rule: a message is a kind, then a payload; what a page says is checked. Kind 1 is JSON in UTF-8, both ways. Kind 2, to
-the page alone, is a picture: the frame's number (uint32), its time in the scene and its age (float64, ms), all
+Rule: a message is a kind, then a payload; every message of a page is checked. Kind 1 is JSON in UTF-8, both ways. Kind
+2, to the page alone, is a picture: the frame's number (uint32), its time in the scene and its age (float64, ms), all
 little-endian, then a JPEG. No page can make anything wait: each has a queue of its own and a task that empties it. A
 page whose queue is full, or that takes nothing for SEND_S, is dropped and counted.
 """
@@ -62,7 +62,7 @@ class Client:
             self._drop()
 
     async def send_all(self) -> None:
-        """Send what is put until the client is dropped or has left."""
+        """Send the queued messages until the client is dropped or has left."""
         sender = asyncio.ensure_future(self._send())
         dropped = asyncio.ensure_future(self._dropped.wait())
         try:
@@ -104,7 +104,7 @@ class Clients:
 
     @contextlib.contextmanager
     def joined(self, client: Client) -> Iterator[None]:
-        """Tell `client`, inside the block, what all are told."""
+        """Send `client` the messages to all clients while the block runs."""
         self._live.add(client)
         try:
             yield
@@ -134,7 +134,7 @@ class PictureAsked(_PageMessage):
 
 
 class ControlSaid(_PageMessage):
-    """The page wants the control `name` to have `value`; the control says whether it can."""
+    """The page requests that the control `name` gets `value`; the control decides whether it can."""
 
     type: Literal["control"]
     name: str = Field(max_length=40)
@@ -147,7 +147,7 @@ class ControlSaid(_PageMessage):
 
 
 class Seek(_PageMessage):
-    """The page wants what a finished run did from `span_ms` before `t_ms` until as long after."""
+    """The page requests the part of a finished run from `span_ms` before `t_ms` to `span_ms` after it."""
 
     type: Literal["seek"]
     t_ms: Finite = Field(ge=0)
@@ -162,7 +162,7 @@ class MalformedError(ValueError):
 
 
 def heard(data: bytes) -> PictureAsked | ControlSaid | Seek:
-    """Read what a client said with `data`. Raises MalformedError."""
+    """Read a client's message `data`. Raises MalformedError."""
     if data[:1] != bytes([JSON_KIND]):
         raise MalformedError("a kind that no client sends")
     try:

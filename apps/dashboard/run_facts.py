@@ -1,7 +1,7 @@
-"""What the page is told of a run besides its course, and what somebody may do to it from there.
+"""Facts about a run for the page, apart from the run's course, and the controls that the page has.
 
-Rule: what is not known is null, nothing is guessed, and the words are those of report.json. What a value of a control
-must be stands in its row alone.
+Rule: unknown facts are null, nothing is guessed, and the words are those of report.json. Only the row of a control
+states its valid values.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ Value = str | float | list[float] | None
 
 @dataclass(frozen=True)
 class RunFacts:
-    """What the page is told of a run besides its course.
+    """Facts about a run for the page, apart from the run's course.
 
     `name`: name of the run folder. `clock`: host or virtual. `machine`: line for people.
     `fps`, `output` (width, height): rate and size of the scene. `config`: value in force of each control.
-    `plan`, `placement`, `accuracy`: as in report.json, with `notes` beside the plan. `bound`: as there, with the
-    efficiencies, for a run that is over.
+    `plan`, `placement`, `accuracy`: as in report.json, with `notes` beside the plan. `bound`: as in report.json, with
+    the efficiencies, for a finished run.
     """
 
     name: str
@@ -77,9 +77,9 @@ class RunFacts:
 
 
 def config_in_force(config: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the value of each control that is set before a run, as the word that its choices have for it.
+    """Return the value in force of each control of a new run, as one of the words of its choices.
 
-    `config`: block of report.json, which says what an option left open. `options`: by name, as they were asked for.
+    `config`: block of report.json, with the values of options that were left open. `options`: given options, by name.
     """
     scene = config["scene"]
     chosen = {**config, "size": scene["size"], "avatar": scene["avatars"][0]["bundle"]}
@@ -122,7 +122,7 @@ def facts_of_checked(name: str, checked: Checked, options: RunOptions, machine: 
 
 
 def facts_of_report(name: str, report: Report) -> RunFacts:
-    """Return what the report of a finished run says."""
+    """Return the facts in the report of a finished run."""
     document = report.as_json()
     scene = document["config"]["scene"]
     caps = document["caps"]

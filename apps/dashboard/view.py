@@ -1,8 +1,8 @@
-"""What a server shows of a run that goes on (`live_server.py`) or one that is over (`finished_view.py`).
+"""What a server shows of a live run (`live_server.py`) or a finished one (`finished_view.py`).
 
-Rule: a view answers at once or awaits; it never blocks the loop that all clients share. `TimelineRows` keeps
-nothing that was taken: times become milliseconds since the run's first step, units and stages their places in the
-hello. The page and /metrics are told the same figures.
+Rule: a view answers at once or awaits; it never blocks the loop that all clients share. `TimelineRows` forgets rows
+once they are taken. It turns times into milliseconds since the run's first step, and names of units and stages into
+their places in the hello. The page and /metrics get the same figures.
 """
 
 from __future__ import annotations
@@ -37,22 +37,25 @@ class RunView(Protocol):
     """A run as a server shows it. Messages are those of docs/dashboard.md."""
 
     def greeting(self) -> Iterable[Message]:
-        """What a client is told first: the hello, the state, and what happened lately."""
+        """Return the first messages to a client: the hello, the state, and recent events."""
 
     async def news(self, *, is_watched: bool) -> Iterable[Message]:
-        """What happened since the last call, for all clients; nothing when none is there to watch it."""
+        """Return what happened since the last call, for all clients; nothing while there is no client."""
 
     async def picture(self, client: Client) -> bytes | None:
-        """The newest picture that `client` has not had, as `pages.shown` writes it; the view notes that it has it."""
+        """Return the newest picture that `client` has not had, as `pages.shown` writes it.
+
+        The view notes that the client has it.
+        """
 
     def control(self, asked: ControlSaid) -> str:
-        """Do what was asked, or begin to; returns why not, "" when it is done."""
+        """Carry out a request, or begin to. Return the reason for a refusal, "" for none."""
 
     async def seek(self, client: Client, to: Seek) -> Iterable[Message]:
-        """What `client` is told of another time of the run."""
+        """Return the messages to `client` about another time of the run."""
 
     def metrics(self) -> str:
-        """The run's figures in OpenMetrics, without the end mark; "" before there are any."""
+        """Return the run's figures in OpenMetrics, without the end mark; "" before there are any."""
 
     @property
     def trace(self) -> Path | None:
@@ -104,14 +107,14 @@ class TimelineRows:
             self._idle.append((unit, cause, self._ms(piece.begin_ns), self._ms(piece.end_ns)))
 
     def _ms(self, now_ns: int) -> float:
-        """Return the time since the first step, to a microsecond; the first time that it is asked for is that step."""
+        """Return the time since the first step, rounded to a microsecond; the first call sets that step."""
         if self._start_ns is None:
             self._start_ns = now_ns
         return round((now_ns - self._start_ns) * MS, 3)
 
 
 def described(graph: Graph) -> dict[str, Any]:
-    """Return the part of the hello that says what a timeline's numbers mean."""
+    """Return the part of the hello that explains a timeline's numbers."""
     return {
         "stages": [{"name": stage.name, "unit": stage.unit} for stage in graph.stages],
         "units": list(graph.units),

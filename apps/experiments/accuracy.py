@@ -1,7 +1,7 @@
 """How far apart are the runtimes on the frames of a scene?
 
-Rule: every runtime gets the same bytes, drawn by the pipeline's own pose and raster stages; the largest difference of
-any byte stands beside the mean.
+Rule: every runtime gets the same bytes, drawn by the pipeline's own pose and raster stages. The largest difference of a
+byte is shown beside the mean.
 """
 
 from __future__ import annotations

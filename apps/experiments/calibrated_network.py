@@ -1,7 +1,7 @@
-"""The avatar of a scene with its network quantised again, by another method of calibration; all else is as it was.
+"""A scene's avatar with its network quantised again by another method of calibration; nothing else changes.
 
-Rule: it is quantised from the same float network as the avatar's own, on views drawn as in the training. A part that
-cannot be found is refused; nothing else takes its place.
+Rule: the network is quantised from the avatar's own float network, on views drawn as in the training. If a part is
+missing, the request is refused; nothing replaces it.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """How far is a run's picture from the reference, and which cause costs how much?
 
-Rule: causes are counted in two ways, and each way says what it leaves. One at a time: each cause acts alone in the
-reference, with what it needs; the sum need not be the whole. In order: each cause joins those before it, and the
-picture goes in steps from the reference's to the run's. So the differences of MAE, those of mean squares, and the
-products of each step with the whole add up to the whole, but for float64's rounding. Figures are of the region with
-the avatars.
+Rule: causes are counted in two ways, and each way states its remainder. Alone: each cause acts in the reference, with
+only the causes that it needs; the sum may differ from the whole. In order: each cause joins those before it, so the
+picture changes in steps from the reference to the run. The steps' differences of MAE and of mean squares, and the
+products of each step with the whole, each sum to the whole, up to float64's rounding. Figures cover the region with the
+avatars.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ class _Moved:
 
 
 def _pixels(vertices: F64, clip: F64, output: Shape) -> tuple[F64, Any]:
-    """Return where `vertices` (V,3) are on the picture, (V,2) pixels, and which are on it, (V,)."""
+    """Return the place of each of `vertices` (V,3) on the picture, (V,2) pixels, and whether it is inside, (V,)."""
     x, y, _, w = (np.c_[vertices, np.ones(len(vertices))] @ clip.T).T
     in_front = w > 0
     place = np.stack([x, y], axis=1) / np.where(in_front, w, 1.0)[:, None]
@@ -287,8 +287,8 @@ def write_heat_map(file: Path, title: str, picture: F64, reference: F64) -> None
 def heat_map(title: str, picture: F64, reference: F64) -> U8:
     """Return a heat map (h,w,3): picture, reference, their difference, and the bar of its colours.
 
-    The difference is the mean over the colours of its size, times a power of two that is written on the map. What is
-    beyond the bar has the bar's last colour. `picture`, `reference`: (h,w,3) sRGB in 0..1.
+    The difference is the mean absolute difference of the colours, times a power of two that is written on the map.
+    Larger values than those of the bar have the bar's last colour. `picture`, `reference`: (h,w,3) sRGB in 0..1.
     """
     difference = np.abs(picture - reference).mean(axis=2)
     factor = shown_factor(difference)

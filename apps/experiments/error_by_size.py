@@ -1,8 +1,8 @@
 """What does a speed cost in image error, for each size of tensor on each runtime?
 
-Rule: all rows have the same moments and the same part of the picture, the one with the avatars. The pictures come
-first, which warms up. Then the frames are made again in the order of the scene, the rows in turns, one job at a time;
-with two frames or more, no frame follows itself. Time without a core does not count.
+Rule: all rows use the same moments and the same part of the picture, where the avatars are. The pictures are made
+first, as a warm-up. The rows then take turns at the frames in the scene's order, one job at a time; with two frames or
+more, no frame follows itself. Time without a core does not count.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ STEPS = 255
 def flicker(before: F64, now: F64) -> float:
     """Return the mean change of the error of two successive frames, in steps of 1/255.
 
-    `before`, `now`: errors of the frames, picture minus what it should be; equal shapes, pictures in 0..1.
+    `before`, `now`: errors of the frames, picture minus its reference; equal shapes, pictures in 0..1.
     """
     return float(np.abs(now - before).mean() * STEPS)
 
@@ -49,7 +49,10 @@ class FlickerRow:
         self._errors: list[float] = []
 
     def add(self, error: F64, part: tuple[slice, slice]) -> None:
-        """Count the next frame. `error`: its error (h,w,3). `part`: where avatars of it and of the last frame are."""
+        """Count the next frame.
+
+        `error`: its error (h,w,3). `part`: where avatars of it and of the last frame are.
+        """
         if self._before is not None:
             self.changes.append(flicker(self._before[part], error[part]))
         self._errors.append(float(np.abs(error[part]).mean() * STEPS))

@@ -1,10 +1,9 @@
 """How near an integer network's picture stays to the float network's on hard networks and inputs, on every runtime.
 
-Rule: a bound is the smaller of two that follow from network, input and steps, never from a runtime's picture: the
-integer network's own (`noise_model`), and an ideal quantiser's (`ideal_noise_model`). So coarse steps do not raise the
-bound of their error. A row fails, whatever its error is, if a wrong picture would keep the bound. Networks are seeded,
-untrained, and made so that a wrong picture shows. No input is the same everywhere: where a constant picture is the
-right answer, nothing can be told.
+Rule: a bound follows from network, input and steps, never from a runtime's picture. It is the smaller of two: that of
+the integer network itself (`noise_model`), and that of an ideal quantiser (`ideal_noise_model`). So coarse steps do not
+widen the bound of their error. A row also fails if a wrong picture would stay within its bound. Networks are seeded,
+untrained, and made so that a wrong picture shows. No input is constant, because a constant picture could then be right.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Numbers that are hard to get right, each with a bound: all rows, and here those of bodies, cameras and times.
+"""Numbers that are hard to compute, each with a bound: all rows; this file makes those of bodies, cameras and times.
 
 Rule: the body is the default avatar's, so that the rows are the same everywhere. A reference sums in extended precision
-or float64; a bound counts the roundings of what is computed, and never follows from a result.
+or float64. A bound counts the roundings of the computation, and never follows from a result.
 """
 
 from __future__ import annotations

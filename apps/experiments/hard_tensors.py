@@ -101,7 +101,7 @@ def _steps_off(pixels: U8, values: F64, scale: float, zero_point: int) -> float:
 
 
 def _texels(ctx: Any) -> Iterator[HardNumber]:
-    """Yield rows of what the texture on the GPU holds, and of what it refuses to hold."""
+    """Yield rows of the texture's values on the GPU, and of values that it refuses."""
     rng = np.random.default_rng(11)
     for name, exponents in {"usual numbers": (-6, 6), "subnormals": (-24, -14), "large numbers": (10, 15)}.items():
         sizes = 2.0 ** rng.uniform(*exponents, (8, 8, 4)) * rng.choice([-1.0, 1.0], (8, 8, 4))

@@ -1,7 +1,7 @@
-"""Is what `trilane predict --profile host` says true: of runs of an avatar, and of networks by themselves?
+"""Are the predictions of `trilane predict --profile host` right, for runs of an avatar and for single networks?
 
-Rule: each prediction comes first, then its subject runs as it always does: a whole `trilane run` in processes of its
-own; calls of the network in a process that the prediction did not start. No measured time enters a prediction.
+Rule: each prediction is made before its measurement. A run is a whole `trilane run` in processes of its own; a network
+is called in a process that the prediction did not start. No measured time enters a prediction.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ from trilane.avatars.bundle import load_bundle
 from trilane.bench.lib.interleaved_processes import ProcessVariant, runners
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host_model import NETWORK
-from trilane.hw_profiles.profile_files import HOST, load_runnable
+from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import NORMAL_80
 from trilane.stages.configure import requested_runtime
 from trilane.stages.run_options import RunOptions
+from trilane.units import HOST
 
 RUN, ALONE = "run", "network"
 MIN_FRAMES = 100  # frames of a run that is placed by its times

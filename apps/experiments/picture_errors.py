@@ -235,7 +235,7 @@ class Lpips:
     """
 
     def __init__(self, weights: Path) -> None:
-        """Raises BadInputError, MissingPartError without PyTorch."""
+        """Raise BadInputError, MissingPartError without PyTorch."""
         try:
             import torch
         except ImportError as error:

@@ -193,7 +193,7 @@ class ReferencePath:
     """
 
     def __init__(self, checked: Checked) -> None:
-        """Raises BadInputError, MissingPartError."""
+        """Raise BadInputError, MissingPartError."""
         config = checked.config
         self.cast, self.frames = Cast(checked), AvatarFrames(checked)
         self.output: Shape = (config.scene.output.height, config.scene.output.width)
@@ -334,7 +334,7 @@ class ReferenceMoment:
         return made
 
     def _once(self, key: Hashable, make: Callable[[], Any]) -> Any:
-        """Return what `make` gives, made once for each `key`, so that a cause that changes nothing costs nothing."""
+        """Return the result of `make`, which is called once per `key`, so that a cause without effect costs nothing."""
         if key not in self._made:
             self._made[key] = make()
         return self._made[key]
@@ -360,13 +360,13 @@ class _Avatar:
     by_runtime: Paint
 
     def packed(self, tensor: F64, causes: Causes) -> F64:
-        """Return what the bytes of `tensor` stand for if the causes have packing; else `tensor` itself."""
+        """Return the values that the bytes of `tensor` represent, if packing is among the causes; else `tensor`."""
         if Cause.PACKING not in causes:
             return tensor
         return self.real(quantise(tensor, self.encoding.scale, self.encoding.zero_point))
 
     def real(self, tensor: U8) -> F64:
-        """Return what the bytes of a tensor stand for."""
+        """Return the values that the bytes of a tensor represent."""
         return (tensor.astype(np.float64) - self.encoding.zero_point) * self.encoding.scale
 
 
@@ -388,7 +388,7 @@ def _avatar(data: AvatarData, runtime: str, on_cpu: bool) -> _Avatar:
 
 
 def _by_runtime(network: NetworkFile, name: str) -> Paint:
-    """Return `network` on runtime `name`; it takes tensors whose real numbers bytes can stand for."""
+    """Return `network` on runtime `name`; its input holds only real numbers that bytes can represent."""
     bound: dict[Shape, tuple[U8, U8, Binding]] = {}
 
     def paint(tensor: F64) -> F32:

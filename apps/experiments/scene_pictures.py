@@ -1,7 +1,7 @@
-"""The pictures of a scene's frames by one configuration, what each stage took, and what they are compared with.
+"""The pictures of a scene's frames by one configuration, the time of each stage, and the reference pictures.
 
-Rule: the run's own stages make the pictures in this process, one after the other. Their reference is ground truth, the
-clothed body itself, where a scene has it, else the plan `full`; a caller that compares says which.
+Rule: the run's own stages make the pictures in this process, one after the other. Their reference is the ground truth
+(the clothed body) if the scene has one, else the plan `full`; a caller that compares names it.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ Wanted = Callable[[int, U8], U8]
 
 
 class ScenePictures:
-    """The frames of the scene in `checked`. `gpu`: context of other pictures in this process, which all share."""
+    """The frames of the scene in `checked`. `gpu`: OpenGL context that all pictures in this process share."""
 
     def __init__(self, checked: Checked, gpu: UnitContext | None = None) -> None:
-        """Raises BadInputError, MissingPartError."""
+        """Raise BadInputError, MissingPartError."""
         pipeline, output = avatar_pipeline(checked.config, checked.assets), checked.config.scene.output
         units = units_of(pipeline, checked.assets)
         self.gpu = units["gpu"] if gpu is None else replace(gpu, assets=checked.assets)
@@ -70,7 +70,7 @@ class ScenePictures:
         return self._picture(packet), times
 
     def background(self, number: int) -> U8:
-        """Return what is under the avatars of the frame, their shadows too, (h,w,3) uint8."""
+        """Return the background under the frame's avatars, with their shadows, (h,w,3) uint8."""
         self._chain.run(number, len(self._names) - 2).payload[:] = 0
         return self._picture(self._chain.go_on(number))
 
@@ -81,7 +81,7 @@ class ScenePictures:
 
 
 def wanted_pictures(cast: Cast, ctx: Any) -> tuple[Wanted, str]:
-    """Return the reference of pictures of `cast`, and which one it is. `ctx`: OpenGL context in use."""
+    """Return the reference pictures of `cast`, and the name of the reference. `ctx`: OpenGL context in use."""
     from trilane.bench.lib.full_picture import true_pictures
 
     true = true_pictures(cast, ctx)

@@ -1,8 +1,8 @@
 """Where the time of a run went, as a document and as a table of its jobs.
 
-Rule: the figures come from the run's journal in one reading, in memory that does not grow with the run, whether or not
-it still goes on; the report of one that has ended says how it ended. The table is written as it is read. It needs two
-readings: the first finds the names of the figures that stages report, which are the last columns.
+Rule: the figures come from one pass over the journal of a live or finished run, in bounded memory. The report of a
+finished run says how it ended. The table is written during a second pass, because the first pass finds the figures that
+stages report, which are the last columns.
 """
 
 from __future__ import annotations
@@ -23,11 +23,10 @@ from trilane.pipeline.journal import NAME, Begun, Ended, Record, Worked, config_
 from trilane.pipeline.reckoning import Reckoning, places_of
 from trilane.pipeline.timeline import ExplainedJob, Timeline
 from trilane.pipeline.unit_history import PREEMPTED
-from trilane.units import NS_PER_MS
+from trilane.units import HOST_CLOCK, NS_PER_MS
 from trilane.writing import write_atomically
 
 SCHEMA = 1
-HOST = "host"
 GOES_ON = "the run still goes on: what follows is of its frames so far"
 #: Column -> its type, and its value for a job. Times are ns of the run's clock, durations ns; docs/explain.md explains
 #: each column.
@@ -78,7 +77,7 @@ def open_journal(folder: Path) -> tuple[Begun, Iterator[Record]]:
 
 
 class RunExplanation:
-    """Takes the records of a journal after the first; `document` says what follows from them.
+    """Takes the records of a journal after the first; `document` is the explanation.
 
     `begun`: first record of the journal. `report`: report of the run, None while it goes on. `slowest`: number of
     frames to name.
@@ -117,7 +116,7 @@ class RunExplanation:
         slowest, usual = self._slow.close()
         unit_of = {stage.name: stage.unit for stage in self._begun.graph.stages}
         intervals = max(self._frames - 1, 1)
-        clock = str(self._begun.facts.get("clock", HOST))
+        clock = str(self._begun.facts.get("clock", HOST_CLOCK))
         frame_ms = (self._last_ns - self._first_ns) / intervals / NS_PER_MS if self._frames > 1 else None
         rows = _budget_rows(budget, unit_of, intervals)
         shared = [self._shared(stage, row) for stage, row in taken.items() if row.preempted_ns]
@@ -140,7 +139,7 @@ class RunExplanation:
             "slowest": [_slow_row(shown, usual) for shown in slowest],
             "advice": advice(rows, self._begun.settings.policy, self._spare_cores(unit_of)),
             "sources": {
-                "frames, waits_ms, service_ms, preempted_ms": MEASURED if clock == HOST else COMPUTED,
+                "frames, waits_ms, service_ms, preempted_ms": MEASURED if clock == HOST_CLOCK else COMPUTED,
                 "efficiency, core_efficiency, machine_efficiency, cores": "CPU time of the run's own jobs",
                 "budget, bound": "the same times along the path that ends with the last frame",
                 "taken_ms": "computed: whose jobs ran then on the same cores",
@@ -149,7 +148,7 @@ class RunExplanation:
         }
 
     def _of_run(self) -> dict[str, Any]:
-        """Return what the run said of itself before its first frame, and how it ended."""
+        """Return the facts of the run from before its first frame, and how it ended."""
         facts, report = self._begun.facts, self._report
         return {
             "scene": config_of(self._begun).get("scene", {}).get("name"),
@@ -176,7 +175,7 @@ class RunExplanation:
         }
 
     def _of_cores(self, frame_ms: float | None, efficiency: float | None) -> dict[str, Any] | None:
-        """Return the CPU time of all jobs per frame beside what the run's cores had; None where either is unknown."""
+        """Return the CPU time of all jobs per frame, and the time of the run's cores; None if either is unknown."""
         cores = sorted({core for place in self._places.values() for core in place.cores})
         if frame_ms is None or efficiency is None or not cores or len(self._places) < len(self._begun.graph.units):
             return None
@@ -184,7 +183,7 @@ class RunExplanation:
         return {"numbers": cores, "cpu_ms": efficiency * had_ms, "had_ms": had_ms}
 
     def _spare_cores(self, unit_of: Mapping[str, str]) -> int:
-        """Return how many cores the run might have used beyond one for each unit; below 0 units must share."""
+        """Return the number of cores that the run had beyond one for each unit; below 0, units share cores."""
         cpu = self._begun.facts.get("machine", {}).get("cpu", {})
         return len(cpu.get("cores_allowed", ())) - len(set(unit_of.values()))
 

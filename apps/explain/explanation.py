@@ -22,7 +22,7 @@ from trilane.hw_profiles.application import Plan, Variant, stage_times_ms, stead
 from trilane.hw_profiles.host import described, host_cores, usable_cores
 from trilane.hw_profiles.host_model import place_units
 from trilane.hw_profiles.network_work import Network, count_work
-from trilane.hw_profiles.profile_files import HOST, load_runnable
+from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.scene.planner import ALL_WORK, MOST_DENSITY, FrameWork
 from trilane.scheduler.placement import Ranked
@@ -30,7 +30,7 @@ from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, network_of, shaped_body
 from trilane.stages.configure import Checked
 from trilane.stages.cpu.pose import FramePlan
-from trilane.units import NS_PER_MS, UNITS, UnitName
+from trilane.units import HOST, NS_PER_MS, UNITS, UnitName
 
 #: What every plan is compared with: the square that the reference application fills.
 FIXED: Shape = (512, 512)
@@ -120,7 +120,7 @@ class _Bodies:
 
 
 def _image(checked: Checked) -> dict[str, Any]:
-    """Return the share of its network's own pixels that a planned tensor may have, and the loss that this costs."""
+    """Return the size of a planned tensor as a share of its network's own pixels, and the loss that it costs."""
     if not checked.config.scene.plans_tensor:
         return {"work": None, "psnr_loss_db": None, "source": "the scene fixes the tensor's size"}
     work = checked.config.works[0]

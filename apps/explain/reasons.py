@@ -1,8 +1,8 @@
 """Why a run takes its time, in words: its slowest frames with their reasons, what bounded it, and what to try.
 
-Rule: each cause names what it rests on. A frame's time is the path that ends with it, cut at the presentation of the
-frame before and at its own. The usual length of a part is its median over the run's frames; a frame was slow because of
-the parts that were longer.
+Rule: each cause names its evidence. A frame's time is the path that ends with it, from the presentation of the frame
+before to its own. The usual length of a part is its median over the run's frames; the parts that were longer than usual
+made the frame slow.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class EvenSample(Generic[T]):
 
 
 class SlowFrames:
-    """Takes the jobs of a run in order, each after `paths` and `sharing` have taken it.
+    """Finds the slowest frames from the jobs of a run in order; `paths` and `sharing` get each job first.
 
     `most`: number of slowest frames to keep.
     """
@@ -107,7 +107,7 @@ class SlowFrames:
         self._services: dict[str, EvenSample[int]] = {stage.name: EvenSample() for stage in graph.stages}
 
     def add(self, explained: ExplainedJob) -> None:
-        """Take the next job that has ended."""
+        """Count a job; jobs come in the order of their ends."""
         job = explained.job
         self._services[job.stage].add(job.end_ns - job.begin_ns)
         if explained.presented is not None:
@@ -116,7 +116,7 @@ class SlowFrames:
             self._look(self._waiting.popleft())
 
     def close(self) -> tuple[list[Shown], Usual]:
-        """Return the slowest frames, the slowest first, and what is usual. Call it after the last job."""
+        """Return the slowest frames, the slowest first, and the usual lengths of parts. Call it after the last job."""
         while self._waiting:
             self._look(self._waiting.popleft())
         slowest = [shown for _, _, shown in sorted(self._slowest, reverse=True)]
@@ -181,7 +181,7 @@ def reasons(shown: Shown, usual: Usual) -> list[Reason]:
 
 
 def notes(shown: Shown) -> list[str]:
-    """Return what else was unlike the frame before."""
+    """Return the other differences from the frame before."""
     said = []
     now, before = shown.now, shown.before
     missing = now.frame - before.frame - 1

@@ -1,8 +1,8 @@
-"""What a run would decide for each frame of a scene, and that plan as a picture.
+"""The plan that a run makes for each frame of a scene, also as a picture.
 
-Rule: the pose stage of the run decides, and nothing else does. `ScenePlan` measures what levels of detail move on the
-picture, against the whole body in float64. The picture shows what was decided, not what the run paints: the bodies'
-vertices, their rectangles and the tensor's, a frame of each phase.
+Rule: the run's own pose stage decides. `ScenePlan` measures how far a level of detail moves vertices on the picture,
+against the whole body in float64. The picture shows the plan, not the painted frame: the bodies' vertices, their
+rectangles and the tensor's, for a frame of each phase.
 """
 
 from __future__ import annotations
@@ -66,11 +66,11 @@ class ScenePlan:
         return PlannedFrame(frame, plan, crops)
 
     def places(self, frame: int, avatar: int) -> F64:
-        """Return (V,2) pixels of the picture at which the whole body's vertices lie; NaN for those not on it."""
+        """Return the pixels (V,2) of the picture where the whole body's vertices lie; NaN for any outside of it."""
         return self._places(self._exact(frame, avatar), frame)
 
     def measured_px(self, frame: int, avatar: int) -> float:
-        """Return how far the last decision, for `frame`, moves a vertex of `avatar` on the picture, at most; pixels."""
+        """Return the largest distance in pixels by which the last decision, for `frame`, moves a vertex of `avatar`."""
         if not self._drawn:
             return 0.0
         exact = self.places(frame, avatar)

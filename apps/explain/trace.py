@@ -1,9 +1,9 @@
 """The trace of a run from the records of its journal: tracks of units, stages and frames, on either clock.
 
-Rule: bounded memory: what is held is what the run has in flight, however long it lasts. A slice is a job as it was
-recorded, or the time between two jobs under its cause; nothing is drawn that was not measured. The slices of a unit do
-not overlap, so its accounts can be added up from them. A frame is late as in the report: past its deadline, or, without
-one, longer after the frame before than the scene's rate allows. A file is whole or absent.
+Rule: memory is bounded by what the run has in flight. A slice is a recorded job, or the time between two jobs with its
+cause; only measured times are drawn. The slices of a unit do not overlap, so they sum to its accounts. A frame is late
+as in the report: past its deadline or, without one, longer after the frame before than the scene's rate allows. A file
+is complete or absent.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class RunTracks:
                 self._end_ns = record.now_ns
 
     def close(self) -> None:
-        """Write what is still held: the run has ended, or nothing more of it is known."""
+        """Write the remaining slices: the run has ended, or its journal has no more records."""
         for piece in self._timeline.end():
             self._units.idle(piece)
         self._units.close()
@@ -164,7 +164,7 @@ def write_tracks(sink: Sink, runs: Mapping[str, Iterable[Record]]) -> None:
 
 
 def _facts_of(begun: Begun) -> dict[str, Any]:
-    """Return what is known of a run before its first frame, and which clock its times are of."""
+    """Return the facts of a run from before its first frame, and the clock of its times."""
     clocks = {"host": "CLOCK_MONOTONIC", "virtual": "simulated time from 0 on"}
     times = f"ns of {clocks.get(str(begun.facts.get('clock')), 'an unknown clock')}"
     settings = {key: value for key, value in asdict(begun.settings).items() if not isinstance(value, Sequence) or value}
@@ -307,7 +307,7 @@ class _UnitTracks:
             self._sink.count(counter, at_ns, frames)
 
     def close(self) -> None:
-        """Write what still waits."""
+        """Write the waiting slices."""
         for unit in self._units:
             self._write(unit, rest=True)
 
@@ -346,8 +346,8 @@ def _if_any(**times_ns: int) -> dict[str, int]:
 class Tiles(Generic[Item]):
     """The slices of one track, which come in any order and leave in order, without overlap.
 
-    At any moment a unit has a job or is idle, so a slice can be written once those before it reach up to it. A slice
-    that begins within the written time is cut.
+    A unit always has a job or is idle, so a slice can be written as soon as the slices before it reach its begin. A
+    slice that begins within the written time is cut.
     """
 
     def __init__(self) -> None:

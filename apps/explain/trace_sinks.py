@@ -1,8 +1,8 @@
-"""What a trace is written into: Perfetto's packets (ui.perfetto.dev) or Chrome's JSON (chrome://tracing).
+"""The formats of a trace: Perfetto's packets (ui.perfetto.dev) or Chrome's JSON (chrome://tracing).
 
-Rule: tracks, slices, instants, counters and flows, whatever the file's format. Times are ns of the run's clock. The
-slices of one track come in the order of their begins and do not overlap. Memory is bounded: packets are written in
-blocks, JSON event by event. A file that ends early is whole up to its last block.
+Rule: both have tracks, slices, instants, counters and flows. Times are ns of the run's clock. The slices of one track
+come in the order of their begins and do not overlap. Memory is bounded: packets are written in blocks, JSON event by
+event. A file that ends early is readable up to its last block.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Says what a file or folder is. Rule: it is recognised by content, and then read by the reader of its kind alone.
+"""Says what a file or folder is. Rule: content identifies a file, and only the reader of its kind reads it.
 
-Where the content leaves it open, the ending of the name decides. Nothing is loaded to recognise a file: at most its
-head, the names in an archive or a JSON document are looked at.
+If the content is ambiguous, the ending of the name decides. To identify a file, only its head, the names in an archive
+or a JSON document are read.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""What is said of one file, as plain data for people and for JSON, and its contact sheet of skeletons, paths or points.
+"""The description of one file, as plain data for people and JSON, and its sheet of skeletons, paths or points.
 
-Rule: a file is usable when the reader that a run would use takes it; a problem is that reader's own sentence. A row of
-skeletons has one scale, and so has a path, so that lengths compare. Y is up, and a person who faces +Z faces the
-reader; the person's left is blue, the right is orange.
+Rule: a file is usable when the reader of a run takes it; a problem is that reader's own sentence. All skeletons of a
+row have one scale, and so has a path, so that lengths compare. Y is up, and a person who faces +Z faces the reader; the
+person's left is blue, the right is orange.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Length:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What is said of one file.
+    """The description of one file.
 
     `what`: the file in words. `problem`: why it is not usable, empty when it is. `advice`: how to use it, or what to
     do. `notes`: notes as a run prints them. `draw`: draws the contact sheet; None where there is nothing to draw.
@@ -215,7 +215,8 @@ def _path_tile(
 ) -> Image.Image:
     """Return a path (T, 2) in a tile of `extent` metres, with a bar for a length.
 
-    `every`: points whose middle is the tile's; None: the path's own. `seen`: eyes, corners and view of the cameras.
+    `every`: points in whose middle the tile is centred; None for the path's own points. `seen`: eyes, corners and view
+    of the cameras.
     """
     room = path if every is None else every
     low, high = room.min(axis=0), room.max(axis=0)

@@ -1,4 +1,4 @@
-"""What a picture, a video or a folder of pictures is, as a background would show it.
+"""Describes a picture, a video or a folder of pictures as a background would show it.
 
 Rule: the reader of backgrounds decides whether it is usable; sizes and rates are those that its header states.
 """

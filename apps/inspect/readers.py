@@ -1,7 +1,7 @@
-"""What motions, cameras, bodies, avatars, networks, scenes, traces and runs are, each by a command's own reader.
+"""Describes motions, cameras, bodies, avatars, networks, scenes, traces and runs, each by a command's own reader.
 
-Rule: a fact is one that the reader found; what this file adds is words. Nothing is placed in a scene, so everything
-said is of the file alone.
+Rule: the reader finds all facts; this file only adds words. Nothing is placed in a scene, so all facts are about the
+file alone.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""The pipelines that `trilane predict` sets beside each other, from what was typed: scenes, and networks at a rate.
+"""The pipelines that `trilane predict` puts on one chip, from the command line: scenes, and networks at a rate.
 
-Rule: the pose stage of a run plans a scene, frame by frame, as for `trilane explain`; a network is its file.
+Rule: as in `trilane explain`, a run's pose stage plans each frame of a scene; a network comes from its file.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class AskedPipeline(NamedTuple):
 
 
 def asked(text: str) -> AskedPipeline:
-    """Read what was typed. Raises BadInputError.
+    """Read a pipeline from the command line. Raises BadInputError.
 
     An @ belongs to the file's name unless a rate follows it, so that a file may have one in its name.
     """

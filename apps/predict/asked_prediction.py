@@ -1,7 +1,7 @@
-"""A prediction as somebody asked for it, from options to an answer: the same for a command line and for a program.
+"""A prediction from options to an answer, for the command line and for programs alike.
 
-Rule: nothing is printed here, and nothing computed. `trilane.hw_profiles` answers, for this machine with what
-`this_machine.py` measured. `say`: function that is told before something takes seconds.
+Rule: this module neither prints nor computes. `trilane.hw_profiles` computes the answers; for this machine it uses the
+measurements of `this_machine.py`. `say`: function that gets a message before something takes seconds.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from trilane.apps.predict.predict_options import HOST, PredictOptions
+from trilane.apps.predict.predict_options import PredictOptions
 from trilane.errors import BadInputError
-from trilane.units import INFER
+from trilane.units import HOST, INFER
 
 if TYPE_CHECKING:
     from trilane.hw_profiles.application import Plan

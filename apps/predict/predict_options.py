@@ -1,7 +1,7 @@
-"""The options of a prediction, each as one field: `trilane predict` and `trilane.predict` have theirs from here.
+"""The options of a prediction, each as one field, for `trilane predict` and `trilane.predict`.
 
-Rule: what is wrong with one option is found by its field, what does not go together by `check_together`. Words of a
-chip's model are read when they are checked, because importing it takes long.
+Rule: a field checks its own value, and `check_together` checks combinations. Words of a chip's model are imported only
+when they are checked, because the import takes long.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from trilane.options import Finite, Option, Options, Text, Texts, one_of
 from trilane.scheduler.policy import POLICIES
 from trilane.stages.run_options import AVATARS_HELP, PROFILE_HELP
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import BURST, PERFORMANCE_PROFILES, SUSTAINED, UnitName
+from trilane.units import BURST, HOST, PERFORMANCE_PROFILES, SUSTAINED, UnitName
 
 if TYPE_CHECKING:
     from trilane.hw_profiles.application import Variant
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 ENCODER_HELP: Final = "resnet18, mobilenetv2, mobilenetv3 or efficientnet-lite0."
 NORM_HELP: Final = "batch, instance or group."
 FIXED_SIZE_HELP: Final = "Tensor size in pixels: one side, or HEIGHTxWIDTH."
-HOST: Final = "host"
 #: How people call precisions -> as a hardware profile does.
 PRECISIONS: Final = {"w8a8": "int8", "int8": "int8", "float": "fp16", "fp16": "fp16", "fp32": "fp32"}
 OF_A_FILE: Final = {"encoder", "norm", "size", "channels"}
@@ -54,7 +53,7 @@ OF_A_SCENE: Final = {"scene", "beside", "turns", "profile", "minutes", "policy",
 
 
 def _either(read_words: Callable[[], tuple[str, ...]], expected: str = "") -> AfterValidator:
-    """Return a validator of words that are read when a value comes. `expected`: what an error says of them."""
+    """Return a validator that calls `read_words` when a value comes. `expected`: the words as an error names them."""
 
     def known(text: str | None) -> str | None:
         if text is not None and text not in (words := read_words()):
@@ -127,15 +126,15 @@ class PredictOptions(Options):
 
     scene: Annotated[Text | None, Option(is_argument=True)] = Field(
         default=None,
-        description="A scene, priced frame by frame, instead of one network: a name, a file, or SCENE@RATE.",
+        description="A scene to predict frame by frame, in place of a network: a name, a file, or SCENE@RATE.",
     )
     beside: Texts = Field(
         default=(),
-        description="What else the chip does: SCENE, SCENE@RATE, NETWORK.onnx@RATE or @RATE:gpu. Once for each.",
+        description="Another pipeline on the chip: SCENE, SCENE@RATE, NETWORK.onnx@RATE or @RATE:gpu. Repeat it.",
     )
     turns: Annotated[str, _either(_turns)] = Field(
         default="round-robin",
-        description="Whose job a unit takes that several pipelines wait for: round-robin or deadline.",
+        description="Order of pipelines that wait for the same unit: round-robin or deadline.",
     )
     profile: Text = Field(default="snapdragon-888", description=PROFILE_HELP)
     encoder: str = Field(default="resnet18", description=ENCODER_HELP)
@@ -145,28 +144,28 @@ class PredictOptions(Options):
     layout: Annotated[str, _either(lambda: ("packed", "split"))] = Field(
         default="packed", description="packed: one raster pass; split: one for every 4 channels."
     )
-    avatar: Text | None = Field(default=None, description=f"An avatar's network instead: {AVATARS_HELP}")
+    avatar: Text | None = Field(default=None, description=f"Predict the network of an avatar: {AVATARS_HELP}")
     network: Annotated[tuple[Path, ...], BeforeValidator(_paths)] = Field(
         default=(),
-        description="A network by itself, without raster and composite: an ONNX file. May be given again.",
+        description="ONNX file of a network by itself, without raster and composite. Repeat it.",
     )
     application: Annotated[bool, Option("--application")] = Field(
-        default=False, description="The application with the --network instead of the network by itself."
+        default=False, description="Predict the application with the --network, not the network by itself."
     )
     input_shape: Annotated[Texts, AfterValidator(_shapes)] = Field(
-        default=(), description="Shape of an input of a --network: NAME=1x3x224x224. May be given again."
+        default=(), description="Shape of an input of a --network: NAME=1x3x224x224. Repeat it."
     )
     precision: Annotated[str | None, _either(lambda: tuple(PRECISIONS), "w8a8 (int8), float (fp16) or fp32")] = Field(
-        default=None, description="w8a8 (int8), float (fp16) or fp32; as the network says and its unit has it."
+        default=None, description="w8a8 (int8), float (fp16) or fp32; by the network and its unit if not given."
     )
     engine_runtime: Annotated[str | None, _either(_engine_runtimes)] = Field(
         default=None,
-        description="Of a tensor engine that runs a --network by itself: tflite (if not given) or qnn_dlc.",
+        description="Runtime of a tensor engine for a --network by itself: tflite (if not given) or qnn_dlc.",
     )
     runtime: str = Field(
         default="dsp", description="Unit of the network: gpu or dsp; cpu too for a --network by itself."
     )
-    minutes: Finite = Field(default=0.0, description="Virtual minutes with heat; 0: settled, without heat.")
+    minutes: Finite = Field(default=0.0, description="Virtual minutes with heat; 0: the settled state without heat.")
     policy: Annotated[str | None, one_of("reference", *POLICIES), Option(synonyms=("--pipelining",))] = Field(
         default=None,
         description="reference (if not given), or sequential, pipelined (if not given, on host), latest, deadline.",
@@ -176,26 +175,28 @@ class PredictOptions(Options):
     )
     batch: int = Field(default=1, description="Frames per job of the network.")
     fps: Annotated[float | None, AfterValidator(_rate)] = Field(
-        default=None, description="A rate: does it hold, at which power? latest and deadline have 30 without."
+        default=None,
+        description="Rate to judge: whether it holds, and at which power. latest and deadline use 30 if not given.",
     )
     power_limit_w: Annotated[float | None, AfterValidator(_watts)] = Field(
-        default=None, description="Also the highest rate within so many watts of the device."
+        default=None, description="Also predict the highest rate at which the device stays within this many watts."
     )
     gpu_share: Finite = Field(default=0.0, description="Share of the network that the GPU does for the DSP.")
-    performance_profile: Annotated[str, _either(lambda: PERFORMANCE_PROFILES), Option(words=PERFORMANCE_PROFILES)] = (
-        Field(default=SUSTAINED, description="Which power and speed the units ask for, by SNPE's names.")
+    performance_profile: Annotated[str, Option(words=PERFORMANCE_PROFILES)] = Field(
+        default=SUSTAINED, description="Power and speed of the units, by SNPE's names."
     )
     governor: Annotated[str | None, _either(_governors)] = Field(
-        default=None, description="step_wise or power_allocator; the profile's if not given."
+        default=None, description="Rule against heat: step_wise or power_allocator; the profile's if not given."
     )
     what_if: Annotated[bool, Option("--what-if")] = Field(
-        default=False, description="Compare policies and edges for the same network, at --fps all."
+        default=False,
+        description="Compare policies and edges for the same network; with --fps, every policy with every edge.",
     )
     plot: Annotated[Path | None, BeforeValidator(_path)] = Field(
-        default=None, description="Draw frame rate and temperature here (.png, .svg, .pdf)."
+        default=None, description="File for a drawing of frame rate and temperature (.png, .svg, .pdf)."
     )
     trace: Annotated[Path | None, BeforeValidator(_path)] = Field(
-        default=None, description="Write the simulated run here, for ui.perfetto.dev (docs/trace.md)."
+        default=None, description="File for the simulated run as a trace, for ui.perfetto.dev (docs/trace.md)."
     )
     table: Annotated[Path | None, BeforeValidator(_path)] = Field(
         default=None, description="CSV of configurations: one answer per row."
@@ -208,9 +209,10 @@ class PredictOptions(Options):
 
     @property
     def cap(self) -> str:
-        """Return the performance profile.
+        """Return the performance profile that was given, or the usual one.
 
-        If none was given, a network by itself has that of published latencies, and a run on this machine has no cap.
+        `burst` is usual for a network by itself, because published latencies are measured with it, and on this
+        machine, where a run has no cap. All others have `sustained_high_performance`.
         """
         if "performance_profile" in self.model_fields_set:
             return self.performance_profile
@@ -235,7 +237,7 @@ class PredictOptions(Options):
 
     @property
     def unit(self) -> UnitName:
-        """Return the unit of the network. Raises BadInputError for none that it can be."""
+        """Return the unit of the network. Raises BadInputError for any other word."""
         units: tuple[UnitName, ...] = ("cpu", "gpu", "dsp") if self.is_bare else ("gpu", "dsp")
         for unit in units:
             if unit == self.runtime:
@@ -251,9 +253,10 @@ class PredictOptions(Options):
 
     @property
     def variant(self) -> Variant:
-        """Return how stages are joined. Without a policy: as in the published application, on this machine as in a run.
+        """Return how stages are joined.
 
-        Raises BadInputError for an edge that the published application does not have.
+        Without a policy they are joined as in the published application, or on this machine as in a run. Raises
+        BadInputError for an edge that the published application does not have.
         """
         from trilane.hw_profiles.application import REFERENCE, Variant
 

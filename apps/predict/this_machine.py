@@ -1,7 +1,8 @@
-"""The profile `host` with what was measured of this machine: a network's own calls, and the stages of an avatar's run.
+"""The profile `host` with measurements of this machine: calls of a network, and the stages of an avatar's run.
 
-Rule: a measurement takes at most half a minute, which is said before, happens once, and is kept with the machine's
-facts. What cannot be measured is said, and the profile stays as it is: then nothing that it predicts has an interval.
+Rule: a measurement is announced, takes at most half a minute, and is kept with the machine's facts, so that it happens
+once. If something cannot be measured, a message says so; the profile stays as it is, and its predictions have no
+interval.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ Say = Callable[[str], None]
 def with_avatar(chip: Profile, avatar: str, say: Say) -> tuple[Profile, Network]:
     """Return `chip`, this machine, with the times by which a run of `avatar` is placed, and its usual network.
 
-    The network is that of the run's usual tensor. `say`: function that is told what takes time and what cannot be
-    measured. Raises BadInputError for what is no avatar.
+    The network is that of the run's usual tensor. `say`: function that gets messages on what takes time and what cannot
+    be measured. Raises BadInputError for what is no avatar.
     """
     measured, network = _with_run(chip, RunOptions(avatar=avatar), say)
     return measured, network._replace(facts={"avatar": avatar})
@@ -70,7 +71,7 @@ def _with_run(chip: Profile, request: RunOptions, say: Say) -> tuple[Profile, Ne
 
 
 def with_first(chip: Profile, text: str, say: Say) -> Profile:
-    """Return `chip`, this machine, with what was measured of the first of several pipelines, as it was typed."""
+    """Return `chip`, this machine, with measurements of the first of several pipelines, as it was typed."""
     what = asked(text).what
     if what.endswith(NETWORK_ENDING):
         return with_file(chip, read_graph(Path(what)), {}, say)

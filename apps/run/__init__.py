@@ -1,4 +1,4 @@
-"""What happens around a run: what was asked for becomes a run folder, with its report, its files and its check.
+"""Turns the options of a run into a run folder, with its report, its files and its check.
 
 It may use every lower folder and apps/experiments/, but not apps/cli/.
 """

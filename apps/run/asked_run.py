@@ -1,7 +1,7 @@
-"""A run as somebody asked for it, from options to a run folder: the same for a command line and for a program.
+"""A run from its options to its run folder, for the command line and for programs alike.
 
-Rule: nothing is printed here. The fork server starts first and imports what the units need while this process goes on,
-so functions here import what this process needs.
+Rule: nothing is printed here. The fork server starts first and imports the units' modules while this process goes on.
+So functions here import the modules of this process when they need them.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ def run_asked(
 ) -> RunOutcome:
     """Check the options, run what they ask for and leave its run folder.
 
-    `hooks`: context manager of those who are told; it opens when the input is checked and the units start.
-    `command`: words by which the run was asked for.
-    Raises BadInputError and MissingPartError for what cannot be run, TrilaneError when no frame was presented.
+    `hooks`: context manager that gives the callbacks; it opens when the input is checked and the units start.
+    `command`: words by which the run was asked for. Raises BadInputError and MissingPartError for what cannot be run,
+    TrilaneError when no frame was presented.
     """
     options.check_together()
     with early_processes() as (starter, gl):
@@ -127,9 +127,8 @@ def run_prepared(
 ) -> RunOutcome:
     """Run what was checked and leave its run folder.
 
-    `hooks`: as in `run_asked`. `starter`, `gl`: fork server and facts that `early_processes` gives. `watched`: who
-    looks at the run, if anybody.
-    Raises what `run_asked` raises.
+    `hooks`: as in `run_asked`. `starter`, `gl`: fork server and facts that `early_processes` gives. `watched`: viewer
+    of the run, if any. Raises what `run_asked` raises.
     """
     from trilane.apps.run.run_folder import default_place
     from trilane.apps.run.run_job import run_to_folder

@@ -1,7 +1,7 @@
-"""What report.json says of a run: made of the run's result, with the source of every figure.
+"""Builds report.json from the result of a run, with the source of every figure.
 
-Rule: of all keys of `SOURCES` that a figure stands under, the longest decides; no figure stands under none. Frames of a
-tensor size are counted by the run; the error of that size is the avatars' own, from their validation, or unknown.
+Rule: the longest matching key of `SOURCES` gives the source of a figure, and every figure matches one. The run counts
+the frames of each tensor size; the error of a size comes from the avatars' validation, or is unknown.
 """
 
 from __future__ import annotations
@@ -72,9 +72,9 @@ def build_report(
     """Build the report of a run on the host clock. Raises ValueError naming a wrong or unknown key.
 
     `result`: result of the run. `config`: its configuration.
-    `machine`: what `machine_facts` said.
+    `machine`: result of `machine_facts`.
     `baseline`: result of the same scene under another policy, None without one.
-    `facts`: what others know of the run: `video`, `checksum`, and any of `made`, `options`, `placement`, `resolution`,
+    `facts`: further facts about the run: `video`, `checksum`, and any of `made`, `options`, `placement`, `resolution`,
     `pace`, `accuracy`, `check`, `notes`.
     """
     metrics = result.report
@@ -115,7 +115,7 @@ def sources_of(document: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _of_bytes(stages: Mapping[str, Any]) -> dict[str, str]:
-    """Return the sources of `least` and `ratio` for the stages that count their bytes: nobody counts these two."""
+    """Return the sources of `least` and `ratio`, which are computed, for the stages that count their bytes."""
     counting = [f"stages.{name}.bytes" for name, row in stages.items() if row.get("bytes")]
     return {f"{key}.{figure}": SOURCES[f"bytes.{figure}"] for key in counting for figure in ("least", "ratio")}
 

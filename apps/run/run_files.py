@@ -1,4 +1,4 @@
-"""The files of a run folder that are made of others: video, contact sheet, checksum, recording and trace.
+"""The files of a run folder that are made from other files: video, contact sheet, checksum, recording and trace.
 
 Rule: nothing is encoded again: video.mp4 holds the packets of the segments, and the contact sheet is decoded from it.
 The journal is read once, record by record.
@@ -32,9 +32,9 @@ FAST_PNG = 1  # a fifth larger than the best compression, in a quarter of the ti
 
 
 def write_files(work: Path, fps: float) -> tuple[dict[str, Any], UnwrittenError | None]:
-    """Write every file of the run folder `work` but the report; returns what the report says of them.
+    """Write every file of the run folder `work` except the report. Return the report's facts about these files.
 
-    Where the disk takes no more, also returns the error. Files are then whole or absent, and the segments stay.
+    On a full disk the error is returned too; files are then complete or absent, and the segments stay.
 
     `fps`: frames a second of the scene. Raises BadInputError for a broken journal.
     """
@@ -187,7 +187,7 @@ def _decode_all(container: Any, wanted: list[int]) -> Iterator[tuple[int, Image.
 
 
 def _decode_each(container: Any, wanted: list[int]) -> Iterator[tuple[int, Image.Image]]:
-    """Yield the same after a seek to each, which is less work where many frames lie between them."""
+    """Yield the same frames after a seek to each, which is faster if many frames lie between them."""
     stream = container.streams.video[0]
     for pts in wanted:
         container.seek(pts, stream=stream)

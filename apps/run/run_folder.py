@@ -1,7 +1,7 @@
-"""The folder that a run writes: made under a temporary name beside its place and renamed when it is whole.
+"""The folder that a run writes: made under a temporary name beside its place and renamed when it is complete.
 
-Rule: a folder with the run's name is complete; a folder whose name ends in `.partial` is not. Where something in it
-could not be written, such as on a full disk, what was written stays, and the error says where.
+Rule: a folder with the run's name is complete; a folder whose name ends in `.partial` is not. If a file cannot be
+written, as on a full disk, the written files stay, and the error names their place.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ def default_place(scene: str) -> Path:
 class RunFolder:
     """Make a run folder under a temporary name, `work`; without `complete()` it and parents that it made are removed.
 
-    A context manager. On entry it raises BadInputError when `target` exists, when another run that goes on has the
-    name, or when no report can be written there: RESERVED_BYTES are taken, and given back by `release`.
-    On leaving by an error about a file that could not be written, it raises TrilaneError; a folder that holds anything
-    then stays. It also raises TrilaneError when `work` was removed.
+    A context manager. On entry it raises BadInputError when `target` exists, when another live run has the name, or
+    when there is no room for a report. RESERVED_BYTES stay reserved for the report until `release`. On leaving by an
+    error about a file that could not be written, it raises TrilaneError; a folder that holds anything then stays. It
+    also raises TrilaneError when `work` was removed.
     """
 
     def __init__(self, target: Path) -> None:

@@ -1,9 +1,9 @@
 """One run from a checked configuration to a complete run folder, and the comparison of its frames with the truth.
 
-Rule: what is in the folder is whole. A run that was interrupted or failed says so in its report and keeps the frames
-that were presented; a run that presented none leaves no folder. `check_run` compares pictures that were presented, kept
-without loss: first with the truth, which a person would see without Trilane, then with the float path, which tells what
-integers, rasters and plans cost.
+Rule: a run folder is complete. The report of an interrupted or failed run says so, and the folder keeps the presented
+frames. A run that presented none leaves no folder. `check_run` compares presented pictures, stored without loss, with
+the truth, which a person would see without Trilane. It also compares them with the float path, which shows the cost of
+integers, rasters and plans.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.configure import Checked
 from trilane.stages.placing import placed
 from trilane.stages.run_options import RunOptions
+from trilane.units import HOST
 
 if TYPE_CHECKING:
     from trilane.apps.experiments.picture_errors import ErrorFigures
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
     from trilane.avatars.bundle import Bundle
 
 BASELINE_POLICY = "sequential"
-HOST = "host"
 INTERRUPTED = 130
 NO_VIDEO = "no video, no contact sheet and no checksum: the frames were presented without, as was asked for"
 TRUTH = "the truth: the clothed body that the avatar was trained on"
@@ -69,7 +69,7 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Hooks:
-    """Functions that are told of a run: `progress(what, presented, requested)` and `message(text)`."""
+    """Callbacks of a run: `progress(what, presented, requested)` and `message(text)`."""
 
     progress: Callable[[str, int, int], None]
     message: Callable[[str], None]
@@ -77,7 +77,7 @@ class Hooks:
 
 @dataclass(frozen=True)
 class Watched:
-    """A run that somebody looks at and steers while it goes on.
+    """A live run that somebody watches and steers.
 
     `frames`: number of frames; None for the scene's. `window`: file to look through (`trilane.transport.live_window`).
     `controls`: requests to the run. `begins(folder, checked)`: function that is called when the units are placed,
@@ -112,13 +112,12 @@ def run_to_folder(
     """Run what was prepared and leave the run folder at `target`.
 
     `target`: folder that does not exist yet.
-    `hooks`: functions that are told of the run.
-    `machine`: what `machine_facts` said.
-    `made`: what `trilane.apps.run.asked_run.made_facts` said; None for a run without a command line.
+    `hooks`: callbacks of the run.
+    `machine`: result of `machine_facts`.
+    `made`: result of `trilane.apps.run.asked_run.made_facts`; None for a run without a command line.
     `starter`: fork server that was started earlier; without one, the units stay where they were prepared.
-    `watched`: who looks at the run, if anybody.
-    Raises BadInputError when `target` cannot be written. Raises TrilaneError when no frame was presented, or when a
-    file could not be written; then the folder stays.
+    `watched`: viewer of the run, if any. Raises BadInputError when `target` cannot be written. Raises TrilaneError when
+    no frame was presented, or when a file could not be written; then the folder stays.
     """
     options, checked, pace = prepared.options, prepared.checked, prepared.pace
     with RunFolder(target) as folder:
@@ -183,7 +182,7 @@ class _Job:
         self._hooks, self._starter, self._watched = hooks, starter, watched
 
     def run(self, folder: Path, facts: Mapping[str, Any]) -> RunResult:
-        """Run what was asked for and write its journal, which begins with `facts`.
+        """Run the prepared run and write its journal, which begins with `facts`.
 
         Raises TrilaneError when the run ended before any frame was presented.
         """
@@ -308,7 +307,7 @@ def _exit_code(result: RunResult) -> int:
 
 
 def _tell(report: Report, hooks: Hooks) -> None:
-    """Tell a person what should not have to be found in the report."""
+    """Tell a person the facts that nobody should have to search in the report."""
     if report.video is not None and report.video.frames < report.frames.presented:
         shown = f"{report.video.frames} of {report.frames.presented} frames"
         hooks.message(f"video.mp4 holds {shown}: a writer was killed before its last")
@@ -330,7 +329,7 @@ def asked_frames(total: int, count: int) -> tuple[int, ...]:
 
 
 def require_parts(bundles: Iterable[Bundle]) -> None:
-    """Raises MissingPartError for a missing library that the check of a run with avatars `bundles` needs."""
+    """Raise MissingPartError for a missing library that the check of a run with avatars `bundles` needs."""
     from trilane.bench.lib.full_network import require_float_network
 
     require_metrics()

@@ -1,8 +1,8 @@
-"""What a sweep tries: a command with fixed options and axes, its trials by name, and the TOML file that says so.
+"""Defines a sweep: a command with fixed options and axes, its named trials, and its TOML file.
 
-Rule: the same definition gives the same trials in the same order on every machine. A trial's name is a hash of what is
-asked and of nothing else: not of the machine, the folder or the moment. The first defect of a file is named with its
-key; whether its options are those of the command is not known here.
+Rule: the same definition gives the same trials in the same order on every machine. A trial's name is a hash of its
+options alone, not of machine, folder or time. An error names the first defect of a file with its key. This module does
+not know the options of any command.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ def _combination(definition: Definition, number: int) -> list[Value]:
 
 
 class TrialClock(StrEnum):
-    """The clock of a trial. HOST: it takes time and needs its machine for itself. VIRTUAL: it computes its times."""
+    """The clock of a trial. HOST: the trial measures, and has its machine for itself. VIRTUAL: it computes times."""
 
     HOST = "host"
     VIRTUAL = "virtual"
@@ -219,7 +219,7 @@ def canonical(command: tuple[str, ...], options: Options, repeat: int = 1) -> st
 
 @dataclass(frozen=True)
 class SweepFile:
-    """What a file says. Values of options are as the file has them."""
+    """The content of a sweep file."""
 
     command: tuple[str, ...]
     kind: SweepKind = SweepKind.GRID

@@ -1,9 +1,9 @@
 """How trials are done: one in a process, many on this machine, and many on the machines of a Ray cluster.
 
-Rule: a process that was ended from outside is lost and may be tried again; what ends by itself has said its last word.
-Trials of the host clock run one at a time on a machine, virtual ones on all its cores, and no process is left. On Ray a
-task does one trial as this machine would, and the driver alone writes the sweep's folder. Ray retries nothing by
-itself; a driver that leaves takes its workers with it, and they their trials.
+Rule: a trial whose process was ended from outside is lost and may be tried again; a trial that ended by itself is
+final. Trials of the host clock run one at a time on a machine, virtual ones on all its cores. No process is left
+behind. On Ray, a task does one trial as this machine would, and only the driver writes the sweep's folder. Ray itself
+retries nothing. When the driver ends, its workers end, and so do their trials.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def perform(trial: Trial, place: TrialPlace, children: Children) -> Record:
 
 
 def about(trial: Trial) -> Record:
-    """Return what is known of a trial before it is done."""
+    """Return the facts of a trial before it is done."""
     return {
         "schema": 1,
         "id": trial.id,
@@ -279,7 +279,7 @@ def _run_on(ray: Any, place: TrialPlace, trials: Sequence[Trial]) -> Generator[R
 
 
 def _resources(ray: Any, clock: TrialClock) -> dict[str, int]:
-    """Return what a trial takes besides a core. Raises BadInputError when no machine has it."""
+    """Return the resources that a trial takes besides a core. Raises BadInputError when no machine has them."""
     if clock is TrialClock.VIRTUAL:
         return {}
     if RESOURCE not in ray.cluster_resources():

@@ -223,7 +223,7 @@ def summary(trials: Sequence[Trial], store: Store, before: set[str]) -> dict[str
 
 
 def row_of(trial: Trial, record: Record | None) -> dict[str, Any]:
-    """Return a trial as a row of a summary: what it is and, unless it is planned, how it ended."""
+    """Return a trial as a row of a summary: its options and, unless it is planned, how it ended."""
     ended = record or {"status": "planned", "exit_code": None, "error": None, "seconds": None}
     return {
         "id": trial.id,

@@ -1,4 +1,4 @@
-"""A run while it goes on: found by its name, its figures of the moment, and these as metrics.
+"""Follows a live run: finds it by name, and gives its present figures, also as metrics.
 
-Rule: everything follows the run's journal, which tells the same after the run as during it.
+Rule: everything comes from the run's journal, which says the same after the run as during it.
 """

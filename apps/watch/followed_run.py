@@ -1,7 +1,7 @@
-"""A run that others look at while it goes on, or after: where its journal is, and what has become of it.
+"""A run that others follow, during it or after it: the place of its journal, and its state.
 
-Rule: whoever follows a run touches nothing of it. A run that goes on writes into `NAME.PID.partial` beside its place
-(run_folder.py). Whoever asks for NAME is given that folder, and follows it when it gets its name.
+Rule: a follower changes nothing of the run. A live run writes into `NAME.PID.partial` beside its place (run_folder.py).
+A request for NAME finds that folder, and still follows it after the folder gets its name.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ PARTIAL = re.compile(r"(?P<name>.+)\.(?P<pid>[0-9]{1,9})\.partial")
 
 
 class RunState(StrEnum):
-    """What has become of a run.
+    """The state of a run.
 
-    GOES_ON: its process lives. FINISHED: the folder has its name. KILLED: the process left the folder behind.
-    REMOVED: the folder is gone; a run that ends before any frame removes its own.
+    GOES_ON: its process lives. FINISHED: the folder has its name. KILLED: the process left the folder behind. REMOVED:
+    the folder is gone; a run that ends before any frame removes its own.
     """
 
     GOES_ON = "goes on"
@@ -40,7 +40,7 @@ class RunState(StrEnum):
 
 
 def without_journal(folder: Path) -> str:
-    """Say what is where the journal of `folder` should be."""
+    """Describe what lies where the journal of `folder` should be."""
     if (folder / NAME).is_symlink():
         return f"{NAME}, a link to a file that is not there"
     return f"no {NAME}" if folder.is_dir() else "no such folder"
@@ -66,7 +66,7 @@ class FollowedRun:
 
     @property
     def state(self) -> RunState:
-        """Return what has become of the run until now."""
+        """Return the state of the run now."""
         self._find_again()
         if not self.folder.is_dir():
             return RunState.REMOVED
@@ -135,7 +135,7 @@ def _is_alive(pid: int) -> bool:
 
 
 def folder_of(given: Path) -> Path | None:
-    """Return the folder of the run that has begun and that `given` means (`follow`), or what is there in its place."""
+    """Return the folder of the run that `given` means (see `follow`), or the place itself if it exists; else None."""
     if given.name == NAME:
         return given.parent
     places = [given] if given.is_absolute() or len(given.parts) > 1 else [given, RUNS / given]

@@ -1,9 +1,9 @@
 """Figures of a run at any moment, from its journal as it grows. Rule: pure, and of bounded memory.
 
-Every time of the last `WINDOW_NS` is kept, so that percentiles are exact; of the whole run sums and counts alone. A
-unit's time follows the ledger (scheduler/ledger.py): its accounts and jobs are spans, told as they change and end. What
-was assigned but neither ran nor was preempted is overhead. `looks` gives the figures again and again until the run
-ends; it looks once at a run that is over.
+All times of the last `WINDOW_NS` are kept, so that percentiles are exact; the whole run only has sums and counts. A
+unit's time follows the ledger (scheduler/ledger.py): its accounts and jobs are spans. Time in which a job was assigned,
+but neither ran nor was preempted, is overhead. `looks` gives the figures repeatedly until a live run ends, and once for
+a finished run.
 """
 
 from __future__ import annotations
@@ -120,9 +120,8 @@ class LiveFigures:
     def now(self, now_ns: int | None = None, state: RunState | None = None) -> MomentFigures:
         """Return the figures at `now_ns`, of the run's clock; at the last record where it is None or earlier.
 
-        `state`: what has become of the run, which the journal of a killed run does not say; None to take it from the
-        journal.
-        After the step that finished the run the moment stays at that step: what follows are no frames.
+        `state`: state of the run, which the journal of a killed run does not show; None to take it from the journal.
+        After the run's last step the moment stays at that step, because no frames follow.
         """
         now_ns = min(max(now_ns or 0, self._last_ns), self._finished_ns)
         start_ns = now_ns if self._timeline.start_ns is None else self._timeline.start_ns
@@ -253,7 +252,7 @@ class LiveFigures:
 
 
 class RunLook(NamedTuple):
-    """One look at a run: its name, its state and its figures. `name`: its folder's at the end."""
+    """One look at a run: its name, its state and its figures. `name`: final name of its folder."""
 
     name: str
     state: RunState
@@ -311,7 +310,10 @@ class _UnitTime:
         self._state, self._since_ns = NAMES.get(account, ASSIGNED), now_ns
 
     def add_job(self, job: JobDone) -> None:
-        """Take a job that has ended; time before it counts as preempted only while the unit had it and ran no other."""
+        """Count a job that has ended.
+
+        The time before it counts as preempted only if the unit had this job and ran no other.
+        """
         begin_ns, end_ns = job.t_begin_ns, job.t_end_ns
         held_from_ns = max(self._last_end_ns, self._since_ns)
         if begin_ns > held_from_ns:

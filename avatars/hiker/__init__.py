@@ -1,1 +1,1 @@
-"""The embedded avatar of another look (data)."""
+"""The data of the bundled avatar `hiker`."""

@@ -54,8 +54,8 @@ def require_float_network(bundle: Bundle) -> Path | None:
 def float_weights(bundle: Bundle) -> Path | None:
     """Return the file of the network that `bundle` was quantised from; None when its manifest names none here.
 
-    A manifest names it by file and digest, as `avatar validate --float-network` writes it, or with how the network was
-    quantised.
+    The manifest names file and digest in the entry of `avatar validate --float-network`, or among the facts about
+    quantising.
     """
     validation = bundle.manifest.validation
     validated = ((validation.model_extra or {}) if validation is not None else {}).get("float", {}).get("network", "")

@@ -53,7 +53,7 @@ class FullBody:
     """
 
     def __init__(self, body: Body, betas: Sequence[float] = (), expression: Sequence[float] = ()) -> None:
-        """Shape `body` by `betas` and `expression`; missing coefficients are 0."""
+        """Return the shape `body` by `betas` and `expression`; missing coefficients are 0."""
         self._body = body
         self._weights = body.weights.astype(np.float64)
         self.rest = body.v_template.astype(np.float64)

@@ -97,7 +97,7 @@ class RingReadback:
             self._finish()
 
     def drain(self) -> None:
-        """Wait for all of them."""
+        """Wait for all buffers."""
         while self._waiting:
             self._finish()
 

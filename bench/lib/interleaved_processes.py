@@ -38,7 +38,7 @@ def answer_of(pipe: Connection, name: str, wait_s: float) -> Any:
 
 @contextmanager
 def asked_processes() -> Iterator[Callable[[Callable[..., None], Any], Connection]]:
-    """Yield a function that starts a process, given what it runs and what it gets beside its pipe."""
+    """Yield a function that starts a process for a given function and its arguments besides the pipe."""
     context = multiprocessing.get_context("spawn")
     processes, pipes = [], list[Connection]()
 

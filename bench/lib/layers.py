@@ -124,10 +124,10 @@ def placed(light: F64, rect: Rect, output: Shape, depth: float) -> RasterLayer:
 
 
 def _reads(begin: float, end: float, count: int, side: int, taps: int) -> tuple[int, F64]:
-    """Return the first pixel whose centre lies in [begin, end), and the weights (n, count) of the pixels between.
+    """Return how the pixels between `begin` and `end` are read along one axis of a picture of `side` pixels.
 
-    This is along one axis. The first pixel is in pixels of a picture of `side`. The weights say, for it and the
-    following ones, how much each of the `count` pixels between `begin` and `end` counts.
+    They are the number of the first pixel of the picture whose centre lies in [begin, end), and weights (n, count). Row
+    k says how much each of the `count` pixels counts for the first pixel + k.
     """
     first, last = (min(max(int(np.ceil(place - 0.5)), 0), side) for place in (begin, end))
     middles = np.arange(first, last)[:, None] + 0.5

@@ -1,7 +1,7 @@
 """Ranges of the benches' options.
 
-Rule: an option means the same in every bench, so its range stands here once; a bench that needs a narrower range checks
-it itself.
+Rule: an option means the same in every bench, so its range is defined once, here. A bench that needs a narrower range
+checks it itself.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ class Queries:
     `size`: number of frames in a query, which is answered with the last of them.
     `asked_s`, `answered_s`: monotonic seconds of the queries that count.
     `over`: whether nothing more counts: the run has ended, or a frame was dropped or lost.
-    `why`: in the second case, a sentence.
+    `why`: sentence about the dropped or lost frame.
     `changed`: condition that is notified with every answer and when it is over.
     """
 
@@ -76,7 +76,7 @@ class Queries:
         requests.request(count * self.size)
 
     def answered(self, _frame: int) -> None:
-        """Called by the `FrameRequestQueue` with each presented frame."""
+        """Note a presented frame; the `FrameRequestQueue` calls this."""
         with self.changed:
             self._frames += 1
             if self._frames % self.size == 0:
@@ -84,13 +84,13 @@ class Queries:
                 self.changed.notify_all()
 
     def unanswered(self, causes: Mapping[str, int]) -> None:
-        """Called by the `FrameRequestQueue` when a frame was dropped or lost: its query has no answer."""
+        """Note that a frame was dropped or lost, so its query has no answer; the `FrameRequestQueue` calls this."""
         frames = ", ".join(f"{cause} {count}" for cause, count in causes.items())
         self.why = f"frames of queries were dropped or lost ({frames}), and every query must be answered: {KEEPS_ALL}"
         self.ended()
 
     def ended(self) -> None:
-        """Called by the `FrameRequestQueue` when the run is over."""
+        """Note that the run is over; the `FrameRequestQueue` calls this."""
         with self.changed:
             self.over = True
             self.changed.notify_all()

@@ -48,7 +48,7 @@ class LoadGenPlayer:
     """Lets LoadGen ask a run for frames.
 
     `load`: pattern and its limits, which LoadGen gets.
-    `queries`: times that are told about the frames too, and know when the run is over early.
+    `queries`: times of the same frames, which also show an early end of the run.
     `verdict`: LoadGen's verdict, which `play` fills in.
     """
 
@@ -60,22 +60,19 @@ class LoadGenPlayer:
     _completed: int = 0
 
     def answered(self, frame: int) -> None:
-        """Called by the `FrameRequestQueue`: after the warm-up each frame is a sample of LoadGen's."""
+        """Pass a presented frame on to LoadGen, as a sample after the warm-up; the `FrameRequestQueue` calls this."""
         self.queries.answered(frame)
         if self._begun and not self.queries.over:
             self._completed = frame - WARM_UP + 1
             self._complete(frame - WARM_UP)
 
     def unanswered(self, causes: Mapping[str, int]) -> None:
-        """Called by the `FrameRequestQueue` when a frame was dropped or lost: the rest of LoadGen's run is void."""
+        """Note a dropped or lost frame, which voids the rest of the run; the `FrameRequestQueue` calls this."""
         self.queries.unanswered(causes)
         self.ended()
 
     def ended(self) -> None:
-        """Called by the `FrameRequestQueue` when the run is over.
-
-        LoadGen waits for every answer, so queries that will never be answered are completed here.
-        """
+        """Note that the run is over; the `FrameRequestQueue` calls this."""
         self.queries.ended()
         if self._begun:
             with self.queries.changed:  # no sample is completed twice, whichever thread comes first

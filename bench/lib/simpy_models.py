@@ -63,7 +63,7 @@ class SimpyPipeline:
 
 
 class LeanPipeline:
-    """The same with one timeout for each job and callbacks instead of processes; nothing is checked.
+    """The same model with one timeout for each job and callbacks instead of processes; nothing is checked.
 
     SimPy keeps the clock and the order of events; slots, held jobs and queues are plain numbers. The instants are the
     same to the nanosecond unless events tie, as with service times in whole milliseconds. It only suits chains whose

@@ -31,9 +31,9 @@ RASTER = 1
 
 
 def units_of(pipeline: Pipeline, assets: Assets) -> Units:
-    """Return what the stages of each unit share.
+    """Return the shared objects of each unit's stages.
 
-    Chains that draw in one process must share it too: one OpenGL context.
+    Chains that draw in one process must share them too: one OpenGL context.
     """
     return {name: UnitContext(name, settings, assets) for name, settings in pipeline.units.items()}
 
@@ -113,10 +113,7 @@ class AvatarFrames:
         return tensor
 
     def composited(self, number: int, painted: U8) -> U8:
-        """Return frame `number` with `painted` (h,w,4) in place of the network's picture: (h,w,3) uint8.
-
-        `painted` has the shape of that picture.
-        """
+        """Return frame `number`, (h,w,3) uint8, composited with `painted` (h,w,4) in place of the network's output."""
         self._chain.run(number, self._composite - 1).payload[: painted.size] = painted.reshape(-1)
         return self._picture(self._chain.go_on(number))
 
@@ -128,7 +125,7 @@ class AvatarFrames:
 
     @property
     def posed(self) -> NDArray[np.void]:
-        """Return what the pose stage said about the latest frame: a header as in `stages/config.py`."""
+        """Return the pose stage's header of the latest frame, as in `stages/config.py`."""
         return self._chain.packets[0].header
 
     @property

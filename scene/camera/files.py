@@ -108,7 +108,7 @@ OTHERS = {
 def detect(path: Path, up_axis: str = AUTO, axes: str = AUTO) -> Guess:
     """Return the format of `path`. Raises BadInputError when it is none, or may be two.
 
-    `up_axis`: axis that is up, from the scene. `axes`: axes of a pose, from the scene.
+    `up_axis`: axis that is up, by the scene. `axes`: where x, y and z of a pose point, by the scene.
     """
     if path.is_dir():
         return _of_folder(path)
@@ -255,8 +255,8 @@ def _require_one_order(path: Path, numbers: F64, names: tuple[str, ...], axes: F
     """Raise BadInputError where the quaternion's parts may be in another order than `names` of a table's columns.
 
     This holds where another order makes cameras more level, or where the other usual one (scalar first or last) makes
-    them as level. A map of SLAM that begins without a turn has the 1 where its scalar is. `axes` (3, 3): camera's axes
-    in those of a pose.
+    them as level. A map of SLAM that begins without a turn has the 1 where its scalar is. `axes` (3, 3): columns
+    are the directions of the camera's axes, in the coordinates of a pose.
     """
     at = names.index("qw"), names.index("qx"), names.index("qy"), names.index("qz")
     first_of = min(at)
@@ -314,7 +314,10 @@ OPENGL_KINDS = ("arkit", "nerf", "record3d")
 
 
 def _axes(kind: str, stated: str) -> F64:
-    """Return the camera's OpenGL axes as columns (3, 3) in the axes of a pose of the format, or in those `stated`."""
+    """Return the directions of the camera's OpenGL axes as columns (3, 3), in the coordinates of a pose.
+
+    `kind`: format of the file. `stated`: axes of its poses by the scene; `auto` for those of the format.
+    """
     axes = axes_of(stated)
     if axes is None:
         return np.eye(3) if kind in OPENGL_KINDS else OPENGL_FROM_OPTICAL

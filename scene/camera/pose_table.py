@@ -133,7 +133,7 @@ def _number(word: str) -> list[float]:
 
 
 def names_in(line: str) -> tuple[str, ...]:
-    """Return what the columns hold if `line`, maybe a comment, names four or more known ones; else nothing."""
+    """Return the contents of the columns if `line`, maybe a comment, names four or more known ones; else nothing."""
     text = UNIT.sub("", line.strip().lstrip("#"))
     words = text.split(",") if "," in text else text.split()
     plain = (OTHER.sub("", SYMBOLS.sub("", word.strip().lower())) for word in words)

@@ -315,12 +315,12 @@ class RawCamera:
     """The content of a camera file, before anything is left out or turned.
 
     `times_s` (N,): times in seconds. `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes, metres.
-    `usual_up`: axis of the world that is usually up in the format. `lenses`: lens of the picture in the axes of a pose,
-    one for all poses or one for each. `lens`: source of the lenses. `notes`: notes on the file, for people. `place_of`:
-    place of a sample in the file. `detected`: facts about the file, without its axes and lens. `pictures`: name of the
-    photo of each pose, or none. `is_levelled`: whether the world of the format is aligned with gravity, by its
-    definition. `unit`: unit of the lengths. `began_s`: seconds since 1970 at time 0; None where the file does not say
-    it.
+    `usual_up`: axis of the world that is usually up in the format. `lenses`: lens of the picture, along the axes of its
+    pose; one for all poses or one for each. `lens`: source of the lenses. `notes`: notes on the file, for people.
+    `place_of`: place of a sample in the file. `detected`: facts about the file, without its axes and lens. `pictures`:
+    name of the photo of each pose, or none. `is_levelled`: whether the world of the format is aligned with gravity, by
+    its definition. `unit`: unit of the lengths. `began_s`: seconds since 1970 at time 0; None where the file does not
+    say it.
     """
 
     times_s: F64

@@ -83,7 +83,7 @@ def _stands_in(root: Path) -> bool:
 
 
 def _requirements(extra: str) -> Iterator[str]:
-    """Yield what the installed distribution requires for `extra` (for "": in any case), without the markers."""
+    """Yield the requirements of the installed distribution for `extra` (for "": of every run), without the markers."""
     try:
         lines = importlib.metadata.requires("trilane") or []
     except importlib.metadata.PackageNotFoundError:

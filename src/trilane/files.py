@@ -92,14 +92,14 @@ _PATTERNS = tuple((re.compile(pattern, re.DOTALL), signature) for pattern, signa
 
 
 def signature_of(path: Path) -> Signature | None:
-    """Return what the regular file `path` is; None when its head says nothing. Raises OSError when it is unreadable."""
+    """Return the format of the regular file `path`; None if its head shows none. Raises OSError if it is unreadable."""
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
     return signature_of_head(head)
 
 
 def signature_of_head(head: bytes) -> Signature | None:
-    """Return what a file is that begins with `head`, which is up to HEAD_BYTES long."""
+    """Return the format of a file that begins with `head`, which is up to HEAD_BYTES long."""
     return next((signature for pattern, signature in _PATTERNS if pattern.match(head)), None)
 
 
@@ -327,7 +327,10 @@ def read_header(where: Path | str, file: IO[bytes]) -> tuple[tuple[int, ...], bo
 
 
 def _header(file: IO[bytes], version: tuple[int, int]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, Fortran order and type by the header that comes next in `file`. Raises one of DAMAGED on a broken one."""
+    """Return the shape, Fortran order and type by the header that comes next in `file`.
+
+    Raises one of DAMAGED on a broken one.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of headers written by Python 2

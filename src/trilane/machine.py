@@ -80,7 +80,7 @@ class Machine:
         return max(values) if values else None
 
     def memory_bytes(self) -> int:
-        """Physical memory in bytes."""
+        """Return the physical memory in bytes."""
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
     def free_bytes(self) -> int:
@@ -122,7 +122,7 @@ class Machine:
         return file
 
     def read_counter(self, file: int, size: int) -> bytes:
-        """Return what the kernel says of an opened counter. Raises OSError."""
+        """Return the kernel's reading of an opened counter."""
         return os.read(file, size)
 
     def system(self) -> str:
@@ -130,15 +130,15 @@ class Machine:
         return platform.platform()
 
     def python(self) -> str:
-        """The version of this Python."""
+        """Return the version of this Python."""
         return platform.python_version()
 
     def host_name(self) -> str:
-        """The machine's name in its network."""
+        """Return the machine's name in its network."""
         return platform.node()
 
     def program(self, name: str, first: Path | None = None) -> str | None:
-        """The path of a program in the folder `first` or on PATH; None where there is none."""
+        """Return the path of a program in the folder `first` or on PATH; None where there is none."""
         path = os.environ.get("PATH", os.defpath)
         return shutil.which(name, path=path if first is None else f"{first}{os.pathsep}{path}")
 
@@ -159,7 +159,7 @@ class Machine:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 
     def now(self) -> datetime:
-        """Date and time in UTC."""
+        """Return date and time in UTC."""
         return datetime.now(UTC)
 
 

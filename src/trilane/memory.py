@@ -1,7 +1,7 @@
-"""Whether memory is what a failure lacks: what a run takes, and what it may have.
+"""Decides whether a failure comes from a lack of memory, by the need of a run and its limits.
 
-Rule: a shortage is told only where a limit is below what a run takes, or where the kernel has ended a process for it.
-The figures are measured (docs/limits.md); a larger scene, avatar or background takes more.
+Rule: a shortage is reported only where a limit is below what a run takes, or where the kernel has ended a process for
+it. The figures are measured (docs/limits.md); a larger scene, avatar or background takes more.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ def require_memory(part: int = 1) -> None:
 
 
 def shortage() -> str:
-    """Return what tells that memory is short, as part of a sentence; "" where nothing does.
+    """Return the evidence that memory is short, as part of a sentence; "" without evidence.
 
-    It is for a failure that memory may have caused: a run of small tensors may do with less.
+    Call it after a failure that a lack of memory may have caused: a run of small tensors may need less than the limit.
     """
     if (limit := _address_limit()) < ADDRESS_BYTES:
         needed = f"a run's largest process takes {ADDRESS_BYTES // MB} MB: ulimit -v unlimited"

@@ -11,8 +11,18 @@ from pathlib import Path, PurePath
 from types import NoneType, UnionType
 from typing import Annotated, Any, Final, Self, Union, get_args, get_origin
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    TypeAdapter,
+    ValidationError,
+)
 from pydantic.fields import FieldInfo
+from pydantic_core import CoreSchema
 
 from trilane.errors import BadInputError, did_you_mean
 from trilane.unexpected_value import UnexpectedValue, unexpected_in
@@ -29,7 +39,7 @@ class Option:
     `synonyms`: other spellings of it.
     `is_argument`: whether the command line takes it without a name.
     `unit`: unit of a number, as a plural noun.
-    `words`: all words that it may be; any text where empty.
+    `words`: the only words that the field accepts; it accepts any text where empty.
     `offered`: words that the dashboard's control offers beside what it finds here; None where the dashboard has no
     control.
     """
@@ -40,6 +50,10 @@ class Option:
     unit: str = ""
     words: tuple[str, ...] = ()
     offered: tuple[str, ...] | None = None
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Let the field refuse a text which is none of `words`."""
+        return one_of(*self.words).__get_pydantic_core_schema__(source, handler) if self.words else handler(source)
 
 
 def option_of(field: FieldInfo) -> Option:

@@ -1,4 +1,4 @@
-"""Names that all folders share: units, performance profiles, the avatar's stages. Rule: each list stands once."""
+"""Names that all folders share: units, profiles, the host's name, the avatar's stages. Rule: each list stands once."""
 
 from __future__ import annotations
 
@@ -27,6 +27,10 @@ class PerformanceProfile(StrEnum):
 PERFORMANCE_PROFILES = tuple(profile.value for profile in PerformanceProfile)
 BURST = PerformanceProfile.BURST.value
 SUSTAINED = PerformanceProfile.SUSTAINED_HIGH_PERFORMANCE.value
+
+#: Name of this machine's hardware profile, and of a run's clock that is this machine's.
+HOST = "host"
+HOST_CLOCK = "host"
 
 #: Stages of the avatar's pipeline before and after the network's, and the unit of each.
 BEFORE_INFER: tuple[tuple[str, UnitName], ...] = (("pose", "cpu"), ("raster", "gpu"))

@@ -148,7 +148,7 @@ class FramePlan:
 
 @dataclass(frozen=True)
 class _Made:
-    """What a frame showed, its header, and what was decided for it."""
+    """A frame's content, its header, and the decisions for it."""
 
     shown: bytes
     header: NDArray[np.void]

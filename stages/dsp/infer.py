@@ -51,7 +51,7 @@ def parts_for(config: RunConfig, network: NetworkFile, shape: Shape) -> list[Net
 
 
 def _to_arrays(parts: Sequence[NetworkPart]) -> dict[str, NDArray[Any]]:
-    """Return the model's bytes of each part, and its shapes as JSON."""
+    """Return each part as arrays: the bytes of its model, and its shapes as JSON."""
     arrays: dict[str, NDArray[Any]] = {}
     for number, part in enumerate(parts):
         shapes = json.dumps({name: list(getattr(part, name).items()) for name in SHAPES})

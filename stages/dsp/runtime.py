@@ -57,7 +57,7 @@ class Runtime(Protocol):
         """Compile `network` for its shape. Raises BadInputError naming a node that it cannot run in integers."""
 
     def version(self) -> str:
-        """Name and version of the installed library."""
+        """Return the name and version of the installed library."""
 
 
 @dataclass(frozen=True)

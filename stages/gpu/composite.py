@@ -62,7 +62,7 @@ Drawing = tuple[int, int, bytes, bytes]
 
 
 class DrawnFrames:
-    """Remembers what was drawn in each slot."""
+    """Remembers the drawing in each slot."""
 
     def __init__(self) -> None:
         self._slots: dict[int, tuple[Drawing | None, int]] = {}
@@ -230,9 +230,8 @@ class CompositeStage:
 
         Figures: 1 or 0 for `nobody` (nobody is on the screen), `reused` (the picture of an earlier frame is the right
         one), `stale` (the right one never came, so an earlier one is shown), and `copied` (the frame was copied from an
-        earlier one, not drawn); and the bytes moved.
-        The least bytes: what is new of the background, and of the network's picture in the cells of avatars in view;
-        and the frame, unless a slot holds it already.
+        earlier one, not drawn); and the bytes moved. The least bytes count the new parts of the background and of the
+        network's picture, in the cells of visible avatars. They also count the frame, unless a slot holds it already.
         """
         if slot_in is None or slot_out is None:
             raise ValueError("composite needs an input and an output slot")
@@ -269,7 +268,7 @@ class CompositeStage:
         self._draw(pose)
 
     def _take(self, pose: NDArray[np.void], image: NDArray[np.uint8]) -> None:
-        """Upload what is new in this frame: the background's picture, and for a full frame the avatars' picture."""
+        """Upload the new parts of this frame: the background's picture, and for a full frame the avatars' picture."""
         if self._background is not None and self._picture is not None:
             picture = self._background.at(float(pose["media_time_s"]))
             if picture is not None:
@@ -289,7 +288,7 @@ class CompositeStage:
         return self._held is not None and int(self._held["picture"]) == picture
 
     def _drawing(self, pose: NDArray[np.void]) -> Drawing | None:
-        """Return what the frame's bytes depend on; None when it is like no other."""
+        """Return the inputs of the frame's bytes; None for a frame like no other."""
         if self._hud is not None:
             return None
         nobody = self._held is None or int(pose["work"]) == FrameWork.NONE

@@ -1,11 +1,11 @@
-"""What stages and units are handed in tests that start no process: a pipeline, its packets, assets and a clock.
+"""Things for tests that start no process: a pipeline, its packets and assets, a stage and a clock.
 
 The pipeline has three stages on two units. Rule: every number in it has a value of its own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +76,30 @@ def assets_of(config: RunConfig) -> dict[str, NDArray[Any]]:
 def without_bytes(figures: Mapping[str, float]) -> dict[str, float]:
     """`figures` of a job but the bytes that it moved."""
     return {name: value for name, value in figures.items() if name not in BYTES}
+
+
+class FakeStage:
+    """A stage that notes what it is asked, and raises `error` when it runs and when it closes."""
+
+    def __init__(self, error: Exception | None = None) -> None:
+        self.error = error
+        self.runs: list[Any] = []
+        self.bound: Any = None
+        self.closed = False
+
+    def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
+        self.bound = (inputs, outputs)
+
+    def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
+        self.runs.append((frame, slot_in, slot_out))
+        if self.error is not None:
+            raise self.error
+        return {"shade": 3}
+
+    def close(self) -> None:
+        self.closed = True
+        if self.error is not None:
+            raise self.error
 
 
 BEGIN_NS = 5_000_000

@@ -217,7 +217,7 @@ NO_FLIP = (False, False)
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What is done to a frame.
+    """The changes to a frame before it is a sample.
 
     `centre` (x, y): point of the frame, in its pixels, that moves to the middle of the target. `turn_rad`: turn about
     that point, clockwise as the picture is seen, radians. `scale` (x, y): target pixels for a pixel of the frame along

@@ -121,7 +121,7 @@ class NoiseGraph:
         self.limits: list[onnx.TensorProto] = []
 
     def take(self, node: onnx.NodeProto) -> None:
-        """Add what stands for `node`."""
+        """Add the float model of `node`."""
         if node.op_type == "QuantizeLinear":
             self.store(node)
         elif node.op_type == "DequantizeLinear" and node.input[0] in self.values:

@@ -4,40 +4,20 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pytest
 
-from support.small_pipeline import OWN, UNITS, ToldTime, packets, pipeline, spec_of
+from support.small_pipeline import OWN, UNITS, FakeStage, ToldTime, packets, pipeline, spec_of
 from trilane.pipeline import unit_loop
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.memory import edge_regions
 from trilane.pipeline.stage import UnitContext
 from trilane.pipeline.unit_loop import BoundStage, UnitSpec
-from trilane.transport.packets import Packet, header_dtype
+from trilane.transport.packets import header_dtype
 
 MS = 1_000_000
-
-
-class FakeStage:
-    def __init__(self, error: Exception | None = None) -> None:
-        self.error, self.runs, self.bound, self.closed = error, [], None, False
-
-    def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
-        self.bound = (inputs, outputs)
-
-    def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
-        self.runs.append((frame, slot_in, slot_out))
-        if self.error is not None:
-            raise self.error
-        return {"shade": 3}
-
-    def close(self) -> None:
-        self.closed = True
-        if self.error is not None:
-            raise self.error
 
 
 def context() -> UnitContext:

@@ -7,13 +7,13 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Set
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from support.small_pipeline import OWN, UNITS, packets, spec_of
+from support.small_pipeline import OWN, UNITS, FakeStage, packets, spec_of
 from trilane import machine
 from trilane.errors import BadInputError, MissingPartError, TrilaneError, UnitLostError
 from trilane.pipeline import unit_loop
@@ -22,7 +22,6 @@ from trilane.pipeline.job_times import LOSS_NS
 from trilane.pipeline.stage import UnitContext
 from trilane.pipeline.unit_loop import BoundStage, UnitSpec
 from trilane.transport.messages import Close, Closed, Failed, MessageError, Ping, PongMessage, Ready, RunJob
-from trilane.transport.packets import Packet
 
 
 def context() -> UnitContext:
@@ -53,24 +52,12 @@ class ToldMeter:
         self.looks += 1
 
 
-class FakeStage:
-    def __init__(self, error: Exception | None = None) -> None:
-        self.error, self.runs, self.bound, self.closed = error, [], None, False
-
-    def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
-        self.bound = (inputs, outputs)
+class SlowStage(FakeStage):
+    """Takes so long that its times differ."""
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
-        self.runs.append((frame, slot_in, slot_out))
         time.sleep(2 * LOSS_NS / 1e9)
-        if self.error is not None:
-            raise self.error
-        return {"shade": 3}
-
-    def close(self) -> None:
-        self.closed = True
-        if self.error is not None:
-            raise self.error
+        return super().run(frame, slot_in, slot_out)
 
 
 class FakeLink:
@@ -115,7 +102,7 @@ def served(monkeypatch: pytest.MonkeyPatch, link: FakeLink, stages: list[Any]) -
 
 
 def test_a_unit_answers_every_message_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    first, second = FakeStage(), FakeStage()
+    first, second = SlowStage(), SlowStage()
     outputs = packets(OWN, 2)
     stages = [
         BoundStage("a", first, [], outputs, 0, context()),
@@ -159,7 +146,7 @@ def test_a_unit_ends_when_its_pipe_does_and_refuses_what_is_not_for_it(monkeypat
 def test_a_stage_that_fails_is_an_answer_in_one_line(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], error: Exception, code: int, said: str
 ) -> None:
-    stage = BoundStage("a", FakeStage(error), [], packets(OWN, 1), 0, context())
+    stage = BoundStage("a", SlowStage(error), [], packets(OWN, 1), 0, context())
     link = FakeLink(RunJob(11, 0, 5, -1, 0, 0, 0, 0), Close())
     assert served(monkeypatch, link, [stage]) == code
     assert [(answer.id, answer.exit_code) for answer in link.sent[:2]] == [(11, code), (-2, code)]
@@ -169,9 +156,9 @@ def test_a_stage_that_fails_is_an_answer_in_one_line(
 
 
 def test_closing_names_its_stage_and_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    last = FakeStage()
+    last = SlowStage()
     stages = [
-        BoundStage("a", FakeStage(ValueError("x")), [], [], 0, context()),
+        BoundStage("a", SlowStage(ValueError("x")), [], [], 0, context()),
         BoundStage("b", last, [], [], 0, context()),
     ]
     link = FakeLink(Close())
@@ -182,7 +169,7 @@ def test_closing_names_its_stage_and_goes_on(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_a_lost_unit_does_not_answer_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     link = FakeLink(RunJob(11, 0, 5, -1, 0, 0, 0, 0))
-    stage = BoundStage("a", FakeStage(UnitLostError("context lost")), [], packets(OWN, 1), 0, context())
+    stage = BoundStage("a", SlowStage(UnitLostError("context lost")), [], packets(OWN, 1), 0, context())
     with pytest.raises(UnitLostError):
         served(monkeypatch, link, [stage])
     assert link.sent == []

@@ -56,7 +56,7 @@ def test_the_group_knows_its_benches_and_nothing_else(command: Command) -> None:
     out, err = command("bench", "nothing", code=2)
     assert (out, "No such command 'nothing'" in err) == ("", True)
     out, err = command("bench", code=2)
-    assert "Measure this machine; results carry its facts." in out + err
+    assert "Measure this machine; each result includes facts about it." in out + err
 
 
 def test_a_table_of_many_columns_is_turned_and_has_no_header() -> None:
