@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 from collections.abc import Callable, Mapping
@@ -11,6 +12,7 @@ import pytest
 
 from support.doubles import pipeline_of_doubles
 from support.faults import unit_process
+from trilane.pipeline.controls import RunControls
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline
@@ -34,14 +36,24 @@ STILL, OFF_SCREEN = "[0.0, 0.0, 0.0]", "[0.0, 0.0, 40.0]"
 pytestmark = pytest.mark.usefixtures("nothing_left")
 
 
-def kills(unit: str) -> tuple[Callable[[int, int], None], list[int]]:
-    """What kills the unit once `KILL_AT` frames were presented, and whom it killed."""
+def kills(unit: str, controls: RunControls | None = None) -> tuple[Callable[[int, int], None], list[int]]:
+    """What kills the unit once `KILL_AT` frames were presented, and whom it killed.
+
+    `controls`: of a run that ends 20 frames after the unit is back.
+    """
     victims: list[int] = []
+    stop_at: list[int] = []
 
     def kill(presented: int, _requested: int) -> None:
         if presented >= KILL_AT and not victims:
             victims.append(unit_process(unit).pid)
             os.kill(victims[0], signal.SIGKILL)
+        elif controls is not None and victims and not stop_at:
+            with contextlib.suppress(LookupError):
+                if unit_process(unit).pid != victims[0]:
+                    stop_at.append(presented + 20)
+        elif controls is not None and stop_at and presented >= stop_at[0]:
+            controls.stop()
 
     return kill, victims
 
@@ -58,13 +70,16 @@ def test_a_unit_that_dies_between_skipping_frames_costs_no_more_than_its_jobs(
     doubles = with_pose(
         pipeline_of_doubles(tmp_path / "log", infer=10, composite=6), "support.doubles:build_skipping", BYPASS
     )
-    kill, victims = kills(unit)
-    result = run_pipeline(doubles.with_rule(edge), 60, policy=policy, pace_fps=100, on_progress=kill)
+    controls = RunControls()
+    kill, victims = kills(unit, controls)
+    chosen = doubles.with_rule(edge)
+    result = run_pipeline(chosen, 100_000, policy=policy, pace_fps=100, on_progress=kill, controls=controls)
     report, presented = result.report, [int(line) for line in (tmp_path / "log").read_text().split()]
     assert (result.failure, bool(victims), report.units[unit].restarts) == (None, True, 1)
     assert presented == sorted(set(presented)) and len(presented) == result.presented
     assert sum(result.lost.values()) <= 2
-    assert result.presented + sum(result.lost.values()) + sum(result.dropped.values()) == 60
+    begun = report.frames.requested - report.frames.not_begun
+    assert result.presented + sum(result.lost.values()) + sum(result.dropped.values()) == begun
     posed = report.stages["pose"].jobs
     full = round(result.metrics["pose"]["full"] * posed)
     assert report.stages["infer"].jobs <= full < posed / 2
