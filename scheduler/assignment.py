@@ -99,7 +99,7 @@ class Choice:
         return sink is None or bool(sink.free) or self.can_claim(stage, sink)
 
     def can_claim(self, stage: StageState, sink: EdgeSlots) -> bool:
-        """Whether the stage may write to one of its slots."""
+        """Return whether the stage may write to one of its slots."""
         if self._flow.is_chain:
             return sink.can_claim()
         return sink.can_claim(lambda frame: self._flow.must_stay(stage, frame))
@@ -116,7 +116,7 @@ class Choice:
 
     def is_full(self) -> bool:
         """Return whether the number of frames in flight has reached its limit."""
-        return 0 < self._in_flight <= len(self._frames)
+        return 0 < self._in_flight <= len(self._frames) - self._flow.aside
 
     def latch_from_ns(self, now_ns: int) -> int:
         """Return when the first stage may begin its next frame; only for a run that latches.
@@ -141,7 +141,7 @@ class Choice:
             return False
         bypass = self._bypass if self._bypass is not None and self._bypass.was_taken else None
         state = self._frames.get(waiting.frame)
-        todo = (1 << len(self._stages)) - 1 if state is None else state.todo
+        todo = (self._flow.next_todo() if state is None else state.todo) & self._flow.main
         end_ns = earliest_completion_ns(now_ns, waiting.frame, self._stages, self._frames, todo, bypass)
         return end_ns > waiting.deadline_ns
 
@@ -155,7 +155,7 @@ class Choice:
             return ASSIGNED
         account = STARVED
         for stage in unit.stages:
-            if stage.input is None:
+            if not stage.before and not stage.waiting:
                 if self._source.is_empty:
                     continue
                 if self.is_full() or (self.latches and now_ns < self.latch_from_ns(now_ns)):
@@ -226,7 +226,7 @@ class _LateFrames:
                     flow.drop_waiting(stage, slot, DropCause.STALE)
 
     def _is_complete(self, stage: StageState, frame: int) -> bool:
-        """Whether all inputs of the stage have the frame."""
+        """Return whether all inputs of the stage have the frame."""
         return all(any(inlet.edge.frame[slot] == frame for slot in inlet.waiting) for inlet in stage.inlets)
 
     def _drop_at_source(self, first: StageState, now_ns: int) -> None:
@@ -259,7 +259,7 @@ class Assignment:
         self._lead_ns = policy.lead_ns
         self._first_unit = flow.stages[0].unit
         self._late = _LateFrames(policy, flow, source, choice)
-        self._drops = policy.newest or policy.drop_late
+        self._drops, self._newest = policy.newest or policy.drop_late, policy.newest
 
     def assign(self, now_ns: int, released_ns: int, actions: list[Action]) -> None:
         """Hand jobs to the dirty units, as `Dispatch` in `actions`, until each is full or has nothing to run.
@@ -269,6 +269,8 @@ class Assignment:
         """
         dirty = self._flow.dirty
         for unit in dirty:  # a dispatch may append to it, even a unit looked at before
+            if self._flow.source_lines and self._source.queue:
+                self._feed(now_ns)
             while len(unit.queue) < unit.queue_capacity:
                 stage = self._next_stage(unit, now_ns)
                 if stage is None:
@@ -283,25 +285,38 @@ class Assignment:
         dirty.clear()
 
     def _feed(self, now_ns: int) -> None:
-        """Put frames in flight for stages without inputs, if there are several.
+        """Put the released frames in flight, for several stages without inputs."""
+        while self._source.queue and not self._choice.is_full():
+            if self._newest:
+                self._source.keep_newest()
+            self._admit(now_ns)
 
-        A source without a rate has a frame for the first of these stages that waits for one.
-        """
-        source, lines = self._source, self._flow.source_lines
-        while not source.is_empty and not self._choice.is_full():
-            if not source.queue and all([line.ready for _, line in lines]):
-                return
-            frame, release_ns = source.take(now_ns)
-            self._flow.admit(frame, release_ns, self._choice.deadline_from_ns(release_ns))
+    def _feed_stage(self, stage: StageState, now_ns: int) -> None:
+        """Let a source without a rate have a frame for a stage of several without inputs, which could begin one."""
+        if stage.before or not (stage.output is None or self._choice.can_claim(stage, stage.output)):
+            return
+        while not stage.waiting and not self._source.is_empty and not self._choice.is_full():
+            self._admit(now_ns)
+
+    def _admit(self, now_ns: int) -> int:
+        """Put the source's next frame in flight, and return its number."""
+        frame, release_ns = self._source.take(now_ns)
+        self._flow.admit(frame, release_ns, self._choice.deadline_from_ns(release_ns))
+        return frame
 
     def _next_stage(self, unit: UnitState, now_ns: int) -> StageState | None:
-        if self._flow.source_lines:
-            self._feed(now_ns)
         if self._lead_ns and unit.queue and now_ns < unit.expected_end_ns() - self._lead_ns:
             return None
+        if self._flow.source_lines:
+            for stage in unit.stages:
+                self._feed_stage(stage, now_ns)
+        is_chain = self._flow.is_chain
+        if self._drops and not is_chain:  # what one stage drops, another of the unit may have been about to take
+            for stage in unit.stages:
+                self._late.drop(stage, now_ns)
         runnable: list[StageState] = []
         for stage in unit.stages:
-            if self._drops:
+            if self._drops and is_chain:
                 self._late.drop(stage, now_ns)
             if self._choice.can_begin(stage, now_ns):
                 runnable.append(stage)
@@ -313,8 +328,7 @@ class Assignment:
         edge = stage.input
         slot_in = -1
         if edge is None:
-            frame, release_ns = self._source.take(now_ns)
-            self._flow.admit(frame, release_ns, self._choice.deadline_from_ns(release_ns))
+            frame = self._admit(now_ns)
         elif stage.bypassed is None:
             slot_in = stage.waiting[0]
             frame = edge.frame[slot_in]

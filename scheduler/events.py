@@ -289,7 +289,7 @@ class Input:
     `stage`: name of the stage that writes it.
     `latest`: whether the stage takes the newest frame that there is, of whatever number. Otherwise it takes the same
     frame as from its other inputs.
-    `max_age_ns`: age from which on the newest frame counts as absent; 0: no such age.
+    `max_age_ns`: longest age at which the newest frame is taken; an older one counts as absent. 0: any age.
     """
 
     stage: str

@@ -126,6 +126,7 @@ class Flow:
     `bypass`: bypass of the chain, or None.
     `rung`: rung of the work of frames that are admitted from now on.
     `gone`: frames that were dropped or lost while jobs worked on them, until these end.
+    `aside`: number of frames in flight that are presented, so that only side work is left.
     `source_lines`: where frames wait for each stage without inputs, if there are several such stages.
     """
 
@@ -141,7 +142,7 @@ class Flow:
         self.dirty: list[UnitState] = []
         self.is_chain = graph.is_chain
         self._ledger, self._drops = ledger, drops
-        self._jobs = self._admitted = 0
+        self._jobs = self._admitted = self.aside = 0
         self.rung = 0
         self._count = len(self.stages)
         self._all = (1 << self._count) - 1
@@ -149,7 +150,7 @@ class Flow:
         self._every = any(stage.period > 1 for stage in self.stages)
         self._roots = [stage for stage in self.stages if not stage.before]
         self.source_lines = [(each, each.input) for each in self._roots if isinstance(each.input, SourceLine)]
-        self._main = sum(stage.bit for stage in self.stages if stage.is_main)
+        self.main = sum(stage.bit for stage in self.stages if stage.is_main)
         self._samples: dict[tuple[int, int], tuple[int, int]] = {}  # of the slots behind a stage with newest readers
         self.bypass: Bypass | None = None
         if graph.bypass is not None:
@@ -162,18 +163,21 @@ class Flow:
 
     def admit(self, frame: int, release_ns: int, deadline_ns: int) -> None:
         """Put the frame in flight."""
-        number = self._admitted
+        todo = self.next_todo()
+        self.frames[frame] = FrameState(release_ns, deadline_ns, self.rung, self._admitted, todo, self._count)
         self._admitted += 1
-        todo = self._all
-        if self._every:
-            todo = sum(stage.bit for stage in self.stages if not number % stage.period)
-        self.frames[frame] = FrameState(release_ns, deadline_ns, self.rung, number, todo, self._count)
         for stage, line in self.source_lines:
             if todo & stage.bit:
                 line.ready.append(frame)
                 self.mark_dirty(stage.unit)
         if not todo:
             self._leave(frame)
+
+    def next_todo(self) -> int:
+        """Return the bits of the stages that the next frame in flight has to do."""
+        if not self._every:
+            return self._all
+        return sum(stage.bit for stage in self.stages if not self._admitted % stage.period)
 
     def begin(self, stage: StageState, frame: int, slot_in: int, now_ns: int) -> Job:
         """Return the stage's job for `frame`, which was just admitted or waits for the stage.
@@ -229,13 +233,21 @@ class Flow:
         return packed(slots)
 
     def must_stay(self, behind: StageState, frame: int) -> bool:
-        """Whether a frame behind a stage is not dropped for a newer one, because another branch has begun it."""
-        state = self.frames.get(frame)
-        return state is not None and bool(state.begun & self._main & ~(behind.before | behind.bit))
+        """Whether a frame behind a stage is not dropped for a newer one, because another branch has begun it.
+
+        If only side work waits for it there, it is left out there and goes on elsewhere.
+        """
+        state = self.frames[frame]
+        return self._is_awaited(behind, state) and bool(state.begun & self.main & ~(behind.before | behind.bit))
+
+    def _is_awaited(self, behind: StageState, state: FrameState) -> bool:
+        """Whether a reader of the stage waits for the frame, and a picture for the reader."""
+        waiting = state.todo & ~state.begun & self.main
+        return any(waiting & reader.bit for reader in behind.readers)
 
     def is_held(self, before: StageState, frame: int) -> bool:
         """Whether a frame that waits for a stage is not dropped as stale, because another branch has begun it."""
-        return bool(self.frames[frame].begun & self._main & ~before.before)
+        return bool(self.frames[frame].begun & self.main & ~before.before)
 
     def pass_on(self, stage: StageState, job: Job, end_ns: int) -> None:
         """Note that the job is done: its frame waits for the next stages, or is presented."""
@@ -281,14 +293,22 @@ class Flow:
         if not state.todo & self._ends:
             state.is_presented = True
             self._ledger.presented(frame, end_ns, state.latency_ns, state.deadline_ns, state.skips, state.rung)
+            self.aside += 1
+            self._mark_roots_dirty()
         if not state.todo:
             self._leave(frame)
 
     def _leave(self, frame: int) -> None:
         """Note that nothing is left to do for the frame."""
-        if not self.frames.pop(frame).is_presented:
-            ends = [stage.name for stage in self.stages if stage.output is None]
-            self._ledger.dropped[Drop(",".join(ends), DropCause.EVERY)] += 1
+        if self.frames.pop(frame).is_presented:
+            self.aside -= 1
+            return
+        ends = [stage.name for stage in self.stages if stage.output is None]
+        self._ledger.dropped[Drop(",".join(ends), DropCause.EVERY)] += 1
+        self._mark_roots_dirty()
+
+    def _mark_roots_dirty(self) -> None:
+        """Note that another frame may be put in flight."""
         for root in self._roots:
             self.mark_dirty(root.unit)
 
@@ -343,8 +363,7 @@ class Flow:
         for frame in frames:
             self._count_drop(frame, behind, before, cause)
             self.mark_dirty(behind.unit)
-            for root in self._roots:
-                self.mark_dirty(root.unit)
+            self._mark_roots_dirty()
 
     def drop_waiting(self, stage: StageState, slot_in: int, cause: DropCause) -> None:
         """Drop the frame that waits for the stage in `slot_in`."""
@@ -361,7 +380,9 @@ class Flow:
 
     def _leave_out(self, stage: StageState, frame: int) -> None:
         """Let a stage of side work, and those that read it, leave out a frame."""
-        state = self.frames[frame]
+        state = self.frames.get(frame)
+        if state is None or not state.todo & ~state.begun & stage.bit:
+            return
         for each in self.stages:
             if each is stage or each.before & stage.bit:
                 state.todo &= ~each.bit
@@ -374,11 +395,12 @@ class Flow:
     def mark_lost(self, frame: int, loss: Loss) -> None:
         """Count a frame in flight as lost, if it is not yet presented; its slots, if it has any, are not freed here."""
         state = self.frames.pop(frame)
-        if not state.is_presented:
+        if state.is_presented:
+            self.aside -= 1
+        else:
             self._ledger.lost[loss] += 1
         self._forget(frame, state)
-        for root in self._roots:
-            self.mark_dirty(root.unit)
+        self._mark_roots_dirty()
         self._tell_bypass(state)
 
     def reclaim(self, unit: UnitState, loss: Loss) -> None:
@@ -459,19 +481,26 @@ class Flow:
             self._mark_all_dirty()
 
     def _give_back(self, edge: EdgeSlots | SourceLine, slot: int, line: int, producer: StageState) -> None:
-        for frame in edge.give_back(slot, line):
+        keeps = None if self.is_chain else lambda frame: self.must_stay(producer, frame)
+        for frame in edge.give_back(slot, line, keeps):
             self._count_drop(frame, producer, None, DropCause.STALE)
         self.mark_dirty(producer.unit)
 
     def _count_drop(self, frame: int, behind: StageState, before: StageState | None, cause: DropCause) -> None:
-        state, bypass = self.frames.pop(frame), self.bypass
+        state, bypass = self.frames[frame], self.bypass
+        if before is None and not self.is_chain and not self._is_awaited(behind, state):
+            for reader in behind.readers:
+                self._leave_out(reader, frame)
+            return
+        del self.frames[frame]
         if bypass is not None and state.skips and behind is bypass.begin:
             readers = bypass.end.name
         elif before is not None:
             readers = before.name
         else:
             readers = ",".join(reader.name for reader in behind.readers)
-        self._ledger.dropped[Drop(f"{behind.name}->{readers}", cause)] += 1
+        writer = "source" if behind is before else behind.name
+        self._ledger.dropped[Drop(f"{writer}->{readers}", cause)] += 1
         self._forget(frame, state)
         self._tell_bypass(state)
 

@@ -24,7 +24,7 @@ from typing import Final
 
 from trilane.scheduler.events import NEVER, Graph, Input, Job, JobDone, JobFailed, Pinged, Pong, UnitDied, UnitReady
 from trilane.scheduler.ledger import STARVED
-from trilane.transport.slots import EdgeSlots, edge_rule
+from trilane.transport.slots import EdgeSlots, Keeps, edge_rule
 from trilane.unexpected_value import UnexpectedValue
 
 DOWN: Final = 0
@@ -182,7 +182,7 @@ class SourceLine:
     def pass_by(self, frame: int, _line: int) -> None:
         self.forget(frame)
 
-    def give_back(self, slot: int, _line: int = 0) -> list[int]:
+    def give_back(self, slot: int, _line: int = 0, _keeps: Keeps | None = None) -> list[int]:
         """Let a taken frame wait again in its old place."""
         place = sum(frame < slot for frame in self.ready)
         self.ready.insert(place, slot)
@@ -213,7 +213,7 @@ class NewestInlet:
 
     `edge`: slots that it reads.
     `reader`: index of what it holds in `edge.newest`.
-    `max_age_ns`: age from which on the frame counts as absent; 0: no such age.
+    `max_age_ns`: longest age at which the frame is taken; 0: any age.
     """
 
     edge: EdgeSlots

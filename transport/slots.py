@@ -130,8 +130,8 @@ class EdgeSlots:
     def claim(self, frame: int, keeps: Keeps = _keeps_none) -> tuple[int, int | None]:
         """Claim a slot for `frame`; return the slot and the waiting frame that was evicted from it, or None.
 
-        A frame in the last line is evicted first: frames on a bypass wait there, and no frame can need them. Raises
-        SlotError when no slot is free and none may be evicted.
+        Without `keeps` a frame in the last line is evicted first: frames on a bypass wait there, and no frame can need
+        them. Raises SlotError when no slot is free and none may be evicted.
         """
         dropped = None
         if not self.free and self.rule.yields and (oldest := self._evictable(keeps)) >= 0:
@@ -233,8 +233,11 @@ class EdgeSlots:
                 self._leave(slot)
                 return
 
-    def give_back(self, slot: int, line: int = 0) -> list[int]:
-        """Let a taken frame wait again in its old place; return it if a newer frame waits in a mailbox."""
+    def give_back(self, slot: int, line: int = 0, keeps: Keeps | None = None) -> list[int]:
+        """Let a taken frame wait again in its old place; return it if a newer frame waits in a mailbox.
+
+        `keeps`: function that says which frames must not be replaced; None: all may be.
+        """
         self._reading[slot] -= 1
         if not self._reading[slot]:
             self._move("give_back", slot)
@@ -245,15 +248,21 @@ class EdgeSlots:
         waiting.extend(ordered)
         if not self.rule.mailbox:
             return []
-        return [self.drop(old) for old in ordered[:-1] if not self._reading[old]]
+        old = [each for each in ordered[:-1] if not self._reading[each] and each not in self.newest]
+        return [self.drop(each) for each in old if keeps is None or not keeps(self.frame[each])]
 
     def _evictable(self, keeps: Keeps) -> int:
         """Return the slot whose frame a claim may evict; -1: none."""
+        found = -1
         for line in reversed(self.lines):
             for slot in line:
                 if not self._reading[slot] and slot not in self.newest and not keeps(self.frame[slot]):
-                    return slot
-        return -1
+                    if keeps is _keeps_none:
+                        return slot
+                    if found < 0 or self.frame[slot] < self.frame[found]:
+                        found = slot
+                    break
+        return found
 
     def _leave(self, slot: int) -> None:
         """Note that one reader of the slot needs it no more."""

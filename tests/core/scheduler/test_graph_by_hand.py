@@ -1,0 +1,447 @@
+"""Graphs worked out on paper or in closed form: periods, latencies, jobs, drops and losses are written down here.
+
+Times are in ms. The published times of a cut network are those of HaX-CoNN on an NVIDIA Xavier: GoogLeNet up to layer
+81 on the GPU, then on the DLA.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+from trilane.scheduler.events import (
+    Dispatch,
+    Graph,
+    Input,
+    Settings,
+    StageSpec,
+    chain,
+    unpacked,
+)
+from trilane.scheduler.virtual import Simulation, simulate
+from trilane.unexpected_value import UnexpectedValue
+
+MS = 1_000_000
+DRIVER = ("message_delay_ns", "restart_ns", "faults", "inputs")
+CHAIN_MS = {"a": 2, "b": 3, "c": 5, "d": 4, "e": 1}
+
+
+def stage(name: str, unit: str, *inputs: str | Input, every: int = 1) -> StageSpec:
+    return StageSpec(name, unit, tuple(Input(i) if isinstance(i, str) else i for i in inputs), every)
+
+
+def graph(*stages: StageSpec, rule: str = "double", to: str = "", released: bool = False, **rules: str) -> Graph:
+    """`rule` for every stream but those in `rules`; the latency ends at the last stage, or at `to`."""
+    read = {each.stage for reader in stages for each in reader.inputs or ()}
+    edges = tuple(rules.get(s.name, rule) for s in stages if s.name in read)
+    return Graph(stages, edges, to or stages[-1].name, from_release=released)
+
+
+def run(
+    described: Graph, times_ms: dict[str, float | Callable[[int], float]], frames: int = 60, **options: Any
+) -> Simulation:
+    """`times_ms`: time of each stage, or a function of the frame. `options`: of the driver; the others are settings."""
+
+    def service(name: str, _unit: str, frame: int, _begin_ns: int) -> int:
+        time = times_ms[name]
+        return round((time(frame) if callable(time) else time) * MS)
+
+    driver = {key: value for key, value in options.items() if key in DRIVER}
+    given = {key: value for key, value in options.items() if key not in DRIVER}
+    return simulate(described, Settings(frames, **given), service, keep=True, **driver)
+
+
+def ends(done: Simulation, name: str) -> dict[int, float]:
+    """End of each frame at the stage."""
+    return {job.frame: job.end_ns / MS for job in done.jobs if job.stage == name}
+
+
+def begins(done: Simulation, name: str) -> dict[int, float]:
+    return {job.frame: job.begin_ns / MS for job in done.jobs if job.stage == name}
+
+
+def period(done: Simulation, name: str, over: int = 1) -> float:
+    """The time between two ends at the stage, once it is the same for ever; of `over` frames together."""
+    at = list(ends(done, name).values())
+    steps = {round(later - earlier, 9) for earlier, later in zip(at[20:], at[20 + over :], strict=False)}
+    assert len(steps) == 1
+    return steps.pop() / over
+
+
+# Chains
+
+
+def chain_of_five(rule: str, **settings: Any) -> Simulation:
+    names = list(CHAIN_MS)
+    stages = [stage(name, name, *names[max(place - 1, 0) : place]) for place, name in enumerate(names)]
+    return run(graph(*stages, rule=rule), CHAIN_MS, **settings)
+
+
+@pytest.mark.parametrize(("rule", "expected"), [("single", 5 + 4), ("double", 5)])
+def test_a_chain_has_the_period_of_its_slowest_pair_or_stage(rule: str, expected: float) -> None:
+    assert period(chain_of_five(rule), "e") == expected
+
+
+@pytest.mark.parametrize(("frames", "expected"), [(1, 15), (2, 7.5), (3, 5)])
+def test_frames_in_flight_bound_the_period_of_a_chain(frames: int, expected: float) -> None:
+    assert period(chain_of_five("double", in_flight=frames), "e", over=frames) == expected
+
+
+def test_a_chain_with_its_inputs_written_down_takes_the_steps_of_the_chain() -> None:
+    done = chain_of_five("double")
+    same = simulate(
+        chain([(name, name) for name in CHAIN_MS], "double", "e"),
+        Settings(60),
+        lambda name, *_: CHAIN_MS[name] * MS,
+        keep=True,
+    )
+    assert done.recording is not None
+    assert same.recording is not None
+    assert done.recording.steps == same.recording.steps
+    assert done.report == same.report
+
+
+def test_a_published_cut_has_the_period_of_its_slower_half() -> None:
+    halves = graph(stage("head", "gpu"), stage("tail", "dla", "head"))
+    assert period(run(halves, {"head": 1.1146, "tail": 1.1717}), "tail") == 1.1717
+    assert period(run(graph(stage("all", "gpu")), {"all": 1.7662}), "all") == 1.7662
+
+
+# A fork and a join
+
+DEPTH = [
+    stage("frame", "isp"),
+    stage("depth", "dsp", "frame"),
+    stage("seg", "gpu", "frame"),
+    stage("composite", "cpu", "depth", "seg"),
+]
+DEPTH_MS = {"frame": 2, "depth": 14, "seg": 10, "composite": 3}
+
+
+@pytest.mark.parametrize(("rule", "expected"), [("single", 14 + 3), ("double", 14), ("fifo:3", 14)])
+def test_a_join_has_the_period_of_its_slowest_branch(rule: str, expected: float) -> None:
+    assert period(run(graph(*DEPTH, rule=rule), DEPTH_MS), "composite") == expected
+
+
+@pytest.mark.parametrize(("frames", "expected"), [(1, 19), (2, 14)])
+def test_frames_in_flight_bound_the_period_of_a_join(frames: int, expected: float) -> None:
+    assert period(run(graph(*DEPTH), DEPTH_MS, in_flight=frames), "composite", over=frames) == expected
+    assert period(run(graph(*DEPTH), DEPTH_MS, policy="sequential"), "composite") == 19
+
+
+@pytest.mark.parametrize("released", [False, True])
+def test_the_latency_of_a_join_follows_its_slowest_branch(released: bool) -> None:
+    alone = run(graph(*DEPTH, released=released), DEPTH_MS, frames=1).report
+    assert alone["latency_ms"]["mean"] == 2 + 14 + 3
+    paced = run(graph(*DEPTH, released=released), DEPTH_MS, period_ns=20 * MS).report
+    assert (paced["latency_ms"]["mean"], paced["latency_ms"]["max"]) == (19, 19)
+
+
+def test_a_unit_that_has_some_inputs_of_a_frame_idles_for_the_join() -> None:
+    """Five frames, one in 20 ms: seg ends at 12, depth at 16, composite at 19."""
+    row = run(graph(*DEPTH), DEPTH_MS, frames=5, period_ns=20 * MS).report["units"]["cpu"]
+    total = 4 * 20 + 19
+    shares = {cause: round(share * total, 9) for cause, share in row["idle"].items()}
+    assert (row["busy"] * total, shares["join"]) == pytest.approx((5 * 3, 5 * 4))
+    assert shares["starved"] == total - 5 * 7
+
+
+def test_branches_of_one_unit_take_turns_by_frame() -> None:
+    """The DSP has 3 + 4 ms a frame, and the first join ends at 2 + 3 + 4 + 1."""
+    shared = graph(stage("src", "cpu"), stage("a", "dsp", "src"), stage("b", "dsp", "src"), stage("j", "cpu", "a", "b"))
+    done = run(shared, {"src": 2, "a": 3, "b": 4, "j": 1})
+    assert list(ends(done, "j").values()) == [10 + 7 * frame for frame in range(60)]
+
+
+@pytest.mark.parametrize(("rule", "expected"), [("single", 15), ("double", 7.5), ("fifo:3", 6)])
+def test_a_stream_that_skips_stages_needs_their_slots(rule: str, expected: float) -> None:
+    """a -> b -> c -> d, and a -> d: a's slots are held for 3 + 4 + 6 + 2 ms; c takes 6."""
+    skip = [stage("a", "a"), stage("b", "b", "a"), stage("c", "c", "b"), stage("d", "d", "c", "a")]
+    done = run(graph(*skip, a=rule), {"a": 3, "b": 4, "c": 6, "d": 2})
+    assert period(done, "d", over=2) == expected
+
+
+# Several sources, and stages that take some frames
+
+
+@pytest.mark.parametrize(("rule", "expected"), [("single", 5 + 4), ("double", 5)])
+def test_two_sources_are_as_fast_as_the_slower(rule: str, expected: float) -> None:
+    two = graph(stage("a", "a"), stage("b", "b"), stage("c", "c", "a", "b"), rule=rule)
+    assert period(run(two, {"a": 3, "b": 5, "c": 4}), "c") == expected
+
+
+def test_the_latency_of_two_sources_begins_with_the_first_of_them() -> None:
+    """b takes 0-5, 5-10, 10-15; a 0-3, 3-6, and 9-12 when c gave its slot back. c ends at 9, 14, 19."""
+    two = graph(stage("a", "a"), stage("b", "b"), stage("c", "c", "a", "b"))
+    done = run(two, {"a": 3, "b": 5, "c": 4}, frames=3)
+    assert begins(done, "a") == {0: 0, 1: 3, 2: 9}
+    assert begins(done, "b") == {0: 0, 1: 5, 2: 10}
+    assert ends(done, "c") == {0: 9, 1: 14, 2: 19}
+    assert done.report["latency_ms"]["mean"] == (9 + 11 + 10) / 3
+    paced = run(two, {"a": 3, "b": 5, "c": 4}, period_ns=10 * MS).report
+    assert (paced["latency_ms"]["mean"], paced["latency_ms"]["max"]) == (9, 9)
+
+
+TRACK_MS = {"tracker": 12, "detector": 45}
+
+
+@pytest.mark.parametrize(
+    ("to", "latencies"),
+    [("tracker", [12, 69 - 100 / 3, 81 - 200 / 3]), ("detector", [57])],
+)
+def test_a_detector_every_third_frame_delays_the_tracker(to: str, latencies: list[float]) -> None:
+    """30 Hz, one unit: tracker 0 to 12, detector to 57, tracker 1 to 69, tracker 2 to 81, tracker 3 from 100."""
+    both = graph(stage("tracker", "npu"), stage("detector", "npu", every=3), to=to, released=True)
+    done = run(both, TRACK_MS, frames=9, period_ns=33_333_333)
+    found = [at - frame * 33.333333 for frame, at in ends(done, to).items()]
+    assert found == pytest.approx(latencies * 3, abs=1e-5)
+    assert done.report["latency_ms"]["mean"] == pytest.approx(sum(latencies) / len(latencies), abs=1e-5)
+    assert done.report["frames"]["presented"] == 9
+
+
+def test_a_detector_every_third_frame_costs_a_third_of_its_time() -> None:
+    both = graph(stage("tracker", "npu"), stage("detector", "npu", every=3), to="tracker")
+    assert period(run(both, TRACK_MS, frames=90), "tracker", over=3) == (3 * 12 + 45) / 3
+
+
+def test_a_join_takes_the_frames_that_all_its_inputs_have() -> None:
+    """Of every second and every third frame it takes every sixth; nobody waits for the others."""
+    sixth = graph(
+        stage("cam", "a"),
+        stage("slow", "b", "cam", every=2),
+        stage("fast", "c", "cam", every=3),
+        stage("join", "d", "slow", "fast"),
+    )
+    done = run(sixth, {"cam": 1, "slow": 5, "fast": 2, "join": 3}, frames=13, period_ns=4 * MS)
+    assert ends(done, "join") == {frame: 4 * frame + 1 + 5 + 3 for frame in (0, 6, 12)}
+    assert list(ends(done, "slow")) == [0, 2, 4, 6, 8, 10, 12]
+    assert list(ends(done, "fast")) == [0, 3, 6, 9, 12]
+    assert done.report["frames"]["dropped"] == {"join:every": 10}
+    assert done.report["latency_ms"]["mean"] == 9
+
+
+# The newest frame
+
+BOXES = Input("det", latest=True)
+
+
+def boxes(max_age_ms: int = 0) -> Graph:
+    """cam -> det on every second frame; trk takes cam's frame and det's newest."""
+    newest = Input("det", latest=True, max_age_ns=max_age_ms * MS)
+    return graph(stage("cam", "a"), stage("det", "b", "cam", every=2), stage("trk", "c", "cam", newest), cam="fifo:3")
+
+
+BOXES_MS = {"cam": 1, "det": 12, "trk": 2}
+
+
+def newest(done: Simulation) -> dict[int, bool]:
+    """For each frame of trk whether it got boxes."""
+    assert done.recording is not None
+    jobs = [a.job for step in done.recording.steps for a in step[2] if isinstance(a, Dispatch) and a.job.stage == "trk"]
+    return {job.frame: unpacked(job.slot_in, 2)[1] >= 0 for job in jobs}
+
+
+@pytest.mark.parametrize(
+    ("max_age_ms", "with_boxes"),
+    [(0, [2, 3, 4, 5]), (31, [2, 3, 4, 5]), (30, [2, 4]), (21, [2, 4]), (20, [])],
+)
+def test_the_newest_boxes_age_until_they_are_too_old(max_age_ms: int, with_boxes: list[int]) -> None:
+    """One frame in 10 ms: det 0 ends at 13, det 2 at 33. trk begins at 1, 11, 21…: boxes of 21, 31, 21, 31 ms."""
+    done = run(boxes(max_age_ms), BOXES_MS, frames=6, period_ns=10 * MS)
+    assert [frame for frame, has in newest(done).items() if has] == with_boxes
+    assert ends(done, "trk") == {frame: 10 * frame + 3 for frame in range(6)}
+    assert ends(done, "det") == {0: 13, 2: 33, 4: 53}
+
+
+def test_the_report_has_the_age_of_the_newest_boxes() -> None:
+    ages = run(boxes(), BOXES_MS, frames=6, period_ns=10 * MS).report["streams"]["det"]
+    assert ages["age_ms"]["mean"] == (21 + 31 + 21 + 31) / 4
+    assert ages["age_ms"]["max"] == 31
+    assert ages["frames_behind"]["mean"] == (2 + 3 + 2 + 3) / 4
+
+
+def test_a_branch_of_side_work_that_dies_takes_only_a_frame_that_is_not_shown() -> None:
+    """det dies at 5, when frame 0 is shown (3): nothing is lost. At 22 trk still has frame 2, and it is lost."""
+    later = run(boxes(), BOXES_MS, frames=6, period_ns=10 * MS, faults=[(5 * MS, "b")], restart_ns=3 * MS)
+    assert later.report["frames"]["lost_by_cause"] == {}
+    assert ends(later, "det") == {2: 33, 4: 53}
+    assert [frame for frame, has in newest(later).items() if has] == [4, 5]
+    worse = run(boxes(), BOXES_MS, frames=6, period_ns=10 * MS, faults=[(22 * MS, "b")], restart_ns=3 * MS)
+    assert worse.report["frames"]["lost_by_cause"] == {"died:b": 1}
+    assert worse.report["frames"]["presented"] == 5
+    assert [frame for frame, has in newest(worse).items() if has] == [2, 3, 4, 5]  # det 0 is still the newest
+    assert list(ends(worse, "det")) == [0, 4]
+
+
+def test_a_single_slot_cannot_hold_the_newest_and_be_written() -> None:
+    with pytest.raises((UnexpectedValue, ValueError), match="det"):
+        run(graph(stage("det", "b"), stage("trk", "c", BOXES), det="single"), {"det": 1, "trk": 1})
+
+
+# Drops and losses
+
+FORK = [stage("src", "s"), stage("a", "a", "src"), stage("b", "b", "src"), stage("j", "j", "a", "b")]
+
+
+def test_branches_agree_on_the_frames_that_they_show() -> None:
+    """A 10, B 11, a frame in 6 ms: a frame per 11 ms, which B needs; without the rule 18.2, hardly any pair meets."""
+    done = run(graph(*FORK), {"src": 0.001, "a": 10, "b": 11, "j": 0.001}, 3000, period_ns=6 * MS, policy="latest")
+    shown = list(ends(done, "j").values())
+    assert 11 <= (shown[-1] - shown[0]) / (len(shown) - 1) < 11.05
+    frames = done.report["frames"]
+    assert frames["presented"] + sum(frames["dropped"].values()) == 3000
+
+
+def test_only_complete_frames_are_stale_at_a_join() -> None:
+    """A frame in 4 ms is complete 4 ms after its release. The join has no estimate at 8 and takes frame 1 at once.
+
+    Later it looks 1 ms before its end: at 23, 33, 43, 53 and 63, when frames 4, 7, 9, 12 and 14 are the newest.
+    """
+    times = {"src": 1, "a": 2, "b": 3, "j": 10}
+    done = run(graph(*FORK, rule="fifo:8"), times, 16, period_ns=4 * MS, policy="latest")
+    assert ends(done, "j") == {0: 14, 1: 24, 4: 34, 7: 44, 9: 54, 12: 64, 14: 74, 15: 84}
+    assert sum(done.report["frames"]["dropped"].values()) == 16 - 8
+    assert list(ends(done, "a")) == list(ends(done, "b")) == list(range(16))
+
+
+def paced_fork(rule: str, b_ms: float, frames: int) -> Simulation:
+    """A frame in 4 ms, which src has done after 1; a takes 11."""
+    times = {"src": 1, "a": 11, "b": b_ms, "j": 1}
+    return run(graph(*FORK, rule="fifo:8", src=rule), times, frames, period_ns=4 * MS)
+
+
+def test_a_triple_stream_keeps_the_newest_for_all_its_readers() -> None:
+    """The branches work on frame 0, and have 1 at 5 and 2 at 12: the third slot changes hands until 23, and until 34.
+
+    Frame 3 is evicted at 16 and 4 at 20, so that both branches take 5 at 23; then 6 at 28, 7 at 32, and they take 8.
+    """
+    done = paced_fork("triple", 11, 9)
+    assert ends(done, "j") == {0: 13, 1: 24, 2: 35, 5: 46, 8: 57}
+    assert done.report["frames"]["dropped"] == {"src->a,b:stale": 4}
+
+
+def test_a_triple_stream_keeps_a_frame_that_one_branch_has_begun() -> None:
+    """b, which takes 5, has frame 3 at 13. So src waits at 16 until a gives the slot of frame 1 back at 23.
+
+    It then makes up for 20 and 24: frames 4 and 5 are evicted when they end. b has frame 6 at 26, and src waits again.
+    """
+    done = paced_fork("triple", 5, 8)
+    assert begins(done, "src") == {0: 0, 1: 4, 2: 8, 3: 12, 4: 23, 5: 24, 6: 25, 7: 34}
+    assert begins(done, "b") == {0: 1, 1: 6, 2: 11, 3: 16, 6: 26, 7: 35}
+    assert ends(done, "j") == {0: 13, 1: 24, 2: 35, 3: 46, 6: 57, 7: 68}
+    assert done.report["frames"]["dropped"] == {"src->a,b:stale": 2}
+
+
+def test_an_orphan_stream_gives_up_its_oldest_frame() -> None:
+    """Four slots, so that two frames wait. Frame 3 goes at 20, and the branches take 4 at 23; 5 and 6, and they take 7;
+    8 and 9, and they take 10.
+    """
+    done = paced_fork("orphan:4", 11, 12)
+    assert ends(done, "j") == {0: 13, 1: 24, 2: 35, 4: 46, 7: 57, 10: 68, 11: 79}
+    assert done.report["frames"]["dropped"] == {"src->a,b:pool": 5}
+
+
+def test_a_source_that_is_always_ready_evicts_before_a_triple_stream_is_read() -> None:
+    """src is handed its next frame when it ends one, before the branches are looked at: it has two slots of three.
+
+    While the branches have frame 0, to 13, each frame that src ends is evicted in that instant: 1 at 4, 2 at 6 and so
+    on. At 14 src takes the slot of frame 0, so that frame 6 is read. The last two frames evict nothing.
+    """
+    done = run(graph(*FORK, src="triple"), {"src": 2, "a": 11, "b": 5, "j": 1}, 16)
+    assert begins(done, "src") == {frame: 2 * frame for frame in range(16)}
+    assert ends(done, "j") == {0: 14, 6: 26, 12: 38, 14: 49, 15: 60}
+
+
+def test_two_branches_that_die_lose_the_frames_that_they_work_on() -> None:
+    """At 6 a works on frame 0 and b on 1. Both are up again at 9, when frame 2 is there since 7, and 3 since 8."""
+    times = {"src": 1, "a": 10, "b": 4, "j": 2}
+    done = run(graph(*FORK), times, 4, faults=[(6 * MS, "a"), (6 * MS, "b")], restart_ns=3 * MS)
+    assert done.report["frames"]["lost_by_cause"] == {"died:a": 1, "died:b": 1}
+    assert begins(done, "src") == {0: 0, 1: 1, 2: 6, 3: 7}
+    assert begins(done, "b") == {0: 1, 2: 9, 3: 13}
+    assert ends(done, "j") == {2: 21, 3: 31}
+
+
+def test_a_frame_that_two_branches_lose_is_lost_once() -> None:
+    """At 3 both work on frame 0, and both are handed frame 1, which waits again. They are up at 6."""
+    times = {"src": 1, "a": 10, "b": 4, "j": 2}
+    done = run(graph(*FORK), times, 3, faults=[(3 * MS, "a"), (3 * MS, "b")], restart_ns=3 * MS)
+    assert done.report["frames"]["lost_by_cause"] == {"died:a": 1}
+    assert ends(done, "a") == {1: 16, 2: 26}
+    assert ends(done, "j") == {1: 18, 2: 28}
+
+
+def test_what_a_lost_frame_wrote_is_thrown_away() -> None:
+    """a dies at 3. b ends frame 0 at 5 all the same, and the join never waits for it."""
+    done = run(graph(*FORK), {"src": 1, "a": 10, "b": 4, "j": 2}, 2, faults=[(3 * MS, "a")], restart_ns=3 * MS)
+    assert ends(done, "b") == {0: 5, 1: 9}
+    assert ends(done, "j") == {1: 18}
+
+
+def test_a_source_that_dies_before_a_fork_loses_both_frames_that_it_was_handed() -> None:
+    """At 3 src works on frame 1, and has frame 2."""
+    times = {"src": 2, "a": 3, "b": 1, "j": 1}
+    done = run(graph(*FORK, src="fifo:3"), times, 4, faults=[(3 * MS, "s")], restart_ns=3 * MS)
+    assert done.report["frames"]["lost_by_cause"] == {"died:s": 2}
+    assert ends(done, "j") == {0: 6, 3: 12}
+
+
+# Chance
+
+
+def mean_and_error(values: list[float], batches: int = 40) -> tuple[float, float]:
+    """The mean, and its standard error from the means of consecutive batches, which hardly depend on each other."""
+    size = len(values) // batches
+    means = [sum(values[place * size : (place + 1) * size]) / size for place in range(batches)]
+    mean = sum(means) / batches
+    return mean, math.sqrt(sum((each - mean) ** 2 for each in means) / (batches - 1) / batches)
+
+
+def poisson(rate: float, frames: int, seed: int) -> tuple[int, ...]:
+    """Arrivals at `rate` per ms."""
+    draw, at_ms, found = random.Random(seed), 0.0, []
+    for _ in range(frames):
+        at_ms += draw.expovariate(rate)
+        found.append(round(at_ms * MS))
+    return tuple(found)
+
+
+def check_close(values: list[float], expected: float, most: float) -> None:
+    """Within three standard errors, which are at most `most` of it, so that the test can tell."""
+    mean, error = mean_and_error(values)
+    assert 3 * error < most * expected
+    assert abs(mean - expected) < 3 * error
+
+
+@pytest.mark.parametrize(("rule", "slots"), [("single", 1), ("double", 2), ("fifo:3", 3), ("fifo:5", 5)])
+def test_two_exponential_stages_share_their_slots(rule: str, slots: int) -> None:
+    """Slots in use are a birth and death process at equal rates: all n + 1 states are equally likely, one blocks."""
+    draw = random.Random(slots)
+    times = {"a": lambda _: draw.expovariate(1), "b": lambda _: draw.expovariate(1)}
+    shown = list(ends(run(graph(stage("a", "a"), stage("b", "b", "a"), rule=rule), times, 16_000), "b").values())
+    steps = [later - earlier for earlier, later in pairwise(shown)]
+    check_close(steps, (slots + 1) / slots, 0.05)
+
+
+@pytest.mark.parametrize(("load", "wait", "frames"), [(0.5, 0.5, 15_000), (0.8, 2.0, 60_000)])
+def test_frames_that_come_by_chance_wait_as_pollaczek_and_khinchine_say(load: float, wait: float, frames: int) -> None:
+    """load / (2 (1 - load)) of the service time of 1."""
+    served = run(graph(stage("a", "a")), {"a": 1}, frames, arrivals_ns=poisson(load, frames, 3))
+    check_close([(job.begin_ns - job.ready_ns) / MS for job in served.jobs], wait, 0.15)
+
+
+@pytest.mark.parametrize("limits", [{"in_queue": 4, "in_flight": 1}, {"in_queue": 3}])
+def test_a_short_queue_turns_away_what_erlang_says(limits: dict[str, int]) -> None:
+    """At load r, of K = 5 places all are taken with (1 - r) r^5 / (1 - r^6). A unit holds one job ahead, or none."""
+    frames, load = 40_000, 0.9
+    draw = random.Random(5)
+    times = {"a": lambda _: draw.expovariate(1)}
+    served = run(graph(stage("a", "a")), times, frames, arrivals_ns=poisson(load, frames, 4), **limits)
+    shown = ends(served, "a")
+    check_close([float(frame not in shown) for frame in range(frames)], (1 - load) * load**5 / (1 - load**6), 0.15)
+    assert served.report["frames"]["dropped"] == {"source->a:queue_full": frames - len(shown)}

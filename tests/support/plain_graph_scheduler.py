@@ -1,0 +1,583 @@
+"""A second scheduler for graphs. Rule: written from docs/decisions/graph-core.md, not from the scheduler's code.
+
+It looks at every unit at every instant, marks nothing as dirty and keeps a list of slots for each stage, with who has
+yet to read them. At the end stand graphs, settings and faults drawn at random; the same seed draws the same.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+from support import plain_scheduler
+from support.plain_scheduler import BACK_OFF_NS, LEAD_NS, NO_TIME, RESTART_NS
+from trilane.scheduler.events import Graph, Input, Settings, StageSpec
+
+SLOTS = {**plain_scheduler.SLOTS, "fifo:4": 4}
+
+
+@dataclass(eq=False)
+class Frame:
+    """`todo`: stages that take it and have not begun it. `is_over`: shown, or of no use to the last stages."""
+
+    number: int
+    ordinal: int
+    released_ns: int
+    deadline_ns: int
+    todo: set[int]
+    begun: set[int] = field(default_factory=set)
+    done: dict[int, int] = field(default_factory=dict)  # the stage, and when
+    sampled_ns: int = NO_TIME
+    latency_ns: int = 0
+    is_over: bool = False
+    is_gone: bool = False
+
+
+@dataclass(eq=False)
+class Slot:
+    """`pending`: stages that wait to read it. `holders`: stages of which it is the newest. `jobs`: that read it now."""
+
+    frame: Frame
+    is_written: bool = False
+    pending: set[int] = field(default_factory=set)
+    holders: set[int] = field(default_factory=set)
+    jobs: list[Job] = field(default_factory=list)
+
+
+@dataclass(eq=False)
+class Job:
+    stage: int
+    frame: Frame
+    inputs: list[Slot]
+    output: Slot | None
+    begin_ns: int
+    end_ns: int
+
+
+class PlainUnit:
+    def __init__(self, name: str, stages: list[int], duty: int) -> None:
+        self.name, self.stages, self.duty = name, stages, duty
+        self.queue: list[Job] = []
+        self.is_up, self.free_ns, self.head_since_ns, self.failures = True, 0, 0, 0
+        self.hold_until_ns: int | None = None
+        self.start_ns: int | None = None
+        self.ready_ns: int | None = None
+        self.account, self.times_ns = "starved", Counter[str]()
+        self.busy: list[tuple[int, int]] = []
+
+    def room(self) -> int:
+        if not self.is_up or self.hold_until_ns is not None:
+            return 0
+        return 2 if self.duty == 1000 else 1
+
+
+class PlainGraph:
+    """One run of `graph` at one instant, and what can be said of it."""
+
+    def __init__(self, graph: Graph, settings: Settings, service: Any, delay_ns: int, faults: Any, duties: Any) -> None:
+        self.graph, self.settings, self.service, self.delay_ns = graph, settings, service, delay_ns
+        self.faults = sorted(faults)
+        names = [stage.name for stage in graph.stages]
+        self.inputs = [[(names.index(each.stage), each) for each in stage.inputs or ()] for stage in graph.stages]
+        self.same = [[x for x, each in found if not each.latest] for found in self.inputs]
+        places = range(len(names))
+        self.readers = [[i for i in places if x in self.same[i]] for x in places]
+        self.newest_readers = [[i for i in places if any(y == x and e.latest for y, e in self.inputs[i])] for x in places]
+        self.sources = [i for i in places if not self.same[i]]
+        self.before: list[set[int]] = []
+        self.period: list[int] = []
+        for i in places:
+            self.before.append(set(self.same[i]).union(*(self.before[x] for x in self.same[i])))
+            self.period.append(math.lcm(graph.stages[i].every, *(self.period[x] for x in self.same[i])))
+        ends = [i for i in places if not self.readers[i] and not self.newest_readers[i]]
+        self.ends = ends
+        self.is_side = [not any(i == end or i in self.before[end] for end in ends) for i in places]
+        self.waits_at_release = len(self.sources) > 1 or graph.stages[self.sources[0]].every > 1
+        streams = [i for i in places if self.readers[i] or self.newest_readers[i]]
+        self.rule = dict(zip(streams, graph.edges, strict=True))
+        self.slots: list[list[Slot]] = [[] for _ in places]
+        self.newest: dict[tuple[int, int], Slot] = {}  # (reader, stage that is read)
+        self.units = [
+            PlainUnit(name, [i for i, s in enumerate(graph.stages) if s.unit == name], duties.get(name, 1000))
+            for name in graph.units
+        ]
+        self.unit_of = [next(u for u in self.units if i in u.stages) for i in places]
+        self.estimate = [0] * len(names)
+        self.frames: list[Frame] = []
+        self.queue: list[tuple[int, int]] = []
+        self.next_frame = self.now_ns = self.ordinals = 0
+        self.has_begun = False
+        self.jobs: list[tuple[Any, ...]] = []
+        self.ended: list[tuple[Any, ...]] = []
+        self.presented: list[tuple[int, int]] = []
+        self.latencies: list[int] = []
+        self.dropped, self.lost = Counter[str](), Counter[str]()
+
+    # what there is
+
+    @property
+    def is_paced(self) -> bool:
+        return bool(self.settings.period_ns or self.settings.arrivals_ns)
+
+    def release_ns(self, frame: int) -> int:
+        arrivals = self.settings.arrivals_ns
+        return arrivals[frame] if arrivals else frame * self.settings.period_ns
+
+    def flying(self) -> int:
+        return sum(not frame.is_over for frame in self.frames)
+
+    def is_full(self) -> bool:
+        limits = [self.settings.in_flight] if self.settings.in_flight else []
+        limits += [1] if self.settings.policy == "sequential" else []
+        return bool(limits) and self.flying() >= min(limits)
+
+    def line(self, stage: int) -> list[Frame]:
+        """The frames that the stage could read, in order."""
+        return [f for f in self.frames if stage in f.todo and all(x in f.done for x in self.same[stage])]
+
+    def has_source(self) -> bool:
+        return bool(self.queue) if self.is_paced else self.next_frame < self.settings.frames
+
+    def head(self, stage: int) -> tuple[int, int] | None:
+        """The frame that the stage would take, and its deadline."""
+        if line := self.line(stage):
+            return line[0].number, line[0].deadline_ns
+        if stage not in self.sources or not self.has_source():
+            return None
+        frame, released_ns = self.queue[0] if self.queue else (self.next_frame, self.now_ns)
+        return frame, self.deadline(released_ns)
+
+    def deadline(self, released_ns: int) -> int:
+        return released_ns + self.settings.deadline_ns if self.settings.deadline_ns else NO_TIME
+
+    def may_enter(self, stage: int) -> bool:
+        return bool(self.line(stage)) or not self.is_full()
+
+    def has_slot(self, stage: int) -> bool:
+        if stage not in self.rule:
+            return True
+        return len(self.slots[stage]) < SLOTS[self.rule[stage]] or bool(self.evictable(stage))
+
+    def can_begin(self, stage: int) -> bool:
+        return self.head(stage) is not None and self.may_enter(stage) and self.has_slot(stage)
+
+    def is_kept(self, frame: Frame, stages: set[int]) -> bool:
+        """Whether a stage that a picture waits for has begun it, other than `stages`."""
+        return any(not self.is_side[s] and s not in stages for s in frame.begun)
+
+    def evictable(self, stage: int, except_newest: bool = True) -> list[Slot]:
+        """Of a stream that yields: what waits there and may be given up, the oldest first."""
+        if not self.rule[stage].startswith(("triple", "orphan")):
+            return []
+        found = [s for s in self.slots[stage] if s.pending and not s.is_written and not s.jobs]
+        found = [s for s in found if not (except_newest and s.holders)]
+        own = self.before[stage] | {stage}
+        found = [s for s in found if all(self.is_side[r] for r in s.pending) or not self.is_kept(s.frame, own)]
+        return sorted(found, key=lambda s: s.frame.number)
+
+    def expected_end_ns(self, unit: PlainUnit) -> int:
+        return unit.head_since_ns + self.estimate[unit.queue[0].stage]
+
+
+class PlainGraphScheduler(PlainGraph):
+    """One run of `graph` from 0 to its end; `run` fills the public fields."""
+
+    # frames
+
+    def admit(self, number: int, released_ns: int) -> Frame:
+        todo = {i for i in range(len(self.period)) if self.ordinals % self.period[i] == 0}
+        frame = Frame(number, self.ordinals, released_ns, self.deadline(released_ns), todo)
+        self.ordinals += 1
+        self.frames.append(frame)
+        if self.graph.from_release:
+            frame.sampled_ns = released_ns
+        self.end_if_over(frame)
+        return frame
+
+    def end_if_over(self, frame: Frame) -> None:
+        """It is shown when the last stages that take it have done it; it is forgotten when its side work is done too."""
+        ends = set(self.ends) & (frame.todo | frame.begun)
+        left = (ends or frame.todo | frame.begun) - set(frame.done)
+        if not frame.is_over and not left:
+            frame.is_over = True
+            if any(end in frame.done for end in self.ends):
+                self.presented.append((frame.number, max(frame.done[end] for end in self.ends if end in frame.done)))
+                if frame.latency_ns:
+                    self.latencies.append(frame.latency_ns)
+            else:
+                self.dropped[f"{','.join(self.graph.stages[i].name for i in self.ends)}:every"] += 1
+        if frame.is_over and not frame.todo and not frame.begun - set(frame.done):
+            self.frames.remove(frame)
+
+    def remove(self, frame: Frame) -> None:
+        self.frames.remove(frame)
+        frame.is_gone = True
+        for slots in self.slots:
+            for slot in slots:
+                if slot.frame is frame:
+                    slot.pending.clear()
+        self.free_slots()
+
+    def free_slots(self) -> None:
+        for slots in self.slots:
+            slots[:] = [s for s in slots if s.is_written or s.pending or s.holders or s.jobs]
+
+    def leave_out(self, frame: Frame, stage: int) -> None:
+        """Side work: the frame goes on elsewhere."""
+        out = {i for i in frame.todo if i == stage or stage in self.before[i]}
+        frame.todo -= out
+        for slots in self.slots:
+            for slot in slots:
+                if slot.frame is frame:
+                    slot.pending -= out
+        self.free_slots()
+        self.end_if_over(frame)
+
+    def drop(self, frame: Frame, edge: str, cause: str) -> None:
+        self.dropped[f"{edge}:{cause}"] += 1
+        self.remove(frame)
+
+    def drop_from_queue(self, cause: str) -> None:
+        self.queue.pop(0)
+        self.dropped[f"source->{self.graph.stages[self.sources[0]].name}:{cause}"] += 1
+
+    def evict(self, slot: Slot, stage: int) -> None:
+        cause = "stale" if self.rule[stage] == "triple" else "pool"
+        if all(self.is_side[r] for r in slot.pending):
+            for reader in sorted(slot.pending):
+                self.leave_out(slot.frame, reader)
+        else:
+            names = [self.graph.stages[r].name for r in self.readers[stage]]
+            self.drop(slot.frame, f"{self.graph.stages[stage].name}->{','.join(names)}", cause)
+
+    def all_readers(self, stage: int) -> list[int]:
+        return self.readers[stage] + self.newest_readers[stage]
+
+    def drop_in_vain(self, stage: int) -> None:
+        if self.settings.policy != "latest":
+            return
+        if stage in self.sources and not self.waits_at_release:
+            while len(self.queue) > 1 and not self.is_full():
+                self.drop_from_queue("stale")
+            return
+        for frame in self.line(stage)[:-1]:
+            if self.is_side[stage]:
+                self.leave_out(frame, stage)
+            elif not self.is_kept(frame, self.before[stage]):
+                name = self.graph.stages[self.same[stage][0]].name if self.same[stage] else "source"
+                self.drop(frame, f"{name}->{self.graph.stages[stage].name}", "stale")
+
+    # jobs
+
+    def next_stage(self, unit: PlainUnit) -> int | None:
+        lead_ns = LEAD_NS[self.settings.policy]
+        if lead_ns and unit.queue and self.now_ns < self.expected_end_ns(unit) - lead_ns:
+            return None
+        runnable: list[tuple[int, int, int]] = []
+        for stage in unit.stages:
+            self.release_for(stage)
+        for stage in unit.stages:
+            self.drop_in_vain(stage)
+        for stage in unit.stages:
+            if self.can_begin(stage):
+                head = self.head(stage)
+                assert head is not None
+                runnable.append((*head, stage))
+        if not runnable:
+            return None
+        if self.settings.policy == "latest":
+            return max(stage for _, _, stage in runnable)
+        if self.settings.policy == "deadline":
+            return min(runnable, key=lambda row: (row[1], row[0]))[2]
+        return min(runnable, key=lambda row: row[0])[2]
+
+    def release_for(self, stage: int) -> None:
+        """Without a rate a frame is released when a stage could take it."""
+        if stage not in self.sources or self.is_paced or not self.waits_at_release or not self.has_slot(stage):
+            return
+        while self.has_source() and not self.line(stage) and not self.is_full():
+            self.next_frame += 1
+            self.admit(self.next_frame - 1, self.now_ns)
+
+    def taken(self, stage: int) -> Frame:
+        if line := self.line(stage):
+            return line[0]
+        if not self.waits_at_release and self.queue:
+            return self.admit(*self.queue.pop(0))
+        self.next_frame += 1
+        return self.admit(self.next_frame - 1, self.now_ns)
+
+    def hand_over(self, unit: PlainUnit, stage: int) -> None:
+        frame = self.taken(stage)
+        if stage in self.rule and len(self.slots[stage]) >= SLOTS[self.rule[stage]]:
+            self.evict(self.evictable(stage)[0], stage)
+        frame.todo.remove(stage)
+        frame.begun.add(stage)
+        inputs, read = [], []
+        for x, each in self.inputs[stage]:
+            slot = self.newest.get((stage, x)) if each.latest else self.slot_of(x, frame)
+            if slot and each.max_age_ns and self.now_ns - slot.frame.sampled_ns > each.max_age_ns:
+                slot = None
+            read.append(slot.frame.number if slot else None)
+            if slot:
+                inputs.append(slot)
+                slot.pending.discard(stage)
+        output = Slot(frame, is_written=True) if stage in self.rule else None
+        if output:
+            self.slots[stage].append(output)
+        begin_ns = max(self.now_ns + self.delay_ns, unit.free_ns)
+        name = self.graph.stages[stage].name
+        end_ns = unit.free_ns = begin_ns + self.service(name, unit.name, frame.number, begin_ns)
+        if not unit.queue:
+            unit.head_since_ns = self.now_ns
+        job = Job(stage, frame, inputs, output, begin_ns, end_ns)
+        for slot in inputs:
+            slot.jobs.append(job)
+        unit.queue.append(job)
+        self.jobs.append((self.now_ns, name, unit.name, frame.number, tuple(read), begin_ns, end_ns))
+
+    def slot_of(self, stage: int, frame: Frame) -> Slot:
+        return next(slot for slot in self.slots[stage] if slot.frame is frame)
+
+    def ready_since_ns(self, job: Job) -> int:
+        return max((job.frame.done[x] for x in self.same[job.stage]), default=job.frame.released_ns)
+
+    def release_inputs(self, job: Job) -> None:
+        for slot in job.inputs:
+            slot.jobs.remove(job)
+
+    def job_done(self, unit: PlainUnit) -> None:
+        job = unit.queue.pop(0)
+        stage, end_ns, frame = job.stage, job.end_ns, job.frame
+        took_ns = end_ns - job.begin_ns
+        unit.head_since_ns, unit.failures = self.now_ns, 0
+        unit.busy.append((job.begin_ns, end_ns))
+        self.ended.append((self.graph.stages[stage].name, frame.number, job.begin_ns, end_ns))
+        learnt = self.estimate[stage]
+        self.estimate[stage] = learnt + ((took_ns - learnt) >> 3) if learnt else took_ns
+        if unit.duty < 1000:
+            unit.hold_until_ns = end_ns + took_ns * (1000 - unit.duty) // unit.duty
+        self.release_inputs(job)
+        if not frame.is_gone:
+            self.goes_on(job)
+        if job.output:
+            job.output.is_written = False
+        self.free_slots()
+
+    def goes_on(self, job: Job) -> None:
+        stage, frame = job.stage, job.frame
+        frame.done[stage] = job.end_ns
+        if stage in self.sources and not self.graph.from_release:
+            frame.sampled_ns = min(frame.sampled_ns, job.begin_ns)
+        if self.graph.stages[stage].name == self.graph.latency_to:
+            frame.latency_ns = job.end_ns - frame.sampled_ns
+        if job.output:
+            pending = {r for r in self.readers[stage] if r in frame.todo}
+            for slot in self.evictable(stage, except_newest=False) if self.rule[stage] == "triple" else []:
+                if slot.pending & pending:
+                    self.evict(slot, stage)
+            job.output.pending = pending & frame.todo
+            for reader in self.newest_readers[stage]:
+                if (old := self.newest.get((reader, stage))) is not None:
+                    old.holders.remove(reader)
+                self.newest[reader, stage] = job.output
+                job.output.holders.add(reader)
+        self.end_if_over(frame)
+
+    def die(self, unit: PlainUnit) -> None:
+        jobs, unit.queue = unit.queue, []
+        for place, job in enumerate(jobs):
+            frame = job.frame
+            self.release_inputs(job)
+            if job.output:
+                job.output.is_written = False
+            if not frame.is_gone:
+                if place == 0 or (job.stage in self.sources and not self.waits_at_release):
+                    if not frame.is_over:
+                        self.lost[f"died:{unit.name}"] += 1
+                    self.remove(frame)
+                else:
+                    self.wait_again(job)
+        self.free_slots()
+        unit.is_up, unit.ready_ns = False, None
+        unit.start_ns = self.now_ns + BACK_OFF_NS[unit.failures]
+        unit.failures += 1
+
+    def wait_again(self, job: Job) -> None:
+        job.frame.begun.remove(job.stage)
+        job.frame.todo.add(job.stage)
+        for x in self.same[job.stage]:
+            self.slot_of(x, job.frame).pending.add(job.stage)
+        for x in self.same[job.stage]:
+            newest = max(s.frame.number for s in self.slots[x] if s.pending)
+            for slot in self.evictable(x) if self.rule[x] == "triple" else []:
+                if slot.frame.number < newest:
+                    self.evict(slot, x)
+
+    def account(self, unit: PlainUnit) -> str:
+        if unit.queue or not unit.is_up:
+            return "assigned"
+        why = "starved"
+        for stage in unit.stages:
+            if self.head(stage) is not None:
+                if not self.may_enter(stage) or not self.has_slot(stage):
+                    return "blocked"
+                why = "throttled"
+            elif why == "starved" and any(slot.pending >= {stage} for x in self.same[stage] for slot in self.slots[x]):
+                why = "join"
+        return why
+
+    # the run
+
+    def run(self) -> None:
+        while True:
+            at_ns, event = self.next_event()
+            for unit in self.units:
+                unit.times_ns[unit.account] += at_ns - self.now_ns
+            self.now_ns = at_ns
+            first: list[PlainUnit] = event() if event is not None else []
+            self.clockwork()
+            self.assign([*first, *self.units])
+            for unit in self.units:
+                unit.account = self.account(unit)
+            if not self.frames and not self.queue and self.next_frame >= self.settings.frames:
+                return
+
+    def next_event(self) -> tuple[int, Any]:
+        """Faults come before other events at one time, events before the times that are only looked at."""
+        events: list[tuple[int, int, int, Any]] = []
+        if self.faults:
+            at_ns, name = self.faults[0]
+            events.append((at_ns, 0, 0, lambda: self.fault(name)))
+        for number, unit in enumerate(self.units):
+            if unit.queue:
+                events.append((unit.queue[0].end_ns + self.delay_ns, 1, number, lambda u=unit: self.done(u)))
+            if unit.ready_ns is not None:
+                events.append((unit.ready_ns, 1, number, lambda u=unit: self.ready(u)))
+        looks = [at for unit in self.units for at in (unit.hold_until_ns, unit.start_ns) if at is not None]
+        if self.is_paced and self.next_frame < self.settings.frames:
+            looks.append(self.release_ns(self.next_frame))
+        if self.settings.queue_timeout_ns and self.queue:
+            looks.append(self.queue[0][1] + self.settings.queue_timeout_ns)
+        if lead_ns := LEAD_NS[self.settings.policy]:
+            looks += [self.expected_end_ns(unit) - lead_ns for unit in self.units if len(unit.queue) == 1]
+        later = [(at, 2, 0, None) for at in looks if self.now_ns < at < NO_TIME]
+        if not self.has_begun:
+            self.has_begun = True
+            later.append((0, 2, 0, None))
+        at_ns, _, _, event = min([*events, *later], key=lambda row: row[:3])
+        return at_ns, event
+
+    def fault(self, name: str) -> list[PlainUnit]:
+        self.faults.pop(0)
+        unit = next(unit for unit in self.units if unit.name == name)
+        if unit.is_up or unit.ready_ns is not None:
+            self.die(unit)
+        return []
+
+    def done(self, unit: PlainUnit) -> list[PlainUnit]:
+        """The unit itself is served first, then those that it reads, then those that read it."""
+        stage = unit.queue[0].stage
+        self.job_done(unit)
+        near = [*(x for x, _ in self.inputs[stage]), *(self.all_readers(stage) or self.sources)]
+        return [unit, *(self.unit_of[i] for i in near)]
+
+    def ready(self, unit: PlainUnit) -> list[PlainUnit]:
+        unit.is_up, unit.ready_ns = True, None
+        return [unit]
+
+    def clockwork(self) -> None:
+        for unit in self.units:
+            if unit.hold_until_ns is not None and unit.hold_until_ns <= self.now_ns:
+                unit.hold_until_ns = None
+            if unit.start_ns is not None and unit.start_ns <= self.now_ns:
+                unit.start_ns, unit.ready_ns, unit.free_ns = None, self.now_ns + RESTART_NS, 0
+                unit.hold_until_ns = None
+        while self.is_paced and self.next_frame < self.settings.frames:
+            if self.release_ns(self.next_frame) > self.now_ns:
+                break
+            self.queue.append((self.next_frame, self.release_ns(self.next_frame)))
+            self.next_frame += 1
+            if self.settings.in_queue and len(self.queue) > self.settings.in_queue:
+                number, released_ns = self.queue.pop()
+                self.queue.append((number, released_ns))
+                self.dropped[f"source->{self.graph.stages[self.sources[0]].name}:queue_full"] += 1
+                self.queue.pop()
+        timeout_ns = self.settings.queue_timeout_ns
+        while timeout_ns and self.queue and self.queue[0][1] + timeout_ns <= self.now_ns:
+            self.drop_from_queue("timeout")
+        self.enter()
+
+    def enter(self) -> bool:
+        entered = False
+        while self.waits_at_release and self.queue and not self.is_full():
+            while self.settings.policy == "latest" and len(self.queue) > 1:
+                self.drop_from_queue("stale")
+            self.admit(*self.queue.pop(0))
+            entered = True
+        return entered
+
+    def assign(self, units: list[PlainUnit]) -> None:
+        changed = True
+        while changed:
+            changed = False
+            for unit in units:
+                before = self.dropped.total(), sum(map(len, self.slots)), len(self.frames)
+                while len(unit.queue) < unit.room() and (stage := self.next_stage(unit)) is not None:
+                    self.hand_over(unit, stage)
+                    changed = True
+                changed |= (self.dropped.total(), sum(map(len, self.slots)), len(self.frames)) != before
+            changed |= self.enter()
+
+
+def drawn(seed: int, yields: bool = False) -> tuple[Graph, Settings, int, list[tuple[int, str]], dict[str, int]]:
+    """Up to 12 stages. `yields`: whether streams may be `triple` and `orphan`."""
+    draw = random.Random(f"{seed} graph")
+    policy = draw.choice(["sequential", "pipelined", "pipelined", "latest", "deadline"])
+    count = draw.randint(2, 12)
+    units = [f"u{i}" for i in range(draw.randint(1, min(count, 6)))]
+    sources = draw.choice([1, 1, 1, 2])
+    stages: list[StageSpec] = []
+    for i in range(count):
+        read = draw.sample(range(i), min(i, draw.choice([1, 1, 1, 2, 2, 3]))) if i >= sources else []
+        if i and draw.random() < 0.3 and i >= sources:
+            read = sorted({*read, i - 1})
+        inputs = tuple(
+            Input(f"s{x}", draw.random() < 0.25, draw.choice([0, 0, 9_000_001])) for x in sorted(read)
+        )
+        inputs = tuple(each if each.latest else Input(each.stage) for each in inputs)
+        if inputs and all(each.latest for each in inputs):
+            inputs = (Input(inputs[0].stage), *inputs[1:])
+        stages.append(StageSpec(f"s{i}", draw.choice(units), inputs, draw.choice([1, 1, 1, 1, 1, 2, 3])))
+    rules = ["fifo:64"] if policy == "deadline" else ["single", "double", "double", "fifo:3", "fifo:4"]
+    rules += ["triple", "orphan:4"] if yields and policy != "deadline" else []
+    newest = {each.stage for s in stages for each in s.inputs or () if each.latest}
+    read_of = {each.stage for s in stages for each in s.inputs or ()}
+    edges = tuple(
+        draw.choice([rule for rule in rules if rule != "single" or s.name not in newest])
+        for s in stages
+        if s.name in read_of
+    )
+    ends = [s.name for s in stages if s.name not in read_of]
+    graph = Graph(tuple(stages), edges, draw.choice(ends), from_release=draw.random() < 0.3)
+    paced = policy in ("latest", "deadline") or draw.random() < 0.5
+    rate = draw.choice(["period_ns", "arrivals_ns"]) if paced else None
+    period_ns, frames = draw.randint(2_000_000, 12_000_000), 40
+    settings = Settings(
+        frames,
+        policy,
+        period_ns=period_ns if rate == "period_ns" else 0,
+        arrivals_ns=tuple(sorted(draw.randint(0, frames * period_ns) for _ in range(frames)))
+        if rate == "arrivals_ns"
+        else (),
+        deadline_ns=1_000_000_000_000 if policy == "deadline" else 0,
+        in_flight=draw.choice([0, 0, 2, 3, 5]),
+        in_queue=draw.choice([0, 0, 1, 2]),
+        queue_timeout_ns=draw.choice([0, 0, 6_000_001]) if rate else 0,
+    )
+    faults = [(draw.randint(1, 150_000_000), draw.choice(graph.units)) for _ in range(draw.choice([0, 0, 1, 3]))]
+    duties = {name: draw.choice([1000, 1000, 1000, 500, 333]) for name in graph.units}
+    return graph, settings, draw.choice([0, 50_001]), faults, duties
