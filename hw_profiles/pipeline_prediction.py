@@ -33,8 +33,9 @@ from trilane.units import NS_PER_MS, UNITS, UnitName
 
 DRAWS: Final = 200
 SIMULATIONS: Final = 20
-SIMULATED_FRAMES: Final = 200  # of each of them
-SATURATED_FRAMES: Final = 1000
+SIMULATED_FRAMES: Final = 100  # of each of them
+#: Frames of the run with an always ready source, where all times are constant and where some vary.
+CONSTANT_FRAMES, VARYING_FRAMES = 200, 1000
 BLOCK: Final = 4096  # frames whose times are drawn at once
 #: No job hangs in virtual time, however long the file says that it takes.
 NEVER_HANGS_NS: Final = 1 << 60
@@ -157,7 +158,7 @@ def predict_file(
     graph, bound = bound_of(file, prices)
     settings = settings_of(file, frames, seed, hang_ns=NEVER_HANGS_NS)
     report = simulate(graph, settings, _Drawn(prices, seed)).report
-    needs = _needs(file, prices, graph, report, seed)
+    needs = _needs(file, prices, graph, seed)
     frame_time, latency = _intervals(file, prices, graph, report, needs, seed)
     answer = {
         "name": file.path.stem,
@@ -187,9 +188,7 @@ def _row(stage: StagePrice) -> dict[str, Any]:
     }
 
 
-def _needs(
-    file: PipelineFile, prices: Mapping[str, StagePrice], graph: Graph, report: Mapping[str, Any], seed: int
-) -> FrameInterval:
+def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], graph: Graph, seed: int) -> FrameInterval:
     """Return the time of a frame of the source when frames never wait for it, with the interval by ignorance.
 
     The jitter's part is that of a run with an always ready source; 200 draws of the bound have the ignorance.
@@ -197,7 +196,8 @@ def _needs(
     times = {name: each.mean_ns for name, each in prices.items()}
     in_flight = in_flight_of(file)
     bound_ns = period_bound(graph, times, in_flight).period_ns
-    ready = Settings(min(report["frames"]["requested"], SATURATED_FRAMES), hang_ns=NEVER_HANGS_NS, in_flight=in_flight)
+    count = VARYING_FRAMES if any(each.time.varies for each in prices.values()) else CONSTANT_FRAMES
+    ready = Settings(count, hang_ns=NEVER_HANGS_NS, in_flight=in_flight)
     done = simulate(replace(graph, from_release=False), ready, _Drawn(prices, seed)).report
     presented = done["frames"]["presented"]
     ms = done["duration_s"] * 1e3 / ready.frames if presented < ready.frames else done["frame_time_ms"]["mean"]
