@@ -275,6 +275,14 @@ class StageTime(Keys):
             return math.fsum(self.samples) / len(self.samples)
         return (self.mean if self.exponential is None else self.exponential) or 0.0
 
+    def times(self, factor: float) -> StageTime:
+        """Return times that are `factor` times as long."""
+        if self.samples:
+            return StageTime(samples=tuple(each * factor for each in self.samples))
+        if self.exponential is not None:
+            return StageTime(exponential=self.exponential * factor)
+        return StageTime(mean=self.mean_ms * factor, sd=self.sd * factor)
+
     @property
     def varies(self) -> bool:
         """Whether one job's time may differ from another's."""

@@ -12,8 +12,13 @@ from typing import Any
 import pytest
 
 from support.pipeline_files import CUT, DEPTH, STREET, write_file
+from support.run_folders import write_run
 from trilane.hw_profiles.pipeline_prediction import _sentence
 from trilane.hw_profiles.rates import FrameInterval
+from trilane.pipeline.file_graph import edge_rules, graph_of
+from trilane.pipeline.pipeline_file import read_pipeline
+from trilane.scheduler.events import Settings
+from trilane.scheduler.virtual import simulate
 
 Command = Callable[..., tuple[str, str]]
 Predict = Callable[..., dict[str, Any]]
@@ -266,3 +271,31 @@ def test_the_text(command: Command, tmp_path: Path, check_printed: Callable[[str
     text = STREET.replace("block =", "time_ms = 3, block =").replace("python =", "time_ms = 2, python =")
     what_ifs = ("--set", "stages.segmenter.unit=gpu", "--set", "run.fps=120")
     check_printed("predict-file", command("predict", write_file(tmp_path, text), *what_ifs)[0])
+
+
+def test_measured_times_are_those_of_a_run_and_on_a_chip_times_their_scale(
+    command: Command, documents: Predict, tmp_path: Path
+) -> None:
+    """A run in virtual time stands for one here: depth takes 20 and 10 in turn, so 15 in the mean."""
+    text = """
+    [stages]
+    frame = { block = "busy", unit = "a", load_ms = 2 }
+    depth = { python = "m:f", unit = "b", in = "frame", scale = { snapdragon-888 = 2 } }
+    """
+    file = read_pipeline(write_file(tmp_path, text))
+
+    def service(stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
+        return {"frame": 2, "depth": 20 - 10 * (frame % 2)}[stage] * 1_000_000
+
+    done = simulate(graph_of(file, edge_rules(file, None)), Settings(40), service, keep=True)
+    run = write_run(tmp_path / "run", done)
+    here = documents(text, "--measured", str(run))["pipelines"][0]["stages"]["depth"]
+    assert (here["alone_ms"], here["service_ms"]["max"]) == (15, 20)
+    assert here["low_ms"] < 15 < here["high_ms"]
+    chip = documents(text, "--measured", str(run), "--profile", "snapdragon-888")["pipelines"][0]["stages"]["depth"]
+    assert (chip["alone_ms"], chip["source"]) == (30, f"measured in {run}, times 2")
+    options = ("--measured", run, "--profile", "snapdragon-8-gen-3")
+    error = " ".join(command("predict", tmp_path / "pipeline.toml", *options, code=2)[1].split())
+    assert "stages.depth: found python without a time" in error
+    assert "scale = { snapdragon-8-gen-3 = ... }" in error
+    command("predict", tmp_path / "pipeline.toml", "--measured", tmp_path / "none", code=2)
