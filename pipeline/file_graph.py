@@ -1,0 +1,96 @@
+"""What the scheduler knows of a pipeline file: its graph, the rules of its streams, and the settings of a run.
+
+Rule: a run on this machine and a prediction take theirs from here, so that a file means the same on both clocks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+
+from trilane.pipeline.pipeline_file import PipelineFile, stage_inputs
+from trilane.scheduler.events import Graph, Input, Settings, StageSpec
+from trilane.scheduler.period_bound import LEAST_SLOTS, fewest_slots
+from trilane.scheduler.policy import POLICIES, run_settings
+from trilane.units import NS_PER_MS, NS_PER_S
+
+DEFAULT_FRAMES: Final = 1000
+
+
+def graph_of(file: PipelineFile, rules: Mapping[str, str]) -> Graph:
+    """Return the scheduler's graph of a file; a chain where each stage reads the stage before it.
+
+    `rules`: rule of the stream of each stage that has a reader.
+    """
+    stages = tuple(
+        StageSpec(
+            name,
+            stage.unit,
+            tuple(Input(one.stage, one.latest, round(one.max_age_ms * NS_PER_MS)) for one in stage_inputs(stage)),
+            stage.every,
+        )
+        for name, stage in file.stages.items()
+    )
+    if _is_chain(stages):
+        stages = tuple(StageSpec(stage.name, stage.unit) for stage in stages)
+    edges = tuple(rules[name] for name in file.readers)
+    return Graph(stages, edges, file.latency_to, from_release=file.run.fps is not None or file.run.arrivals is not None)
+
+
+def _is_chain(stages: tuple[StageSpec, ...]) -> bool:
+    before: tuple[Input, ...] = ()
+    for stage in stages:
+        if stage.inputs != before or stage.every != 1:
+            return False
+        before = (Input(stage.name),)
+    return True
+
+
+def source_ns(file: PipelineFile) -> int:
+    """Return the period of the source, a mean for random arrivals; 0: it is always ready."""
+    rate = file.run.fps or (file.run.arrivals.poisson if file.run.arrivals else 0.0)
+    return round(NS_PER_S / rate) if rate else 0
+
+
+def settings_of(file: PipelineFile, frames: int = 0, seed: int = 0, **others: Any) -> Settings:
+    """Return the settings of a run of the file.
+
+    `frames`: number of frames; 0: as the file says, or DEFAULT_FRAMES.
+    `seed`: seed of the arrivals.
+    `others`: further fields of Settings.
+    """
+    run, count, period_ns = file.run, frames or file.run.frames or DEFAULT_FRAMES, source_ns(file)
+    given = {"in_flight": run.in_flight, "in_queue": run.in_queue, **others}
+    if run.arrivals is not None:
+        gaps = np.random.default_rng([seed, 0]).exponential(NS_PER_S / run.arrivals.poisson, count)
+        given["arrivals_ns"] = tuple(np.rint(gaps.cumsum()).astype(np.int64).tolist())
+    return run_settings(run.policy, count, period_ns, period_ns, **given)
+
+
+def edge_rules(file: PipelineFile, times_ns: Mapping[str, int] | None) -> dict[str, str]:
+    """Return the rule of each stream: that of the file, else two slots, or more where branches meet.
+
+    Then it has the fewest slots that do not lengthen the period.
+
+    `times_ns`: time of a job of each stage; None where they are unknown. Then all stages count as equally long, and
+    each as if it had a unit of its own.
+    """
+    given = {name: file.run.edge for name in file.readers} if file.run.edge else {}
+    given |= file.edges
+    rules = {name: given.get(name, "double") for name in file.readers}
+    graph = graph_of(file, rules)
+    if times_ns is None:
+        apart = tuple(replace(stage, unit=stage.name) for stage in graph.stages)
+        graph, times_ns = replace(graph, stages=apart), dict.fromkeys(file.stages, 1)
+    slots = fewest_slots(graph, times_ns, given, in_flight_of(file))
+    pairs = zip(rules, slots, strict=True)
+    return rules | {name: f"fifo:{count}" for name, count in pairs if name not in given and count > LEAST_SLOTS}
+
+
+def in_flight_of(file: PipelineFile) -> int:
+    """Return the limit of frames in flight, by the file or by its policy; 0: none."""
+    limits = [each for each in (file.run.in_flight, POLICIES[file.run.policy].in_flight) if each]
+    return min(limits, default=0)
