@@ -18,7 +18,7 @@ from trilane.options import Finite, Option, Options, Text, Texts, one_of
 from trilane.scheduler.policy import POLICIES
 from trilane.stages.run_options import AVATARS_HELP, PROFILE_HELP
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import BURST, PERFORMANCE_PROFILES, SUSTAINED, UnitName
+from trilane.units import BURST, MAX_MINUTES, PERFORMANCE_PROFILES, SUSTAINED, UnitName
 
 if TYPE_CHECKING:
     from trilane.hw_profiles.application import Variant
@@ -166,7 +166,9 @@ class PredictOptions(Options):
     runtime: str = Field(
         default="dsp", description="Unit of the network: gpu or dsp; cpu too for a --network by itself."
     )
-    minutes: Finite = Field(default=0.0, description="Virtual minutes with heat; 0: settled, without heat.")
+    minutes: Annotated[Finite, Option(unit="minutes")] = Field(
+        default=0.0, ge=0, le=MAX_MINUTES, description="Virtual minutes with heat; 0: settled, without heat."
+    )
     policy: Annotated[str | None, one_of("reference", *POLICIES), Option(synonyms=("--pipelining",))] = Field(
         default=None,
         description="reference (if not given), or sequential, pipelined (if not given, on host), latest, deadline.",
