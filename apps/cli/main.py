@@ -19,6 +19,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from trilane.errors import TrilaneError, install_line, reason
 from trilane.memory import require_memory, shortage
+from trilane.signals import interrupting
 
 #: Command: its module, and the line that `trilane --help` shows for it.
 COMMANDS = {
@@ -184,7 +185,8 @@ def entry() -> NoReturn:
     """Call `main` and end the process without taking every module down, which would take 0.1 s."""
     code: object = 0
     try:
-        main()
+        with interrupting():
+            main()
     except SystemExit as left:
         code = left.code
     except KeyboardInterrupt:

@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Self
 
 from trilane import machine
-from trilane.errors import FREE_SPACE, FULL, BadInputError, TrilaneError, UnwrittenError, reason
+from trilane.errors import FREE_SPACE, FULL, BadInputError, TrilaneError, UnwrittenError, reason, remedy
 from trilane.writing import WRITABLE
 
 #: Bytes that are kept free for the report: MOST_MESSAGES of 2000 bytes each, twice as long as JSON, and its figures.
@@ -60,7 +60,8 @@ class RunFolder:
             self._reserve_space()
         except OSError as error:
             self._remove()
-            raise BadInputError.of_os_error(self.target, error, WRITABLE, "choose another --out") from None
+            helps = remedy(error, "choose another --out")
+            raise BadInputError.of_os_error(self.target, error, WRITABLE, helps) from None
         return self
 
     def _make_parents(self) -> None:
@@ -91,6 +92,10 @@ class RunFolder:
     def release(self) -> None:
         """Give back the space that was kept free, for the files that are written last."""
         self._reserve.unlink(missing_ok=True)
+
+    def named(self, text: str) -> str:
+        """Return `text` with the name that the folder is to have in place of the one that it has."""
+        return text.replace(str(self.work), str(self.target))
 
     def complete(self) -> Path:
         """Give the folder its name.
@@ -132,9 +137,9 @@ class RunFolder:
         if isinstance(error, UnwrittenError):
             return str(error)
         if isinstance(error, BadInputError) and isinstance(error.__cause__, OSError):
-            return f"{error.where}: {error.found}; {FREE_SPACE}"
+            return f"{error.where}: {error.found}; {remedy(error.__cause__, FREE_SPACE)}"
         if isinstance(error, OSError) and error.errno in FULL:
-            return f"{error.filename or self.work}: {reason(error)}; {FREE_SPACE}"
+            return f"{error.filename or self.work}: {reason(error)}; {remedy(error, FREE_SPACE)}"
         return ""
 
     def _is_there(self) -> bool:
