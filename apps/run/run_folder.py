@@ -38,7 +38,8 @@ class RunFolder:
     """Make a run folder under a temporary name, `work`; without `complete()` it and parents that it made are removed.
 
     A context manager. On entry it raises BadInputError when `target` exists, when another run that goes on has the
-    name, or when no report can be written there: RESERVED_BYTES are taken, and given back by `release`.
+    name, or when no report can be written there: RESERVED_BYTES are taken, and given back by `release`. It raises
+    UnwrittenError when no file may be so long.
     On leaving by an error about a file that could not be written, it raises TrilaneError; a folder that holds anything
     then stays. It also raises TrilaneError when `work` was removed.
     """
@@ -60,8 +61,9 @@ class RunFolder:
             self._reserve_space()
         except OSError as error:
             self._remove()
-            helps = remedy(error, "choose another --out")
-            raise BadInputError.of_os_error(self.target, error, WRITABLE, helps) from None
+            if remedy(error, ""):  # of a limit of the process: no other place would help
+                raise UnwrittenError(self.target, error) from None
+            raise BadInputError.of_os_error(self.target, error, WRITABLE, "choose another --out") from None
         return self
 
     def _make_parents(self) -> None:

@@ -15,7 +15,7 @@ from support.doubles import pipeline_of_doubles
 from trilane.apps.run import run_folder
 from trilane.apps.run.report import read_report
 from trilane.apps.run.run_job import Hooks, Prepared, RunOutcome, run_to_folder
-from trilane.errors import BadInputError, TrilaneError
+from trilane.errors import BadInputError, TrilaneError, UnwrittenError
 from trilane.hw_profiles.host import host_units
 from trilane.pipeline.memory import Assets
 from trilane.pipeline.result import RunResult
@@ -104,9 +104,9 @@ def test_a_disk_that_fills_keeps_the_report(
 
 
 def test_a_run_takes_the_space_of_its_report_before_it_begins(run: Callable[..., RunOutcome], tmp_path: Path) -> None:
-    with (
-        file_limit(150_000),
-        pytest.raises(BadInputError, match=r"file too large: .* 150000 bytes .*ulimit -f unlimited$"),
-    ):
+    """A limit of the process is no bad input."""
+    said = r"run: file too large: no file may have more than 150000 bytes \(ulimit -f\); ulimit -f unlimited$"
+    with file_limit(150_000), pytest.raises(UnwrittenError, match=said) as raised:
         run(lambda _work: pytest.fail("it began"))
+    assert raised.value.exit_code == 1
     assert list(tmp_path.rglob("*")) == []
