@@ -141,9 +141,19 @@ def _describe(error: Exception) -> tuple[str, int]:
         return f"memory is short: {error or 'nothing says how much was wanted'}", FAILED
     if isinstance(error, OSError) and not error.filename and _is_of_stdout(error):
         return f"stdout: {reason(error)}; free space there, or write the output elsewhere", FAILED
+    if isinstance(error, FileNotFoundError) and not error.filename and not _has_working_directory():
+        return "the working directory was removed; change to another one", FAILED
     if isinstance(error, OSError):
         return f"{error.filename or 'the system'}: {reason(error)}", FAILED
     return f"{type(error).__name__}: {error}; this is a defect of Trilane, --debug shows where", FAILED
+
+
+def _has_working_directory() -> bool:
+    try:
+        os.getcwd()  # noqa: PTH109 - this is what fails
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def _is_of_stdout(error: OSError) -> bool:

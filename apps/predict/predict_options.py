@@ -18,7 +18,7 @@ from trilane.options import Finite, Option, Options, Text, Texts, one_of
 from trilane.scheduler.policy import POLICIES
 from trilane.stages.run_options import AVATARS_HELP, PROFILE_HELP
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import BURST, MAX_MINUTES, PERFORMANCE_PROFILES, SUSTAINED, UnitName
+from trilane.units import BURST, MAX_MINUTES, PERFORMANCE_PROFILES, SUSTAINED, UNITS, UnitName
 
 if TYPE_CHECKING:
     from trilane.hw_profiles.application import Variant
@@ -68,6 +68,13 @@ def _engine_runtimes() -> tuple[str, ...]:
     from trilane.hw_profiles.schema import ENGINE_RUNTIMES
 
     return tuple(ENGINE_RUNTIMES)
+
+
+def _known_engine_runtime(text: str | None) -> str | None:
+    if text is not None and text not in (words := _engine_runtimes()):
+        remedy = f"--runtime {text} names the network's unit" if text in UNITS else ""
+        raise UnexpectedValue(repr(text), " or ".join(words), remedy)
+    return text
 
 
 def _governors() -> tuple[str, ...]:
@@ -159,7 +166,7 @@ class PredictOptions(Options):
     precision: Annotated[str | None, _either(lambda: tuple(PRECISIONS), "w8a8 (int8), float (fp16) or fp32")] = Field(
         default=None, description="w8a8 (int8), float (fp16) or fp32; as the network says and its unit has it."
     )
-    engine_runtime: Annotated[str | None, _either(_engine_runtimes)] = Field(
+    engine_runtime: Annotated[str | None, AfterValidator(_known_engine_runtime)] = Field(
         default=None,
         description="Of a tensor engine that runs a --network by itself: tflite (if not given) or qnn_dlc.",
     )

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import resource
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +14,7 @@ from typing import Any
 import pytest
 
 from support.doubles import pipeline_of_doubles
+from trilane.apps.cli.main import _describe
 from trilane.apps.run import run_folder
 from trilane.apps.run.report import read_report
 from trilane.apps.run.run_job import Hooks, Prepared, RunOutcome, run_to_folder
@@ -110,3 +113,17 @@ def test_a_run_takes_the_space_of_its_report_before_it_begins(run: Callable[...,
         run(lambda _work: pytest.fail("it began"))
     assert raised.value.exit_code == 1
     assert list(tmp_path.rglob("*")) == []
+
+
+def test_a_command_in_a_folder_that_was_removed_says_so(tmp_path: Path) -> None:
+    """Other files that are missing keep their own sentence."""
+    code = "import os, shutil; shutil.rmtree(os.getcwd()); from trilane.apps.cli.main import entry; entry()"
+    for words in (("run", "--frames", "3"), ("explain", "default")):
+        folder = tmp_path / words[0]
+        folder.mkdir()
+        done = subprocess.run(
+            [sys.executable, "-c", code, *words], cwd=folder, capture_output=True, text=True, timeout=120, check=False
+        )
+        assert done.returncode == 1
+        assert done.stderr == "error: the working directory was removed; change to another one\n"
+    assert _describe(FileNotFoundError(2, "No such file or directory")) == ("the system: no such file or directory", 1)
