@@ -210,9 +210,16 @@ def under_runtime(profile: Profile, unit: UnitName, runtime: EngineRuntime | Non
     changed = profile.units[unit].model_copy(update={"engine_runtime": runtime})
     if changed.engine is None:
         found = f"{runtime} for the {unit} of {profile.name} in {changed.precision}"
-        known = [f"{', '.join(each.engines)} of the {name}" for name, each in profile.units.items() if each.engines]
-        expected = " or ".join(known) or "a chip with a tensor engine"
-        raise BadInputError("engine runtime", found, expected, "without it a unit is priced as its profile says")
+        engines = {name: [key.split("_", 1) for key in each.engines] for name, each in profile.units.items()}
+        known = [
+            f"{' or '.join(dict.fromkeys(words))} for the {name} in {' or '.join(dict.fromkeys(numbers))}"
+            for name, keys in engines.items()
+            if keys
+            for numbers, words in [zip(*keys, strict=True)]
+        ]
+        expected = ", or ".join(known) or "a chip with a tensor engine"
+        remedy = f"without it the {unit} is priced as its profile says"
+        raise BadInputError("--engine-runtime", found, expected, remedy)
     return profile.model_copy(update={"units": {**profile.units, unit: changed}})
 
 

@@ -15,9 +15,8 @@ from trilane.errors import BadInputError
 from trilane.hw_profiles.application import Plan, steady
 from trilane.hw_profiles.governor import GOVERNORS, ThermalState, Throttle
 from trilane.hw_profiles.schema import CORNERS, Corners, Profile, corners_of
-from trilane.units import UNITS, UnitName
+from trilane.units import MAX_MINUTES, UNITS, UnitName
 
-MAX_MINUTES = 24 * 60
 MOST_SHOWN = 360  # moments in a report
 
 

@@ -19,6 +19,7 @@ from types import FrameType
 from typing import Any, Self
 
 from trilane.scheduler.events import Event, FrameRequest, Hold, Stop
+from trilane.signals import that_end
 
 ALL = -1
 
@@ -131,18 +132,18 @@ class FrameRequestQueue:
                 os.eventfd_write(self.fd, 1)
 
 
-_UNLESS_IGNORED = (signal.SIGHUP, signal.SIGQUIT)
-
-
 class Interrupts:
     """Counts the signals and makes `fd` readable while entered from the main thread; in other threads it does nothing.
 
-    SIGHUP and SIGQUIT stay ignored if the caller was started so (`nohup`, a shell's background job). SIGPIPE is ignored
-    meanwhile, as Python does it: a message to a unit that is gone must not end the program.
+    SIGPIPE is ignored meanwhile, as Python does it: a message to a unit that is gone must not end the program.
+
+    `count`: number of signals that end a run. `last`: the last of them.
+    `continued`: number of times that this process went on after a signal had stopped it.
     """
 
     def __init__(self) -> None:
-        self.count = 0
+        self.count = self.continued = 0
+        self.last = signal.SIGINT
         self.fd, self._write_fd = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._before: dict[int, Any] = {}
         self._wakeup_before = -1
@@ -150,9 +151,9 @@ class Interrupts:
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
             self._wakeup_before = signal.set_wakeup_fd(self._write_fd, warn_on_full_buffer=False)
-            hears = [number for number in _UNLESS_IGNORED if signal.getsignal(number) not in (signal.SIG_IGN, None)]
-            for number in (signal.SIGINT, signal.SIGTERM, *hears):
+            for number in that_end():
                 self._before[number] = signal.signal(number, self._count)
+            self._before[signal.SIGCONT] = signal.signal(signal.SIGCONT, self._continue)
             self._before[signal.SIGPIPE] = signal.signal(signal.SIGPIPE, signal.SIG_IGN)
         return self
 
@@ -164,5 +165,9 @@ class Interrupts:
         os.close(self.fd)
         os.close(self._write_fd)
 
-    def _count(self, _number: int, _frame: FrameType | None) -> None:
+    def _count(self, number: int, _frame: FrameType | None) -> None:
         self.count += 1
+        self.last = signal.Signals(number)
+
+    def _continue(self, _number: int, _frame: FrameType | None) -> None:
+        self.continued += 1

@@ -20,7 +20,7 @@ from collections import OrderedDict, deque
 from collections.abc import Iterator, Mapping, Reversible, Sequence
 from typing import Any, Final, NamedTuple
 
-from trilane.pipeline.timeline import Down, ExplainedJob
+from trilane.pipeline.timeline import Down, ExplainedJob, Span
 from trilane.pipeline.unit_history import DOWN, HELD, KEPT, LOST, OVERHEAD, PREEMPTED, THROTTLED, UNKNOWN, Key
 from trilane.scheduler.events import Graph, Settings
 from trilane.scheduler.ledger import JobRecord
@@ -118,7 +118,7 @@ def _within_ns(job: JobRecord, begin_ns: int, end_ns: int) -> int:
     return ns * max(length_ns - job.preempted_ns - job.asleep_ns, 0) // length_ns if ns > 0 else 0
 
 
-WORK, TAKEN, ASLEEP, RELEASE = "work", "taken", "asleep", "release"
+WORK, TAKEN, ASLEEP, RELEASE, STOPPED, STALLED = "work", "taken", "asleep", "release", "stopped", "stalled"
 #: The kinds of a piece of a path, and what each means.
 WHATS = {
     WORK: "the stage worked",
@@ -127,6 +127,8 @@ WHATS = {
     ASLEEP: "the stage slept in its job, and no device of its own worked for it",
     OVERHEAD: "messages and hand-over before the stage's job",
     THROTTLED: "the unit's cap held the stage's job",
+    STOPPED: "a signal had stopped the stage's unit",
+    STALLED: "the scheduler itself did not run: a signal had stopped it, or it had no core",
     LOST: "the unit was at a job that was lost with its process",
     DOWN: "a unit's process was down",
     HELD: "the policy, or the order of frames, held the stage's job",
@@ -148,6 +150,7 @@ class Piece(NamedTuple):
 
     `job`: job to which it belongs, or before which it lies.
     `stage`: stage of that job, or a stage of the unit that was down.
+    `asleep`: what time is in which the job slept.
     """
 
     what: str
@@ -155,6 +158,7 @@ class Piece(NamedTuple):
     job: JobRecord
     begin_ns: int
     end_ns: int
+    asleep: str = ASLEEP
 
 
 class Paths:
@@ -162,10 +166,18 @@ class Paths:
 
     `graph`, `settings`: graph and settings of the run.
     `downs`: times in which units were down so far, as `Timeline` notes them.
+    `stalls`: times in which the scheduler did not run so far, as `Timeline` notes them.
     `kept`: number of jobs that are kept.
     """
 
-    def __init__(self, graph: Graph, settings: Settings, downs: Reversible[Down] = (), kept: int = KEPT) -> None:
+    def __init__(
+        self,
+        graph: Graph,
+        settings: Settings,
+        downs: Reversible[Down] = (),
+        stalls: Reversible[Span] = (),
+        kept: int = KEPT,
+    ) -> None:
         names = [stage.name for stage in graph.stages]
         self._first, self._last = names[0], names[-1]
         self._next = {name: [*names[place + 1 : place + 2], self._last] for place, name in enumerate(names)}
@@ -174,7 +186,7 @@ class Paths:
         self._paced = bool(settings.period_ns or settings.arrivals_ns or settings.asked)
         self._latches = settings.latch_ns > 0
         self._stage_of = {stage.unit: stage.name for stage in reversed(graph.stages)}
-        self._downs, self._kept = downs, kept
+        self._downs, self._stalls, self._kept = downs, stalls, kept
         self._jobs: OrderedDict[Key, ExplainedJob] = OrderedDict()
         self._before: dict[Key, Key] = {}  # the job that the same unit did before
         self._last_of_unit: dict[str, Key] = {}
@@ -210,7 +222,8 @@ class Paths:
         end_ns = last.job.end_ns
         while now is not None and end_ns > until_ns:
             job = now.job
-            yield Piece(WORK, job.stage, job, max(job.begin_ns, until_ns), end_ns)
+            asleep = STOPPED if job.begin_ns < now.stopped_ns <= job.end_ns else ASLEEP
+            yield Piece(WORK, job.stage, job, max(job.begin_ns, until_ns), end_ns, asleep)
             before, released = self._bound_by(now)
             from_ns = until_ns if before is None else max(min(before.job.end_ns, job.begin_ns), until_ns)
             for piece in self._gap(now, from_ns, released, before is None):
@@ -222,13 +235,23 @@ class Paths:
         job = now.job
         if released:
             ready_ns = min(max(job.ready_ns, from_ns), job.begin_ns)
-            yield from _divided(now, ready_ns, OVERHEAD)
+            yield from _divided(now, ready_ns, self._overhead(now, ready_ns))
             yield from self._unreleased(job, from_ns, ready_ns)
         elif is_first:
             yield Piece(UNKNOWN, job.stage, job, from_ns, job.begin_ns)
         else:
             is_latched = self._latches and job.stage == self._first and not now.after
-            yield from _divided(now, from_ns, HELD if is_latched else OVERHEAD)
+            yield from _divided(now, from_ns, HELD if is_latched else self._overhead(now, from_ns))
+
+    def _overhead(self, now: ExplainedJob, from_ns: int) -> str:
+        """Return what the time from `from_ns` to the begin of `now` is that has no other cause."""
+        begin_ns = now.job.begin_ns
+        for stall in reversed(self._stalls):
+            if stall.end_ns <= from_ns:
+                break
+            if stall.begin_ns < begin_ns:
+                return STALLED
+        return STOPPED if from_ns < now.stopped_ns <= begin_ns else OVERHEAD
 
     def _unreleased(self, job: JobRecord, from_ns: int, end_ns: int) -> Iterator[Piece]:
         """Yield the time before a frame was released.
@@ -319,7 +342,7 @@ def parts(piece: Piece, begin_ns: int, end_ns: int, sharing: Sharing | None = No
     preempted_ns = ns * lacked_ns // length_ns
     asleep_ns = ns * min(job.asleep_ns, length_ns - lacked_ns) // length_ns
     taken = sharing.taken(job.unit, job.begin_ns, job.end_ns, lacked_ns) if sharing is not None else {}
-    found = {(WORK, job.stage): ns - preempted_ns - asleep_ns, (ASLEEP, job.stage): asleep_ns}
+    found = {(WORK, job.stage): ns - preempted_ns - asleep_ns, (piece.asleep, job.stage): asleep_ns}
     found |= _divided_preempted(job.stage, preempted_ns, taken, lacked_ns)
     return {part: ns for part, ns in found.items() if ns}
 

@@ -29,10 +29,10 @@ import traceback
 from collections.abc import Sequence
 from typing import Any
 
+from trilane.signals import ENDING
+
 PR_SET_PDEATHSIG, PR_SET_NAME = 1, 15  # <linux/prctl.h>
 F_SETSIG = 10  # <linux/fcntl.h>
-#: Signals that end a run; the parent decides how.
-OF_THE_PARENT = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 MAX_FDS = 250  # descriptors that one packet carries; SCM_MAX_FD of Linux is 253
 PACKET_BYTES = 1 << 16
 ALWAYS = "trilane.pipeline.unit_loop"
@@ -119,7 +119,7 @@ def _call(request: dict[str, Any], fds: Sequence[int], server_pid: int) -> int:
 
 def _leave_server() -> None:
     """In a forked process, take signals as any process does, except for Ctrl-C, which the parent handles."""
-    for number in (signal.SIGCHLD, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
+    for number in {signal.SIGCHLD, *ENDING} - {signal.SIGINT}:
         signal.signal(number, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGCHLD})
 
@@ -158,7 +158,7 @@ def main() -> None:
     parser.add_argument("--preload", default="")
     arguments = parser.parse_args()
     die_with_parent(arguments.parent)
-    for number in OF_THE_PARENT:
+    for number in ENDING:  # the parent decides what they end, and how
         signal.signal(number, signal.SIG_IGN)
     importlib.import_module(ALWAYS)
     for module in filter(None, arguments.preload.split(",")):

@@ -109,8 +109,15 @@ class Ended(NamedTuple):
     report: Mapping[str, Any]
 
 
-Record = Begun | Stepped | Accounted | Worked | Counted | Sampled | Said | Ended
-RECORDS: tuple[type[Any], ...] = (Begun, Stepped, Accounted, Worked, Counted, Sampled, Said, Ended)
+class Stopped(NamedTuple):
+    """At `now_ns` a signal had stopped the process of `unit`; it is noted once for each time."""
+
+    now_ns: int
+    unit: str
+
+
+Record = Begun | Stepped | Accounted | Worked | Counted | Sampled | Said | Ended | Stopped
+RECORDS: tuple[type[Any], ...] = (Begun, Stepped, Accounted, Worked, Counted, Sampled, Said, Ended, Stopped)
 _PLACES = {kind: place for place, kind in enumerate(RECORDS)}
 
 
@@ -347,6 +354,7 @@ def _checks(run: RunValues) -> _Checks:
         Sampled: (values.time_ns, values.numbers),
         Said: (values.time_ns, values.text),
         Ended: (values.time_ns, values.facts),
+        Stopped: (values.time_ns, run.unit),
     }
     return tuple(of[kind] for kind in RECORDS)
 

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane import machine
-from trilane.errors import TrilaneError, reason
+from trilane.errors import TrilaneError, reason, remedy
 from trilane.pipeline.description import HeaderDtype, Model, Pipeline
 from trilane.transport.packets import (
     F_ADD_SEALS,
@@ -104,7 +104,8 @@ def share_assets(assets: Assets) -> int:
         fcntl.fcntl(fd, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW | _F_SEAL_WRITE)
     except OSError as error:
         os.close(fd)
-        raise TrilaneError(f"assets: no room for {(start + end) >> 20} MiB: {reason(error)}") from None
+        why = "; ".join(filter(None, (reason(error), remedy(error, ""))))
+        raise TrilaneError(f"assets: no room for {(start + end) >> 20} MiB: {why}") from None
     return fd
 
 

@@ -7,6 +7,7 @@ messages. The run's figures include the time for which a viewer held the run, an
 from __future__ import annotations
 
 import contextlib
+import signal
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
@@ -15,7 +16,7 @@ from typing import Protocol
 from trilane.errors import TrilaneError
 from trilane.pipeline.controls import FrameRequestQueue, Interrupts, RunControls
 from trilane.pipeline.cpu_use import CpuTimes
-from trilane.pipeline.journal import Worked
+from trilane.pipeline.journal import Stopped, Worked
 from trilane.pipeline.result import RunLog
 from trilane.pipeline.unit_processes import UnitMessage, UnitProcesses
 from trilane.scheduler.core import Core
@@ -95,8 +96,9 @@ class RealtimeClock:
         self._held = HeldTime()
         self._to_end: set[str] = set()
         self._stopped_ns: dict[str, int] = {}
+        self._unnoted: list[Stopped] = []
         self._begun = self._stopping = self._is_lost = False
-        self._step_ns = self._ping_ns = 0
+        self._step_ns = self._ping_ns = self._continued = 0
         self._progress_s = 0.0
         processes.watch(interrupts.fd)
         if requests is not None:
@@ -116,7 +118,9 @@ class RealtimeClock:
         # This process was stopped. Unless the core is told, it restarts healthy units.
         if now_ns - self._step_ns > LONGEST_STEP_NS:
             events.insert(0, SchedulerStalled(now_ns - self._step_ns))
+            self._tell_stalled(now_ns - self._step_ns)
         self._step_ns = now_ns
+        self._continued = self._interrupts.continued
         return now_ns, tuple(events)
 
     def perform(self, now_ns: int, actions: tuple[Action, ...]) -> None:
@@ -125,7 +129,9 @@ class RealtimeClock:
             if isinstance(action, Dispatch):
                 self._dispatch(now_ns, action.job)
             elif isinstance(action, Kill):
-                self._log.say(f"unit {action.unit} did not answer in time and is restarted")
+                why = ", because a signal has stopped it," if action.unit in self._processes.stopped else ""
+                self._log.say(f"unit {action.unit} did not answer in time{why} and is restarted")
+                self._to_end.add(action.unit)
                 self._processes.kill(action.unit)
             elif isinstance(action, Start):
                 self._start(action.unit)
@@ -152,6 +158,11 @@ class RealtimeClock:
                 counts[name] += 1
         self._unbooked.clear()
         return found
+
+    def stopped(self) -> list[Stopped]:
+        """Return the units that were seen stopped by a signal since the last call, each once for each time."""
+        unnoted, self._unnoted = self._unnoted, []
+        return unnoted
 
     def finish(self) -> None:
         """Show the final progress, and say how long the run was held."""
@@ -202,7 +213,8 @@ class RealtimeClock:
             return [Abort()]
         if self._interrupts.count and not self._stopping:
             self._stopping = True
-            self._log.say("interrupted: the frames in flight are finished; interrupt again to end at once")
+            by = "" if self._interrupts.last == signal.SIGINT else f" by {self._interrupts.last.name}"
+            self._log.say(f"interrupted{by}: the frames in flight are finished; interrupt again to end at once")
             return [Stop()]
         return []
 
@@ -232,9 +244,17 @@ class RealtimeClock:
         stopped = self._processes.stopped
         for unit in stopped - self._stopped_ns.keys():
             self._stopped_ns[unit] = now_ns
+            self._unnoted.append(Stopped(now_ns, unit))
         for unit in self._stopped_ns.keys() - stopped:
             seconds = (now_ns - self._stopped_ns.pop(unit)) / NS_PER_S
             self._log.say(f"unit {unit} was stopped by a signal for about {seconds:.1f} s")
+
+    def _tell_stalled(self, ns: int) -> None:
+        """Say that a signal had stopped this process for `ns`, if one had; without it, the process had no core."""
+        if self._interrupts.continued > self._continued:
+            frame = min(self._core.frames, default=self._core.ledger.presented_count)
+            seconds = ns / NS_PER_S
+            self._log.say(f"the scheduler itself was stopped by a signal for about {seconds:.1f} s, at frame {frame}")
 
     def _event(self, unit_message: UnitMessage) -> Event | None:
         unit, message = unit_message

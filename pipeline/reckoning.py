@@ -6,12 +6,12 @@ again. The memory for reading a run is bounded, however long the run lasts.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Reversible, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from trilane.pipeline.critical_path import Budget, Part, Paths, Sharing, Taken
 from trilane.pipeline.journal import Begun, Record, config_of
-from trilane.pipeline.timeline import Down, ExplainedJob, Timeline
+from trilane.pipeline.timeline import ExplainedJob, Timeline
 from trilane.scheduler.events import Graph, Settings
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.places import Place, Placement, busiest_core_ns
@@ -103,12 +103,12 @@ class Reckoning:
 
     `graph`, `settings`: graph and settings of the run.
     `places`: places of its units, as far as they are known.
-    `downs`: times in which units were down so far, as `Timeline` notes them.
+    `timeline`: what takes the run's records; its jobs are added here.
     `paths`, `sharing`: paths and core sharing of the jobs so far.
     """
 
-    def __init__(self, graph: Graph, settings: Settings, places: Placement, downs: Reversible[Down]) -> None:
-        self.paths = Paths(graph, settings, downs)
+    def __init__(self, graph: Graph, settings: Settings, places: Placement, timeline: Timeline) -> None:
+        self.paths = Paths(graph, settings, timeline.downs, timeline.stalls)
         self.sharing = Sharing({unit: place.cores for unit, place in places.items()})
         self._budget = Budget(self.paths, self.sharing)
         # as if each unit had a core of its own
@@ -155,7 +155,7 @@ def places_of(begun: Begun) -> dict[str, Place]:
 def reckoned(graph: Graph, settings: Settings, places: Placement, records: Iterable[Record]) -> Reckoned:
     """Return what bounded a run. `records`: records of the run after the first."""
     timeline = Timeline(graph, settings, waits=True)
-    reckoning = Reckoning(graph, settings, places, timeline.downs)
+    reckoning = Reckoning(graph, settings, places, timeline)
     for record in records:
         for fact in timeline.add(record):
             if isinstance(fact, ExplainedJob):

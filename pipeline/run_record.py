@@ -27,6 +27,7 @@ from trilane.pipeline.journal import (
     Said,
     Sampled,
     Stepped,
+    Stopped,
     Worked,
     read_journal,
     records_of,
@@ -69,6 +70,9 @@ class JobSource(Protocol):
 
     def ended(self) -> list[Worked | None]:
         """Return the jobs that ended since the last call; None stands for a job of a lost frame."""
+
+    def stopped(self) -> list[Stopped]:
+        """Return the units that were seen stopped since the last call."""
 
 
 class CapReadings(Protocol):
@@ -197,6 +201,8 @@ class _JournaledRun:
         """Write the notes since the last call; raises UnwrittenError when they cannot be written."""
         add, told = self._writer.add, 0
         jobs = self._source.ended() if self._source is not None else []
+        for stopped in self._source.stopped() if self._source is not None else []:
+            add(stopped)  # before the end of the job that it made longer
         for step, follows, ended in self._steps:
             add(step)
             for record in (*follows, *jobs[told:ended]):

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
-from trilane.pipeline.journal import Accounted, Counted, Record, Stepped, Worked
+from trilane.pipeline.journal import Accounted, Counted, Record, Stepped, Stopped, Worked
 from trilane.pipeline.unit_history import KEPT, Handed, IdleCutter, IdleSlice, Key, UnitHistory
 from trilane.scheduler.events import (
     NEVER,
@@ -33,6 +33,7 @@ from trilane.scheduler.events import (
     JobFailed,
     Kill,
     OutcomeKind,
+    SchedulerStalled,
     Settings,
     Stop,
     UnitDied,
@@ -97,6 +98,7 @@ class ExplainedJob(NamedTuple):
     `presented`: the presented frame, for the job that presents it.
     `rung`: rung of the frame's work.
     `skips`: whether the frame takes the bypass; set for the stage at which the bypass begins.
+    `stopped_ns`: last time at which its unit was seen stopped by a signal; 0: never.
     """
 
     job: JobRecord
@@ -107,6 +109,7 @@ class ExplainedJob(NamedTuple):
     presented: Presented | None
     rung: int
     skips: bool
+    stopped_ns: int = 0
 
     @property
     def key(self) -> Key:
@@ -119,7 +122,7 @@ class ExplainedJob(NamedTuple):
 
 
 class Span(NamedTuple):
-    """The time from the step in which the last unit got ready to the step that finished the run."""
+    """A time from one step of the run to another."""
 
     begin_ns: int
     end_ns: int
@@ -148,10 +151,12 @@ class Timeline:
     `frames`: frames in flight, by number.
     `start_ns`: time at which the last unit got ready; None before.
     `is_over`: whether the run is over.
-    `span`: time from the start to the end of the run; None until the end, and for a run that never started.
+    `span`: time from the step in which the last unit got ready to the step that finished the run; None until the end,
+    and for a run that never started.
     `presented`: number of frames that reached the end.
     `skipped`: number of presented frames that took the bypass.
     `downs`: last times in which a unit was down after its start, in the order of their ends.
+    `stalls`: last times in which the scheduler itself did not run, in their order.
     """
 
     def __init__(
@@ -169,6 +174,7 @@ class Timeline:
         self.is_over = False
         self.presented = self.skipped = 0
         self.downs: deque[Down] = deque(maxlen=kept)
+        self.stalls: deque[Span] = deque(maxlen=kept)
         self._source = Source(settings, self._drop_at_source)
         self._turned_away: dict[str, deque[tuple[int, int]]] = {cause: deque() for cause in DropCause}
         self._waiting: dict[str, list[int]] = {name: [] for name in names[1:]}
@@ -187,6 +193,7 @@ class Timeline:
             FrameRequest: lambda event: self._source.request(event.frames, self._now_ns),
             Hold: lambda event: self._source.hold(event.frames, self._now_ns),
             Stop: lambda _: self._source.stop(),
+            SchedulerStalled: lambda event: self.stalls.append(Span(self._now_ns - event.ns, self._now_ns)),
         }
 
     def add(self, record: Record) -> list[Fact]:
@@ -197,6 +204,8 @@ class Timeline:
             return [*self._count(record)]
         if isinstance(record, Accounted):
             self._account(record)
+        elif isinstance(record, Stopped):
+            self.units[record.unit].stopped_ns = record.now_ns
         elif isinstance(record, Worked):
             return self._work(record)
         return []
@@ -261,7 +270,7 @@ class Timeline:
         waits_ns, behind = unit.explain(job, handed.heard_ns if handed is not None else 0)
         after, rung = (handed.after, handed.job.rung) if handed is not None else ((), 0)
         skips = event is not None and event.skips
-        return [ExplainedJob(job, worked.figures, waits_ns, behind, after, presented, rung, skips)]
+        return [ExplainedJob(job, worked.figures, waits_ns, behind, after, presented, rung, skips, unit.stopped_ns)]
 
     def _count(self, counted: Counted) -> Iterator[Gone]:
         """Yield the frames that were lost or dropped since the last such record."""

@@ -78,6 +78,7 @@ class UnitHistory:
     `held`: jobs that the unit has, the running one first.
     `account`: account of the ledger that gets the unit's time without a job.
     `is_up`: whether the unit's process is up and ready, and no kill is under way.
+    `stopped_ns`: last time at which its process was seen stopped by a signal; 0: never.
     """
 
     def __init__(self, name: str, kept: int = KEPT) -> None:
@@ -85,6 +86,7 @@ class UnitHistory:
         self.held: deque[Handed] = deque()
         self.account = ledger.STARVED
         self.is_up = self._is_ending = False
+        self.stopped_ns = 0
         self._down_ns: int | None = None  # start of the time in which its process is down, after it was up
         self._jobs: deque[JobRecord] = deque(maxlen=kept)
         self._changes: deque[tuple[int, str]] = deque(maxlen=kept)

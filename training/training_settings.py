@@ -11,11 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import AfterValidator, Field, ValidationError
 
 from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_text
 from trilane.scene.schema import LISTED, Table
+from trilane.unexpected_value import UnexpectedValue, unexpected_in
 
 # Options of a training, in tables of `training.toml`: the optimiser, the batches, and what regularises the avatar.
 #
@@ -135,6 +136,7 @@ NEW: dict[str, Any] = {"small_until": 0.12, "freeze_norms_at": 0.6}
 #: A training of a new network in fewer minutes than this takes cheap steps at a high rate
 #: (docs/decisions/avatar-training.md).
 SHORT_MINUTES = 5.0
+MOST_MINUTES = 100_000
 SHORT: dict[str, Any] = {"batch": 2, "small_until": 0.8, "network_rate": 5e-3, "texture_rate": 1e-3}
 
 
@@ -160,6 +162,12 @@ def _of_loss(name: str, where: str | Path) -> dict[str, Any]:
 def _is_short(values: dict[str, Any]) -> bool:
     minutes = values.get("minutes")
     return "steps" not in values and isinstance(minutes, int | float) and minutes < SHORT_MINUTES
+
+
+def _minutes(minutes: float) -> float:
+    if not 0 < minutes <= MOST_MINUTES:  # not a number is no time either
+        raise UnexpectedValue(f"{minutes:g}", f"above 0, at most {MOST_MINUTES} minutes")
+    return minutes
 
 
 def _over(usual: Any, value: Any) -> Any:
@@ -203,7 +211,7 @@ class TrainingSettings(Table):
 
     schema_: Literal[1] = Field(default=1, alias="schema")
     samples: int = Field(default=4000, ge=8, le=200_000)
-    minutes: float = Field(default=60.0, gt=0, le=100_000)
+    minutes: Annotated[float, AfterValidator(_minutes)] = 60.0
     steps: int | None = Field(default=None, ge=10, le=10_000_000)
     batch: int = Field(default=4, ge=1, le=64)
     seed: int = Field(default=1, ge=0, lt=2**31)
@@ -293,6 +301,8 @@ def _lines(values: dict[str, Any]) -> list[str]:
 def _refused(details: dict[str, Any], where: str | Path) -> BadInputError:
     """Turn one of the `errors()` of a ValidationError into a BadInputError."""
     place, keys = f"{where}: {'.'.join(map(str, details['loc']))}", details["loc"]
+    if (unexpected := unexpected_in(details)) is not None:
+        return BadInputError.at(place, unexpected)
     if details["type"] != "extra_forbidden":
         return BadInputError(place, repr(details["input"])[:80], details["msg"].removeprefix("Input should be "))
     table = TrainingSettings.model_fields[keys[0]].annotation if len(keys) > 1 else TrainingSettings

@@ -20,10 +20,14 @@ from typer.core import TyperCommand, TyperOption
 
 from trilane.apps.predict.predict_options import ENCODER_HELP, FIXED_SIZE_HELP, NORM_HELP
 from trilane.errors import BadInputError, did_you_mean
-from trilane.options import Options, element_of, kind_of, limits_of, option_of
+from trilane.options import Options, element_of, expected, kind_of, limits_of, option_of
 from trilane.stages.run_options import AVATARS_HELP, PROFILE_HELP, WIDTH_HELP, RunOptions
 from trilane.units import PerformanceProfile
 
+#: Name of the attribute of a command's function that holds its model of options.
+OPTIONS = "options_model"
+#: What pydantic calls the kinds of numbers.
+IN_PLAIN_WORDS = {"a valid number": "a number", "a valid integer": "a whole number"}
 POLICY_HELP = "sequential, pipelined, latest or deadline."
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")]
 OutFileOption = Annotated[Path, typer.Option("--out", help="File to write.")]
@@ -49,12 +53,12 @@ class OnceCommand(TyperCommand):
             return super().parse_args(ctx, args)
         except typer.BadParameter as error:
             if isinstance(error.__cause__, ValidationError) and error.param is not None:
-                raise _wrong_value(error.param, error.__cause__) from None
+                raise _wrong_value(error.param, error.__cause__, getattr(self.callback, OPTIONS, None)) from None
             raise
 
 
-def _wrong_value(parameter: Any, error: ValidationError) -> BadInputError:
-    """Say what pydantic found wrong with the value of an option or argument."""
+def _wrong_value(parameter: Any, error: ValidationError, model: type[Options] | None) -> BadInputError:
+    """Say what pydantic found wrong with the value of an option or argument. `model`: options of the command."""
     first, kind = error.errors()[0], parameter.type_descriptor.annotation
     where = parameter.opts[0]
     found = first["input"]
@@ -62,8 +66,10 @@ def _wrong_value(parameter: Any, error: ValidationError) -> BadInputError:
     if choices and get_origin(kind) in (None, Literal):
         words = [str(each) for each in choices]
         return BadInputError(where, repr(found), f"one of {', '.join(words)}", did_you_mean(str(found), words))
-    expected = first["msg"].removeprefix("Input should be ").partition(",")[0]
-    return BadInputError(where, repr(found), expected)
+    if model is not None and parameter.name in model.model_fields:
+        return BadInputError(where, repr(found), expected(model.model_fields[parameter.name]))
+    wanted = first["msg"].removeprefix("Input should be ").partition(",")[0]
+    return BadInputError(where, repr(found), IN_PLAIN_WORDS.get(wanted, wanted))
 
 
 def _may_be_repeated(option: TyperOption) -> bool:
@@ -133,6 +139,7 @@ def with_options(
         rest = [parameter.replace(kind=context.kind) for parameter in own if parameter.name != context.name]
         called.__signature__ = inspect.Signature([context, *parameters, *rest])  # type: ignore[attr-defined]
         called.__name__, called.__doc__ = command.__name__, command.__doc__
+        setattr(called, OPTIONS, model)
         return called
 
     return decorated

@@ -9,7 +9,7 @@ import errno
 import json
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import IO, TYPE_CHECKING, Any, cast
 
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 #: C0, DEL and C1, as Python writes them.
+#: Most messages of a run that are shown at its end.
+MOST_SHOWN = 5
 _WRITTEN_OUT = {code: repr(chr(code))[1:-1] for code in (*range(0x20), *range(0x7F, 0xA0))}
 
 
@@ -103,6 +105,13 @@ def without_controls(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {without_controls(key): without_controls(each) for key, each in value.items()}
     return [without_controls(each) for each in value] if isinstance(value, list | tuple) else value
+
+
+def shown_messages(messages: Sequence[str], failure: str | None) -> list[str]:
+    """Return a run's messages as a person is shown them: the first few, without its `failure`, which is shown too."""
+    others = [message for message in messages if message != failure]
+    more = len(others) - MOST_SHOWN
+    return others if more <= 0 else [*others[:MOST_SHOWN], f"{more} more messages: report.json has them"]
 
 
 def print_json(document: Mapping[str, Any]) -> None:

@@ -18,8 +18,15 @@ from trilane.apps.cli.commands import (
     given,
     with_options,
 )
-from trilane.apps.cli.console import print_json, spinner, stderr_console, stdout_console, without_controls
-from trilane.errors import BadInputError
+from trilane.apps.cli.console import (
+    print_json,
+    shown_messages,
+    spinner,
+    stderr_console,
+    stdout_console,
+    without_controls,
+)
+from trilane.errors import BadInputError, did_you_mean
 from trilane.stages.run_options import PROFILE_HELP, RunOptions
 from trilane.units import PerformanceProfile
 
@@ -216,7 +223,8 @@ def _totals(totals: dict[str, Any], config: dict[str, Any]) -> list[str]:
 def run_folder(name: str) -> Path | None:
     """Return the run folder that `trilane explain NAME` means, found as `trilane top` finds it; None for a scene.
 
-    The name of a bundled scene means that scene. Raises BadInputError for a folder whose journal is a broken link.
+    The name of a bundled scene means that scene. Raises BadInputError for a folder whose journal is a broken link, and
+    for a name that is more like a run folder's than a scene's.
     """
     from trilane.apps.watch.followed_run import EXPECTED, follow, without_journal
     from trilane.pipeline.journal import NAME
@@ -231,8 +239,11 @@ def run_folder(name: str) -> Path | None:
         return None
     try:
         return follow(folder).folder
-    except BadInputError:  # the scene's own message names what was expected
-        return None
+    except BadInputError as error:
+        is_path = len(folder.parts) > 1 or folder.is_dir()
+        if folder.suffix == ".toml" or did_you_mean(name, scene_names()) or not (is_path or error.remedy):
+            return None  # the scene's own message names what was expected
+        raise
 
 
 def _refuse_options(typed: set[str], *, of_a_run: bool) -> None:
@@ -294,6 +305,7 @@ def _head(document: Mapping[str, Any]) -> Iterator[str]:
     yield from _efficiency(document)
     if document["failure"]:
         yield f"the run failed: {document['failure']}"
+    yield from (f"in the run: {message}" for message in shown_messages(document["messages"], document["failure"]))
     for name, facts in document["accuracy"].items():
         if "psnr_db_by_band" in facts:
             bands = ", ".join(f"{band} {value:.1f}" for band, value in facts["psnr_db_by_band"].items())

@@ -19,6 +19,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from trilane.errors import TrilaneError, install_line, reason
 from trilane.memory import require_memory, shortage
+from trilane.signals import interrupting
 
 #: Command: its module, and the line that `trilane --help` shows for it.
 COMMANDS = {
@@ -141,9 +142,19 @@ def _describe(error: Exception) -> tuple[str, int]:
         return f"memory is short: {error or 'nothing says how much was wanted'}", FAILED
     if isinstance(error, OSError) and not error.filename and _is_of_stdout(error):
         return f"stdout: {reason(error)}; free space there, or write the output elsewhere", FAILED
+    if isinstance(error, FileNotFoundError) and not error.filename and not _has_working_directory():
+        return "the working directory was removed; change to another one", FAILED
     if isinstance(error, OSError):
         return f"{error.filename or 'the system'}: {reason(error)}", FAILED
     return f"{type(error).__name__}: {error}; this is a defect of Trilane, --debug shows where", FAILED
+
+
+def _has_working_directory() -> bool:
+    try:
+        os.getcwd()  # noqa: PTH109 - this is what fails
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def _is_of_stdout(error: OSError) -> bool:
@@ -188,7 +199,8 @@ def entry() -> NoReturn:
     """Call `main`, and end the process without Python's clean-up, which would take 0.1 s."""
     code: object = 0
     try:
-        main()
+        with interrupting():
+            main()
     except SystemExit as left:
         code = left.code
     except KeyboardInterrupt:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from trilane.apps.cli.commands import Commands, JsonOption, PortOption, with_options
-from trilane.apps.cli.console import print_json, stderr_console, stdout_console
+from trilane.apps.cli.console import print_json, shown_messages, stderr_console, stdout_console
 from trilane.errors import BadInputError
 from trilane.stages.run_options import RunOptions
 
@@ -117,5 +117,7 @@ def _print_outcome(outcome: RunOutcome, as_json: bool) -> None:
     else:
         stdout_console().print(run_table(report))
     stderr_console().print(f"run folder: {outcome.folder}", soft_wrap=True, markup=False)
+    for message in shown_messages(report.messages, report.failure):
+        stderr_console().print(f"in the run: {message}", soft_wrap=True, markup=False)
     if report.failure:
         stderr_console().print(f"the run failed: {report.failure}", soft_wrap=True, markup=False)

@@ -8,6 +8,7 @@ stages report, which are the last columns.
 from __future__ import annotations
 
 import csv
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
@@ -19,8 +20,9 @@ from trilane.apps.watch.followed_run import CUT_OFF, FollowedRun, RunState
 from trilane.errors import BadInputError, MissingPartError
 from trilane.figure_sources import COMPUTED, MEASURED
 from trilane.pipeline.critical_path import WHATS, Part, Taken
-from trilane.pipeline.journal import NAME, Begun, Ended, Record, Worked, config_of, journal_in, read_journal
+from trilane.pipeline.journal import NAME, Begun, Ended, Record, Said, Worked, config_of, journal_in, read_journal
 from trilane.pipeline.reckoning import Reckoning, places_of
+from trilane.pipeline.result import MOST_MESSAGES
 from trilane.pipeline.timeline import ExplainedJob, Timeline
 from trilane.pipeline.unit_history import PREEMPTED
 from trilane.units import HOST_CLOCK, NS_PER_MS
@@ -86,14 +88,17 @@ class RunExplanation:
     def __init__(self, begun: Begun, report: Report | None, slowest: int) -> None:
         self._begun, self._report, self._places = begun, report, places_of(begun)
         self._timeline = Timeline(begun.graph, begun.settings, waits=True)
-        self._reckoning = Reckoning(begun.graph, begun.settings, self._places, self._timeline.downs)
+        self._reckoning = Reckoning(begun.graph, begun.settings, self._places, self._timeline)
         self._slow = SlowFrames(begun.graph, self._reckoning.paths, self._reckoning.sharing, slowest)
         self._waits: dict[str, dict[str, int]] = {stage.name: {} for stage in begun.graph.stages}
         self._jobs = dict.fromkeys(self._waits, 0)
         self._frames, self._first_ns, self._last_ns = 0, 0, 0
+        self._said: deque[str] = deque(maxlen=MOST_MESSAGES)
 
     def add(self, record: Record) -> None:
         """Take the next record."""
+        if isinstance(record, Said):
+            self._said.append(record.text)
         for fact in self._timeline.add(record):
             if isinstance(fact, ExplainedJob):
                 self._count(fact)
@@ -157,6 +162,7 @@ class RunExplanation:
             "accuracy": facts.get("accuracy", {}),
             "interrupted": None if report is None else report.interrupted,
             "failure": None if report is None else report.failure,
+            "messages": list(self._said if report is None else report.messages),
         }
 
     def _shared(self, stage: str, taken: Taken) -> dict[str, Any]:

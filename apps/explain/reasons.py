@@ -16,6 +16,8 @@ from typing import Any, Final, Generic, NamedTuple, TypeVar
 from trilane.pipeline.critical_path import (
     ASLEEP,
     RELEASE,
+    STALLED,
+    STOPPED,
     TAKEN,
     WORK,
     Part,
@@ -213,6 +215,8 @@ def _text(shown: Shown, usual: Usual, part: Part, longer_ns: float) -> str:
         DOWN: f"{unit} was restarted",
         HELD: f"the policy or the order of frames held {stage}{whose}",
         RELEASE: "its input was late: no frame was released yet",
+        STOPPED: f"{unit} was stopped by a signal at {stage}{whose}",
+        STALLED: f"the scheduler itself did not run when {stage}{whose} was to begin",
     }
     return words.get(what, "before what is known")
 
@@ -254,6 +258,8 @@ SHORTER = {
 OF_CAUSES = {
     THROTTLED: "a performance profile with more power, such as `--performance-profile burst`, caps {unit} less",
     DOWN: "{unit} was restarted: the run's messages say why",
+    STOPPED: "nothing: {unit} was stopped by a signal, from outside of Trilane",
+    STALLED: "nothing, if a message of the run says that a signal stopped the scheduler; else end other programs",
     LOST: "{unit} was restarted: the run's messages say why",
     HELD: "another `--policy`, `--edge` or `--latch` lets {stage} begin sooner (docs/policies-and-edges.md)",
     ASLEEP: "{stage} sleeps in its jobs: what it waits for is outside of Trilane",

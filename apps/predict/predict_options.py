@@ -18,7 +18,7 @@ from trilane.options import Finite, Option, Options, Text, Texts, one_of
 from trilane.scheduler.policy import MOST_FRAMES, POLICIES
 from trilane.stages.run_options import AVATARS_HELP, PROFILE_HELP
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import BURST, HOST, PERFORMANCE_PROFILES, SUSTAINED, UnitName
+from trilane.units import BURST, HOST, MAX_MINUTES, PERFORMANCE_PROFILES, SUSTAINED, UNITS, UnitName
 
 if TYPE_CHECKING:
     from trilane.hw_profiles.application import Variant
@@ -70,6 +70,13 @@ def _engine_runtimes() -> tuple[str, ...]:
     from trilane.hw_profiles.schema import ENGINE_RUNTIMES
 
     return tuple(ENGINE_RUNTIMES)
+
+
+def _known_engine_runtime(text: str | None) -> str | None:
+    if text is not None and text not in (words := _engine_runtimes()):
+        remedy = f"--runtime {text} names the network's unit" if text in UNITS else ""
+        raise UnexpectedValue(repr(text), " or ".join(words), remedy)
+    return text
 
 
 def _governors() -> tuple[str, ...]:
@@ -173,14 +180,16 @@ class PredictOptions(Options):
     precision: Annotated[str | None, _either(lambda: tuple(PRECISIONS), "w8a8 (int8), float (fp16) or fp32")] = Field(
         default=None, description="w8a8 (int8), float (fp16) or fp32; by the network and its unit if not given."
     )
-    engine_runtime: Annotated[str | None, _either(_engine_runtimes)] = Field(
+    engine_runtime: Annotated[str | None, AfterValidator(_known_engine_runtime)] = Field(
         default=None,
         description="Runtime of a tensor engine for a --network by itself: tflite (if not given) or qnn_dlc.",
     )
     runtime: str = Field(
         default="dsp", description="Unit of the network: gpu or dsp; cpu too for a --network by itself."
     )
-    minutes: Finite = Field(default=0.0, description="Virtual minutes with heat; 0: the settled state without heat.")
+    minutes: Annotated[Finite, Option(unit="minutes")] = Field(
+        default=0.0, ge=0, le=MAX_MINUTES, description="Virtual minutes with heat; 0: the settled state without heat."
+    )
     policy: Annotated[str | None, one_of("reference", *POLICIES), Option(synonyms=("--pipelining",))] = Field(
         default=None,
         description="reference (if not given), or sequential, pipelined (if not given, on host), latest, deadline.",

@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Self
 
 from trilane import machine
-from trilane.errors import FREE_SPACE, FULL, BadInputError, TrilaneError, UnwrittenError, reason
+from trilane.errors import FREE_SPACE, FULL, BadInputError, TrilaneError, UnwrittenError, reason, remedy
 from trilane.writing import WRITABLE
 
 #: Bytes that are kept free for the report: MOST_MESSAGES of 2000 bytes each, twice as long as JSON, and its figures.
@@ -38,9 +38,9 @@ class RunFolder:
     """Make a run folder under a temporary name, `work`; without `complete()` it and parents that it made are removed.
 
     A context manager. On entry it raises BadInputError when `target` exists, when another live run has the name, or
-    when there is no room for a report. RESERVED_BYTES stay reserved for the report until `release`. On leaving by an
-    error about a file that could not be written, it raises TrilaneError; a folder that holds anything then stays. It
-    also raises TrilaneError when `work` was removed.
+    when there is no room for a report, and UnwrittenError when no file may be so long. RESERVED_BYTES stay reserved for
+    the report until `release`. On leaving by an error about a file that could not be written, it raises TrilaneError; a
+    folder that holds anything then stays. It also raises TrilaneError when `work` was removed.
     """
 
     def __init__(self, target: Path) -> None:
@@ -60,6 +60,8 @@ class RunFolder:
             self._reserve_space()
         except OSError as error:
             self._remove()
+            if remedy(error, ""):  # of a limit of the process: no other place would help
+                raise UnwrittenError(self.target, error) from None
             raise BadInputError.of_os_error(self.target, error, WRITABLE, "choose another --out") from None
         return self
 
@@ -91,6 +93,10 @@ class RunFolder:
     def release(self) -> None:
         """Give back the space that was kept free, for the files that are written last."""
         self._reserve.unlink(missing_ok=True)
+
+    def named(self, text: str) -> str:
+        """Return `text` with the name that the folder is to have in place of the one that it has."""
+        return text.replace(str(self.work), str(self.target))
 
     def complete(self) -> Path:
         """Give the folder its name.
@@ -132,9 +138,9 @@ class RunFolder:
         if isinstance(error, UnwrittenError):
             return str(error)
         if isinstance(error, BadInputError) and isinstance(error.__cause__, OSError):
-            return f"{error.where}: {error.found}; {FREE_SPACE}"
+            return f"{error.where}: {error.found}; {remedy(error.__cause__, FREE_SPACE)}"
         if isinstance(error, OSError) and error.errno in FULL:
-            return f"{error.filename or self.work}: {reason(error)}; {FREE_SPACE}"
+            return f"{error.filename or self.work}: {reason(error)}; {remedy(error, FREE_SPACE)}"
         return ""
 
     def _is_there(self) -> bool:

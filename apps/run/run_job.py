@@ -167,11 +167,18 @@ def run_to_folder(
             if unwritten is not None:
                 result = replace(result, failure=result.failure or Failure(str(unwritten)))
             folder.release()
+            result = _renamed(result, folder.named)
             report = build_report(result, checked.config, machine=machine, baseline=baseline, facts=facts)
             _tell(report, hooks)
             write_report(report, folder.work / "report.json")
             place = folder.complete()
         return RunOutcome(report, place, INTERRUPTED if stopped or late.count else _exit_code(result))
+
+
+def _renamed(result: RunResult, named: Callable[[str], str]) -> RunResult:
+    """Return `result` with what it says `named` as the reader of the report finds it."""
+    failure = result.failure and replace(result.failure, message=named(result.failure.message))
+    return replace(result, failure=failure, messages=tuple(map(named, result.messages)))
 
 
 class _Job:

@@ -21,6 +21,7 @@ RUNS = Path("runs")
 LOOK_S = 0.2
 SILENCE_NS = 1_000_000_000
 EXPECTED = "a run folder with a journal"
+MOST_NAMED = 4
 NO_RECORD = "a journal without a record"
 CUT_OFF = "the journal stops here: the run was killed, or the file is cut off; what came after is not known"
 PARTIAL = re.compile(r"(?P<name>.+)\.(?P<pid>[0-9]{1,9})\.partial")
@@ -165,9 +166,12 @@ def _missing(given: Path | None) -> BadInputError:
         return BadInputError(
             RUNS, "no run with a journal", EXPECTED, "start one with `trilane run`, or name its folder"
         )
-    parent = given.parent if len(given.parts) > 1 else RUNS
-    names = [run_name(each) for each in parent.iterdir() if each.is_dir()] if parent.is_dir() else []
-    return BadInputError(given, "no such run", EXPECTED, did_you_mean(given.name, names))
+    prefix = str(given).removesuffix(given.name)
+    folders = [*(given.parent if prefix else RUNS).glob("*/")]
+    folders += [] if prefix else [journal.parent for journal in Path().glob(f"*/{NAME}")]
+    names = sorted({run_name(folder) for folder in folders})
+    others = f"{prefix} has {', '.join(names[-MOST_NAMED:])}" if prefix and names else ""
+    return BadInputError(given, "no such run", EXPECTED, did_you_mean(given.name, names, prefix) or others)
 
 
 def run_name(folder: Path) -> str:

@@ -68,7 +68,7 @@ class LiveFigures:
     def __init__(self, begun: Begun, *, finds_bound: bool = True) -> None:
         self._graph, self._facts, self._settings = begun.graph, begun.facts, begun.settings
         self._timeline = line = Timeline(begun.graph, begun.settings, waits=finds_bound)
-        self._reckoning = Reckoning(begun.graph, begun.settings, places_of(begun), line.downs) if finds_bound else None
+        self._reckoning = Reckoning(begun.graph, begun.settings, places_of(begun), line) if finds_bound else None
         self._bound: Mapping[str, Any] | None = None
         self._first_ns: int | None = None
         self._last_ns = 0

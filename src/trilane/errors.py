@@ -11,6 +11,7 @@ from __future__ import annotations
 import errno
 import importlib.metadata
 import re
+import resource
 import shlex
 import sys
 from collections.abc import Iterable, Iterator
@@ -103,11 +104,28 @@ LONGEST_FOUND = 500
 
 
 def reason(error: Exception) -> str:
-    """Return the reason of `error` as part of a sentence: an OSError without number and path, else its own text."""
+    """Return the reason of `error` as part of a sentence: an OSError without number and path, else its own text.
+
+    A limit on the length of files is named.
+    """
     if not isinstance(error, OSError):
         return str(error)
     text = error.strerror or str(error)
-    return text[:1].lower() + text[1:]
+    limit = f": no file may have more than {_file_limit()} bytes (ulimit -f)" if _is_of_limit(error) else ""
+    return text[:1].lower() + text[1:] + limit
+
+
+def remedy(error: OSError, otherwise: str) -> str:
+    """Return what helps against a limit on the length of files, if that is what `error` is about, else `otherwise`."""
+    return "ulimit -f unlimited" if _is_of_limit(error) else otherwise
+
+
+def _is_of_limit(error: OSError) -> bool:
+    return error.errno == errno.EFBIG and _file_limit() != resource.RLIM_INFINITY
+
+
+def _file_limit() -> int:
+    return resource.getrlimit(resource.RLIMIT_FSIZE)[0]
 
 
 class TrilaneError(Exception):
@@ -164,8 +182,8 @@ class UnwrittenError(TrilaneError):
         self.path, self.error = str(path), error
 
     def __str__(self) -> str:
-        remedy = f"; {FREE_SPACE}" if self.error.errno in FULL else ""
-        return f"{self.path}: {reason(self.error)}{remedy}"
+        helps = f"; {remedy(self.error, FREE_SPACE)}" if self.error.errno in FULL else ""
+        return f"{self.path}: {reason(self.error)}{helps}"
 
 
 class UnitLostError(TrilaneError):

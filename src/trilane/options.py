@@ -127,7 +127,7 @@ class Options(BaseModel):
             first = error.errors()[0]
         name = str(first["loc"][0])
         field, where = cls.model_fields[name], cls.spelling(name) if as_typed else name
-        unexpected = unexpected_in(first) or UnexpectedValue(repr(first["input"]), _expected(field))
+        unexpected = unexpected_in(first) or UnexpectedValue(repr(first["input"]), expected(field))
         raise BadInputError.at(where, unexpected)
 
     @classmethod
@@ -142,7 +142,7 @@ class Options(BaseModel):
         try:
             return None if word == NOTHING else TypeAdapter(kind_of(field)).validate_python(word)
         except ValidationError:
-            raise BadInputError(name, repr(word), _expected(field)) from None
+            raise BadInputError(name, repr(word), expected(field)) from None
 
     def changed(self, **values: Any) -> Self:
         """Return the same options with other `values`. Raises BadInputError as `checked`."""
@@ -159,7 +159,7 @@ def _as_json(value: object) -> object:
     return str(value) if isinstance(value, PurePath) else value
 
 
-def _expected(field: FieldInfo) -> str:
+def expected(field: FieldInfo) -> str:
     """Say what a field's value must be, from its type, range and unit."""
     kind, unit = kind_of(field), option_of(field).unit
     if kind not in (int, float):

@@ -7,6 +7,8 @@ from typing import Literal, get_args
 
 #: Nanoseconds in a millisecond and in a second.
 NS_PER_MS, NS_PER_S = 1e6, 1e9
+#: Longest virtual time of a prediction, minutes.
+MAX_MINUTES = 24 * 60
 
 UnitName = Literal["cpu", "gpu", "dsp"]
 UNITS: tuple[UnitName, ...] = get_args(UnitName)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import re
 import resource
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from trilane.stages.configure import required_machine
 from trilane.transport.messages import BUILDING, Failed
 
 MB = 1 << 20
+LIMITS = Path(__file__).parents[2] / "docs" / "limits.md"
 GIGABYTE = str(1 << 30)
 
 
@@ -51,6 +53,36 @@ def test_each_shortage_says_what_is_there_and_what_is_needed(plenty: pytest.Monk
     plenty.setattr(resource, "getrlimit", lambda _kind: (900 * MB, 900 * MB))
     said = "each process may have 900 MB of addresses (ulimit -v), and a run's largest process takes 1700 MB"
     assert memory.shortage() == f"{said}: ulimit -v unlimited"
+
+
+def limit_addresses(plenty: pytest.MonkeyPatch, bytes_: int) -> None:
+    """Set the limit that a process reaches (`ulimit -S -v`); no other limit, nor the one that may be asked for, is."""
+    free = resource.RLIM_INFINITY
+    plenty.setattr(resource, "getrlimit", lambda kind: (bytes_ if kind == resource.RLIMIT_AS else free, free))
+
+
+def test_addresses_are_short_below_what_the_largest_process_takes(plenty: pytest.MonkeyPatch) -> None:
+    """docs/limits.md has the figure, and the measured one that it is rounded up from, by less than a twentieth."""
+    row = next(line for line in LIMITS.read_text().splitlines() if line.startswith("| `memory.ADDRESS_BYTES`"))
+    needed, measured_mb = int(row.split("|")[2]), int(re.findall(r"measured, .*?: (\d+) MB", row)[0])
+    assert measured_mb * MB <= needed < 1.05 * measured_mb * MB
+    limit_addresses(plenty, needed)
+    assert memory.shortage() == ""
+    limit_addresses(plenty, needed - 1)
+    said = f"(ulimit -v), and a run's largest process takes {needed // MB} MB: ulimit -v unlimited"
+    assert memory.shortage() == f"each process may have {(needed - 1) // MB} MB of addresses {said}"
+
+
+@pytest.mark.parametrize("part", [1, 2])
+def test_a_limit_of_addresses_that_no_run_fits_in_is_refused(plenty: pytest.MonkeyPatch, part: int) -> None:
+    least = memory.LEAST_ADDRESS_BYTES // part
+    limit_addresses(plenty, least)
+    memory.require_memory(part)
+    limit_addresses(plenty, least - 1)
+    with pytest.raises(TrilaneError) as raised:
+        memory.require_memory(part)
+    found = f"memory: found a limit of {(least - 1) // MB} MB of addresses (ulimit -v)"
+    assert str(raised.value) == f"{found}, expected at least 1700 MB for a run: ulimit -v unlimited"
 
 
 @pytest.mark.parametrize("part", [1, 2])

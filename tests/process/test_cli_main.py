@@ -60,7 +60,7 @@ WRONG_USAGE = {
     ("fly",): "Error: No such command 'fly'.",
     ("run", "--fly"): "Error: No such option: --fly",
     ("run", "--policy", "fly"): "error: --policy: found 'fly', expected one of sequential, pipelined, latest, deadline",
-    ("run", "--frames", "x"): "error: --frames: found 'x', expected a valid integer",
+    ("run", "--frames", "x"): "error: --frames: found 'x', expected a whole number",
 }
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import resource
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,10 +14,11 @@ from typing import Any
 import pytest
 
 from support.doubles import pipeline_of_doubles
+from trilane.apps.cli.main import _describe
 from trilane.apps.run import run_folder
 from trilane.apps.run.report import read_report
 from trilane.apps.run.run_job import Hooks, Prepared, RunOutcome, run_to_folder
-from trilane.errors import BadInputError, TrilaneError
+from trilane.errors import BadInputError, TrilaneError, UnwrittenError
 from trilane.hw_profiles.host import host_units
 from trilane.pipeline.memory import Assets
 from trilane.pipeline.result import RunResult
@@ -93,8 +96,9 @@ def test_a_disk_that_fills_keeps_the_report(
     monkeypatch.setattr(run_folder, "RESERVED_BYTES", 50_000)
     with file_limit(150_000):
         outcome = run(lambda _work: None)
-    said = "journal.msgpack: file too large; free space there or choose another --out"
-    assert outcome.exit_code == 1 and (outcome.report.failure or "").endswith(said)
+    why = "file too large: no file may have more than 150000 bytes (ulimit -f); ulimit -f unlimited"
+    said = f"{tmp_path}/a/run/journal.msgpack: {why}"  # the folder has its name by then
+    assert (outcome.exit_code, outcome.report.failure) == (1, said)
     frames = read_report(tmp_path / "a" / "run").frames
     assert frames.presented > 20
     assert frames.presented + frames.lost + (frames.not_begun or 0) == FRAMES
@@ -103,6 +107,23 @@ def test_a_disk_that_fills_keeps_the_report(
 
 
 def test_a_run_takes_the_space_of_its_report_before_it_begins(run: Callable[..., RunOutcome], tmp_path: Path) -> None:
-    with file_limit(150_000), pytest.raises(BadInputError, match="found file too large, expected a place that can be"):
+    """A limit of the process is no bad input."""
+    said = r"run: file too large: no file may have more than 150000 bytes \(ulimit -f\); ulimit -f unlimited$"
+    with file_limit(150_000), pytest.raises(UnwrittenError, match=said) as raised:
         run(lambda _work: pytest.fail("it began"))
+    assert raised.value.exit_code == 1
     assert list(tmp_path.rglob("*")) == []
+
+
+def test_a_command_in_a_folder_that_was_removed_says_so(tmp_path: Path) -> None:
+    """Other files that are missing keep their own sentence."""
+    code = "import os, shutil; shutil.rmtree(os.getcwd()); from trilane.apps.cli.main import entry; entry()"
+    for words in (("run", "--frames", "3"), ("explain", "default")):
+        folder = tmp_path / words[0]
+        folder.mkdir()
+        done = subprocess.run(
+            [sys.executable, "-c", code, *words], cwd=folder, capture_output=True, text=True, timeout=120, check=False
+        )
+        assert done.returncode == 1
+        assert done.stderr == "error: the working directory was removed; change to another one\n"
+    assert _describe(FileNotFoundError(2, "No such file or directory")) == ("the system: no such file or directory", 1)

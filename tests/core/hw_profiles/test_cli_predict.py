@@ -167,6 +167,13 @@ REFUSED = {
         "it says that the application runs the network of the file"
     ),
     ("--network", "n", "--engine-runtime", "snpe"): "--engine-runtime: found 'snpe', expected tflite or qnn_dlc",
+    ("--engine-runtime", "gpu"): (
+        "--engine-runtime: found 'gpu', expected tflite or qnn_dlc; --runtime gpu names the network's unit"
+    ),
+    **{
+        ("--minutes", each): f"--minutes: found '{each}', expected minutes, from 0 to 1440"
+        for each in ("-1", "nan", "1441", "soon")
+    },
     ("--network", "n", "--application", "--engine-runtime", "tflite"): (
         "options: found --engine-runtime, expected a --network by itself beside it; "
         "the application runs as its profile says"

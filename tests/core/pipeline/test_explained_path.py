@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from itertools import chain as chain_of
 from itertools import pairwise
 
 import pytest
 
 from trilane.pipeline.critical_path import MARGIN, Budget, Paths, Piece, Sharing, parts
-from trilane.pipeline.journal import journal_of
+from trilane.pipeline.journal import Record, Stepped, Stopped, Worked, journal_of
 from trilane.pipeline.timeline import ExplainedJob, Timeline
-from trilane.scheduler.events import Graph, Settings, chain
+from trilane.scheduler.events import Graph, JobDone, SchedulerStalled, Settings, chain
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.virtual import Simulation, simulate
 
@@ -26,13 +27,18 @@ def simulated(
     return simulate(graph, settings, lambda stage, *_: times[stage], keep=True, **driver)
 
 
-def walked(run: Simulation, kept: int = 4096) -> tuple[Paths, Budget, list[ExplainedJob]]:
-    """All jobs of a run through the paths; and the jobs that presented a frame."""
+Changed = Callable[[Record], Iterable[Record]]
+
+
+def walked(
+    run: Simulation, kept: int = 4096, changed: Changed = lambda record: [record]
+) -> tuple[Paths, Budget, list[ExplainedJob]]:
+    """All jobs of a run through the paths; and the jobs that presented a frame. `changed`: what a record becomes."""
     assert run.recording is not None
-    records = journal_of(run.recording, run.jobs, {}, {})
+    records = chain_of.from_iterable(map(changed, journal_of(run.recording, run.jobs, {}, {})))
     next(records)
     timeline = Timeline(run.recording.graph, run.recording.settings, waits=True)
-    paths = Paths(run.recording.graph, run.recording.settings, timeline.downs, kept)
+    paths = Paths(run.recording.graph, run.recording.settings, timeline.downs, timeline.stalls, kept)
     budget, shown = Budget(paths), []
     for one in (fact for record in records for fact in timeline.add(record) if isinstance(fact, ExplainedJob)):
         paths.add(one)
@@ -70,6 +76,45 @@ def test_messages_are_overhead_before_the_stage_that_they_are_for() -> None:
     assert {part: ns for part, ns in found.items() if part[0] == "overhead"} == {
         ("overhead", name): 49 * 6 for name in TIMES
     }
+
+
+def test_a_time_in_which_the_scheduler_did_not_run_is_told_from_messages() -> None:
+    """It hears 3 ns late that infer of frame 20 has ended, and was stopped then; the other 48 gaps are messages."""
+
+    def stalled(record: Record) -> list[Record]:
+        heard = isinstance(record, Stepped) and [event for event in record.events if isinstance(event, JobDone)]
+        if not heard or heard[0].unit != "dsp" or heard[0].job != 3 * 20 + 1:
+            return [record]
+        return [record._replace(events=(SchedulerStalled(3), *record.events))]
+
+    _, budget, _ = walked(simulated(Settings(50, "sequential"), message_delay_ns=3), changed=stalled)
+    found = budget.close()
+    assert (found["stalled", "show"], found["overhead", "show"]) == (6, 48 * 6)
+    assert budget.bound({"draw": "gpu", "infer": "dsp", "show": "cpu"})["bottleneck"] == "dsp"
+
+
+@pytest.mark.parametrize(
+    ("since_ns", "part"),
+    [
+        (7, {("stopped", "infer"): 30, ("asleep", "infer"): 0, ("overhead", "infer"): 49 * 6}),
+        (-1, {("stopped", "infer"): 6, ("asleep", "infer"): 30, ("overhead", "infer"): 48 * 6}),
+        (-7, {("stopped", "infer"): 0, ("asleep", "infer"): 30, ("overhead", "infer"): 49 * 6}),
+    ],
+)
+def test_a_unit_that_a_signal_stopped_neither_sleeps_nor_waits_for_messages(
+    since_ns: int, part: dict[tuple[str, str], int]
+) -> None:
+    """infer of frame 20 slept for 30 ns, and its unit was seen stopped `since_ns` after its begin, or before."""
+
+    def stopped(record: Record) -> list[Record]:
+        if not isinstance(record, Worked) or (record.job.stage, record.job.frame) != ("infer", 20):
+            return [record]
+        job = record.job._replace(asleep_ns=30)
+        return [Stopped(job.begin_ns + since_ns, "dsp"), record._replace(job=job)]
+
+    _, budget, _ = walked(simulated(Settings(50, "sequential"), message_delay_ns=3), changed=stopped)
+    found = budget.close()
+    assert {each: found.get(each, 0) for each in part} == part
 
 
 def test_a_slot_that_gets_free_late_hands_the_path_to_the_stage_behind() -> None:

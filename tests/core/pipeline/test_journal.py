@@ -24,6 +24,7 @@ from trilane.pipeline.journal import (
     Said,
     Sampled,
     Stepped,
+    Stopped,
     Worked,
     journal_of,
     read_journal,
@@ -46,6 +47,7 @@ REST: tuple[Record, ...] = (
     Counted(9, {"died:gpu": 1}, {"raster->infer:stale": 2}),
     Sampled(9, {"temperature_c.device": 31.5}),
     Said(9, "unit gpu could not be kept alive"),
+    Stopped(9, "dsp"),
     Ended(9, {"fps": 0.0, "frames": {"presented": 1}}),
 )
 

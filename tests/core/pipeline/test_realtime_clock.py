@@ -5,6 +5,7 @@ The time is set by the test; every wait, ping, standstill, booking and message i
 
 from __future__ import annotations
 
+import signal
 import threading
 from collections import Counter
 from collections.abc import Mapping
@@ -15,7 +16,7 @@ import pytest
 
 from trilane.errors import TrilaneError
 from trilane.pipeline import realtime_clock
-from trilane.pipeline.journal import Worked
+from trilane.pipeline.journal import Stopped, Worked
 from trilane.pipeline.realtime_clock import RealtimeClock
 from trilane.pipeline.result import Failure, RunLog
 from trilane.pipeline.unit_processes import UnitMessage
@@ -66,7 +67,7 @@ class World:
         self.places = {"draw": 0, "mix": 1, "show": 0}
         self.core_counts = {"gpu": 2, "cpu": 1}
         self.refuses: Exception | None = None
-        self.interrupts: Any = SimpleNamespace(fd=50, count=0)
+        self.interrupts: Any = SimpleNamespace(fd=50, count=0, continued=0, last=signal.SIGINT)
         monkeypatch.setattr(realtime_clock, "time", self)
         self.core = Core(GRAPH, Settings(9, **more.pop("settings", {})))
         self.log = RunLog()
@@ -202,6 +203,40 @@ def test_a_step_that_comes_late_says_by_how_much(
     assert clock.wait(START) == (now_ns, ())
 
 
+def test_a_signal_that_stopped_the_scheduler_is_told_with_its_time_and_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frame 0 is the oldest in flight. A process that merely had no core for so long was not stopped."""
+    world = World(monkeypatch)
+    clock = world.begun()
+    for continued, said in ((0, 0), (1, 1), (1, 1), (2, 2)):
+        clock.wait(world.now_ns)
+        world.now_ns += 3100 * MS
+        world.interrupts.continued = continued
+        assert clock.wait(world.now_ns)[1][0] == SchedulerStalled(3100 * MS)
+        text = "the scheduler itself was stopped by a signal for about 3.1 s, at frame 0"
+        assert world.log.messages == [text] * said
+    world.interrupts.continued = 3
+    world.now_ns += 700 * MS  # no longer than a step may take
+    clock.wait(world.now_ns)
+    assert len(world.log.messages) == 2
+
+
+def test_a_unit_that_is_restarted_because_it_was_stopped_is_not_said_to_end_unexpectedly(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World(monkeypatch)
+    clock = world.begun()
+    world.stopped = {"gpu"}
+    clock.perform(START, (Kill("gpu"),))
+    world.inbox = [[("gpu", None)], [("gpu", None)]]
+    clock.wait(START)
+    clock.wait(START)
+    assert world.log.messages == [
+        "unit gpu did not answer in time, because a signal has stopped it, and is restarted",
+        "unit gpu has ended and is started again; it was gpu",
+        "unit gpu ended unexpectedly and is started again; it was gpu",
+    ]
+
+
 def test_what_units_say_becomes_events_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World(monkeypatch)
     clock = world.begun()
@@ -248,6 +283,15 @@ def test_one_interrupt_stops_a_second_aborts(monkeypatch: pytest.MonkeyPatch) ->
     assert world.log.messages == ["interrupted: the frames in flight are finished; interrupt again to end at once"]
     world.interrupts.count = 2
     assert clock.wait(START)[1] == (Abort(),)
+
+
+def test_a_signal_that_nobody_typed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World(monkeypatch)
+    clock = world.begun()
+    world.interrupts.count, world.interrupts.last = 1, signal.SIGUSR1
+    clock.wait(START)
+    said = "interrupted by SIGUSR1: the frames in flight are finished; interrupt again to end at once"
+    assert world.log.messages == [said]
 
 
 def test_requests_are_heard_and_answered_when_their_frame_is_presented(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -344,6 +388,7 @@ def test_a_unit_that_was_stopped_is_told_with_its_time(monkeypatch: pytest.Monke
         world.now_ns += 500 * MS
         clock.wait(world.now_ns)
         assert world.log.messages == [f"unit gpu was stopped by a signal {text}" for text in said]
+    assert (clock.stopped(), clock.stopped()) == ([Stopped(START + 1000 * MS, "gpu")], [])
 
 
 def test_progress_is_shown_ten_times_a_second_and_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:

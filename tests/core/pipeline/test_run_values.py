@@ -24,6 +24,7 @@ from trilane.pipeline.result import Failure, RunLog, UnitError, after_stderr
 from trilane.pipeline.surroundings import prompt_answers
 from trilane.pipeline.unit_processes import UnitMessage, close_units, listen_before_run, start_units
 from trilane.scheduler.events import FrameRequest, Hold, Stop
+from trilane.signals import interrupting
 from trilane.transport.messages import Close, Closed, Failed, PongMessage, Ready
 
 S = 1_000_000_000
@@ -108,6 +109,34 @@ def test_interrupts_are_counted_wake_the_poller_and_are_given_back() -> None:
         signal.signal(signal.SIGPIPE, mine)
         signal.signal(signal.SIGHUP, others[0])
         signal.signal(signal.SIGQUIT, others[1])
+
+
+def test_each_signal_that_would_end_the_process_ends_the_run_and_a_continued_one_is_counted() -> None:
+    """SIGUSR2 has a handler of the program's own, which is left alone."""
+    heard: list[int] = []
+    before = {number: signal.getsignal(number) for number in (signal.SIGUSR1, signal.SIGUSR2, signal.SIGXCPU)}
+    try:
+        for number in before:
+            signal.signal(number, signal.SIG_DFL)
+        signal.signal(signal.SIGUSR2, lambda number, _frame: heard.append(number))
+        with interrupting(), Interrupts() as interrupts:
+            for number in (signal.SIGXCPU, signal.SIGUSR2, signal.SIGUSR1, signal.SIGCONT):
+                signal.raise_signal(number)
+            assert (interrupts.count, interrupts.last, interrupts.continued) == (2, signal.SIGUSR1, 1)
+        assert heard == [signal.SIGUSR2]
+        assert signal.getsignal(signal.SIGUSR1) == signal.getsignal(signal.SIGXCPU) == signal.SIG_DFL
+        assert signal.getsignal(signal.SIGCONT) == signal.SIG_DFL
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def test_a_signal_before_the_run_ends_a_command_as_ctrl_c_does_and_is_named(capfd: pytest.CaptureFixture[str]) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt), interrupting():
+        signal.raise_signal(signal.SIGTERM)
+    assert capfd.readouterr().err == "interrupted by SIGTERM\n"
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_interrupts_do_nothing_outside_the_main_thread() -> None:

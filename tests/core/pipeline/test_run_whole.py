@@ -24,6 +24,7 @@ from trilane.pipeline.journal import (
     Said,
     Sampled,
     Stepped,
+    Stopped,
     Worked,
     read_journal,
 )
@@ -71,6 +72,9 @@ class World:
             def ended(self) -> list[Worked]:
                 found, driver.jobs[:] = [Worked(job, {"n": 1.0}) for job in driver.jobs], []
                 return found
+
+            def stopped(self) -> list[Stopped]:
+                return []
 
         return Clock(cpu=cpu, finish=lambda: None, driver=driver, **said)
 

@@ -108,7 +108,7 @@ def test_a_value_of_another_kind_is_said_as_everywhere() -> None:
     for words, sentence in (
         (["--size", "smal"], "--size: found 'smal', expected one of small, large; did you mean 'small'?"),
         (["--size", "7"], "--size: found '7', expected one of small, large"),
-        (["--count", "abc"], "--count: found 'abc', expected a valid integer"),
+        (["--count", "abc"], "--count: found 'abc', expected a whole number"),
         (["--share", "2.5"], "--share: found '2.5', expected less than or equal to 2"),
     ):
         with pytest.raises(BadInputError) as refused:

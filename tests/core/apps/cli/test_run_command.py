@@ -122,9 +122,11 @@ REFUSED = {
     ("--check", "2", "--dashboard"): (
         "options: found --check with --dashboard, expected one of them; a run that is steered has no reference"
     ),
-    ("--latch", "-1"): "--latch: found '-1', expected greater than or equal to 0",
-    ("--latch", "1001"): "--latch: found '1001', expected less than or equal to 1000",
-    ("--baseline", "-1"): "--baseline: found '-1', expected greater than or equal to 0",
+    ("--latch", "-1"): "--latch: found '-1', expected milliseconds, from 0 to 1000",
+    ("--latch", "1001"): "--latch: found '1001', expected milliseconds, from 0 to 1000",
+    ("--latch", "nan"): "--latch: found 'nan', expected milliseconds, from 0 to 1000",
+    ("--latch", "soon"): "--latch: found 'soon', expected milliseconds, from 0 to 1000",
+    ("--baseline", "-1"): "--baseline: found '-1', expected a whole number of frames, 0 or more",
     ("--policy", "latst"): (
         "--policy: found 'latst', expected one of sequential, pipelined, latest, deadline; did you mean 'latest'?"
     ),

@@ -136,7 +136,7 @@ def test_values_are_what_the_command_makes_of_them() -> None:
     [
         ("run --sze 3", "unknown 'sze', expected an option of run; did you mean 'size'"),
         ("run --policy piplined", "'piplined', expected one of .*, pipelined.* did you mean 'pipelined'"),
-        ("run --frames x", "--frames: found 'x', expected a valid integer"),
+        ("run --frames x", "--frames: found 'x', expected a whole number"),
         ("run --size", "--size without a value"),
         ("run --dashboard", "--dashboard, expected options of the trials; it waits for a person"),
         ("run --out x", "the sweep's own --out"),

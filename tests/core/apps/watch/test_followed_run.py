@@ -125,6 +125,10 @@ def test_one_that_has_not_begun_is_waited_for() -> None:
         (None, "runs: found no run with a journal, expected a run folder with a journal; start one"),
         ("wolk", "wolk: found no such run, expected a run folder with a journal; did you mean 'walk'?"),
         ("elsewhere/walk", "elsewhere/walk: found no such run"),
+        ("runs/wolk", "runs/wolk: found no such run, .*; did you mean 'runs/walk'?"),
+        ("runs/x", r"runs/x: found no such run, expected a run folder with a journal; runs/ has old, walk$"),
+        ("dangl", "dangl: found no such run, expected a run folder with a journal$"),
+        ("mines", "mines: found no such run, .*; did you mean 'mine'?"),
         ("runs/old", r"runs/old: found no journal\.msgpack, .*; an older Trilane wrote it; run the scene again"),
         ("file", "file: found no such folder"),
         ("dangling", r"dangling: found journal\.msgpack, a link to a file that is not there, expected a run folder"),
@@ -135,6 +139,8 @@ def test_what_is_no_run_is_refused(given: str | None, said: str) -> None:
     Path("runs/old").mkdir()
     Path("runs/old/report.json").touch()
     Path("file").touch()
+    Path("mine").mkdir()
+    (Path("mine") / NAME).touch()
     Path("dangling").mkdir()
     (Path("dangling") / NAME).symlink_to("nothing")
     with pytest.raises(BadInputError, match=said):
