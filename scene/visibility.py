@@ -124,6 +124,6 @@ def _hint(scene: Scene, heights: F64) -> tuple[str, ...]:
     if not is_placed or not len(heights) or np.median(heights) >= SMALL:
         return ()
     return (
-        f"the person is hard to find, at {np.median(heights):.1%} of the picture's height in the median: if the camera "
-        "was nearer, the unit of its file is smaller, and camera.metres_per_unit states it",
+        f"the person is only {np.median(heights):.1%} of the picture's height in the median, hard to find: if the "
+        "camera was nearer, its file's unit is smaller than it was taken for; camera.metres_per_unit states it",
     )
