@@ -18,7 +18,7 @@ from trilane.errors import BadInputError
 from trilane.scene.camera.files import load_camera
 from trilane.scene.camera.path import CameraPath
 from trilane.scene.camera.recorded import UP
-from trilane.scene.camera_placement import SCORED_MOMENTS, PlacedCamera, place_camera
+from trilane.scene.camera_placement import PlacedCamera, place_camera
 from trilane.scene.footage import Footage, filmed
 from trilane.scene.mover import Mover
 from trilane.scene.schema import CameraSpec, Scene
@@ -27,6 +27,8 @@ from trilane.scene.visibility import seen_at
 
 #: Least share of the frames in which a recorded camera has to show the person.
 ENOUGH = 0.5
+#: Number of frames that are looked at; of a longer run as many, evenly spread.
+MOST_JUDGED = 120
 #: Score of the person's share of the picture's height beside the share of moments: it only breaks ties.
 HEIGHT_WEIGHT = 0.01
 #: Axes of poses that are tried: of cameras (optical, OpenGL), of robots and of aircraft.
@@ -47,7 +49,7 @@ def require_person(
     if not staged.camera.path.recorded:
         return
     share, _ = _shares(staged.camera, scene, staged.movers, bodies)
-    if share >= ENOUGH:
+    if _is_enough(share):
         return
     is_placed = scene.camera.place == "auto"
     what = "the whole person" if is_placed else "a part of the person"
@@ -58,11 +60,15 @@ def require_person(
     raise BadInputError(f"camera {scene.camera.source}", f"{found}{where}", expected, f"{remedy}; {RUNS_ANYHOW}")
 
 
+def _is_enough(share: float) -> bool:
+    return share >= ENOUGH
+
+
 def _shares(
     camera: PlacedCamera, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]
 ) -> tuple[float, float]:
     """Return the share of the frames in which the camera shows the bodies, and their mean share of its height."""
-    times = np.linspace(0.0, (scene.frames - 1) / scene.fps, min(SCORED_MOMENTS, scene.frames))
+    times = np.linspace(0.0, (scene.frames - 1) / scene.fps, min(MOST_JUDGED, scene.frames))
     seen = seen_at(times, camera, movers, bodies, (scene.output.height, scene.output.width))
     share = seen.whole.mean() if scene.camera.place == "auto" else 1 - seen.nobody.mean()
     return float(share), float(seen.height.mean())
@@ -79,7 +85,7 @@ def _remedy(scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], base: Pa
         except BadInputError:
             continue
         share, height = _shares(place_camera(path, other, staged.movers, bodies), other, staged.movers, bodies)
-        if share >= ENOUGH and share + HEIGHT_WEIGHT * height > best:
+        if _is_enough(share) and share + HEIGHT_WEIGHT * height > best:
             best, text = (
                 share + HEIGHT_WEIGHT * height,
                 f"camera.{key} = {_toml(value)} would show it in {share:.0%}, if it is true",

@@ -8,6 +8,7 @@ are on the floor, and other frames are lifted by the average of those.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F32, F64
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINT_INDEX
+from trilane.body.joints import JOINT_INDEX, JOINT_NAMES
 from trilane.body.kinematics import Skeleton
 from trilane.scene.motion.motion import Motion, bracket, rest_leg_m, wrapped_time
 from trilane.scene.rotations import about
@@ -27,6 +28,7 @@ WEIGHTS = 4
 #: Number of frames whose heights are computed together: so few that the arrays stay in the processor's cache.
 FRAMES_AT_ONCE = 16
 FEET = ("left_ankle", "right_ankle", "left_foot", "right_foot")
+HEAD = ("head", "jaw", "left_eye", "right_eye")
 #: Directions in which the outermost vertices of each joint are taken: the axes and the diagonals of a cube.
 _SIGNS = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if abs(x) + abs(y) + abs(z) in (1, 3)]
 DIRECTIONS: F64 = np.array(_SIGNS, dtype=np.float64) / np.linalg.norm(_SIGNS, axis=1, keepdims=True)
@@ -60,12 +62,15 @@ class BodyOutline:
         return np.asarray(np.einsum("tkb,kb->tk", blend, self.points))
 
 
-def outline(body: ShapedBody) -> BodyOutline:
-    """Return the outline of the vertices furthest along each of DIRECTIONS, among those that each joint moves most."""
+def outline(body: ShapedBody, joints: Collection[str] = JOINT_NAMES) -> BodyOutline:
+    """Return the outline of the vertices furthest along each of DIRECTIONS, among those that each joint moves most.
+
+    `joints`: names of the joints that count.
+    """
     weights, rest = body.body.weights, body.vertices.astype(np.float64)
     owner = weights.argmax(axis=1)
     picked: set[int] = set()
-    for joint in np.unique(owner):
+    for joint in np.unique(owner[np.isin(owner, [JOINT_INDEX[name] for name in joints])]):
         own = np.flatnonzero(owner == joint)
         picked.update(own[(rest[own] @ DIRECTIONS.T).argmax(axis=0)].tolist())
     index = np.array(sorted(picked))

@@ -6,6 +6,7 @@ file never change, except paths, which are made absolute.
 
 from __future__ import annotations
 
+import json
 import math
 import tomllib
 from collections.abc import Mapping
@@ -33,6 +34,7 @@ from trilane.unexpected_value import UnexpectedValue, unexpected_in
 
 MAX_DEPTH_RATIO = 1e6  # largest ratio of far to near clip plane; beyond it a depth buffer of 24 bits is too coarse
 AUTO = "auto"  # size of a planned tensor
+BUILT_IN_PREFIX = "builtin:"
 LEAST_FPS = 1e-3  # far below that, a period in nanoseconds overflows
 LONGEST_S = 1e6  # longest motion
 FARTHEST_M = 1e4  # farthest avatar from the scene's origin; there float32 still resolves millimetres
@@ -138,6 +140,10 @@ def _camera_axes(text: str) -> str:
     return text
 
 
+#: Keys of a camera that say how its file is read.
+FILE_KEYS = ("format", "up_axis", "metres_per_unit", "rate_hz", "axes")
+
+
 class CameraSpec(Table):
     """The camera.
 
@@ -161,6 +167,17 @@ class CameraSpec(Table):
     near_m: float = Field(default=0.05, gt=0, allow_inf_nan=False)
     far_m: float = Field(default=100.0, gt=0, allow_inf_nan=False)
     place: Literal["auto", "none"] = "auto"
+
+    @model_validator(mode="after")
+    def _is_of_a_file(self) -> Self:
+        """Refuse keys that say how a file is read where none is."""
+        for key in FILE_KEYS if self.source.startswith(BUILT_IN_PREFIX) else ():
+            value = getattr(self, key)
+            if value != type(self).model_fields[key].default:
+                found = f"{key} = {json.dumps(value)} with source = {json.dumps(self.source)}"
+                expected = f"{key} with a file alone: a built-in camera has none"
+                raise UnexpectedValue(found, expected, "remove it, or name the file in camera.source")
+        return self
 
     @model_validator(mode="after")
     def _near_before_far(self) -> Self:
@@ -284,7 +301,6 @@ EXPECTED = {
 IN_STEPS = ("multiple_of", "greater_than_equal", "less_than_equal")
 #: Reason why a key cannot have its value, where the range alone does not tell.
 REASONS = {"error_budget_px": "numbers are rounded, so nothing is drawn without an error"}
-BUILT_IN_PREFIX = "builtin:"
 BUILT_IN = ("room", "default", "hiker")  # a background, and avatars
 
 

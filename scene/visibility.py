@@ -6,7 +6,7 @@ clip planes. Nobody is seen when all points of every body are beyond one side of
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -14,11 +14,14 @@ import numpy as np
 
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody
+from trilane.body.joints import JOINT_NAMES
 from trilane.body.kinematics import Skeleton
 from trilane.scene.mover import Mover, outline
-from trilane.scene.schema import Scene
+from trilane.scene.schema import BUILT_IN_PREFIX, Scene
 from trilane.shapes import Shape
 
+#: Share of the picture's height below which a person is hard to find, in the median over the frames.
+SMALL = 0.08
 #: Number of frames that are looked at; of a longer run as many, evenly spread.
 MOST_FRAMES = 300
 
@@ -48,13 +51,20 @@ class Seen:
     height: F64
 
 
-def seen_at(times_s: F64, camera: Camera, movers: Sequence[Mover], bodies: Sequence[ShapedBody], output: Shape) -> Seen:
+def seen_at(
+    times_s: F64,
+    camera: Camera,
+    movers: Sequence[Mover],
+    bodies: Sequence[ShapedBody],
+    output: Shape,
+    joints: Collection[str] = JOINT_NAMES,
+) -> Seen:
     """Return what `camera` shows of the `movers` with `bodies` at `times_s` (F,).
 
-    `output`: (height, width) of the picture.
+    `output`: (height, width) of the picture. `joints`: names of the joints whose part of a body is looked at.
     """
     actors = [
-        (mover, Skeleton(body.joints, body.body.parents), outline(body))
+        (mover, Skeleton(body.joints, body.body.parents), outline(body, joints))
         for mover, body in zip(movers, bodies, strict=True)
     ]
     rows = []
@@ -91,7 +101,10 @@ def _shown(clip: F64) -> tuple[float, float, float]:
 
 
 def seen_notes(camera: Camera, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> tuple[str, ...]:
-    """Say in how many of the run's frames the bodies are whole in the picture, in how many nobody is, and how large."""
+    """Say in how many of the run's frames the bodies are whole in the picture, in how many nobody is, and how large.
+
+    A recorded camera that was placed and shows them very small gets a hint at the key that may be wrong.
+    """
     count = min(scene.frames, MOST_FRAMES)
     frames = np.arange(count) * scene.frames // count
     seen = seen_at(frames / scene.fps, camera, movers, bodies, (scene.output.height, scene.output.width))
@@ -102,4 +115,15 @@ def seen_notes(camera: Camera, scene: Scene, movers: Sequence[Mover], bodies: Se
     parts += [f"a part of it in {1 - whole - nobody:.0%}"] if round(1 - whole - nobody, 9) else []
     parts += [f"nobody in {nobody:.0%}"] if nobody else []
     parts += [f"{height:.0%} of its height on average"] if nobody < 1 else []
-    return (", ".join(parts),)
+    return (", ".join(parts), *_hint(scene, seen.height[seen.nobody == 0]))
+
+
+def _hint(scene: Scene, heights: F64) -> tuple[str, ...]:
+    """Return a note where `heights` (F,), shares of the picture's height, are small for want of the right unit."""
+    is_placed = scene.camera.place == "auto" and not scene.camera.source.startswith(BUILT_IN_PREFIX)
+    if not is_placed or not len(heights) or np.median(heights) >= SMALL:
+        return ()
+    return (
+        f"the person is only {np.median(heights):.1%} of the picture's height in the median, hard to find: if the "
+        "camera was nearer, its file's unit is smaller than it was taken for; camera.metres_per_unit states it",
+    )

@@ -27,7 +27,7 @@ from trilane.pipeline.memory import Assets
 from trilane.scene.footage import Footage
 from trilane.scene.missing_person import require_person
 from trilane.scene.planner import TensorBudget
-from trilane.scene.schema import Scene, find_scene, load_scene, located, scene_from
+from trilane.scene.schema import BUILT_IN_PREFIX, FILE_KEYS, Scene, find_scene, load_scene, located, scene_from
 from trilane.scene.staging import Staged, stage_scene
 from trilane.stages.avatar_assets import AvatarData, load_avatar, pack_assets, require_one_tensor
 from trilane.stages.config import NetworkCut, RunConfig
@@ -70,14 +70,14 @@ def requested_scene(options: RunOptions) -> Scene:
     """Return the scene file with the options laid over it. Raises BadInputError.
 
     An option that is a key of the scene replaces its value. A motion or camera from the options drops the format that
-    the scene states for its own file.
+    the scene states for its own file; a built-in camera drops all that the scene states about it.
     """
     values = load_scene(find_scene(options.scene))
     here = Path.cwd()
     as_keys: dict[str, Callable[[str], Any]] = {
         "output": _output,
         "background": lambda text: located(text, here),
-        "camera": lambda text: values["camera"] | {"source": located(text, here), "format": "auto"},
+        "camera": lambda text: _camera(values["camera"], located(text, here)),
     }
     for name, value in options:
         if name in Scene.model_fields and value is not None:
@@ -89,6 +89,12 @@ def requested_scene(options: RunOptions) -> Scene:
         first["bundle"] = located(options.avatar, here)
     values["avatars"] = [first, *values["avatars"][1:]]
     return scene_from(COMMAND_LINE, values)
+
+
+def _camera(values: Mapping[str, Any], source: str) -> dict[str, Any]:
+    """Return the scene's `values` for another `source`: without the format of a file, for a built-in one all of it."""
+    dropped = FILE_KEYS if source.startswith(BUILT_IN_PREFIX) else ("format",)
+    return {key: value for key, value in values.items() if key not in dropped} | {"source": source}
 
 
 def _output(text: str) -> dict[str, int]:

@@ -123,7 +123,8 @@ class CameraPath:
     of the photo of each sample; empty where the file names none. `quarter`: number of quarters by which the camera's
     picture was turned clockwise. `is_held`: whether each sample holds, halfway to its neighbours, because its photo
     does. `repeat_s`: time after which the path starts again, as its background does; 0 for `wrap` alone. `began_s`:
-    time of the recording, seconds since 1970; None where the file does not say it.
+    time of the recording, seconds since 1970; None where the file does not say it. `is_closeup`: whether it is made for
+    a head, and not for a whole body.
     """
 
     times_s: F64
@@ -139,6 +140,7 @@ class CameraPath:
     is_held: bool = False
     repeat_s: float = 0.0
     began_s: float | None = None
+    is_closeup: bool = False
 
     @property
     def duration_s(self) -> float:
@@ -197,6 +199,7 @@ class CameraPath:
 
 FOV_Y_DEG = 40.0
 RATE_HZ = 30
+HEAD_AND_SHOULDERS = "head and shoulders"
 
 
 @dataclass(frozen=True)
@@ -254,7 +257,7 @@ class Stand:
 ORBITS = {
     "orbit": Orbit("whole person, going round, coming nearer", (0.0, 0.93, 0.0), 1.35, 3.9, 3.4, 28.0, 20.0),
     "static": Orbit("whole person, standing still", (0.0, 0.93, 0.0), 1.30, 3.8, 3.8, 0.0, 20.0),
-    "closeup": Orbit("head and shoulders", (0.0, 1.50, 0.0), 1.58, 1.15, 0.95, 16.0, 12.0),
+    "closeup": Orbit(HEAD_AND_SHOULDERS, (0.0, 1.50, 0.0), 1.58, 1.15, 0.95, 16.0, 12.0),
     "far": Orbit("whole person, far off", (0.0, 1.00, 0.0), 1.60, 10.0, 8.0, 10.0, 20.0),
 }
 
@@ -282,4 +285,7 @@ def load_builtin(name: str, spec: CameraSpec) -> CameraPath | None:
     fov = FOV_Y_DEG if spec.fov_y_deg is None else spec.fov_y_deg
     notes = (f"built in: {camera.what}, {_pace(camera)}, field of view {fov:g} degrees high",)
     quats = quat_from_matrix(axes_towards(places, np.array(camera.target)))
-    return CameraPath(times, quats, places, one_lens(fov, spec.near_m, spec.far_m), notes, Wrap.LOOP, recorded=False)
+    optics = one_lens(fov, spec.near_m, spec.far_m)
+    return CameraPath(
+        times, quats, places, optics, notes, Wrap.LOOP, recorded=False, is_closeup=camera.what == HEAD_AND_SHOULDERS
+    )

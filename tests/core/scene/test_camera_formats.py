@@ -265,7 +265,8 @@ def test_a_map_without_unit_is_scaled_by_where_its_cameras_look() -> None:
     assert "at 125 m/s its unit can be no metre" in fast[1][0]
     kept = metres_per_unit(turns, places, times, 60.0, LengthUnit.NONE, CameraSpec(place="none"))
     assert kept[0] == 1.0 and "as camera.place is none" in kept[1][0]
-    given_ = metres_per_unit(turns, places, times, 60.0, LengthUnit.NONE, CameraSpec(metres_per_unit=0.25))
+    given = CameraSpec(source="a.txt", metres_per_unit=0.25)
+    given_ = metres_per_unit(turns, places, times, 60.0, LengthUnit.NONE, given)
     assert given_ == (0.25, ("1 unit of the file is 0.25 m, as given",))
     still = metres_per_unit(turns[:1], places[:1], times[:1], 60.0, LengthUnit.NONE, spec)
     assert still[0] == 1.0

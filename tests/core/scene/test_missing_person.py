@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from support.camera_files import OPTICAL, write_tum
 from trilane.arrays import F64
@@ -81,6 +82,24 @@ def test_the_frames_of_the_run_are_judged(tmp_path: Path, body: ShapedBody) -> N
     away_s = load_camera(CameraSpec(source=str(path)), Path("/")).times_s[29]
     assert "in 0% of the run's frames" in refused(path, body, int(away_s * 30), place="none")
     assert refused(path, body, int(away_s * 30 * 3), place="none") == ""
+
+
+@pytest.mark.parametrize(("shown", "is_taken"), [(1, False), (2, True), (3, True)])
+def test_half_of_the_frames_is_enough(shown: int, is_taken: bool, tmp_path: Path, body: ShapedBody) -> None:
+    """Of four frames one, two or three look at the person, who stands 3.5 m ahead."""
+    turns = about(1, np.where(np.arange(4) < shown, 0.0, np.pi))
+    path = write_tum(tmp_path, Z_UP @ turns, np.tile([0.0, -3.5, 1.0], (4, 1)))
+    assert (refused(path, body, 4, place="none") == "") == is_taken
+
+
+def test_people_far_apart_are_shown_from_far_off(tmp_path: Path, body: ShapedBody) -> None:
+    """Two people 250 m apart: no unit and no axes are wrong, the camera only has to stand far off."""
+    path = write_tum(tmp_path, Z_UP @ np.tile(np.eye(3), (9, 1, 1)), np.zeros((9, 3)))
+    people = tuple(AvatarSpec(motion="builtin:idle", position=(x, 0.0, 0.0)) for x in (-125.0, 125.0))
+    scene = Scene(camera=CameraSpec(source=str(path)), avatars=people, background="film.mp4")
+    staged = stage_scene(scene, [body, body], Path("/"))
+    require_person(scene, staged, [body, body], Path("/"))
+    assert any(note.startswith("camera: whole body in the picture in 100%") for note in staged.notes)
 
 
 def test_a_built_in_camera_is_never_refused(body: ShapedBody) -> None:

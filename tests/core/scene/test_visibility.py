@@ -50,6 +50,18 @@ def test_half_as_near_half_as_large(body: ShapedBody, distance: float) -> None:
     )
 
 
+@pytest.mark.parametrize(("distance", "hint"), [(18.0, False), (20.0, True)])
+def test_a_person_of_a_twelfth_of_the_height_gets_a_hint(body: ShapedBody, distance: float, hint: bool) -> None:
+    """1.7 m are 8 % of the height of this lens 18.4 m off. Only a camera from a file that was placed has a unit."""
+    mover, path = standing(body), film([np.eye(3)], [[0.0, 0.9, distance]])
+    camera = place_camera(path, Scene(camera=CameraSpec(place="none")), [mover], [body])
+    for spec, said in ((CameraSpec(source="a.txt"), hint), (CameraSpec(), False)):
+        notes = seen_notes(camera, Scene(camera=spec), [mover], [body])
+        assert any("camera.metres_per_unit" in note for note in notes) == said
+    unplaced = Scene(camera=CameraSpec(source="a.txt", place="none"))
+    assert len(seen_notes(camera, unplaced, [mover], [body])) == 1
+
+
 def test_all_frames_of_the_run_count(body: ShapedBody) -> None:
     """Of ten frames four look at the person, three past the feet, and three the other way."""
     away, down, ahead = rot.about(1, math.pi), rot.about(0, math.radians(35)), np.eye(3)

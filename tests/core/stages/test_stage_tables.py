@@ -18,7 +18,7 @@ from trilane.errors import BadInputError, MissingPartError
 from trilane.figure_sources import NO_FIGURES
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.memory import BYTES
-from trilane.scene.schema import AvatarSpec, OutputSpec, Scene
+from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, Scene
 from trilane.scene.staging import stage_scene
 from trilane.stages import avatar_assets, avatar_pipeline, configure
 from trilane.stages.config import NetworkCut, RunConfig
@@ -147,6 +147,16 @@ def test_rate_and_output_are_laid_over_the_scene() -> None:
         with pytest.raises(BadInputError) as raised:
             configure.requested_scene(RunOptions(output=output))
         assert str(raised.value) == sentence
+
+
+def test_a_camera_of_the_command_line_drops_what_the_scene_says_of_its_own_file(tmp_path: Path) -> None:
+    """All of it where a built-in one has no file; another file keeps all but the format."""
+    scene = tmp_path / "mine.toml"
+    scene.write_text("[camera]\nsource = 'a.txt'\nformat = 'tum'\nup_axis = 'z'\nrate_hz = 10\nfov_y_deg = 50\n")
+    built_in = configure.requested_scene(RunOptions(scene=str(scene), camera="builtin:far")).camera
+    assert built_in == CameraSpec(source="builtin:far", fov_y_deg=50.0)
+    other = configure.requested_scene(RunOptions(scene=str(scene), camera=str(tmp_path / "b.txt"))).camera
+    assert (other.format, other.up_axis, other.rate_hz) == ("auto", "z", 10.0)
 
 
 def test_an_edge_is_one_of_the_rules() -> None:
