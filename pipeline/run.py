@@ -141,6 +141,9 @@ def run_pipeline(
     check_open_files()
     check_cores(pipeline)
     settings = _stepped(_settings(policy, frames, fps, pace_fps, hang_ns, latch_ms, requests), works, follow)
+    if not pipeline.graph().is_chain and (settings.latch_ns or settings.works or requests is not None):
+        expected = "a chain of stages, or none of latching, a ladder of work and requests for frames"
+        raise BadInputError("the run's settings", "a pipeline with stages that have a list of inputs", expected)
     with recorded(journal, pipeline.graph(), settings, governor) as record:
         log = RunLog(record.say, *([on_message] if on_message is not None else []))
         with (
@@ -215,12 +218,13 @@ class _Run:
         self._startup_ms = start_units(self._processes, self._core.graph.units, self._interrupts)
         self.pids = self._processes.pids
         graph, settings = self._core.graph, self._core.settings
-        # The last stage writes files, so the frames before the run leave it out.
-        chain = Chain(graph, dict.fromkeys(graph.units, self._processes), self._interrupts, whole=False)
-        if settings.works:
-            few = _spread(settings.frames, FRAMES_ON_RUNGS)
-            self._clock.first += on_rungs(chain, few, len(settings.works), settings.follow)
-        chain.frame(0)
+        if graph.is_chain:  # the stages of a graph may count their calls, so they see the run's own frames alone
+            # The last stage writes files, so the frames before the run leave it out.
+            chain = Chain(graph, dict.fromkeys(graph.units, self._processes), self._interrupts, whole=False)
+            if settings.works:
+                few = _spread(settings.frames, FRAMES_ON_RUNGS)
+                self._clock.first += on_rungs(chain, few, len(settings.works), settings.follow)
+            chain.frame(0)
         others = beside_units(self._cores, self.pids)
         self._record.begin(self._clock, lambda: self._processes.pids)
         try:
