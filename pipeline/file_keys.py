@@ -1,0 +1,467 @@
+"""The keys of a pipeline file, each as one field: its type, its range and what it means.
+
+Rule: this module knows one value at a time. What must fit together is in `pipeline_file.py`. docs/pipeline-file.md has
+its tables from the descriptions here. Nothing is opened and nothing is imported for a file: it may be a stranger's.
+"""
+
+from __future__ import annotations
+
+import math
+import posixpath
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Final, Literal, Self
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+from trilane.errors import did_you_mean
+from trilane.options import one_of
+from trilane.pipeline.description import FACTORY, LONGEST_NAME
+from trilane.scheduler.policy import POLICIES
+from trilane.transport.slots import edge_rule
+from trilane.unexpected_value import UnexpectedValue
+from trilane.units import UNITS
+
+MOST_STAGES: Final = 64
+MOST_SAMPLES: Final = 1_000_000
+MOST_FRAMES: Final = 1_000_000
+MOST_PORT_BYTES: Final = 256 << 20
+LONGEST_SIDE: Final = 16_384  # of a picture, in pixels
+LONGEST_MS: Final = 3.6e6  # of a stage, an hour
+NAME: Final = rf"^[\w-]{{1,{LONGEST_NAME}}}$"
+#: Types of numbers in a port, by NumPy's name.
+TYPES: Final = {
+    "u8": "uint8",
+    "i8": "int8",
+    "u16": "uint16",
+    "i16": "int16",
+    "i32": "int32",
+    "i64": "int64",
+    "f16": "float16",
+    "f32": "float32",
+    "f64": "float64",
+    "bool": "bool",
+}
+
+
+def shown(value: object) -> str:
+    """Return a wrong value as a message shows it."""
+    if isinstance(value, Mapping):
+        return "a table"
+    if isinstance(value, list):
+        return "a list"
+    text = repr(value) if not isinstance(value, bool) else str(value).lower()
+    return text if len(text) < 80 else f"{text[:77]}..."
+
+
+def is_number(value: object) -> bool:
+    """Say whether a value of the file is a number; true and false are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+class Keys(BaseModel):
+    """Base of all tables: unknown keys and values of another type are errors, and values never change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    @classmethod
+    def known(cls) -> list[str]:
+        """The keys of the table, as the file has them."""
+        return [field.alias or name for name, field in cls.model_fields.items()]
+
+
+def _rule(text: str | None) -> str | None:
+    if text is not None:
+        edge_rule(text)
+    return text
+
+
+def _as_tuple(value: object) -> object:
+    return tuple(value) if isinstance(value, list) else value
+
+
+EdgeRule = Annotated[str, AfterValidator(_rule)]
+Rate = Annotated[float, Field(ge=0.001, le=1e6, allow_inf_nan=False)]
+Side = Annotated[int, Field(ge=1, le=LONGEST_SIDE)]
+
+
+class Arrivals(Keys):
+    """When frames arrive. `poisson`: mean rate of arrivals that are independent of each other, frames a second."""
+
+    poisson: Rate = Field(description="Mean rate in frames a second; arrivals are independent of each other.")
+
+
+class RunKeys(Keys):
+    """The table [run]."""
+
+    fps: Rate | None = Field(default=None, description="Frames a second that the source gives, under each policy.")
+    arrivals: Arrivals | None = Field(
+        default=None, description="`{ poisson = RATE }` instead of fps: a source without a beat, for queues."
+    )
+    policy: Annotated[str, one_of(*POLICIES)] = Field(
+        default="pipelined",
+        description="sequential, pipelined, latest or deadline; the last two need fps or arrivals.",
+    )
+    edge: EdgeRule | None = Field(
+        default=None,
+        description="Rule of each stream that [edges] does not name: single, double, triple, fifo:N or orphan:N. "
+        "Without it double, and more where branches meet.",
+    )
+    in_flight: int = Field(default=0, ge=0, le=1000, description="Most frames on their way at once; 0: no limit.")
+    in_queue: int = Field(
+        default=0, ge=0, le=MOST_FRAMES, description="Most frames that wait before the first stage; 0: no limit."
+    )
+    latency_to: str = Field(
+        default="", description="Stage at whose end the latency ends; without it the last one that nobody reads."
+    )
+    frames: int | None = Field(default=None, ge=1, le=MOST_FRAMES, description="Frames of a run.")
+
+
+class UnitKeys(Keys):
+    """A unit in the table [units]."""
+
+    hardware: Annotated[str, one_of(*UNITS)] | None = Field(
+        default=None, description="Unit of a hardware profile that it is: cpu, gpu or dsp; without it that of its name."
+    )
+    cores: Annotated[tuple[Annotated[int, Field(ge=0, le=4095)], ...], BeforeValidator(_as_tuple)] | None = Field(
+        default=None, min_length=1, description="Cores of this machine that it may use, such as [0, 1]."
+    )
+    threads: int | None = Field(default=None, ge=1, le=4096, description="Threads that it may use.")
+
+
+@dataclass(frozen=True)
+class PortType:
+    """What a port carries: `dtype` is a key of TYPES, `shape` has the sizes of its axes."""
+
+    dtype: str
+    shape: tuple[int, ...]
+
+    @property
+    def payload_bytes(self) -> int:
+        return math.prod(self.shape) * _bytes_of(self.dtype)
+
+    def __str__(self) -> str:
+        return " ".join([self.dtype, "x".join(map(str, self.shape))]).strip()
+
+
+def _bytes_of(dtype: str) -> int:
+    return 1 if dtype == "bool" else int(dtype[1:]) // 8
+
+
+def port_type(text: object) -> PortType:
+    """Read `u8 256x256x3`. Raises UnexpectedValue."""
+    expected = f"a type and sizes, such as 'u8 256x256x3', of at most {MOST_PORT_BYTES >> 20} MiB"
+    found = re.fullmatch(r"(\w+) (\d{1,9}(?:x\d{1,9}){0,7})", text) if isinstance(text, str) else None
+    if found is None:
+        raise UnexpectedValue(shown(text), expected)
+    if found[1] not in TYPES:
+        raise UnexpectedValue(f"type {found[1]!r}", f"one of {', '.join(TYPES)}", did_you_mean(found[1], TYPES))
+    port = PortType(found[1], tuple(map(int, found[2].split("x"))))
+    if not 0 < port.payload_bytes <= MOST_PORT_BYTES:
+        raise UnexpectedValue(f"{text!r}, {port.payload_bytes} bytes", expected)
+    return port
+
+
+def _ports(value: object) -> object:
+    """Read the ports that a stage writes, by name; the name of a lone one is empty."""
+    if not isinstance(value, dict):
+        return {"": port_type(value)}
+    if not value:
+        raise UnexpectedValue("an empty table", "a port, such as { boxes = 'f32 32x5' }")
+    for name in value:
+        if not re.fullmatch(NAME, name):
+            raise UnexpectedValue(f"port {name!r}", f"letters, digits, _ and -, at most {LONGEST_NAME}")
+    return {name: port_type(each) for name, each in value.items()}
+
+
+@dataclass(frozen=True)
+class StageInput:
+    """What a port of a stage reads.
+
+    `port`: name of the port; empty where the file names a stage alone.
+    `stage`, `from_port`: stage that writes it, and its port; empty for the only one.
+    `latest`: whether it takes the newest frame that there is, not the frame of the other inputs.
+    `max_age_ms`: age from which on the newest frame counts as absent; 0: no such age.
+    """
+
+    port: str
+    stage: str
+    from_port: str = ""
+    latest: bool = False
+    max_age_ms: float = 0.0
+
+
+class InputKeys(Keys):
+    """An input that is written as a table."""
+
+    source: str = Field(alias="from", description="Stage, or stage.port, that it reads.")
+    sync: Literal["frame", "latest"] = Field(
+        default="frame",
+        description="frame: the same frame as the other inputs; latest: the newest that there is.",
+    )
+    max_age_ms: float | None = Field(
+        default=None,
+        gt=0,
+        le=LONGEST_MS,
+        allow_inf_nan=False,
+        description="Age from which on the newest frame counts as absent; only beside sync = 'latest'.",
+    )
+
+    @model_validator(mode="after")
+    def _age_of_latest(self) -> Self:
+        if self.max_age_ms is not None and self.sync != "latest":
+            raise UnexpectedValue("max_age_ms beside sync = 'frame'", "sync = 'latest'")
+        return self
+
+
+def read_input(port: str, value: object) -> StageInput:
+    """Read one input. `port`: name of the port; empty without one. Raises UnexpectedValue or pydantic's error."""
+    if isinstance(value, dict):
+        keys = InputKeys.model_validate(value)
+    elif isinstance(value, str):
+        keys = InputKeys.model_validate({"from": value})
+    else:
+        raise UnexpectedValue(shown(value), "a stage, stage.port, or a table { from, sync, max_age_ms }")
+    stage, dot, from_port = keys.source.partition(".")
+    if not stage or (dot and not from_port):
+        raise UnexpectedValue(repr(keys.source), "a stage, or stage.port")
+    return StageInput(port, stage, from_port, keys.sync == "latest", keys.max_age_ms or 0.0)
+
+
+class StageTime(Keys):
+    """The time of one job of a stage, in ms: one of `mean`, `exponential` and `samples`; `sd` beside `mean`."""
+
+    mean: float | None = Field(default=None, ge=0, le=LONGEST_MS, allow_inf_nan=False, description="Mean, ms.")
+    sd: float = Field(
+        default=0.0,
+        ge=0,
+        le=LONGEST_MS,
+        allow_inf_nan=False,
+        description="Standard deviation beside mean, ms; times are lognormal.",
+    )
+    exponential: float | None = Field(
+        default=None, ge=0, le=LONGEST_MS, allow_inf_nan=False, description="Mean of exponential times, ms."
+    )
+    samples: Annotated[
+        tuple[Annotated[float, Field(ge=0, le=LONGEST_MS, allow_inf_nan=False)], ...], BeforeValidator(_as_tuple)
+    ] = Field(default=(), description="Measured times, ms; each frame draws one of them.")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_table(cls, value: Any) -> Any:
+        if is_number(value):
+            return {"mean": value}
+        if not isinstance(value, dict):
+            raise UnexpectedValue(shown(value), "a time in ms, or a table of mean and sd, exponential, or samples")
+        samples = value.get("samples", ())
+        if isinstance(samples, list) and not 1 <= len(samples) <= MOST_SAMPLES:
+            raise UnexpectedValue(f"{len(samples)} samples", f"1 to {MOST_SAMPLES}")
+        return value
+
+    @model_validator(mode="after")
+    def _one_of_three(self) -> Self:
+        given = [self.mean is not None, self.exponential is not None, bool(self.samples)]
+        if sum(given) != 1 or (self.sd and self.mean is None):
+            found = ", ".join(name for name in type(self).model_fields if name in self.model_fields_set) or "no key"
+            raise UnexpectedValue(found, "mean with or without sd, exponential, or samples")
+        if self.sd and not self.mean:
+            raise UnexpectedValue("sd beside mean = 0", "a mean above 0")
+        return self
+
+    @property
+    def mean_ms(self) -> float:
+        """The mean of the times."""
+        if self.samples:
+            return math.fsum(self.samples) / len(self.samples)
+        return (self.mean if self.exponential is None else self.exponential) or 0.0
+
+    @property
+    def varies(self) -> bool:
+        """Whether one job's time may differ from another's."""
+        return bool(self.sd or self.exponential or len(set(self.samples)) > 1)
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Read `640x480` as width and height in pixels."""
+    found = re.fullmatch(r"(\d{1,9})x(\d{1,9})", text)
+    if found is None:
+        raise UnexpectedValue(repr(text), "WIDTHxHEIGHT in pixels, such as 640x480")
+    sides = int(found[1]), int(found[2])
+    if not 1 <= min(sides) <= max(sides) <= LONGEST_SIDE:
+        raise UnexpectedValue(repr(text), f"sides of 1 to {LONGEST_SIDE} pixels")
+    return sides
+
+
+def _read_size(value: object) -> object:
+    return _size(value) if isinstance(value, str) else value
+
+
+Size = Annotated[tuple[int, int], BeforeValidator(_read_size)]
+
+
+def _inside(text: str) -> str:
+    """Refuse a path that leads out of the file's folder; the file may be a stranger's."""
+    normal = posixpath.normpath(text)
+    if not text or "\0" in text or "\\" in text or normal in (".", "..") or normal.startswith(("/", "../")):
+        remedy = "copy the file there, or put a link to it there"
+        raise UnexpectedValue(repr(text), "a path inside the folder of the pipeline file", remedy)
+    return text
+
+
+InsidePath = Annotated[str, Field(max_length=1000), AfterValidator(_inside)]
+SIZE_HELP = "Width and height in pixels, such as '640x480'"
+
+
+class StageKeys(Keys):
+    """The keys that every stage may have.
+
+    `kind`: key that says what the stage is. `in_ports`: ports that it can read, and whether it needs them; None where
+    that is not known from the file. `out_ports`: names of the ports that it writes; None where that is not known.
+    """
+
+    kind: ClassVar[str]
+    in_ports: ClassVar[Mapping[str, bool] | None] = None
+
+    unit: str = Field(pattern=NAME, description="Unit that does it; a name of your choice.")
+    inputs: tuple[StageInput, ...] = Field(
+        default=(), alias="in", description="What it reads: a stage, stage.port, or a table of ports."
+    )
+    every: int = Field(default=1, ge=1, le=1000, description="3: it takes the first frame, the fourth and so on.")
+    out: Annotated[dict[str, PortType] | None, BeforeValidator(_ports)] = Field(
+        default=None,
+        description="What it writes: a type and sizes, such as 'u8 256x256x3', or a table of ports.",
+    )
+    stateful: bool = Field(
+        default=False, description="Whether it remembers frames, so that it is never called out of order."
+    )
+    scale: dict[str, Annotated[float, Field(gt=0, le=1e4, allow_inf_nan=False)]] = Field(
+        default={}, description="How many times longer it takes on a chip than here, such as { snapdragon-888 = 2.1 }."
+    )
+    time_ms: StageTime | None = Field(
+        default=None,
+        description="Time of a job in ms: a number, { mean, sd }, { exponential } or { samples = [...] }.",
+    )
+
+    @property
+    def named_kind(self) -> str:
+        """The kind as `trilane check` says it."""
+        return self.kind
+
+    @property
+    def out_ports(self) -> tuple[str, ...] | None:
+        return None if self.out is None else tuple(self.out)
+
+
+class TimedStage(StageKeys):
+    """A time alone: no model, no code."""
+
+    kind = "time_ms"
+
+
+class OnnxStage(StageKeys):
+    """A network."""
+
+    kind = "onnx"
+    onnx: InsidePath = Field(description="Network, an ONNX file in this folder.")
+    precision: Annotated[str, one_of("int8", "fp16", "fp32")] | None = Field(
+        default=None, description="int8, fp16 or fp32 on a chip; as the network says and its unit has it."
+    )
+    shapes: dict[str, Annotated[tuple[Annotated[int, Field(ge=1, le=1 << 24)], ...], BeforeValidator(_as_tuple)]] = (
+        Field(
+            default={}, description="Shapes of inputs whose sizes the file leaves open: { image = [1, 3, 224, 224] }."
+        )
+    )
+
+
+class PythonStage(StageKeys):
+    """Own code."""
+
+    kind = "python"
+    python: str = Field(pattern=FACTORY, description="`module:factory`, a module in this folder or an installed one.")
+
+
+class BlockStage(StageKeys):
+    """A built-in block."""
+
+    kind = "block"
+    block: str = Field(description="Built-in stage: video, prepare, overlay, encode, discard or busy.")
+
+    @property
+    def named_kind(self) -> str:
+        return self.block
+
+
+class VideoBlock(BlockStage):
+    """Reads a video, a camera or a folder of pictures."""
+
+    in_ports = {}
+    path: InsidePath = Field(description="A video, a folder of pictures, or the number of a camera.")
+    size: Size = Field(description=f"{SIZE_HELP}; pictures are scaled to it.")
+
+    @property
+    def is_camera(self) -> bool:
+        return self.path.isdecimal()
+
+
+class PrepareBlock(BlockStage):
+    """Makes of a picture what a network expects."""
+
+    in_ports = {"": True}
+    like: str = Field(pattern=NAME, description="Network stage for whose input it prepares.")
+    port: str = Field(default="", description="Input of that network, if it has several.")
+    fit: Literal["stretch", "letterbox", "crop"] = Field(
+        default="stretch", description="How a picture gets another shape: stretch, letterbox or crop."
+    )
+    layout: Literal["nchw", "nhwc"] | None = Field(
+        default=None, description="nchw or nhwc; without it as the network's input looks."
+    )
+    mean: Annotated[tuple[float, ...], BeforeValidator(_as_tuple)] | None = Field(
+        default=None, description="Mean of each channel that is subtracted, of values from 0 to 1."
+    )
+    sd: Annotated[tuple[float, ...], BeforeValidator(_as_tuple)] | None = Field(
+        default=None, description="Standard deviation of each channel by which it is divided."
+    )
+    step: float | None = Field(
+        default=None, gt=0, allow_inf_nan=False, description="Step of quantised numbers (their scale)."
+    )
+    zero_point: int | None = Field(default=None, description="Quantised number that stands for 0.")
+
+
+class OverlayBlock(BlockStage):
+    """Draws on a picture what networks found."""
+
+    in_ports = {"frame": True, "mask": False, "depth": False, "boxes": False}
+    alpha: float = Field(default=0.5, ge=0, le=1, description="Weight of what is drawn, 0 to 1.")
+
+
+class EncodeBlock(BlockStage):
+    """Writes a video."""
+
+    in_ports = {"": True}
+    path: InsidePath = Field(description="Video to write, such as out.mp4.")
+
+
+class DiscardBlock(BlockStage):
+    """Takes frames and does nothing with them."""
+
+
+class BusyBlock(BlockStage):
+    """A load that is made up."""
+
+    load_ms: float = Field(ge=0, le=LONGEST_MS, allow_inf_nan=False, description="How long it works, ms.")
+
+
+BLOCKS: Final[dict[str, type[BlockStage]]] = {
+    "video": VideoBlock,
+    "prepare": PrepareBlock,
+    "overlay": OverlayBlock,
+    "encode": EncodeBlock,
+    "discard": DiscardBlock,
+    "busy": BusyBlock,
+}
+#: Blocks behind which nothing comes.
+ENDS: Final = frozenset(["encode", "discard"])
+KINDS: Final[dict[str, type[StageKeys]]] = {
+    each.kind: each for each in (OnnxStage, PythonStage, BlockStage, TimedStage)
+}

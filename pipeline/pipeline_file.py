@@ -1,0 +1,449 @@
+"""Reads a pipeline file: TOML that describes stages, what each reads, and the units that they run on.
+
+    file = read_pipeline(Path("street.toml"))
+    file.stages["detector"].unit, file.graph_inputs("overlay")
+
+Rule: a defect becomes one BadInputError that names the file and the key. The file may be a stranger's: sizes are
+checked before anything is made, no path leads out of its folder, and nothing of it is imported.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from heapq import heapify, heappop, heappush
+from math import lcm
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+from pydantic import ValidationError
+
+from trilane.errors import BadInputError, did_you_mean
+from trilane.files import instead_of_file, read_bytes
+from trilane.pipeline.file_keys import (
+    BLOCKS,
+    ENDS,
+    KINDS,
+    MOST_STAGES,
+    NAME,
+    InputKeys,
+    Keys,
+    OnnxStage,
+    PrepareBlock,
+    RunKeys,
+    StageInput,
+    StageKeys,
+    StageTime,
+    UnitKeys,
+    read_input,
+    shown,
+)
+from trilane.scheduler.events import MOST_INPUTS
+from trilane.scheduler.policy import POLICIES
+from trilane.transport.slots import edge_rule
+from trilane.unexpected_value import UnexpectedValue, unexpected_in
+from trilane.units import UNITS
+
+MOST_BYTES: Final = 16 << 20
+MOST_PERIOD: Final = 100_000  # of a stage, in frames: the least common multiple of all `every` before it
+TABLES: Final = ("run", "units", "stages", "edges")
+FORM: Final = "a pipeline file, TOML in UTF-8"
+#: Tables that a stage's key may hold, by the key.
+INNER: Final[dict[str, type[Keys]]] = {"in": InputKeys, "time_ms": StageTime}
+
+AnyKeys = TypeVar("AnyKeys", bound=Keys)
+
+
+@dataclass(frozen=True)
+class PipelineFile:
+    """A checked pipeline file.
+
+    `path`: path of the file; paths in it are relative to its folder.
+    `stages`: stages by name, each after those that it reads; otherwise in the order of the file.
+    `units`: every unit that a stage names, in the order of the stages.
+    `edges`: rule of the streams of which the file says one, by the stage that writes it.
+    `tables`: the tables as the file has them.
+    """
+
+    path: Path
+    run: RunKeys
+    units: Mapping[str, UnitKeys]
+    stages: Mapping[str, StageKeys]
+    edges: Mapping[str, str]
+    tables: Mapping[str, Any] = field(repr=False, compare=False)
+
+    @property
+    def folder(self) -> Path:
+        return self.path.parent
+
+    def hardware(self, unit: str) -> str | None:
+        """Return the unit of a hardware profile that `unit` is: cpu, gpu, dsp, or None where that is not known."""
+        return self.units[unit].hardware or (unit if unit in UNITS else None)
+
+    @property
+    def readers(self) -> dict[str, list[str]]:
+        """The readers of each stage that has any, by its name, in the order of the stages."""
+        found: dict[str, list[str]] = {name: [] for name in self.stages}
+        for name, stage in self.stages.items():
+            for source in dict.fromkeys(each.stage for each in stage.inputs):
+                found[source].append(name)
+        return {name: readers for name, readers in found.items() if readers}
+
+    @property
+    def periods(self) -> dict[str, int]:
+        """The distance between the frames that each stage takes: of its own `every` and of what it reads."""
+        found: dict[str, int] = {}
+        for name, stage in self.stages.items():
+            found[name] = lcm(stage.every, *(found[each.stage] for each in stage.inputs if not each.latest))
+        return found
+
+    @property
+    def latency_to(self) -> str:
+        """The stage at whose end the latency ends."""
+        return self.run.latency_to or [name for name in self.stages if name not in self.readers][-1]
+
+    def changed(self, assignments: Sequence[str]) -> PipelineFile:
+        """Return the file with other values, each written `stages.seg.unit=dsp`. Raises BadInputError."""
+        tables = dict(self.tables)
+        for text in assignments:
+            tables = _assigned(tables, text)
+        return checked_tables(tables, self.path)
+
+
+def read_pipeline(path: Path) -> PipelineFile:
+    """Read and check a pipeline file. Raises BadInputError."""
+    data = read_bytes(path, MOST_BYTES, FORM)
+    try:
+        tables = tomllib.loads(data.decode("utf-8-sig"))
+    except UnicodeDecodeError:
+        raise BadInputError(path, "bytes that are no text in UTF-8", FORM) from None
+    except (ValueError, RecursionError) as error:
+        raise _of_toml(path, str(error)) from None
+    return checked_tables(tables, path)
+
+
+def is_pipeline_file(path: Path) -> bool:
+    """Say whether a file looks like a pipeline file: a .toml with stages, or one that is not there or cannot be read.
+
+    A scene is a .toml file too, and has no stages.
+    """
+    if path.suffix != ".toml":
+        return False
+    try:
+        with path.open("rb") as file:
+            text = file.read(MOST_BYTES)
+    except OSError:
+        return False
+    return re.search(rb"^\s*\[\s*\"?stages\"?\s*[\].]", text, re.MULTILINE) is not None
+
+
+def _of_toml(path: Path, message: str) -> BadInputError:
+    """Return the error for what the TOML reader said."""
+    place = re.search(r" \(at line (\d+), column \d+\)$", message)
+    where = f"{path}, line {place[1]}" if place else str(path)
+    text = message[: place.start()] if place else message
+    if "verwrite" in text or "twice" in text or "mutate" in text or "more than once" in text:
+        return BadInputError(where, "the same name twice", "each name once", f"TOML says: {text}")
+    return BadInputError(where, text[:1].lower() + text[1:] or "no TOML", "TOML")
+
+
+def checked_tables(tables: Mapping[str, Any], path: Path) -> PipelineFile:
+    """Check the tables of a file. `path`: file to name in errors. Raises BadInputError."""
+    for name in tables:
+        if name not in TABLES:
+            found = f"the unknown key {name!r}"
+            raise BadInputError(path, found, f"tables {', '.join(TABLES)}", did_you_mean(name, TABLES))
+    run = _checked(RunKeys, _table(tables, "run", path), f"{path}: run")
+    written = _table(tables, "stages", path)
+    if not 1 <= len(written) <= MOST_STAGES:
+        raise BadInputError(f"{path}: stages", f"{len(written)} stages", f"1 to {MOST_STAGES}")
+    units = {
+        name: _checked(UnitKeys, keys, f"{path}: units.{name}") for name, keys in _table(tables, "units", path).items()
+    }
+    for table in ("units", "stages"):
+        for name in _table(tables, table, path):
+            if not re.fullmatch(NAME, name):
+                raise BadInputError(f"{path}: {table}", f"the name {name!r}", "at most 40 letters, digits, _ and -")
+    stages = {name: _stage(name, keys, path) for name, keys in written.items()}
+    stages = _in_order(stages, path)
+    named = list(dict.fromkeys(stage.unit for stage in stages.values()))
+    for name, stage in stages.items():
+        if units and stage.unit not in units and stage.unit not in UNITS:
+            known = list(dict.fromkeys([*units, *UNITS]))
+            remedy = did_you_mean(stage.unit, known) or f"add {stage.unit} to [units]"
+            where = f"{path}: stages.{name}.unit"
+            raise BadInputError(where, f"the unknown unit {stage.unit!r}", f"one of {', '.join(known)}", remedy)
+    edges = _table(tables, "edges", path)
+    used = {name: units.get(name, UnitKeys()) for name in named}
+    file = PipelineFile(path, run, used, stages, edges, tables)
+    _check_together(file)
+    return file
+
+
+def _table(tables: Mapping[str, Any], name: str, path: Path) -> Mapping[str, Any]:
+    table = tables.get(name, {})
+    if not isinstance(table, dict):
+        raise BadInputError(f"{path}: {name}", shown(table), "a table")
+    return table
+
+
+def _checked(model: type[AnyKeys], values: object, where: str) -> AnyKeys:
+    """Check a table by its model. Raises BadInputError that names the key behind `where`."""
+    if not isinstance(values, dict):
+        raise BadInputError(where, shown(values), f"a table with {', '.join(model.known())}")
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise _bad_input(model, error, where) from None
+
+
+def _bad_input(model: type[Keys], error: ValidationError, where: str) -> BadInputError:
+    """Return the error for the first defect that pydantic found; an unknown key comes first, as it may be a slip."""
+    errors = error.errors(include_url=False)
+    first = next((each for each in errors if each["type"] == "extra_forbidden"), errors[0])
+    place = [str(part) for part in first["loc"]]
+    where = ".".join([where, *place])
+    if first["type"] == "extra_forbidden":
+        known = (INNER.get(place[0], model) if len(place) > 1 else model).known()
+        hint = did_you_mean(place[-1], known)
+        return BadInputError(where, f"the unknown key {place[-1]!r}", f"one of {', '.join(known)}", hint)
+    unexpected = unexpected_in(first)
+    if unexpected is not None:
+        return BadInputError.at(where, unexpected)
+    if first["type"] == "missing":
+        return BadInputError(where, "nothing", "this key", _meaning(model, place[0]))
+    expected = first["msg"].removeprefix("Input should be ").removeprefix("Value should have ")
+    return BadInputError(where, shown(first["input"]), expected, _meaning(model, place[0]))
+
+
+def _meaning(model: type[Keys], key: str) -> str:
+    """Return what the description of a key says, as part of a sentence."""
+    fields = {one.alias or name: one for name, one in model.model_fields.items()}
+    text = (fields[key].description or "") if key in fields else ""
+    return f"{key}: {text[:1].lower()}{text[1:].rstrip('.')}" if text else ""
+
+
+def _stage(name: str, values: object, path: Path) -> StageKeys:
+    """Check one stage by its kind."""
+    where = f"{path}: stages.{name}"
+    if not isinstance(values, dict):
+        raise BadInputError(where, shown(values), "a table with a unit and one of onnx, python, block, time_ms")
+    kinds = [kind for kind in KINDS if kind in values]
+    named = [kind for kind in kinds if kind != "time_ms"] or kinds
+    if len(named) != 1:
+        known = [*KINDS, "unit", "in"]
+        near = [hint for key in values if key not in known and (hint := did_you_mean(key, list(KINDS)))]
+        found = " and ".join(named) or "none of onnx, python, block, time_ms"
+        raise BadInputError(where, found, "exactly one of them", near[0] if near else "they say what the stage is")
+    model = KINDS[named[0]]
+    if named[0] == "block":
+        block = values["block"]
+        if not isinstance(block, str) or block not in BLOCKS:
+            hint = did_you_mean(block, BLOCKS) if isinstance(block, str) else ""
+            raise BadInputError(f"{where}.block", shown(block), f"one of {', '.join(BLOCKS)}", hint)
+        model = BLOCKS[block]
+    inputs = _inputs(values["in"], f"{where}.in") if "in" in values else ()
+    stage = _checked(model, {**values, "in": inputs}, where)
+    _check_ports(stage, where)
+    if isinstance(stage, OnnxStage) and not (path.parent / stage.onnx).is_file():
+        model_path = path.parent / stage.onnx
+        found = f"{instead_of_file(model_path)} at {model_path}"
+        raise BadInputError(f"{where}.onnx", found, "an ONNX file", f"put {stage.onnx} beside {path.name}")
+    return stage
+
+
+def _inputs(value: object, where: str) -> tuple[StageInput, ...]:
+    """Read `in`: a stage, stage.port, or a table of ports."""
+    ports = value if isinstance(value, dict) and not _is_input(value) else {"": value}
+    if not ports:
+        raise BadInputError(where, "an empty table", "a port, such as { frame = 'camera' }", "a source has no `in`")
+    found = []
+    for port, each in ports.items():
+        place = f"{where}.{port}" if port else where
+        if port and not re.fullmatch(NAME, port):
+            raise BadInputError(where, f"port {port!r}", "letters, digits, _ and -")
+        try:
+            found.append(read_input(port, each))
+        except UnexpectedValue as error:
+            raise BadInputError.at(place, error) from None
+        except ValidationError as error:
+            raise _bad_input(InputKeys, error, place) from None
+    return tuple(found)
+
+
+def _is_input(value: Mapping[str, object]) -> bool:
+    """Say whether a table is one input, `{ from = "camera", sync = "latest" }`, not a table of ports."""
+    return "from" in value and value.keys() <= set(InputKeys.known())
+
+
+def _check_ports(stage: StageKeys, where: str) -> None:
+    """Check the ports that a stage reads against those that its kind has."""
+    known = stage.in_ports
+    if known is None:
+        return
+    ports = [each.port for each in stage.inputs]
+    if not known and ports:
+        raise BadInputError(f"{where}.in", "an input", f"none, as {stage.named_kind} is a source")
+    first = next(iter(known), "")
+    for port in ports:
+        if port and port not in known:
+            names = [name for name in known if name]
+            expected = f"one of {', '.join(names)}" if names else "a stage alone, as it has one input"
+            raise BadInputError(f"{where}.in.{port}", f"the unknown port {port!r}", expected, did_you_mean(port, names))
+    read = {port or first for port in ports}
+    for port, needed in known.items():
+        if needed and port not in read:
+            name = f"the input {port!r}" if port else "an input"
+            raise BadInputError(f"{where}.in", f"nobody who feeds {name} of {stage.named_kind}", "a stage")
+
+
+def _in_order(stages: Mapping[str, StageKeys], path: Path) -> dict[str, StageKeys]:
+    """Return the stages so that each follows those that it reads, otherwise in their order. Raises BadInputError."""
+    for name, stage in stages.items():
+        _check_sources(name, stage, stages, path)
+    places = {name: place for place, name in enumerate(stages)}
+    waits = {name: {each.stage for each in stage.inputs} for name, stage in stages.items()}
+    ready = [places[name] for name, sources in waits.items() if not sources]
+    heapify(ready)
+    names, done = list(stages), []
+    while ready:
+        name = names[heappop(ready)]
+        done.append(name)
+        for other, sources in waits.items():
+            if name in sources:
+                sources.remove(name)
+                if not sources:
+                    heappush(ready, places[other])
+    if len(done) < len(names):
+        circle = _circle({name: sources for name, sources in waits.items() if sources})
+        found = f"the circle {' -> '.join(circle)}"
+        raise BadInputError(f"{path}: stages.{circle[-1]}.in", found, "stages that do not wait for themselves")
+    return {name: stages[name] for name in done}
+
+
+def _check_sources(name: str, stage: StageKeys, stages: Mapping[str, StageKeys], path: Path) -> None:
+    """Check that the stages and ports which a stage reads are there."""
+    synced: dict[str, StageInput] = {}
+    for each in stage.inputs:
+        where = f"{path}: stages.{name}.in" + (f".{each.port}" if each.port else "")
+        if each.stage not in stages:
+            remedy = did_you_mean(each.stage, stages)
+            raise BadInputError(where, f"the unknown stage {each.stage!r}", "a stage of the file", remedy)
+        source = stages[each.stage]
+        if source.named_kind in ENDS:
+            raise BadInputError(where, f"{each.stage!r}, a {source.named_kind}", "a stage that writes something")
+        ports = source.out_ports
+        if each.from_port and ports is not None and each.from_port not in ports:
+            names = [port for port in ports if port]
+            expected = f"one of {', '.join(names)}" if names else f"{each.stage!r} alone, which has one port"
+            found = f"the unknown port {each.from_port!r} of {each.stage}"
+            raise BadInputError(where, found, expected, did_you_mean(each.from_port, names))
+        if not each.from_port and ports is not None and len(ports) > 1:
+            found = f"{each.stage!r}, which has the ports {', '.join(ports)}"
+            raise BadInputError(where, found, f"one of them, such as '{each.stage}.{ports[0]}'")
+        before = synced.setdefault(each.stage, each)
+        if (before.latest, before.max_age_ms) != (each.latest, each.max_age_ms):
+            raise BadInputError(where, f"{each.stage!r} with another sync or age than before", "the same for its ports")
+    if len(synced) > MOST_INPUTS:
+        found = f"{len(synced)} stages"
+        raise BadInputError(f"{path}: stages.{name}.in", found, f"at most {MOST_INPUTS}", "join some of them before")
+
+
+def _circle(waits: Mapping[str, set[str]]) -> list[str]:
+    """Return a circle of stages that wait for each other, from a stage on to itself, in the direction of frames."""
+    seen: list[str] = []
+    name = next(iter(waits))
+    while name not in seen:
+        seen.append(name)
+        name = next(source for source in sorted(waits[name]) if source in waits)
+    return [name, *reversed(seen[seen.index(name) :])]
+
+
+def _check_together(file: PipelineFile) -> None:
+    """Check what concerns several tables. Raises BadInputError."""
+    _check_run(file)
+    _check_edges(file)
+    for name, period in file.periods.items():
+        if period > MOST_PERIOD:
+            found = f"a frame of {period}, by every {file.stages[name].every} and those before"
+            raise BadInputError(f"{file.path}: stages.{name}.every", found, f"one of at most {MOST_PERIOD}")
+    for name, stage in file.stages.items():
+        _check_stage_together(file, name, stage)
+
+
+def _check_run(file: PipelineFile) -> None:
+    path, run = file.path, file.run
+    if run.fps is not None and run.arrivals is not None:
+        raise BadInputError(f"{path}: run.arrivals", "arrivals beside fps", "one or the other")
+    if POLICIES[run.policy].paced and run.fps is None and run.arrivals is None:
+        remedy = "add fps = 30 to [run]"
+        raise BadInputError(f"{path}: run.policy", f"{run.policy} without a rate", "fps or arrivals", remedy)
+    if run.latency_to and run.latency_to not in file.stages:
+        remedy = did_you_mean(run.latency_to, file.stages)
+        raise BadInputError(f"{path}: run.latency_to", f"the unknown stage {run.latency_to!r}", "a stage", remedy)
+
+
+def _check_edges(file: PipelineFile) -> None:
+    readers = file.readers
+    for name, rule in file.edges.items():
+        where = f"{file.path}: edges.{name}"
+        if name not in readers:
+            kind = "a stage that nobody reads" if name in file.stages else "an unknown stage"
+            remedy = did_you_mean(name, readers)
+            raise BadInputError(where, kind, f"one of {', '.join(readers) or 'none, as nobody reads'}", remedy)
+        if not isinstance(rule, str):
+            raise BadInputError(where, shown(rule), "single, double, triple, fifo:N or orphan:N")
+        try:
+            edge_rule(rule)
+        except UnexpectedValue as error:
+            raise BadInputError.at(where, error) from None
+
+
+def _check_stage_together(file: PipelineFile, name: str, stage: StageKeys) -> None:
+    where = f"{file.path}: stages.{name}"
+    if isinstance(stage, OnnxStage) and stage.time_ms is None and file.hardware(stage.unit) is None:
+        remedy = f'add {stage.unit} = {{ hardware = "dsp" }} to [units]'
+        found = f"the unknown unit {stage.unit!r} for a network"
+        raise BadInputError(f"{where}.unit", found, f"{', '.join(UNITS)}, or a unit with hardware", remedy)
+    if isinstance(stage, PrepareBlock):
+        other = file.stages.get(stage.like)
+        if not isinstance(other, OnnxStage):
+            networks = [each for each, one in file.stages.items() if isinstance(one, OnnxStage)]
+            found = f"{stage.like!r}, {'no network' if other else 'an unknown stage'}"
+            expected = f"one of {', '.join(networks)}" if networks else "a stage with onnx"
+            raise BadInputError(f"{where}.like", found, expected, did_you_mean(stage.like, networks))
+    for each in stage.inputs:
+        rule = file.edges.get(each.stage, file.run.edge or "double")
+        if each.latest and edge_rule(rule).slots < 2:
+            found = f"edge {rule!r} behind {each.stage}, whose newest frame {name} holds"
+            raise BadInputError(f"{file.path}: edges.{each.stage}", found, "two slots or more, such as double")
+
+
+def _assigned(tables: Mapping[str, Any], text: str) -> dict[str, Any]:
+    """Return `tables` with one other value. `text`: KEY=VALUE; a value that is no TOML is a text."""
+    key, equals, value = text.partition("=")
+    parts = [part.strip() for part in key.split(".")]
+    if not equals or not all(parts) or parts[0] not in TABLES or len(parts) < 2:
+        raise BadInputError("--set", repr(text), "KEY=VALUE, such as stages.seg.unit=dsp")
+    try:
+        read = tomllib.loads(f"value = {value}")
+        new = read["value"] if len(read) == 1 else value
+    except ValueError:
+        new = value.strip()
+    return _with_value(tables, parts, new)
+
+
+def _with_value(tables: Mapping[str, Any], parts: Sequence[str], value: object) -> dict[str, Any]:
+    if len(parts) == 1:
+        return {**tables, parts[0]: value}
+    inner = tables.get(parts[0], {})
+    if not isinstance(inner, dict):
+        raise BadInputError("--set", f"{parts[1]!r} of {parts[0]}, which is {shown(inner)}", "a key of a table")
+    return {**tables, parts[0]: _with_value(inner, parts[1:], value)}
+
+
+def stage_inputs(stage: StageKeys) -> tuple[StageInput, ...]:
+    """Return one input for each stage that `stage` reads; several ports of one stage are one stream."""
+    return tuple({each.stage: replace(each, port="", from_port="") for each in stage.inputs}.values())

@@ -1,0 +1,255 @@
+"""The least period of a graph, from the times of its stages: the maximum ratio of a cycle (max-plus algebra).
+
+A job begins when other jobs have ended: those that it reads, the one before it on its stage, and those that free its
+slot. A cycle of such waits that takes w ns and leads s frames on allows no period below w / s. The bound is the largest
+ratio of all cycles. Other cycles are the work of a unit for one frame and the period of the source. With constant times
+and one stage on each unit the bound is reached. Where stages share a unit, their order may cost more.
+
+With `every` a stage takes one frame of several, so the jobs of a whole hyperperiod are told apart. Inputs of the newest
+frame hold back nobody. A rule that replaces waiting frames (triple, orphan) holds back nobody either.
+
+Rule: all is exact, in whole ns and fractions. The ratio is found by Newton's method: a positive cycle for the ratio so
+far gives the next one (Bellman and Ford), until none is left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from math import ceil, lcm
+from typing import Final, NamedTuple
+
+from trilane.scheduler.events import Graph
+from trilane.transport.slots import MAX_SLOTS, edge_rule
+
+#: Jobs of a hyperperiod from which on only units and the source count, because the search would take long.
+MOST_JOBS: Final = 4096
+LEAST_SLOTS: Final = 2
+
+
+@dataclass(frozen=True)
+class Bound:
+    """The least period of a graph.
+
+    `period_ns`: least time between two frames of the source.
+    `stages`: stages of the cycle that makes it, in the order of a frame.
+    `limit`: what makes it: `unit NAME`, `slots`, `in_flight`, or `rate`; "" where no stage takes time.
+    `streams`: stages whose slots are in the cycle.
+    """
+
+    period_ns: Fraction
+    stages: tuple[str, ...]
+    limit: str
+    streams: tuple[str, ...] = ()
+
+
+class _Arc(NamedTuple):
+    """A wait between two jobs of a hyperperiod, by their places. `stream`: stage whose slot is waited for; "" for none.
+
+    The job `to`, `tokens` hyperperiods later, begins `ns` after the job `job` or later.
+    """
+
+    job: int
+    to: int
+    ns: int
+    tokens: int
+    stream: str = ""
+    in_flight: bool = False
+
+
+class _Waits:
+    """The waits of a graph between the jobs of one hyperperiod; all but those for slots stay the same."""
+
+    def __init__(self, graph: Graph, times_ns: Mapping[str, int], in_flight: int) -> None:
+        self.graph, self.times_ns = graph, times_ns
+        self.names = [stage.name for stage in graph.stages]
+        self.periods = _periods(graph)
+        self.hyperperiod = lcm(*self.periods.values())
+        self.is_small = sum(self.hyperperiod // period for period in self.periods.values()) <= MOST_JOBS
+        self.stages: list[str] = []  # of each job
+        self._place: dict[tuple[str, int], int] = {}
+        self._fixed: list[_Arc] = []
+        if self.is_small:
+            jobs = sorted(
+                (frame, place)
+                for place, name in enumerate(self.names)
+                for frame in range(0, self.hyperperiod, self.periods[name])
+            )
+            self.stages = [self.names[place] for _, place in jobs]
+            self._place = {(self.names[place], frame): index for index, (frame, place) in enumerate(jobs)}
+            self._fixed = [*self._of_frames(), *(self._of_flight(in_flight) if in_flight else ())]
+
+    def arcs(self, slots: Mapping[str, int]) -> list[_Arc]:
+        """Return all waits, in the order of what is waited for. `slots`: slots of each stream that holds back."""
+        found = [*self._fixed]
+        for name, count in slots.items():
+            for reader in self.frame_readers(name):
+                found += self._behind(reader, name, count, self.periods[name], stream=name)
+        return sorted(found, key=lambda arc: arc.job)
+
+    def frame_readers(self, name: str) -> Iterator[str]:
+        """Yield the stages that take the stream of stage `name` frame by frame."""
+        for index, stage in enumerate(self.graph.stages):
+            if any(each.stage == name and not each.latest for each in self.graph.inputs_of(index)):
+                yield stage.name
+
+    def _of_frames(self) -> Iterator[_Arc]:
+        """Yield the waits for inputs, and for the job before on the same stage."""
+        for index, name in enumerate(self.names):
+            for frame in range(0, self.hyperperiod, self.periods[name]):
+                yield self._arc(name, frame, name, frame + self.periods[name])
+                for each in self.graph.inputs_of(index):
+                    if not each.latest:
+                        yield self._arc(each.stage, frame, name, frame)
+
+    def _of_flight(self, in_flight: int) -> Iterator[_Arc]:
+        """Yield the waits of the first stages for the frames in flight."""
+        read = self.graph.streams
+        ends = [name for name in self.names if name not in read]
+        roots = [
+            name for index, name in enumerate(self.names) if all(one.latest for one in self.graph.inputs_of(index))
+        ]
+        for end in ends:
+            for root in roots:
+                yield from self._behind(end, root, in_flight, 1, in_flight=True)
+
+    def _behind(
+        self, reader: str, writer: str, count: int, step: int, stream: str = "", in_flight: bool = False
+    ) -> Iterator[_Arc]:
+        """Yield the waits of `writer` for `reader`, which holds at most `count` places.
+
+        The reader's frames f, f + q, ... take them all, if nobody has ended. So the frame of the writer that follows
+        the last of them waits for f. `step`: distance from that last frame to the next one.
+        """
+        period, own = self.periods[reader], self.periods[writer]
+        for frame in range(0, self.hyperperiod, period):
+            after = frame + (count - 1) * period + step
+            yield self._arc(reader, frame, writer, own * ceil(Fraction(after, own)), stream, in_flight)
+
+    def _arc(self, name: str, frame: int, to: str, later: int, stream: str = "", in_flight: bool = False) -> _Arc:
+        tokens, phase = divmod(later, self.hyperperiod)
+        places = self._place[name, frame], self._place[to, phase]
+        return _Arc(*places, self.times_ns[name], tokens, stream, in_flight)
+
+
+def _periods(graph: Graph) -> dict[str, int]:
+    """Return the distance between the frames that each stage takes."""
+    found: dict[str, int] = {}
+    for index, stage in enumerate(graph.stages):
+        found[stage.name] = lcm(stage.every, *(found[one.stage] for one in graph.inputs_of(index) if not one.latest))
+    return found
+
+
+def period_bound(graph: Graph, times_ns: Mapping[str, int], in_flight: int = 0, source_ns: int = 0) -> Bound:
+    """Return the least period of `graph`.
+
+    `times_ns`: time of a job of each stage.
+    `in_flight`: limit of frames in flight; 0: none.
+    `source_ns`: period of the source; 0: it is always ready.
+    """
+    return _bound(_Waits(graph, times_ns, in_flight), _slots(graph), source_ns)
+
+
+def _slots(graph: Graph) -> dict[str, int]:
+    """Return the number of slots of each stream whose writer waits for a free one."""
+    rules = {name: edge_rule(rule) for name, rule in zip(graph.streams, graph.edges, strict=True)}
+    return {name: rule.slots for name, rule in rules.items() if not rule.yields}
+
+
+def _bound(waits: _Waits, slots: Mapping[str, int], source_ns: int = 0) -> Bound:
+    best = max(_of_units(waits), key=lambda bound: bound.period_ns)
+    arcs = waits.arcs(slots) if waits.is_small else []
+    ratio = best.period_ns * waits.hyperperiod
+    while cycle := _positive_cycle(len(waits.stages), arcs, ratio):
+        ratio = Fraction(sum(arc.ns for arc in cycle), sum(arc.tokens for arc in cycle))
+        best = _of_cycle(waits, cycle, ratio / waits.hyperperiod)
+    if source_ns > best.period_ns:
+        roots = tuple(name for index, name in enumerate(waits.names) if not waits.graph.inputs_of(index))
+        return Bound(Fraction(source_ns), roots, "rate")
+    return best
+
+
+def _of_units(waits: _Waits) -> Iterator[Bound]:
+    """Yield the work of each unit for one frame."""
+    for unit in waits.graph.units:
+        names = tuple(stage.name for stage in waits.graph.stages if stage.unit == unit)
+        work = sum((Fraction(waits.times_ns[name], waits.periods[name]) for name in names), Fraction())
+        busy = tuple(name for name in names if waits.times_ns[name])
+        yield Bound(work, busy, f"unit {unit}" if work else "")
+
+
+def _of_cycle(waits: _Waits, cycle: Sequence[_Arc], period_ns: Fraction) -> Bound:
+    places = {name: place for place, name in enumerate(waits.names)}
+    stages = sorted({waits.stages[arc.job] for arc in cycle}, key=places.__getitem__)
+    streams = tuple(dict.fromkeys(arc.stream for arc in cycle if arc.stream))
+    limit = "in_flight" if any(arc.in_flight for arc in cycle) else "slots"
+    return Bound(period_ns, tuple(stages), limit, streams)
+
+
+def _positive_cycle(jobs: int, arcs: Sequence[_Arc], ratio: Fraction) -> list[_Arc]:
+    """Return a cycle that takes longer than `ratio` ns for each hyperperiod, or none.
+
+    `jobs`: number of jobs. `arcs`: waits, by the place of the job that is waited for, so that most of them are passed
+    in one round.
+    """
+    weights = [(arc.job, arc.to, arc.ns * ratio.denominator - arc.tokens * ratio.numerator) for arc in arcs]
+    begin, before = [0] * jobs, [-1] * jobs
+    changed = True
+    while changed:
+        changed = False
+        for index, (job, to, weight) in enumerate(weights):
+            if begin[job] + weight > begin[to]:
+                begin[to], before[to], changed = begin[job] + weight, index, True
+        if changed and (cycle := _circle(arcs, before)):
+            return cycle
+    return []
+
+
+def _circle(arcs: Sequence[_Arc], before: Sequence[int]) -> list[_Arc]:
+    """Return a cycle of the arcs by which jobs were last put off, or none. `before`: such an arc of each job, or -1."""
+    seen = [-1] * len(before)
+    for first in range(len(before)):
+        job = first
+        while seen[job] < 0 and before[job] >= 0:
+            seen[job] = first
+            job = arcs[before[job]].job
+        if seen[job] == first and before[job] >= 0:
+            found, place = [arcs[before[job]]], arcs[before[job]].job
+            while place != job:
+                found.append(arcs[before[place]])
+                place = arcs[before[place]].job
+            return found
+    return []
+
+
+def fewest_slots(
+    graph: Graph, times_ns: Mapping[str, int], given: Collection[str] = (), in_flight: int = 0
+) -> list[int]:
+    """Return slots of each stream, in the order of `graph.edges`: two, or the fewest that do not lengthen the period.
+
+    With one slot fewer of any stream that has more than two the period would be longer.
+
+    `times_ns`, `in_flight`: as in `period_bound`.
+    `given`: streams whose rule stays as it is in `graph`.
+    """
+    waits, held = _Waits(graph, times_ns, in_flight), _slots(graph)
+    rules = {name: edge_rule(rule).slots for name, rule in zip(graph.streams, graph.edges, strict=True)}
+    free = [name for name in rules if name not in given]
+    slots = {name: count for name, count in held.items() if name in given}
+    least = _bound(waits, slots).period_ns
+    slots |= dict.fromkeys(free, LEAST_SLOTS)
+    while (now := _bound(waits, slots)).period_ns > least:
+        growing = [name for name in now.streams if name in free and slots[name] < MAX_SLOTS]
+        if not growing:
+            break
+        slots = min((_with_one(slots, name, 1) for name in growing), key=lambda each: _bound(waits, each).period_ns)
+    least = _bound(waits, slots).period_ns
+    for name in reversed(free):
+        while slots[name] > LEAST_SLOTS and _bound(waits, fewer := _with_one(slots, name, -1)).period_ns <= least:
+            slots = fewer
+    return [slots[name] if name in free else rules[name] for name in rules]
+
+
+def _with_one(slots: Mapping[str, int], name: str, change: int) -> dict[str, int]:
+    return {**slots, name: slots[name] + change}
