@@ -459,7 +459,7 @@ class Flow:
             self._mark_all_dirty()
 
     def _give_back(self, edge: EdgeSlots | SourceLine, slot: int, line: int, producer: StageState) -> None:
-        for frame in edge.give_back(slot, line):
+        for frame in edge.give_back(slot, line, lambda other: self.must_stay(producer, other)):
             self._count_drop(frame, producer, None, DropCause.STALE)
         self.mark_dirty(producer.unit)
 

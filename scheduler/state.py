@@ -23,7 +23,7 @@ from typing import Final
 
 from trilane.scheduler.events import NEVER, Graph, Input, Job, JobDone, JobFailed, Pinged, Pong, UnitDied, UnitReady
 from trilane.scheduler.ledger import STARVED
-from trilane.transport.slots import EdgeSlots, edge_rule
+from trilane.transport.slots import EdgeSlots, Keeps, edge_rule
 from trilane.unexpected_value import UnexpectedValue
 
 DOWN: Final = 0
@@ -181,7 +181,7 @@ class SourceLine:
     def pass_by(self, frame: int, _line: int) -> None:
         self.forget(frame)
 
-    def give_back(self, slot: int, _line: int = 0) -> list[int]:
+    def give_back(self, slot: int, _line: int = 0, _keeps: Keeps | None = None) -> list[int]:
         """Let a taken frame wait again in its old place."""
         place = sum(frame < slot for frame in self.ready)
         self.ready.insert(place, slot)

@@ -233,8 +233,11 @@ class EdgeSlots:
                 self._leave(slot)
                 return
 
-    def give_back(self, slot: int, line: int = 0) -> list[int]:
-        """Let a taken frame wait again in its old place; return it if a newer frame waits in a mailbox."""
+    def give_back(self, slot: int, line: int = 0, keeps: Keeps = _keeps_none) -> list[int]:
+        """Let a taken frame wait again in its old place; return it if a newer frame waits in a mailbox.
+
+        `keeps`: function that says which frames must not be replaced.
+        """
         self._reading[slot] -= 1
         if not self._reading[slot]:
             self._move("give_back", slot)
@@ -245,7 +248,7 @@ class EdgeSlots:
         waiting.extend(ordered)
         if not self.rule.mailbox:
             return []
-        return [self.drop(old) for old in ordered[:-1] if not self._reading[old]]
+        return [self.drop(old) for old in ordered[:-1] if not self._reading[old] and not keeps(self.frame[old])]
 
     def _evictable(self, keeps: Keeps) -> int:
         """Return the slot whose frame a claim may evict; -1: none."""
