@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.apps.explain.explained_run import COLUMNS, explain_run, figure_names, job_rows, open_journal
-from trilane.apps.predict.predict_options import PredictOptions
+from trilane.apps.predict.predict_options import OF_A_PIPELINE_ALONE, PredictOptions
 from trilane.apps.run.asked_run import run_asked
 from trilane.apps.run.report import Report, read_report
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
@@ -41,7 +41,9 @@ INTERRUPTED = 130
 #: Defaults of a program's run that are not those of the command line.
 DEFAULTS = {"baseline_frames": 0}
 #: Options of a prediction that a program may give: those that lead to one answer, and to no file.
-PREDICTED = PredictOptions.model_fields.keys() - {"scene", "beside", "turns", "what_if", "plot", "trace", "table"}
+PREDICTED = PredictOptions.model_fields.keys() - (
+    {"scene", "beside", "turns", "what_if", "plot", "trace", "table"} | OF_A_PIPELINE_ALONE
+)
 FRAME_TYPE = np.dtype(
     [("frame", np.int64), ("presented_ns", np.int64), ("frame_ns", np.int64), ("latency_ns", np.int64)]
 )

@@ -6,13 +6,15 @@ Rule: a run on this machine and a prediction take theirs from here, so that a fi
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 
 from trilane.pipeline.pipeline_file import PipelineFile, stage_inputs
 from trilane.scheduler.events import Graph, Input, Settings, StageSpec
-from trilane.scheduler.policy import run_settings
+from trilane.scheduler.period_bound import LEAST_SLOTS, fewest_slots
+from trilane.scheduler.policy import POLICIES, run_settings
 from trilane.units import NS_PER_MS, NS_PER_S
 
 DEFAULT_FRAMES: Final = 1000
@@ -47,6 +49,12 @@ def _is_chain(stages: tuple[StageSpec, ...]) -> bool:
     return True
 
 
+def source_ns(file: PipelineFile) -> int:
+    """Return the period of the source, a mean for random arrivals; 0: it is always ready."""
+    rate = file.run.fps or (file.run.arrivals.poisson if file.run.arrivals else 0.0)
+    return round(NS_PER_S / rate) if rate else 0
+
+
 def settings_of(file: PipelineFile, frames: int = 0, seed: int = 0, **others: Any) -> Settings:
     """Return the settings of a run of the file.
 
@@ -54,9 +62,7 @@ def settings_of(file: PipelineFile, frames: int = 0, seed: int = 0, **others: An
     `seed`: seed of the arrivals.
     `others`: further fields of Settings.
     """
-    run, count = file.run, frames or file.run.frames or DEFAULT_FRAMES
-    rate = run.fps or (run.arrivals.poisson if run.arrivals else 0.0)
-    period_ns = round(NS_PER_S / rate) if rate else 0
+    run, count, period_ns = file.run, frames or file.run.frames or DEFAULT_FRAMES, source_ns(file)
     given = {"in_flight": run.in_flight, "in_queue": run.in_queue, **others}
     if run.arrivals is not None:
         gaps = np.random.default_rng([seed, 0]).exponential(NS_PER_S / run.arrivals.poisson, count)
@@ -64,26 +70,27 @@ def settings_of(file: PipelineFile, frames: int = 0, seed: int = 0, **others: An
     return run_settings(run.policy, count, period_ns, period_ns, **given)
 
 
-def depth_rules(file: PipelineFile) -> dict[str, str]:
-    """Return the rule of each stream by the graph's form alone, for a file without times.
+def edge_rules(file: PipelineFile, times_ns: Mapping[str, int] | None) -> dict[str, str]:
+    """Return the rule of each stream: that of the file, else two slots, or more where branches meet.
 
-    A stream gets two slots, and more where its branches meet again after different numbers of stages: one more than
-    the difference.
+    Then it has the fewest slots that do not lengthen the period.
+
+    `times_ns`: time of a job of each stage; None where they are unknown. Then all stages count as equally long, and
+    each as if it had a unit of its own.
     """
-    rules = {}
-    for name in file.readers:
-        depths = _depths_behind(file, name)
-        spread = max((most - least for least, most in depths.values()), default=0)
-        slots = max(2, 1 + spread)
-        rules[name] = file.edges.get(name) or file.run.edge or ("double" if slots == 2 else f"fifo:{slots}")
-    return rules
+    given = {name: file.run.edge for name in file.readers} if file.run.edge else {}
+    given |= file.edges
+    rules = {name: given.get(name, "double") for name in file.readers}
+    graph = graph_of(file, rules)
+    if times_ns is None:
+        apart = tuple(replace(stage, unit=stage.name) for stage in graph.stages)
+        graph, times_ns = replace(graph, stages=apart), dict.fromkeys(file.stages, 1)
+    slots = fewest_slots(graph, times_ns, given, in_flight_of(file))
+    pairs = zip(rules, slots, strict=True)
+    return rules | {name: f"fifo:{count}" for name, count in pairs if name not in given and count > LEAST_SLOTS}
 
 
-def _depths_behind(file: PipelineFile, name: str) -> dict[str, tuple[int, int]]:
-    """Return the least and the largest number of steps from stage `name` to each stage behind it."""
-    found = {name: (0, 0)}
-    for other, stage in file.stages.items():
-        steps = [found[each.stage] for each in stage.inputs if not each.latest and each.stage in found]
-        if steps:
-            found[other] = min(least for least, _ in steps) + 1, max(most for _, most in steps) + 1
-    return found
+def in_flight_of(file: PipelineFile) -> int:
+    """Return the limit of frames in flight, by the file or by its policy; 0: none."""
+    limits = [each for each in (file.run.in_flight, POLICIES[file.run.policy].in_flight) if each]
+    return min(limits, default=0)

@@ -18,14 +18,13 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from trilane.errors import did_you_mean
 from trilane.options import one_of
 from trilane.pipeline.description import FACTORY, LONGEST_NAME
-from trilane.scheduler.policy import POLICIES
+from trilane.scheduler.policy import MOST_FRAMES, POLICIES
 from trilane.transport.slots import edge_rule
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import UNITS
 
 MOST_STAGES: Final = 64
 MOST_SAMPLES: Final = 1_000_000
-MOST_FRAMES: Final = 1_000_000
 MOST_PORT_BYTES: Final = 256 << 20
 LONGEST_SIDE: Final = 16_384  # of a picture, in pixels
 LONGEST_MS: Final = 3.6e6  # of a stage, an hour
@@ -313,6 +312,14 @@ InsidePath = Annotated[str, Field(max_length=1000), AfterValidator(_inside)]
 SIZE_HELP = "Width and height in pixels, such as '640x480'"
 
 
+def _sizes(value: object) -> object:
+    """Read `1x3x224x224`."""
+    found = re.fullmatch(r"\d{1,7}(x\d{1,7}){0,7}", value) if isinstance(value, str) else None
+    if found is None or 0 in (sizes := tuple(map(int, found[0].split("x")))):
+        raise UnexpectedValue(shown(value), "sizes, such as '1x3x224x224'")
+    return sizes
+
+
 class StageKeys(Keys):
     """The keys that every stage may have.
 
@@ -367,10 +374,8 @@ class OnnxStage(StageKeys):
     precision: Annotated[str, one_of("int8", "fp16", "fp32")] | None = Field(
         default=None, description="int8, fp16 or fp32 on a chip; as the network says and its unit has it."
     )
-    shapes: dict[str, Annotated[tuple[Annotated[int, Field(ge=1, le=1 << 24)], ...], BeforeValidator(_as_tuple)]] = (
-        Field(
-            default={}, description="Shapes of inputs whose sizes the file leaves open: { image = [1, 3, 224, 224] }."
-        )
+    shapes: dict[str, Annotated[tuple[int, ...], BeforeValidator(_sizes)]] = Field(
+        default={}, description="Sizes of inputs that the file leaves open: `{ image = '1x3x224x224' }`."
     )
 
 

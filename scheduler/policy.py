@@ -76,6 +76,7 @@ def policy_named(name: str) -> Policy:
     return POLICIES[name]
 
 
+MOST_FRAMES = 1_000_000  # that a pipeline file may ask for
 DEADLINE_PERIODS = 3  # from a frame's release until it must be presented
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from trilane.apps.cli.commands import Commands, JsonOption, with_options
 from trilane.apps.cli.console import say, stderr_console
+from trilane.apps.cli.predict_file import predict_pipeline_file
 from trilane.apps.cli.predict_output import draw, show_answer, show_networks, show_table
 from trilane.apps.cli.predict_pipelines import predict_pipelines
 from trilane.apps.predict.asked_prediction import answer_of, application_of, predict_networks
@@ -39,6 +40,8 @@ Examples:
   trilane predict --network unet.onnx --application --fps 30 --what-if
   trilane predict --table rows.csv --json
   trilane predict portrait --beside default --beside network.onnx@30
+  trilane predict street.toml --profile snapdragon-8-gen-3
+  trilane predict street.toml --set stages.segmenter.unit=gpu --set run.fps=60,run.policy=latest
 """
 PLOT_MINUTES = 30.0
 
@@ -48,7 +51,8 @@ PLOT_MINUTES = 30.0
 def predict(options: PredictOptions, *, json: JsonOption = False) -> None:
     """Predict frame time, idleness, heat and energy on a chip, with the error to expect.
 
-    Without --network, or with --application: the avatar's application. With --network: each network by itself.
+    Without --network, or with --application: the avatar's application. With --network: each network by itself. With a
+    pipeline file: that pipeline, by the times of its stages (docs/pipeline-file.md).
 
     The performance profile is burst, if none is given, for a network by itself, as published latencies are, and for the
     profile `host`, this machine, where a run has no cap.
@@ -56,6 +60,9 @@ def predict(options: PredictOptions, *, json: JsonOption = False) -> None:
     from trilane.hw_profiles.profile_files import load_runnable
 
     options.check_together()
+    if options.pipeline is not None:
+        predict_pipeline_file(options, options.pipeline, json)
+        return
     if options.scene is not None:
         predict_pipelines(options, json)
         return

@@ -15,7 +15,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from trilane.errors import BadInputError
 from trilane.options import Finite, Option, Options, Text, Texts, one_of
-from trilane.scheduler.policy import POLICIES
+from trilane.scheduler.policy import MOST_FRAMES, POLICIES
 from trilane.stages.run_options import AVATARS_HELP, PROFILE_HELP
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import BURST, PERFORMANCE_PROFILES, SUSTAINED, UnitName
@@ -51,6 +51,11 @@ OF_A_SCENE: Final = {"scene", "beside", "turns", "profile", "minutes", "policy",
     "governor",
     "trace",
 }
+#: Options that mean something beside a pipeline file, and those that mean nothing without one.
+OF_A_PIPELINE: Final = {"scene", "changes", "frames", "seed", "profile", "performance_profile", "engine_runtime"} | {
+    "precision",
+}
+OF_A_PIPELINE_ALONE: Final = {"changes", "frames", "seed"}
 
 
 def _either(read_words: Callable[[], tuple[str, ...]], expected: str = "") -> AfterValidator:
@@ -127,8 +132,16 @@ class PredictOptions(Options):
 
     scene: Annotated[Text | None, Option(is_argument=True)] = Field(
         default=None,
-        description="A scene, priced frame by frame, instead of one network: a name, a file, or SCENE@RATE.",
+        description="A scene, priced frame by frame, instead of one network: a name, a file, or SCENE@RATE. "
+        "Or a pipeline file (.toml).",
     )
+    changes: Annotated[Texts, Option("--set")] = Field(
+        default=(),
+        description="Of a pipeline file: another value, such as stages.seg.unit=dsp, or several with commas. "
+        "May be given again.",
+    )
+    frames: int | None = Field(default=None, ge=1, le=MOST_FRAMES, description="Of a pipeline file: simulated frames.")
+    seed: int = Field(default=0, ge=0, le=2**32 - 1, description="Of a pipeline file: seed of its random times.")
     beside: Texts = Field(
         default=(),
         description="What else the chip does: SCENE, SCENE@RATE, NETWORK.onnx@RATE or @RATE:gpu. Once for each.",
@@ -214,7 +227,15 @@ class PredictOptions(Options):
         """
         if "performance_profile" in self.model_fields_set:
             return self.performance_profile
-        return BURST if self.is_bare or self.profile == HOST else SUSTAINED
+        return BURST if self.is_bare or self.pipeline is not None or self.profile == HOST else SUSTAINED
+
+    @property
+    def pipeline(self) -> Path | None:
+        """Return the pipeline file that is asked for; None for a scene, a network or the application."""
+        from trilane.pipeline.pipeline_file import is_pipeline_file
+
+        path = None if self.scene is None else Path(self.scene)
+        return path if path is not None and is_pipeline_file(path) else None
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -269,6 +290,11 @@ class PredictOptions(Options):
 
     def check_together(self) -> None:
         """Raise BadInputError for options that leave another one without effect, or that lack another."""
+        self._check_pipeline_file()
+        if self.pipeline is None:
+            self._check_others()
+
+    def _check_others(self) -> None:
         given = self.model_fields_set
         if self.beside and self.scene is None:
             raise BadInputError("options", "--beside without a scene", "a scene, such as `trilane predict default`")
@@ -294,6 +320,15 @@ class PredictOptions(Options):
             raise BadInputError("options", found, "one --network", remedy)
         if self.input_shape and not self.network:
             raise BadInputError("options", "--input-shape without --network", "a network whose input it is")
+
+    def _check_pipeline_file(self) -> None:
+        given = self.model_fields_set
+        if self.pipeline is not None and (useless := given - OF_A_PIPELINE):
+            found, remedy = f"{self._spelt(useless)} beside a pipeline file", "the file says so itself, or --set does"
+            raise BadInputError("options", found, "none of them", remedy)
+        if self.pipeline is None and (useless := given & OF_A_PIPELINE_ALONE):
+            found = f"{self._spelt(useless)} without a pipeline file"
+            raise BadInputError("options", found, "a .toml file with [stages] before them")
 
     def _spelt(self, names: set[str]) -> str:
         return ", ".join(sorted(map(self.spelling, names)))

@@ -1,0 +1,183 @@
+"""The types of a pipeline file's ports: from its own words, from its networks, and from what blocks do.
+
+    types = port_types(file, read_networks(file))
+    types["camera"][""].shape  # (480, 640, 3)
+
+Rule: what is not known stays unknown, because own code may write anything. What is known must fit.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+
+import numpy as np
+import onnx
+
+from trilane.errors import BadInputError, did_you_mean
+from trilane.hw_profiles.graph_file import GraphFile, read_graph
+from trilane.pipeline.file_keys import (
+    TYPES,
+    EncodeBlock,
+    OnnxStage,
+    OverlayBlock,
+    PortType,
+    PrepareBlock,
+    StageInput,
+    StageKeys,
+    VideoBlock,
+)
+from trilane.pipeline.pipeline_file import PipelineFile
+
+#: Types of the ports that each stage writes, by name; without the stages of which nothing is known.
+PortTypes = dict[str, dict[str, PortType]]
+CODES = {name: code for code, name in TYPES.items()}
+PICTURE_CHANNELS = (1, 3, 4)
+NETWORK_CHANNELS = (1, 3)
+
+
+def read_networks(file: PipelineFile) -> dict[str, GraphFile]:
+    """Read the network of every stage that has one, by the stage's name.
+
+    Raises BadInputError, also for inputs that nobody feeds and ports that the network does not have.
+    """
+    found = {}
+    for name, stage in file.stages.items():
+        if isinstance(stage, OnnxStage):
+            found[name] = _read(file, name, stage)
+            _check_names(file, name, stage, found[name])
+    for name, stage in file.stages.items():
+        for each in stage.inputs:
+            if each.stage in found:
+                _check_output(file, name, each, [one.name for one in found[each.stage].model.graph.output])
+    return found
+
+
+def _read(file: PipelineFile, name: str, stage: OnnxStage) -> GraphFile:
+    where = f"{file.path}: stages.{name}"
+    try:
+        return read_graph(file.folder / stage.onnx, stage.shapes)
+    except BadInputError as error:
+        found = re.sub(r"--input-shape (\S+)=", r"shapes.\1 = ", error.found)
+        remedy = re.sub(r"give it: --input-shape (\S+)=([\dxN]+)", r"add shapes = { \1 = '\2' }", error.remedy)
+        raise BadInputError(f"{where}.onnx: {error.where}", found, error.expected, remedy) from None
+
+
+def _check_names(file: PipelineFile, name: str, stage: OnnxStage, graph: GraphFile) -> None:
+    """Check that each input of a network is fed, and that no other one is."""
+    where, inputs = f"{file.path}: stages.{name}", [value.name for value in graph.model.graph.input]
+    for shape in stage.shapes:
+        if shape not in inputs:
+            expected = f"one of {', '.join(inputs)}"
+            raise BadInputError(f"{where}.shapes.{shape}", "an unknown input", expected, did_you_mean(shape, inputs))
+    ports = [each.port for each in stage.inputs]
+    if ports == [""] and len(inputs) == 1:
+        return
+    for port in ports:
+        if port not in inputs:
+            found = f"the unknown port {port!r}" if port else "a stage without a port"
+            expected = f"a table with {', '.join(inputs)}"
+            raise BadInputError(f"{where}.in", found, expected, did_you_mean(port, inputs))
+    for each in inputs:
+        if each not in ports:
+            found = f"nobody who feeds the input {each!r} of {stage.onnx}"
+            raise BadInputError(f"{where}.in", found, f"a stage for each of {', '.join(inputs)}")
+
+
+def _check_output(file: PipelineFile, name: str, each: StageInput, outputs: list[str]) -> None:
+    """Check the port of a network that stage `name` reads."""
+    where = f"{file.path}: stages.{name}.in" + (f".{each.port}" if each.port else "")
+    if each.from_port and each.from_port not in outputs:
+        found = f"the unknown port {each.from_port!r} of {each.stage}"
+        raise BadInputError(where, found, f"one of {', '.join(outputs)}", did_you_mean(each.from_port, outputs))
+
+
+def port_types(file: PipelineFile, networks: Mapping[str, GraphFile]) -> PortTypes:
+    """Return the types of the ports. `networks`: those of `read_networks`. Raises BadInputError for a misfit."""
+    found: PortTypes = {}
+    for name, stage in file.stages.items():
+        _check_inputs(file, name, stage, found, networks)
+        known = _written(stage, found, networks.get(name), networks)
+        if known:
+            found[name] = known
+    return found
+
+
+def _written(
+    stage: StageKeys, known: PortTypes, network: GraphFile | None, networks: Mapping[str, GraphFile]
+) -> dict[str, PortType]:
+    """Return the types of what a stage writes; empty where they are unknown. `known`: types of the stages before."""
+    if stage.out is not None:
+        return stage.out
+    if network is not None:
+        outputs = {value.name: value_type(value) for value in network.model.graph.output}
+        return {name: each for name, each in outputs.items() if each is not None}
+    if isinstance(stage, VideoBlock):
+        return {"": PortType("u8", (stage.size[1], stage.size[0], 3))}
+    if isinstance(stage, PrepareBlock):
+        inputs = networks[stage.like].model.graph.input
+        chosen = [value for value in inputs if stage.port in ("", value.name)]
+        wanted = value_type(chosen[0]) if len(chosen) == 1 else None
+        return {"": wanted} if wanted else {}
+    if isinstance(stage, OverlayBlock):
+        frame = next(each for each in stage.inputs if each.port in ("", "frame"))
+        picture = source_type(frame, known)
+        return {"": picture} if picture else {}
+    return {}
+
+
+def source_type(each: StageInput, known: PortTypes) -> PortType | None:
+    """Return the type of what an input reads; None where it is unknown."""
+    ports = known.get(each.stage, {})
+    if each.from_port:
+        return ports.get(each.from_port)
+    return next(iter(ports.values())) if len(ports) == 1 else None
+
+
+def value_type(value: onnx.ValueInfoProto) -> PortType | None:
+    """Return the type of a network's input or output; None for numbers that no port carries."""
+    kind = value.type.tensor_type
+    try:
+        name = np.dtype(onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type)).name
+    except KeyError:
+        return None
+    shape = tuple(size.dim_value for size in kind.shape.dim)
+    return PortType(CODES[name], shape or (1,)) if name in CODES else None
+
+
+def is_picture(port: PortType) -> bool:
+    """Say whether a port carries a picture, height x width x channels of bytes."""
+    return port.dtype == "u8" and len(port.shape) == 3 and port.shape[2] in PICTURE_CHANNELS
+
+
+def _check_inputs(
+    file: PipelineFile, name: str, stage: StageKeys, known: PortTypes, networks: Mapping[str, GraphFile]
+) -> None:
+    """Check the types of what a stage reads, where they are known."""
+    for each in stage.inputs:
+        found = source_type(each, known)
+        if found is None:
+            continue
+        where = f"{file.path}: stages.{name}.in" + (f".{each.port}" if each.port else "")
+        takes_picture = isinstance(stage, PrepareBlock | EncodeBlock) or (
+            isinstance(stage, OverlayBlock) and each.port in ("", "frame")
+        )
+        if takes_picture and not is_picture(found):
+            raise BadInputError(where, f"{found} from {each.stage}", "a picture, such as u8 480x640x3")
+        if name in networks:
+            _check_network(where, found, each, networks[name])
+
+
+def _check_network(where: str, found: PortType, each: StageInput, network: GraphFile) -> None:
+    """Check what a network's input reads: that type, or a picture where the network takes one."""
+    inputs = network.model.graph.input
+    value = next(one for one in inputs if each.port in ("", one.name))
+    wanted = value_type(value)
+    if wanted is None or (found.dtype == wanted.dtype and math.prod(found.shape) == math.prod(wanted.shape)):
+        return
+    if is_picture(found) and len(wanted.shape) == 4 and {wanted.shape[1], wanted.shape[3]} & set(NETWORK_CHANNELS):
+        return
+    prepared = 'a block = "prepare" before it' if is_picture(found) else f"a stage that writes {wanted}"
+    remedy = f"add {prepared}"
+    raise BadInputError(where, f"{found} from {each.stage}", f"{wanted} for the input {value.name!r}", remedy)

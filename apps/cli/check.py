@@ -1,0 +1,137 @@
+"""`trilane check`: a pipeline file as text, JSON or a drawing.
+
+Rule: this module shows what `trilane.apps.check` found; nothing is computed here, and nothing of the file is imported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from trilane.apps.cli.commands import Commands, JsonOption
+from trilane.apps.cli.console import print_json, stdout_console, without_controls
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+app = Commands()
+
+EPILOG = """\b
+Examples:
+  trilane check street.toml
+  trilane check street.toml --svg street.svg
+  trilane check street.toml --json
+
+\b
+Exit codes:
+  0 the file is right, 2 it is not, or no such file
+"""
+
+FileArgument = Annotated[Path, typer.Argument(help="Pipeline file (.toml, docs/pipeline-file.md).")]
+SvgOption = Annotated[Path | None, typer.Option("--svg", help="Draw the graph here (.svg).")]
+
+
+@app.command(epilog=EPILOG)
+def check(file: FileArgument, svg: SvgOption = None, json: JsonOption = False) -> None:
+    """Check a pipeline file and print its graph, the least period with the cycle that makes it, and its memory.
+
+    Nothing runs, and no Python of the file is imported.
+    """
+    from trilane.apps.check.checked_file import check_file
+    from trilane.apps.check.graph_svg import draw_graph
+    from trilane.errors import BadInputError
+    from trilane.writing import require_writable, write_bytes
+
+    if svg is not None:
+        if svg.suffix.lower() != ".svg":
+            raise BadInputError("--svg", f"'{svg}'", "a name that ends in .svg")
+        require_writable(svg)
+    document = check_file(file)
+    if svg is not None:
+        write_bytes(svg, draw_graph(document).encode())
+    if json:
+        print_json(document)
+        return
+    console = stdout_console()
+    for line in _head(document):
+        console.print(line, soft_wrap=True, markup=False)
+    console.print(_stages(document))
+    if document["streams"]:
+        console.print(_streams(document))
+    for line in _tail(document):
+        console.print(line, soft_wrap=True, markup=False)
+
+
+def _head(document: Mapping[str, Any]) -> list[str]:
+    run = document["run"]
+    source = "a source that is always ready"
+    if "fps" in run:
+        source = f"{run['fps']:g} fps"
+    elif "arrivals" in run:
+        source = f"arrivals at {run['arrivals']['poisson']:g} a second"
+    count = f"{len(document['stages'])} stages on {len(document['units'])} units"
+    return [f"{without_controls(document['file'])}: {count}, {source}, {run['policy']}"]
+
+
+def _stages(document: Mapping[str, Any]) -> Table:
+    """Return the stages by unit, in the order of a frame."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table("unit", "stage", "what", "reads", "time, ms", "from")
+    for unit, facts in document["units"].items():
+        title = unit if facts["hardware"] in (None, unit) else f"{unit} ({facts['hardware']})"
+        for stage in document["stages"]:
+            if stage["unit"] != unit:
+                continue
+            every = f", every {stage['every']}" if stage["every"] > 1 else ""
+            what = escape(" ".join(filter(None, (stage["kind"], without_controls(stage["what"])))))
+            reads = escape(", ".join(map(_input, stage["in"]))) or "-"
+            time = "?" if stage["time_ms"] is None else f"{stage['time_ms']:.4g}"
+            table.add_row(title, stage["name"], what + every, reads, time, stage["time_from"] or "-")
+            title = ""
+    return table
+
+
+def _input(each: Mapping[str, Any]) -> str:
+    port = f"{each['port']}: " if each["port"] else ""
+    age = f" to {each['max_age_ms']:g} ms" if each.get("max_age_ms") else ""
+    return without_controls(f"{port}{each['from']}") + (f" (latest{age})" if each["sync"] == "latest" else "")
+
+
+def _streams(document: Mapping[str, Any]) -> Table:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table("stream", "readers", "rule", "slots", "ports", "memory")
+    for stream in document["streams"]:
+        ports = ", ".join(f"{name}: {kind}" if name else kind for name, kind in stream["ports"].items())
+        memory = "?" if stream["memory_bytes"] is None else f"{stream['memory_bytes'] / 1e6:.3g} MB"
+        readers = ", ".join(stream["to"])
+        table.add_row(
+            stream["from"], readers, stream["rule"], str(stream["slots"]), escape(without_controls(ports)), memory
+        )
+    return table
+
+
+def _tail(document: Mapping[str, Any]) -> list[str]:
+    unknown = [stage["name"] for stage in document["stages"] if stage["time_ms"] is None]
+    lines = []
+    if document["period_ms"] is None:
+        lines.append(
+            f"period    unknown, as no time is known of {', '.join(unknown)}; `trilane predict` prices networks"
+        )
+    else:
+        period = document["period_ms"]
+        rate = f" ({1e3 / period:.4g} a second)" if period else ""
+        limit = f", by {document['limit'].replace('_', ' ')}: {' -> '.join(document['cycle'])}"
+        lines.append(f"period    {period:.6g} ms or more{rate}{limit if document['cycle'] else ''}")
+    more = f", and what is unknown of {', '.join(document['memory_unknown'])}" if document["memory_unknown"] else ""
+    lines.append(f"memory    {document['memory_bytes'] / 1e6:.3g} MB of slots{more}")
+    lines.append(f"latency   to the end of {document['latency_to']}")
+    if document["imports"]:
+        lines.append(f"imports   {', '.join(document['imports'])}, by `trilane run` alone")
+    return lines

@@ -1,0 +1,82 @@
+"""A pipeline file on a chip, as somebody asked for it: the file as it is, and a variant for each `--set`.
+
+Rule: nothing is printed here and no Python of the file is imported. `trilane.hw_profiles` answers.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+from trilane.apps.check.port_types import port_types, read_networks
+from trilane.apps.predict.predict_options import HOST, PredictOptions
+from trilane.hw_profiles.graph_file import GraphFile
+from trilane.hw_profiles.network_time import in_precision, under_runtime
+from trilane.hw_profiles.pipeline_prediction import predict_file, prices_of
+from trilane.hw_profiles.profile_files import load_runnable
+from trilane.hw_profiles.schema import Profile
+from trilane.pipeline.file_keys import OnnxStage
+from trilane.pipeline.pipeline_file import TABLES, PipelineFile, read_pipeline
+from trilane.units import INFER, UnitName
+
+#: A comma between two assignments, not one in a list or a table.
+BETWEEN: Final = re.compile(rf",(?=\s*(?:{'|'.join(TABLES)})\.)")
+APART: Final = "networks are priced alone: units that work at once share memory and heat, which is not in these times"
+
+
+def predict_asked_file(options: PredictOptions, path: Path, say: Callable[[str], None]) -> dict[str, Any]:
+    """Return the prediction of a pipeline file and its variants. Raises BadInputError.
+
+    `say`: function that is told before something takes seconds.
+    """
+    file = read_pipeline(path)
+    variants = [("", file)] + [(text, file.changed(BETWEEN.split(text))) for text in options.changes]
+    chips = _Chips(options, say)
+    answers = [_answer(each, text, options, chips) for text, each in variants]
+    chip = chips.used
+    return {
+        "schema": 1,
+        "clock": "virtual",
+        "machine": {"profile": chip.name, "title": chip.title} if chip else None,
+        "config": {"performance_profile": options.cap if chip else None, "seed": options.seed},
+        "pipelines": answers,
+        "notes": [APART] if chip else [],
+    }
+
+
+class _Chips:
+    """The chip, loaded when the first network needs it, and as each network uses it. `used`: None before that."""
+
+    def __init__(self, options: PredictOptions, say: Callable[[str], None]) -> None:
+        self._options, self._say = options, say
+        self._known: dict[tuple[Path, tuple[tuple[str, tuple[int, ...]], ...], UnitName, str | None], Profile] = {}
+        self.used = load_runnable(options.profile) if "profile" in options.model_fields_set else None
+
+    def chip_for(self, stage: OnnxStage, graph: GraphFile, unit: UnitName) -> Profile:
+        """Return the chip with `unit` as it computes the network of `stage`; this machine measures it first."""
+        options, asked = self._options, stage.precision or self._options.numbers
+        key = graph.path, tuple(sorted(stage.shapes.items())), unit, asked
+        if key not in self._known:
+            chip = self.used = self.used or load_runnable(options.profile)
+            chip = under_runtime(in_precision(chip, unit, graph.numbers, asked), unit, options.engine)
+            if chip.name == HOST and unit == INFER[1] and asked is None:
+                from trilane.apps.predict.this_machine import with_file
+
+                chip = with_file(chip, graph, stage.shapes, self._say)
+            self._known[key] = chip
+        return self._known[key]
+
+
+def _answer(file: PipelineFile, text: str, options: PredictOptions, chips: _Chips) -> dict[str, Any]:
+    graphs = read_networks(file)
+    port_types(file, graphs)
+
+    def chip_for(name: str, graph: GraphFile, unit: UnitName) -> Profile:
+        stage = file.stages[name]
+        assert isinstance(stage, OnnxStage)
+        return chips.chip_for(stage, graph, unit)
+
+    prices = prices_of(file, graphs, chip_for, options.cap)
+    return {"what_if": text, **predict_file(file, prices, options.frames or 0, options.seed)}

@@ -1,0 +1,258 @@
+"""What a pipeline file does on a chip: a time for each stage, then one run of the scheduler in virtual time.
+
+The time of a stage is that of the file, else of its network on the unit's hardware. Two kinds of uncertainty are kept
+apart. Jitter is what differs from frame to frame; the simulated run has it. Ignorance is the error of the chip's model;
+it is the same for all frames, and makes the intervals. They hold 80 %, as those of a network by itself.
+
+Rule: all draws follow from the seed, the stage's name and the frame, so that two variants of a file meet the same luck.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.errors import BadInputError
+from trilane.hw_profiles.graph_file import GraphFile
+from trilane.hw_profiles.network_time import interval, price, spread_of
+from trilane.hw_profiles.rates import FrameInterval, holding
+from trilane.hw_profiles.schema import Profile, corners_of
+from trilane.pipeline.file_graph import edge_rules, graph_of, in_flight_of, settings_of, source_ns
+from trilane.pipeline.file_keys import BusyBlock, OnnxStage, StageTime
+from trilane.pipeline.pipeline_file import PipelineFile
+from trilane.scheduler.events import Graph, Settings
+from trilane.scheduler.period_bound import Bound, period_bound
+from trilane.scheduler.virtual import simulate
+from trilane.units import NS_PER_MS, UNITS, UnitName
+
+DRAWS: Final = 200
+SIMULATIONS: Final = 20
+SIMULATED_FRAMES: Final = 200  # of each of them
+SATURATED_FRAMES: Final = 1000
+BLOCK: Final = 4096  # frames whose times are drawn at once
+#: No job hangs in virtual time, however long the file says that it takes.
+NEVER_HANGS_NS: Final = 1 << 60
+QUANTILES: Final = (10, 90)
+
+#: (name of a stage, its graph, its unit of hardware) -> the chip that computes as this network does.
+ChipFor = Callable[[str, GraphFile, UnitName], Profile]
+
+
+@dataclass(frozen=True)
+class StagePrice:
+    """The time of a job of a stage.
+
+    `source`: where it comes from. `spread`: standard deviation of the logarithm of the model's error; 0 for times that
+    the file gives. `low_ms`, `high_ms`: 80 % interval of the mean. `why`: reasons for its width.
+    """
+
+    time: StageTime
+    source: str
+    spread: float = 0.0
+    low_ms: float = 0.0
+    high_ms: float = 0.0
+    why: tuple[str, ...] = ()
+
+    @property
+    def mean_ns(self) -> int:
+        return round(self.time.mean_ms * NS_PER_MS)
+
+
+def given_price(file: PipelineFile, name: str) -> StagePrice | None:
+    """Return the price that the file itself states for stage `name`; None where it states none."""
+    stage = file.stages[name]
+    time, source = stage.time_ms, "time_ms"
+    if time is None and isinstance(stage, BusyBlock):
+        time, source = StageTime(mean=stage.load_ms), "load_ms"
+    if time is None:
+        return None
+    return StagePrice(time, source, low_ms=time.mean_ms, high_ms=time.mean_ms)
+
+
+def network_price(chip: Profile, graph: GraphFile, unit: UnitName, performance_profile: str) -> StagePrice:
+    """Return the price of a network on `unit` of `chip`, which computes in the network's precision."""
+    time = price(chip, graph.work, unit, corners_of(chip, performance_profile))
+    around = interval(chip, graph.work, time)
+    source = f"{chip.name}, {unit} in {chip.units[unit].precision}"
+    spread = spread_of(around) if around.low_ms > 0 else 0.0
+    return StagePrice(StageTime(mean=time.total_ms), source, spread, around.low_ms, around.high_ms, around.why)
+
+
+def prices_of(
+    file: PipelineFile, graphs: Mapping[str, GraphFile], chip_for: ChipFor, performance_profile: str
+) -> dict[str, StagePrice]:
+    """Return the price of every stage. Raises BadInputError naming a stage without one.
+
+    `graphs`: graphs of the stages whose network has to be priced, by the stage's name.
+    """
+    found = {}
+    for name, stage in file.stages.items():
+        known = given_price(file, name)
+        if known is None and isinstance(stage, OnnxStage):
+            unit = next(each for each in UNITS if each == file.hardware(stage.unit))
+            chip = chip_for(name, graphs[name], unit)
+            known = network_price(chip, graphs[name], unit, performance_profile)
+        if known is None:
+            what = f"{stage.named_kind} without a time"
+            remedy = "add time_ms = ... to it: what it takes on that chip"
+            raise BadInputError(f"{file.path}: stages.{name}", what, "a stage whose time is known", remedy)
+        found[name] = known
+    return found
+
+
+def bound_of(file: PipelineFile, prices: Mapping[str, StagePrice]) -> tuple[Graph, Bound]:
+    """Return the scheduler's graph of a file and the bound on its period, from the mean times of its stages."""
+    times = {name: each.mean_ns for name, each in prices.items()}
+    graph = graph_of(file, edge_rules(file, times))
+    return graph, period_bound(graph, times, in_flight_of(file), source_ns(file))
+
+
+class _Drawn:
+    """The time of each job in ns, as a function for the virtual clock. `factors`: what each stage's time is times."""
+
+    def __init__(self, prices: Mapping[str, StagePrice], seed: int, factors: Mapping[str, float] | None = None) -> None:
+        self._prices, self._seed, self._factors = prices, seed, factors or {}
+        self._fixed = {name: self._ns(name, each.mean_ns) for name, each in prices.items() if not each.time.varies}
+        self._blocks: dict[str, tuple[int, list[int]]] = {}
+
+    def __call__(self, stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
+        fixed = self._fixed.get(stage)
+        if fixed is not None:
+            return fixed
+        number, place = divmod(frame, BLOCK)
+        block = self._blocks.get(stage)
+        if block is None or block[0] != number:
+            rng = np.random.default_rng([self._seed, crc32(stage.encode()), number])
+            times = _draw_ms(self._prices[stage].time, rng) * self._factors.get(stage, 1.0) * NS_PER_MS
+            block = self._blocks[stage] = number, np.rint(times).astype(np.int64).tolist()
+        return block[1][place]
+
+    def _ns(self, name: str, mean_ns: int) -> int:
+        return round(mean_ns * self._factors.get(name, 1.0))
+
+
+def _draw_ms(time: StageTime, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Draw the times of a block of frames, shape (BLOCK,), in ms."""
+    if time.samples:
+        return rng.choice(np.array(time.samples), BLOCK)
+    if time.exponential is not None:
+        return rng.exponential(time.exponential, BLOCK)
+    variance = math.log1p((time.sd / time.mean_ms) ** 2)
+    return rng.lognormal(math.log(time.mean_ms) - variance / 2, math.sqrt(variance), BLOCK)
+
+
+def predict_file(
+    file: PipelineFile, prices: Mapping[str, StagePrice], frames: int = 0, seed: int = 0
+) -> dict[str, Any]:
+    """Return the prediction, with the keys of report.json.
+
+    `frames`: frames of the simulated run; 0: as the file says, or 1000.
+    """
+    graph, bound = bound_of(file, prices)
+    settings = settings_of(file, frames, seed, hang_ns=NEVER_HANGS_NS)
+    report = simulate(graph, settings, _Drawn(prices, seed)).report
+    needs = _needs(file, prices, graph, report, seed)
+    frame_time, latency = _intervals(file, prices, graph, report, needs, seed)
+    answer = {
+        "name": file.path.stem,
+        "source": str(file.path),
+        "period_ms": float(bound.period_ns) / NS_PER_MS,
+        "cycle": list(bound.stages),
+        "limit": bound.limit,
+        "needs_ms": {"mean": needs.ms, "low": needs.low_ms, "high": needs.high_ms},
+        **report,
+        "frame_time_ms": {**report["frame_time_ms"], **frame_time},
+        "latency_ms": {**report["latency_ms"], **latency},
+        "stages": {name: {**row, **_row(prices[name])} for name, row in report["stages"].items()},
+        "slots": dict(zip(graph.streams, graph.edges, strict=True)),
+    }
+    if file.run.fps is not None:
+        answer["rate"] = {**holding(file.run.fps, needs), "sentence": _sentence(file.run.fps, needs)}
+    return answer
+
+
+def _row(stage: StagePrice) -> dict[str, Any]:
+    return {
+        "alone_ms": stage.time.mean_ms,
+        "low_ms": stage.low_ms,
+        "high_ms": stage.high_ms,
+        "source": stage.source,
+        "why": list(stage.why),
+    }
+
+
+def _needs(
+    file: PipelineFile, prices: Mapping[str, StagePrice], graph: Graph, report: Mapping[str, Any], seed: int
+) -> FrameInterval:
+    """Return the time of a frame of the source when frames never wait for it, with the interval by ignorance.
+
+    The jitter's part is that of a run with an always ready source; 200 draws of the bound have the ignorance.
+    """
+    times = {name: each.mean_ns for name, each in prices.items()}
+    in_flight = in_flight_of(file)
+    bound_ns = period_bound(graph, times, in_flight).period_ns
+    ready = Settings(min(report["frames"]["requested"], SATURATED_FRAMES), hang_ns=NEVER_HANGS_NS, in_flight=in_flight)
+    done = simulate(replace(graph, from_release=False), ready, _Drawn(prices, seed)).report
+    presented = done["frames"]["presented"]
+    ms = done["duration_s"] * 1e3 / ready.frames if presented < ready.frames else done["frame_time_ms"]["mean"]
+    if not bound_ns or not any(each.spread for each in prices.values()):
+        return FrameInterval(ms, ms, ms)
+    rng = np.random.default_rng([seed, 1])
+    found = []
+    for _ in range(DRAWS):
+        factors = _factors(prices, rng)
+        drawn = {name: round(ns * factors[name]) for name, ns in times.items()}
+        found.append(float(period_bound(graph, drawn, in_flight).period_ns / bound_ns))
+    low, high = np.percentile(found, QUANTILES)
+    return FrameInterval(ms, float(ms * low), float(ms * high))
+
+
+def _factors(prices: Mapping[str, StagePrice], rng: np.random.Generator) -> dict[str, float]:
+    """Draw by how much the model of the chip may be wrong for each stage."""
+    return {name: math.exp(each.spread * rng.standard_normal()) for name, each in prices.items()}
+
+
+def _intervals(
+    file: PipelineFile,
+    prices: Mapping[str, StagePrice],
+    graph: Graph,
+    report: Mapping[str, Any],
+    needs: FrameInterval,
+    seed: int,
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the intervals of the mean frame time and the mean latency by ignorance, from short simulated runs.
+
+    Where no frame is dropped the frame time is that of the bound, or of the source.
+    """
+    frame_ms, latency_ms = report["frame_time_ms"]["mean"], report["latency_ms"]["mean"]
+    if not any(each.spread for each in prices.values()):
+        return {"low": frame_ms, "high": frame_ms}, {"low": latency_ms, "high": latency_ms}
+    rng = np.random.default_rng([seed, 2])
+    count = min(report["frames"]["requested"], SIMULATED_FRAMES)
+    settings = settings_of(file, count, seed, hang_ns=NEVER_HANGS_NS)
+    runs = [simulate(graph, settings, _Drawn(prices, seed, _factors(prices, rng))).report for _ in range(SIMULATIONS)]
+    latency = _quantiles([run["latency_ms"]["mean"] for run in runs])
+    if report["frames"]["dropped"]:
+        return _quantiles([run["frame_time_ms"]["mean"] for run in runs]), latency
+    least = source_ns(file) / NS_PER_MS
+    return {"low": max(least, needs.low_ms), "high": max(least, needs.high_ms)}, latency
+
+
+def _quantiles(values: list[float]) -> dict[str, float]:
+    low, high = np.percentile(values, QUANTILES)
+    return {"low": float(low), "high": float(high)}
+
+
+def _sentence(fps: float, needs: FrameInterval) -> str:
+    """Say whether the rate holds: `holds 30 fps: yes; 12-19 ms of 33 ms (80 %)`."""
+    frame_ms = 1e3 / fps
+    holds = "yes" if needs.high_ms <= frame_ms else "no" if needs.low_ms > frame_ms else "perhaps"
+    if needs.low_ms == needs.high_ms:
+        return f"holds {fps:g} fps: {holds}; {needs.ms:.3g} ms of {frame_ms:.3g} ms"
+    return f"holds {fps:g} fps: {holds}; {needs.low_ms:.3g}-{needs.high_ms:.3g} ms of {frame_ms:.3g} ms (80 %)"
