@@ -328,7 +328,8 @@ def _run_rows(report: Report) -> Iterable[Row]:
         idle = ", ".join(f"{cause} {share:.0%}" for cause, share in shares.idle if share)
         yield unit, f"busy {shares.busy:.0%}; {idle}", measured
     scene = report.config["scene"]
-    yield "scene", f"{scene['name']}, tensor size {scene['size']}, {report.policy}, {report.edge}", ""
+    size = f"tensor size {scene['size']}, " if "size" in scene else ""
+    yield "scene", f"{scene['name']}, {size}{report.policy}, {report.edge}", ""
     yield "machine", report.machine.cpu.model, ""
 
 

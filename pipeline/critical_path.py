@@ -1,8 +1,9 @@
 """What bounds the frame time: the critical path of jobs and waits that ends with a presented frame, walked backwards.
 
 Rule: a job begins when the last thing that it needs is there. It needs its input, its unit, a slot, room in flight, and
-its frame's release. Of several inputs, the one that came last counts. The path goes on with the job that brought the last thing. Time between the two belongs to no job:
-overhead, a cap, a restart. So the pieces of a path follow each other without gaps and sum to the time that it spans.
+its frame's release. Of several inputs, the one that came last counts. The path goes on with the job that brought the
+last thing. Time between the two belongs to no job: overhead, a cap, a restart. So the pieces of a path follow each
+other without gaps and sum to the time that it spans.
 
 The last thing is known, not guessed. A job that was handed over while its unit did another waited for that one. Any
 other job waited for one of the ends that the scheduler heard of in the step in which it handed the job over.

@@ -169,6 +169,7 @@ class Pipeline(Described):
     `latency_to`: stage at whose end a frame's latency ends; without it, the last stage.
     `bypass`: names of two stages. A frame for which the first returns a `Skip` goes on to the second, past those
     between. The edges behind the first and before the second have the same header.
+    `from_release`: whether the latency begins with a frame's release, as for a camera with a rate.
     `module_folders`: folders where a unit's process first looks for the modules of factories.
     `preload`: modules that are imported once, before the units' processes are forked; none from `module_folders`.
     """
@@ -178,6 +179,7 @@ class Pipeline(Described):
     units: dict[str, UnitSettings]
     latency_to: str = ""
     bypass: tuple[str, str] | None = None
+    from_release: bool = False
     module_folders: tuple[Path, ...] = ()
     preload: tuple[str, ...] = ()
 
@@ -212,7 +214,7 @@ class Pipeline(Described):
         """Return what the scheduler knows of the pipeline."""
         stages = tuple(StageSpec(stage.name, stage.unit, _inputs(stage), stage.every) for stage in self.stages)
         rules = tuple(edge.rule for edge in self.edges)
-        return Graph(stages, rules, self.latency_to or self.stages[-1].name, self.bypass)
+        return Graph(stages, rules, self.latency_to or self.stages[-1].name, self.bypass, self.from_release)
 
     @property
     def joints(self) -> dict[str, tuple[PipelineStage, tuple[PipelineStage, ...]]]:

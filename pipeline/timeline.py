@@ -20,7 +20,6 @@ from trilane.pipeline.tracks import UNKNOWN, track_of
 from trilane.pipeline.tracks import Gone as GoneFrame
 from trilane.pipeline.unit_history import KEPT, Handed, IdleCutter, IdleSlice, Key, UnitHistory
 from trilane.scheduler.events import (
-    NEVER,
     Action,
     Dispatch,
     DropCause,

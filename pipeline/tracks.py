@@ -1,7 +1,8 @@
 """Where the frames in flight of a run are, by what its journal says: along a chain, or through a graph.
 
-Rule: a track decides nothing. It knows the rules by which the scheduler moves frames (docs/decisions/graph-core.md), and
-finds out which frame a count in the journal means. Frames do not overtake each other: where several wait, the oldest
+Rule: a track decides nothing. It knows the rules by which the scheduler moves frames (docs/decisions/graph-core.md),
+and finds out which frame a count in the journal means. Where several frames were dropped in one step, for several
+causes or from several sources, it names the oldest. Frames do not overtake each other: where several wait, the oldest
 are dropped.
 """
 
@@ -248,9 +249,10 @@ class GraphTrack:
         """Return the frame that the scheduler drops behind one stage and before others; None where there is none."""
         for reader in reversed(before) if cause == DropCause.POOL else before:
             for number, frame in self.frames.items():
-                if self._waits(frame, reader) and (behind is reader or not frame.todo & behind.bit):
-                    if cause == DropCause.LATE or self._may_drop(number, frame, behind, reader, cause):
-                        return number
+                if not self._waits(frame, reader) or (behind is not reader and frame.todo & behind.bit):
+                    continue
+                if cause == DropCause.LATE or self._may_drop(number, frame, behind, reader, cause):
+                    return number
         return None
 
     def _may_drop(self, number: int, frame: FrameState, behind: StageState, reader: StageState, cause: str) -> bool:
