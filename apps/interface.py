@@ -104,14 +104,16 @@ class Run:
         """Return the presented frames, in order: a structured array of shape (frames,), all int64.
 
         `frame`: number; `presented_ns`: time of presentation; `frame_ns`: time since the frame before, -1 for the
-        first; `latency_ns`: time from its sampled pose to the end of the stage that the pipeline names.
+        first; `latency_ns`: time from its sampled pose to the end of the stage that the pipeline names, -1 where
+        this stage did not take it.
         Raises BadInputError.
         """
         begun, records = open_journal(self.folder)
         timeline = Timeline(begun.graph, begun.settings)
         shown = (fact for record in records for fact in timeline.add(record) if isinstance(fact, Presented))
         rows = [
-            (one.frame, one.end_ns, -1 if one.interval_ns is None else one.interval_ns, one.latency_ns) for one in shown
+            (one.frame, one.end_ns, *(-1 if ns is None else ns for ns in (one.interval_ns, one.latency_ns)))
+            for one in shown
         ]
         return np.array(rows, FRAME_TYPE)
 
@@ -327,7 +329,8 @@ def _run_rows(report: Report) -> Iterable[Row]:
         idle = ", ".join(f"{cause} {share:.0%}" for cause, share in shares.idle if share)
         yield unit, f"busy {shares.busy:.0%}; {idle}", measured
     scene = report.config["scene"]
-    yield "scene", f"{scene['name']}, tensor size {scene['size']}, {report.policy}, {report.edge}", ""
+    size = f"tensor size {scene['size']}, " if "size" in scene else ""
+    yield "scene", f"{scene['name']}, {size}{report.policy}, {report.edge}", ""
     yield "machine", report.machine.cpu.model, ""
 
 

@@ -1,8 +1,9 @@
 """What bounds the frame time: the critical path of jobs and waits that ends with a presented frame, walked backwards.
 
 Rule: a job begins when the last thing that it needs is there. It needs its input, its unit, a slot, room in flight, and
-its frame's release. The path goes on with the job that brought the last thing. Time between the two belongs to no job:
-overhead, a cap, a restart. So the pieces of a path follow each other without gaps and sum to the time that it spans.
+its frame's release. Of several inputs, the one that came last counts. The path goes on with the job that brought the
+last thing. Time between the two belongs to no job: overhead, a cap, a restart. So the pieces of a path follow each
+other without gaps and sum to the time that it spans.
 
 The last thing is known, not guessed. A job that was handed over while its unit did another waited for that one. Any
 other job waited for one of the ends that the scheduler heard of in the step in which it handed the job over.
@@ -178,11 +179,15 @@ class Paths:
         stalls: Reversible[Span] = (),
         kept: int = KEPT,
     ) -> None:
-        names = [stage.name for stage in graph.stages]
-        self._first, self._last = names[0], names[-1]
-        self._next = {name: [*names[place + 1 : place + 2], self._last] for place, name in enumerate(names)}
+        streams = graph.streams
+        ends = [stage.name for stage in graph.stages if stage.name not in streams]
+        self._next = {stage.name: [*streams.get(stage.name, ()), *ends] for stage in graph.stages}
         if graph.bypass is not None:
             self._next[graph.bypass[0]].append(graph.bypass[1])
+        self._is_chain, self._last = graph.is_chain, ends[-1]
+        reads = {stage.name: graph.inputs_of(place) for place, stage in enumerate(graph.stages)}
+        self._reads = {name: [each.stage for each in inputs if not each.latest] for name, inputs in reads.items()}
+        self._firsts = {name for name, read in self._reads.items() if not read}
         self._paced = bool(settings.period_ns or settings.arrivals_ns or settings.asked)
         self._latches = settings.latch_ns > 0
         self._stage_of = {stage.unit: stage.name for stage in reversed(graph.stages)}
@@ -201,12 +206,15 @@ class Paths:
         if before := self._last_of_unit.get(job.unit):
             self._before[key] = before
         self._last_of_unit[job.unit] = key
-        if before := self._last_of_frame.pop(job.frame, None):
-            self._input[key] = before
-        if job.stage == self._last:
+        if self._is_chain:
+            if before := self._last_of_frame.pop(job.frame, None):
+                self._input[key] = before
+            if job.stage != self._last:
+                self._last_of_frame[job.frame] = key
+        elif read := [each for stage in self._reads[job.stage] if (each := (stage, job.frame)) in self._jobs]:
+            self._input[key] = max(read, key=lambda each: self._jobs[each].job.end_ns)
+        if explained.presented is not None or (self._is_chain and job.stage == self._last):
             self._presented.append(key)
-        else:
-            self._last_of_frame[job.frame] = key
         while len(self._jobs) > self._kept:
             self._forget(self._jobs.popitem(last=False)[0])
 
@@ -240,7 +248,7 @@ class Paths:
         elif is_first:
             yield Piece(UNKNOWN, job.stage, job, from_ns, job.begin_ns)
         else:
-            is_latched = self._latches and job.stage == self._first and not now.after
+            is_latched = self._latches and job.stage in self._firsts and not now.after
             yield from _divided(now, from_ns, HELD if is_latched else self._overhead(now, from_ns))
 
     def _overhead(self, now: ExplainedJob, from_ns: int) -> str:
@@ -279,7 +287,7 @@ class Paths:
             return mine, False
         heard = [other for other in now.after if other in own or other[0] in self._next[job.stage]]
         found = self._latest(heard, job) or self._latest([each for each in own if each], job)
-        if self._paced and job.stage == self._first and (found is None or found.job.end_ns <= job.ready_ns):
+        if self._paced and job.stage in self._firsts and (found is None or found.job.end_ns <= job.ready_ns):
             return self._shown_by(job.ready_ns), True
         return found, False
 

@@ -7,7 +7,6 @@ so that JSON can carry it to a unit's process.
 from __future__ import annotations
 
 import ast
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -24,11 +23,13 @@ from pydantic import (
 from pydantic.functional_validators import ModelWrapValidatorHandler
 
 from trilane.errors import BadInputError
-from trilane.scheduler.events import Graph, StageSpec
+from trilane.scheduler.events import Graph, Input, StageSpec
 from trilane.scheduler.places import Place
+from trilane.scheduler.state import build
 from trilane.transport.packets import FRAME_FIELDS, header_dtype
 from trilane.transport.slots import edge_rule
 from trilane.unexpected_value import UnexpectedValue, unexpected_in
+from trilane.units import NS_PER_MS
 
 LONGEST_FOUND = 120  # of a wrong value, in characters, as a message shows it
 LONGEST_NAME = 40  # of a stage or unit; a socket of that name must fit into a path of 107 bytes
@@ -104,12 +105,27 @@ class UnitSettings(Described):
     spin: bool = False
 
 
+class StageInput(Described):
+    """What a stage of a graph reads: the stream that another stage writes.
+
+    `stage`: name of the stage that writes it.
+    `latest`: whether the stage takes the newest frame that there is, of whatever number.
+    `max_age_ms`: age from which on the newest frame counts as absent; 0: no such age.
+    """
+
+    stage: str
+    latest: bool = False
+    max_age_ms: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+
+
 class PipelineStage(Described):
     """One stage.
 
     `factory`: `module:name` of a `trilane.pipeline.stage.StageFactory`, importable in the unit's process.
     `settings`: JSON values that are handed to the factory.
     `pace_ns`: least time in ns for which a job is held.
+    `inputs`: what the stage reads; None for a stage of a chain, which reads what the stage before it writes.
+    `every`: distance between the frames that the stage takes.
     """
 
     name: str = Field(pattern=r"^[\w-]+$", max_length=LONGEST_NAME)
@@ -117,10 +133,18 @@ class PipelineStage(Described):
     factory: str = Field(pattern=FACTORY)
     settings: dict[str, Any] = {}
     pace_ns: int = Field(default=0, ge=0)
+    inputs: tuple[StageInput, ...] | None = None
+    every: int = Field(default=1, ge=1)
+
+    @property
+    def joins(self) -> bool:
+        """Whether it is a `trilane.pipeline.stage.JoiningStage`: it has several inputs, or one of the newest frame."""
+        inputs = self.inputs or ()
+        return len(inputs) > 1 or any(each.latest for each in inputs)
 
 
 class PipelineEdge(Described):
-    """The slots between a stage and the next.
+    """The slots behind a stage, which the next stage reads; in a graph, all stages that read its stream.
 
     `payload_bytes`: bytes of every packet's payload.
     `header`: dtype of every packet's header, made by `trilane.transport.packets.header_dtype`.
@@ -133,13 +157,16 @@ class PipelineEdge(Described):
 
 
 class Pipeline(Described):
-    """A chain of `stages`, joined by `edges`, one fewer. Raises BadInputError naming the wrong field, as its parts do.
+    """Stages and the edges between them. Raises BadInputError naming the wrong field, as its parts do.
 
+    `stages`: a chain, or a graph in which each stage has `inputs` and follows the stages that it reads.
+    `edges`: slots behind each stage that has a reader, in the order of the stages.
     `units`: cores and threads of each unit that a stage names; the scheduler runs on the cores of the first stage's
     unit.
     `latency_to`: stage at whose end a frame's latency ends; without it, the last stage.
     `bypass`: names of two stages. A frame for which the first returns a `Skip` goes on to the second, past those
     between. The edges behind the first and before the second have the same header.
+    `from_release`: whether the latency begins with a frame's release, as for a camera with a rate.
     `module_folders`: folders where a unit's process first looks for the modules of factories.
     `preload`: modules that are imported once, before the units' processes are forked; none from `module_folders`.
     """
@@ -149,6 +176,7 @@ class Pipeline(Described):
     units: dict[str, UnitSettings]
     latency_to: str = ""
     bypass: tuple[str, str] | None = None
+    from_release: bool = False
     module_folders: tuple[Path, ...] = ()
     preload: tuple[str, ...] = ()
 
@@ -165,13 +193,11 @@ class Pipeline(Described):
         missing = {stage.unit for stage in self.stages} - set(self.units)
         if missing:
             raise UnexpectedValue(f"no settings of unit {', '.join(sorted(missing))}", "them in `units`")
-        self.graph()
+        build(self.graph())
         for unit in self.units:
-            count = sum(unit in (before.unit, after.unit) for before, after in self.joints.values())
+            count = sum(unit in {before.unit, *(each.unit for each in after)} for before, after in self.joints.values())
             if count > MOST_EDGES:
                 raise UnexpectedValue(f"unit {unit} at {count} edges", f"at most {MOST_EDGES}", "use more units")
-        for edge in self.edges:
-            edge_rule(edge.rule)
         if self.bypass is not None:
             self._check_headers(self.edges_into(self.bypass[1]))
 
@@ -183,28 +209,34 @@ class Pipeline(Described):
 
     def graph(self) -> Graph:
         """Return the graph of the pipeline for the scheduler."""
-        stages = tuple(StageSpec(stage.name, stage.unit) for stage in self.stages)
+        stages = tuple(StageSpec(stage.name, stage.unit, _inputs(stage), stage.every) for stage in self.stages)
         rules = tuple(edge.rule for edge in self.edges)
-        return Graph(stages, rules, self.latency_to or self.stages[-1].name, self.bypass)
+        return Graph(stages, rules, self.latency_to or self.stages[-1].name, self.bypass, self.from_release)
 
     @property
-    def joints(self) -> dict[str, tuple[PipelineStage, PipelineStage]]:
-        """The stages that each edge joins, by the edge's name `FROM->TO`, in the order of the chain."""
-        return {f"{before.name}->{after.name}": (before, after) for before, after in pairwise(self.stages)}
+    def joints(self) -> dict[str, tuple[PipelineStage, tuple[PipelineStage, ...]]]:
+        """The stage before each edge and those behind it, by the edge's name `FROM->TO`, in the order of `edges`."""
+        graph, named = self.graph(), {stage.name: stage for stage in self.stages}
+        return {
+            graph.edge_name(place): (named[name], tuple(named[reader] for reader in readers))
+            for place, (name, readers) in enumerate(graph.streams.items())
+        }
 
     @property
     def edge_names(self) -> list[str]:
         return list(self.joints)
 
     def edges_into(self, stage: str) -> tuple[str, ...]:
-        """Return the names of the edges from which the stage takes frames.
+        """Return the names of the edges from which the stage takes frames, in the order of its inputs.
 
-        Its own edge is first; where a bypass ends at the stage, the edge on which the bypass begins follows.
+        Where a bypass ends at the stage of a chain, the edge on which the bypass begins follows.
         """
         begin, end = self.bypass or ("", "")
-        own = [name for name, (_, after) in self.joints.items() if after.name == stage]
-        bypassed = [name for name, (before, _) in self.joints.items() if before.name == begin and stage == end]
-        return (*own, *bypassed)
+        joints, graph = self.joints, self.graph()
+        behind = {before.name: name for name, (before, _) in joints.items()}
+        place = next(place for place, each in enumerate(self.stages) if each.name == stage)
+        own = [behind[each.stage] for each in graph.inputs_of(place)]
+        return (*own, *([behind[begin]] if stage == end else []))
 
     @property
     def rule(self) -> str:
@@ -238,9 +270,18 @@ class Pipeline(Described):
         return tuple(stage for stage in self.stages if stage.unit == unit)
 
     def with_rule(self, rule: str) -> Pipeline:
-        """Return the same pipeline with `rule` for every edge; raises BadInputError for an unknown rule."""
+        """Return the same pipeline with `rule` for every edge; raises BadInputError for one that cannot be."""
+        changed = self.model_copy(update={"edges": tuple(e.model_copy(update={"rule": rule}) for e in self.edges)})
         try:
             edge_rule(rule)
+            build(changed.graph())
         except UnexpectedValue as error:
             raise BadInputError.at("the run's settings", error) from None
-        return self.model_copy(update={"edges": tuple(e.model_copy(update={"rule": rule}) for e in self.edges)})
+        return changed
+
+
+def _inputs(stage: PipelineStage) -> tuple[Input, ...] | None:
+    """Return what the scheduler knows of the stage's inputs."""
+    if stage.inputs is None:
+        return None
+    return tuple(Input(each.stage, each.latest, round(each.max_age_ms * NS_PER_MS)) for each in stage.inputs)

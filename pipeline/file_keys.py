@@ -392,6 +392,7 @@ class PythonStage(StageKeys):
 
     kind = "python"
     python: str = Field(pattern=FACTORY, description="`module:factory`, a module in this folder or an installed one.")
+    settings: dict[str, Any] = Field(default={}, description="What the factory is called with.")
 
 
 class BlockStage(StageKeys):

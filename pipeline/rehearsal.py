@@ -25,13 +25,14 @@ from trilane.scheduler.events import Graph, StageAlone
 from trilane.scheduler.places import Times, UnitWork
 from trilane.transport.messages import Done, RunJob
 from trilane.transport.slots import edge_rule
+from trilane.unexpected_value import UnexpectedValue
 
 WARM_UP = 2  # frames that do not count; most edges have as many slots
 LIMIT_S = 0.5  # seconds after the warm-up from which no further frame is begun
 
 
 class Chain:
-    """The stages of `graph`, without the last unless `whole`.
+    """The stages of `graph`, which must be a chain, without the last unless `whole`.
 
     `processes`: process of each unit, ready and without a job.
     """
@@ -39,6 +40,8 @@ class Chain:
     def __init__(
         self, graph: Graph, processes: Mapping[str, UnitProcesses], interrupts: Interrupts, *, whole: bool
     ) -> None:
+        if not graph.is_chain:
+            raise UnexpectedValue("a graph", "a chain", "the stages of a graph may count their calls")
         self._stages = graph.stages if whole else graph.stages[:-1]
         self._slots = [edge_rule(edge).slots for edge in graph.edges]
         self._processes, self._interrupts = processes, interrupts

@@ -100,6 +100,7 @@ def run_pipeline(
     latch_ms: float = 0.0,
     works: tuple[int, ...] = (),
     follow: tuple[str, ...] = (),
+    settings: Settings | None = None,
     requests: FrameRequestQueue | None = None,
     controls: RunControls | None = None,
     governor: ReportingGovernor | None = None,
@@ -122,6 +123,7 @@ def run_pipeline(
     frame that would be late is given less work (`trilane.scheduler.work_ladder`), and the first stage is told
     (`SteppedStage`).
     `follow`: names of the stages whose time follows the work.
+    `settings`: all that the scheduler is asked, in place of `frames` and of the options above.
     `requests`: queue through which others ask for frames, at most `frames`; it is closed when this returns.
     `controls`: queue of what others ask of the run, closed when this returns. At the run's end, the frames that it has
     released count as requested.
@@ -140,7 +142,14 @@ def run_pipeline(
     refuse_in_a_unit()
     check_open_files()
     check_cores(pipeline)
-    settings = _stepped(_settings(policy, frames, fps, pace_fps, hang_ns, latch_ms, requests), works, follow)
+    if settings is None:
+        settings = _stepped(_settings(policy, frames, fps, pace_fps, hang_ns, latch_ms, requests), works, follow)
+        target_ns = 0 if settings.deadline_ns else round(NS_PER_S / fps)
+    else:
+        target_ns = 0 if settings.deadline_ns else settings.period_ns
+    if not pipeline.graph().is_chain and (settings.latch_ns or settings.works or requests is not None):
+        expected = "a chain of stages, or none of latching, a ladder of work and requests for frames"
+        raise BadInputError("the run's settings", "a pipeline with stages that have a list of inputs", expected)
     with recorded(journal, pipeline.graph(), settings, governor) as record:
         log = RunLog(record.say, *([on_message] if on_message is not None else []))
         with (
@@ -153,10 +162,7 @@ def run_pipeline(
             unit_processes(pipeline, assets or {}, starter, UnitProcesses) as processes,
         ):
             # A run with a journal may last for days, so the ledger keeps sketches instead of all values.
-            target_ns, sketch = (
-                0 if settings.deadline_ns else round(NS_PER_S / fps),
-                None if journal is None else DdSketch,
-            )
+            sketch = None if journal is None else DdSketch
             core = Core(pipeline.graph(), settings, Books(target_ns, sketch))
             clock = RealtimeClock(core, processes, interrupts, log, requests, governor, on_progress, sketch)
             cores = sorted({core for unit in pipeline.units.values() for core in unit.cores})
@@ -167,7 +173,7 @@ def run_pipeline(
         is_open = requests is not None or controls is not None
         report = core.report(clock="host", requested=core.source.released if is_open else None)
         report["percentiles"] = EXACT if core.ledger.is_exact else SKETCHED
-        report.update(policy=policy, edge=pipeline.rule, idle_cores=idle_cores, other_programs=run.other_programs)
+        report.update(policy=settings.policy, edge=pipeline.rule, idle_cores=idle_cores, other_programs=run.other_programs)
         _add_caps(report, governor)
         for unit, row in report["units"].items():
             row.update(pid=run.pids[unit], **pipeline.units[unit].model_dump(mode="json"))
@@ -215,12 +221,13 @@ class _Run:
         self._startup_ms = start_units(self._processes, self._core.graph.units, self._interrupts)
         self.pids = self._processes.pids
         graph, settings = self._core.graph, self._core.settings
-        # The last stage writes files, so the frames before the run leave it out.
-        chain = Chain(graph, dict.fromkeys(graph.units, self._processes), self._interrupts, whole=False)
-        if settings.works:
-            few = _spread(settings.frames, FRAMES_ON_RUNGS)
-            self._clock.first += on_rungs(chain, few, len(settings.works), settings.follow)
-        chain.frame(0)
+        if graph.is_chain:  # the stages of a graph may count their calls, so they see the run's own frames alone
+            # The last stage writes files, so the frames before the run leave it out.
+            chain = Chain(graph, dict.fromkeys(graph.units, self._processes), self._interrupts, whole=False)
+            if settings.works:
+                few = _spread(settings.frames, FRAMES_ON_RUNGS)
+                self._clock.first += on_rungs(chain, few, len(settings.works), settings.follow)
+            chain.frame(0)
         others = beside_units(self._cores, self.pids)
         self._record.begin(self._clock, lambda: self._processes.pids)
         try:

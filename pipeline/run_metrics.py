@@ -173,6 +173,7 @@ class IdleShares(Record):
     `preempted`: share in which it had a job, but no core; null where the kernel does not say how long threads wait for
     one.
     `overhead`: share in which a job was on its way to it, it slept within a job, or its process was down.
+    `join`: share in which some inputs of a frame were there and others not; absent where no branches meet at it.
     """
 
     starved: float
@@ -180,6 +181,7 @@ class IdleShares(Record):
     throttled: float
     preempted: float | None = None
     overhead: float
+    join: float = 0.0
 
 
 class UnitShares(Record):
@@ -310,6 +312,24 @@ class Bound(Record):
     stage: PathShare | None = None
 
 
+class FramesBehind(Record):
+    """By how many frames inputs of the newest frame were behind: `mean` and `max` over the jobs that took one."""
+
+    mean: float
+    max: int
+
+
+class NewestTaken(Record):
+    """What inputs of the newest frame took from one stream.
+
+    `age_ms`: times from the sampling of the frame to the moment at which a job that took it was handed out.
+    `frames_behind`: distances to the frame of that job.
+    """
+
+    age_ms: TimeSummary
+    frames_behind: FramesBehind
+
+
 class PolicyMetrics(Record):
     """What a run measured of its policy, so that runs of two policies can be compared.
 
@@ -323,6 +343,7 @@ class PolicyMetrics(Record):
     `stages`: times of each stage, in the order of the pipeline.
     `bytes`: bytes that the stages moved for a presented frame, over all stages that count them; absent where none does.
     `units`: shares of each unit.
+    `streams`: age of what was taken from each stream that has an input of the newest frame, by its stage.
     `efficiency`: work of the slowest unit's jobs, as a share of the time between the first and the last presented
     frame; null for fewer than two.
     `core_efficiency`: the same share for the fullest cores.
@@ -344,6 +365,7 @@ class PolicyMetrics(Record):
     stages: dict[str, StageTimes]
     bytes: MovedInAll | None = None
     units: dict[str, UnitShares]
+    streams: dict[str, NewestTaken] = Field(default={})
     efficiency: float | None = None
     core_efficiency: float | None = None
     machine_efficiency: float | None = None

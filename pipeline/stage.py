@@ -45,6 +45,25 @@ class Stage(Protocol):
         """Release what the stage holds; files are completed and renamed here."""
 
 
+class JoiningStage(Protocol):
+    """A stage of a graph with several inputs, or with one of the newest frame."""
+
+    def bind(self, inputs: Sequence[Sequence[Packet]], outputs: Sequence[Packet]) -> None:
+        """Take every slot of each input, in the order of the stage's inputs, and of the output, as `Stage.bind`."""
+
+    def run(self, frame: int, slots_in: tuple[int | None, ...], slot_out: int | None) -> Mapping[str, float]:
+        """Do `frame`, as `Stage.run`.
+
+        `slots_in`: slot of each input; None for one of the newest frame where there is none.
+
+        The header of the output slot already holds the frame's number and the sampling time of the oldest input that is
+        of this frame. It holds no other fields of the inputs.
+        """
+
+    def close(self) -> None:
+        """Release what the stage holds, as `Stage.close`."""
+
+
 class SteppedStage(Stage, Protocol):
     """The first stage of a pipeline whose frames may be given less work (`run_pipeline`'s `works`)."""
 
@@ -104,7 +123,7 @@ class UnitContext:
 class StageFactory(Protocol):
     """The kind of function that `PipelineStage.factory` names."""
 
-    def __call__(self, settings: Mapping[str, Any], unit: UnitContext) -> Stage:
+    def __call__(self, settings: Mapping[str, Any], unit: UnitContext) -> Stage | JoiningStage:
         """Return the built stage; everything slow or fallible happens here.
 
         Raises BadInputError or MissingPartError.

@@ -5,22 +5,21 @@ frames are released and wait (frame_source.py). Its record of a frame says when 
 frame took (state.py).
 
 A frame waits before the first stage from its release on. It waits before another stage from the step in which the
-scheduler heard that the stage before had ended. The wait ends when the frame is handed to a unit, dropped or lost.
-Frames do not overtake each other: where several wait, the oldest are dropped. The exception is a frame that is turned
-away before the first stage.
+scheduler heard that the stage before had ended; where branches meet, the last of those stages. The wait ends when the
+frame is handed to a unit, dropped or lost. Where the frames are is known to a track (tracks.py).
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 from trilane.pipeline.journal import Accounted, Counted, Record, Stepped, Stopped, Worked
+from trilane.pipeline.tracks import UNKNOWN, track_of
+from trilane.pipeline.tracks import Gone as GoneFrame
 from trilane.pipeline.unit_history import KEPT, Handed, IdleCutter, IdleSlice, Key, UnitHistory
 from trilane.scheduler.events import (
-    NEVER,
     Action,
     Dispatch,
     DropCause,
@@ -44,7 +43,6 @@ from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.state import FrameState
 
 SOURCE: Final = "source"
-UNKNOWN: Final = -1  # the number of a frame that is gone and cannot be told from others
 
 
 class Presented(NamedTuple):
@@ -53,7 +51,8 @@ class Presented(NamedTuple):
     `release_ns`: time of its release.
     `end_ns`: end of its last job.
     `interval_ns`: time since the end of the frame presented before it; None for the first.
-    `latency_ns`: time from its sampled pose to the end of the stage that the pipeline names.
+    `latency_ns`: time from its sampled pose to the end of the stage that the pipeline names; None for a frame that this
+    stage does not take.
     `skips`: whether it took the bypass.
     `rung`: rung of its work.
     """
@@ -62,7 +61,7 @@ class Presented(NamedTuple):
     release_ns: int
     end_ns: int
     interval_ns: int | None
-    latency_ns: int
+    latency_ns: int | None
     skips: bool
     rung: int
 
@@ -148,7 +147,6 @@ class Timeline:
     `idle`: whether to cut idle time into slices, which come in the order of their ends.
     `kept`: number of jobs and changes of each unit that are kept to explain a wait.
 
-    `frames`: frames in flight, by number.
     `start_ns`: time at which the last unit got ready; None before.
     `is_over`: whether the run is over.
     `span`: time from the step in which the last unit got ready to the step that finished the run; None until the end,
@@ -162,13 +160,8 @@ class Timeline:
     def __init__(
         self, graph: Graph, settings: Settings, *, waits: bool = False, idle: bool = False, kept: int = KEPT
     ) -> None:
-        names = [stage.name for stage in graph.stages]
         self._explains, self._kept = waits, kept
-        self._first, self._last, self._bypass = names[0], names[-1], graph.bypass
-        self._latency_to = graph.latency_to
-        self._next = dict(pairwise(names))
         self.units = {unit: UnitHistory(unit, kept if waits else 0) for unit in graph.units}
-        self.frames: dict[int, FrameState] = {}
         self.start_ns: int | None = None
         self.span: Span | None = None
         self.is_over = False
@@ -177,9 +170,8 @@ class Timeline:
         self.stalls: deque[Span] = deque(maxlen=kept)
         self._source = Source(settings, self._drop_at_source)
         self._turned_away: dict[str, deque[tuple[int, int]]] = {cause: deque() for cause in DropCause}
-        self._waiting: dict[str, list[int]] = {name: [] for name in names[1:]}
-        self._heard_ns: dict[int, int] = {}
-        self._lost: deque[tuple[int, int]] = deque()  # those whose cause was not counted yet
+        self._track = track_of(graph, self._source)
+        self._lost: deque[GoneFrame] = deque()  # those whose cause was not counted yet
         self._counts: dict[tuple[str, str], int] = {}
         self._requested = settings.frames
         self._ended: dict[Key, tuple[Handed, JobDone, Presented | None]] = {}
@@ -192,7 +184,7 @@ class Timeline:
             UnitDied: self._on_died,
             FrameRequest: lambda event: self._source.request(event.frames, self._now_ns),
             Hold: lambda event: self._source.hold(event.frames, self._now_ns),
-            Stop: lambda _: self._source.stop(),
+            Stop: lambda _: self._stop(),
             SchedulerStalled: lambda event: self.stalls.append(Span(self._now_ns - event.ns, self._now_ns)),
         }
 
@@ -216,7 +208,12 @@ class Timeline:
 
     def waiting(self, stage: str) -> list[int]:
         """Return the frames that wait before `stage`, the oldest first; before the first stage, the released frames."""
-        return [frame for frame, _ in self._source.queue] if stage == self._first else [*self._waiting[stage]]
+        return self._track.waiting(stage)
+
+    @property
+    def frames(self) -> Mapping[int, FrameState]:
+        """The frames in flight, by number."""
+        return self._track.frames
 
     @property
     def not_begun(self) -> int:
@@ -230,6 +227,7 @@ class Timeline:
         if self.is_over:
             return facts
         self._now_ns = step.now_ns
+        self._track.settle()
         after: list[Key] = []
         for event in step.events:
             if type(event) is JobDone:  # most events
@@ -280,22 +278,17 @@ class Timeline:
                     yield Gone(*gone(cause, counted.now_ns), counted.now_ns, kind, cause)
                 self._counts[kind, cause] = count
 
-    def _lost_for(self, _cause: str, now_ns: int) -> tuple[int, int]:
-        """Return the frame that was lost first, and its release time."""
-        return self._lost.popleft() if self._lost else (UNKNOWN, now_ns)
+    def _lost_for(self, _cause: str, now_ns: int) -> GoneFrame:
+        """Return the frame that was lost first."""
+        return self._lost.popleft() if self._lost else GoneFrame(UNKNOWN, now_ns)
 
-    def _dropped(self, cause: str, now_ns: int) -> tuple[int, int]:
-        """Return the frame that was dropped for `cause`, given as `producer->consumer:kind`, and its release time."""
+    def _dropped(self, cause: str, now_ns: int) -> GoneFrame:
+        """Return the frame that was dropped for `cause`, given as `producer->consumer:kind`."""
         edge, _, kind = cause.rpartition(":")
-        producer, _, consumer = edge.partition("->")
-        if producer == SOURCE:
-            queue = self._turned_away.get(kind) or self._source.queue
-            return queue.popleft() if queue else (UNKNOWN, now_ns)
-        is_bypass = (producer, consumer) == self._bypass
-        for frame in self._waiting.get(consumer, ()):
-            if self._frame(frame).skips == is_bypass:
-                return frame, self._leave(frame)
-        return UNKNOWN, now_ns
+        if not edge.startswith(f"{SOURCE}->"):
+            return self._track.dropped(edge, kind, now_ns)
+        queue = self._turned_away.get(kind) or self._source.queue
+        return GoneFrame(*queue.popleft()) if queue else GoneFrame(UNKNOWN, now_ns)
 
     def _drop_at_source(self, frame: int, release_ns: int, cause: DropCause) -> None:
         self._turned_away[cause].append((frame, release_ns))
@@ -304,47 +297,21 @@ class Timeline:
 
     def _begin(self, job: Job, after: tuple[Key, ...]) -> None:
         """Note that the job is handed to its unit."""
-        heard_ns = self._heard_ns.get(job.frame, 0)
+        heard_ns = self._track.begin(job, self._now_ns)
         self.units[job.unit].held.append(Handed(job, self._now_ns, heard_ns, after))
-        if job.stage == self._first:
-            self.frames[job.frame] = FrameState(self._take(job.frame), NEVER, job.rung)
-        elif job.frame in self._waiting[job.stage]:
-            self._waiting[job.stage].remove(job.frame)
-
-    def _frame(self, number: int) -> FrameState:
-        """Return a frame in flight; where the journal lacks its begin, make one that is known from now on."""
-        if (frame := self.frames.get(number)) is None:
-            frame = self.frames[number] = FrameState(self._now_ns, NEVER)
-        return frame
-
-    def _take(self, frame: int) -> int:
-        """Note that the frame is in flight from now on, and return its release time."""
-        for released in self._source.queue:
-            if released[0] == frame:  # others may come first: a frame dropped in this step is counted after it
-                self._source.queue.remove(released)
-                return released[1]
-        return self._source.take(self._now_ns)[1]
 
     def _end(self, event: JobDone, after: list[Key]) -> Iterator[Fact]:
-        """Note the end of a job: its frame waits for the next stage, or is presented."""
+        """Note the end of a job: its frame waits for the next stages, or is presented."""
         handed = self.units[event.unit].take(event.job)
         if handed is None:
             return
         job = handed.job
         after.append((job.stage, job.frame))
-        self._heard_ns[job.frame] = self._now_ns
-        frame = self._frame(job.frame)
-        # The scheduler's own record computes the latency, so that it is defined once.
-        sampled_ns = event.t_sampled_ns if job.stage == self._first else None
-        frame.end_stage(sampled_ns, event.t_end_ns, job.stage == self._latency_to)
-        frame.skips |= event.skips
+        frame = self._track.end(job, event, self._now_ns)
         yield EndedJob(handed, event)
         presented = None
-        if job.stage == self._last:
+        if frame is not None:
             yield (presented := self._present(job.frame, frame, event.t_end_ns))
-        else:
-            skips_to = self._bypass[1] if event.skips and self._bypass is not None else ""
-            self._waiting[skips_to or self._next[job.stage]].append(job.frame)
         if self._explains:
             self._ended[job.stage, job.frame] = handed, event, presented
             # a job whose frame was lost meanwhile has no record and would stay for ever
@@ -352,18 +319,22 @@ class Timeline:
                 del self._ended[next(iter(self._ended))]
 
     def _present(self, number: int, frame: FrameState, end_ns: int) -> Presented:
-        self._leave(number)
         self.presented += 1
         self.skipped += frame.skips
         interval_ns = None if self._last_end_ns is None else end_ns - self._last_end_ns
         self._last_end_ns = end_ns
-        return Presented(number, frame.release_ns, end_ns, interval_ns, frame.latency_ns, frame.skips, frame.rung)
+        latency_ns = frame.latency_ns if frame.latency_ns >= 0 else None
+        return Presented(number, frame.release_ns, end_ns, interval_ns, latency_ns, frame.skips, frame.rung)
 
     def _on_failed(self, event: JobFailed) -> None:
         handed = self.units[event.unit].take(event.job)
         if handed is not None:
             self._lose(handed.job.frame)
-            self._source.stop()
+            self._stop()
+
+    def _stop(self) -> None:
+        self._track.stop()
+        self._source.stop()
 
     def _on_ready(self, event: UnitReady) -> None:
         down_ns = self.units[event.unit].rise(self._now_ns)
@@ -376,17 +347,15 @@ class Timeline:
     def _on_died(self, event: UnitDied) -> None:
         """Lose the frame that the dead unit worked on.
 
-        Its other frames wait for their stage again, but a frame at the first stage is lost too.
+        Its other frames wait for their stage again, but a frame at a first stage may be lost too.
         """
         unit = self.units[event.unit]
         unit.fall(self._now_ns, is_gone=True)
         for place, handed in enumerate(unit.held):
-            job = handed.job
-            if place == 0 or job.stage == self._first:
-                self._lose(job.frame)
-            else:
-                self._waiting[job.stage].append(job.frame)
-                self._waiting[job.stage].sort()
+            if place == 0:
+                self._lose(handed.job.frame)
+            elif (gone := self._track.give_back(handed.job, self._now_ns)) is not None:
+                self._lost.append(gone)
         unit.held.clear()
 
     def _finish(self, kind: OutcomeKind) -> None:
@@ -398,20 +367,12 @@ class Timeline:
         if self.start_ns is not None:
             self.span = Span(self.start_ns, self._now_ns)
         if kind in (OutcomeKind.ABORTED, OutcomeKind.GAVE_UP):
-            for frame in sorted(self.frames):
+            for frame in sorted(self._track.frames):
                 self._lose(frame)
         for unit in self.units.values():
             unit.held.clear()
 
     def _lose(self, frame: int) -> None:
         """Note that the frame is lost; the next count says why."""
-        self._lost.append((frame, self._leave(frame)))
-
-    def _leave(self, number: int) -> int:
-        """Remove the frame from all queues, and return its release time."""
-        for waiting in self._waiting.values():
-            if number in waiting:
-                waiting.remove(number)
-        self._heard_ns.pop(number, None)
-        frame = self.frames.pop(number, None)
-        return self._now_ns if frame is None else frame.release_ns
+        if (gone := self._track.lose(frame, self._now_ns)) is not None:
+            self._lost.append(gone)

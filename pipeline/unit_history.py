@@ -29,18 +29,19 @@ from trilane.scheduler.events import NEVER, Job
 from trilane.scheduler.ledger import JobRecord
 
 BUSY, PREEMPTED, OVERHEAD = "busy", "preempted", "overhead"
-THROTTLED = "throttled"
+THROTTLED, JOIN = "throttled", "join"
+_OF_ALL: Final = {ledger.STARVED: "starved", ledger.BLOCKED: "blocked", ledger.THROTTLED: THROTTLED}
 #: What the ledger's account says about why a unit has no job.
-NAMES: Final = {ledger.STARVED: "starved", ledger.BLOCKED: "blocked", ledger.THROTTLED: THROTTLED}
-#: Why a unit is idle.
-IDLE_CAUSES: Final = (*NAMES.values(), PREEMPTED, OVERHEAD)
+NAMES: Final = {**_OF_ALL, ledger.JOIN: JOIN}
+#: Why a unit is idle; where branches of a graph meet, also for JOIN.
+IDLE_CAUSES: Final = (*_OF_ALL.values(), PREEMPTED, OVERHEAD)
 #: The cause of a unit that has neither a job nor a noted cause; the sums lack its time, which shows the gap.
 UNEXPLAINED = "unexplained"
 LOST, DOWN, HELD, UNKNOWN = "lost", "down", "held", "unknown"
 #: Why a job waits.
 WAIT_CAUSES: Final = (BUSY, LOST, DOWN, THROTTLED, NAMES[ledger.BLOCKED], HELD, PREEMPTED, OVERHEAD, UNKNOWN)
 #: What the account of a unit without this job means for the job, once the scheduler has heard of the job's input.
-MEANING: Final = {**NAMES, ledger.ASSIGNED: OVERHEAD, ledger.STARVED: HELD}
+MEANING: Final = {**NAMES, ledger.ASSIGNED: OVERHEAD, ledger.STARVED: HELD, ledger.JOIN: HELD}
 KEPT: Final = 4096
 
 #: The stage and the frame of a job that has ended.

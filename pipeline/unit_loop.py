@@ -15,7 +15,7 @@ import os
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, cast
@@ -27,7 +27,8 @@ from trilane.pipeline.description import Model, PipelineStage, UnitSettings
 from trilane.pipeline.hardware_counters import HardwareCounters, NoCounters, counters_here
 from trilane.pipeline.job_times import TASKS, CoreMeter, JobClock
 from trilane.pipeline.memory import EdgeRegion, map_assets
-from trilane.pipeline.stage import Skip, SkippingStage, Stage, StageFactory, SteppedStage, UnitContext
+from trilane.pipeline.stage import JoiningStage, Skip, SkippingStage, Stage, StageFactory, SteppedStage, UnitContext
+from trilane.scheduler.events import unpacked
 from trilane.transport.link import LINGER_MS, Link, context_on_cores
 from trilane.transport.messages import (
     BUILDING,
@@ -105,24 +106,30 @@ class BoundStage:
     def __init__(
         self,
         name: str,
-        stage: Stage,
+        stage: Stage | JoiningStage,
         inputs: list[Packet],
         outputs: list[Packet],
         pace_ns: int,
         unit: UnitContext,
         may_skip: bool = False,
+        join: Join | None = None,
     ) -> None:
         """Bind `stage` to its slots.
 
         `pace_ns`: least time in ns for which a job is held.
         `unit`: context of the unit that it runs on.
         `may_skip`: whether a bypass begins at it.
+        `join`: inputs of a `JoiningStage`; `inputs` is then empty.
         """
         self.name, self._pace_ns, self._may_skip = name, pace_ns, may_skip
-        self._stage, self._outputs, self._unit = stage, outputs, unit
-        self._is_first, self._rung = not inputs, 0
+        self._stage, self._outputs, self._unit, self._join = cast(Stage, stage), outputs, unit, join
+        self._is_first = not inputs if join is None else join.is_source
+        self._rung = self._sampled_ns = 0
         self._pass_on = _header_copier(inputs, outputs)
-        stage.bind(inputs, outputs)
+        if join is None:
+            self._stage.bind(inputs, outputs)
+        else:
+            cast(JoiningStage, stage).bind(join.inputs, outputs)
 
     def run(
         self, frame: int, slot_in: int, slot_out: int, epoch: int, fresh: bool = False, rung: int = 0
@@ -142,14 +149,19 @@ class BoundStage:
             self._rung = rung
             cast(SteppedStage, self._stage).step_to(rung)
         end_ns = time.monotonic_ns() + self._pace_ns
+        taken: Any = slot_in if slot_in >= 0 else None
+        if self._join is not None:
+            taken = self._join.slots(slot_in)
+        self._sampled_ns = time.monotonic_ns() if self._is_first else 0
         if slot_out >= 0:
-            if slot_in >= 0:
-                self._pass_on(slot_in, slot_out)
-            else:
+            if self._is_first or self._join is not None:
                 header = self._outputs[slot_out].header
-                header["frame"], header["t_sampled_ns"] = frame, time.monotonic_ns()
+                sampled_ns = self._sampled_ns if self._join is None else self._join.sampled_ns(taken, self._sampled_ns)
+                header["frame"], header["t_sampled_ns"] = frame, sampled_ns
+            else:
+                self._pass_on(slot_in, slot_out)
             self._outputs[slot_out].header["epoch"] = epoch
-        metrics = self._stage.run(frame, slot_in if slot_in >= 0 else None, slot_out if slot_out >= 0 else None)
+        metrics = self._stage.run(frame, taken, slot_out if slot_out >= 0 else None)
         if isinstance(metrics, Skip) and not self._may_skip:
             raise TrilaneError(f"stage {self.name} returned a Skip, and the pipeline's bypass does not begin at it")
         if self._pace_ns:
@@ -165,11 +177,39 @@ class BoundStage:
         return self._pace_ns > 0 or self._unit.has_device
 
     def sampled_ns(self, slot_in: int, slot_out: int) -> int:
-        """Return when the frame in the output slot of a pipeline's first stage was sampled; 0 for other stages."""
-        return int(self._outputs[slot_out].header["t_sampled_ns"]) if slot_in < 0 <= slot_out else 0
+        """Return when a stage that reads no frame by number sampled the frame of its last job; 0 for other stages."""
+        if not self._is_first or (slot_in >= 0 and self._join is None):
+            return 0
+        return int(self._outputs[slot_out].header["t_sampled_ns"]) if slot_out >= 0 else self._sampled_ns
 
     def close(self) -> None:
         self._stage.close()
+
+
+class Join:
+    """The inputs of a stage that takes several slots for a job.
+
+    `inputs`: slots of each input.
+    """
+
+    def __init__(self, inputs: Sequence[list[Packet]], latest: Sequence[bool]) -> None:
+        """Take the slots. `latest`: whether each input takes the newest frame."""
+        self.inputs = list(inputs)
+        self._by_frame = [place for place, is_latest in enumerate(latest) if not is_latest]
+
+    @property
+    def is_source(self) -> bool:
+        """Whether no input tells which frame the stage does."""
+        return not self._by_frame
+
+    def slots(self, packed: int) -> tuple[int | None, ...]:
+        """Return the slot of each input that `Job.slot_in` has packed; None where there is no frame."""
+        return tuple(slot if slot >= 0 else None for slot in unpacked(packed, len(self.inputs)))
+
+    def sampled_ns(self, slots: Sequence[int | None], now_ns: int) -> int:
+        """Return when the oldest input of the job's own frame was sampled; `now_ns` for a source."""
+        found = [int(self.inputs[place][slots[place] or 0].header["t_sampled_ns"]) for place in self._by_frame]
+        return min(found, default=now_ns)
 
 
 def hold_until(end_ns: int) -> None:
@@ -279,18 +319,15 @@ def build_stages(spec: UnitSpec) -> list[BoundStage]:
     unit = UnitContext(spec.unit, spec.settings, map_assets(spec.assets_fd))
     stages = [factory_named(stage.factory)(stage.settings, unit) for stage in spec.stages]
     packets = {name: map_region(edge.fd, edge.layout) for name, edge in spec.edges.items()}
-    return [
-        BoundStage(
-            described.name,
-            stage,
-            [packet for edge in spec.inputs.get(described.name, ()) for packet in packets[edge]],
-            packets[spec.outputs[described.name]] if described.name in spec.outputs else [],
-            described.pace_ns,
-            unit,
-            described.name == spec.may_skip,
-        )
-        for described, stage in zip(spec.stages, stages, strict=True)
-    ]
+    bound = []
+    for described, stage in zip(spec.stages, stages, strict=True):
+        read = [packets[edge] for edge in spec.inputs.get(described.name, ())]
+        outputs = packets[spec.outputs[described.name]] if described.name in spec.outputs else []
+        join = Join(read, [each.latest for each in described.inputs or ()]) if described.joins else None
+        inputs = [packet for slots in read for packet in slots] if join is None else []
+        skips = described.name == spec.may_skip
+        bound.append(BoundStage(described.name, stage, inputs, outputs, described.pace_ns, unit, skips, join))
+    return bound
 
 
 def factory_named(name: str) -> StageFactory:

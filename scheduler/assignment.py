@@ -320,6 +320,8 @@ class Assignment:
                 self._late.drop(stage, now_ns)
             if self._choice.can_begin(stage, now_ns):
                 runnable.append(stage)
+        if self._drops and not self._flow.is_chain:  # what was dropped for one stage may have waited for another
+            runnable = [stage for stage in unit.stages if self._choice.can_begin(stage, now_ns)]
         if len(runnable) > 1:
             return self._choice.preferred(runnable, now_ns)
         return runnable[0] if runnable else None

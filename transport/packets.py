@@ -70,6 +70,7 @@ def view_packet(buffer: memoryview, layout: SlotLayout) -> Packet:
 
 
 MIB = 1 << 20
+MOST_NAME = 249  # bytes, of memfd_create(2)
 #: From <linux/fcntl.h>; the fcntl module of Python 3.11 does not have all of them.
 F_ADD_SEALS, F_SEAL_SHRINK, F_SEAL_GROW = 1033, 0x2, 0x4
 
@@ -95,7 +96,7 @@ def create_region(name: str, layout: RegionLayout) -> int:
     free = machine.here.free_bytes()
     if layout.total_bytes > free:
         raise TrilaneError(_too_little(name, layout, f"{free // MIB} MiB are free"))
-    fd = os.memfd_create(f"trilane:{name}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    fd = os.memfd_create(f"trilane:{name}"[:MOST_NAME], os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     try:
         os.posix_fallocate(fd, 0, layout.total_bytes)
         fcntl.fcntl(fd, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW)

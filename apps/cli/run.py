@@ -83,6 +83,7 @@ def run(
     docs/report.md explains every key, the policies and the edges.
     """
     from trilane.apps.run.asked_run import run_asked
+    from trilane.apps.run.run_file import pipeline_file_of, run_file
 
     if port is not None and not dashboard:
         raise BadInputError("options", "--port without --dashboard", "both or neither")
@@ -91,6 +92,12 @@ def run(
             "options", "--check with --dashboard", "one of them", "a run that is steered has no reference"
         )
     command = ("trilane", *sys.argv[1:])
+    if pipeline_file_of(options) is not None:
+        if dashboard:
+            raise BadInputError("options", "--dashboard with a pipeline file", "one of them", "`trilane dashboard RUN`")
+        outcome = run_file(options, _hooks, command)
+        _print_outcome(outcome, as_json)
+        raise typer.Exit(outcome.exit_code)
     outcome = _run_live(options, command, port) if dashboard else run_asked(options, _hooks, command)
     _print_outcome(outcome, as_json)
     raise typer.Exit(outcome.exit_code)

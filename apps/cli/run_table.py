@@ -61,6 +61,8 @@ def run_table(report: Report) -> Table:
 
 def _title(report: Report) -> str:
     scene = report.config["scene"]
+    if "pipeline" in report.config:
+        return f"Pipeline {scene['name']}: {len(report.stages)} stages"
     return f"Scene {scene['name']}: {scene['output']['width']}x{scene['output']['height']}, tensor size {scene['size']}"
 
 
@@ -70,8 +72,9 @@ def _caption(report: Report) -> str:
     lines = [
         f"stages, units, times, rates: {MEASURED}",
         f"{cpu.model} ({' '.join(cpu.flags)}); cores: {cores}; idle cores {report.idle_cores}",
-        f"network on {report.config['runtime']}; OpenGL on {gl.renderer if gl else DASH}",
     ]
+    if "runtime" in report.config:
+        lines.append(f"network on {report.config['runtime']}; OpenGL on {gl.renderer if gl else DASH}")
     if report.made:
         lines.insert(0, _made(report.made))
     if report.frames.skipped:
@@ -187,13 +190,15 @@ def _megabytes(moved: MovedBytes | None) -> str:
 
 def _unit_rows(runs: Sequence[PolicyMetrics]) -> Rows:
     for unit in runs[0].units:
-        yield unit, "busy / " + " ".join(IDLE) + ", %", [_shares(run.units.get(unit)) for run in runs]
+        joins = "join" in runs[0].units[unit].idle.model_fields_set
+        causes = (*IDLE, "join") if joins else IDLE
+        yield unit, "busy / " + " ".join(causes) + ", %", [_shares(run.units.get(unit), causes) for run in runs]
 
 
-def _shares(unit: UnitShares | None) -> str:
+def _shares(unit: UnitShares | None, causes: Sequence[str]) -> str:
     if unit is None:
         return DASH
-    return f"{_percent(unit.busy)} / " + " ".join(_percent(getattr(unit.idle, cause)) for cause in IDLE)
+    return f"{_percent(unit.busy)} / " + " ".join(_percent(getattr(unit.idle, cause)) for cause in causes)
 
 
 def _core_rows(runs: Sequence[PolicyMetrics]) -> Rows:

@@ -19,11 +19,11 @@ from trilane.arrays import F64, I64
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import Begun, Counted, Ended, Record, Worked, read_journal
 from trilane.pipeline.timeline import Presented, Timeline
-from trilane.pipeline.unit_history import BUSY, IDLE_CAUSES, OVERHEAD, PREEMPTED, IdleSlice
+from trilane.pipeline.unit_history import BUSY, IDLE_CAUSES, JOIN, OVERHEAD, PREEMPTED, IdleSlice
 from trilane.scheduler.ledger import JobRecord
 from trilane.units import NS_PER_MS
 
-STATES = (BUSY, *IDLE_CAUSES)
+STATES = (BUSY, *IDLE_CAUSES)  # and JOIN where branches meet
 INSTRUCTIONS, INSTRUCTION_TIME = "instructions", "time of an instruction"
 #: Figures of jobs that stages report or the processor counts -> their measures here.
 REPORTED = {f"bytes_{name}": f"bytes {name.replace('_', ' ')}" for name in ("read", "written", "uploaded", "read_back")}
@@ -77,9 +77,10 @@ def frames_of(records: Iterable[Record]) -> RunFrames | None:
     graph, jobs, idle = story.graph, story.jobs, story.idle()
     if len(story.shown) < 2:
         return None
-    shown = [(one.frame, one.end_ns, one.latency_ns) for one in story.shown]
-    numbers, end_ns, latency_ns = (np.array(column, np.int64) for column in zip(*shown, strict=True))
-    series = {Key("frame time"): _plain(numbers[1:], np.diff(end_ns)), Key("latency"): _plain(numbers, latency_ns)}
+    numbers, end_ns = (np.array([getattr(one, of) for one in story.shown], np.int64) for of in ("frame", "end_ns"))
+    latencies = [(one.frame, one.latency_ns) for one in story.shown if one.latency_ns is not None]
+    of_frames, latency_ns = np.array(latencies, np.int64).reshape(-1, 2).T
+    series = {Key("frame time"): _plain(numbers[1:], np.diff(end_ns)), Key("latency"): _plain(of_frames, latency_ns)}
     for stage in graph.stages:
         series |= _stage(stage.name, [job for job in jobs if job.stage == stage.name])
     for unit in graph.units:
@@ -175,11 +176,12 @@ def _unit(
             pieces.append((piece.begin_ns, piece.end_ns, states))
     pieces.sort(key=lambda piece: piece[:2])
     weights = np.diff(end_ns) / NS_PER_MS
+    found = (*STATES, JOIN) if any(JOIN in parts for _, _, parts in pieces) else STATES
     return {
         Key("busy" if state == BUSY else "idle", unit, "" if state == BUSY else state): Series(
             frames[1:], _within(pieces, state, end_ns), weights
         )
-        for state in STATES
+        for state in found
     }
 
 

@@ -27,7 +27,7 @@ from trilane.apps.dashboard.view import Message, RunMeter, TimelineRows, describ
 from trilane.apps.watch.followed_run import CUT_OFF, FollowedRun, RunState
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import NAME, Begun, Ended, Record, Stepped, journal_in, read_journal
-from trilane.pipeline.unit_history import IDLE_CAUSES, UNEXPLAINED
+from trilane.pipeline.unit_history import IDLE_CAUSES, JOIN, UNEXPLAINED
 
 FIRST_SPAN_MS: Final = 5000.0
 FIGURES_EVERY_MS: Final = 1000.0
@@ -36,7 +36,7 @@ MOST_IDLE: Final = 6000
 MOST_NOTES: Final = 100
 OVER: Final = "the run is over"
 NO_VIDEO: Final = "there are no pictures: video.mp4 is missing or cannot be read"
-CAUSE_NAMES: Final = (*IDLE_CAUSES, UNEXPLAINED)
+CAUSE_NAMES: Final = (*IDLE_CAUSES, JOIN, UNEXPLAINED)
 TIMES: Final = [("begin", "<f8"), ("end", "<f8")]
 JOB: Final = np.dtype([("unit", "u1"), ("stage", "u1"), ("frame", "<u4"), *TIMES, ("wait", "<f8")])
 IDLE: Final = np.dtype([("unit", "u1"), ("cause", "u1"), *TIMES])
@@ -125,7 +125,8 @@ class _FinishedRun:
         self.jobs, self.idle, self.presented, self.figures = map(TimeTable, (JOB, IDLE, PRESENTED, FIGURES))
         self._written = _TextStore()
         self._timeline, self._meter = TimelineRows(begun), RunMeter(begun, finds_bound=facts.bound is None)
-        self._last_stage = len(begun.graph.stages) - 1
+        read = begun.graph.streams
+        self._ends = {place for place, stage in enumerate(begun.graph.stages) if stage.name not in read}
         self._due_ms = 0.0
         self.metrics = ""
         self._is_whole = False
@@ -185,7 +186,7 @@ class _FinishedRun:
         jobs, idle, notes = self._timeline.take()
         for unit, stage, frame, begin, end, wait in jobs:
             self.jobs.add((unit, stage, frame, begin, end, wait))
-            if stage == self._last_stage:
+            if stage in self._ends:
                 self.presented.add((frame, end, end))
         for unit, cause, begin, end in idle:
             self.idle.add((unit, CAUSE_NAMES.index(cause), begin, end))

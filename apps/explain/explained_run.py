@@ -243,7 +243,7 @@ def _slow_row(shown: Shown, usual: Usual) -> dict[str, Any]:
         "presented_ns": shown.now.end_ns,
         "frame_ms": shown.frame_ns / NS_PER_MS,
         "longer_ms": (shown.frame_ns - usual.frame_ns) / NS_PER_MS,
-        "latency_ms": shown.now.latency_ns / NS_PER_MS,
+        "latency_ms": None if shown.now.latency_ns is None else shown.now.latency_ns / NS_PER_MS,
         "why": [reason._asdict() for reason in reasons(shown, usual)],
         "notes": notes(shown),
     }

@@ -17,7 +17,7 @@ from typing import IO, Any, Final, Generic, TypeVar
 from trilane.apps.explain.trace_sinks import ChromeSink, FlowArrow, PacketSink, Sink
 from trilane.pipeline.journal import Begun, Ended, Record, Said, Sampled, Stepped, Worked, journal_of
 from trilane.pipeline.timeline import UNKNOWN, Gone, Presented, Timeline
-from trilane.pipeline.unit_history import IDLE_CAUSES, UNEXPLAINED, IdleSlice
+from trilane.pipeline.unit_history import IDLE_CAUSES, JOIN, UNEXPLAINED, IdleSlice
 from trilane.scheduler.events import NEVER, Graph
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.virtual import Simulation
@@ -265,10 +265,13 @@ class _UnitTracks:
 
     def __init__(self, sink: Sink, graph: Graph, parent: int, rank: int, flows_from: int = 1) -> None:
         self._sink, self._flows_from = sink, flows_from
-        sink.recurring([*IDLE_CAUSES, UNEXPLAINED, *(stage.name for stage in graph.stages)])
+        causes = IDLE_CAUSES if graph.is_chain else (*IDLE_CAUSES, JOIN)
+        sink.recurring([*causes, UNEXPLAINED, *(stage.name for stage in graph.stages)])
         self._units = {unit: sink.track(unit, parent, rank + place) for place, unit in enumerate(graph.units)}
         self._tiles: dict[str, Tiles[JobRecord | IdleSlice]] = {unit: Tiles() for unit in graph.units}
-        self._first, self._last = graph.stages[0].name, graph.stages[-1].name
+        read = [graph.inputs_of(place) for place in range(len(graph.stages))]
+        self._begins = {stage.name for stage, inputs in zip(graph.stages, read, strict=True) if not inputs}
+        self._ends = {stage.name for stage in graph.stages} - graph.streams.keys()
         self._stages = {
             stage.name: sink.track(stage.name, self._units[stage.unit], place)
             for place, stage in enumerate(graph.stages)
@@ -318,7 +321,7 @@ class _UnitTracks:
                 notes = _if_any(preempted_ns=piece.preempted_ns)
                 self._sink.slice(track, begin_ns, end_ns, piece.cause, notes)
             else:
-                flow = FlowArrow(self._flows_from + piece.frame, piece.stage == self._first, piece.stage == self._last)
+                flow = FlowArrow(self._flows_from + piece.frame, piece.stage in self._begins, piece.stage in self._ends)
                 self._sink.slice(track, begin_ns, end_ns, piece.stage, _notes_of(piece), flow)
 
     def _count_figures(self, job: JobRecord, figures: Mapping[str, float]) -> None:

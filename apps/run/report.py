@@ -259,7 +259,7 @@ class Preamble(Record):
     `clock`: clock of all times.
     `machine`: machine that the run was measured on.
     `config`: the RunConfig as JSON without its folder, with `policy` and `edge`.
-    `plan`: sizes that follow from the scene.
+    `plan`: sizes that follow from the scene; absent for a pipeline file.
     `caps`: limits on the work of the units.
     """
 
@@ -267,7 +267,7 @@ class Preamble(Record):
     clock: Literal["host", "virtual"]
     machine: MachineFacts
     config: dict[str, Any]
-    plan: WorkPlan
+    plan: WorkPlan | None = None
     caps: Caps
 
 

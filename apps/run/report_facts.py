@@ -77,14 +77,27 @@ def build_report(
     `facts`: further facts about the run: `video`, `checksum`, and any of `made`, `options`, `placement`, `resolution`,
     `pace`, `accuracy`, `check`, `notes`.
     """
+    facts = {"plan": {"tensor_shapes": config.buckets}, **facts}
+    shown = config_facts(config, result.report.policy, result.report.edge)
+    return report_of(result, shown, machine=machine, baseline=baseline, facts=facts)
+
+
+def report_of(
+    result: RunResult,
+    config: Mapping[str, Any],
+    *,
+    machine: Mapping[str, Any],
+    baseline: RunResult | None = None,
+    facts: Mapping[str, Any],
+) -> Report:
+    """Build the report of a run of any pipeline. `config`: block of that name. The rest is as in `build_report`."""
     metrics = result.report
     sensor = {"sensor": here.sensor_c()}
     document = {
         **metrics.as_json(),
         "schema": SCHEMA,
         "machine": machine,
-        "config": config_facts(config, metrics.policy, metrics.edge),
-        "plan": {"tensor_shapes": config.buckets},
+        "config": config,
         "caps": metrics.caps.as_json() if metrics.caps else {"how": NO_CAP},
         "temperature_c": (metrics.temperature_c.as_json() if metrics.temperature_c else {}) | sensor,
         "pids": result.pids,

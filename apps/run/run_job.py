@@ -172,7 +172,7 @@ def run_to_folder(
             _tell(report, hooks)
             write_report(report, folder.work / "report.json")
             place = folder.complete()
-        return RunOutcome(report, place, INTERRUPTED if stopped or late.count else _exit_code(result))
+        return RunOutcome(report, place, INTERRUPTED if stopped or late.count else exit_code_of(result))
 
 
 def _renamed(result: RunResult, named: Callable[[str], str]) -> RunResult:
@@ -193,7 +193,7 @@ class _Job:
 
         Raises TrilaneError when the run ended before any frame was presented.
         """
-        file, watched = JournalFile(folder / journal.NAME, facts, _sensors), self._watched
+        file, watched = JournalFile(folder / journal.NAME, facts, sensors), self._watched
         frames, controls = (None, None) if watched is None else (watched.frames, watched.controls)
         total = frames or self._checked.config.scene.frames
         kept = asked_frames(total, self._options.check) if self._options.check else ()
@@ -250,7 +250,7 @@ class _Job:
             return result
         if result.interrupted:
             raise KeyboardInterrupt
-        raise _error_of(result)
+        raise error_of(result)
 
     def _release_fps(self, policy: str) -> float | None:
         """Return the rate of a policy that needs one, at a chip's pace; without a pace it has the scene's rate."""
@@ -290,7 +290,7 @@ def _notes(checked: Checked) -> list[str]:
     return [*checked.notes, *([] if checked.config.record else [NO_VIDEO])]
 
 
-def _sensors() -> dict[str, float]:
+def sensors() -> dict[str, float]:
     """Return the figures that the journal samples in passing."""
     celsius = machine.here.sensor_c()
     return {} if celsius is None else {"temperature_c.sensor": celsius}
@@ -300,14 +300,14 @@ def _is_complete(result: RunResult) -> bool:
     return not result.interrupted and result.failure is None
 
 
-def _error_of(result: RunResult) -> TrilaneError:
+def error_of(result: RunResult) -> TrilaneError:
     failure = result.failure
     error = TrilaneError(failure.message if failure else "no frame was presented: " + "; ".join(result.messages))
     error.exit_code = failure.exit_code if failure else error.exit_code
     return error
 
 
-def _exit_code(result: RunResult) -> int:
+def exit_code_of(result: RunResult) -> int:
     if result.interrupted:
         return INTERRUPTED
     return 0 if result.failure is None else result.failure.exit_code

@@ -29,7 +29,7 @@ from trilane.figure_sources import COMPUTED, MEASURED
 from trilane.pipeline.journal import Accounted, Begun, Counted, Ended, Record, Said, Sampled, Stepped, Worked
 from trilane.pipeline.reckoning import Reckoning, places_of
 from trilane.pipeline.timeline import EndedJob, ExplainedJob, Presented, Timeline
-from trilane.pipeline.unit_history import BUSY, IDLE_CAUSES, NAMES, OVERHEAD, PREEMPTED
+from trilane.pipeline.unit_history import BUSY, IDLE_CAUSES, JOIN, NAMES, OVERHEAD, PREEMPTED
 from trilane.scheduler.events import NEVER, Finish, JobDone, Start
 from trilane.scheduler.ledger import STARVED
 from trilane.scheduler.stats import summary_ms
@@ -140,7 +140,7 @@ class LiveFigures:
             fps=len(recent) / window_s if window_s else 0.0,
             run_fps=self._run_fps(),
             frame_time_ms=summary_ms(each.interval_ns for each in recent if each.interval_ns is not None),
-            latency_ms=summary_ms(each.latency_ns for each in recent),
+            latency_ms=summary_ms(each.latency_ns for each in recent if each.latency_ns is not None),
             frames=self._frame_figures(),
             units={unit: self._unit_figures(unit, now_ns, goes_on) for unit in self._graph.units},
             stages=self._stage_figures(now_ns),
@@ -176,7 +176,8 @@ class LiveFigures:
             self._first_end_ns = presented.end_ns
         else:
             self._frame_times.add(presented.interval_ns)
-        self._latencies.add(presented.latency_ns)
+        if presented.latency_ns is not None:
+            self._latencies.add(presented.latency_ns)
         self._recent.append(presented)
         while self._recent[0].end_ns < presented.end_ns - WINDOW_NS:
             self._recent.popleft()
@@ -351,11 +352,12 @@ class _UnitTime:
 
 
 def _shares(sums: Mapping[str, int], total_ns: int) -> Shares:
+    causes = (*IDLE_CAUSES, JOIN) if sums[JOIN] else IDLE_CAUSES
     if total_ns <= 0:
-        return Shares(0.0, dict.fromkeys(IDLE_CAUSES, 0.0))
+        return Shares(0.0, dict.fromkeys(causes, 0.0))
     overhead_ns = max(sums[ASSIGNED] - sums[BUSY] - sums[PREEMPTED], 0)  # parts that were cut are rounded down
     idle_ns = {**sums, OVERHEAD: overhead_ns}
-    return Shares(sums[BUSY] / total_ns, {cause: idle_ns[cause] / total_ns for cause in IDLE_CAUSES})
+    return Shares(sums[BUSY] / total_ns, {cause: idle_ns[cause] / total_ns for cause in causes})
 
 
 class _Work(NamedTuple):

@@ -165,7 +165,12 @@ def test_frames_that_never_come_to_an_end_are_forgotten() -> None:
         timeline.add(Stepped(number, (JobDone("gpu", number, number, number, 0),), ()))
         (gone,) = timeline.add(Counted(number, {}, {"draw->infer:stale": number + 1}))
         assert gone == Gone(number, number, number, "dropped", "draw->infer:stale")
-    assert (len(timeline._ended), timeline.frames, timeline._heard_ns, timeline.waiting("infer")) == (10, {}, {}, [])
+    assert (len(timeline._ended), timeline.frames, timeline._track._heard_ns, timeline.waiting("infer")) == (
+        10,
+        {},
+        {},
+        [],
+    )
 
 
 def test_the_ends_that_were_heard_of_in_the_step_of_the_hand_over_are_kept() -> None:

@@ -86,7 +86,7 @@ def test_what_is_wrong_is_named(name: str) -> None:
 def test_a_description_answers_what_follows_from_it() -> None:
     described = pipeline()
     assert described.edge_names == ["in->mid", "mid->out"]
-    assert described.joints["mid->out"] == (STAGES[1], STAGES[2])
+    assert described.joints["mid->out"] == (STAGES[1], (STAGES[2],))
     assert (described.rule, described.with_rule("double").rule) == ("single,fifo:3", "double")
     assert described.with_rule("double").edges[1] == EDGES[1].model_copy(update={"rule": "double"})
     assert (described.scheduler_cores, described.run_cores) == ((1, 0), (0, 1, 3))

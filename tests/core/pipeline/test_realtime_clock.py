@@ -345,7 +345,7 @@ def test_every_job_that_ended_is_booked_with_its_times_and_figures(monkeypatch: 
     """
     world = World(monkeypatch)
     clock = world.begun()
-    released = world.core.frames[0].ready_ns
+    released = world.core.frames[0].ready_ns[0]
     world.inbox = [[("gpu", Done(0, START + 1, START + 9, START + 2, 3, 2, 1, 0, 4, 99, {"area": 3.0}))]]
     clock.wait(START)
     job = JobRecord("draw", "gpu", 0, released, START, START + 1, START + 9, 3, 2, 1, 4)

@@ -1,0 +1,216 @@
+"""The pipeline that a pipeline file describes, ready for a run on this machine: factories, slots, and units' cores.
+
+Rule: the types of all ports are known before a slot is made, and nothing of the file is imported here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from trilane.apps.check.port_types import PortTypes, port_types, read_networks, value_type
+from trilane.errors import BadInputError
+from trilane.hw_profiles.graph_file import GraphFile
+from trilane.hw_profiles.host import settings_of, usable_cores
+from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
+from trilane.pipeline.description import StageInput as StreamInput
+from trilane.pipeline.file_graph import DEFAULT_FRAMES, edge_rules
+from trilane.pipeline.file_keys import (
+    BlockStage,
+    EncodeBlock,
+    OnnxStage,
+    PortType,
+    PythonStage,
+    StageInput,
+    StageKeys,
+    TimedStage,
+    VideoBlock,
+)
+from trilane.pipeline.pipeline_file import PipelineFile, stage_inputs
+from trilane.pipeline.ports import payload_bytes
+from trilane.scheduler.places import Place
+from trilane.stages.blocks.video import DEFAULT_FPS, footage
+
+BLOCKS: Final = "trilane.stages.blocks"
+#: Module of each block, where it is not the block's name.
+MODULES: Final = {"busy": "loads", "discard": "loads"}
+SEGMENTS: Final = "segments"  # of the first video, as `trilane.apps.run.run_files` reads them
+TOKEN: Final = {"": PortType("u8", (1,))}  # what a made-up load writes
+
+
+def pipeline_of(file: PipelineFile, run_folder: Path) -> Pipeline:
+    """Return the pipeline of a checked file; its units' cores are dealt out by `cores_of`.
+
+    `run_folder`: folder in which the run leaves its files. Raises BadInputError naming the key.
+    """
+    networks = read_networks(file)
+    types = _all_types(file, networks)
+    stages = tuple(_stage(file, name, types, networks, run_folder) for name in file.stages)
+    rules = edge_rules(file, None)
+    edges = tuple(PipelineEdge(payload_bytes=payload_bytes(types[name]), rule=rules[name]) for name in file.readers)
+    return Pipeline(
+        stages=stages,
+        edges=edges,
+        units=cores_of(file, usable_cores()),
+        latency_to=file.latency_to,
+        from_release=file.run.fps is not None or file.run.arrivals is not None,
+        module_folders=(file.folder.absolute(),),
+    )
+
+
+def preload_of(file: PipelineFile) -> tuple[str, ...]:
+    """Return the modules that the stages of a file come from, none of them the file's own."""
+    return tuple(dict.fromkeys(_module(stage) for stage in file.stages.values() if not isinstance(stage, TimedStage)))
+
+
+def imports_of(file: PipelineFile) -> list[str]:
+    """Return the modules that a run of the file imports for its own code."""
+    return sorted({each.python.partition(":")[0] for each in file.stages.values() if isinstance(each, PythonStage)})
+
+
+def frames_of(file: PipelineFile) -> int:
+    """Return the number of frames of a run: that of the file, else that of its shortest video, else DEFAULT_FRAMES.
+
+    Raises BadInputError for a video that cannot be read.
+    """
+    if file.run.frames is not None:
+        return file.run.frames
+    counts = []
+    for stage in file.stages.values():
+        if isinstance(stage, VideoBlock) and not stage.is_camera:
+            found = footage(file.folder / stage.path)
+            rate = file.run.fps / found.fps if file.run.fps and found.fps else 1.0
+            counts += [max(round(found.pictures * rate), 1)] if found.pictures else []
+    return min(counts, default=DEFAULT_FRAMES)
+
+
+def picture_fps(file: PipelineFile) -> float:
+    """Return the rate of what the file's videos show: that of the run, else of its first video, else DEFAULT_FPS."""
+    if file.run.fps is not None:
+        return file.run.fps
+    videos = [stage for stage in file.stages.values() if isinstance(stage, VideoBlock) and not stage.is_camera]
+    rates = [footage(file.folder / stage.path).fps for stage in videos]
+    return next((rate for rate in rates if rate), DEFAULT_FPS)
+
+
+def segments_of(file: PipelineFile) -> dict[str, str]:
+    """Return the folder of segments of each stage that encodes, by the stage's name."""
+    names = [name for name, stage in file.stages.items() if isinstance(stage, EncodeBlock)]
+    return {name: f"{SEGMENTS}.{name}" if place else SEGMENTS for place, name in enumerate(names)}
+
+
+def cores_of(file: PipelineFile, cores: Sequence[int]) -> dict[str, UnitSettings]:
+    """Return cores and threads of each unit: those of the file, else a share of `cores`.
+
+    Cores are dealt out to the units in turn, in the order of the stages. Cores that are left over go to the units with
+    networks, in turn. Nothing is measured for it.
+    """
+    open_units = [unit for unit, keys in file.units.items() if keys.cores is None]
+    shares: dict[str, list[int]] = {unit: [cores[place % len(cores)]] for place, unit in enumerate(open_units)}
+    with_networks = [
+        unit
+        for unit in open_units
+        if any(isinstance(stage, OnnxStage) and stage.unit == unit for stage in file.stages.values())
+    ]
+    for place, core in enumerate(cores[len(open_units) :] if with_networks else ()):
+        shares[with_networks[place % len(with_networks)]].append(core)
+    places = {}
+    for unit, keys in file.units.items():
+        own = tuple(sorted(keys.cores or shares[unit]))
+        if absent := set(own) - set(cores):
+            found = f"core {', '.join(map(str, sorted(absent)))}"
+            expected = f"cores that this process may use: {', '.join(map(str, cores))}"
+            raise BadInputError(f"{file.path}: units.{unit}.cores", found, expected)
+        places[unit] = Place(own, keys.threads or len(own))
+    return settings_of(places)
+
+
+def _all_types(file: PipelineFile, networks: Mapping[str, GraphFile]) -> PortTypes:
+    """Return the types of all ports that are written. Raises BadInputError where one is read and not known."""
+    types = port_types(file, networks)
+    for name, stage in file.stages.items():
+        if isinstance(stage, VideoBlock) and stage.is_camera:
+            expected = "a video or a folder of pictures"
+            raise BadInputError(f"{file.path}: stages.{name}.path", "a camera, which a run cannot read yet", expected)
+        if isinstance(stage, TimedStage):
+            found, expected = "a time alone, with nothing to run", "onnx, python or block"
+            remedy = 'block = "busy" works for a time; `trilane predict` takes times alone'
+            raise BadInputError(f"{file.path}: stages.{name}", found, expected, remedy)
+        if name in file.readers and name not in types:
+            if not isinstance(stage, BlockStage) or stage.block != "busy":
+                found, expected = "nothing", "the type of what it writes, such as 'u8 256x256x3'"
+                raise BadInputError(f"{file.path}: stages.{name}.out", found, expected, "a run makes its slots by it")
+            types[name] = TOKEN
+    return types
+
+
+def _stage(
+    file: PipelineFile, name: str, types: PortTypes, networks: Mapping[str, GraphFile], run_folder: Path
+) -> PipelineStage:
+    stage = file.stages[name]
+    streams = stage_inputs(stage)
+    inputs = tuple(
+        StreamInput(stage=each.stage, latest=each.latest, max_age_ms=each.max_age_ms) for each in streams
+    )
+    place_of = {each.stage: place for place, each in enumerate(streams)}
+    made = PipelineStage(
+        name=name, unit=stage.unit, factory=f"{_module(stage)}:build", inputs=inputs, every=stage.every
+    )
+    settings = {
+        "where": f"{file.path.name}: stages.{name}",
+        "folder": str(file.folder.absolute()),
+        "run_folder": str(run_folder.absolute()),
+        "joins": made.joins,
+        "reads": [
+            {"name": each.port, "stream": place_of[each.stage], "port": _port(file, name, each, types)}
+            for each in stage.inputs
+        ],
+        "streams": [_texts(types[each.stage]) for each in streams],
+        "writes": _texts(types.get(name, {})) if name in file.readers else {},
+        "keys": _keys(file, name, stage, networks),
+    }
+    return made.model_copy(update={"settings": settings})
+
+
+def _module(stage: StageKeys) -> str:
+    """Return the module that makes a stage."""
+    if isinstance(stage, BlockStage):
+        return f"{BLOCKS}.{MODULES.get(stage.block, stage.block)}"
+    return f"{BLOCKS}.{'network' if isinstance(stage, OnnxStage) else 'own_code'}"
+
+
+def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str, GraphFile]) -> dict[str, Any]:
+    """Return the keys of a stage's own kind, and what follows from the rest of the file."""
+    common = set(StageKeys.model_fields)
+    keys: dict[str, Any] = {
+        key: value for key, value in stage.model_dump(mode="json").items() if key not in common and value is not None
+    }
+    if isinstance(stage, OnnxStage):
+        values = [(value.name, value_type(value)) for value in networks[name].model.graph.input]
+        keys["inputs"] = {}
+        for each, found in values:
+            if found is None:
+                raise BadInputError(f"{file.path}: stages.{name}.onnx", f"an input {each!r} of no numbers", "numbers")
+            keys["inputs"][each] = str(found)
+    elif isinstance(stage, VideoBlock):
+        keys["fps"] = file.run.fps
+    elif isinstance(stage, EncodeBlock):
+        keys |= {"fps": picture_fps(file), "segments": segments_of(file)[name]}
+    return keys
+
+
+def _port(file: PipelineFile, name: str, each: StageInput, types: PortTypes) -> str:
+    """Return the port of a stream that an input reads. Raises BadInputError where it is not named and there are several."""
+    ports = types[each.stage]
+    if each.from_port or len(ports) == 1:
+        chosen = each.from_port or next(iter(ports))
+        if chosen in ports:
+            return chosen
+    where = f"{file.path}: stages.{name}.in" + (f".{each.port}" if each.port else "")
+    found = f"{each.stage!r}, which has the ports {', '.join(ports)}"
+    raise BadInputError(where, found, f"one of them, such as '{each.stage}.{next(iter(ports))}'")
+
+
+def _texts(ports: Mapping[str, PortType]) -> dict[str, str]:
+    return {name: str(port) for name, port in ports.items()}

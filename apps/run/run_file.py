@@ -1,0 +1,166 @@
+"""A run of a pipeline file as somebody asked for it, from options to a run folder.
+
+Rule: nothing is printed here. The modules of the file's own code are named before any of them is imported.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+from trilane.apps.run.asked_run import made_facts
+from trilane.apps.run.file_pipeline import (
+    frames_of,
+    imports_of,
+    picture_fps,
+    pipeline_of,
+    preload_of,
+    segments_of,
+)
+from trilane.apps.run.report import write_report
+from trilane.apps.run.report_facts import report_of
+from trilane.apps.run.run_files import VIDEO, join_segments, write_files
+from trilane.apps.run.run_folder import RunFolder, default_place
+from trilane.apps.run.run_job import Hooks, RunOutcome, error_of, exit_code_of, sensors
+from trilane.errors import BadInputError
+from trilane.memory import require_memory
+from trilane.pipeline import journal
+from trilane.pipeline.controls import Interrupts
+from trilane.pipeline.description import Pipeline
+from trilane.pipeline.file_graph import settings_of
+from trilane.pipeline.file_keys import EncodeBlock
+from trilane.pipeline.pipeline_file import PipelineFile, read_pipeline
+from trilane.pipeline.result import Failure, RunResult
+from trilane.pipeline.run import HANG_NS, run_pipeline
+from trilane.pipeline.run_record import JournalFile
+from trilane.pipeline.unit_starter import UnitStarter
+from trilane.stages.machine_facts import machine_facts
+from trilane.stages.run_options import RunOptions
+
+#: Options of a run that a pipeline file takes, beside the file itself; each but `out` stands for a key of [run].
+TAKEN: Final = ("frames", "fps", "policy", "edge", "out")
+
+
+def pipeline_file_of(options: RunOptions) -> Path | None:
+    """Return the pipeline file that the options ask for; None for a scene."""
+    from trilane.pipeline.pipeline_file import is_pipeline_file
+
+    path = Path(options.scene)
+    return path if is_pipeline_file(path) else None
+
+
+def run_file(
+    options: RunOptions,
+    hooks: Callable[[], AbstractContextManager[Hooks]],
+    command: tuple[str, ...] = (),
+) -> RunOutcome:
+    """Check the options and the pipeline file, run it and leave its run folder.
+
+    `hooks`, `command`, and the errors raised: as in `trilane.apps.run.asked_run.run_asked`.
+    """
+    file = asked_file(options)
+    require_memory()
+    target = options.out or default_place(file.path.stem)
+    with RunFolder(target) as folder:
+        pipeline = pipeline_of(file, folder.work)
+        frames = options.frames or frames_of(file)
+        with UnitStarter(preload_of(file)) as starter, hooks() as told:
+            if modules := imports_of(file):
+                told.message(f"own code: {', '.join(modules)} of {file.folder.absolute()} is imported and run")
+            return _run(_Asked(options, file, pipeline, frames, command), folder, told, starter)
+
+
+def asked_file(options: RunOptions) -> PipelineFile:
+    """Return the checked file with what the options change. Raises BadInputError, also for an option of a scene."""
+    for name in sorted(options.model_fields_set - {"scene", *TAKEN}):
+        known = ", ".join(RunOptions.spelling(each) for each in TAKEN)
+        found = f"{RunOptions.spelling(name)} with a pipeline file"
+        raise BadInputError("options", found, f"one of {known}", "it is an option of the avatar's scenes")
+    file = read_pipeline(Path(options.scene))
+    given = {name: getattr(options, name) for name in TAKEN if name in options.model_fields_set}
+    return file.changed([f"run.{name}={given[name]}" for name in ("frames", "fps", "policy", "edge") if given.get(name)])
+
+
+class _Asked:
+    """A run that was asked for, and what its report says of it."""
+
+    def __init__(
+        self, options: RunOptions, file: PipelineFile, pipeline: Pipeline, frames: int, command: tuple[str, ...]
+    ) -> None:
+        self.options, self.file, self.pipeline = options, file, pipeline
+        self.settings = settings_of(file, frames, hang_ns=HANG_NS)
+        self.machine, self.made = machine_facts(), made_facts(command)
+        units = {unit: each.model_dump(mode="json") for unit, each in pipeline.units.items()}
+        self.config: dict[str, Any] = {
+            "pipeline": {"file": str(file.path), **{name: dict(table) for name, table in file.tables.items()}},
+            "scene": {"name": file.path.stem, "fps": picture_fps(file), "frames": frames},
+            "units": units,
+            "policy": self.settings.policy,
+            "edge": pipeline.rule,
+        }
+
+
+def _run(asked: _Asked, folder: RunFolder, told: Hooks, starter: UnitStarter) -> RunOutcome:
+    config, file = asked.config, asked.file
+    facts = {"config": config, "machine": asked.machine, "made": asked.made}
+    try:
+        result = run_pipeline(
+            asked.pipeline,
+            asked.settings.frames,
+            settings=asked.settings,
+            journal=JournalFile(folder.work / journal.NAME, facts, sensors),
+            starter=starter,
+            on_progress=lambda presented, requested: told.progress(asked.settings.policy, presented, requested),
+            on_message=told.message,
+        )
+    except KeyboardInterrupt:
+        told.message("interrupted: nothing was written")
+        raise
+    if not result.presented:
+        if result.interrupted:
+            raise KeyboardInterrupt
+        raise error_of(result)
+    with Interrupts() as late:  # from here on a signal waits until the folder is whole
+        written, result = _written(file, folder.work, config["scene"]["fps"], result)
+        folder.release()
+        options = {name: asked.options.as_json()[name] for name in ("scene", *TAKEN)}
+        known = {"made": asked.made, "options": options, **written}
+        report = report_of(result, config, machine=asked.machine, facts=known)
+        write_report(report, folder.work / "report.json")
+        place = folder.complete()
+    return RunOutcome(report, place, 130 if late.count else exit_code_of(result))
+
+
+def _written(file: PipelineFile, work: Path, fps: float, result: RunResult) -> tuple[dict[str, Any], RunResult]:
+    """Write the files of the folder and the file's own videos; return what the report says of them, and the result."""
+    segments = segments_of(file)
+    videos = {name: work / (VIDEO if place == 0 else f"{name}.mp4") for place, name in enumerate(segments)}
+    for name, video in videos.items():
+        if video.name != VIDEO:
+            join_segments(sorted((work / segments[name]).glob("*.mp4")), video, fps)
+            shutil.rmtree(work / segments[name], ignore_errors=True)
+    facts, unwritten = write_files(work, fps)
+    if unwritten is not None:
+        result = replace(result, failure=result.failure or Failure(str(unwritten)))
+    for name, video in videos.items():
+        stage = file.stages[name]
+        assert isinstance(stage, EncodeBlock)
+        if video.exists():
+            _copied(video, file.folder / stage.path)
+    return facts, result
+
+
+def _copied(video: Path, target: Path) -> None:
+    """Copy a video to its place, which is whole at any time. Raises BadInputError where it cannot be written."""
+    partial = target.with_name(f"{target.name}.partial")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(video, partial)
+        partial.replace(target)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise BadInputError.of_os_error(target, error, "a place for the video") from None

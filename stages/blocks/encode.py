@@ -1,0 +1,56 @@
+"""The block `encode`: writes pictures to a video.
+
+The pictures go into a segment below the run's folder, which a killed unit leaves whole up to its last frames. After the
+run the segments are joined to the video.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.pipeline.ports import Arrays, PortedStage
+from trilane.pipeline.stage import UnitContext
+from trilane.stages.cpu.present import Segment
+
+
+class Encode(PortedStage):
+    """Encodes one picture a frame.
+
+    Keys: `fps`, `segments`: name of the folder of segments below the run's folder. Sides are cut to even numbers, as
+    the video's colours need it.
+    """
+
+    def __init__(self, settings: Mapping[str, Any]) -> None:
+        super().__init__(settings)
+        height, width, self._channels = self.reads[0].type.shape
+        self._height, self._width = max(height // 2 * 2, 2), max(width // 2 * 2, 2)
+        folder = self.settings.run_folder / self.settings.keys["segments"]
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / f"{time.monotonic_ns():020d}-{os.getpid()}.mp4"
+        self._segment: Segment | None = Segment(path, self.settings.keys["fps"], self._height, self._width)
+
+    def work(self, frame: int, arrays: Sequence[NDArray[Any] | None], outputs: Arrays) -> Mapping[str, float]:  # noqa: ARG002
+        if arrays[0] is None or self._segment is None:
+            return {}
+        picture = arrays[0][: self._height, : self._width, :3]
+        picture = np.ascontiguousarray(picture if self._channels > 1 else np.repeat(picture, 3, axis=2))
+        self._segment.moved.start()
+        self._segment.digest(frame, picture)
+        self._segment.add(frame, picture)
+        return {}
+
+    def close(self) -> None:
+        if self._segment is not None:
+            self._segment.close()
+            self._segment = None
+
+
+def build(settings: Mapping[str, Any], unit: UnitContext) -> Encode:  # noqa: ARG001 - a factory's signature
+    """Build the block."""
+    return Encode(settings)

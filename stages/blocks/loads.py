@@ -1,0 +1,36 @@
+"""The blocks `busy`, a load that is made up, and `discard`, which takes frames and does nothing with them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from numpy.typing import NDArray
+
+from trilane.pipeline.ports import Arrays, PortedStage
+from trilane.pipeline.stage import UnitContext
+from trilane.units import NS_PER_MS
+
+
+class Busy(PortedStage):
+    """Works for a stated time of its core, and writes zeros."""
+
+    def work(self, frame: int, arrays: Sequence[NDArray[Any] | None], outputs: Arrays) -> Mapping[str, float]:  # noqa: ARG002
+        # CPU time, because a stage that lost its core to another has its work still before it.
+        end_ns = time.thread_time_ns() + round(self.settings.keys["load_ms"] * NS_PER_MS)
+        while time.thread_time_ns() < end_ns:
+            pass
+        return {}
+
+
+class Discard(PortedStage):
+    """Takes frames and does nothing with them."""
+
+    def work(self, frame: int, arrays: Sequence[NDArray[Any] | None], outputs: Arrays) -> Mapping[str, float]:  # noqa: ARG002
+        return {}
+
+
+def build(settings: Mapping[str, Any], unit: UnitContext) -> PortedStage:  # noqa: ARG001 - a factory's signature
+    """Build the block that the keys name."""
+    return {"busy": Busy, "discard": Discard}[settings["keys"]["block"]](settings)

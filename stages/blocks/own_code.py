@@ -1,0 +1,120 @@
+"""Own code as a stage: `python = "module:factory"` of a pipeline file.
+
+`factory(settings)` is called once in the unit's process and returns something callable. That is called for each frame
+with an array for each input: a named port as a keyword, a lone input without a name as the only argument. A newest
+frame that is not there is None. It returns a dict of arrays by port, or the array of the only port. If it has a
+parameter `out`, it gets the arrays to fill, by port, and may return None.
+
+Rule: what it returns must have the type that the file says; nothing is cast or broadcast in silence. An error says
+which stage, file and line it comes from.
+"""
+
+from __future__ import annotations
+
+import inspect
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.errors import BadInputError, TrilaneError
+from trilane.pipeline.file_keys import TYPES
+from trilane.pipeline.ports import Arrays, PortedStage
+from trilane.pipeline.stage import UnitContext
+
+OUT = "out"
+
+
+class OwnCode(PortedStage):
+    """A stage that calls a person's own code. Raises BadInputError for a module or factory that is not there."""
+
+    def __init__(self, settings: Mapping[str, Any]) -> None:
+        super().__init__(settings)
+        name, _, factory = self.settings.keys["python"].partition(":")
+        where = f"{self.settings.where}.python"
+        self._module = self._imported(name, where)
+        made = getattr(self._module, factory, None)
+        if not callable(made):
+            known = [one for one in vars(self._module) if not one.startswith("_")]
+            raise BadInputError(where, f"no function {factory!r} in {name}", f"one of {', '.join(known) or 'none'}")
+        self._call: Callable[..., Any] = self._guarded(made, dict(self.settings.keys.get("settings", {})))
+        if not callable(self._call):
+            found = f"{factory} returned {type(self._call).__name__}"
+            raise BadInputError(where, found, "something callable", "the factory returns a function for the frames")
+        self._fills = _takes_out(self._call)
+
+    def work(self, frame: int, arrays: Sequence[NDArray[Any] | None], outputs: Arrays) -> Mapping[str, float]:  # noqa: ARG002
+        named = {each.name: array for each, array in zip(self.reads, arrays, strict=True) if each.name}
+        plain = [array for each, array in zip(self.reads, arrays, strict=True) if not each.name]
+        filled = {OUT: outputs} if self._fills else {}
+        found = self._guarded(self._call, *plain, **named, **filled)
+        if not outputs or (found is None and self._fills):
+            return {}
+        if not isinstance(found, dict):
+            found = dict.fromkeys(outputs, found) if len(outputs) == 1 else found
+        self._check(found, outputs)
+        for name, target in outputs.items():
+            target[...] = found[name]
+        return {}
+
+    def _check(self, found: object, outputs: Arrays) -> None:
+        """Check what the code returned. Raises TrilaneError."""
+        if not isinstance(found, dict) or found.keys() != outputs.keys():
+            said = f"a dict of {', '.join(map(str, found))}" if isinstance(found, dict) else type(found).__name__
+            ports = ", ".join(name or "one array" for name in outputs)
+            raise TrilaneError(f"{self.settings.where}: its code returned {said}, expected {ports}")
+        for name, target in outputs.items():
+            array = found[name]
+            if not isinstance(array, np.ndarray) or (array.dtype, array.shape) != (target.dtype, target.shape):
+                port = f" for port {name}" if name else ""
+                said = f"{_shown(array)}{port}, expected {_shown(target)}"
+                raise TrilaneError(f"{self.settings.where}: its code returned {said}")
+
+    def _imported(self, name: str, where: str) -> ModuleType:
+        try:
+            return self._guarded(import_module, name)
+        except ModuleNotFoundError as error:
+            found = f"no module {error.name!r}"
+            remedy = f"put {name}.py beside the pipeline file, or install it"
+            raise BadInputError(where, found, "a module of the file's folder or an installed one", remedy) from None
+
+    def _guarded(self, call: Callable[..., Any], *args: Any, **named: Any) -> Any:
+        """Return what a call returns; an error in it names the stage, and the file and line of the code."""
+        try:
+            return call(*args, **named)
+        except (TrilaneError, ModuleNotFoundError):
+            raise
+        except Exception as error:
+            traceback.print_exception(error)
+            own = [each for each in traceback.extract_tb(error.__traceback__) if _is_own(each.filename)]
+            at = f" at {own[-1].filename}, line {own[-1].lineno}" if own else ""
+            raise TrilaneError(f"{self.settings.where}: {type(error).__name__}: {error}{at}") from error
+
+
+def _is_own(file: str) -> bool:
+    """Whether a file of a traceback is a person's own code: neither this one nor part of the import machinery."""
+    return Path(file) != Path(__file__) and not file.startswith("<") and "/importlib/" not in file
+
+
+def _takes_out(call: Callable[..., Any]) -> bool:
+    try:
+        return OUT in inspect.signature(call).parameters
+    except (TypeError, ValueError):
+        return False
+
+
+def _shown(array: object) -> str:
+    if not isinstance(array, np.ndarray):
+        return type(array).__name__
+    code = next((code for code, name in TYPES.items() if name == array.dtype.name), array.dtype.name)
+    return f"{code} {'x'.join(map(str, array.shape))}".strip()
+
+
+def build(settings: Mapping[str, Any], unit: UnitContext) -> OwnCode:  # noqa: ARG001 - a factory's signature
+    """Build the stage; imports its module. Raises BadInputError, TrilaneError."""
+    return OwnCode(settings)

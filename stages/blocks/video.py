@@ -1,0 +1,97 @@
+"""The block `video`: pictures of a video file, or of a folder of pictures, scaled and cropped to one size.
+
+Frame n is the picture that is shown n / rate after the beginning. The rate is that of the run, else the file's own; of
+a folder, frame n is picture n. After its end a video or folder begins again. A frame is found by its number, so a unit
+that was started again goes on where it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageOps, UnidentifiedImageError
+
+from trilane.arrays import U8
+from trilane.errors import BadInputError
+from trilane.pipeline.ports import Arrays, PortedStage
+from trilane.pipeline.stage import UnitContext
+from trilane.shapes import Shape
+from trilane.stages.gpu.video_reader import VideoReader, video_stream
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
+DEFAULT_FPS = 30.0
+EXPECTED = "a video or a folder of pictures"
+
+
+class Footage(NamedTuple):
+    """What a path holds. `pictures`: number of pictures; 0 where it is not known. `fps`: its own rate, or None."""
+
+    pictures: int
+    fps: float | None
+
+
+def footage(path: Path) -> Footage:
+    """Return what a video file or a folder of pictures holds. Raises BadInputError."""
+    if path.is_dir():
+        return Footage(len(picture_files(path)), None)
+    try:
+        with av.open(str(path), metadata_errors="replace") as container:
+            stream = video_stream(container, path)
+            rate = stream.average_rate or stream.guessed_rate
+            count = stream.frames or sum(packet.size > 0 for packet in container.demux(stream))
+            return Footage(count, float(rate) if rate else None)
+    except (av.FFmpegError, OSError) as error:
+        raise BadInputError(path, f"no readable video ({error})", EXPECTED) from None
+
+
+def picture_files(folder: Path) -> list[Path]:
+    """Return the pictures of a folder, by name. Raises BadInputError where there is none."""
+    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in PICTURES)
+    if not files:
+        raise BadInputError(folder, "a folder without pictures", f"files that end in {', '.join(PICTURES)}")
+    return files
+
+
+class Video(PortedStage):
+    """Writes one picture a frame. Raises BadInputError for a file that cannot be read."""
+
+    def __init__(self, settings: Mapping[str, Any]) -> None:
+        super().__init__(settings)
+        self._path = self.settings.folder / self.settings.keys["path"]
+        height, width = next(iter(self.writes.values())).shape[:2]
+        self._shape: Shape = (height, width)
+        self._files = picture_files(self._path) if self._path.is_dir() else []
+        self._reader = None if self._files else VideoReader(self._path, self._shape)
+        self._fps = self.settings.keys.get("fps") or (None if self._files else footage(self._path).fps) or DEFAULT_FPS
+        self._picture: U8 = np.zeros((height, width, 3), np.uint8)
+
+    def work(self, frame: int, arrays: Sequence[NDArray[Any] | None], outputs: Arrays) -> Mapping[str, float]:  # noqa: ARG002
+        if self._reader is None:
+            self._picture = self._of_file(self._files[frame % len(self._files)])
+        elif (picture := self._reader.at(frame / self._fps)) is not None:
+            self._picture = picture
+        for target in outputs.values():
+            target[...] = self._picture
+        return {}
+
+    def close(self) -> None:
+        if self._reader is not None:
+            self._reader.close()
+
+    def _of_file(self, path: Path) -> U8:
+        try:
+            with Image.open(path) as image:
+                upright = ImageOps.exif_transpose(image).convert("RGB")
+        except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+            raise BadInputError(path, f"no readable picture ({error})", "a picture") from None
+        return np.asarray(ImageOps.fit(upright, self._shape[::-1], Image.Resampling.BILINEAR), np.uint8)
+
+
+def build(settings: Mapping[str, Any], unit: UnitContext) -> Video:  # noqa: ARG001 - a factory's signature
+    """Build the block. Raises BadInputError."""
+    return Video(settings)
