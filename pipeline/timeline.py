@@ -170,7 +170,7 @@ class Timeline:
         self.stalls: deque[Span] = deque(maxlen=kept)
         self._source = Source(settings, self._drop_at_source)
         self._turned_away: dict[str, deque[tuple[int, int]]] = {cause: deque() for cause in DropCause}
-        self._track = track_of(graph, self._source)
+        self._track = track_of(graph, settings, self._source)
         self._lost: deque[GoneFrame] = deque()  # those whose cause was not counted yet
         self._counts: dict[tuple[str, str], int] = {}
         self._requested = settings.frames
@@ -184,7 +184,7 @@ class Timeline:
             UnitDied: self._on_died,
             FrameRequest: lambda event: self._source.request(event.frames, self._now_ns),
             Hold: lambda event: self._source.hold(event.frames, self._now_ns),
-            Stop: lambda _: self._stop(),
+            Stop: lambda _: self._source.stop(),
             SchedulerStalled: lambda event: self.stalls.append(Span(self._now_ns - event.ns, self._now_ns)),
         }
 
@@ -227,7 +227,7 @@ class Timeline:
         if self.is_over:
             return facts
         self._now_ns = step.now_ns
-        self._track.settle()
+        self._track.step(step.now_ns, step.events)
         after: list[Key] = []
         for event in step.events:
             if type(event) is JobDone:  # most events
@@ -278,15 +278,19 @@ class Timeline:
                     yield Gone(*gone(cause, counted.now_ns), counted.now_ns, kind, cause)
                 self._counts[kind, cause] = count
 
-    def _lost_for(self, _cause: str, now_ns: int) -> GoneFrame:
-        """Return the frame that was lost first."""
+    def _lost_for(self, cause: str, now_ns: int) -> GoneFrame:
+        """Return the next frame that was lost."""
+        if (gone := self._track.left(cause, now_ns)) is not None:
+            return gone
         return self._lost.popleft() if self._lost else GoneFrame(UNKNOWN, now_ns)
 
     def _dropped(self, cause: str, now_ns: int) -> GoneFrame:
         """Return the frame that was dropped for `cause`, given as `producer->consumer:kind`."""
+        if (gone := self._track.left(cause, now_ns)) is not None:
+            return gone
         edge, _, kind = cause.rpartition(":")
         if not edge.startswith(f"{SOURCE}->"):
-            return self._track.dropped(edge, kind, now_ns)
+            return self._track.dropped(edge, now_ns)
         queue = self._turned_away.get(kind) or self._source.queue
         return GoneFrame(*queue.popleft()) if queue else GoneFrame(UNKNOWN, now_ns)
 
@@ -330,11 +334,7 @@ class Timeline:
         handed = self.units[event.unit].take(event.job)
         if handed is not None:
             self._lose(handed.job.frame)
-            self._stop()
-
-    def _stop(self) -> None:
-        self._track.stop()
-        self._source.stop()
+            self._source.stop()
 
     def _on_ready(self, event: UnitReady) -> None:
         down_ns = self.units[event.unit].rise(self._now_ns)

@@ -214,8 +214,8 @@ class Core:
             self.flow.mark_lost(frame, loss)
         self._finish(outcome)
 
-    def _count_drop_at_source(self, _frame: int, _release_ns: int, cause: DropCause) -> None:
-        self.ledger.dropped[Drop(f"source->{self.graph.stages[0].name}", cause)] += 1
+    def _count_drop_at_source(self, frame: int, release_ns: int, cause: DropCause) -> None:
+        self.ledger.drop(frame, release_ns, Drop(f"source->{self.graph.stages[0].name}", cause))
 
     # events of jobs
 

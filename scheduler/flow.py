@@ -292,7 +292,8 @@ class Flow:
         """Note that a stage without readers has done the frame; the last of them presents it."""
         if not state.todo & self._ends:
             state.is_presented = True
-            self._ledger.presented(frame, end_ns, state.latency_ns, state.deadline_ns, state.skips, state.rung)
+            known = (state.latency_ns, state.deadline_ns, state.skips, state.rung, state.release_ns)
+            self._ledger.presented(frame, end_ns, *known)
             self.aside += 1
             self._mark_roots_dirty()
         if not state.todo:
@@ -300,11 +301,12 @@ class Flow:
 
     def _leave(self, frame: int) -> None:
         """Note that nothing is left to do for the frame."""
-        if self.frames.pop(frame).is_presented:
+        state = self.frames.pop(frame)
+        if state.is_presented:
             self.aside -= 1
             return
         ends = [stage.name for stage in self.stages if stage.output is None]
-        self._ledger.dropped[Drop(",".join(ends), DropCause.EVERY)] += 1
+        self._ledger.drop(frame, state.release_ns, Drop(",".join(ends), DropCause.EVERY))
         self._mark_roots_dirty()
 
     def _mark_roots_dirty(self) -> None:
@@ -398,7 +400,7 @@ class Flow:
         if state.is_presented:
             self.aside -= 1
         else:
-            self._ledger.lost[loss] += 1
+            self._ledger.lose(frame, state.release_ns, loss)
         self._forget(frame, state)
         self._mark_roots_dirty()
         self._tell_bypass(state)
@@ -500,7 +502,7 @@ class Flow:
         else:
             readers = ",".join(reader.name for reader in behind.readers)
         writer = "source" if behind is before else behind.name
-        self._ledger.dropped[Drop(f"{writer}->{readers}", cause)] += 1
+        self._ledger.drop(frame, state.release_ns, Drop(f"{writer}->{readers}", cause))
         self._forget(frame, state)
         self._tell_bypass(state)
 

@@ -31,6 +31,21 @@ THROTTLED: Final = 3
 JOIN: Final = 4
 
 
+class FrameLeft(NamedTuple):
+    """A frame that left the run.
+
+    `cause`: key of the cause in the report; empty for a presented frame.
+    `end_ns`, `latency_ns`, `rung`: as in `Ledger.presented`; 0 for other frames.
+    """
+
+    frame: int
+    release_ns: int
+    cause: str = ""
+    end_ns: int = 0
+    latency_ns: int = 0
+    rung: int = 0
+
+
 class JobRecord(NamedTuple):
     """One finished job; times in ns of the run's clock.
 
@@ -135,6 +150,7 @@ class Ledger:
     `presented_count`, `skipped`: number of presented frames, and of those that took the bypass.
     `rungs`: number of presented frames on each rung of work.
     `rung_switches`: how often a frame had another rung than the frame before.
+    `left`: list that gets every frame that leaves the run; None: none is kept.
     `presented_frames`, `lateness_ns`: numbers and lateness of the presented frames in order; filled only for a run that
     keeps all values.
     """
@@ -148,6 +164,7 @@ class Ledger:
         self._joining = {stage.unit for stage, inputs in reads if sum(not each.latest for each in inputs) > 1}
         self._newest = {each.stage: _NewestBook(sketch) for _, inputs in reads for each in inputs if each.latest}
         self.start_ns = self.end_ns = 0
+        self.left: list[FrameLeft] | None = None
         self.lost: Counter[Loss] = Counter()
         self.dropped: Counter[Drop] = Counter()
         self.skipped = self.presented_count = 0
@@ -190,6 +207,18 @@ class Ledger:
         stage.wait.add(begin_ns - ready_ns)
         self._units[job.unit].add_job(begin_ns, end_ns, preempted_ns, asleep_ns, preempted_before_ns)
 
+    def lose(self, frame: int, release_ns: int, loss: Loss) -> None:
+        """Book a lost frame."""
+        self.lost[loss] += 1
+        if self.left is not None:
+            self.left.append(FrameLeft(frame, release_ns, str(loss)))
+
+    def drop(self, frame: int, release_ns: int, drop: Drop) -> None:
+        """Book a dropped frame."""
+        self.dropped[drop] += 1
+        if self.left is not None:
+            self.left.append(FrameLeft(frame, release_ns, str(drop)))
+
     def newest(self, stream: str, age_ns: int, behind: int) -> None:
         """Book that a job takes the newest frame of a stream.
 
@@ -209,7 +238,14 @@ class Ledger:
         self._units[unit].restarts += 1
 
     def presented(
-        self, frame: int, end_ns: int, latency_ns: int, deadline_ns: int, skipped: bool = False, rung: int = 0
+        self,
+        frame: int,
+        end_ns: int,
+        latency_ns: int,
+        deadline_ns: int,
+        skipped: bool = False,
+        rung: int = 0,
+        release_ns: int = 0,
     ) -> None:
         """Book a presented frame.
 
@@ -217,6 +253,7 @@ class Ledger:
         `deadline_ns`: time of its deadline; NEVER without one.
         `skipped`: whether it took the bypass.
         `rung`: rung of its work.
+        `release_ns`: time of its release.
         """
         self.skipped += skipped
         self.rungs[rung] += 1
@@ -237,6 +274,8 @@ class Ledger:
             self._lateness.add(end_ns - deadline_ns)
         if self._books.sketch is None:
             self._keep(frame, end_ns, deadline_ns)
+        if self.left is not None:
+            self.left.append(FrameLeft(frame, release_ns, "", end_ns, latency_ns, rung))
 
     def _keep(self, frame: int, end_ns: int, deadline_ns: int) -> None:
         self.presented_frames.append(frame)

@@ -172,7 +172,7 @@ class EdgeSlots:
 
     def take(self, slot: int, line: int = 0) -> None:
         """Let the unit of the stage that the slot waits for in `line` read it from now on."""
-        if not self._reading[slot]:
+        if not self._reading[slot] or slot not in self.lines[line]:
             self._move("take", slot)
         self._reading[slot] += 1
         self.lines[line].remove(slot)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from trilane.pipeline.journal import Stepped, journal_of
-from trilane.pipeline.timeline import UNKNOWN, ExplainedJob, Gone, Presented, Timeline
+from trilane.pipeline.timeline import ExplainedJob, Gone, Presented, Timeline
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import Drop, DropCause, Graph, Input, Loss, Settings, StageSpec
 from trilane.scheduler.flow import Flow
@@ -79,7 +79,8 @@ def told(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
 
     def dropped(flow: Flow, frame: int, behind: StageState, before: StageState | None, cause: DropCause) -> None:
         readers = before.name if before is not None else ",".join(each.name for each in behind.readers)
-        found.append((frame, flow.frames[frame].release_ns, str(Drop(f"{behind.name}->{readers}", cause))))
+        writer = "source" if behind is before else behind.name
+        found.append((frame, flow.frames[frame].release_ns, str(Drop(f"{writer}->{readers}", cause))))
 
     def lost(flow: Flow, frame: int, loss: Loss) -> None:
         if not flow.frames[frame].is_presented:
@@ -94,6 +95,10 @@ def told(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     def presented(_ledger: Ledger, frame: int, end_ns: int, latency_ns: int, *_rest: Any) -> None:
         found.append((frame, end_ns, latency_ns if latency_ns >= 0 else None))
 
+    def at_source(core: Core, frame: int, release_ns: int, cause: DropCause) -> None:
+        found.append((frame, release_ns, str(Drop(f"source->{core.graph.stages[0].name}", cause))))
+
+    noted(Core, "_count_drop_at_source", at_source)
     noted(Flow, "_count_drop", dropped)
     noted(Flow, "mark_lost", lost)
     noted(Flow, "_leave", left)
@@ -108,37 +113,25 @@ def test_the_timeline_tells_which_frames_a_graph_presents_drops_and_loses(
     recording, jobs, report = run(seed)
     records = list(journal_of(recording, jobs, {}, report))
     core = Core(recording.graph, recording.settings)
-    timeline = Timeline(recording.graph, recording.settings, waits=True, idle=True)
-
-    def agree() -> None:
-        assert sorted(str(row[2]) for row in found) == sorted(str(row[2]) for row in expected)
-        causes = {row[2] for row in expected if isinstance(row[2], str)}
-        # Of several causes in one step, the journal does not say which of the frames had which.
-        if len(causes) < 2 and all(row[0] != UNKNOWN for row in found):
-            assert sorted(found, key=str) == sorted(expected, key=str)
-            named[0] += 1
-        named[1] += 1
-
-    named = [0, 0]
-    is_timed = bool(recording.settings.period_ns)  # else the journal lacks when a frame was put in flight
-    found: list[tuple[Any, ...]] = []
-    expected: list[tuple[Any, ...]] = []
+    told.clear()
+    expected: list[list[tuple[Any, ...]]] = []
     for record in records[1:]:
         if isinstance(record, Stepped):
-            agree()
-            told.clear()
             core.step(record.now_ns, record.events)
-            expected = told if is_timed else [(row[0], 0, row[2]) if isinstance(row[2], str) else row for row in told]
-            expected, found = [*expected], []
-
+            expected.append([*told])
+            told.clear()
+    timeline = Timeline(recording.graph, recording.settings, waits=True, idle=True)
+    found: list[list[tuple[Any, ...]]] = []
+    for record in records[1:]:
+        if isinstance(record, Stepped):
+            found.append([])
         for fact in timeline.add(record):
-            if isinstance(fact, Gone) and not fact.cause.startswith("source"):
-                found.append((fact.frame, fact.release_ns if is_timed else 0, fact.cause))
+            if isinstance(fact, Gone):
+                found[-1].append((fact.frame, fact.release_ns, fact.cause))
             elif isinstance(fact, Presented):
-                found.append((fact.frame, fact.end_ns, fact.latency_ns))
+                found[-1].append((fact.frame, fact.end_ns, fact.latency_ns))
             elif isinstance(fact, ExplainedJob):
                 assert sum(fact.waits_ns.values()) == fact.job.begin_ns - fact.job.ready_ns
-    agree()
-    assert named[0] >= 0.75 * named[1]
+    assert [sorted(step, key=str) for step in found] == [sorted(step, key=str) for step in expected]
     assert (timeline.frames, timeline.is_over) == ({}, True)
     assert timeline.presented == report["frames"]["presented"]
