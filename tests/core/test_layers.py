@@ -22,6 +22,7 @@ ROWS = (
         "files",
         "options",
         "shapes",
+        "signals",
         "unet_tables",
         "unexpected_value",
         "units",
