@@ -126,6 +126,33 @@ def test_random_arrivals_wait_as_theory_says(predict: Predict, load: float, wait
     assert abs(fmean(waits) - wait_ms) < 3 * stdev(waits) / sqrt(len(waits))
 
 
+def test_a_full_queue_turns_away_as_many_as_theory_says(predict: Predict) -> None:
+    """M/M/1/K at load 0.9: one in work, one that the unit holds ready and three that wait are K = 5."""
+    text = chain("{ exponential = 1 }", head="[run]\narrivals = { poisson = 900 }\nin_queue = 3\nframes = 10000")
+    runs = [predict(text, "--seed", str(seed))["frames"] for seed in range(6)]
+    shares = [1 - run["presented"] / run["requested"] for run in runs]
+    loss = (1 - 0.9) * 0.9**5 / (1 - 0.9**6)
+    assert abs(fmean(shares) - loss) < 3 * stdev(shares) / sqrt(len(shares))
+
+
+def test_branches_choose_the_same_frames(predict: Predict) -> None:
+    """A of 10 and B of 11 ms behind a source every 6 ms: a frame that one has begun is not stale for the other."""
+    text = """
+    [run]
+    fps = 166.66666666666666
+    policy = "latest"
+    [stages]
+    source = { unit = "s", time_ms = 0 }
+    a = { unit = "a", in = "source", time_ms = 10 }
+    b = { unit = "b", in = "source", time_ms = 11 }
+    join = { unit = "j", in = { a = "a", b = "b" }, time_ms = 0 }
+    """
+    answer = predict(text)
+    assert answer["frame_time_ms"]["mean"] == pytest.approx(11, abs=0.03)
+    assert answer["needs_ms"]["mean"] == 11
+    assert sum(answer["frames"]["dropped"].values()) + answer["frames"]["presented"] == 1000
+
+
 def test_samples_are_drawn_as_they_are(predict: Predict) -> None:
     row = predict(chain("{ samples = [1, 1, 4] }", head="[run]\nframes = 3000"))["stages"]["s0"]
     assert row["alone_ms"] == 2
