@@ -76,7 +76,7 @@ def test_rules_of_streams_by_file_run_and_default(tmp_path: Path) -> None:
 
     assert rules("") == dict.fromkeys(("frame", "depth", "seg"), "double")
     assert rules('[run]\nedge = "single"') == dict.fromkeys(("frame", "depth", "seg"), "single")
-    assert rules('[run]\nedge = "single"', '[edges]\ndepth = "fifo:3"')["depth"] == "fifo:3"
+    assert rules('[run]\nedge = "single"', '[edges]\ndepth = "triple"')["depth"] == "triple"
 
 
 def test_slots_where_branches_meet(tmp_path: Path) -> None:
