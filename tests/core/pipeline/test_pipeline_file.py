@@ -118,5 +118,5 @@ def test_a_scene_is_no_pipeline_file(tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text('motion = "walk.bvh"\n[camera]\nwidth = 3\n')
     assert not is_pipeline_file(tmp_path / "scene.toml")
     assert not is_pipeline_file(tmp_path / "none.toml")
-    for number, head in enumerate(("[stages]", " [ stages.a ]", '["stages"]')):
+    for number, head in enumerate(("[stages]", " [ stages.a ]", '["stages"]', "stages.a = {}", "stages = 3")):
         assert is_pipeline_file(write_file(tmp_path, head, f"{number}.toml"))
