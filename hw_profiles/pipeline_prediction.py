@@ -271,17 +271,22 @@ def _intervals(
     rng = np.random.default_rng([seed, 2])
     count = min(report["frames"]["requested"], SIMULATED_FRAMES)
     settings = settings_of(file, count, seed, hang_ns=NEVER_HANGS_NS)
-    runs = [simulate(graph, settings, _Drawn(prices, seed, _factors(prices, rng))).report for _ in range(SIMULATIONS)]
-    latency = _quantiles([run["latency_ms"]["mean"] for run in runs])
+    whole, *runs = [
+        simulate(graph, settings, _Drawn(prices, seed, factors)).report
+        for factors in ({}, *(_factors(prices, rng) for _ in range(SIMULATIONS)))
+    ]
+
+    def around(key: str, mean: float) -> dict[str, float]:
+        """Return the interval by what errors change in short runs, whose own jitter is the same in each."""
+        usual = whole[key]["mean"]
+        low, high = np.percentile([run[key]["mean"] / usual if usual else 1.0 for run in runs], QUANTILES)
+        return {"low": float(mean * low), "high": float(mean * high)}
+
     if report["frames"]["dropped"]:
-        return _quantiles([run["frame_time_ms"]["mean"] for run in runs]), latency
+        return around("frame_time_ms", frame_ms), around("latency_ms", latency_ms)
     least = source_ns(file) / NS_PER_MS
-    return {"low": max(least, needs.low_ms), "high": max(least, needs.high_ms)}, latency
-
-
-def _quantiles(values: list[float]) -> dict[str, float]:
-    low, high = np.percentile(values, QUANTILES)
-    return {"low": float(low), "high": float(high)}
+    by_bound = {"low": max(least, needs.low_ms), "high": max(least, needs.high_ms)}
+    return by_bound, around("latency_ms", latency_ms)
 
 
 def _sentence(fps: float, needs: FrameInterval) -> str:

@@ -109,7 +109,11 @@ class RunKeys(Keys):
     )
     in_flight: int = Field(default=0, ge=0, le=1000, description="Most frames on their way at once; 0: no limit.")
     in_queue: int = Field(
-        default=0, ge=0, le=MOST_FRAMES, description="Most frames that wait before the first stage; 0: no limit."
+        default=0,
+        ge=0,
+        le=MOST_FRAMES,
+        description="Most frames that wait before the first stage, beside one that its unit holds ready; "
+        "more are turned away. 0: no limit.",
     )
     latency_to: str = Field(
         default="", description="Stage at whose end the latency ends; without it the last one that nobody reads."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from math import log, sqrt
 from pathlib import Path
 from statistics import fmean, stdev
@@ -13,7 +14,7 @@ import pytest
 
 from support.pipeline_files import CUT, DEPTH, STREET, write_file
 from support.run_folders import write_run
-from trilane.hw_profiles.pipeline_prediction import _sentence
+from trilane.hw_profiles.pipeline_prediction import _sentence, given_price, predict_file
 from trilane.hw_profiles.rates import FrameInterval
 from trilane.pipeline.file_graph import edge_rules, graph_of
 from trilane.pipeline.pipeline_file import read_pipeline
@@ -126,11 +127,55 @@ def test_random_arrivals_wait_as_theory_says(predict: Predict, load: float, wait
     assert abs(fmean(waits) - wait_ms) < 3 * stdev(waits) / sqrt(len(waits))
 
 
+def test_a_full_queue_turns_away_as_many_as_theory_says(predict: Predict) -> None:
+    """M/M/1/K at load 0.9: one in work, one that the unit holds ready and three that wait are K = 5."""
+    text = chain("{ exponential = 1 }", head="[run]\narrivals = { poisson = 900 }\nin_queue = 3\nframes = 10000")
+    runs = [predict(text, "--seed", str(seed))["frames"] for seed in range(6)]
+    shares = [1 - run["presented"] / run["requested"] for run in runs]
+    loss = (1 - 0.9) * 0.9**5 / (1 - 0.9**6)
+    assert abs(fmean(shares) - loss) < 3 * stdev(shares) / sqrt(len(shares))
+
+
+def test_branches_choose_the_same_frames(predict: Predict) -> None:
+    """A of 10 and B of 11 ms behind a source every 6 ms: a frame that one has begun is not stale for the other."""
+    text = """
+    [run]
+    fps = 166.66666666666666
+    policy = "latest"
+    [stages]
+    source = { unit = "s", time_ms = 0 }
+    a = { unit = "a", in = "source", time_ms = 10 }
+    b = { unit = "b", in = "source", time_ms = 11 }
+    join = { unit = "j", in = { a = "a", b = "b" }, time_ms = 0 }
+    """
+    answer = predict(text)
+    assert answer["frame_time_ms"]["mean"] == pytest.approx(11, abs=0.03)
+    assert answer["needs_ms"]["mean"] == 11
+    assert sum(answer["frames"]["dropped"].values()) + answer["frames"]["presented"] == 1000
+
+
 def test_samples_are_drawn_as_they_are(predict: Predict) -> None:
     row = predict(chain("{ samples = [1, 1, 4] }", head="[run]\nframes = 3000"))["stages"]["s0"]
     assert row["alone_ms"] == 2
     assert (row["service_ms"]["p50"], row["service_ms"]["max"]) == (1, 4)
     assert row["service_ms"]["mean"] == pytest.approx(2, abs=3 * sqrt(2) / sqrt(3000))
+
+
+def test_a_mean_and_a_deviation_are_those_of_the_times(predict: Predict) -> None:
+    """Also where they are alike: the logarithm then has the variance log 2, so the median is mean / sqrt 2."""
+    times = predict(chain("{ mean = 2, sd = 2 }", head="[run]\nframes = 20000"))["stages"]["s0"]["service_ms"]
+    assert times["mean"] == pytest.approx(2, abs=3 * 2 / sqrt(20000))
+    assert times["p50"] == pytest.approx(sqrt(2), rel=0.03)
+
+
+def test_ignorance_where_frames_are_dropped_comes_from_runs(tmp_path: Path) -> None:
+    """An error of 1 % moves the time between shown frames little; it is not that between arrivals, 1.11."""
+    head = "[run]\narrivals = { poisson = 900 }\nin_queue = 1\nframes = 4000"
+    file = read_pipeline(write_file(tmp_path, chain("{ exponential = 1 }", head=head)))
+    given = given_price(file, "s0")
+    assert given is not None
+    frame = predict_file(file, {"s0": replace(given, spread=0.01)})["frame_time_ms"]
+    assert 1.2 < 0.9 * frame["mean"] < frame["low"] < frame["high"] < 1.1 * frame["mean"]
 
 
 def test_a_seed_says_all_and_given_times_leave_no_ignorance(predict: Predict) -> None:

@@ -76,7 +76,7 @@ def test_rules_of_streams_by_file_run_and_default(tmp_path: Path) -> None:
 
     assert rules("") == dict.fromkeys(("frame", "depth", "seg"), "double")
     assert rules('[run]\nedge = "single"') == dict.fromkeys(("frame", "depth", "seg"), "single")
-    assert rules('[run]\nedge = "single"', '[edges]\ndepth = "fifo:3"')["depth"] == "fifo:3"
+    assert rules('[run]\nedge = "single"', '[edges]\ndepth = "triple"')["depth"] == "triple"
 
 
 def test_slots_where_branches_meet(tmp_path: Path) -> None:
@@ -118,5 +118,5 @@ def test_a_scene_is_no_pipeline_file(tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text('motion = "walk.bvh"\n[camera]\nwidth = 3\n')
     assert not is_pipeline_file(tmp_path / "scene.toml")
     assert not is_pipeline_file(tmp_path / "none.toml")
-    for number, head in enumerate(("[stages]", " [ stages.a ]", '["stages"]')):
+    for number, head in enumerate(("[stages]", " [ stages.a ]", '["stages"]', "stages.a = {}", "stages = 3")):
         assert is_pipeline_file(write_file(tmp_path, head, f"{number}.toml"))
