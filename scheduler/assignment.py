@@ -108,7 +108,7 @@ class Choice:
         """Return the slot of the frame that the stage would do next, as `next_slot` does; -1 if it has none to do."""
         if stage.bypassed is not None:
             return next_slot(stage, self._frames)
-        return stage.waiting[0] if stage.waiting else -1
+        return stage.waiting[0] if stage.waiting and all(stage.others) else -1
 
     def preferred(self, runnable: Sequence[StageState], now_ns: int) -> StageState:
         """Return the stage of `runnable` whose job the policy chooses for the unit."""
@@ -163,7 +163,7 @@ class Choice:
             elif stage.others:
                 there = [bool(line) for line in (stage.waiting, *stage.others)]
                 if not all(there):
-                    account = JOIN if any(there) else account
+                    account = JOIN if any(there) and account == STARVED else account
                     continue
             elif not stage.waiting and (stage.bypassed is None or next_slot(stage, self._frames) < 0):
                 continue
@@ -210,6 +210,8 @@ class _LateFrames:
                 self._flow.drop_waiting(stage, slot, DropCause.STALE)
         if self._policy.drop_late and stage.is_main:
             while (slot := self._choice.slot_to_take(stage)) >= 0 and self._choice.is_late(stage, now_ns):
+                if not stage.before and len(self._flow.frames) == 1:
+                    self._expect_less()
                 self._flow.drop_waiting(stage, slot, DropCause.LATE)
 
     def _drop_stale(self, stage: StageState) -> None:
@@ -234,10 +236,14 @@ class _LateFrames:
             self._source.keep_newest()
         if self._policy.drop_late:
             while self._source.queue and self._choice.is_late(first, now_ns):
-                if not self._flow.frames:  # nothing is in its way, so only the estimates make it late
-                    for stage in self._flow.stages:
-                        stage.lower_estimate()
+                if not self._flow.frames:
+                    self._expect_less()
                 self._source.drop_late_head()
+
+    def _expect_less(self) -> None:
+        """Lower the estimates, as nothing is in the way of a frame, and they alone make it late."""
+        for stage in self._flow.stages:
+            stage.lower_estimate()
 
 
 class Assignment:

@@ -180,7 +180,7 @@ class Core:
         due_ns = self.source.due_ns
         if not self.source.advance(now_ns):
             return now_ns
-        self.flow.mark_dirty(self.stages[0].unit)
+        self.flow.mark_roots_dirty()
         return due_ns
 
     def _next_deadline(self) -> int:
@@ -371,11 +371,11 @@ class Core:
 
     def _on_request(self, event: FrameRequest) -> None:
         self.source.request(event.frames, self.now_ns)
-        self.flow.mark_dirty(self.stages[0].unit)
+        self.flow.mark_roots_dirty()
 
     def _on_hold(self, event: Hold) -> None:
         self.source.hold(event.frames, self.now_ns)
-        self.flow.mark_dirty(self.stages[0].unit)
+        self.flow.mark_roots_dirty()
 
     def _on_abort(self, _event: Abort) -> None:
         self._finish_at_once(Loss(LossKind.ABORTED), Outcome(OutcomeKind.ABORTED))

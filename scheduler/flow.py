@@ -151,7 +151,7 @@ class Flow:
         self._roots = [stage for stage in self.stages if not stage.before]
         self.source_lines = [(each, each.input) for each in self._roots if isinstance(each.input, SourceLine)]
         self.main = sum(stage.bit for stage in self.stages if stage.is_main)
-        self._samples: dict[tuple[int, int], tuple[int, int]] = {}  # of the slots behind a stage with newest readers
+        self._written: dict[tuple[int, int], FrameState] = {}  # frame of each slot behind a stage with newest readers
         self.bypass: Bypass | None = None
         if graph.bypass is not None:
             begin, end = graph.bypass
@@ -169,7 +169,7 @@ class Flow:
         for stage, line in self.source_lines:
             if todo & stage.bit:
                 line.ready.append(frame)
-                self.mark_dirty(stage.unit)
+            self.mark_dirty(stage.unit)
         if not todo:
             self._leave(frame)
 
@@ -226,10 +226,11 @@ class Flow:
             held = side.edge.newest[side.reader]
             slots.append(-1)
             if held >= 0:
-                sampled_ns, number = self._samples[side.producer.position, held]
-                if not 0 < side.max_age_ns < now_ns - sampled_ns:
+                newest = self._written[side.producer.position, held]
+                age_ns = now_ns - newest.pose_ns
+                if not 0 < side.max_age_ns < age_ns:
                     slots[-1] = side.edge.take_newest(side.reader)
-                    self._ledger.newest(side.producer.name, now_ns - sampled_ns, state.number - number)
+                    self._ledger.newest(side.producer.name, age_ns, state.number - newest.number)
         return packed(slots)
 
     def must_stay(self, behind: StageState, frame: int) -> bool:
@@ -278,7 +279,7 @@ class Flow:
         """Let the slot wait for the readers of its frame."""
         readers = [(line, reader) for line, reader in enumerate(stage.readers) if state.todo & reader.bit]
         if sink.newest:
-            self._samples[stage.position, slot] = (state.pose_ns, state.number)
+            self._written[stage.position, slot] = state
         replaced = sink.commit(slot, [line for line, _ in readers], lambda other: self.must_stay(stage, other))
         for _, reader in readers:
             state.ready_ns[reader.position] = max(state.ready_ns[reader.position], end_ns)
@@ -294,7 +295,7 @@ class Flow:
             state.is_presented = True
             self._ledger.presented(frame, end_ns, state.latency_ns, state.deadline_ns, state.skips, state.rung)
             self.aside += 1
-            self._mark_roots_dirty()
+            self.mark_roots_dirty()
         if not state.todo:
             self._leave(frame)
 
@@ -305,9 +306,9 @@ class Flow:
             return
         ends = [stage.name for stage in self.stages if stage.output is None]
         self._ledger.dropped[Drop(",".join(ends), DropCause.EVERY)] += 1
-        self._mark_roots_dirty()
+        self.mark_roots_dirty()
 
-    def _mark_roots_dirty(self) -> None:
+    def mark_roots_dirty(self) -> None:
         """Note that another frame may be put in flight."""
         for root in self._roots:
             self.mark_dirty(root.unit)
@@ -363,7 +364,7 @@ class Flow:
         for frame in frames:
             self._count_drop(frame, behind, before, cause)
             self.mark_dirty(behind.unit)
-            self._mark_roots_dirty()
+            self.mark_roots_dirty()
 
     def drop_waiting(self, stage: StageState, slot_in: int, cause: DropCause) -> None:
         """Drop the frame that waits for the stage in `slot_in`."""
@@ -400,7 +401,7 @@ class Flow:
         else:
             self._ledger.lost[loss] += 1
         self._forget(frame, state)
-        self._mark_roots_dirty()
+        self.mark_roots_dirty()
         self._tell_bypass(state)
 
     def reclaim(self, unit: UnitState, loss: Loss) -> None:
