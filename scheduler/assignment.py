@@ -93,9 +93,8 @@ class Choice:
                 return False
         elif not stage.waiting and (stage.bypassed is None or next_slot(stage, self._frames) < 0):
             return False
-        for line in stage.others:
-            if not line:
-                return False
+        if stage.others and not all(stage.others):
+            return False
         return sink is None or bool(sink.free) or self.can_claim(stage, sink)
 
     def can_claim(self, stage: StageState, sink: EdgeSlots) -> bool:
@@ -265,7 +264,11 @@ class Assignment:
         self._lead_ns = policy.lead_ns
         self._first_unit = flow.stages[0].unit
         self._late = _LateFrames(policy, flow, source, choice)
-        self._drops, self._newest = policy.newest or policy.drop_late, policy.newest
+        self._newest, self._is_fed = policy.newest, bool(flow.source_lines)
+        drops = policy.newest or policy.drop_late
+        self._drops = drops and flow.is_chain
+        self._drops_first = drops and not flow.is_chain
+        self._prepares = self._is_fed or self._drops_first
 
     def assign(self, now_ns: int, released_ns: int, actions: list[Action]) -> None:
         """Hand jobs to the dirty units, as `Dispatch` in `actions`, until each is full or has nothing to run.
@@ -273,9 +276,9 @@ class Assignment:
         `released_ns`: time at which the first frame of this step's release was due, else now. A unit without input
         until then has waited for the scheduler since.
         """
-        dirty = self._flow.dirty
+        dirty, is_fed = self._flow.dirty, self._is_fed
         for unit in dirty:  # a dispatch may append to it, even a unit looked at before
-            if self._flow.source_lines and self._source.queue:
+            if is_fed and self._source.queue:
                 self._feed(now_ns)
             while len(unit.queue) < unit.queue_capacity:
                 stage = self._next_stage(unit, now_ns)
@@ -313,22 +316,29 @@ class Assignment:
     def _next_stage(self, unit: UnitState, now_ns: int) -> StageState | None:
         if self._lead_ns and unit.queue and now_ns < unit.expected_end_ns() - self._lead_ns:
             return None
-        if self._flow.source_lines:
-            for stage in unit.stages:
-                self._feed_stage(stage, now_ns)
-        is_chain = self._flow.is_chain
-        if self._drops and not is_chain:  # what one stage drops, another of the unit may have been about to take
-            for stage in unit.stages:
-                self._late.drop(stage, now_ns)
+        if self._prepares:
+            self._prepare(unit, now_ns)
         runnable: list[StageState] = []
         for stage in unit.stages:
-            if self._drops and is_chain:
+            if self._drops:
                 self._late.drop(stage, now_ns)
             if self._choice.can_begin(stage, now_ns):
                 runnable.append(stage)
         if len(runnable) > 1:
             return self._choice.preferred(runnable, now_ns)
         return runnable[0] if runnable else None
+
+    def _prepare(self, unit: UnitState, now_ns: int) -> None:
+        """Feed the unit's stages of a graph, and drop what waits for them in vain, before the policy chooses.
+
+        A stage may drop what another of the unit could take.
+        """
+        if self._is_fed:
+            for stage in unit.stages:
+                self._feed_stage(stage, now_ns)
+        if self._drops_first:
+            for stage in unit.stages:
+                self._late.drop(stage, now_ns)
 
     def _dispatch(self, unit: UnitState, stage: StageState, now_ns: int, actions: list[Action]) -> None:
         edge = stage.input

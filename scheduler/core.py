@@ -244,11 +244,6 @@ class Core:
             self._reset_alarm()
         sampled_ns = None if stage.before else frame.release_ns if self.graph.from_release else pose_ns
         frame.end_stage(sampled_ns, end_ns, stage is self._latency_stage)
-        if self.flow.is_chain and stage.output is not None:
-            frame.position = stage.position + 1
-            frame.ready_ns[frame.position] = end_ns
-        if skips:
-            self.flow.skip(frame)
         self.flow.mark_dirty(unit)
         self.flow.pass_on(stage, job, end_ns)
 
