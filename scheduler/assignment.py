@@ -93,9 +93,8 @@ class Choice:
                 return False
         elif not stage.waiting and (stage.bypassed is None or next_slot(stage, self._frames) < 0):
             return False
-        for line in stage.others:
-            if not line:
-                return False
+        if stage.others and not all(stage.others):
+            return False
         return sink is None or bool(sink.free) or self.can_claim(stage, sink)
 
     def can_claim(self, stage: StageState, sink: EdgeSlots) -> bool:
@@ -108,7 +107,7 @@ class Choice:
         """Return the slot of the frame that the stage would do next, as `next_slot` does; -1 if it has none to do."""
         if stage.bypassed is not None:
             return next_slot(stage, self._frames)
-        return stage.waiting[0] if stage.waiting else -1
+        return stage.waiting[0] if stage.waiting and all(stage.others) else -1
 
     def preferred(self, runnable: Sequence[StageState], now_ns: int) -> StageState:
         """Return the stage of `runnable` whose job the policy chooses for the unit."""
@@ -163,7 +162,7 @@ class Choice:
             elif stage.others:
                 there = [bool(line) for line in (stage.waiting, *stage.others)]
                 if not all(there):
-                    account = JOIN if any(there) else account
+                    account = JOIN if any(there) and account == STARVED else account
                     continue
             elif not stage.waiting and (stage.bypassed is None or next_slot(stage, self._frames) < 0):
                 continue
@@ -210,6 +209,8 @@ class _LateFrames:
                 self._flow.drop_waiting(stage, slot, DropCause.STALE)
         if self._policy.drop_late and stage.is_main:
             while (slot := self._choice.slot_to_take(stage)) >= 0 and self._choice.is_late(stage, now_ns):
+                if not stage.before and len(self._flow.frames) == 1:
+                    self._expect_less()
                 self._flow.drop_waiting(stage, slot, DropCause.LATE)
 
     def _drop_stale(self, stage: StageState) -> None:
@@ -234,10 +235,14 @@ class _LateFrames:
             self._source.keep_newest()
         if self._policy.drop_late:
             while self._source.queue and self._choice.is_late(first, now_ns):
-                if not self._flow.frames:  # nothing is in its way, so only the estimates make it late
-                    for stage in self._flow.stages:
-                        stage.lower_estimate()
+                if not self._flow.frames:
+                    self._expect_less()
                 self._source.drop_late_head()
+
+    def _expect_less(self) -> None:
+        """Lower the estimates, as nothing is in the way of a frame, and they alone make it late."""
+        for stage in self._flow.stages:
+            stage.lower_estimate()
 
 
 class Assignment:
@@ -259,7 +264,11 @@ class Assignment:
         self._lead_ns = policy.lead_ns
         self._first_unit = flow.stages[0].unit
         self._late = _LateFrames(policy, flow, source, choice)
-        self._drops, self._newest = policy.newest or policy.drop_late, policy.newest
+        self._newest, self._is_fed = policy.newest, bool(flow.source_lines)
+        drops = policy.newest or policy.drop_late
+        self._drops = drops and flow.is_chain
+        self._drops_first = drops and not flow.is_chain
+        self._prepares = self._is_fed or self._drops_first
 
     def assign(self, now_ns: int, released_ns: int, actions: list[Action]) -> None:
         """Hand jobs to the dirty units, as `Dispatch` in `actions`, until each is full or has nothing to run.
@@ -267,9 +276,9 @@ class Assignment:
         `released_ns`: time at which the first frame of this step's release was due, else now. A unit without input
         until then has waited for the scheduler since.
         """
-        dirty = self._flow.dirty
+        dirty, is_fed = self._flow.dirty, self._is_fed
         for unit in dirty:  # a dispatch may append to it, even a unit looked at before
-            if self._flow.source_lines and self._source.queue:
+            if is_fed and self._source.queue:
                 self._feed(now_ns)
             while len(unit.queue) < unit.queue_capacity:
                 stage = self._next_stage(unit, now_ns)
@@ -307,16 +316,11 @@ class Assignment:
     def _next_stage(self, unit: UnitState, now_ns: int) -> StageState | None:
         if self._lead_ns and unit.queue and now_ns < unit.expected_end_ns() - self._lead_ns:
             return None
-        if self._flow.source_lines:
-            for stage in unit.stages:
-                self._feed_stage(stage, now_ns)
-        is_chain = self._flow.is_chain
-        if self._drops and not is_chain:  # what one stage drops, another of the unit may have been about to take
-            for stage in unit.stages:
-                self._late.drop(stage, now_ns)
+        if self._prepares:
+            self._prepare(unit, now_ns)
         runnable: list[StageState] = []
         for stage in unit.stages:
-            if self._drops and is_chain:
+            if self._drops:
                 self._late.drop(stage, now_ns)
             if self._choice.can_begin(stage, now_ns):
                 runnable.append(stage)
@@ -325,6 +329,18 @@ class Assignment:
         if len(runnable) > 1:
             return self._choice.preferred(runnable, now_ns)
         return runnable[0] if runnable else None
+
+    def _prepare(self, unit: UnitState, now_ns: int) -> None:
+        """Feed the unit's stages of a graph, and drop what waits for them in vain, before the policy chooses.
+
+        A stage may drop what another of the unit could take.
+        """
+        if self._is_fed:
+            for stage in unit.stages:
+                self._feed_stage(stage, now_ns)
+        if self._drops_first:
+            for stage in unit.stages:
+                self._late.drop(stage, now_ns)
 
     def _dispatch(self, unit: UnitState, stage: StageState, now_ns: int, actions: list[Action]) -> None:
         edge = stage.input

@@ -180,7 +180,7 @@ class Core:
         due_ns = self.source.due_ns
         if not self.source.advance(now_ns):
             return now_ns
-        self.flow.mark_dirty(self.stages[0].unit)
+        self.flow.mark_roots_dirty()
         return due_ns
 
     def _next_deadline(self) -> int:
@@ -244,11 +244,6 @@ class Core:
             self._reset_alarm()
         sampled_ns = None if stage.before else frame.release_ns if self.graph.from_release else pose_ns
         frame.end_stage(sampled_ns, end_ns, stage is self._latency_stage)
-        if self.flow.is_chain and stage.output is not None:
-            frame.position = stage.position + 1
-            frame.ready_ns[frame.position] = end_ns
-        if skips:
-            self.flow.skip(frame)
         self.flow.mark_dirty(unit)
         self.flow.pass_on(stage, job, end_ns)
 
@@ -371,11 +366,11 @@ class Core:
 
     def _on_request(self, event: FrameRequest) -> None:
         self.source.request(event.frames, self.now_ns)
-        self.flow.mark_dirty(self.stages[0].unit)
+        self.flow.mark_roots_dirty()
 
     def _on_hold(self, event: Hold) -> None:
         self.source.hold(event.frames, self.now_ns)
-        self.flow.mark_dirty(self.stages[0].unit)
+        self.flow.mark_roots_dirty()
 
     def _on_abort(self, _event: Abort) -> None:
         self._finish_at_once(Loss(LossKind.ABORTED), Outcome(OutcomeKind.ABORTED))

@@ -48,7 +48,7 @@ class Bypass:
     def __init__(self, begin: StageState, end: StageState) -> None:
         assert begin.output is not None
         self.begin, self.end, self.edge = begin, end, begin.output
-        end.bypassed = begin.output
+        end.bypassed, end.feeder = begin.output, None
         self.must_be_fresh = True
         self.was_taken = False
 
@@ -151,7 +151,7 @@ class Flow:
         self._roots = [stage for stage in self.stages if not stage.before]
         self.source_lines = [(each, each.input) for each in self._roots if isinstance(each.input, SourceLine)]
         self.main = sum(stage.bit for stage in self.stages if stage.is_main)
-        self._samples: dict[tuple[int, int], tuple[int, int]] = {}  # of the slots behind a stage with newest readers
+        self._written: dict[tuple[int, int], FrameState] = {}  # frame of each slot behind a stage with newest readers
         self.bypass: Bypass | None = None
         if graph.bypass is not None:
             begin, end = graph.bypass
@@ -163,13 +163,13 @@ class Flow:
 
     def admit(self, frame: int, release_ns: int, deadline_ns: int) -> None:
         """Put the frame in flight."""
-        todo = self.next_todo()
+        todo = self.next_todo() if self._every else self._all
         self.frames[frame] = FrameState(release_ns, deadline_ns, self.rung, self._admitted, todo, self._count)
         self._admitted += 1
         for stage, line in self.source_lines:
             if todo & stage.bit:
                 line.ready.append(frame)
-                self.mark_dirty(stage.unit)
+            self.mark_dirty(stage.unit)
         if not todo:
             self._leave(frame)
 
@@ -186,16 +186,15 @@ class Flow:
         """
         source, sink, state = stage.input, stage.output, self.frames[frame]
         slot_out = -1
-        if stage.joins or self.source_lines:
+        if not self.is_chain:
             slot_in = self._take_all(stage, state, now_ns)
+            state.begun |= stage.bit
+            state.jobs += 1
+        elif stage.bypassed is not None:
+            edge, slot = side_of(stage, slot_in)
+            edge.take(slot, SKIPPING if edge is stage.bypassed else 0)
         elif source is not None:
-            if stage.bypassed is None:
-                source.take(slot_in, stage.inlets[0].line)
-            else:
-                edge, slot = side_of(stage, slot_in)
-                edge.take(slot, SKIPPING if edge is stage.bypassed else 0)
-        state.begun |= stage.bit
-        state.jobs += 1
+            source.take(slot_in)
         if sink is not None:
             if self.is_chain:
                 slot_out, evicted = sink.claim(frame)
@@ -226,10 +225,11 @@ class Flow:
             held = side.edge.newest[side.reader]
             slots.append(-1)
             if held >= 0:
-                sampled_ns, number = self._samples[side.producer.position, held]
-                if not 0 < side.max_age_ns < now_ns - sampled_ns:
+                newest = self._written[side.producer.position, held]
+                age_ns = now_ns - newest.pose_ns
+                if not 0 < side.max_age_ns < age_ns:
                     slots[-1] = side.edge.take_newest(side.reader)
-                    self._ledger.newest(side.producer.name, now_ns - sampled_ns, state.number - number)
+                    self._ledger.newest(side.producer.name, age_ns, state.number - newest.number)
         return packed(slots)
 
     def must_stay(self, behind: StageState, frame: int) -> bool:
@@ -255,20 +255,29 @@ class Flow:
         if state is None:
             self.free_slots(job)
             return
-        self._release(stage, job)
-        state.jobs -= 1
-        state.todo &= ~stage.bit
+        feeder, source = stage.feeder, stage.input
+        if feeder is not None and source is not None:  # most jobs: `_release` takes longer
+            if not source.free:
+                self.dirty.append(feeder)
+            source.release(job.slot_in)
+        elif job.slot_in >= 0:
+            self._release(stage, job)
+        state.todo ^= stage.bit
         sink, bypass = stage.output, self.bypass
+        if not self.is_chain:
+            state.jobs -= 1
         if sink is None:
             self._present(job.frame, state, end_ns)
         elif self.is_chain:
+            state.position = place = stage.position + 1
+            state.ready_ns[place] = end_ns
             if bypass is not None and stage is bypass.begin and self._take_bypass(bypass, job):
                 return
             replaced = sink.commit(job.slot_out)
             if replaced:
                 self.drop(replaced, stage, DropCause.STALE)
             if len(sink.ready) == 1 or self._drops:
-                self.mark_dirty(self.stages[stage.position + 1].unit)
+                self.mark_dirty(self.stages[place].unit)
         else:
             self._commit(stage, sink, job.slot_out, state, end_ns)
             if not state.todo:
@@ -278,7 +287,7 @@ class Flow:
         """Let the slot wait for the readers of its frame."""
         readers = [(line, reader) for line, reader in enumerate(stage.readers) if state.todo & reader.bit]
         if sink.newest:
-            self._samples[stage.position, slot] = (state.pose_ns, state.number)
+            self._written[stage.position, slot] = state
         replaced = sink.commit(slot, [line for line, _ in readers], lambda other: self.must_stay(stage, other))
         for _, reader in readers:
             state.ready_ns[reader.position] = max(state.ready_ns[reader.position], end_ns)
@@ -290,14 +299,16 @@ class Flow:
 
     def _present(self, frame: int, state: FrameState, end_ns: int) -> None:
         """Note that a stage without readers has done the frame; the last of them presents it."""
-        if not state.todo & self._ends:
-            state.is_presented = True
-            known = (state.latency_ns, state.deadline_ns, state.skips, state.rung, state.release_ns)
-            self._ledger.presented(frame, end_ns, *known)
+        if state.todo & self._ends:
+            return
+        state.is_presented = True
+        known = (state.latency_ns, state.deadline_ns, state.skips, state.rung, state.release_ns)
+        self._ledger.presented(frame, end_ns, *known)
+        if state.todo:
             self.aside += 1
-            self._mark_roots_dirty()
-        if not state.todo:
-            self._leave(frame)
+        else:
+            del self.frames[frame]
+        self.mark_roots_dirty()
 
     def _leave(self, frame: int) -> None:
         """Note that nothing is left to do for the frame."""
@@ -307,25 +318,22 @@ class Flow:
             return
         ends = [stage.name for stage in self.stages if stage.output is None]
         self._ledger.drop(frame, state.release_ns, Drop(",".join(ends), DropCause.EVERY))
-        self._mark_roots_dirty()
+        self.mark_roots_dirty()
 
-    def _mark_roots_dirty(self) -> None:
+    def mark_roots_dirty(self) -> None:
         """Note that another frame may be put in flight."""
         for root in self._roots:
             self.mark_dirty(root.unit)
 
-    def skip(self, frame: FrameState) -> None:
-        """Let the frame, for which the stage at the bypass's begin has ended, go past the stages between."""
-        if self.bypass is not None:
-            frame.position = self.bypass.end.position
-            frame.ready_ns[frame.position] = frame.ready_ns[self.bypass.begin.position + 1]
-            between = self.stages[self.bypass.begin.position + 1 : frame.position]
-            frame.todo &= ~sum(stage.bit for stage in between)
-
     def _take_bypass(self, bypass: Bypass, job: Job) -> bool:
         """Return whether the frame takes the bypass; if so, it waits for the stage at the bypass's end."""
-        bypass.was_taken = self.frames[job.frame].skips
+        frame = self.frames[job.frame]
+        bypass.was_taken = frame.skips
         if bypass.was_taken:
+            between = self.stages[frame.position : bypass.end.position]
+            frame.todo &= ~sum(stage.bit for stage in between)
+            frame.ready_ns[bypass.end.position] = frame.ready_ns[frame.position]
+            frame.position = bypass.end.position
             self.drop(bypass.edge.commit(job.slot_out, (SKIPPING,)), bypass.begin, DropCause.STALE)
             self.mark_dirty(bypass.end.unit)
         return bypass.was_taken
@@ -337,17 +345,11 @@ class Flow:
             if not edge.free:
                 self.mark_dirty(self._producer(stage, edge).unit)
             edge.release(slot)
-        elif stage.joins:
+        else:
             for side, slot in zip(stage.slots_of, unpacked(job.slot_in, len(stage.slots_of)), strict=True):
                 if slot >= 0 and side.producer is not None:
                     self.mark_dirty(side.producer.unit)
                     side.edge.release(slot)
-        elif job.slot_in >= 0:
-            inlet = stage.inlets[-1]
-            assert inlet.producer is not None
-            if not inlet.edge.free:
-                self.mark_dirty(inlet.producer.unit)
-            inlet.edge.release(job.slot_in)
 
     def _producer(self, stage: StageState, edge: EdgeSlots | SourceLine) -> StageState:
         """Return the stage that fills `edge`, from which `stage` takes frames; the stage has one input."""
@@ -365,7 +367,7 @@ class Flow:
         for frame in frames:
             self._count_drop(frame, behind, before, cause)
             self.mark_dirty(behind.unit)
-            self._mark_roots_dirty()
+            self.mark_roots_dirty()
 
     def drop_waiting(self, stage: StageState, slot_in: int, cause: DropCause) -> None:
         """Drop the frame that waits for the stage in `slot_in`."""
@@ -402,7 +404,7 @@ class Flow:
         else:
             self._ledger.lose(frame, state.release_ns, loss)
         self._forget(frame, state)
-        self._mark_roots_dirty()
+        self.mark_roots_dirty()
         self._tell_bypass(state)
 
     def reclaim(self, unit: UnitState, loss: Loss) -> None:
@@ -429,7 +431,8 @@ class Flow:
     def free_slots(self, job: Job) -> None:
         """Free all slots of a job whose frame does not go on."""
         stage = self.stage_named[job.stage]
-        self._release(stage, job)
+        if job.slot_in >= 0:
+            self._release(stage, job)
         for side in stage.slots_of:
             if side.producer is not None:
                 self.mark_dirty(side.producer.unit)
@@ -440,10 +443,11 @@ class Flow:
 
     def _end_job(self, job: Job) -> None:
         """Note that no unit holds the job any more."""
-        state = self.frames.get(job.frame) or self.gone[job.frame]
-        state.jobs -= 1
-        if not state.jobs:
-            self.gone.pop(job.frame, None)
+        if not self.is_chain:
+            state = self.frames.get(job.frame) or self.gone[job.frame]
+            state.jobs -= 1
+            if not state.jobs:
+                self.gone.pop(job.frame, None)
 
     def _put_back(self, job: Job, loss: Loss) -> None:
         """Let the job's frame wait for its stage again."""

@@ -174,13 +174,10 @@ class SourceLine:
     def release(self, slot: int) -> None:
         """Do nothing: no memory was held."""
 
-    def forget(self, frame: int) -> None:
+    def pass_by(self, frame: int, _line: int) -> None:
         """Let the stage not wait for `frame` any more."""
         if frame in self.ready:
             self.ready.remove(frame)
-
-    def pass_by(self, frame: int, _line: int) -> None:
-        self.forget(frame)
 
     def give_back(self, slot: int, _line: int = 0, _keeps: Keeps | None = None) -> list[int]:
         """Let a taken frame wait again in its old place."""
@@ -229,6 +226,7 @@ class StageState:
     `inlets`: inputs that take frame by frame; `input` is the first one's edge, and `waiting` its line.
     `others`: lines of the further ones.
     `slots_of`: inputs whose slots a job names, in the order of `Job.slot_in`.
+    `feeder`: unit that fills the input, of a stage whose jobs read one slot, always of the same edge.
     `joins`: whether a job names other slots than that of one frame.
     `bypassed`: for the stage at which a bypass ends, the edge whose frames may skip to it.
     `readers`: stages that read its output frame by frame, in the order of the output's lines.
@@ -246,6 +244,7 @@ class StageState:
         "bit",
         "bypassed",
         "estimate_ns",
+        "feeder",
         "inlets",
         "input",
         "is_main",
@@ -269,6 +268,7 @@ class StageState:
         self.inlets: tuple[Inlet, ...] = ()
         self.slots_of: tuple[Inlet | NewestInlet, ...] = ()
         self.others: tuple[deque[int], ...] = ()
+        self.feeder: UnitState | None = None
         self.waiting: deque[int] = deque()
         self.readers: list[StageState] = []
         self.after: list[int] = []
@@ -298,6 +298,8 @@ class StageState:
             self.others = tuple(inlet.waiting for inlet in inlets[1:])
         self.after = [inlet.producer.position for inlet in inlets if inlet.producer is not None]
         self.joins = tuple(slots_of) != tuple(inlets) or len(slots_of) > 1
+        if not self.joins and inlets and inlets[0].producer is not None:
+            self.feeder = inlets[0].producer.unit
 
 
 class FrameState:

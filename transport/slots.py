@@ -118,7 +118,8 @@ class EdgeSlots:
         self.newest = [-1] * newest
         self.epoch = 0
         self._left = [0] * rule.slots  # readers that have yet to release the slot
-        self._reading = [0] * rule.slots  # jobs that read the slot
+        self._reading = [0] * rule.slots  # jobs that read the slot; not counted for a single reader
+        self._is_shared = lines > 1 or newest > 0
 
     def can_claim(self, keeps: Keeps = _keeps_none) -> bool:
         """Return whether a slot is free, or may be taken from the oldest waiting frame.
@@ -160,21 +161,28 @@ class EdgeSlots:
                 replaced += [self.drop(each) for each in old]
         for line in to:
             self.lines[line].append(slot)
-        self._left[slot] = len(to) + len(self.newest)
+        self._left[slot] = len(to)
+        if self.newest:
+            self._hold(slot)
+        elif not to:
+            self._move("drop", slot)
+            self._empty(slot)
+        return replaced
+
+    def _hold(self, slot: int) -> None:
+        """Let the readers of the newest frame hold the slot, and leave what they hold."""
+        self._left[slot] += len(self.newest)
         for reader, held in enumerate(self.newest):
             self.newest[reader] = slot
             if held >= 0:
                 self._leave(held)
-        if not self._left[slot]:
-            self._move("drop", slot)
-            self._empty(slot)
-        return replaced
 
     def take(self, slot: int, line: int = 0) -> None:
         """Let the unit of the stage that the slot waits for in `line` read it from now on."""
         if not self._reading[slot] or slot not in self.lines[line]:
             self._move("take", slot)
-        self._reading[slot] += 1
+        if self._is_shared:
+            self._reading[slot] += 1
         self.lines[line].remove(slot)
 
     def take_newest(self, reader: int) -> int:
@@ -189,8 +197,7 @@ class EdgeSlots:
 
     def release(self, slot: int) -> None:
         """Note that a job has read the slot, which is free when no other reader needs it."""
-        if self._reading[slot] == 1 == self._left[slot]:  # most slots have one reader
-            self._reading[slot] = self._left[slot] = 0
+        if not self._is_shared:
             self._move("release", slot)
             self._empty(slot)
             return
@@ -220,11 +227,6 @@ class EdgeSlots:
         self._empty(slot)
         return frame
 
-    def forget(self, frame: int) -> None:
-        """Let no reader wait for `frame` any more, as it was dropped or lost; who reads or holds its slot keeps it."""
-        for line in range(len(self.lines)):
-            self.pass_by(frame, line)
-
     def pass_by(self, frame: int, line: int) -> None:
         """Take `frame` out of one line, if it waits there; the other readers keep it."""
         for slot in self.lines[line]:
@@ -238,7 +240,8 @@ class EdgeSlots:
 
         `keeps`: function that says which frames must not be replaced; None: all may be.
         """
-        self._reading[slot] -= 1
+        if self._is_shared:
+            self._reading[slot] -= 1
         if not self._reading[slot]:
             self._move("give_back", slot)
         waiting = self.lines[line]

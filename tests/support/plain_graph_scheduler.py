@@ -35,6 +35,9 @@ class Frame:
     is_over: bool = False
     is_gone: bool = False
 
+    def left(self) -> set[int]:
+        return self.todo | self.begun - set(self.done)
+
 
 @dataclass(eq=False)
 class Slot:
@@ -85,7 +88,9 @@ class PlainGraph:
         self.same = [[x for x, each in found if not each.latest] for found in self.inputs]
         places = range(len(names))
         self.readers = [[i for i in places if x in self.same[i]] for x in places]
-        self.newest_readers = [[i for i in places if any(y == x and e.latest for y, e in self.inputs[i])] for x in places]
+        self.newest_readers = [
+            [i for i in places if any(y == x and e.latest for y, e in self.inputs[i])] for x in places
+        ]
         self.sources = [i for i in places if not self.same[i]]
         self.before: list[set[int]] = []
         self.period: list[int] = []
@@ -162,6 +167,8 @@ class PlainGraph:
         return len(self.slots[stage]) < SLOTS[self.rule[stage]] or bool(self.evictable(stage))
 
     def can_begin(self, stage: int) -> bool:
+        if self.waits_at_release and not self.line(stage):
+            return False
         return self.head(stage) is not None and self.may_enter(stage) and self.has_slot(stage)
 
     def is_kept(self, frame: Frame, stages: set[int]) -> bool:
@@ -198,7 +205,7 @@ class PlainGraphScheduler(PlainGraph):
         return frame
 
     def end_if_over(self, frame: Frame) -> None:
-        """It is shown when the last stages that take it have done it; it is forgotten when its side work is done too."""
+        """It is shown when the last stages that take it have done it; its side work may still be left."""
         ends = set(self.ends) & (frame.todo | frame.begun)
         left = (ends or frame.todo | frame.begun) - set(frame.done)
         if not frame.is_over and not left:
@@ -209,7 +216,7 @@ class PlainGraphScheduler(PlainGraph):
                     self.latencies.append(frame.latency_ns)
             else:
                 self.dropped[f"{','.join(self.graph.stages[i].name for i in self.ends)}:every"] += 1
-        if frame.is_over and not frame.todo and not frame.begun - set(frame.done):
+        if frame.is_over and not frame.left() and frame in self.frames:
             self.frames.remove(frame)
 
     def remove(self, frame: Frame) -> None:
@@ -256,7 +263,41 @@ class PlainGraphScheduler(PlainGraph):
     def all_readers(self, stage: int) -> list[int]:
         return self.readers[stage] + self.newest_readers[stage]
 
+    def is_late(self, stage: int) -> bool:
+        """Whether even the earliest end of the frame's work but side work is past its deadline.
+
+        A stage begins when those that it reads have ended, and has done the older frames' work before.
+        """
+        found = self.head(stage)
+        if found is None or found[1] == NO_TIME:
+            return False
+        number, deadline_ns = found
+        frame = next((each for each in self.frames if each.number == number), None)
+        left = frame.left() if frame else {i for i, every in enumerate(self.period) if self.ordinals % every == 0}
+        ends: dict[int, int] = {}
+        for i in sorted(s for s in left if not self.is_side[s]):
+            older = sum(each.number < number and i in each.left() for each in self.frames)
+            unit, backlog_ns = self.unit_of[i], older * self.estimate[i]
+            if older and unit.queue and unit.queue[0].stage == i:
+                backlog_ns -= min(self.now_ns - unit.head_since_ns, self.estimate[i])
+            ends[i] = max(backlog_ns, *(ends.get(x, 0) for x in self.same[i]), 0) + self.estimate[i]
+        return self.now_ns + max(ends.values(), default=0) > deadline_ns
+
+    def drop_late(self, stage: int) -> None:
+        """One that nothing is in the way of is late by the estimates alone, which are lowered."""
+        from_queue = stage in self.sources and not self.waits_at_release
+        while (self.queue if from_queue else self.line(stage)) and not self.is_side[stage] and self.is_late(stage):
+            if stage in self.sources and len(self.frames) == (not from_queue):
+                self.estimate = [ns - (ns >> 4) for ns in self.estimate]
+            if from_queue:
+                self.drop_from_queue("late")
+            else:
+                writer = self.graph.stages[self.same[stage][0]].name if self.same[stage] else "source"
+                self.drop(self.line(stage)[0], f"{writer}->{self.graph.stages[stage].name}", "late")
+
     def drop_in_vain(self, stage: int) -> None:
+        if self.settings.policy == "deadline" and (self.line(stage) or not self.is_full()):
+            self.drop_late(stage)
         if self.settings.policy != "latest":
             return
         if stage in self.sources and not self.waits_at_release:
@@ -337,13 +378,12 @@ class PlainGraphScheduler(PlainGraph):
         for slot in inputs:
             slot.jobs.append(job)
         unit.queue.append(job)
-        self.jobs.append((self.now_ns, name, unit.name, frame.number, tuple(read), begin_ns, end_ns))
+        ready_ns = max((frame.done[x] for x in self.same[stage]), default=frame.released_ns)
+        times = (ready_ns, self.now_ns, begin_ns, end_ns)
+        self.jobs.append((self.now_ns, name, unit.name, frame.number, tuple(read), times))
 
     def slot_of(self, stage: int, frame: Frame) -> Slot:
         return next(slot for slot in self.slots[stage] if slot.frame is frame)
-
-    def ready_since_ns(self, job: Job) -> int:
-        return max((job.frame.done[x] for x in self.same[job.stage]), default=job.frame.released_ns)
 
     def release_inputs(self, job: Job) -> None:
         for slot in job.inputs:
@@ -361,6 +401,8 @@ class PlainGraphScheduler(PlainGraph):
         if unit.duty < 1000:
             unit.hold_until_ns = end_ns + took_ns * (1000 - unit.duty) // unit.duty
         self.release_inputs(job)
+        if stage in self.sources and not self.graph.from_release:
+            frame.sampled_ns = min(frame.sampled_ns, job.begin_ns)
         if not frame.is_gone:
             self.goes_on(job)
         if job.output:
@@ -370,8 +412,6 @@ class PlainGraphScheduler(PlainGraph):
     def goes_on(self, job: Job) -> None:
         stage, frame = job.stage, job.frame
         frame.done[stage] = job.end_ns
-        if stage in self.sources and not self.graph.from_release:
-            frame.sampled_ns = min(frame.sampled_ns, job.begin_ns)
         if self.graph.stages[stage].name == self.graph.latency_to:
             frame.latency_ns = job.end_ns - frame.sampled_ns
         if job.output:
@@ -502,10 +542,8 @@ class PlainGraphScheduler(PlainGraph):
             self.queue.append((self.next_frame, self.release_ns(self.next_frame)))
             self.next_frame += 1
             if self.settings.in_queue and len(self.queue) > self.settings.in_queue:
-                number, released_ns = self.queue.pop()
-                self.queue.append((number, released_ns))
-                self.dropped[f"source->{self.graph.stages[self.sources[0]].name}:queue_full"] += 1
                 self.queue.pop()
+                self.dropped[f"source->{self.graph.stages[self.sources[0]].name}:queue_full"] += 1
         timeout_ns = self.settings.queue_timeout_ns
         while timeout_ns and self.queue and self.queue[0][1] + timeout_ns <= self.now_ns:
             self.drop_from_queue("timeout")
@@ -545,9 +583,7 @@ def drawn(seed: int, yields: bool = False) -> tuple[Graph, Settings, int, list[t
         read = draw.sample(range(i), min(i, draw.choice([1, 1, 1, 2, 2, 3]))) if i >= sources else []
         if i and draw.random() < 0.3 and i >= sources:
             read = sorted({*read, i - 1})
-        inputs = tuple(
-            Input(f"s{x}", draw.random() < 0.25, draw.choice([0, 0, 9_000_001])) for x in sorted(read)
-        )
+        inputs = tuple(Input(f"s{x}", draw.random() < 0.25, draw.choice([0, 0, 9_000_001])) for x in sorted(read))
         inputs = tuple(each if each.latest else Input(each.stage) for each in inputs)
         if inputs and all(each.latest for each in inputs):
             inputs = (Input(inputs[0].stage), *inputs[1:])
@@ -573,7 +609,7 @@ def drawn(seed: int, yields: bool = False) -> tuple[Graph, Settings, int, list[t
         arrivals_ns=tuple(sorted(draw.randint(0, frames * period_ns) for _ in range(frames)))
         if rate == "arrivals_ns"
         else (),
-        deadline_ns=1_000_000_000_000 if policy == "deadline" else 0,
+        deadline_ns=draw.choice([12_000_000, 30_000_001, 10**12]) if policy == "deadline" else 0,
         in_flight=draw.choice([0, 0, 2, 3, 5]),
         in_queue=draw.choice([0, 0, 1, 2]),
         queue_timeout_ns=draw.choice([0, 0, 6_000_001]) if rate else 0,
