@@ -172,6 +172,8 @@ class EdgeSlots:
 
     def take(self, slot: int, line: int = 0) -> None:
         """Let the unit of the stage that the slot waits for in `line` read it from now on."""
+        if slot not in self.lines[line]:
+            raise SlotError(f"cannot take slot {slot}, which is {self.state[slot]}")
         if not self._reading[slot]:
             self._move("take", slot)
         self._reading[slot] += 1

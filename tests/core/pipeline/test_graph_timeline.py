@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from trilane.pipeline.journal import Stepped, journal_of
-from trilane.pipeline.timeline import UNKNOWN, ExplainedJob, Gone, Presented, Timeline
+from trilane.pipeline.timeline import ExplainedJob, Gone, Presented, Timeline
+from trilane.pipeline.tracks import UNKNOWN
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import Drop, DropCause, Graph, Input, Loss, Settings, StageSpec
 from trilane.scheduler.flow import Flow
