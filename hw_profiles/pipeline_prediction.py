@@ -1,8 +1,9 @@
 """What a pipeline file does on a chip: a time for each stage, then one run of the scheduler in virtual time.
 
-The time of a stage is that of the file, else of its network on the unit's hardware. Two kinds of uncertainty are kept
-apart. Jitter is what differs from frame to frame; the simulated run has it. Ignorance is the error of the chip's model;
-it is the same for all frames, and makes the intervals. They hold 80 %, as those of a network by itself.
+The time of a stage is that of the file, else as measured here, else of its network on the unit's hardware. Two kinds of
+uncertainty are kept apart. Jitter is what differs from frame to frame; the simulated run has it. Ignorance is the error
+of the chip's model, or of measured times; it is the same for all frames, and makes the intervals. They hold 80 %, as
+those of a network by itself.
 
 Rule: all draws follow from the seed, the stage's name and the frame, so that two variants of a file meet the same luck.
 """
@@ -12,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -20,9 +21,11 @@ from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_file import GraphFile
+from trilane.hw_profiles.host_model import MODEL_ERROR
 from trilane.hw_profiles.network_time import interval, price, spread_of
+from trilane.hw_profiles.profile_files import HOST
 from trilane.hw_profiles.rates import FrameInterval, holding
-from trilane.hw_profiles.schema import Profile, corners_of
+from trilane.hw_profiles.schema import NORMAL_80, Profile, corners_of
 from trilane.pipeline.file_graph import edge_rules, graph_of, in_flight_of, settings_of, source_ns
 from trilane.pipeline.file_keys import BusyBlock, OnnxStage, StageTime
 from trilane.pipeline.pipeline_file import PipelineFile
@@ -33,8 +36,9 @@ from trilane.units import NS_PER_MS, UNITS, UnitName
 
 DRAWS: Final = 200
 SIMULATIONS: Final = 20
-SIMULATED_FRAMES: Final = 200  # of each of them
-SATURATED_FRAMES: Final = 1000
+SIMULATED_FRAMES: Final = 100  # of each of them
+#: Frames of the run with an always ready source, where all times are constant and where some vary.
+CONSTANT_FRAMES, VARYING_FRAMES = 200, 1000
 BLOCK: Final = 4096  # frames whose times are drawn at once
 #: No job hangs in virtual time, however long the file says that it takes.
 NEVER_HANGS_NS: Final = 1 << 60
@@ -48,8 +52,8 @@ ChipFor = Callable[[str, GraphFile, UnitName], Profile]
 class StagePrice:
     """The time of a job of a stage.
 
-    `source`: where it comes from. `spread`: standard deviation of the logarithm of the model's error; 0 for times that
-    the file gives. `low_ms`, `high_ms`: 80 % interval of the mean. `why`: reasons for its width.
+    `source`: where it comes from. `spread`: standard deviation of the logarithm of its error; 0 for times that the file
+    gives. `low_ms`, `high_ms`: 80 % interval of the mean. `why`: reasons for its width.
     """
 
     time: StageTime
@@ -84,23 +88,55 @@ def network_price(chip: Profile, graph: GraphFile, unit: UnitName, performance_p
     return StagePrice(StageTime(mean=time.total_ms), source, spread, around.low_ms, around.high_ms, around.why)
 
 
-def prices_of(
-    file: PipelineFile, graphs: Mapping[str, GraphFile], chip_for: ChipFor, performance_profile: str
-) -> dict[str, StagePrice]:
-    """Return the price of every stage. Raises BadInputError naming a stage without one.
+class Measured(NamedTuple):
+    """Times of stages in a run of the file on this machine, for the chip that is asked for.
 
-    `graphs`: graphs of the stages whose network has to be priced, by the stage's name.
+    `times`: by the stage's name. `run`: folder of the run. `chip`: name of the chip, HOST for this machine.
+    """
+
+    times: Mapping[str, StageTime]
+    run: str
+    chip: str
+
+
+NOTHING_MEASURED: Final = Measured({}, "", HOST)
+
+
+def measured_price(file: PipelineFile, name: str, measured: Measured) -> StagePrice | None:
+    """Return the price of a stage that was measured here, on a chip by its `scale`; None without one of them."""
+    factor = 1.0 if measured.chip == HOST else file.stages[name].scale.get(measured.chip)
+    if name not in measured.times or factor is None:
+        return None
+    time = measured.times[name].times(factor)
+    source = f"measured in {measured.run}" + (f", times {factor:g}" if measured.chip != HOST else "")
+    around = math.exp(NORMAL_80 * MODEL_ERROR)
+    return StagePrice(time, source, MODEL_ERROR, time.mean_ms / around, time.mean_ms * around)
+
+
+def prices_of(
+    file: PipelineFile,
+    graphs: Mapping[str, GraphFile],
+    chip_for: ChipFor,
+    performance_profile: str,
+    measured: Measured = NOTHING_MEASURED,
+) -> dict[str, StagePrice]:
+    """Return the price of every stage: of the file, as measured, or of its network.
+
+    Raises BadInputError naming a stage without one.
+
+    `graphs`: graphs of the networks, by the stage's name.
     """
     found = {}
     for name, stage in file.stages.items():
-        known = given_price(file, name)
+        known = given_price(file, name) or measured_price(file, name, measured)
         if known is None and isinstance(stage, OnnxStage):
             unit = next(each for each in UNITS if each == file.hardware(stage.unit))
-            chip = chip_for(name, graphs[name], unit)
-            known = network_price(chip, graphs[name], unit, performance_profile)
+            known = network_price(chip_for(name, graphs[name], unit), graphs[name], unit, performance_profile)
         if known is None:
             what = f"{stage.named_kind} without a time"
             remedy = "add time_ms = ... to it: what it takes on that chip"
+            if name in measured.times:
+                remedy = f"add time_ms = ... to it, or scale = {{ {measured.chip} = ... }} for its measured time"
             raise BadInputError(f"{file.path}: stages.{name}", what, "a stage whose time is known", remedy)
         found[name] = known
     return found
@@ -157,7 +193,7 @@ def predict_file(
     graph, bound = bound_of(file, prices)
     settings = settings_of(file, frames, seed, hang_ns=NEVER_HANGS_NS)
     report = simulate(graph, settings, _Drawn(prices, seed)).report
-    needs = _needs(file, prices, graph, report, seed)
+    needs = _needs(file, prices, graph, seed)
     frame_time, latency = _intervals(file, prices, graph, report, needs, seed)
     answer = {
         "name": file.path.stem,
@@ -187,9 +223,7 @@ def _row(stage: StagePrice) -> dict[str, Any]:
     }
 
 
-def _needs(
-    file: PipelineFile, prices: Mapping[str, StagePrice], graph: Graph, report: Mapping[str, Any], seed: int
-) -> FrameInterval:
+def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], graph: Graph, seed: int) -> FrameInterval:
     """Return the time of a frame of the source when frames never wait for it, with the interval by ignorance.
 
     The jitter's part is that of a run with an always ready source; 200 draws of the bound have the ignorance.
@@ -197,7 +231,8 @@ def _needs(
     times = {name: each.mean_ns for name, each in prices.items()}
     in_flight = in_flight_of(file)
     bound_ns = period_bound(graph, times, in_flight).period_ns
-    ready = Settings(min(report["frames"]["requested"], SATURATED_FRAMES), hang_ns=NEVER_HANGS_NS, in_flight=in_flight)
+    count = VARYING_FRAMES if any(each.time.varies for each in prices.values()) else CONSTANT_FRAMES
+    ready = Settings(count, hang_ns=NEVER_HANGS_NS, in_flight=in_flight)
     done = simulate(replace(graph, from_release=False), ready, _Drawn(prices, seed)).report
     presented = done["frames"]["presented"]
     ms = done["duration_s"] * 1e3 / ready.frames if presented < ready.frames else done["frame_time_ms"]["mean"]

@@ -109,7 +109,11 @@ class RunKeys(Keys):
     )
     in_flight: int = Field(default=0, ge=0, le=1000, description="Most frames on their way at once; 0: no limit.")
     in_queue: int = Field(
-        default=0, ge=0, le=MOST_FRAMES, description="Most frames that wait before the first stage; 0: no limit."
+        default=0,
+        ge=0,
+        le=MOST_FRAMES,
+        description="Most frames that wait before the first stage, beside one that its unit holds ready; "
+        "more are turned away. 0: no limit.",
     )
     latency_to: str = Field(
         default="", description="Stage at whose end the latency ends; without it the last one that nobody reads."
@@ -274,6 +278,14 @@ class StageTime(Keys):
         if self.samples:
             return math.fsum(self.samples) / len(self.samples)
         return (self.mean if self.exponential is None else self.exponential) or 0.0
+
+    def times(self, factor: float) -> StageTime:
+        """Return times that are `factor` times as long."""
+        if self.samples:
+            return StageTime(samples=tuple(each * factor for each in self.samples))
+        if self.exponential is not None:
+            return StageTime(exponential=self.exponential * factor)
+        return StageTime(mean=self.mean_ms * factor, sd=self.sd * factor)
 
     @property
     def varies(self) -> bool:

@@ -31,7 +31,8 @@ def check_file(path: Path) -> dict[str, Any]:
     types = port_types(file, read_networks(file))
     prices = {name: price for name in file.stages if (price := given_price(file, name)) is not None}
     known = prices if len(prices) == len(file.stages) else None
-    rules, period = edge_rules(file, None), {"period_ms": None, "cycle": [], "limit": ""}
+    rules = edge_rules(file, None)
+    period: dict[str, Any] = {"period_ms": None, "cycle": [], "limit": ""}
     if known is not None:
         graph, bound = bound_of(file, known)
         rules = dict(zip(graph.streams, graph.edges, strict=True))

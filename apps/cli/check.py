@@ -99,7 +99,8 @@ def _stages(document: Mapping[str, Any]) -> Table:
 def _input(each: Mapping[str, Any]) -> str:
     port = f"{each['port']}: " if each["port"] else ""
     age = f" to {each['max_age_ms']:g} ms" if each.get("max_age_ms") else ""
-    return without_controls(f"{port}{each['from']}") + (f" (latest{age})" if each["sync"] == "latest" else "")
+    name: str = without_controls(f"{port}{each['from']}")
+    return name + (f" (latest{age})" if each["sync"] == "latest" else "")
 
 
 def _streams(document: Mapping[str, Any]) -> Table:

@@ -11,15 +11,17 @@ from pathlib import Path
 from typing import Any, Final
 
 from trilane.apps.check.port_types import port_types, read_networks
+from trilane.apps.explain.explained_run import open_journal
 from trilane.apps.predict.predict_options import HOST, PredictOptions
 from trilane.hw_profiles.graph_file import GraphFile
 from trilane.hw_profiles.network_time import in_precision, under_runtime
-from trilane.hw_profiles.pipeline_prediction import predict_file, prices_of
+from trilane.hw_profiles.pipeline_prediction import NOTHING_MEASURED, Measured, predict_file, prices_of
 from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import Profile
-from trilane.pipeline.file_keys import OnnxStage
+from trilane.pipeline.file_keys import MOST_SAMPLES, OnnxStage, StageTime
+from trilane.pipeline.journal import Worked
 from trilane.pipeline.pipeline_file import TABLES, PipelineFile, read_pipeline
-from trilane.units import INFER, UnitName
+from trilane.units import INFER, NS_PER_MS, UnitName
 
 #: A comma between two assignments, not one in a list or a table.
 BETWEEN: Final = re.compile(rf",(?=\s*(?:{'|'.join(TABLES)})\.)")
@@ -34,7 +36,8 @@ def predict_asked_file(options: PredictOptions, path: Path, say: Callable[[str],
     file = read_pipeline(path)
     variants = [("", file)] + [(text, file.changed(BETWEEN.split(text))) for text in options.changes]
     chips = _Chips(options, say)
-    answers = [_answer(each, text, options, chips) for text, each in variants]
+    measured = _measured(options.measured, chips.name) if options.measured else NOTHING_MEASURED
+    answers = [_answer(each, text, options, chips, measured) for text, each in variants]
     chip = chips.used
     return {
         "schema": 1,
@@ -47,19 +50,24 @@ def predict_asked_file(options: PredictOptions, path: Path, say: Callable[[str],
 
 
 class _Chips:
-    """The chip, loaded when the first network needs it, and as each network uses it. `used`: None before that."""
+    """The chip, loaded when the first network needs it, and as each network uses it.
+
+    `name`: its name; this machine's where a run was measured and no chip is asked for. `used`: None until it is loaded.
+    """
 
     def __init__(self, options: PredictOptions, say: Callable[[str], None]) -> None:
         self._options, self._say = options, say
         self._known: dict[tuple[Path, tuple[tuple[str, tuple[int, ...]], ...], UnitName, str | None], Profile] = {}
-        self.used = load_runnable(options.profile) if "profile" in options.model_fields_set else None
+        is_asked = "profile" in options.model_fields_set
+        self.used = load_runnable(options.profile) if is_asked else None
+        self.name = self.used.name if self.used else HOST if options.measured else options.profile
 
     def chip_for(self, stage: OnnxStage, graph: GraphFile, unit: UnitName) -> Profile:
         """Return the chip with `unit` as it computes the network of `stage`; this machine measures it first."""
         options, asked = self._options, stage.precision or self._options.numbers
         key = graph.path, tuple(sorted(stage.shapes.items())), unit, asked
         if key not in self._known:
-            chip = self.used = self.used or load_runnable(options.profile)
+            chip = self.used = self.used or load_runnable(self.name)
             chip = under_runtime(in_precision(chip, unit, graph.numbers, asked), unit, options.engine)
             if chip.name == HOST and unit == INFER[1] and asked is None:
                 from trilane.apps.predict.this_machine import with_file
@@ -69,7 +77,19 @@ class _Chips:
         return self._known[key]
 
 
-def _answer(file: PipelineFile, text: str, options: PredictOptions, chips: _Chips) -> dict[str, Any]:
+def _measured(folder: Path, chip: str) -> Measured:
+    """Return the times of the jobs of a run, for `chip`."""
+    samples: dict[str, list[float]] = {}
+    for record in open_journal(folder)[1]:
+        if isinstance(record, Worked):
+            samples.setdefault(record.job.stage, []).append((record.job.end_ns - record.job.begin_ns) / NS_PER_MS)
+    times = {name: StageTime(samples=tuple(each[:MOST_SAMPLES])) for name, each in samples.items()}
+    return Measured(times, str(folder), chip)
+
+
+def _answer(
+    file: PipelineFile, text: str, options: PredictOptions, chips: _Chips, measured: Measured
+) -> dict[str, Any]:
     graphs = read_networks(file)
     port_types(file, graphs)
 
@@ -78,5 +98,5 @@ def _answer(file: PipelineFile, text: str, options: PredictOptions, chips: _Chip
         assert isinstance(stage, OnnxStage)
         return chips.chip_for(stage, graph, unit)
 
-    prices = prices_of(file, graphs, chip_for, options.cap)
+    prices = prices_of(file, graphs, chip_for, options.cap, measured)
     return {"what_if": text, **predict_file(file, prices, options.frames or 0, options.seed)}

@@ -51,11 +51,9 @@ OF_A_SCENE: Final = {"scene", "beside", "turns", "profile", "minutes", "policy",
     "governor",
     "trace",
 }
-#: Options that mean something beside a pipeline file, and those that mean nothing without one.
-OF_A_PIPELINE: Final = {"scene", "changes", "frames", "seed", "profile", "performance_profile", "engine_runtime"} | {
-    "precision",
-}
-OF_A_PIPELINE_ALONE: Final = {"changes", "frames", "seed"}
+#: Options that mean nothing without a pipeline file, and all that mean something beside one.
+OF_A_PIPELINE_ALONE: Final = {"changes", "frames", "measured", "seed"}
+OF_A_PIPELINE: Final = OF_A_PIPELINE_ALONE | {"scene", "profile", "performance_profile", "engine_runtime", "precision"}
 
 
 def _either(read_words: Callable[[], tuple[str, ...]], expected: str = "") -> AfterValidator:
@@ -141,6 +139,10 @@ class PredictOptions(Options):
         "May be given again.",
     )
     frames: int | None = Field(default=None, ge=1, le=MOST_FRAMES, description="Of a pipeline file: simulated frames.")
+    measured: Annotated[Path | None, BeforeValidator(_path)] = Field(
+        default=None,
+        description="Of a pipeline file: folder of its run here, whose stage times count; on a chip times their scale.",
+    )
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="Of a pipeline file: seed of its random times.")
     beside: Texts = Field(
         default=(),

@@ -1,0 +1,323 @@
+"""`trilane check`: what it says of right files, and how it refuses wrong ones."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import onnx
+import pytest
+
+from support.pipeline_files import BRANCHES, CUT, DEPTH, STREET, write_file
+
+Command = Callable[..., tuple[str, str]]
+
+
+@pytest.fixture
+def check(command: Command, tmp_path: Path) -> Callable[..., dict[str, Any]]:
+    """The document of `trilane check` for a text."""
+    return lambda text: json.loads(command("check", write_file(tmp_path, text), "--json")[0])
+
+
+def test_the_document_of_a_join(check: Callable[..., dict[str, Any]]) -> None:
+    document = check(DEPTH)
+    assert [(each["name"], each["unit"], each["kind"]) for each in document["stages"]] == [
+        ("frame", "a", "time_ms"),
+        ("depth", "b", "time_ms"),
+        ("seg", "c", "time_ms"),
+        ("composite", "d", "time_ms"),
+    ]
+    assert [(each["from"], each["to"], each["slots"]) for each in document["streams"]] == [
+        ("frame", ["depth", "seg"], 2),
+        ("depth", ["composite"], 2),
+        ("seg", ["composite"], 2),
+    ]
+    assert (document["period_ms"], document["cycle"]) == (14, ["depth"])
+
+
+@pytest.mark.parametrize(
+    ("head", "period", "cycle"),
+    [
+        ('[run]\nedge = "single"', 17, ["depth", "composite"]),
+        ("[run]\nfps = 50", 20, ["frame"]),
+        ("[run]\nin_flight = 1", 19, ["frame", "depth", "composite"]),
+    ],
+)
+def test_what_makes_the_period(
+    check: Callable[..., dict[str, Any]], head: str, period: float, cycle: list[str]
+) -> None:
+    document = check(head + DEPTH)
+    assert (document["period_ms"], document["cycle"]) == (period, cycle)
+
+
+def test_the_published_cut(check: Callable[..., dict[str, Any]]) -> None:
+    assert (check(CUT)["period_ms"], check(CUT)["cycle"]) == (1.1717, ["tail"])
+
+
+def test_the_street_has_no_period_without_times_but_memory(check: Callable[..., dict[str, Any]]) -> None:
+    document = check(STREET)
+    assert (document["period_ms"], document["cycle"]) == (None, [])
+    picture, network, boxes, mask = 640 * 480 * 3, 3 * 128**2 * 4, 8 * 128**2 * 4, 8 * 256**2 * 4
+    slots = {each["from"]: each["slots"] for each in document["streams"]}
+    assert slots == {"camera": 6, **dict.fromkeys(("small", "detector", "crop", "segmenter", "overlay"), 2)}
+    assert document["memory_bytes"] == 6 * picture + 2 * (network + boxes + 256 * 256 * 3 + mask + picture)
+    assert document["imports"] == ["crop:best"]
+
+
+def test_nothing_of_a_file_is_imported(command: Command, tmp_path: Path) -> None:
+    (tmp_path / "crop.py").write_text(f"open({str(tmp_path / 'was_run')!r}, 'w')\n")
+    command("check", write_file(tmp_path, STREET))
+    command("predict", tmp_path / "pipeline.toml", code=2)
+    assert "crop" not in sys.modules
+    assert not (tmp_path / "was_run").exists()
+
+
+def test_the_text_of_a_file(command: Command, tmp_path: Path, check_printed: Callable[[str, str], None]) -> None:
+    texts = [command("check", write_file(tmp_path, text))[0] for text in (STREET, BRANCHES, CUT, DEPTH)]
+    check_printed("check", "\n".join(texts).replace(f"{tmp_path}/", ""))
+
+
+def test_the_drawing_has_a_box_for_each_stage_and_a_line_for_each_input(command: Command, tmp_path: Path) -> None:
+    out = tmp_path / "graph.svg"
+    command("check", write_file(tmp_path, BRANCHES), "--svg", out)
+    drawing = ElementTree.parse(out).getroot()  # noqa: S314 - our own
+    name = "{http://www.w3.org/2000/svg}"
+    boxes = drawing.findall(f"{name}g")
+    titles = [box.findtext(f"{name}title", "").partition(":")[0] for box in boxes]
+    assert titles == ["frame", "depth", "seg", "detector", "tracker", "composite"]
+    lines = drawing.findall(f"{name}path")
+    assert [len(lines), sum("stroke-dasharray" in line.attrib for line in lines)] == [9, 1]
+    corners = [(box.find(f"{name}rect").attrib["x"], box.find(f"{name}rect").attrib["y"]) for box in boxes]  # type: ignore[union-attr]
+    assert len(set(corners)) == len(boxes)  # none hides another
+    command("check", tmp_path / "pipeline.toml", "--svg", tmp_path / "graph.png", code=2)
+
+
+A = 'a = { unit = "u", time_ms = 1 }\n'
+STAGES = f"[stages]\n{A}"
+VIDEO = 'v = { block = "video", unit = "cpu", path = "v.mp4", size = "640x480" }\n'
+NET = 'n = { onnx = "seg.onnx", unit = "dsp", in = "a" }\n'
+
+#: What is wrong: the file, then what the message must name, the key first.
+WRONG: dict[str, tuple[str, ...]] = {
+    "circle": (
+        '[stages]\na = { unit = "u", in = "c", time_ms = 1 }\nb = { unit = "u", in = "a", time_ms = 1 }\n'
+        'c = { unit = "u", in = "b", time_ms = 1 }',
+        *("stages.a.in", "the circle a -> b -> c -> a"),
+    ),
+    "itself": ('[stages]\na = { unit = "u", in = "a", time_ms = 1 }', "stages.a.in", "the circle a -> a"),
+    "circle of newest": (
+        STAGES + 'b = { unit = "u", in = { x = "a", y = { from = "c", sync = "latest" } }, time_ms = 1 }\n'
+        'c = { unit = "u", in = "b", time_ms = 1 }',
+        *("stages.b.in", "b -> c -> b"),
+    ),
+    "dangling port": (
+        '[stages]\na = { unit = "u", time_ms = 1, out = { boxes = "f32 32x5" } }\n'
+        'b = { unit = "u", in = "a.boxs", time_ms = 1 }',
+        *("stages.b.in", "'boxs' of a", "did you mean 'boxes'?"),
+    ),
+    "dangling port of a network": (
+        STAGES + NET + 'b = { unit = "u", in = "n.masc", time_ms = 1 }',
+        *("stages.b.in", "'masc' of n", "did you mean 'mask'?"),
+    ),
+    "port that nobody feeds": (
+        f'[stages]\n{VIDEO}o = {{ block = "overlay", unit = "gpu", in = {{ mask = "v" }} }}',
+        *("stages.o.in", "nobody who feeds the input 'frame'"),
+    ),
+    "unknown port of a block": (
+        f'[stages]\n{VIDEO}o = {{ block = "overlay", unit = "gpu", in = {{ frame = "v", masc = "v" }} }}',
+        *("stages.o.in.masc", "did you mean 'mask'?"),
+    ),
+    "unknown input of a network": (
+        STAGES + 'n = { onnx = "seg.onnx", unit = "dsp", in = { imag = "a" } }',
+        *("stages.n.in", "'imag'", "did you mean 'image'?"),
+    ),
+    "which of several ports": (
+        '[stages]\na = { unit = "u", time_ms = 1, out = { x = "u8 4", y = "u8 4" } }\n'
+        'b = { unit = "u", in = "a", time_ms = 1 }',
+        *("stages.b.in", "the ports x, y", "'a.x'"),
+    ),
+    "a network behind nothing": (
+        '[stages]\nn = { onnx = "seg.onnx", unit = "dsp" }',
+        *("stages.n.in", "nobody who feeds the input 'image'"),
+    ),
+    "unknown stage": (
+        STAGES.replace("a =", "camera =") + 'b = { unit = "u", in = "camra", time_ms = 1 }',
+        *("stages.b.in", "the unknown stage 'camra'", "did you mean 'camera'?"),
+    ),
+    "unknown unit": (
+        '[units]\nneural = { hardware = "dsp" }\n[stages]\na = { unit = "neurl", time_ms = 1 }',
+        *("stages.a.unit", "the unknown unit 'neurl'", "did you mean 'neural'?"),
+    ),
+    "network on an unknown unit": (STAGES + NET.replace("dsp", "npu"), "stages.n.unit", "'npu'", "hardware"),
+    "unknown hardware": ('[units]\nu = { hardware = "dps" }\n' + STAGES, "units.u.hardware", "did you mean 'dsp'?"),
+    "twice the same stage": (STAGES + A, "line 3", "the same name twice"),
+    "twice the same table": (STAGES + STAGES, "line 3", "the same name twice"),
+    "two kinds": (
+        STAGES + 'b = { onnx = "seg.onnx", python = "m:f", unit = "cpu", in = "a" }',
+        *("stages.b", "onnx and python", "exactly one"),
+    ),
+    "no kind": (STAGES + 'b = { unit = "u", in = "a" }', "stages.b", "none of onnx, python, block, time_ms"),
+    "a kind with a slip": (STAGES + 'b = { unit = "u", in = "a", time = 3 }', "stages.b", "did you mean 'time_ms'?"),
+    "missing model": (STAGES + NET.replace("seg", "none"), "stages.n.onnx", "no such file", "put none.onnx beside"),
+    "no model": (STAGES + NET.replace("seg.onnx", "pipeline.toml"), "stages.n.onnx", "expected"),
+    "path outside": (STAGES + NET.replace("seg.onnx", "../seg.onnx"), "stages.n.onnx", "'../seg.onnx'", "inside"),
+    "path from the root": (STAGES + NET.replace("seg.onnx", "/etc/passwd"), "stages.n.onnx", "inside the folder"),
+    "path round about": (STAGES + NET.replace("seg.onnx", "x/../../seg.onnx"), "stages.n.onnx", "inside the folder"),
+    "video written outside": (
+        f'[stages]\n{VIDEO}e = {{ block = "encode", unit = "cpu", in = "v", path = "../../out.mp4" }}',
+        *("stages.e.path", "inside the folder"),
+    ),
+    "text for a number": ('[run]\nfps = "30"\n' + STAGES, "run.fps", "'30'", "number"),
+    "true for a number": (STAGES.replace("= 1", "= true"), "stages.a.time_ms", "true", "a time in ms"),
+    "number for a stage": ("[stages]\na = 3", "stages.a", "3", "a table"),
+    "number for an input": (STAGES + 'b = { unit = "u", in = 3, time_ms = 1 }', "stages.b.in", "3", "stage.port"),
+    "two gigabytes": (
+        '[stages]\na = { unit = "u", time_ms = 1, out = "u8 50000x50000" }',
+        *("stages.a.out", "2500000000 bytes", "at most 256 MiB"),
+    ),
+    "slots of gigabytes": (
+        '[edges]\na = "fifo:64"\n[stages]\na = { unit = "u", time_ms = 1, out = "u8 250000000" }\n'
+        'b = { unit = "v", in = "a", time_ms = 1 }',
+        *("edges.a", "64 slots of 238 MiB", "at most 2 GiB"),
+    ),
+    "a huge picture": (
+        f"[stages]\n{VIDEO}".replace("640x480", "999999x999999"),
+        *("stages.v.size", "'999999x999999'", "1 to 16384"),
+    ),
+    "unknown type": (
+        '[stages]\na = { unit = "u", time_ms = 1, out = "float 4" }',
+        *("stages.a.out", "'float'", "u8, i8"),
+    ),
+    "wrong shape": (
+        STAGES.replace("time_ms = 1", 'time_ms = 1, out = "f32 1x3x128x128"') + NET,
+        *("stages.n.in", "f32 1x3x128x128 from a", "f32 1x3x256x256"),
+    ),
+    "wrong type": (
+        STAGES.replace("time_ms = 1", 'time_ms = 1, out = "i8 1x3x256x256"') + NET,
+        *("stages.n.in", "i8 1x3x256x256 from a", "f32 1x3x256x256"),
+    ),
+    "no picture to encode": (
+        STAGES.replace("time_ms = 1", 'time_ms = 1, out = "f32 32x5"')
+        + 'e = { block = "encode", unit = "cpu", in = "a", path = "o.mp4" }',
+        *("stages.e.in", "f32 32x5 from a", "a picture"),
+    ),
+    "too many inputs": (
+        "[stages]\n"
+        + "".join(f'a{n} = {{ unit = "u", time_ms = 1 }}\n' for n in range(8))
+        + 'b = { unit = "u", time_ms = 1, in = { '
+        + ", ".join(f'p{n} = "a{n}"' for n in range(8))
+        + " } }",
+        *("stages.b.in", "8 stages", "at most 7"),
+    ),
+    "too many stages": (
+        "[stages]\n" + "".join(f'a{n} = {{ unit = "u", time_ms = 1 }}\n' for n in range(65)),
+        *("stages", "65 stages", "1 to 64"),
+    ),
+    "no stages": ('[stages]\n[run]\nedge = "double"', "stages", "0 stages"),
+    "negative time": (STAGES.replace("= 1", "= -1"), "stages.a.time_ms.mean", "-1", "greater than or equal to 0"),
+    "no number": (STAGES.replace("= 1", "= nan"), "stages.a.time_ms.mean", "nan", "finite"),
+    "endless time": (STAGES.replace("= 1", "= inf"), "stages.a.time_ms.mean", "inf", "finite"),
+    "no samples": (STAGES.replace("= 1", "= { samples = [] }"), "stages.a.time_ms", "0 samples"),
+    "two kinds of times": (
+        STAGES.replace("= 1", "= { mean = 1, exponential = 2 }"),
+        *("stages.a.time_ms", "mean, exponential"),
+    ),
+    "a negative sample": (STAGES.replace("= 1", "= { samples = [1, -2] }"), "stages.a.time_ms.samples.1", "-2"),
+    "unknown table": (STAGES + "[runs]\nfps = 3", "'runs'", "did you mean 'run'?"),
+    "unknown key of the run": ("[run]\nfsp = 30\n" + STAGES, "run.fsp", "did you mean 'fps'?"),
+    "unknown key of a stage": (STAGES.replace("unit", "evry = 3, unit"), "stages.a.evry", "did you mean 'every'?"),
+    "unknown key of a time": (
+        STAGES.replace("= 1", "= { mean = 1, std = 1 }"),
+        *("stages.a.time_ms.std", "the unknown key 'std'", "mean, sd"),
+    ),
+    "unknown key of an input": (
+        STAGES + 'b = { unit = "u", in = { x = { from = "a", snyc = "latest" } }, time_ms = 1 }',
+        *("stages.b.in.x.snyc", "did you mean 'sync'?"),
+    ),
+    "unknown block": (
+        f"[stages]\n{VIDEO}".replace('"video"', '"vidoe"'),
+        *("stages.v.block", "did you mean 'video'?"),
+    ),
+    "unknown sync": (
+        STAGES + 'b = { unit = "u", in = { from = "a", sync = "newest" }, time_ms = 1 }',
+        *("stages.b.in.sync", "'frame' or 'latest'"),
+    ),
+    "an age without newest": (
+        STAGES + 'b = { unit = "u", in = { from = "a", max_age_ms = 3 }, time_ms = 1 }',
+        *("stages.b.in", "max_age_ms beside sync = 'frame'"),
+    ),
+    "one slot for a newest frame": (
+        STAGES + 'b = { unit = "u", in = { from = "a", sync = "latest" }, time_ms = 1 }\n[edges]\na = "single"',
+        *("edges.a", "two slots or more"),
+    ),
+    "unknown edge": (STAGES + '[edges]\na = "double"', "edges.a", "a stage that nobody reads"),
+    "unknown rule": (
+        STAGES + 'b = { unit = "u", in = "a", time_ms = 1 }\n[edges]\na = "quadruple"',
+        *("edges.a", "'quadruple'", "single, double, triple"),
+    ),
+    "unknown policy": ('[run]\npolicy = "lates"\n' + STAGES, "run.policy", "did you mean 'latest'?"),
+    "policy without a rate": ('[run]\npolicy = "latest"\n' + STAGES, "run.policy", "add fps = 30"),
+    "two rates": ("[run]\nfps = 3\narrivals = { poisson = 3 }\n" + STAGES, "run.arrivals", "one or the other"),
+    "latency to nowhere": ('[run]\nlatency_to = "b"\n' + STAGES, "run.latency_to", "the unknown stage 'b'"),
+    "prepared for nobody": (
+        f'[stages]\n{VIDEO}p = {{ block = "prepare", unit = "cpu", in = "v", like = "det" }}',
+        *("stages.p.like", "'det'", "a stage with onnx"),
+    ),
+    "own code without a factory": (
+        STAGES + 'b = { python = "crop", unit = "cpu" }',
+        "stages.b.python",
+        "module:factory",
+    ),
+    "every nothing": (STAGES.replace("unit", "every = 0, unit"), "stages.a.every", "greater than or equal to 1"),
+    "a name with a dot": ('[stages]\n"a.b" = { unit = "u", time_ms = 1 }', "stages", "'a.b'"),
+    "behind the end": (
+        f'[stages]\n{VIDEO}d = {{ block = "discard", unit = "cpu", in = "v" }}\n'
+        'b = { unit = "u", in = "d", time_ms = 1 }',
+        *("stages.b.in", "'d', a discard"),
+    ),
+    "no TOML": (STAGES + "b = = 3", "line 3", "invalid value"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_file_is_refused_by_its_key(command: Command, tmp_path: Path, name: str) -> None:
+    text, *parts = WRONG[name]
+    path = write_file(tmp_path, text)
+    _, err = command("check", path, code=2)
+    said = " ".join(err.split())
+    assert said.startswith(f"error: {path}"), said
+    assert "found" in said
+    assert "expected" in said
+    assert all(part in said for part in parts), said
+    assert "Traceback" not in said
+
+
+@pytest.mark.parametrize("name", ["circle", "missing model", "two kinds", "negative time"])
+def test_a_prediction_refuses_it_alike(command: Command, tmp_path: Path, name: str) -> None:
+    path = write_file(tmp_path, WRONG[name][0])
+    assert command("predict", path, code=2)[1] == command("check", path, code=2)[1]
+
+
+def test_bytes_that_are_no_text_and_a_missing_file(command: Command, tmp_path: Path) -> None:
+    path = tmp_path / "bytes.toml"
+    path.write_bytes(b"[stages]\n\xff\xfe\x00")
+    assert "no text in UTF-8" in command("check", path, code=2)[1]
+    assert "no such file" in command("check", tmp_path / "none.toml", code=2)[1]
+    assert "a folder" in command("check", tmp_path, code=2)[1]
+
+
+def test_a_network_of_open_sizes_wants_them_from_the_file(command: Command, tmp_path: Path) -> None:
+    path = write_file(tmp_path, STAGES + NET)
+    model = onnx.load(tmp_path / "seg.onnx")
+    model.graph.input[0].type.tensor_type.shape.dim[2].dim_param = "height"
+    onnx.save(model, tmp_path / "seg.onnx")
+    error = " ".join(command("check", path, code=2)[1].split())
+    found = re.search(r"add shapes = \{ image = '1x3xNx256' \}", error)
+    assert found, error
+    path.write_text(STAGES + NET.replace(" }", ", shapes = { image = '1x3x256x256' } }"))
+    command("check", path)

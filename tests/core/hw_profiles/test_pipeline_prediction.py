@@ -1,0 +1,328 @@
+"""`trilane predict FILE.toml`: by hand, by queueing theory, and against a network by itself."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from math import log, sqrt
+from pathlib import Path
+from statistics import fmean, stdev
+from typing import Any
+
+import pytest
+
+from support.pipeline_files import CUT, DEPTH, STREET, write_file
+from support.run_folders import write_run
+from trilane.hw_profiles.pipeline_prediction import _sentence
+from trilane.hw_profiles.rates import FrameInterval
+from trilane.pipeline.file_graph import edge_rules, graph_of
+from trilane.pipeline.pipeline_file import read_pipeline
+from trilane.scheduler.events import Settings
+from trilane.scheduler.virtual import simulate
+
+Command = Callable[..., tuple[str, str]]
+Predict = Callable[..., dict[str, Any]]
+
+
+@pytest.fixture
+def documents(command: Command, tmp_path: Path) -> Predict:
+    """The document of `trilane predict` for a text, with further options."""
+    return lambda text, *options: json.loads(command("predict", write_file(tmp_path, text), *options, "--json")[0])
+
+
+@pytest.fixture
+def predict(documents: Predict) -> Predict:
+    """The first pipeline of that document."""
+    return lambda text, *options: documents(text, *options)["pipelines"][0]
+
+
+def chain(*times: str, head: str = "", tail: str = "") -> str:
+    """A chain with a unit for each stage."""
+    rows = [
+        f's{place} = {{ unit = "u{place}", time_ms = {time}' + (f', in = "s{place - 1}" }}' if place else " }")
+        for place, time in enumerate(times)
+    ]
+    return "\n".join([head, "[stages]", *rows, tail])
+
+
+@pytest.mark.parametrize(
+    ("head", "frame_ms", "first_ms"),
+    [("", 14, 19), ('[run]\nedge = "single"', 17, 19), ("[run]\nin_flight = 1", 19, 19), ("[run]\nfps = 50", 20, 19)],
+)
+def test_a_join(predict: Predict, head: str, frame_ms: float, first_ms: float) -> None:
+    answer, alone = predict(head + DEPTH), predict(head + DEPTH, "--frames", "1")
+    times = answer["frame_time_ms"]
+    assert (times["mean"], times["p50"], times["max"]) == (frame_ms, frame_ms, frame_ms)
+    assert answer["period_ms"] == frame_ms
+    assert answer["fps"] == pytest.approx(1e3 / frame_ms)
+    assert alone["latency_ms"]["mean"] == first_ms
+
+
+def test_a_paced_join_has_its_latency_for_every_frame(predict: Predict) -> None:
+    answer = predict("[run]\nfps = 50\nframes = 300" + DEPTH)
+    assert (answer["latency_ms"]["mean"], answer["latency_ms"]["max"]) == (19, 19)
+    assert answer["frames"]["presented"] == 300
+    assert answer["rate"]["sentence"] == "holds 50 fps: yes; 14 ms of 20 ms"
+
+
+@pytest.mark.parametrize(
+    ("head", "frame_ms"),
+    [
+        *(('[run]\nedge = "single"', 9), ('[run]\nedge = "double"', 5), ("[run]\nin_flight = 1", 15)),
+        *(("[run]\nin_flight = 3", 5), ('[run]\npolicy = "sequential"', 15)),
+    ],
+)
+def test_the_chain_of_five(predict: Predict, head: str, frame_ms: float) -> None:
+    assert predict(chain("2", "3", "5", "4", "1", head=head))["frame_time_ms"]["mean"] == frame_ms
+
+
+TRACKED = """
+[run]
+frames = 999
+latency_to = "{}"
+{}
+[stages]
+source = {{ unit = "camera", time_ms = 0 }}
+tracker = {{ unit = "npu", in = "source", time_ms = 12 }}
+detector = {{ unit = "npu", in = "source", time_ms = 45, every = 3 }}
+"""
+
+
+def test_a_tracker_beside_a_detector_of_each_third_frame(predict: Predict) -> None:
+    """Frame 0 takes 12; frame 1 waits for the detector until 57; frame 2 waits for that until 69."""
+    third = 1e3 / 30
+    tracker = predict(TRACKED.format("tracker", "fps = 30"))["latency_ms"]
+    assert tracker["max"] == pytest.approx(57 - third + 12, abs=1e-5)
+    assert tracker["p50"] == pytest.approx(69 - 2 * third + 12, abs=1e-5)
+    assert tracker["mean"] == pytest.approx((12 + (69 - third) + (81 - 2 * third)) / 3, abs=1e-5)
+    detector = predict(TRACKED.format("detector", "fps = 30"))["latency_ms"]
+    assert (detector["samples"], detector["mean"], detector["max"]) == (333, 57, 57)
+    fed = predict(TRACKED.format("tracker", ""))
+    assert (fed["period_ms"], fed["cycle"]) == (27, ["tracker", "detector"])
+    assert fed["duration_s"] == pytest.approx(999 * 27 / 1e3, rel=1e-3)
+
+
+def test_the_published_cut(predict: Predict) -> None:
+    """Jitter of the head does not reach the frame time, which is the tail's."""
+    answer = predict(CUT)
+    assert answer["period_ms"] == answer["frame_time_ms"]["p50"] == 1.1717
+    assert answer["frame_time_ms"]["mean"] == pytest.approx(1.1717, rel=1e-4)
+    head = answer["stages"]["head"]["service_ms"]
+    assert head["mean"] == pytest.approx(1.1146, abs=3 * 0.02 / sqrt(1000))
+    assert head["p90"] - head["p50"] == pytest.approx(0.02 * 1.2816, rel=0.15)
+
+
+@pytest.mark.parametrize("slots", [1, 3])
+def test_two_exponential_stages_have_the_throughput_of_theory(predict: Predict, slots: int) -> None:
+    text = chain("{ exponential = 1 }", "{ exponential = 1 }", head=f'[run]\nedge = "fifo:{slots}"\nframes = 10000')
+    times = [predict(text, "--seed", str(seed))["frame_time_ms"]["mean"] for seed in range(6)]
+    assert abs(fmean(times) - (slots + 1) / slots) < 3 * stdev(times) / sqrt(len(times))
+
+
+@pytest.mark.parametrize(("load", "wait_ms"), [(0.5, 0.5), (0.8, 2)])
+def test_random_arrivals_wait_as_theory_says(predict: Predict, load: float, wait_ms: float) -> None:
+    text = chain("1", head=f"[run]\narrivals = {{ poisson = {1e3 * load} }}\nframes = 10000")
+    waits = [predict(text, "--seed", str(seed))["stages"]["s0"]["wait_ms"]["mean"] for seed in range(6)]
+    assert abs(fmean(waits) - wait_ms) < 3 * stdev(waits) / sqrt(len(waits))
+
+
+def test_a_full_queue_turns_away_as_many_as_theory_says(predict: Predict) -> None:
+    """M/M/1/K at load 0.9: one in work, one that the unit holds ready and three that wait are K = 5."""
+    text = chain("{ exponential = 1 }", head="[run]\narrivals = { poisson = 900 }\nin_queue = 3\nframes = 10000")
+    runs = [predict(text, "--seed", str(seed))["frames"] for seed in range(6)]
+    shares = [1 - run["presented"] / run["requested"] for run in runs]
+    loss = (1 - 0.9) * 0.9**5 / (1 - 0.9**6)
+    assert abs(fmean(shares) - loss) < 3 * stdev(shares) / sqrt(len(shares))
+
+
+def test_branches_choose_the_same_frames(predict: Predict) -> None:
+    """A of 10 and B of 11 ms behind a source every 6 ms: a frame that one has begun is not stale for the other."""
+    text = """
+    [run]
+    fps = 166.66666666666666
+    policy = "latest"
+    [stages]
+    source = { unit = "s", time_ms = 0 }
+    a = { unit = "a", in = "source", time_ms = 10 }
+    b = { unit = "b", in = "source", time_ms = 11 }
+    join = { unit = "j", in = { a = "a", b = "b" }, time_ms = 0 }
+    """
+    answer = predict(text)
+    assert answer["frame_time_ms"]["mean"] == pytest.approx(11, abs=0.03)
+    assert answer["needs_ms"]["mean"] == 11
+    assert sum(answer["frames"]["dropped"].values()) + answer["frames"]["presented"] == 1000
+
+
+def test_samples_are_drawn_as_they_are(predict: Predict) -> None:
+    row = predict(chain("{ samples = [1, 1, 4] }", head="[run]\nframes = 3000"))["stages"]["s0"]
+    assert row["alone_ms"] == 2
+    assert (row["service_ms"]["p50"], row["service_ms"]["max"]) == (1, 4)
+    assert row["service_ms"]["mean"] == pytest.approx(2, abs=3 * sqrt(2) / sqrt(3000))
+
+
+def test_a_seed_says_all_and_given_times_leave_no_ignorance(predict: Predict) -> None:
+    text = chain("{ mean = 2, sd = 1 }", "{ exponential = 2 }")
+    first, again, other = predict(text), predict(text), predict(text, "--seed", "1")
+    assert first == again
+    assert first["frame_time_ms"]["mean"] != other["frame_time_ms"]["mean"]
+    for times in (first["frame_time_ms"], first["latency_ms"]):
+        assert times["low"] == times["high"] == times["mean"]
+
+
+def test_a_variant_meets_the_same_luck(documents: Predict) -> None:
+    """So a stage that nothing changes has the same times, frame by frame."""
+    text = chain("{ mean = 2, sd = 1 }", "{ exponential = 2 }")
+    rows = documents(text, "--set", "stages.s1.time_ms=1")["pipelines"]
+    assert rows[0]["stages"]["s0"]["service_ms"] == rows[1]["stages"]["s0"]["service_ms"]
+
+
+NETWORK = """
+[stages]
+seg = { onnx = "seg.onnx", unit = "UNIT", in = "frame" }
+frame = { unit = "camera", time_ms = 0 }
+"""
+
+
+@pytest.mark.parametrize("unit", ["gpu", "dsp"])
+def test_a_network_has_the_time_that_it_has_by_itself(
+    command: Command, documents: Predict, tmp_path: Path, unit: str
+) -> None:
+    document = documents(NETWORK.replace("UNIT", unit), "--profile", "snapdragon-8-gen-3")
+    row = document["pipelines"][0]["stages"]["seg"]
+    options = ("--network", tmp_path / "seg.onnx", "--runtime", unit, "--profile", "snapdragon-8-gen-3", "--json")
+    alone = json.loads(command("predict", *options)[0])["networks"][0]
+    assert (row["alone_ms"], row["low_ms"], row["high_ms"]) == (alone["network_ms"], alone["low_ms"], alone["high_ms"])
+    assert row["source"] == f"snapdragon-8-gen-3, {unit} in {alone['precision']}"
+    frame = document["pipelines"][0]["frame_time_ms"]
+    assert frame["mean"] == pytest.approx(alone["network_ms"], abs=1e-5)
+    # The 10 % point of 200 draws has a standard error of sqrt(0.1 * 0.9 / 200) / density = 0.121 deviations.
+    spread = log(alone["high_ms"] / alone["low_ms"]) / 2 / 1.2816
+    for end in ("low", "high"):
+        assert abs(log(frame[end] / frame["mean"]) - log(alone[f"{end}_ms"] / alone["network_ms"])) < 3 * 0.121 * spread
+    assert document["machine"]["profile"] == "snapdragon-8-gen-3"
+
+
+def test_a_time_of_the_file_overrides_the_networks_and_needs_no_chip(documents: Predict) -> None:
+    text = NETWORK.replace("UNIT", "dsp").replace('in = "frame"', 'in = "frame", time_ms = 7')
+    document = documents(text)
+    row = document["pipelines"][0]["stages"]["seg"]
+    assert (row["alone_ms"], row["source"], document["machine"]) == (7, "time_ms", None)
+
+
+def test_precision_is_the_networks_the_files_or_that_of_the_option(documents: Predict) -> None:
+    text = NETWORK.replace("UNIT", "dsp")
+
+    def source(text: str, *options: str) -> str:
+        return str(documents(text, *options)["pipelines"][0]["stages"]["seg"]["source"])
+
+    assert source(text) == "snapdragon-888, dsp in fp16"
+    assert source(text, "--precision", "w8a8") == "snapdragon-888, dsp in int8"
+    own = text.replace('in = "frame"', 'in = "frame", precision = "int8"')
+    assert source(own, "--precision", "float") == "snapdragon-888, dsp in int8"
+
+
+def test_each_set_is_a_row(documents: Predict) -> None:
+    rows = documents(
+        DEPTH,
+        *("--set", "stages.seg.unit=b"),
+        *("--set", "run.fps=20,stages.depth.time_ms={ mean = 15, sd = 0 },stages.seg.time_ms=1"),
+    )["pipelines"]
+    assert [row["what_if"].partition("=")[0] for row in rows] == ["", "stages.seg.unit", "run.fps"]
+    assert [row["period_ms"] for row in rows] == [14, 24, 50]
+    assert [row["latency_ms"]["p50"] for row in rows[2:]] == [2 + 15 + 3]
+    assert rows[2]["needs_ms"]["mean"] == 15
+
+
+def test_newest_inputs_say_their_age(predict: Predict) -> None:
+    """The fast stage begins frame n at 20 n + 1; the slow one has frame 2 m at 40 m + 30.
+
+    So frame 2 j meets frame 2 j - 2, 41 ms old, and frame 2 j + 1 the same, 61 ms old.
+    """
+    text = """
+    [run]
+    fps = 50
+    latency_to = "fast"
+    [stages]
+    source = { unit = "s", time_ms = 1 }
+    slow = { unit = "a", in = "source", time_ms = 29, every = 2 }
+    fast = { unit = "b", in = { now = "source", then = { from = "slow", sync = "latest" } }, time_ms = 2 }
+    """
+    row = predict(text)["streams"]["slow"]
+    assert (row["age_ms"]["mean"], row["age_ms"]["max"]) == (51, 61)
+    assert row["frames_behind"] == {"mean": 2.5, "max": 3}
+
+
+def test_a_stage_without_a_time_is_refused_by_name(command: Command, tmp_path: Path) -> None:
+    error = " ".join(command("predict", write_file(tmp_path, STREET), code=2)[1].split())
+    assert "stages.camera: found video without a time" in error
+    assert "add time_ms" in error
+    text = STREET.replace("block =", "time_ms = 2, block =")
+    error = " ".join(command("predict", write_file(tmp_path, text), code=2)[1].split())
+    assert "stages.crop: found python without a time" in error
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--beside", "default@30"), "--beside beside a pipeline file"),
+        (("--fps", "30"), "--fps beside a pipeline file"),
+        (("--frames", "0"), "--frames"),
+        (("--set", "stages.depth.unti=a"), "did you mean 'unit'?"),
+        (("--set", "depth"), "KEY=VALUE"),
+    ],
+)
+def test_options_that_mean_nothing_beside_a_file(
+    command: Command, tmp_path: Path, options: tuple[str, ...], said: str
+) -> None:
+    assert said in " ".join(command("predict", write_file(tmp_path, DEPTH), *options, code=2)[1].split())
+
+
+def test_options_of_a_file_without_one(command: Command) -> None:
+    assert "--seed without a pipeline file" in command("predict", "--seed", "3", code=2)[1]
+
+
+@pytest.mark.parametrize(
+    ("times", "words"),
+    [
+        ((15, 12, 19), "holds 30 fps: yes; 12-19 ms of 33.3 ms (80 %)"),
+        ((30, 22, 40), "holds 30 fps: perhaps; 22-40 ms of 33.3 ms (80 %)"),
+        ((50, 40, 60), "holds 30 fps: no; 40-60 ms of 33.3 ms (80 %)"),
+        ((14, 14, 14), "holds 30 fps: yes; 14 ms of 33.3 ms"),
+    ],
+)
+def test_the_sentence(times: tuple[float, float, float], words: str) -> None:
+    assert _sentence(30, FrameInterval(*times)) == words
+
+
+def test_the_text(command: Command, tmp_path: Path, check_printed: Callable[[str, str], None]) -> None:
+    text = STREET.replace("block =", "time_ms = 3, block =").replace("python =", "time_ms = 2, python =")
+    what_ifs = ("--set", "stages.segmenter.unit=gpu", "--set", "run.fps=120")
+    check_printed("predict-file", command("predict", write_file(tmp_path, text), *what_ifs)[0])
+
+
+def test_measured_times_are_those_of_a_run_and_on_a_chip_times_their_scale(
+    command: Command, documents: Predict, tmp_path: Path
+) -> None:
+    """A run in virtual time stands for one here: depth takes 20 and 10 in turn, so 15 in the mean."""
+    text = """
+    [stages]
+    frame = { block = "busy", unit = "a", load_ms = 2 }
+    depth = { python = "m:f", unit = "b", in = "frame", scale = { snapdragon-888 = 2 } }
+    """
+    file = read_pipeline(write_file(tmp_path, text))
+
+    def service(stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
+        return {"frame": 2, "depth": 20 - 10 * (frame % 2)}[stage] * 1_000_000
+
+    done = simulate(graph_of(file, edge_rules(file, None)), Settings(40), service, keep=True)
+    run = write_run(tmp_path / "run", done)
+    here = documents(text, "--measured", str(run))["pipelines"][0]["stages"]["depth"]
+    assert (here["alone_ms"], here["service_ms"]["max"]) == (15, 20)
+    assert here["low_ms"] < 15 < here["high_ms"]
+    chip = documents(text, "--measured", str(run), "--profile", "snapdragon-888")["pipelines"][0]["stages"]["depth"]
+    assert (chip["alone_ms"], chip["source"]) == (30, f"measured in {run}, times 2")
+    options = ("--measured", run, "--profile", "snapdragon-8-gen-3")
+    error = " ".join(command("predict", tmp_path / "pipeline.toml", *options, code=2)[1].split())
+    assert "stages.depth: found python without a time" in error
+    assert "scale = { snapdragon-8-gen-3 = ... }" in error
+    command("predict", tmp_path / "pipeline.toml", "--measured", tmp_path / "none", code=2)

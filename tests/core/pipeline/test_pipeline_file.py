@@ -1,0 +1,122 @@
+"""Pipeline files: what is read from them, and what the scheduler gets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support.pipeline_files import BRANCHES, CUT, DEPTH, STREET, write_file
+from trilane.errors import BadInputError
+from trilane.pipeline.file_graph import edge_rules, graph_of, settings_of
+from trilane.pipeline.pipeline_file import is_pipeline_file, read_pipeline
+from trilane.scheduler.events import Graph, Input, StageSpec
+
+MS = 1_000_000
+
+
+def test_the_street(tmp_path: Path) -> None:
+    file = read_pipeline(write_file(tmp_path, STREET))
+    assert list(file.stages) == ["camera", "small", "detector", "crop", "segmenter", "overlay", "video"]
+    assert [file.hardware(unit) for unit in ("cpu", "npu", "gpu")] == ["cpu", "dsp", "gpu"]
+    assert file.latency_to == "video"
+    assert file.readers["camera"] == ["small", "crop", "overlay"]
+    crop = file.stages["crop"]
+    assert [(each.port, each.stage) for each in crop.inputs] == [("frame", "camera"), ("boxes", "detector")]
+    assert crop.out is not None
+    assert (crop.out["picture"].shape, crop.out["picture"].payload_bytes) == ((256, 256, 3), 256 * 256 * 3)
+    settings = settings_of(file)
+    assert (settings.frames, settings.policy, settings.period_ns) == (1000, "pipelined", 33_333_333)
+
+
+def test_the_branches(tmp_path: Path) -> None:
+    file = read_pipeline(write_file(tmp_path, BRANCHES))
+    graph = graph_of(file, dict.fromkeys(file.readers, "double"))
+    detector = Input("detector", latest=True, max_age_ns=250 * MS)
+    assert graph.stages[3] == StageSpec("detector", "dsp", (Input("frame"),), 3)
+    assert graph.stages[4] == StageSpec("tracker", "cpu", (Input("frame"), detector))
+    assert (graph.latency_to, graph.from_release) == ("composite", True)
+    assert settings_of(file, frames=7, hang_ns=3).frames == 7
+
+
+def test_a_row_of_stages_is_a_chain(tmp_path: Path) -> None:
+    """So it takes the steps of a chain, and a file without a rate has a source that is always ready."""
+    file = read_pipeline(write_file(tmp_path, CUT))
+    graph = graph_of(file, edge_rules(file, None))
+    assert graph == Graph((StageSpec("head", "gpu"), StageSpec("tail", "dla")), ("double",), "tail")
+    assert settings_of(file).period_ns == 0
+
+
+def test_stages_come_after_what_they_read_and_else_in_the_order_of_the_file(tmp_path: Path) -> None:
+    text = """
+    [stages]
+    z = { unit = "u", in = { a = "y", b = "a" }, time_ms = 1 }
+    b = { unit = "u", in = "a", time_ms = 1 }
+    y = { unit = "u", time_ms = 1 }
+    a = { unit = "u", time_ms = 1 }
+    """
+    assert list(read_pipeline(write_file(tmp_path, text)).stages) == ["y", "a", "z", "b"]
+
+
+def test_two_ports_of_one_stage_are_one_stream(tmp_path: Path) -> None:
+    text = """
+    [stages]
+    det = { unit = "u", time_ms = 1, out = { boxes = "f32 32x5", scores = "f32 32" } }
+    best = { unit = "v", in = { boxes = "det.boxes", scores = "det.scores" }, time_ms = 1 }
+    """
+    file = read_pipeline(write_file(tmp_path, text))
+    assert [each.from_port for each in file.stages["best"].inputs] == ["boxes", "scores"]
+    assert graph_of(file, edge_rules(file, None)).is_chain
+
+
+def test_rules_of_streams_by_file_run_and_default(tmp_path: Path) -> None:
+    def rules(head: str, tail: str = "") -> dict[str, str]:
+        return edge_rules(read_pipeline(write_file(tmp_path, head + DEPTH + tail)), None)
+
+    assert rules("") == dict.fromkeys(("frame", "depth", "seg"), "double")
+    assert rules('[run]\nedge = "single"') == dict.fromkeys(("frame", "depth", "seg"), "single")
+    assert rules('[run]\nedge = "single"', '[edges]\ndepth = "fifo:3"')["depth"] == "fifo:3"
+
+
+def test_slots_where_branches_meet(tmp_path: Path) -> None:
+    """By equal times: the street's camera is held by six stages. By real times its short stages need fewer."""
+    file = read_pipeline(write_file(tmp_path, STREET))
+    assert edge_rules(file, None) == {
+        "camera": "fifo:6",
+        **dict.fromkeys(("small", "detector", "crop", "segmenter", "overlay"), "double"),
+    }
+    times = {"camera": 1, "small": 1, "detector": 20, "crop": 1, "segmenter": 2, "overlay": 2, "video": 1}
+    assert edge_rules(file, times)["camera"] == "double"  # held for 27 of 2 x 22
+
+
+def test_the_arrivals_of_a_seed(tmp_path: Path) -> None:
+    text = '[run]\narrivals = { poisson = 500 }\n[stages]\na = { unit = "u", time_ms = 1 }'
+    file = read_pipeline(write_file(tmp_path, text))
+    first, again, other = (settings_of(file, 20_000, seed).arrivals_ns for seed in (3, 3, 4))
+    assert first == again != other
+    gaps = np.diff(np.array(first)) / MS
+    assert abs(gaps.mean() - 2) < 3 * 2 / np.sqrt(len(gaps))
+    assert abs((gaps > 2).mean() - np.exp(-1)) < 0.02
+
+
+def test_other_values_are_a_variant_of_the_file(tmp_path: Path) -> None:
+    file = read_pipeline(write_file(tmp_path, DEPTH))
+    changed = file.changed(["stages.seg.unit=b", "run.fps=50", "stages.depth.time_ms={ mean = 3, sd = 1 }"])
+    assert (changed.stages["seg"].unit, changed.run.fps) == ("b", 50)
+    time = changed.stages["depth"].time_ms
+    assert time is not None
+    assert (time.mean_ms, time.sd) == (3, 1)
+    assert file.stages["seg"].unit == "c"
+    with pytest.raises(BadInputError, match=r"stages.seg.uni: found the unknown key 'uni'.*did you mean 'unit'"):
+        file.changed(["stages.seg.uni=b"])
+    with pytest.raises(BadInputError, match=r"--set: found 'seg=b', expected KEY=VALUE"):
+        file.changed(["seg=b"])
+
+
+def test_a_scene_is_no_pipeline_file(tmp_path: Path) -> None:
+    (tmp_path / "scene.toml").write_text('motion = "walk.bvh"\n[camera]\nwidth = 3\n')
+    assert not is_pipeline_file(tmp_path / "scene.toml")
+    assert not is_pipeline_file(tmp_path / "none.toml")
+    for number, head in enumerate(("[stages]", " [ stages.a ]", '["stages"]')):
+        assert is_pipeline_file(write_file(tmp_path, head, f"{number}.toml"))
