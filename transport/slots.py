@@ -172,12 +172,13 @@ class EdgeSlots:
 
     def take(self, slot: int, line: int = 0) -> None:
         """Let the unit of the stage that the slot waits for in `line` read it from now on."""
-        if slot not in self.lines[line]:
-            raise SlotError(f"cannot take slot {slot}, which is {self.state[slot]}")
+        try:
+            self.lines[line].remove(slot)
+        except ValueError:
+            raise SlotError(f"cannot take slot {slot}, which is {self.state[slot]}") from None
         if not self._reading[slot]:
             self._move("take", slot)
         self._reading[slot] += 1
-        self.lines[line].remove(slot)
 
     def take_newest(self, reader: int) -> int:
         """Let a job read what `reader` holds, and return its slot; -1 before the first frame."""
