@@ -241,7 +241,7 @@ def latencies_ns(recording: Recording, jobs: Sequence[JobRecord]) -> list[int]:
     """Return the latency of each presented frame of a run that is in memory."""
     timeline = Timeline(recording.graph, recording.settings)
     facts = (fact for record in records_of(recording, jobs) for fact in timeline.add(record))
-    return [fact.latency_ns for fact in facts if isinstance(fact, Presented)]
+    return [fact.latency_ns for fact in facts if isinstance(fact, Presented) and fact.latency_ns is not None]
 
 
 def _latency_ms(runs: list[dict[str, Any]]) -> dict[str, float | None]:

@@ -173,7 +173,9 @@ def run_pipeline(
         is_open = requests is not None or controls is not None
         report = core.report(clock="host", requested=core.source.released if is_open else None)
         report["percentiles"] = EXACT if core.ledger.is_exact else SKETCHED
-        report.update(policy=settings.policy, edge=pipeline.rule, idle_cores=idle_cores, other_programs=run.other_programs)
+        report.update(
+            policy=settings.policy, edge=pipeline.rule, idle_cores=idle_cores, other_programs=run.other_programs
+        )
         _add_caps(report, governor)
         for unit, row in report["units"].items():
             row.update(pid=run.pids[unit], **pipeline.units[unit].model_dump(mode="json"))

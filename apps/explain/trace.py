@@ -16,7 +16,8 @@ from typing import IO, Any, Final, Generic, TypeVar
 
 from trilane.apps.explain.trace_sinks import ChromeSink, FlowArrow, PacketSink, Sink
 from trilane.pipeline.journal import Begun, Ended, Record, Said, Sampled, Stepped, Worked, journal_of
-from trilane.pipeline.timeline import UNKNOWN, Gone, Presented, Timeline
+from trilane.pipeline.timeline import Gone, Presented, Timeline
+from trilane.pipeline.tracks import UNKNOWN
 from trilane.pipeline.unit_history import IDLE_CAUSES, JOIN, UNEXPLAINED, IdleSlice
 from trilane.scheduler.events import NEVER, Graph
 from trilane.scheduler.ledger import JobRecord

@@ -150,9 +150,7 @@ def _stage(
 ) -> PipelineStage:
     stage = file.stages[name]
     streams = stage_inputs(stage)
-    inputs = tuple(
-        StreamInput(stage=each.stage, latest=each.latest, max_age_ms=each.max_age_ms) for each in streams
-    )
+    inputs = tuple(StreamInput(stage=each.stage, latest=each.latest, max_age_ms=each.max_age_ms) for each in streams)
     place_of = {each.stage: place for place, each in enumerate(streams)}
     made = PipelineStage(
         name=name, unit=stage.unit, factory=f"{_module(stage)}:build", inputs=inputs, every=stage.every
@@ -201,7 +199,7 @@ def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str
 
 
 def _port(file: PipelineFile, name: str, each: StageInput, types: PortTypes) -> str:
-    """Return the port of a stream that an input reads. Raises BadInputError where it is not named and there are several."""
+    """Return the port of a stream that an input reads. Raises BadInputError where several are there and none is named."""
     ports = types[each.stage]
     if each.from_port or len(ports) == 1:
         chosen = each.from_port or next(iter(ports))

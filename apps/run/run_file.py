@@ -82,7 +82,9 @@ def asked_file(options: RunOptions) -> PipelineFile:
         raise BadInputError("options", found, f"one of {known}", "it is an option of the avatar's scenes")
     file = read_pipeline(Path(options.scene))
     given = {name: getattr(options, name) for name in TAKEN if name in options.model_fields_set}
-    return file.changed([f"run.{name}={given[name]}" for name in ("frames", "fps", "policy", "edge") if given.get(name)])
+    return file.changed(
+        [f"run.{name}={given[name]}" for name in ("frames", "fps", "policy", "edge") if given.get(name)]
+    )
 
 
 class _Asked:

@@ -24,6 +24,7 @@ from trilane.stages.blocks.prepare import Preparation
 from trilane.stages.dsp.ort import LOAD_ERRORS, PROVIDER, settings_of
 from trilane.stages.dsp.runtime import RuntimeOptions
 
+
 class _Fed(NamedTuple):
     """An input of the network.
 

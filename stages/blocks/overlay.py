@@ -1,9 +1,11 @@
 """The block `overlay`: draws on a picture what networks found in it.
 
-- `mask`: classes or scores, with its two largest axes as height and width. Of several channels the largest counts, and
-  channel 0 is the background; of one channel, more than half of its range counts. A mask of whole numbers holds classes.
+- `mask`: classes or scores; of three axes the smallest outer one is that of the channels. Of several channels the
+  largest counts, and channel 0 is the background. One channel of floats counts above 0.5; one of whole numbers holds
+  classes.
 - `depth`: one channel, from its least (blue) to its largest number (red).
-- `boxes`: rows of x0, y0, x1, y1 and maybe a score, in pixels of the picture, or from 0 to 1; a score of 0 draws nothing.
+- `boxes`: rows of x0, y0, x1, y1 and maybe a score, in pixels of the picture, or from 0 to 1; a score of 0 draws
+  nothing.
 
 A mask is stretched over the picture.
 """
@@ -69,7 +71,9 @@ class Overlay(PortedStage):
         return {}
 
     def _stretched(self, plane: F32) -> F32:
-        image = Image.fromarray(np.ascontiguousarray(plane)).resize((self._width, self._height), Image.Resampling.NEAREST)
+        image = Image.fromarray(np.ascontiguousarray(plane)).resize(
+            (self._width, self._height), Image.Resampling.NEAREST
+        )
         return np.asarray(image, np.float32)
 
     def _blend(self, picture: U8, colours: U8, where: NDArray[np.bool_] | None = None) -> None:
@@ -111,7 +115,7 @@ def _classes(mask: NDArray[Any]) -> U8:
         return np.asarray(planes.argmax(axis=0) % CLASSES, np.uint8)
     if planes.dtype.kind == "f":
         return np.asarray(planes[0] > 0.5, np.uint8)
-    return np.asarray(planes[0] % CLASSES, np.uint8)
+    return np.asarray(planes[0].astype(np.int64) % CLASSES, np.uint8)
 
 
 def _depth_colours(depth: F32) -> U8:

@@ -77,11 +77,12 @@ class OwnCode(PortedStage):
 
     def _imported(self, name: str, where: str) -> ModuleType:
         try:
-            return self._guarded(import_module, name)
+            found: ModuleType = self._guarded(import_module, name)
         except ModuleNotFoundError as error:
-            found = f"no module {error.name!r}"
+            missing = f"no module {error.name!r}"
             remedy = f"put {name}.py beside the pipeline file, or install it"
-            raise BadInputError(where, found, "a module of the file's folder or an installed one", remedy) from None
+            raise BadInputError(where, missing, "a module of the file's folder or an installed one", remedy) from None
+        return found
 
     def _guarded(self, call: Callable[..., Any], *args: Any, **named: Any) -> Any:
         """Return what a call returns; an error in it names the stage, and the file and line of the code."""

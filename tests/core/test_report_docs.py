@@ -97,10 +97,11 @@ def test_every_event_and_action_stands_with_its_fields_in_order(form: list[str])
 def test_every_key_of_a_recording_is_explained() -> None:
     shown = {path for cells in rows("## events.jsonl") if len(cells) == 2 for path in expanded(cells[0].strip("`"))}
     settings = {f"settings.{field.name}" for field in fields(events.Settings)}
-    graph = {"graph.stages[].name", "graph.stages[].unit", "graph.edges", "graph.latency_to", "graph.bypass"}
+    stages = {f"graph.stages[].{field.name}" for field in fields(events.StageSpec)}
+    graph = stages | {"graph.edges", "graph.latency_to", "graph.bypass", "graph.from_release"}
     assert shown == {"schema", "t", "events", "actions"} | settings | graph
     assert {f"graph.{field.name}" for field in fields(events.Graph)} == {
-        path.replace("[]", "").removesuffix(".name").removesuffix(".unit") for path in graph
+        "graph.stages" if path in stages else path for path in graph
     }
 
 

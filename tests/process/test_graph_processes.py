@@ -59,9 +59,7 @@ def test_branches_meet_frame_by_frame_and_a_slow_one_gives_its_newest(starter: U
 
 
 @pytest.mark.parametrize("unit", ["b", "c", "d", "e"])
-def test_a_unit_killed_again_and_again_in_a_branch_comes_back(
-    unit: str, starter: UnitStarter, tmp_path: Path
-) -> None:
+def test_a_unit_killed_again_and_again_in_a_branch_comes_back(unit: str, starter: UnitStarter, tmp_path: Path) -> None:
     """Five deaths in each of four branches: no deadlock, every frame is counted once, and values stay right."""
     killed: list[int] = []
 

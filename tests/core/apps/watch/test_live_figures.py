@@ -280,7 +280,7 @@ def assert_frames(now: MomentFigures, core: Core) -> None:
     assert sum(counts) == now.frames.requested == core.settings.frames
     for stage in core.stages:
         waiting = len(core.source.queue) if stage.input is None else len(stage.input.ready)
-        waiting += len(stage.bypassed.passing) if stage.bypassed is not None else 0
+        waiting += len(stage.bypassed.lines[1]) if stage.bypassed is not None else 0
         assert now.stages[stage.name].waiting == waiting, stage.name
     for name, unit in core.units.items():
         job = unit.queue[0] if unit.queue else None
