@@ -158,13 +158,14 @@ def _going_along(
     goes = seen_at(times, along, movers, bodies, output, joints)
     if goes.nobody.sum() >= stays.nobody.sum() and goes.share.mean() - stays.share.mean() < LEAST_GAIN:
         return camera
-    shares = f"in {goes.whole.mean():.0%} of the time; in {stays.whole.mean():.0%} if it"
     if goes.whole.sum() < stays.whole.sum():
-        note = f"does not go along with the person: the whole {what} would be in the picture {shares} stays, as it does"
-        return replace(camera, notes=(note,))
-    note = f"goes along with the person over the floor: the whole {what} is in the picture {shares} stayed"
-    lost = f", with no part of it in {stays.nobody.mean():.0%}" if stays.nobody.any() else ""
-    return replace(along, notes=(f"{note}{lost}",))
+        note = (
+            f"does not go along with the person over the floor: whole {what} in the picture in {stays.whole.mean():.0%}"
+        )
+        return replace(camera, notes=(f"{note} of the time; along with the person in {goes.whole.mean():.0%}",))
+    note = f"goes along with the person over the floor: whole {what} in the picture in {goes.whole.mean():.0%}"
+    lost = f", and no part of it in {stays.nobody.mean():.0%}" if stays.nobody.any() else ""
+    return replace(along, notes=(f"{note} of the time; without that in {stays.whole.mean():.0%}{lost}",))
 
 
 def _judged(path: CameraPath, movers: Sequence[Mover], ways: Sequence[Way]) -> F64:
