@@ -1,13 +1,11 @@
 """The camera in the scene: places a recorded one so that it films the avatars, and lets a person steer it.
 
 The recording is moved as one rigid, upright piece: it is turned about the vertical and shifted; its movement from frame
-to frame never changes. The best place shows whole bodies at the most moments; among equals the one where they are
-larger wins. Places are searched where the camera looks: along rays through its pictures, at distances from one that
-fills the picture with a body to many times the length of the path. So the search has no scale of its own. The best of
-them climb from there, in steps that are shares of the distance. At first the camera is in front of the avatars, in the
+to frame never changes. `camera_search` finds the place. At first the camera is in front of the avatars, in the
 direction that a heading of 0 faces. Over a drawn background the camera is also tilted by one constant angle, so that it
 does not look down on people, unless that hides them. The moments are those of the scene's first seconds, however many
-frames a run shows and at whatever rate: a frame of a scene is the same picture in every run.
+frames a run shows and at whatever rate: a frame of a scene is the same picture in every run. A built-in camera goes
+along with people who would leave its picture.
 
 A person turns the view about the vertical through a pivot, then about the level axis that runs to the camera's right.
 The camera stays upright, above the floor and off the pole; where the scene's own camera is beyond that, it is not
