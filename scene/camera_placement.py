@@ -1,13 +1,11 @@
 """The camera in the scene: places a recorded one so that it films the avatars, and lets a person steer it.
 
 The recording is moved as one rigid, upright piece: it is turned about the vertical and shifted; its movement from frame
-to frame never changes. The best place shows whole bodies at the most moments; among equals the one where they are
-larger wins. Places are searched where the camera looks: along rays through its pictures, at distances from one that
-fills the picture with a body to many times the length of the path. So the search has no scale of its own. The best of
-them climb from there, in steps that are shares of the distance. At first the camera is in front of the avatars, in the
+to frame never changes. `camera_search` finds the place. At first the camera is in front of the avatars, in the
 direction that a heading of 0 faces. Over a drawn background the camera is also tilted by one constant angle, so that it
 does not look down on people, unless that hides them. The moments are those of the scene's first seconds, however many
-frames a run shows and at whatever rate: a frame of a scene is the same picture in every run.
+frames a run shows and at whatever rate: a frame of a scene is the same picture in every run. A built-in camera goes
+along with people who would leave its picture.
 
 A person turns the view about the vertical through a pivot, then about the level axis that runs to the camera's right.
 The camera stays upright, above the floor and off the pole; where the scene's own camera is beyond that, it is not
@@ -158,13 +156,14 @@ def _going_along(
     goes = seen_at(times, along, movers, bodies, output, joints)
     if goes.nobody.sum() >= stays.nobody.sum() and goes.share.mean() - stays.share.mean() < LEAST_GAIN:
         return camera
-    shares = f"in {goes.whole.mean():.0%} of the time; in {stays.whole.mean():.0%} if it"
     if goes.whole.sum() < stays.whole.sum():
-        note = f"does not go along with the person: the whole {what} would be in the picture {shares} stays, as it does"
-        return replace(camera, notes=(note,))
-    note = f"goes along with the person over the floor: the whole {what} is in the picture {shares} stayed"
-    lost = f", with no part of it in {stays.nobody.mean():.0%}" if stays.nobody.any() else ""
-    return replace(along, notes=(f"{note}{lost}",))
+        note = (
+            f"does not go along with the person over the floor: whole {what} in the picture in {stays.whole.mean():.0%}"
+        )
+        return replace(camera, notes=(f"{note} of the time; along with the person in {goes.whole.mean():.0%}",))
+    note = f"goes along with the person over the floor: whole {what} in the picture in {goes.whole.mean():.0%}"
+    lost = f", and no part of it in {stays.nobody.mean():.0%}" if stays.nobody.any() else ""
+    return replace(along, notes=(f"{note} of the time; without that in {stays.whole.mean():.0%}{lost}",))
 
 
 def _judged(path: CameraPath, movers: Sequence[Mover], ways: Sequence[Way]) -> F64:

@@ -32,7 +32,7 @@ def rotation(vector: F64) -> F64:
         return np.eye(3)
     x, y, z = vector / angle
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
 
 
 def skinned(body: ShapedBody, mover: Mover, t_s: float) -> F64:
@@ -100,7 +100,7 @@ class PersonSearch:
         down = np.array([1.0, -1.0])
         pixels = self.focal[:, None] * seen[..., :2] * down / ahead + self.centre[:, None]
         beyond = np.abs(2 * pixels / self.size[:, None] - 1).max(axis=2) - 1
-        return np.where(depth > 0.05, beyond, 9.0).max(axis=1)
+        return np.asarray(np.where(depth > 0.05, beyond, 9.0).max(axis=1))
 
     def share(self, place: F64) -> float:
         """The share of the moments at which the whole body is in the picture."""
