@@ -23,7 +23,6 @@ from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_file import GraphFile
 from trilane.hw_profiles.host_model import MODEL_ERROR
 from trilane.hw_profiles.network_time import interval, price, spread_of
-from trilane.hw_profiles.profile_files import HOST
 from trilane.hw_profiles.rates import FrameInterval, holding
 from trilane.hw_profiles.schema import NORMAL_80, Profile, corners_of
 from trilane.pipeline.file_graph import edge_rules, graph_of, in_flight_of, settings_of, source_ns
@@ -32,7 +31,7 @@ from trilane.pipeline.pipeline_file import PipelineFile
 from trilane.scheduler.events import Graph, Settings
 from trilane.scheduler.period_bound import Bound, period_bound
 from trilane.scheduler.virtual import simulate
-from trilane.units import NS_PER_MS, UNITS, UnitName
+from trilane.units import HOST, NS_PER_MS, UNITS, UnitName
 
 DRAWS: Final = 200
 SIMULATIONS: Final = 20

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from trilane.apps.check.port_types import port_types, read_networks
 from trilane.apps.explain.explained_run import open_journal
-from trilane.apps.predict.predict_options import HOST, PredictOptions
+from trilane.apps.predict.predict_options import PredictOptions
 from trilane.hw_profiles.graph_file import GraphFile
 from trilane.hw_profiles.network_time import in_precision, under_runtime
 from trilane.hw_profiles.pipeline_prediction import NOTHING_MEASURED, Measured, predict_file, prices_of
@@ -21,7 +21,7 @@ from trilane.hw_profiles.schema import Profile
 from trilane.pipeline.file_keys import MOST_SAMPLES, OnnxStage, StageTime
 from trilane.pipeline.journal import Worked
 from trilane.pipeline.pipeline_file import TABLES, PipelineFile, read_pipeline
-from trilane.units import INFER, NS_PER_MS, UnitName
+from trilane.units import HOST, INFER, NS_PER_MS, UnitName
 
 #: A comma between two assignments, not one in a list or a table.
 BETWEEN: Final = re.compile(rf",(?=\s*(?:{'|'.join(TABLES)})\.)")
