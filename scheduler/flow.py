@@ -11,7 +11,7 @@ it in vain. A job that has begun it goes on, and what the job writes is thrown a
 is not dropped as stale on another, or two branches would choose different frames, and hardly any pair would meet.
 
 Side work. Only inputs of the newest frame take the work of some stages, so no picture waits for it. A frame that such a
-stage leaves out is dropped there alone, and is not counted.
+stage leaves out is dropped there alone, and is not counted. Nor is a frame that was presented before it is dropped.
 
 A bypass is the way past some stages of a chain. A frame on it overtakes none, and its slot goes back to the edge that
 it came from. The stage at which the bypass begins says of each frame whether it skips (`JobDone.skips`). The slot of
@@ -509,7 +509,10 @@ class Flow:
         else:
             readers = ",".join(reader.name for reader in behind.readers)
         writer = "source" if behind is before else behind.name
-        self._ledger.dropped[Drop(f"{writer}->{readers}", cause)] += 1
+        if state.is_presented:
+            self.aside -= 1
+        else:
+            self._ledger.dropped[Drop(f"{writer}->{readers}", cause)] += 1
         self._forget(frame, state)
         self._tell_bypass(state)
 
