@@ -11,7 +11,7 @@ it in vain. A job that has begun it goes on, and what the job writes is thrown a
 is not dropped as stale on another, or two branches would choose different frames, and hardly any pair would meet.
 
 Side work. Only inputs of the newest frame take the work of some stages, so no picture waits for it. A frame that such a
-stage leaves out is dropped there alone, and is not counted.
+stage leaves out is dropped there alone, and is not counted. Nor is a frame that was presented before it is dropped.
 
 A bypass is the way past some stages of a chain. A frame on it overtakes none, and its slot goes back to the edge that
 it came from. The stage at which the bypass begins says of each frame whether it skips (`JobDone.skips`). The slot of
@@ -263,25 +263,30 @@ class Flow:
         elif job.slot_in >= 0:
             self._release(stage, job)
         state.todo ^= stage.bit
-        sink, bypass = stage.output, self.bypass
+        sink = stage.output
         if not self.is_chain:
             state.jobs -= 1
         if sink is None:
             self._present(job.frame, state, end_ns)
         elif self.is_chain:
-            state.position = place = stage.position + 1
-            state.ready_ns[place] = end_ns
-            if bypass is not None and stage is bypass.begin and self._take_bypass(bypass, job):
-                return
-            replaced = sink.commit(job.slot_out)
-            if replaced:
-                self.drop(replaced, stage, DropCause.STALE)
-            if len(sink.ready) == 1 or self._drops:
-                self.mark_dirty(self.stages[place].unit)
+            self._commit_to_next(stage, sink, job, state, end_ns)
         else:
             self._commit(stage, sink, job.slot_out, state, end_ns)
             if not state.todo:
                 self._leave(job.frame)
+
+    def _commit_to_next(self, stage: StageState, sink: EdgeSlots, job: Job, state: FrameState, end_ns: int) -> None:
+        """Let the slot of a chain's frame wait for the next stage, or for the stage at which the bypass ends."""
+        state.position = place = stage.position + 1
+        state.ready_ns[place] = end_ns
+        bypass = self.bypass
+        if bypass is not None and stage is bypass.begin and self._take_bypass(bypass, job):
+            return
+        replaced = sink.commit(job.slot_out)
+        if replaced:
+            self.drop(replaced, stage, DropCause.STALE)
+        if len(sink.ready) == 1 or self._drops:
+            self.mark_dirty(self.stages[place].unit)
 
     def _commit(self, stage: StageState, sink: EdgeSlots, slot: int, state: FrameState, end_ns: int) -> None:
         """Let the slot wait for the readers of its frame."""
@@ -506,7 +511,10 @@ class Flow:
         else:
             readers = ",".join(reader.name for reader in behind.readers)
         writer = "source" if behind is before else behind.name
-        self._ledger.drop(frame, state.release_ns, Drop(f"{writer}->{readers}", cause))
+        if state.is_presented:
+            self.aside -= 1
+        else:
+            self._ledger.drop(frame, state.release_ns, Drop(f"{writer}->{readers}", cause))
         self._forget(frame, state)
         self._tell_bypass(state)
 

@@ -244,7 +244,8 @@ class PlainGraphScheduler(PlainGraph):
         self.end_if_over(frame)
 
     def drop(self, frame: Frame, edge: str, cause: str) -> None:
-        self.dropped[f"{edge}:{cause}"] += 1
+        if not frame.is_over:
+            self.dropped[f"{edge}:{cause}"] += 1
         self.remove(frame)
 
     def drop_from_queue(self, cause: str) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from typing import Any
 
@@ -43,7 +43,7 @@ def graph(*stages: StageSpec, rule: str = "double", to: str = "", released: bool
 
 
 def run(
-    described: Graph, times_ms: dict[str, float | Callable[[int], float]], frames: int = 60, **options: Any
+    described: Graph, times_ms: Mapping[str, float | Callable[[int], float]], frames: int = 60, **options: Any
 ) -> Simulation:
     """`times_ms`: time of each stage, or a function of the frame. `options`: of the driver; the others are settings."""
 
