@@ -27,7 +27,7 @@ from trilane.hw_profiles.profile_files import HOST
 from trilane.hw_profiles.rates import FrameInterval, holding
 from trilane.hw_profiles.schema import NORMAL_80, Profile, corners_of
 from trilane.pipeline.file_graph import edge_rules, graph_of, in_flight_of, settings_of, source_ns
-from trilane.pipeline.file_keys import BusyBlock, OnnxStage, StageTime
+from trilane.pipeline.file_keys import OnnxStage, StageTime
 from trilane.pipeline.pipeline_file import PipelineFile
 from trilane.scheduler.events import Graph, Settings
 from trilane.scheduler.period_bound import Bound, period_bound
@@ -71,9 +71,7 @@ class StagePrice:
 def given_price(file: PipelineFile, name: str) -> StagePrice | None:
     """Return the price that the file itself states for stage `name`; None where it states none."""
     stage = file.stages[name]
-    time, source = stage.time_ms, "time_ms"
-    if time is None and isinstance(stage, BusyBlock):
-        time, source = StageTime(mean=stage.load_ms), "load_ms"
+    time, source = stage.own_time, "time_ms" if stage.time_ms else "load_ms"
     if time is None:
         return None
     return StagePrice(time, source, low_ms=time.mean_ms, high_ms=time.mean_ms)
@@ -145,7 +143,7 @@ def prices_of(
 def bound_of(file: PipelineFile, prices: Mapping[str, StagePrice]) -> tuple[Graph, Bound]:
     """Return the scheduler's graph of a file and the bound on its period, from the mean times of its stages."""
     times = {name: each.mean_ns for name, each in prices.items()}
-    graph = graph_of(file, edge_rules(file, times))
+    graph = graph_of(file, edge_rules(file))
     return graph, period_bound(graph, times, in_flight_of(file), source_ns(file))
 
 
@@ -236,6 +234,7 @@ def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], graph: Graph, s
     done = simulate(replace(graph, from_release=False), ready, _Drawn(prices, seed)).report
     presented = done["frames"]["presented"]
     ms = done["duration_s"] * 1e3 / ready.frames if presented < ready.frames else done["frame_time_ms"]["mean"]
+    ms = max(ms, float(bound_ns) / NS_PER_MS)  # a short run ends with frames that its source is ahead by
     if not bound_ns or not any(each.spread for each in prices.values()):
         return FrameInterval(ms, ms, ms)
     rng = np.random.default_rng([seed, 1])

@@ -332,7 +332,7 @@ def test_measured_times_are_those_of_a_run_and_on_a_chip_times_their_scale(
     def service(stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
         return {"frame": 2, "depth": 20 - 10 * (frame % 2)}[stage] * 1_000_000
 
-    done = simulate(graph_of(file, edge_rules(file, None)), Settings(40), service, keep=True)
+    done = simulate(graph_of(file, edge_rules(file)), Settings(40), service, keep=True)
     run = write_run(tmp_path / "run", done)
     here = documents(text, "--measured", str(run))["pipelines"][0]["stages"]["depth"]
     assert (here["alone_ms"], here["service_ms"]["max"]) == (15, 20)
