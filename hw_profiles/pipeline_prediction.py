@@ -36,7 +36,7 @@ from trilane.units import NS_PER_MS, UNITS, UnitName
 
 DRAWS: Final = 200
 SIMULATIONS: Final = 20
-SIMULATED_FRAMES: Final = 100  # of each of them
+SIMULATED_FRAMES: Final = 100  # that each of them shows, about
 #: Frames of the run with an always ready source, where all times are constant and where some vary.
 CONSTANT_FRAMES, VARYING_FRAMES = 200, 1000
 BLOCK: Final = 4096  # frames whose times are drawn at once
@@ -268,7 +268,8 @@ def _intervals(
     if not any(each.spread for each in prices.values()):
         return {"low": frame_ms, "high": frame_ms}, {"low": latency_ms, "high": latency_ms}
     rng = np.random.default_rng([seed, 2])
-    count = min(report["frames"]["requested"], SIMULATED_FRAMES)
+    frames = report["frames"]
+    count = min(frames["requested"], SIMULATED_FRAMES * frames["requested"] // max(frames["presented"], 1))
     settings = settings_of(file, count, seed, hang_ns=NEVER_HANGS_NS)
     whole, *runs = [
         simulate(graph, settings, _Drawn(prices, seed, factors)).report
@@ -281,7 +282,7 @@ def _intervals(
         low, high = np.percentile([run[key]["mean"] / usual if usual else 1.0 for run in runs], QUANTILES)
         return {"low": float(mean * low), "high": float(mean * high)}
 
-    if report["frames"]["dropped"]:
+    if frames["dropped"]:
         return around("frame_time_ms", frame_ms), around("latency_ms", latency_ms)
     least = source_ns(file) / NS_PER_MS
     by_bound = {"low": max(least, needs.low_ms), "high": max(least, needs.high_ms)}
@@ -292,6 +293,12 @@ def _sentence(fps: float, needs: FrameInterval) -> str:
     """Say whether the rate holds: `holds 30 fps: yes; 12-19 ms of 33 ms (80 %)`."""
     frame_ms = 1e3 / fps
     holds = "yes" if needs.high_ms <= frame_ms else "no" if needs.low_ms > frame_ms else "perhaps"
-    if needs.low_ms == needs.high_ms:
-        return f"holds {fps:g} fps: {holds}; {needs.ms:.3g} ms of {frame_ms:.3g} ms"
-    return f"holds {fps:g} fps: {holds}; {needs.low_ms:.3g}-{needs.high_ms:.3g} ms of {frame_ms:.3g} ms (80 %)"
+    low, high = _short(needs.low_ms), _short(needs.high_ms)
+    span = f"{low} ms" if low == high else f"{low}-{high} ms"
+    share = "" if needs.low_ms == needs.high_ms else " (80 %)"
+    return f"holds {fps:g} fps: {holds}; {span} of {_short(frame_ms)} ms{share}"
+
+
+def _short(ms: float) -> str:
+    """Return a time with three digits, without an exponent."""
+    return f"{ms:.3g}" if ms < 100 else f"{ms:.0f}"
