@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import Any, Final, NamedTuple
 from zlib import crc32
 
@@ -239,17 +240,26 @@ def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], graph: Graph, s
         return FrameInterval(ms, ms, ms)
     rng = np.random.default_rng([seed, 1])
     found = []
-    for _ in range(DRAWS):
-        factors = _factors(prices, rng)
-        drawn = {name: round(ns * factors[name]) for name, ns in times.items()}
+    for factors in _factors(prices, rng, DRAWS):
+        drawn = {name: round(ns * factors.get(name, 1.0)) for name, ns in times.items()}
         found.append(float(period_bound(graph, drawn, in_flight).period_ns / bound_ns))
     low, high = np.percentile(found, QUANTILES)
     return FrameInterval(ms, float(ms * low), float(ms * high))
 
 
-def _factors(prices: Mapping[str, StagePrice], rng: np.random.Generator) -> dict[str, float]:
-    """Draw by how much the model of the chip may be wrong for each stage."""
-    return {name: math.exp(each.spread * rng.standard_normal()) for name, each in prices.items()}
+def _factors(prices: Mapping[str, StagePrice], rng: np.random.Generator, count: int) -> list[dict[str, float]]:
+    """Draw `count` times by how much the model of the chip may be wrong for each stage.
+
+    Each stage meets each of `count` equally likely ranges once, in a random order (a Latin hypercube), so that few
+    draws give good quantiles.
+    """
+    normal = NormalDist()
+    middles = [normal.inv_cdf((place + 0.5) / count) for place in range(count)]
+    orders = {name: rng.permutation(count).tolist() for name, each in prices.items() if each.spread}
+    return [
+        {name: math.exp(prices[name].spread * middles[order[draw]]) for name, order in orders.items()}
+        for draw in range(count)
+    ]
 
 
 def _intervals(
@@ -273,7 +283,7 @@ def _intervals(
     settings = settings_of(file, count, seed, hang_ns=NEVER_HANGS_NS)
     whole, *runs = [
         simulate(graph, settings, _Drawn(prices, seed, factors)).report
-        for factors in ({}, *(_factors(prices, rng) for _ in range(SIMULATIONS)))
+        for factors in ({}, *_factors(prices, rng, SIMULATIONS))
     ]
 
     def around(key: str, mean: float) -> dict[str, float]:
