@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_file import GraphFile
-from trilane.hw_profiles.host_model import MODEL_ERROR
+from trilane.hw_profiles.host_model import MODEL_ERROR, UNMEASURED
 from trilane.hw_profiles.network_time import interval, price, spread_of
 from trilane.hw_profiles.profile_files import HOST
 from trilane.hw_profiles.rates import FrameInterval, holding
@@ -54,14 +54,15 @@ class StagePrice:
     """The time of a job of a stage.
 
     `source`: where it comes from. `spread`: standard deviation of the logarithm of its error; 0 for times that the file
-    gives. `low_ms`, `high_ms`: 80 % interval of the mean. `why`: reasons for its width.
+    gives. `low_ms`, `high_ms`: 80 % interval of the mean; None where nobody knows the error. `why`: reasons for its
+    width, or why there is none.
     """
 
     time: StageTime
     source: str
     spread: float = 0.0
-    low_ms: float = 0.0
-    high_ms: float = 0.0
+    low_ms: float | None = None
+    high_ms: float | None = None
     why: tuple[str, ...] = ()
 
     @property
@@ -83,6 +84,8 @@ def network_price(chip: Profile, graph: GraphFile, unit: UnitName, performance_p
     time = price(chip, graph.work, unit, corners_of(chip, performance_profile))
     around = interval(chip, graph.work, time)
     source = f"{chip.name}, {unit} in {chip.units[unit].precision}"
+    if chip.name == HOST and chip.units[unit].measured is None:
+        return StagePrice(StageTime(mean=time.total_ms), source, why=(UNMEASURED,))
     spread = spread_of(around) if around.low_ms > 0 else 0.0
     return StagePrice(StageTime(mean=time.total_ms), source, spread, around.low_ms, around.high_ms, around.why)
 
@@ -209,6 +212,18 @@ def predict_file(
     }
     if file.run.fps is not None:
         answer["rate"] = {**holding(file.run.fps, needs), "sentence": _sentence(file.run.fps, needs)}
+    return answer if all(each.low_ms is not None for each in prices.values()) else _without_intervals(answer)
+
+
+def _without_intervals(answer: dict[str, Any]) -> dict[str, Any]:
+    """Return the prediction with null for its intervals, as the error of a stage is unknown."""
+    for key in ("needs_ms", "frame_time_ms", "latency_ms"):
+        answer[key] = {**answer[key], "low": None, "high": None}
+    if rate := answer.get("rate"):
+        words = rate["words"].partition(",")[0]
+        holds = f"{'yes' if rate['holds'] else 'no'}; {_short(answer['needs_ms']['mean'])} ms"
+        sentence = f"holds {rate['fps']:g} fps: {holds} of {_short(1e3 / rate['fps'])} ms (no interval)"
+        answer["rate"] = {**rate, "words": words, "sentence": sentence, "reserve_low": None, "reserve_high": None}
     return answer
 
 

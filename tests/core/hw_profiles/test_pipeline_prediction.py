@@ -219,6 +219,18 @@ def test_a_network_has_the_time_that_it_has_by_itself(
     assert document["machine"]["profile"] == "snapdragon-8-gen-3"
 
 
+def test_this_machine_unmeasured_has_no_interval(documents: Predict) -> None:
+    """Nothing measures its GPU, so its speeds are assumed, as for a network by itself."""
+    text = "[run]\nfps = 1000" + NETWORK.replace("UNIT", "gpu")
+    answer = documents(text, "--profile", "host")["pipelines"][0]
+    for times in (answer["needs_ms"], answer["frame_time_ms"], answer["latency_ms"]):
+        assert (times["low"], times["high"]) == (None, None)
+    row, rate = answer["stages"]["seg"], answer["rate"]
+    assert (row["low_ms"], rate["reserve_low"]) == (None, None)
+    assert rate["sentence"].endswith("of 1 ms (no interval)")
+    assert "assumed" in row["why"][0]
+
+
 def test_a_time_of_the_file_overrides_the_networks_and_needs_no_chip(documents: Predict) -> None:
     text = NETWORK.replace("UNIT", "dsp").replace('in = "frame"', 'in = "frame", time_ms = 7')
     document = documents(text)
