@@ -130,7 +130,8 @@ def prices_of(
     """
     found = {}
     for name, stage in file.stages.items():
-        known = given_price(file, name) or measured_price(file, name, measured)
+        known = None if stage.time_ms is None else given_price(file, name)
+        known = known or measured_price(file, name, measured) or given_price(file, name)
         if known is None and isinstance(stage, OnnxStage):
             unit = next(each for each in UNITS if each == file.hardware(stage.unit))
             known = network_price(chip_for(name, graphs[name], unit), graphs[name], unit, performance_profile)

@@ -342,11 +342,13 @@ def test_measured_times_are_those_of_a_run_and_on_a_chip_times_their_scale(
     file = read_pipeline(write_file(tmp_path, text))
 
     def service(stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
-        return {"frame": 2, "depth": 20 - 10 * (frame % 2)}[stage] * 1_000_000
+        return {"frame": 3, "depth": 20 - 10 * (frame % 2)}[stage] * 1_000_000
 
     done = simulate(graph_of(file, edge_rules(file)), Settings(40), service, keep=True)
     run = write_run(tmp_path / "run", done)
-    here = documents(text, "--measured", str(run))["pipelines"][0]["stages"]["depth"]
+    rows = documents(text, "--measured", str(run))["pipelines"][0]["stages"]
+    here = rows["depth"]
+    assert rows["frame"]["alone_ms"] == 3  # not 2, which the file only asks for
     assert (here["alone_ms"], here["service_ms"]["max"]) == (15, 20)
     assert here["low_ms"] < 15 < here["high_ms"]
     chip = documents(text, "--measured", str(run), "--profile", "snapdragon-888")["pipelines"][0]["stages"]["depth"]
