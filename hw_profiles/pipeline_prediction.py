@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import Any, Final, NamedTuple
 from zlib import crc32
 
@@ -21,12 +22,12 @@ from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_file import GraphFile
-from trilane.hw_profiles.host_model import MODEL_ERROR
+from trilane.hw_profiles.host_model import MODEL_ERROR, UNMEASURED
 from trilane.hw_profiles.network_time import interval, price, spread_of
 from trilane.hw_profiles.rates import FrameInterval, holding
 from trilane.hw_profiles.schema import NORMAL_80, Profile, corners_of
 from trilane.pipeline.file_graph import edge_rules, graph_of, in_flight_of, settings_of, source_ns
-from trilane.pipeline.file_keys import BusyBlock, OnnxStage, StageTime
+from trilane.pipeline.file_keys import OnnxStage, StageTime
 from trilane.pipeline.pipeline_file import PipelineFile
 from trilane.scheduler.events import Graph, Settings
 from trilane.scheduler.period_bound import Bound, period_bound
@@ -35,7 +36,7 @@ from trilane.units import HOST, NS_PER_MS, UNITS, UnitName
 
 DRAWS: Final = 200
 SIMULATIONS: Final = 20
-SIMULATED_FRAMES: Final = 100  # of each of them
+SIMULATED_FRAMES: Final = 100  # that each of them shows, about
 #: Frames of the run with an always ready source, where all times are constant and where some vary.
 CONSTANT_FRAMES, VARYING_FRAMES = 200, 1000
 BLOCK: Final = 4096  # frames whose times are drawn at once
@@ -52,14 +53,15 @@ class StagePrice:
     """The time of a job of a stage.
 
     `source`: where it comes from. `spread`: standard deviation of the logarithm of its error; 0 for times that the file
-    gives. `low_ms`, `high_ms`: 80 % interval of the mean. `why`: reasons for its width.
+    gives. `low_ms`, `high_ms`: 80 % interval of the mean; None where nobody knows the error. `why`: reasons for its
+    width, or why there is none.
     """
 
     time: StageTime
     source: str
     spread: float = 0.0
-    low_ms: float = 0.0
-    high_ms: float = 0.0
+    low_ms: float | None = None
+    high_ms: float | None = None
     why: tuple[str, ...] = ()
 
     @property
@@ -70,9 +72,7 @@ class StagePrice:
 def given_price(file: PipelineFile, name: str) -> StagePrice | None:
     """Return the price that the file itself states for stage `name`; None where it states none."""
     stage = file.stages[name]
-    time, source = stage.time_ms, "time_ms"
-    if time is None and isinstance(stage, BusyBlock):
-        time, source = StageTime(mean=stage.load_ms), "load_ms"
+    time, source = stage.own_time, "time_ms" if stage.time_ms else "load_ms"
     if time is None:
         return None
     return StagePrice(time, source, low_ms=time.mean_ms, high_ms=time.mean_ms)
@@ -83,6 +83,8 @@ def network_price(chip: Profile, graph: GraphFile, unit: UnitName, performance_p
     time = price(chip, graph.work, unit, corners_of(chip, performance_profile))
     around = interval(chip, graph.work, time)
     source = f"{chip.name}, {unit} in {chip.units[unit].precision}"
+    if chip.name == HOST and chip.units[unit].measured is None:
+        return StagePrice(StageTime(mean=time.total_ms), source, why=(UNMEASURED,))
     spread = spread_of(around) if around.low_ms > 0 else 0.0
     return StagePrice(StageTime(mean=time.total_ms), source, spread, around.low_ms, around.high_ms, around.why)
 
@@ -127,7 +129,8 @@ def prices_of(
     """
     found = {}
     for name, stage in file.stages.items():
-        known = given_price(file, name) or measured_price(file, name, measured)
+        known = None if stage.time_ms is None else given_price(file, name)
+        known = known or measured_price(file, name, measured) or given_price(file, name)
         if known is None and isinstance(stage, OnnxStage):
             unit = next(each for each in UNITS if each == file.hardware(stage.unit))
             known = network_price(chip_for(name, graphs[name], unit), graphs[name], unit, performance_profile)
@@ -144,7 +147,7 @@ def prices_of(
 def bound_of(file: PipelineFile, prices: Mapping[str, StagePrice]) -> tuple[Graph, Bound]:
     """Return the scheduler's graph of a file and the bound on its period, from the mean times of its stages."""
     times = {name: each.mean_ns for name, each in prices.items()}
-    graph = graph_of(file, edge_rules(file, times))
+    graph = graph_of(file, edge_rules(file))
     return graph, period_bound(graph, times, in_flight_of(file), source_ns(file))
 
 
@@ -209,6 +212,18 @@ def predict_file(
     }
     if file.run.fps is not None:
         answer["rate"] = {**holding(file.run.fps, needs), "sentence": _sentence(file.run.fps, needs)}
+    return answer if all(each.low_ms is not None for each in prices.values()) else _without_intervals(answer)
+
+
+def _without_intervals(answer: dict[str, Any]) -> dict[str, Any]:
+    """Return the prediction with null for its intervals, as the error of a stage is unknown."""
+    for key in ("needs_ms", "frame_time_ms", "latency_ms"):
+        answer[key] = {**answer[key], "low": None, "high": None}
+    if rate := answer.get("rate"):
+        words = rate["words"].partition(",")[0]
+        holds = f"{'yes' if rate['holds'] else 'no'}; {_short(answer['needs_ms']['mean'])} ms"
+        sentence = f"holds {rate['fps']:g} fps: {holds} of {_short(1e3 / rate['fps'])} ms (no interval)"
+        answer["rate"] = {**rate, "words": words, "sentence": sentence, "reserve_low": None, "reserve_high": None}
     return answer
 
 
@@ -235,21 +250,31 @@ def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], graph: Graph, s
     done = simulate(replace(graph, from_release=False), ready, _Drawn(prices, seed)).report
     presented = done["frames"]["presented"]
     ms = done["duration_s"] * 1e3 / ready.frames if presented < ready.frames else done["frame_time_ms"]["mean"]
+    ms = max(ms, float(bound_ns) / NS_PER_MS)  # a short run ends with frames that its source is ahead by
     if not bound_ns or not any(each.spread for each in prices.values()):
         return FrameInterval(ms, ms, ms)
     rng = np.random.default_rng([seed, 1])
     found = []
-    for _ in range(DRAWS):
-        factors = _factors(prices, rng)
-        drawn = {name: round(ns * factors[name]) for name, ns in times.items()}
+    for factors in _factors(prices, rng, DRAWS):
+        drawn = {name: round(ns * factors.get(name, 1.0)) for name, ns in times.items()}
         found.append(float(period_bound(graph, drawn, in_flight).period_ns / bound_ns))
     low, high = np.percentile(found, QUANTILES)
     return FrameInterval(ms, float(ms * low), float(ms * high))
 
 
-def _factors(prices: Mapping[str, StagePrice], rng: np.random.Generator) -> dict[str, float]:
-    """Draw by how much the model of the chip may be wrong for each stage."""
-    return {name: math.exp(each.spread * rng.standard_normal()) for name, each in prices.items()}
+def _factors(prices: Mapping[str, StagePrice], rng: np.random.Generator, count: int) -> list[dict[str, float]]:
+    """Draw `count` times by how much the model of the chip may be wrong for each stage.
+
+    Each stage meets each of `count` equally likely ranges once, in a random order (a Latin hypercube), so that few
+    draws give good quantiles.
+    """
+    normal = NormalDist()
+    middles = [normal.inv_cdf((place + 0.5) / count) for place in range(count)]
+    orders = {name: rng.permutation(count).tolist() for name, each in prices.items() if each.spread}
+    return [
+        {name: math.exp(prices[name].spread * middles[order[draw]]) for name, order in orders.items()}
+        for draw in range(count)
+    ]
 
 
 def _intervals(
@@ -268,11 +293,12 @@ def _intervals(
     if not any(each.spread for each in prices.values()):
         return {"low": frame_ms, "high": frame_ms}, {"low": latency_ms, "high": latency_ms}
     rng = np.random.default_rng([seed, 2])
-    count = min(report["frames"]["requested"], SIMULATED_FRAMES)
+    frames = report["frames"]
+    count = min(frames["requested"], SIMULATED_FRAMES * frames["requested"] // max(frames["presented"], 1))
     settings = settings_of(file, count, seed, hang_ns=NEVER_HANGS_NS)
     whole, *runs = [
         simulate(graph, settings, _Drawn(prices, seed, factors)).report
-        for factors in ({}, *(_factors(prices, rng) for _ in range(SIMULATIONS)))
+        for factors in ({}, *_factors(prices, rng, SIMULATIONS))
     ]
 
     def around(key: str, mean: float) -> dict[str, float]:
@@ -281,7 +307,7 @@ def _intervals(
         low, high = np.percentile([run[key]["mean"] / usual if usual else 1.0 for run in runs], QUANTILES)
         return {"low": float(mean * low), "high": float(mean * high)}
 
-    if report["frames"]["dropped"]:
+    if frames["dropped"]:
         return around("frame_time_ms", frame_ms), around("latency_ms", latency_ms)
     least = source_ns(file) / NS_PER_MS
     by_bound = {"low": max(least, needs.low_ms), "high": max(least, needs.high_ms)}
@@ -292,6 +318,12 @@ def _sentence(fps: float, needs: FrameInterval) -> str:
     """Say whether the rate holds: `holds 30 fps: yes; 12-19 ms of 33 ms (80 %)`."""
     frame_ms = 1e3 / fps
     holds = "yes" if needs.high_ms <= frame_ms else "no" if needs.low_ms > frame_ms else "perhaps"
-    if needs.low_ms == needs.high_ms:
-        return f"holds {fps:g} fps: {holds}; {needs.ms:.3g} ms of {frame_ms:.3g} ms"
-    return f"holds {fps:g} fps: {holds}; {needs.low_ms:.3g}-{needs.high_ms:.3g} ms of {frame_ms:.3g} ms (80 %)"
+    low, high = _short(needs.low_ms), _short(needs.high_ms)
+    span = f"{low} ms" if low == high else f"{low}-{high} ms"
+    share = "" if needs.low_ms == needs.high_ms else " (80 %)"
+    return f"holds {fps:g} fps: {holds}; {span} of {_short(frame_ms)} ms{share}"
+
+
+def _short(ms: float) -> str:
+    """Return a time with three digits, without an exponent."""
+    return f"{ms:.3g}" if ms < 100 else f"{ms:.0f}"
