@@ -199,7 +199,7 @@ def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str
 
 
 def _port(file: PipelineFile, name: str, each: StageInput, types: PortTypes) -> str:
-    """Return the port of a stream that an input reads. Raises BadInputError where several are there and none is named."""
+    """Return the port of a stream that an input reads. Raises BadInputError where it must be named and is not."""
     ports = types[each.stage]
     if each.from_port or len(ports) == 1:
         chosen = each.from_port or next(iter(ports))
