@@ -27,7 +27,7 @@ from trilane.hw_profiles.profile_files import HOST
 from trilane.hw_profiles.rates import FrameInterval, holding
 from trilane.hw_profiles.schema import NORMAL_80, Profile, corners_of
 from trilane.pipeline.file_graph import edge_rules, graph_of, in_flight_of, settings_of, source_ns
-from trilane.pipeline.file_keys import BusyBlock, OnnxStage, StageTime
+from trilane.pipeline.file_keys import OnnxStage, StageTime
 from trilane.pipeline.pipeline_file import PipelineFile
 from trilane.scheduler.events import Graph, Settings
 from trilane.scheduler.period_bound import Bound, period_bound
@@ -36,7 +36,7 @@ from trilane.units import NS_PER_MS, UNITS, UnitName
 
 DRAWS: Final = 200
 SIMULATIONS: Final = 20
-SIMULATED_FRAMES: Final = 100  # of each of them
+SIMULATED_FRAMES: Final = 100  # that each of them shows, about
 #: Frames of the run with an always ready source, where all times are constant and where some vary.
 CONSTANT_FRAMES, VARYING_FRAMES = 200, 1000
 BLOCK: Final = 4096  # frames whose times are drawn at once
@@ -71,9 +71,7 @@ class StagePrice:
 def given_price(file: PipelineFile, name: str) -> StagePrice | None:
     """Return the price that the file itself states for stage `name`; None where it states none."""
     stage = file.stages[name]
-    time, source = stage.time_ms, "time_ms"
-    if time is None and isinstance(stage, BusyBlock):
-        time, source = StageTime(mean=stage.load_ms), "load_ms"
+    time, source = stage.own_time, "time_ms" if stage.time_ms else "load_ms"
     if time is None:
         return None
     return StagePrice(time, source, low_ms=time.mean_ms, high_ms=time.mean_ms)
@@ -145,7 +143,7 @@ def prices_of(
 def bound_of(file: PipelineFile, prices: Mapping[str, StagePrice]) -> tuple[Graph, Bound]:
     """Return the scheduler's graph of a file and the bound on its period, from the mean times of its stages."""
     times = {name: each.mean_ns for name, each in prices.items()}
-    graph = graph_of(file, edge_rules(file, times))
+    graph = graph_of(file, edge_rules(file))
     return graph, period_bound(graph, times, in_flight_of(file), source_ns(file))
 
 
@@ -236,6 +234,7 @@ def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], graph: Graph, s
     done = simulate(replace(graph, from_release=False), ready, _Drawn(prices, seed)).report
     presented = done["frames"]["presented"]
     ms = done["duration_s"] * 1e3 / ready.frames if presented < ready.frames else done["frame_time_ms"]["mean"]
+    ms = max(ms, float(bound_ns) / NS_PER_MS)  # a short run ends with frames that its source is ahead by
     if not bound_ns or not any(each.spread for each in prices.values()):
         return FrameInterval(ms, ms, ms)
     rng = np.random.default_rng([seed, 1])
@@ -269,25 +268,37 @@ def _intervals(
     if not any(each.spread for each in prices.values()):
         return {"low": frame_ms, "high": frame_ms}, {"low": latency_ms, "high": latency_ms}
     rng = np.random.default_rng([seed, 2])
-    count = min(report["frames"]["requested"], SIMULATED_FRAMES)
+    frames = report["frames"]
+    count = min(frames["requested"], SIMULATED_FRAMES * frames["requested"] // max(frames["presented"], 1))
     settings = settings_of(file, count, seed, hang_ns=NEVER_HANGS_NS)
-    runs = [simulate(graph, settings, _Drawn(prices, seed, _factors(prices, rng))).report for _ in range(SIMULATIONS)]
-    latency = _quantiles([run["latency_ms"]["mean"] for run in runs])
-    if report["frames"]["dropped"]:
-        return _quantiles([run["frame_time_ms"]["mean"] for run in runs]), latency
+    whole, *runs = [
+        simulate(graph, settings, _Drawn(prices, seed, factors)).report
+        for factors in ({}, *(_factors(prices, rng) for _ in range(SIMULATIONS)))
+    ]
+
+    def around(key: str, mean: float) -> dict[str, float]:
+        """Return the interval by what errors change in short runs, whose own jitter is the same in each."""
+        usual = whole[key]["mean"]
+        low, high = np.percentile([run[key]["mean"] / usual if usual else 1.0 for run in runs], QUANTILES)
+        return {"low": float(mean * low), "high": float(mean * high)}
+
+    if frames["dropped"]:
+        return around("frame_time_ms", frame_ms), around("latency_ms", latency_ms)
     least = source_ns(file) / NS_PER_MS
-    return {"low": max(least, needs.low_ms), "high": max(least, needs.high_ms)}, latency
-
-
-def _quantiles(values: list[float]) -> dict[str, float]:
-    low, high = np.percentile(values, QUANTILES)
-    return {"low": float(low), "high": float(high)}
+    by_bound = {"low": max(least, needs.low_ms), "high": max(least, needs.high_ms)}
+    return by_bound, around("latency_ms", latency_ms)
 
 
 def _sentence(fps: float, needs: FrameInterval) -> str:
     """Say whether the rate holds: `holds 30 fps: yes; 12-19 ms of 33 ms (80 %)`."""
     frame_ms = 1e3 / fps
     holds = "yes" if needs.high_ms <= frame_ms else "no" if needs.low_ms > frame_ms else "perhaps"
-    if needs.low_ms == needs.high_ms:
-        return f"holds {fps:g} fps: {holds}; {needs.ms:.3g} ms of {frame_ms:.3g} ms"
-    return f"holds {fps:g} fps: {holds}; {needs.low_ms:.3g}-{needs.high_ms:.3g} ms of {frame_ms:.3g} ms (80 %)"
+    low, high = _short(needs.low_ms), _short(needs.high_ms)
+    span = f"{low} ms" if low == high else f"{low}-{high} ms"
+    share = "" if needs.low_ms == needs.high_ms else " (80 %)"
+    return f"holds {fps:g} fps: {holds}; {span} of {_short(frame_ms)} ms{share}"
+
+
+def _short(ms: float) -> str:
+    """Return a time with three digits, without an exponent."""
+    return f"{ms:.3g}" if ms < 100 else f"{ms:.0f}"

@@ -70,24 +70,31 @@ def settings_of(file: PipelineFile, frames: int = 0, seed: int = 0, **others: An
     return run_settings(run.policy, count, period_ns, period_ns, **given)
 
 
-def edge_rules(file: PipelineFile, times_ns: Mapping[str, int] | None) -> dict[str, str]:
+def edge_rules(file: PipelineFile, times_ns: Mapping[str, int] | None = None) -> dict[str, str]:
     """Return the rule of each stream: that of the file, else two slots, or more where branches meet.
 
-    Then it has the fewest slots that do not lengthen the period.
+    Then it has the fewest slots that do not lengthen the period by the times of the file. Where the file does not state
+    them all, each stage counts as equally long and as if it had a unit of its own. That is enough for any times: a
+    cycle then has no more stages than slots. So a run and all predictions of a file have the same slots.
 
-    `times_ns`: time of a job of each stage; None where they are unknown. Then all stages count as equally long, and
-    each as if it had a unit of its own.
+    `times_ns`: time of a job of each stage, in place of those of the file.
     """
     given = {name: file.run.edge for name in file.readers} if file.run.edge else {}
     given |= file.edges
     rules = {name: given.get(name, "double") for name in file.readers}
-    graph = graph_of(file, rules)
-    if times_ns is None:
+    graph, in_flight, times_ns = graph_of(file, rules), in_flight_of(file), times_ns or _own_times_ns(file)
+    if not times_ns:
         apart = tuple(replace(stage, unit=stage.name) for stage in graph.stages)
-        graph, times_ns = replace(graph, stages=apart), dict.fromkeys(file.stages, 1)
-    slots = fewest_slots(graph, times_ns, given, in_flight_of(file))
+        graph, in_flight, times_ns = replace(graph, stages=apart), 0, dict.fromkeys(file.stages, 1)
+    slots = fewest_slots(graph, times_ns, given, in_flight)
     pairs = zip(rules, slots, strict=True)
     return rules | {name: f"fifo:{count}" for name, count in pairs if name not in given and count > LEAST_SLOTS}
+
+
+def _own_times_ns(file: PipelineFile) -> dict[str, int]:
+    """Return the mean time of a job of each stage, if the file states all of them; else nothing."""
+    known = {name: time.mean_ms for name, stage in file.stages.items() if (time := stage.own_time) is not None}
+    return {name: round(ms * NS_PER_MS) for name, ms in known.items()} if len(known) == len(file.stages) else {}
 
 
 def in_flight_of(file: PipelineFile) -> int:

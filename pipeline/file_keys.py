@@ -368,6 +368,11 @@ class StageKeys(Keys):
         return self.kind
 
     @property
+    def own_time(self) -> StageTime | None:
+        """The time that the file itself states; None where it states none."""
+        return self.time_ms
+
+    @property
     def out_ports(self) -> tuple[str, ...] | None:
         return None if self.out is None else tuple(self.out)
 
@@ -468,6 +473,10 @@ class BusyBlock(BlockStage):
     """A load that is made up."""
 
     load_ms: float = Field(ge=0, le=LONGEST_MS, allow_inf_nan=False, description="How long it works, ms.")
+
+    @property
+    def own_time(self) -> StageTime | None:
+        return self.time_ms or StageTime(mean=self.load_ms)
 
 
 BLOCKS: Final[dict[str, type[BlockStage]]] = {

@@ -49,6 +49,7 @@ from trilane.units import UNITS
 MOST_BYTES: Final = 16 << 20
 MOST_PERIOD: Final = 100_000  # of a stage, in frames: the least common multiple of all `every` before it
 TABLES: Final = ("run", "units", "stages", "edges")
+STAGES: Final = re.compile(rb"""^\s*(\[\s*["']?stages["']?\s*[\].]|["']?stages["']?\s*[.=])""", re.MULTILINE)
 FORM: Final = "a pipeline file, TOML in UTF-8"
 #: Tables that a stage's key may hold, by the key.
 INNER: Final[dict[str, type[Keys]]] = {"in": InputKeys, "time_ms": StageTime}
@@ -125,10 +126,7 @@ def read_pipeline(path: Path) -> PipelineFile:
 
 
 def is_pipeline_file(path: Path) -> bool:
-    """Say whether a file looks like a pipeline file: a .toml with stages, or one that is not there or cannot be read.
-
-    A scene is a .toml file too, and has no stages.
-    """
+    """Say whether a file looks like a pipeline file: a .toml with stages. A scene is a .toml too, and has none."""
     if path.suffix != ".toml":
         return False
     try:
@@ -136,7 +134,7 @@ def is_pipeline_file(path: Path) -> bool:
             text = file.read(MOST_BYTES)
     except OSError:
         return False
-    return re.search(rb"^\s*\[\s*\"?stages\"?\s*[\].]", text, re.MULTILINE) is not None
+    return STAGES.search(text) is not None
 
 
 def _of_toml(path: Path, message: str) -> BadInputError:

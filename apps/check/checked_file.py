@@ -31,11 +31,10 @@ def check_file(path: Path) -> dict[str, Any]:
     types = port_types(file, read_networks(file))
     prices = {name: price for name in file.stages if (price := given_price(file, name)) is not None}
     known = prices if len(prices) == len(file.stages) else None
-    rules = edge_rules(file, None)
+    rules = edge_rules(file)
     period: dict[str, Any] = {"period_ms": None, "cycle": [], "limit": ""}
     if known is not None:
-        graph, bound = bound_of(file, known)
-        rules = dict(zip(graph.streams, graph.edges, strict=True))
+        _, bound = bound_of(file, known)
         period = {
             "period_ms": float(bound.period_ns) / NS_PER_MS,
             "cycle": list(bound.stages),

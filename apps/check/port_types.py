@@ -17,6 +17,7 @@ import onnx
 
 from trilane.errors import BadInputError, did_you_mean
 from trilane.hw_profiles.graph_file import GraphFile, read_graph
+from trilane.hw_profiles.network_work import constant_tensors
 from trilane.pipeline.file_keys import (
     TYPES,
     EncodeBlock,
@@ -64,9 +65,15 @@ def _read(file: PipelineFile, name: str, stage: OnnxStage) -> GraphFile:
         raise BadInputError(f"{where}.onnx: {error.where}", found, error.expected, remedy) from None
 
 
+def data_inputs(graph: GraphFile) -> list[onnx.ValueInfoProto]:
+    """Return the inputs of a network that are no weights; a graph without values has its weights as inputs."""
+    weights = constant_tensors(graph.model.graph)
+    return [value for value in graph.model.graph.input if value.name not in weights]
+
+
 def _check_names(file: PipelineFile, name: str, stage: OnnxStage, graph: GraphFile) -> None:
     """Check that each input of a network is fed, and that no other one is."""
-    where, inputs = f"{file.path}: stages.{name}", [value.name for value in graph.model.graph.input]
+    where, inputs = f"{file.path}: stages.{name}", [value.name for value in data_inputs(graph)]
     for shape in stage.shapes:
         if shape not in inputs:
             expected = f"one of {', '.join(inputs)}"
@@ -116,7 +123,7 @@ def _written(
     if isinstance(stage, VideoBlock):
         return {"": PortType("u8", (stage.size[1], stage.size[0], 3))}
     if isinstance(stage, PrepareBlock):
-        inputs = networks[stage.like].model.graph.input
+        inputs = data_inputs(networks[stage.like])
         chosen = [value for value in inputs if stage.port in ("", value.name)]
         wanted = value_type(chosen[0]) if len(chosen) == 1 else None
         return {"": wanted} if wanted else {}
@@ -171,7 +178,7 @@ def _check_inputs(
 
 def _check_network(where: str, found: PortType, each: StageInput, network: GraphFile) -> None:
     """Check what a network's input reads: that type, or a picture where the network takes one."""
-    inputs = network.model.graph.input
+    inputs = data_inputs(network)
     value = next(one for one in inputs if each.port in ("", one.name))
     wanted = value_type(value)
     if wanted is None or (found.dtype == wanted.dtype and math.prod(found.shape) == math.prod(wanted.shape)):

@@ -63,7 +63,10 @@ def _show(console: Console, answer: Mapping[str, Any]) -> None:
     console.print(_units(answer))
     for name, row in answer.get("streams", {}).items():
         age, behind = row["age_ms"], row["frames_behind"]
-        console.print(f"newest of       {name}: {_ms(age['mean'])} old, {behind['mean']:.1f} frames behind")
+        said = (
+            f"{_ms(age['mean'])} old, {behind['mean']:.1f} frames behind" if age["samples"] else "never there in time"
+        )
+        console.print(f"newest of       {name}: {said}")
 
 
 def _ms(value: float) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from math import log, sqrt
 from pathlib import Path
 from statistics import fmean, stdev
@@ -13,7 +14,7 @@ import pytest
 
 from support.pipeline_files import CUT, DEPTH, STREET, write_file
 from support.run_folders import write_run
-from trilane.hw_profiles.pipeline_prediction import _sentence
+from trilane.hw_profiles.pipeline_prediction import _sentence, given_price, predict_file
 from trilane.hw_profiles.rates import FrameInterval
 from trilane.pipeline.file_graph import edge_rules, graph_of
 from trilane.pipeline.pipeline_file import read_pipeline
@@ -160,6 +161,23 @@ def test_samples_are_drawn_as_they_are(predict: Predict) -> None:
     assert row["service_ms"]["mean"] == pytest.approx(2, abs=3 * sqrt(2) / sqrt(3000))
 
 
+def test_a_mean_and_a_deviation_are_those_of_the_times(predict: Predict) -> None:
+    """Also where they are alike: the logarithm then has the variance log 2, so the median is mean / sqrt 2."""
+    times = predict(chain("{ mean = 2, sd = 2 }", head="[run]\nframes = 20000"))["stages"]["s0"]["service_ms"]
+    assert times["mean"] == pytest.approx(2, abs=3 * 2 / sqrt(20000))
+    assert times["p50"] == pytest.approx(sqrt(2), rel=0.03)
+
+
+def test_ignorance_where_frames_are_dropped_comes_from_runs(tmp_path: Path) -> None:
+    """An error of 1 % moves the time between shown frames little; it is not that between arrivals, 1.11."""
+    head = "[run]\narrivals = { poisson = 900 }\nin_queue = 1\nframes = 4000"
+    file = read_pipeline(write_file(tmp_path, chain("{ exponential = 1 }", head=head)))
+    given = given_price(file, "s0")
+    assert given is not None
+    frame = predict_file(file, {"s0": replace(given, spread=0.01)})["frame_time_ms"]
+    assert 1.2 < 0.9 * frame["mean"] < frame["low"] < frame["high"] < 1.1 * frame["mean"]
+
+
 def test_a_seed_says_all_and_given_times_leave_no_ignorance(predict: Predict) -> None:
     text = chain("{ mean = 2, sd = 1 }", "{ exponential = 2 }")
     first, again, other = predict(text), predict(text), predict(text, "--seed", "1")
@@ -288,6 +306,7 @@ def test_options_of_a_file_without_one(command: Command) -> None:
         ((30, 22, 40), "holds 30 fps: perhaps; 22-40 ms of 33.3 ms (80 %)"),
         ((50, 40, 60), "holds 30 fps: no; 40-60 ms of 33.3 ms (80 %)"),
         ((14, 14, 14), "holds 30 fps: yes; 14 ms of 33.3 ms"),
+        ((5000, 1234.5, 9000), "holds 30 fps: no; 1234-9000 ms of 33.3 ms (80 %)"),
     ],
 )
 def test_the_sentence(times: tuple[float, float, float], words: str) -> None:
@@ -314,7 +333,7 @@ def test_measured_times_are_those_of_a_run_and_on_a_chip_times_their_scale(
     def service(stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
         return {"frame": 2, "depth": 20 - 10 * (frame % 2)}[stage] * 1_000_000
 
-    done = simulate(graph_of(file, edge_rules(file, None)), Settings(40), service, keep=True)
+    done = simulate(graph_of(file, edge_rules(file)), Settings(40), service, keep=True)
     run = write_run(tmp_path / "run", done)
     here = documents(text, "--measured", str(run))["pipelines"][0]["stages"]["depth"]
     assert (here["alone_ms"], here["service_ms"]["max"]) == (15, 20)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from trilane.errors import BadInputError
 from trilane.pipeline.file_graph import edge_rules, graph_of, settings_of
 from trilane.pipeline.pipeline_file import is_pipeline_file, read_pipeline
 from trilane.scheduler.events import Graph, Input, StageSpec
+from trilane.scheduler.period_bound import period_bound
 
 MS = 1_000_000
 
@@ -43,7 +45,7 @@ def test_the_branches(tmp_path: Path) -> None:
 def test_a_row_of_stages_is_a_chain(tmp_path: Path) -> None:
     """So it takes the steps of a chain, and a file without a rate has a source that is always ready."""
     file = read_pipeline(write_file(tmp_path, CUT))
-    graph = graph_of(file, edge_rules(file, None))
+    graph = graph_of(file, edge_rules(file))
     assert graph == Graph((StageSpec("head", "gpu"), StageSpec("tail", "dla")), ("double",), "tail")
     assert settings_of(file).period_ns == 0
 
@@ -67,27 +69,48 @@ def test_two_ports_of_one_stage_are_one_stream(tmp_path: Path) -> None:
     """
     file = read_pipeline(write_file(tmp_path, text))
     assert [each.from_port for each in file.stages["best"].inputs] == ["boxes", "scores"]
-    assert graph_of(file, edge_rules(file, None)).is_chain
+    assert graph_of(file, edge_rules(file)).is_chain
 
 
 def test_rules_of_streams_by_file_run_and_default(tmp_path: Path) -> None:
     def rules(head: str, tail: str = "") -> dict[str, str]:
-        return edge_rules(read_pipeline(write_file(tmp_path, head + DEPTH + tail)), None)
+        return edge_rules(read_pipeline(write_file(tmp_path, head + DEPTH + tail)))
 
     assert rules("") == dict.fromkeys(("frame", "depth", "seg"), "double")
     assert rules('[run]\nedge = "single"') == dict.fromkeys(("frame", "depth", "seg"), "single")
-    assert rules('[run]\nedge = "single"', '[edges]\ndepth = "fifo:3"')["depth"] == "fifo:3"
+    assert rules('[run]\nedge = "single"', '[edges]\ndepth = "triple"')["depth"] == "triple"
 
 
 def test_slots_where_branches_meet(tmp_path: Path) -> None:
     """By equal times: the street's camera is held by six stages. By real times its short stages need fewer."""
     file = read_pipeline(write_file(tmp_path, STREET))
-    assert edge_rules(file, None) == {
+    assert edge_rules(file) == {
         "camera": "fifo:6",
         **dict.fromkeys(("small", "detector", "crop", "segmenter", "overlay"), "double"),
     }
     times = {"camera": 1, "small": 1, "detector": 20, "crop": 1, "segmenter": 2, "overlay": 2, "video": 1}
     assert edge_rules(file, times)["camera"] == "double"  # held for 27 of 2 x 22
+    some = [f"stages.{name}.time_ms={ms}" for name, ms in times.items() if name != "video"]
+    assert edge_rules(file.changed(some))["camera"] == "fifo:6"  # as one is unknown
+    assert edge_rules(file.changed([*some, "stages.video.time_ms=1"]))["camera"] == "double"
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_slots_by_equal_times_do_for_any_times(tmp_path: Path, seed: int) -> None:
+    """A graph of nine stages without times: whatever they turn out to be, more slots gain nothing."""
+    rng = random.Random(seed)
+    rows = ["[stages]"]
+    for place in range(9):
+        sources = rng.sample(range(place), min(place, rng.choice((1, 2, 3))))
+        ports = ", ".join(f'p{each} = "s{each}"' for each in sources)
+        reads = f", in = {{ {ports} }}" if sources else ""
+        rows.append(f's{place} = {{ python = "m:f", unit = "u{rng.randrange(6)}"{reads} }}')
+    file = read_pipeline(write_file(tmp_path, "\n".join(rows)))
+    graph = graph_of(file, edge_rules(file))
+    most = graph_of(file, dict.fromkeys(file.readers, "fifo:64"))
+    for _ in range(5):
+        times = {name: rng.choice((0, 1, 2, 30, 100)) for name in file.stages}
+        assert period_bound(graph, times).period_ns == period_bound(most, times).period_ns
 
 
 def test_the_arrivals_of_a_seed(tmp_path: Path) -> None:
@@ -118,5 +141,5 @@ def test_a_scene_is_no_pipeline_file(tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text('motion = "walk.bvh"\n[camera]\nwidth = 3\n')
     assert not is_pipeline_file(tmp_path / "scene.toml")
     assert not is_pipeline_file(tmp_path / "none.toml")
-    for number, head in enumerate(("[stages]", " [ stages.a ]", '["stages"]')):
+    for number, head in enumerate(("[stages]", " [ stages.a ]", '["stages"]', "stages.a = {}", "stages = 3")):
         assert is_pipeline_file(write_file(tmp_path, head, f"{number}.toml"))

@@ -321,3 +321,13 @@ def test_a_network_of_open_sizes_wants_them_from_the_file(command: Command, tmp_
     assert found, error
     path.write_text(STAGES + NET.replace(" }", ", shapes = { image = '1x3x256x256' } }"))
     command("check", path)
+
+
+def test_weights_that_are_inputs_need_no_stage(command: Command, tmp_path: Path) -> None:
+    """A graph without the values of its weights, as published ones are, has them as inputs."""
+    path = write_file(tmp_path, STAGES + NET)
+    model = onnx.load(tmp_path / "seg.onnx")
+    sizes = list(model.graph.initializer.pop().dims)
+    model.graph.input.append(onnx.helper.make_tensor_value_info("weights", onnx.TensorProto.FLOAT, sizes))
+    onnx.save(model, tmp_path / "seg.onnx")
+    assert json.loads(command("check", path, "--json")[0])["stages"][1]["what"] == "seg.onnx"
