@@ -284,6 +284,10 @@ def _show_run(document: Mapping[str, Any]) -> None:
     for line in _shared(document["shared_cores"]):
         console.print(line, soft_wrap=True, markup=False)
     console.print(_waits(document["waits"]))
+    for row in document.get("joins", ()):
+        from trilane.apps.explain.joins import said
+
+        console.print(said(row), soft_wrap=True, markup=False)
     console.print(_slowest(document))
     for line in document["advice"]:
         console.print(f"try: {line}", soft_wrap=True, markup=False)
@@ -398,7 +402,7 @@ def _slowest(document: Mapping[str, Any]) -> Table:
         table.add_row(
             str(row["frame"]),
             f"{row['frame_ms']:.1f}",
-            f"{row['latency_ms']:.1f}",
+            "-" if row["latency_ms"] is None else f"{row['latency_ms']:.1f}",
             "\n".join([*row["notes"], *reasons]) or "hardly longer than the median",
         )
     return table

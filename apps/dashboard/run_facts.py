@@ -81,6 +81,8 @@ def config_in_force(config: Mapping[str, Any], options: Mapping[str, Any]) -> di
 
     `config`: block of report.json, with the values of options that were left open. `options`: given options, by name.
     """
+    if "pipeline" in config:  # the controls before a run are those of the avatar's scenes
+        return {name: str(config[name]) for name in ("policy", "edge")}
     scene = config["scene"]
     chosen = {**config, "size": scene["size"], "avatar": scene["avatars"][0]["bundle"]}
     values = {name: options.get(name) if chosen.get(name) is None else chosen[name] for name in OF_A_NEW_RUN}
@@ -132,13 +134,19 @@ def facts_of_report(name: str, report: Report) -> RunFacts:
         report.clock,
         _machine_line(document["machine"]),
         scene["fps"],
-        (scene["output"]["width"], scene["output"]["height"]),
+        _output(scene),
         config_in_force(document["config"], {**(document.get("options") or {}), **caps}),
-        {**document["plan"], "notes": document["notes"]},
+        {**document.get("plan", {}), "notes": document.get("notes", [])},
         document.get("placement"),
-        document["accuracy"],
+        document.get("accuracy", {}),
         {key: document.get(key) for key in BOUND} if report.bound is not None else None,
     )
+
+
+def _output(scene: Mapping[str, Any]) -> tuple[int, int]:
+    """Return width and height of the picture; a usual size where the run does not say it."""
+    output = scene.get("output") or {}
+    return output.get("width", 640), output.get("height", 480)
 
 
 def facts_of_folder(folder: Path, begun: Begun) -> RunFacts:
@@ -152,7 +160,6 @@ def facts_of_folder(folder: Path, begun: Begun) -> RunFacts:
         return facts_of_report(folder.name, read_report(folder))
     facts = begun.facts
     scene = (facts.get("config") or {}).get("scene") or {}
-    output = scene.get("output") or {}
     machine = facts.get("machine")
     return RunFacts(
         folder.name,
@@ -160,7 +167,7 @@ def facts_of_folder(folder: Path, begun: Begun) -> RunFacts:
         str(facts.get("clock", "host")),
         _machine_line(machine) if machine else "",
         scene.get("fps", 30.0),
-        (output.get("width", 640), output.get("height", 480)),
+        _output(scene),
         {"policy": begun.settings.policy},
         {},
         None,

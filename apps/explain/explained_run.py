@@ -14,6 +14,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
+from trilane.apps.explain.joins import Joins
 from trilane.apps.explain.reasons import MOST_SAMPLES, Shown, SlowFrames, Usual, advice, notes, reasons
 from trilane.apps.run.report import Report, read_report
 from trilane.apps.watch.followed_run import CUT_OFF, FollowedRun, RunState
@@ -92,6 +93,7 @@ class RunExplanation:
         self._slow = SlowFrames(begun.graph, self._reckoning.paths, self._reckoning.sharing, slowest)
         self._waits: dict[str, dict[str, int]] = {stage.name: {} for stage in begun.graph.stages}
         self._jobs = dict.fromkeys(self._waits, 0)
+        self._joins = Joins(begun.graph)
         self._frames, self._first_ns, self._last_ns = 0, 0, 0
         self._said: deque[str] = deque(maxlen=MOST_MESSAGES)
 
@@ -107,6 +109,7 @@ class RunExplanation:
         job = explained.job
         self._reckoning.add(explained)
         self._slow.add(explained)
+        self._joins.add(explained)
         self._jobs[job.stage] += 1
         sums = self._waits[job.stage]
         for cause, ns in explained.waits_ns.items():
@@ -137,6 +140,7 @@ class RunExplanation:
             "budget": rows,
             "shared_cores": shared,
             "waits": [_wait_row(name, unit_of[name], self._jobs[name], self._waits[name]) for name in self._waits],
+            **({"joins": joins} if (joins := self._joins.rows()) else {}),
             "usual": {
                 "frame_ms": usual.frame_ns / NS_PER_MS,
                 "service_ms": {name: ns / NS_PER_MS for name, ns in usual.service_ns.items()},

@@ -26,6 +26,7 @@ from trilane.pipeline.file_keys import (
     StageKeys,
     TimedStage,
     VideoBlock,
+    port_type,
 )
 from trilane.pipeline.pipeline_file import PipelineFile, stage_inputs
 from trilane.pipeline.ports import payload_bytes
@@ -92,6 +93,16 @@ def picture_fps(file: PipelineFile) -> float:
     videos = [stage for stage in file.stages.values() if isinstance(stage, VideoBlock) and not stage.is_camera]
     rates = [footage(file.folder / stage.path).fps for stage in videos]
     return next((rate for rate in rates if rate), DEFAULT_FPS)
+
+
+def picture_size(pipeline: Pipeline) -> dict[str, dict[str, int]]:
+    """Return `output`, the size of the pictures that the first stage that encodes reads; empty without such a stage."""
+    for stage in pipeline.stages:
+        if stage.factory == f"{BLOCKS}.encode:build":
+            read = stage.settings["reads"][0]
+            height, width, _ = port_type(stage.settings["streams"][read["stream"]][read["port"]]).shape
+            return {"output": {"width": width, "height": height}}
+    return {}
 
 
 def segments_of(file: PipelineFile) -> dict[str, str]:
@@ -199,7 +210,7 @@ def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str
 
 
 def _port(file: PipelineFile, name: str, each: StageInput, types: PortTypes) -> str:
-    """Return the port of a stream that an input reads. Raises BadInputError where several are there and none is named."""
+    """Return the port of a stream that an input reads. Raises BadInputError where it must be named and is not."""
     ports = types[each.stage]
     if each.from_port or len(ports) == 1:
         chosen = each.from_port or next(iter(ports))

@@ -17,6 +17,7 @@ from trilane.apps.run.file_pipeline import (
     frames_of,
     imports_of,
     picture_fps,
+    picture_size,
     pipeline_of,
     preload_of,
     segments_of,
@@ -99,7 +100,7 @@ class _Asked:
         units = {unit: each.model_dump(mode="json") for unit, each in pipeline.units.items()}
         self.config: dict[str, Any] = {
             "pipeline": {"file": str(file.path), **{name: dict(table) for name, table in file.tables.items()}},
-            "scene": {"name": file.path.stem, "fps": picture_fps(file), "frames": frames},
+            "scene": {"name": file.path.stem, "fps": picture_fps(file), "frames": frames, **picture_size(pipeline)},
             "units": units,
             "policy": self.settings.policy,
             "edge": pipeline.rule,
