@@ -72,8 +72,8 @@ IN_THOUSANDS: Final = 10_000
 class Bounds(NamedTuple):
     """What bounded each run of either side, as in report.json; None where nobody knows.
 
-    `outcome` says whether the bounding unit changed. Only that unit's share of the path is known, so another unit's
-    share may be as large unless this one is surely more than a half.
+    `outcome` says whether the bounding unit changed. A run whose bound has rivals does not say so surely. A report
+    without rivals says so surely where the unit has more than half of the path.
     """
 
     base: tuple[Mapping[str, Any] | None, ...]
@@ -88,8 +88,13 @@ class Bounds(NamedTuple):
         base, other = ({unit["name"] for unit in side} for side in (units[: len(self.base)], units[len(self.base) :]))
         if len(base | other) == 1:
             return Finding.SAME
-        is_sure = all((unit["share_low"] or 0.0) > 0.5 for unit in units)
+        is_sure = all(_is_sure(unit) for unit in units)
         return Finding.DIFFERS if len(base) == len(other) == 1 and is_sure else Finding.UNKNOWN
+
+
+def _is_sure(unit: Mapping[str, Any]) -> bool:
+    rivals = unit.get("rivals")
+    return (unit["share_low"] or 0.0) > 0.5 if rivals is None else not rivals
 
 
 @dataclass(frozen=True)
