@@ -168,3 +168,48 @@ def test_a_journal_without_cpu_times_and_units_without_cores_are_not_replayed() 
     old = replace(run, jobs=tuple(job._replace(cpu_ns=0) for job in run.jobs))
     assert "slowed" not in bound_of(old)
     assert "slowed" not in bound_of(run, {"cpu": ON_0})
+
+
+def of_infer(run: Simulation, **fields: Any) -> Simulation:
+    """The run with other times of the jobs of infer: functions of the job."""
+    jobs = tuple(
+        job._replace(**{name: value(job) for name, value in fields.items()}) if job.stage == "infer" else job
+        for job in run.jobs
+    )
+    return replace(run, jobs=jobs)
+
+
+def test_time_in_which_a_device_works_is_slowed_as_well() -> None:
+    """Of infer's 14 ms 4 are CPU time. All of a frame is infer, so a fifth more of it is a fifth more of the frame."""
+    run = of_infer(ran(STAGE_MS | {"infer": 14.0}), cpu_ns=lambda _: 4 * MS)
+    assert bound_of(run)["stage"]["cost"] == pytest.approx(0.2, abs=0.01)
+
+
+def test_the_cpu_time_of_several_threads_is_divided_among_them() -> None:
+    run = of_infer(ran(STAGE_MS | {"infer": 14.0}), cpu_ns=lambda job: 2 * (job.end_ns - job.begin_ns))
+    bound = bound_of(run, {**OWN, "dsp": Place((2, 3), 2)})
+    assert bound["slowed"]["over_measured"] == pytest.approx(1, abs=0.01)
+
+
+@pytest.mark.parametrize("skipped", [False, True])
+def test_messages_take_the_time_that_they_took_and_skipped_stages_none(skipped: bool) -> None:
+    """One frame at a time, 2 ms each way: 24 ms of work and 16 of messages; of every other frame 10 and 8, if it skips.
+
+    Most of the path is overhead, and so is the bottleneck. A fifth more of infer is 1.8 ms of a full frame.
+    """
+    graph = replace(GRAPH, bypass=("pose", "composite"))
+    run = simulate(
+        graph,
+        Settings(FRAMES, "sequential"),
+        lambda stage, *_: round(STAGE_MS[stage] * MS),
+        message_delay_ns=2 * MS,
+        skips=lambda frame, _fresh: skipped and frame % 2 == 1,
+        keep=True,
+    )
+    bound, frame = bound_of(run), (40 + 18) / 2 if skipped else 40
+    assert run.report["frame_time_ms"]["mean"] == pytest.approx(frame, abs=0.2)
+    assert bound["slowed"]["over_measured"] == pytest.approx(1, abs=0.01)
+    assert bound["slowed"]["costs"]["infer"]["cost"] == pytest.approx((0.5 if skipped else 1) * 1.8 / frame, abs=0.002)
+    assert (bound["unit"]["name"], bound["unit"].get("cost"), bound["stage"]["name"]) == (
+        ("overhead", None, "composite" if skipped else "infer")
+    )

@@ -95,3 +95,11 @@ def test_it_is_near_a_kernel_that_gives_slices_in_turn(seed: int) -> None:
     most = mine * (1 + 1 / (FRAMES - 2 * WARM))
     assert most >= max(sum(ms[unit] for unit, place in places.items() if place == own) for own in (ON_0, ON_1))
     assert 2 * most >= sum(ms.values())
+
+
+def test_a_unit_that_wakes_goes_to_a_core_of_its_own_that_is_idle() -> None:
+    """a: 0 to 4 and 4 to 8 ms on core 0, so b begins at 4 on core 1, and has it for 6 ms a frame."""
+    needs = {"a": Need(4 * MS), "b": Need(6 * MS)}
+    places = {"one": ON_0, "two": FLOATS}
+    run = SharedCores(graph_of(TWO), Settings(2), places, lambda stage, _: needs[stage])
+    assert run.run() == [(0, 10 * MS), (1, 16 * MS)]
