@@ -23,6 +23,7 @@ from typing import Final, NamedTuple
 from trilane.pipeline.timeline import ExplainedJob
 from trilane.pipeline.unit_history import OVERHEAD
 from trilane.scheduler.events import NEVER, Graph, Settings
+from trilane.scheduler.placement import SCHEDULER_NS
 from trilane.scheduler.places import Placement
 from trilane.scheduler.shared_cores import Need, SharedCores
 from trilane.scheduler.stats import LEAST_FRAMES, batch_interval
@@ -169,7 +170,8 @@ class WhatIf:
             return Need(found.cpu_ns * (1 + SLOWER), found.other_ns * (1 + SLOWER), found.skips)
 
         settings = replace(self._settings, frames=len(frames), works=(), follow=(), hang_ns=NEVER // 2)
-        run = SharedCores(self._graph, settings, self._places, need, message_ns)
+        scheduler_ns = min(SCHEDULER_NS, message_ns)
+        run = SharedCores(self._graph, settings, self._places, need, message_ns - scheduler_ns, scheduler_ns)
         ends_ns = [end_ns for _, end_ns in run.run()]
         cuts = ends_ns[LEAST_FRAMES - 1 :: LEAST_FRAMES]
         return [after - before for before, after in pairwise(cuts[:-1])]

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from math import ceil, inf
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import NEVER, Dispatch, Event, Graph, Job, JobDone, OutcomeKind, Settings, UnitReady
@@ -47,13 +47,17 @@ Needs = Callable[[str, int], Need]
 
 
 class _Unit:
-    """A unit. `queue`: jobs handed to it; the first one runs. `on`: cores where its threads are while they compute."""
+    """A unit, or the scheduler.
+
+    `queue`: jobs handed to it, or events that the scheduler hears of; the first is worked on.
+    `on`: cores where its threads are while they compute.
+    """
 
     __slots__ = ("begin_ns", "cores", "gangs", "last", "left", "name", "need", "on", "queue", "rate")
 
     def __init__(self, name: str, cores: tuple[int, ...], threads: int) -> None:
         self.name, self.cores, self.gangs = name, cores, threads > 1
-        self.queue: deque[Job] = deque()
+        self.queue: deque[Any] = deque()
         self.need: Need | None = None
         self.on: tuple[int, ...] = ()
         self.last = cores[0]
@@ -64,16 +68,27 @@ class _Unit:
 class SharedCores:
     """The `trilane.scheduler.core.Core` of one run on simulated cores. Equal inputs give equal runs.
 
-    `places`: cores and threads of every unit. `needs`: needs of every job. `message_ns`: time from the end of a job to
-    the step of the scheduler that hears of it; a job that is handed over begins at once when its unit is free.
+    `places`: cores and threads of every unit. `needs`: needs of every job. `message_ns`: time from the end of a job
+    until the scheduler hears of it. `scheduler_ns`: CPU time that the scheduler then takes on the cores of the first
+    stage's unit; a job that it hands over begins at once when its unit is free.
     """
 
-    def __init__(self, graph: Graph, settings: Settings, places: Placement, needs: Needs, message_ns: int = 0) -> None:
+    def __init__(
+        self,
+        graph: Graph,
+        settings: Settings,
+        places: Placement,
+        needs: Needs,
+        message_ns: int = 0,
+        scheduler_ns: int = 0,
+    ) -> None:
         self._core, self._needs, self._message_ns = Core(graph, settings), needs, message_ns
+        self._scheduler, self._scheduler_ns = _Unit("", places[graph.stages[0].unit].cores, 1), scheduler_ns
         self._units = {name: _Unit(name, *places[name]) for name in graph.units}
         self._queues: dict[int, list[_Unit]] = {core: [] for place in places.values() for core in place.cores}
         self._active: list[_Unit] = []
         self._heard: deque[tuple[int, tuple[Event, ...]]] = deque()
+        self._deadline_ns: int = NEVER
         self._last_stage = graph.stages[-1].name
         self._now_ns, self._balance_ns = 0.0, inf
         self.presented: list[tuple[int, int]] = []
@@ -84,9 +99,9 @@ class SharedCores:
         Raises RuntimeError when nothing can ever happen again.
         """
         core, active, heard = self._core, self._active, self._heard
-        deadline_ns = self._step(0, tuple(UnitReady(unit) for unit in self._units))
+        self._step(0, tuple(UnitReady(unit) for unit in self._units))
         while not core.finished:
-            at_ns = min(heard[0][0] if heard else NEVER, deadline_ns)
+            at_ns = min(heard[0][0] if heard else NEVER, self._deadline_ns)
             end_ns = min((self._now_ns + unit.left / unit.rate for unit in active), default=inf)
             if at_ns >= NEVER and end_ns == inf:
                 raise RuntimeError("the simulation stands still: no event and no deadline is left")
@@ -100,32 +115,42 @@ class SharedCores:
                 for unit in [unit for unit in active if unit.left <= DONE_NS]:
                     self._go_on(unit)
                 self._set_rates()
+            elif heard and heard[0][0] <= at_ns:
+                self._hear(at_ns, heard.popleft()[1])
             else:
-                deadline_ns = self._step(at_ns, heard.popleft()[1] if heard and heard[0][0] <= at_ns else ())
+                self._step(at_ns, ())
         if core.outcome is None or core.outcome.kind is not OutcomeKind.DONE:
             raise RuntimeError(f"the simulated run ended so: {core.outcome}")
         return self.presented
 
-    def _step(self, now_ns: int, events: tuple[Event, ...]) -> int:
-        """Tell the scheduler, carry out what it says, and return when it wants to be asked again."""
-        actions, deadline_ns = self._core.step(now_ns, events)
+    def _hear(self, now_ns: int, events: tuple[Event, ...]) -> None:
+        """Let the scheduler take its time for `events`, behind those that it has heard of."""
+        if not self._scheduler_ns:
+            self._step(now_ns, events)
+            return
+        self._scheduler.queue.append(events)
+        if self._scheduler.need is None:
+            self._begin(self._scheduler, Need(self._scheduler_ns))
+            self._set_rates()
+
+    def _step(self, now_ns: int, events: tuple[Event, ...]) -> None:
+        """Tell the scheduler, and carry out what it says."""
+        actions, self._deadline_ns = self._core.step(now_ns, events)
         is_changed = False
         for action in actions:
             if type(action) is Dispatch:
                 unit = self._units[action.job.unit]
                 unit.queue.append(action.job)
                 if unit.need is None:
-                    self._begin(unit)
+                    self._begin(unit, self._needs(action.job.stage, action.job.frame))
                     is_changed = True
         if is_changed:
             self._set_rates()
-        return deadline_ns
 
-    def _begin(self, unit: _Unit) -> None:
-        """Begin the unit's next job: it first computes."""
-        job = unit.queue[0]
-        unit.need, unit.begin_ns = self._needs(job.stage, job.frame), ceil(self._now_ns)
-        unit.left = max(unit.need.cpu_ns, 2 * DONE_NS)
+    def _begin(self, unit: _Unit, need: Need) -> None:
+        """Begin what is next in the unit's queue: it first computes."""
+        unit.need, unit.begin_ns = need, ceil(self._now_ns)
+        unit.left = max(need.cpu_ns, 2 * DONE_NS)
         unit.on = unit.cores if unit.gangs else (self._woken_on(unit),)
         for core in unit.on:
             self._queues[core].append(unit)
@@ -147,15 +172,24 @@ class SharedCores:
             if unit.need.other_ns:
                 unit.left = unit.need.other_ns
                 return
-        job, now_ns = unit.queue.popleft(), ceil(self._now_ns)
+        ended, now_ns, skips = unit.queue.popleft(), ceil(self._now_ns), unit.need.skips
         self._active.remove(unit)
-        done = JobDone(unit.name, job.id, unit.begin_ns, now_ns, unit.begin_ns, skips=unit.need.skips)
+        unit.need = None
+        if unit is self._scheduler:
+            self._step(now_ns, ended)
+            if unit.queue:
+                self._begin(unit, Need(self._scheduler_ns))
+        else:
+            self._end(unit, ended, now_ns, skips)
+
+    def _end(self, unit: _Unit, job: Job, now_ns: int, skips: bool) -> None:
+        """Send word that a job has ended, and begin the unit's next one."""
+        done = JobDone(unit.name, job.id, unit.begin_ns, now_ns, unit.begin_ns, skips=skips)
         self._heard.append((now_ns + self._message_ns, (done,)))
         if job.stage == self._last_stage:
             self.presented.append((job.frame, now_ns))
-        unit.need = None
         if unit.queue:
-            self._begin(unit)
+            self._begin(unit, self._needs(unit.queue[0].stage, unit.queue[0].frame))
 
     def _leave(self, unit: _Unit) -> None:
         """Take the unit off its cores; each that is idle now pulls a unit that shares another core."""

@@ -103,3 +103,23 @@ def test_a_unit_that_wakes_goes_to_a_core_of_its_own_that_is_idle() -> None:
     places = {"one": ON_0, "two": FLOATS}
     run = SharedCores(graph_of(TWO), Settings(2), places, lambda stage, _: needs[stage])
     assert run.run() == [(0, 10 * MS), (1, 16 * MS)]
+
+
+@pytest.mark.parametrize(
+    ("scheduler_ms", "places", "expected"),
+    [
+        (0.5, {"one": ON_0, "two": ON_1}, 6.0),  # it has room beside a
+        (1.5, {"one": ON_0, "two": ON_1}, 4 + 2 * 1.5),  # it takes more of core 0 than a leaves
+        (0.5, {"one": ON_0, "two": ON_0}, 4 + 6 + 2 * 0.5),
+    ],
+)
+def test_the_scheduler_takes_cpu_time_of_the_first_units_cores(
+    scheduler_ms: float, places: Placement, expected: float
+) -> None:
+    """Two jobs a frame, of 4 and 6 ms, and a step for each."""
+    needs = {"a": Need(4 * MS), "b": Need(6 * MS)}
+    run = SharedCores(
+        graph_of(TWO), Settings(FRAMES), places, lambda stage, _: needs[stage], scheduler_ns=round(scheduler_ms * MS)
+    )
+    ends_ns = [end_ns for _, end_ns in run.run()]
+    assert (ends_ns[-WARM] - ends_ns[WARM]) / (FRAMES - 2 * WARM) / MS == pytest.approx(expected, rel=0.01)
