@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.apps.explain.explained_run import COLUMNS, explain_run, figure_names, job_rows, open_journal
+from trilane.apps.explain.reasons import bound_text
 from trilane.apps.predict.predict_options import OF_A_PIPELINE_ALONE, PredictOptions
 from trilane.apps.run.asked_run import run_asked
 from trilane.apps.run.report import Report, read_report
@@ -35,7 +36,6 @@ from trilane.stages.run_options import RunOptions
 if TYPE_CHECKING:
     import pandas
 
-    from trilane.pipeline.run_metrics import PathShare
 
 INTERRUPTED = 130
 #: Defaults of a program's run that are not those of the command line.
@@ -324,7 +324,7 @@ def _run_rows(report: Report) -> Iterable[Row]:
     counts = f"{frames.presented} presented, {frames.lost} lost, {sum(frames.dropped.values())} dropped"
     yield "frames", counts + (f", {frames.not_begun} not begun" if frames.not_begun else ""), measured
     if report.bound is not None:
-        yield "bound", ", ".join(_of_path(part) for part in (report.bound.unit, report.bound.stage) if part), measured
+        yield "bound", bound_text(report.bound.model_dump()), measured
     for unit, shares in report.units.items():
         idle = ", ".join(f"{cause} {share:.0%}" for cause, share in shares.idle if share)
         yield unit, f"busy {shares.busy:.0%}; {idle}", measured
@@ -336,10 +336,6 @@ def _run_rows(report: Report) -> Iterable[Row]:
 
 def _between(low: float | None, high: float | None) -> str:
     return TOO_SHORT if low is None or high is None else f"95 %: {low:.2f} to {high:.2f}"
-
-
-def _of_path(part: PathShare) -> str:
-    return f"{part.names} {part.share:.0%} of the path"
 
 
 def _error(facts: Mapping[str, Any]) -> tuple[str, str]:

@@ -1,4 +1,4 @@
-"""How long does a network take on each runtime, run continuously on constant random input?
+"""How long does a network take on each runtime, run continuously on random inputs that take turns?
 
 Rule: the runtimes and ONNX Runtime in FP32 run interleaved, a period each, on the same cores, in processes of their
 own.

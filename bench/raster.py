@@ -1,7 +1,7 @@
 """How much faster is one packed pass than a pass for every four channels and a permute?
 
-Rule: all variants draw the same body in the same process, interleaved, and must give the same bytes. The split passes
-share mesh, texture and triangles with the packed one.
+Rule: all variants draw the same body in the same process, interleaved, in poses that take turns, and must give the same
+bytes. The split passes share mesh, texture and triangles with the packed one.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import U8, Floats
-from trilane.bench.lib.fixture import ENCODING, Fixture, interleaved_ms, standing, summary_ms
+from trilane.bench.lib.fixture import ENCODING, INPUTS, SLOTS, Fixture, interleaved_ms, standing, summary_ms
 from trilane.body.skinning import FrameSkinner
 from trilane.errors import BadInputError, TrilaneError
 from trilane.stages.gpu.opengl import describe, open_context
@@ -52,7 +52,7 @@ def measure(size: int = 512, channels: int = 16, repeats: int = 40, threads: int
         raise BadInputError("--channels", str(channels), "4, 8, 12 or 16")
     ctx = open_context(threads)
     deferred = not describe(ctx).hardware
-    tensors = {name: np.zeros(size * size * channels, np.uint8) for name in COMPARED}
+    tensors = {name: np.zeros((SLOTS, size * size * channels), np.uint8) for name in COMPARED}
     variants = _variants(ctx, standing(channels), tensors, (size, size), deferred)
     times = interleaved_ms(variants, repeats)
     _check_equal(tensors)
@@ -73,25 +73,29 @@ def measure(size: int = 512, channels: int = 16, repeats: int = 40, threads: int
 
 def _variants(
     ctx: Any, fixture: Fixture, tensors: dict[str, Any], shape: tuple[int, int], deferred: bool
-) -> dict[str, Callable[[], object]]:
+) -> dict[str, Callable[[int], object]]:
     """Return every variant; each of `COMPARED` writes to its own one of `tensors`."""
     draws = (
         packed_variant(ctx, fixture, shape, deferred),
         packed_variant(ctx, fixture, shape, not deferred),
         split_variant(ctx, fixture, shape),
     )
-    variants: dict[str, Callable[[], object]] = {
+    variants: dict[str, Callable[[int], object]] = {
         name: partial(draw, tensors[name]) for name, draw in zip(COMPARED, draws, strict=True)
     }
     skin, draw_skinned = skinned_variant(ctx, fixture, shape, deferred)
     variants["CPU unit skins: packed"] = partial(draw_skinned, np.zeros_like(tensors["packed"]))
     variants["CPU unit skins: skinning"] = skin
-    uv_bytes = np.zeros(shape[0] * shape[1] * 2, np.uint8)
+    uv_bytes = np.zeros((SLOTS, shape[0] * shape[1] * 2), np.uint8)
     variants["UV bytes alone"] = partial(uv_variant(ctx, fixture, shape), uv_bytes)
     return variants
 
 
-def packed_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int], deferred: bool) -> Callable[[Any], None]:
+#: Draws an input, by its number, to its slot of an array (SLOTS, bytes).
+Draw = Callable[[Any, int], None]
+
+
+def packed_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int], deferred: bool) -> Draw:
     """Return a function that draws the body by the packed pass and reads it into a tensor.
 
     `ctx`: OpenGL context.
@@ -101,18 +105,18 @@ def packed_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int], deferred:
     """
     packed = PackedPass(ctx, fixture.texture.shape[2], ENCODING, deferred)
     avatar = PackedAvatar(packed, SkinnedMesh(ctx, fixture.arrays), fixture.texture)
-    placement = Placement(fixture.joints, fixture.projection, (0, 0, *shape))
 
-    def draw_and_read(tensor: Any) -> None:
+    def draw_and_read(tensors: Any, number: int) -> None:
+        placement = Placement(fixture.joints(number), fixture.projection, (0, 0, *shape))
         avatar.draw(packed.begin(shape), fixture.view, placement)
-        packed.read_into(shape, tensor)
+        packed.read_into(shape, tensors[number % SLOTS])
 
     return draw_and_read
 
 
 def skinned_variant(
     ctx: Any, fixture: Fixture, shape: tuple[int, int], deferred: bool
-) -> tuple[Callable[[], None], Callable[[Any], None]]:
+) -> tuple[Callable[[int], None], Draw]:
     """Return a function that skins the body as the CPU unit does, and one that draws it by the packed pass.
 
     The parameters are those of `packed_variant`.
@@ -120,38 +124,40 @@ def skinned_variant(
     packed = PackedPass(ctx, fixture.texture.shape[2], ENCODING, deferred)
     avatar = PackedAvatar(packed, PosedMesh(ctx, fixture.arrays), fixture.texture)
     skinner = FrameSkinner(fixture.shaped)
-    vertices = np.empty((len(fixture.shaped.vertices), 3), np.float32)
-    placement = Placement(fixture.joints, fixture.projection, (0, 0, *shape), vertices=vertices)
+    slots = np.empty((SLOTS, len(fixture.shaped.vertices), 3), np.float32)
+    skinned = np.empty((INPUTS, *slots.shape[1:]), np.float32)
+    for posed, vertices in zip(fixture.poses, skinned, strict=True):
+        skinner.skin_into(posed, vertices)
 
-    def skin() -> None:
-        skinner.skin_into(fixture.posed, vertices)
+    def skin(number: int) -> None:
+        skinner.skin_into(fixture.poses[number % INPUTS], slots[number % SLOTS])
 
-    def draw(tensor: Any) -> None:
+    def draw(tensors: Any, number: int) -> None:
+        vertices = skinned[number % INPUTS]
+        placement = Placement(fixture.joints(number), fixture.projection, (0, 0, *shape), vertices=vertices)
         avatar.draw(packed.begin(shape), fixture.view, placement)
-        packed.read_into(shape, tensor)
+        packed.read_into(shape, tensors[number % SLOTS])
 
-    skin()
     return skin, draw
 
 
-def split_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int]) -> Callable[[Any], None]:
+def split_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int]) -> Draw:
     """Return a function that draws the body by the split passes, reads them and permutes."""
     split = SplitPass(ctx, SkinnedMesh(ctx, fixture.arrays), fixture.texture, ENCODING, shape)
-    placement = Placement(fixture.joints, fixture.projection, (0, 0, *shape))
 
-    def draw_and_read(tensor: Any) -> None:
-        split.draw(fixture.view, placement)
-        split.read_into(tensor)
+    def draw_and_read(tensors: Any, number: int) -> None:
+        split.draw(fixture.view, Placement(fixture.joints(number), fixture.projection, (0, 0, *shape)))
+        split.read_into(tensors[number % SLOTS])
 
     return draw_and_read
 
 
-def uv_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int]) -> Callable[[Any], None]:
+def uv_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int]) -> Draw:
     """Return a function that draws the UV coordinates of the body as two bytes a pixel."""
     image = UvBytes(ctx, SkinnedMesh(ctx, fixture.arrays))
 
-    def draw_and_read(tensor: Any) -> None:
-        image.render_into(tensor, fixture.joints, fixture.view, fixture.projection, shape)
+    def draw_and_read(images: Any, number: int) -> None:
+        image.render_into(images[number % SLOTS], fixture.joints(number), fixture.view, fixture.projection, shape)
 
     return draw_and_read
 

@@ -1,19 +1,19 @@
 """Which variant of moving pixels between GPU and slot is the fastest on this driver?
 
 Rule: all variants move the same bytes and run interleaved, once without a draw and once after one, during which a copy
-may go on.
+may go on. The body's poses and the pictures take turns, and so do the slots.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from trilane.bench.lib.fixture import ENCODING, interleaved_ms, standing, summary_ms
+from trilane.bench.lib.fixture import ENCODING, INPUTS, SLOTS, WARM_UP, interleaved_ms, standing, summary_ms
 from trilane.bench.lib.gpu_buffering import READBACKS, UPLOADS, Readback, Upload
 from trilane.errors import TrilaneError
 from trilane.stages.gpu.opengl import describe, open_context
@@ -60,24 +60,34 @@ def _readback_rows(ctx: Any, size: int, channels: int, repeats: int) -> list[dic
     fixture = standing(channels)
     packed = PackedPass(ctx, channels, ENCODING, deferred=not describe(ctx).hardware)
     avatar = PackedAvatar(packed, SkinnedMesh(ctx, fixture.arrays), fixture.texture)
-    placement = Placement(fixture.joints, fixture.projection, (0, 0, *shape))
     variants = {name: make(ctx, size * size * channels) for name, make in READBACKS.items()}
-    tensors = {name: np.zeros(size * size * channels, np.uint8) for name in READBACKS}
+    tensors = {name: np.zeros((SLOTS, size * size * channels), np.uint8) for name in READBACKS}
 
-    def move(variant: Readback, tensor: Any) -> None:
-        variant.submit(packed.target(shape).words, (0, 0, size, size), packed.layers, tensor)
-
-    def turn(variant: Readback, tensor: Any) -> None:
+    def draw(number: int) -> None:
+        placement = Placement(fixture.joints(number), fixture.projection, (0, 0, *shape))
         avatar.draw(packed.begin(shape), fixture.view, placement)
-        move(variant, tensor)
 
-    turns = interleaved_ms({name: partial(turn, variant, tensors[name]) for name, variant in variants.items()}, repeats)
-    ctx.finish()
-    moves = interleaved_ms({name: partial(move, variant, tensors[name]) for name, variant in variants.items()}, repeats)
-    for name, variant in variants.items():
-        variant.drain()
-        if not np.array_equal(tensors[name], tensors["direct"]):
-            raise TrilaneError(f"readback {name} gave other bytes than direct")
+    def drawn(number: int) -> None:
+        draw(number)
+        ctx.finish()
+
+    def move(variant: Readback, slots: Any, number: int) -> None:
+        variant.submit(packed.target(shape).words, (0, 0, size, size), packed.layers, slots[number % SLOTS])
+
+    def turn(variant: Readback, slots: Any, number: int) -> None:
+        draw(number)
+        move(variant, slots, number)
+
+    def timed(run: Any, prepare: Callable[[int], None] = lambda _: None) -> dict[str, list[float]]:
+        runs = {name: partial(run, variant, tensors[name]) for name, variant in variants.items()}
+        times = interleaved_ms(runs, repeats, prepare)
+        for name, variant in variants.items():
+            variant.drain()
+            if not np.array_equal(tensors[name], tensors["direct"]):
+                raise TrilaneError(f"readback {name} gave other bytes than direct")
+        return times
+
+    turns, moves = timed(turn), timed(move, drawn)
     facts = {"kind": "readback", "size": size, "channels": channels}
     return [
         {**facts, "way": name, "lag": variant.lag, "move": summary_ms(moves[name]), "turn": summary_ms(turns[name])}
@@ -86,26 +96,31 @@ def _readback_rows(ctx: Any, size: int, channels: int, repeats: int) -> list[dic
 
 
 def _upload_rows(ctx: Any, size: int, repeats: int) -> list[dict[str, Any]]:
-    image = np.random.default_rng(0).integers(0, 256, size * size * 4, dtype=np.uint8)
+    images = np.random.default_rng(0).integers(0, 256, (INPUTS, size * size * 4), dtype=np.uint8)
+    slots = np.empty((SLOTS, size * size * 4), np.uint8)
     target = ctx.framebuffer([ctx.texture((size, size), 4)])
     textures = {name: ctx.texture((size, size), 4) for name in UPLOADS}
 
-    def move(variant: Upload, texture: Any, source: Any) -> None:
-        variant.write(texture, image)
+    def fill(number: int) -> None:
+        slots[number % SLOTS] = images[number % INPUTS]
+
+    def move(variant: Upload, texture: Any, source: Any, number: int) -> None:
+        variant.write(texture, slots[number % SLOTS])
         ctx.copy_framebuffer(target, source)
         ctx.finish()
 
     times = interleaved_ms(
         {
-            name: partial(move, make(ctx, image.nbytes), textures[name], ctx.framebuffer([textures[name]]))
+            name: partial(move, make(ctx, slots[0].nbytes), textures[name], ctx.framebuffer([textures[name]]))
             for name, make in UPLOADS.items()
         },
         repeats,
+        fill,
     )
-    read = np.empty_like(image)
+    read, last = np.empty_like(slots[0]), images[(WARM_UP + repeats - 1) % INPUTS]
     for name, texture in textures.items():
         texture.read_into(read)
-        if not np.array_equal(read, image):
+        if not np.array_equal(read, last):
             raise TrilaneError(f"upload {name} gave other bytes than were written")
     facts = {"kind": "upload", "size": size, "channels": 4, "lag": 0}
     return [{**facts, "way": name, "move": summary_ms(moves)} for name, moves in times.items()]

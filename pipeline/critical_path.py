@@ -404,45 +404,44 @@ class Budget:
             self._since.clear()
         return self.ns_of
 
-    def bound(self, unit_of: Mapping[str, str]) -> dict[str, Any]:
-        """Return `bottleneck` and `bound` of a report; empty where there is no path. Called after `close`.
+    def names(self, unit_of: Mapping[str, str]) -> dict[str, dict[Part, str]]:
+        """Return whose each part of the path is: by `unit`, and by `stage` where it is a stage's.
 
         `unit_of`: unit of each stage. Time that is no unit's is named after its kind: other programs, release,
         overhead, held.
         """
         stages = {part: part[1] for part in self.ns_of if part[0] in OF_STAGES}
-        if not self.ns_of:
-            return {}
         names = {PREEMPTED: OTHER_PROGRAMS}
         units = {part: unit_of[stages[part]] if part in stages else names.get(part[0], part[0]) for part in self.ns_of}
-        unit = self._largest(units)
-        assert unit is not None  # every part has one
-        return {"bottleneck": unit["name"], "bound": {"unit": unit, "stage": self._largest(stages)}}
+        return {"unit": units, "stage": stages}
 
-    def _largest(self, name_of: Mapping[Part, str]) -> dict[str, Any] | None:
-        """Return the name with most of the path, its share, and the share's 95 % interval by its scatter over frames.
+    def largest(self, name_of: Mapping[Part, str]) -> dict[str, Any] | None:
+        """Return the `share` of the name with most of the path, and its rivals; None without a path.
 
-        Its rivals are the names whose share may be as large: the 95 % interval of the difference contains 0.
+        Rivals are the names whose share may be as large: the 95 % interval of the difference contains 0. Called after
+        `close`.
         """
         sums = _by_name(self.ns_of, name_of)
         if not sums:
             return None
         name = max(sums, key=sums.__getitem__)
-        whole = sum(self.ns_of.values())
+        rivals = None
+        if self._half_width(name_of, name) is not None:
+            near = {other: (self._half_width(name_of, name, other) or 0) * sum(self.ns_of.values()) for other in sums}
+            rivals = [other for other in sums if other != name and sums[name] - sums[other] <= near[other]]
+        return {**self.share(name_of, name), "rivals": rivals}
+
+    def share(self, name_of: Mapping[Part, str], name: str) -> dict[str, Any]:
+        """Return the share of `name` in the path, with its 95 % interval by the scatter over frames."""
+        share = _by_name(self.ns_of, name_of).get(name, 0) / sum(self.ns_of.values())
+        half = self._half_width(name_of, name)
+        low, high = (None, None) if half is None else (max(share - half, 0.0), min(share + half, 1.0))
+        return {"name": name, "share": share, "share_low": low, "share_high": high}
+
+    def _half_width(self, name_of: Mapping[Part, str], name: str, other: str = "") -> float | None:
+        """Return half the interval of a share, or of its difference from the share of `other`."""
         blocks = [(_by_name(block, name_of), max(sum(block.values()), 1)) for block in self._blocks]
-
-        def half_width(other: str | None) -> float | None:
-            """Return half the interval of the share, or of the difference to the share of `other`."""
-            return batch_interval([(ns.get(name, 0) - (ns.get(other, 0) if other else 0)) / of for ns, of in blocks])
-
-        share, half = sums[name] / whole, half_width(None)
-        if half is None:
-            return {"name": name, "share": share, "share_low": None, "share_high": None, "rivals": None}
-        rivals = [
-            other for other in sums if other != name and sums[name] - sums[other] <= (half_width(other) or 0) * whole
-        ]
-        low, high = max(share - half, 0.0), min(share + half, 1.0)
-        return {"name": name, "share": share, "share_low": low, "share_high": high, "rivals": rivals}
+        return batch_interval([(ns.get(name, 0) - ns.get(other, 0)) / of for ns, of in blocks])
 
     def _cut(self, ends_ns: Sequence[int], *, is_whole: bool = True) -> None:
         """Count the path from its counted part to the last of `ends_ns`, in blocks that end with each of them.

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from trilane.pipeline.critical_path import Budget, Part, Paths, Sharing, Taken
 from trilane.pipeline.journal import Begun, Record, config_of
 from trilane.pipeline.timeline import ExplainedJob, Timeline
+from trilane.pipeline.what_if import SLOWER, Cost, Slowed, WhatIf
 from trilane.scheduler.events import Graph, Settings
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.places import Place, Placement, busiest_core_ns
@@ -114,12 +115,13 @@ class Reckoning:
         # as if each unit had a core of its own
         own = {unit: Place((-1 - number,), 1) for number, unit in enumerate(graph.units)}
         self._efficiencies = RunEfficiencies({**own, **places})
+        self._what_if = WhatIf(graph, settings, places)
         self._unit_of = {stage.name: stage.unit for stage in graph.stages}
 
     @property
     def bound(self) -> Mapping[str, Any] | None:
         """The `bound` of a report, by the path so far; None until 63 frames were presented."""
-        return self._budget.bound(self._unit_of).get("bound")
+        return _bound(self._budget, self._unit_of, None).get("bound")
 
     def add(self, explained: ExplainedJob) -> None:
         """Count a job; jobs come in the order of their ends."""
@@ -127,14 +129,62 @@ class Reckoning:
         self.sharing.add(explained.job)
         presents = explained.presented is not None
         self._efficiencies.add(explained.job, presents=presents)
+        self._what_if.add(explained)
         if presents:
             self._budget.present(explained)
 
     def close(self) -> Reckoned:
         """Return the result; called after the last job."""
         budget = self._budget.close()
-        figures = {**self._efficiencies.close(), **self._budget.bound(self._unit_of)}
-        return Reckoned(budget, self.sharing.close(), figures)
+        bound = _bound(self._budget, self._unit_of, self._what_if.close())
+        return Reckoned(budget, self.sharing.close(), {**self._efficiencies.close(), **bound})
+
+
+def _bound(budget: Budget, unit_of: Mapping[str, str], slowed: Slowed | None) -> dict[str, Any]:
+    """Return `bottleneck` and `bound` of a report; empty where there is no path.
+
+    The bound is what costs most when it is slowed; without a replay that can be trusted, what has most of the path.
+    Where most of the path is no unit's, that is the bottleneck, whatever slowing a unit costs.
+    """
+    names = budget.names(unit_of)
+    path = {kind: budget.largest(name_of) for kind, name_of in names.items()}
+    if path["unit"] is None:
+        return {}
+    bound: dict[str, Any] = dict(path)
+    if slowed is not None and slowed.is_trusted:
+        costs = {"unit": slowed.by(unit_of), "stage": slowed.costs}
+        if path["unit"]["name"] not in costs["unit"]:
+            del costs["unit"]
+        for kind, of in costs.items():
+            name = max(of, key=lambda each: of[each].share)
+            bound[kind] = {**budget.share(names[kind], name), **_costs_most(of, name)}
+        if any((path[kind] or {}).get("name") != bound[kind]["name"] for kind in costs):
+            bound["path"] = path
+    if slowed is not None:
+        bound["slowed"] = {
+            "by": SLOWER,
+            "frames": slowed.frames,
+            "over_measured": slowed.over_measured,
+            "is_trusted": slowed.is_trusted,
+            "costs": {stage: _cost(cost) for stage, cost in slowed.costs.items()},
+        }
+    return {"bottleneck": bound["unit"]["name"], "bound": bound}
+
+
+def _costs_most(costs: Mapping[str, Cost], name: str) -> dict[str, Any]:
+    """Return the cost of `name`, which is the largest, and its rivals: the others whose cost may be as large."""
+    most = costs[name]
+    rivals = None
+    if most.half_width() is not None:
+        near = {other: most.half_width(cost) or 0.0 for other, cost in costs.items()}
+        rivals = [other for other, cost in costs.items() if other != name and most.share - cost.share <= near[other]]
+    return {"rivals": rivals, **_cost(most)}
+
+
+def _cost(cost: Cost) -> dict[str, float | None]:
+    half = cost.half_width()
+    low, high = (None, None) if half is None else (cost.share - half, cost.share + half)
+    return {"cost": cost.share, "cost_low": low, "cost_high": high}
 
 
 def places_of(begun: Begun) -> dict[str, Place]:

@@ -279,14 +279,29 @@ class Temperature(Record):
     sensor: float | None = None
 
 
-class PathShare(Record):
-    """The largest part of the critical path (`trilane.pipeline.critical_path`).
+class SlowedCost(Record):
+    """What it costs when jobs take longer by `Slowed.by`, found by replaying the run (`trilane.pipeline.what_if`).
+
+    `cost`: growth of the frame time, as a share.
+    `cost_low`, `cost_high`: bounds of the 95 % interval of `cost`, from the scatter over the run's frames; null for
+    fewer than 60 frames.
+    """
+
+    cost: float | None = None
+    cost_low: float | None = None
+    cost_high: float | None = None
+
+
+class PathShare(SlowedCost):
+    """A unit or a stage that bounded the run, or what the critical path was instead (`trilane.pipeline.critical_path`).
+
+    The inherited costs are those of slowing its jobs; absent where the path alone says what bounded the run.
 
     `name`: name of the unit or stage, or of time that is neither's, such as `overhead`.
     `share`: its share of the path.
     `share_low`, `share_high`: bounds of the 95 % interval of `share`, from the scatter of this run's frames; null for
     fewer than 51 frames.
-    `rivals`: names whose share may be as large.
+    `rivals`: names whose cost, or without costs whose share, may be as large.
     """
 
     name: str
@@ -297,15 +312,15 @@ class PathShare(Record):
 
     @property
     def names(self) -> str:
-        """The names that may be the largest part: this one and its rivals."""
+        """The names that may be the bound: this one and its rivals."""
         return " or ".join([self.name, *(self.rivals or [])])
 
 
-class Bound(Record):
-    """What bounded the frame time.
+class PathShares(Record):
+    """What has most of the critical path.
 
-    `unit`: share of the unit whose name is the report's `bottleneck`.
-    `stage`: share of the stage; null where no stage bounded it.
+    `unit`: the unit, or what the path was instead.
+    `stage`: the stage; null where none is on the path.
     """
 
     unit: PathShare
@@ -330,6 +345,36 @@ class NewestTaken(Record):
     frames_behind: FramesBehind
 
 
+class Slowed(Record):
+    """What slowing each stage costs, by replays of the run.
+
+    `by`: share by which all jobs of a stage take longer.
+    `frames`: number of the run's frames that were replayed.
+    `over_measured`: frame time of the replay of the run as it was, over the frame time that the run had.
+    `is_trusted`: whether the costs say what bounded the run: the replay is near the run, and a stage costs something.
+    `costs`: cost of each stage.
+    """
+
+    by: float
+    frames: int
+    over_measured: float
+    is_trusted: bool
+    costs: dict[str, SlowedCost]
+
+
+class Bound(PathShares):
+    """What bounded the frame time: what costs most when it is slowed, or without that, what has most of the path.
+
+    `unit`: the unit; its name is the report's `bottleneck`.
+    `stage`: the stage; null where no stage bounded the run.
+    `path`: what has most of the path; absent where it has the same names.
+    `slowed`: what slowing each stage costs; absent where the run was not replayed.
+    """
+
+    path: PathShares | None = None
+    slowed: Slowed | None = None
+
+
 class PolicyMetrics(Record):
     """What a run measured of its policy, so that runs of two policies can be compared.
 
@@ -348,9 +393,9 @@ class PolicyMetrics(Record):
     frame; null for fewer than two.
     `core_efficiency`: the same share for the fullest cores.
     `machine_efficiency`: the same share for all cores of the run.
-    `bottleneck`: name of what most of the critical path is: a unit, `other programs`, `release`, `overhead`, or `held`;
-    null without a path.
-    `bound`: share of the bottleneck in the path, and the stage that has most of it.
+    `bottleneck`: name of what bounded the frame time: a unit, `other programs`, `release`, `overhead`, or `held`; null
+    without a path.
+    `bound`: unit and stage that bounded it, what slowing them costs, and their shares of the critical path.
     `core_shares`: use of each set of cores that a unit has, and of all cores; on the host clock.
     `policy`: policy of the scheduler.
     """

@@ -56,6 +56,8 @@ def sweep_lines(comparison: SweepComparison, show_all: bool) -> Iterator[str | T
     """Yield texts and tables of two sweeps. `show_all`: also show trials that do not differ."""
     yield f"{comparison.other} beside {comparison.base}: {len(comparison.pairs)} trials of equal configuration"
     yield f"verdict: {comparison.verdict}"
+    if said := comparison.bound:
+        yield said
     if comparison.changes:
         yield _change_table(comparison.changes[:MOST_CHANGES])
     shown = [pair for pair in comparison.pairs if show_all or pair.differs]

@@ -260,8 +260,10 @@ def _rate_rows(runs: Sequence[PolicyMetrics]) -> Rows:
     yield "", "busiest core's work / frame time", [_number(run.core_efficiency, 2) for run in runs]
     yield "", "all work / time of all cores", [_number(run.machine_efficiency, 2) for run in runs]
     units, stages = ([getattr(run.bound, kind, None) for run in runs] for kind in ("unit", "stage"))
-    yield "bound", "unit, % of the path (95 % interval)", [_part_of_path(part) for part in units]
-    yield "", "stage, % of the path (95 % interval)", [_part_of_path(part) for part in stages]
+    is_slowed = any(part is not None and part.cost is not None for part in units)
+    what = "% longer if 20 % slower" if is_slowed else "% of the path (95 % interval)"
+    yield "bound", f"unit, {what}", [_bounds(part, is_slowed=is_slowed) for part in units]
+    yield "", f"stage, {what}", [_bounds(part, is_slowed=is_slowed) for part in stages]
     yield "frames", "lost + dropped + not begun", [_left_out(run.frames) for run in runs]
     yield "", "deadline misses", [str(run.deadline_misses) for run in runs]
 
@@ -271,12 +273,17 @@ def _left_out(frames: FrameCounts) -> str:
     return f"{frames.lost} + {sum(frames.dropped.values())} + {not_begun}"
 
 
-def _part_of_path(part: PathShare | None) -> str:
+def _bounds(part: PathShare | None, *, is_slowed: bool) -> str:
+    """Return what slowing a unit or a stage costs, or its share of the path where that is not known."""
     if part is None:
         return DASH
-    if part.share_low is None or part.share_high is None:
-        return f"{part.name} {_percent(part.share)}"
-    return f"{part.names} {_percent(part.share)} ({_percent(part.share_low)} to {_percent(part.share_high)})"
+    if part.cost is None:
+        value, low, high = part.share, part.share_low, part.share_high
+    else:
+        value, low, high = part.cost, part.cost_low, part.cost_high
+    between = "" if low is None or high is None else f" ({_percent(low)} to {_percent(high)})"
+    of_path = " of the path" if is_slowed and part.cost is None else ""
+    return f"{part.names if between else part.name} {_percent(value)}{between}{of_path}"
 
 
 def _number(value: float | None, digits: int = 1) -> str:

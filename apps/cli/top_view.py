@@ -217,9 +217,12 @@ def _percent(share: float) -> str:
 
 
 def _short_bound(figures: MomentFigures) -> str:
-    """Return the bounding unit and its share of the critical path; empty if unknown."""
+    """Return the unit with what slowing it costs, or with its share of the critical path; empty if unknown."""
     unit = (figures.bound or {}).get("unit")
-    return f"bound {unit['name']} {unit['share']:.0%}" if unit else ""
+    if not unit:
+        return ""
+    cost = unit.get("cost")
+    return f"bound {unit['name']} " + (f"{unit['share']:.0%}" if cost is None else f"+{cost:.0%}")
 
 
 def _short_error(figures: MomentFigures) -> str:

@@ -14,7 +14,15 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from trilane.apps.compare.comparison import SCHEMA, change_of, exceeds, interval_of
+from trilane.apps.compare.comparison import (
+    SCHEMA,
+    Bounds,
+    bound_of_runs,
+    bounds_of,
+    change_of,
+    exceeds,
+    interval_of,
+)
 from trilane.apps.compare.difference import ALPHA, LEAST_FRAMES, Difference, Finding, combined, rejected
 from trilane.apps.compare.rows import BUSY_MACHINE, FRAME_TIME, MS, Figure, rows_of
 from trilane.apps.compare.sides import Change, ComparedRun, RunKind, Side, changes, read_told
@@ -38,6 +46,7 @@ class TrialPair:
 
     `name`: name of its first trial in the base. `runs`: number of runs a side. `frame_time`: mean frame time of both.
     `differs`: whether the test of all pairs together calls it different. `changes`: changes of machine and settings.
+    `bounds`: what bounded its runs.
     """
 
     name: str
@@ -46,6 +55,7 @@ class TrialPair:
     frame_time: Difference
     differs: bool
     changes: tuple[Change, ...]
+    bounds: Bounds
 
     @property
     def outcome(self) -> Finding:
@@ -84,6 +94,19 @@ class SweepComparison:
         slower = sum(pair.frame_time.effect > 0 for pair in differing)
         return f"frame time differs in {len(differing)} of {of}, {slower} of them slower; {whole}"
 
+    @property
+    def bound(self) -> str:
+        """How many runs of each sweep each unit bounded, as a sentence; empty where no run knows, as in predictions."""
+        base = [bound for pair in self.pairs for bound in pair.bounds.base]
+        other = [bound for pair in self.pairs for bound in pair.bounds.other]
+        if not any((*base, *other)):
+            return ""
+        found = [pair.bounds.outcome for pair in self.pairs]
+        changed, unsure = found.count(Finding.DIFFERS), found.count(Finding.UNKNOWN)
+        told = f", of {unsure} it cannot be told" if unsure else ""
+        of = f"changed in {changed} of {len(found)} trial{'s' * (len(found) > 1)}{told}"
+        return f"bound: {bound_of_runs(other)}; was {bound_of_runs(base)}; {of}"
+
     def slower_than(self, limit: float) -> list[Finding]:
         """Return whether each pair's frame time is longer by more than the share `limit`: DIFFERS if it surely is."""
         return [exceeds(pair.frame_time, limit, differs=pair.differs) for pair in self.pairs]
@@ -100,6 +123,7 @@ class SweepComparison:
             "trials": [
                 {"id": pair.name, "options": dict(pair.options), "runs": pair.runs}
                 | {**_told(pair.frame_time), "differs": pair.differs, "outcome": str(pair.outcome)}
+                | {"bound": pair.bounds.as_json()}
                 for pair in self.pairs
             ],
             "left_out": {reason: list(names) for reason, names in self.left_out.items()},
@@ -160,6 +184,7 @@ def _compared(
             row,
             row.probability is not None and next(fallen),
             tuple(changes(first.runs[0].document, second.runs[0].document)),
+            bounds_of(first, second),
         )
         for (name, first, second, options), row in zip(found, rows, strict=True)
     )

@@ -72,8 +72,8 @@ IN_THOUSANDS: Final = 10_000
 class Bounds(NamedTuple):
     """The `bound` of each run of either side, as in report.json; None where it is unknown.
 
-    `outcome` says whether the bounding unit changed. Only that unit's share of the path is known, so another unit's
-    share may be as large unless this one is surely more than a half.
+    `outcome` says whether the bounding unit changed. A run whose bound has rivals does not say so surely. A report
+    without rivals says so surely where the unit has more than half of the path.
     """
 
     base: tuple[Mapping[str, Any] | None, ...]
@@ -88,8 +88,22 @@ class Bounds(NamedTuple):
         base, other = ({unit["name"] for unit in side} for side in (units[: len(self.base)], units[len(self.base) :]))
         if len(base | other) == 1:
             return Finding.SAME
-        is_sure = all((unit["share_low"] or 0.0) > 0.5 for unit in units)
+        is_sure = all(_is_sure(unit) for unit in units)
         return Finding.DIFFERS if len(base) == len(other) == 1 and is_sure else Finding.UNKNOWN
+
+    def as_json(self) -> dict[str, Any]:
+        """Return `bound` of an entry of `comparisons`, or of `trials` of two sweeps."""
+        return {**self._asdict(), "outcome": str(self.outcome)}
+
+
+def bounds_of(base: Side, other: Side) -> Bounds:
+    """Return what bounded the runs of both sides, by their reports."""
+    return Bounds(*(tuple(told.document.get("bound") for told in side.runs) for side in (base, other)))
+
+
+def _is_sure(unit: Mapping[str, Any]) -> bool:
+    rivals = unit.get("rivals")
+    return (unit["share_low"] or 0.0) > 0.5 if rivals is None else not rivals
 
 
 @dataclass(frozen=True)
@@ -114,7 +128,7 @@ class Comparison:
             "run": self.other.name,
             "verdict": self.verdict,
             "outcome": str(self.whole),
-            "bound": {**self.bounds._asdict(), "outcome": str(self.bounds.outcome)},
+            "bound": self.bounds.as_json(),
             "changes": [change._asdict() for change in self.changes],
             "rows": [_row_document(figure, self) for figure in self.rows],
             "notes": list(self.notes),
@@ -176,8 +190,7 @@ def _compared(base: Side, other: Side) -> Comparison:
         differing += _differing(rows, [figure for figure in rows if figure not in first])
     changed = tuple(changes(base.runs[0].document, other.runs[0].document))
     said = verdict(rows, first, differing, changed, _stages(base.runs[0].document))
-    bounds = Bounds(*(tuple(told.document.get("bound") for told in side.runs) for side in (base, other)))
-    return Comparison(base, other, rows, differing, changed, said, bounds, tuple(_notes(base, other)))
+    return Comparison(base, other, rows, differing, changed, said, bounds_of(base, other), tuple(_notes(base, other)))
 
 
 def _differing(rows: Rows, figures: Sequence[Figure]) -> tuple[Figure, ...]:
@@ -441,11 +454,11 @@ def bounds_text(bounds: Bounds) -> str:
         return ""
     changed = " changed" if bounds.outcome is Finding.DIFFERS else ""
     unsure = ": whether it changed cannot be told" if bounds.outcome is Finding.UNKNOWN else ""
-    return f"bound{changed}: {_side(bounds.other)}; was {_side(bounds.base)}{unsure}"
+    return f"bound{changed}: {bound_of_runs(bounds.other)}; was {bound_of_runs(bounds.base)}{unsure}"
 
 
-def _side(bounds: Sequence[Mapping[str, Any] | None]) -> str:
-    """Return the bound of one run with its shares; of several runs, how many each unit bounded."""
+def bound_of_runs(bounds: Sequence[Mapping[str, Any] | None]) -> str:
+    """Return the bound of one run in words; of several runs, how many each unit bounded."""
     if len(bounds) == 1:
         return bound_text(bounds[0]) if bounds[0] else "not known"
     names = Counter(bound["unit"]["name"] if bound else "not known" for bound in bounds)

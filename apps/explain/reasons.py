@@ -234,16 +234,26 @@ def _work(shown: Shown, usual: Usual, job: JobRecord, longer_ns: float) -> str:
 
 
 def bound_text(bound: Mapping[str, Any]) -> str:
-    """Return a report's `bound` in words: the unit and the stage with most of the path, their shares and intervals."""
-    named = [f"{part['name']} {_share(part)}" for part in (bound["unit"], bound["stage"]) if part]
-    return ", and of stages most ".join(named)
+    """Return a report's `bound` in words: the unit and the stage, what slowing them costs and their shares of the path.
+
+    Where others have most of the path, they stand behind.
+    """
+    named = ", and of stages most ".join(part_text(part) for part in (bound["unit"], bound["stage"]) if part)
+    path = bound.get("path") or {}
+    of_path = [part_text(part) for kind in ("unit", "stage") if (part := path.get(kind))]
+    return "; most of the path: ".join([named, ", ".join(of_path)] if of_path else [named])
 
 
-def _share(part: Mapping[str, Any]) -> str:
-    if part["share_low"] is None:
-        return f"{part['share']:.0%} of the path"
+def part_text(part: Mapping[str, Any]) -> str:
+    """Return a unit or stage of a report's `bound` in words, with its interval and its rivals."""
+    cost = part.get("cost")
+    key, value = ("share", part["share"]) if cost is None else ("cost", cost)
+    low, high = part[f"{key}_low"], part[f"{key}_high"]
+    between = "" if low is None else f" ({low:.0%} to {high:.0%})"
     rivals = f", not surely more than {' or '.join(part['rivals'])}" if part.get("rivals") else ""
-    return f"{part['share']:.0%} of the path ({part['share_low']:.0%} to {part['share_high']:.0%}){rivals}"
+    if cost is None:
+        return f"{part['name']} {value:.0%} of the path{between}{rivals}"
+    return f"{part['name']} costs {value:.0%}{between} when 20% slower, {part['share']:.0%} of the path{rivals}"
 
 
 #: Stage of the avatar's pipeline -> what makes its work shorter.

@@ -2,7 +2,7 @@
 
 Rule: the default body stands as high as a square picture, with the same numbers every time; only size and channels
 vary. Avatars and ground truth are made by the functions of runs and of training. A busy machine affects all variants
-alike.
+alike. As in a run, no input is the one before, and slots alternate: what repeats is found in caches.
 """
 
 from __future__ import annotations
@@ -30,7 +30,11 @@ TEXTURE_SIDE = 512
 ENCODING = Quantisation(6 / 255, 128)
 DISTANCE_M, HEIGHT_M, FRAME_M = 3.0, 0.9, 1.9
 ARMS_DOWN_RAD = 1.1
+ARMS_STEP_RAD = 0.07  # by which the arms are higher in each further pose
 WARM_UP = 5
+#: Number of inputs that take turns, and of slots that they go through. They have no common divisor, so that each input
+#: comes to each slot.
+INPUTS, SLOTS = 5, 2
 
 
 @dataclass(frozen=True)
@@ -38,41 +42,47 @@ class Fixture:
     """The body and how it is seen.
 
     `shaped`: body in its shape.
-    `posed`: its joints, posed.
+    `poses`: its joints in each of INPUTS poses.
     `arrays`: its mesh for the GPU.
-    `joints`: skinning matrices, (55,3,4) float32.
     `view`, `projection`: matrices of the camera, (4,4) float64.
     `texture`: (512,512,C) float64, the same numbers every time.
     """
 
     shaped: ShapedBody
-    posed: Posed
+    poses: tuple[Posed, ...]
     arrays: MeshArrays
-    joints: NDArray[np.float32]
     view: NDArray[np.float64]
     projection: NDArray[np.float64]
     texture: NDArray[np.float64]
 
+    def joints(self, number: int) -> NDArray[np.float32]:
+        """Return the skinning matrices (55,3,4) float32 of input `number`."""
+        return self.poses[number % INPUTS].matrices
+
 
 def standing(channels: int, weights: int = 8) -> Fixture:
-    """Return the body with arms half down.
+    """Return the body with arms half down, a little higher in each further pose.
 
     `channels`: channels of its texture. `weights`: number of skin weights a vertex, 4, 8 or 12.
     """
     body = load_body(bundle_folder("default") / "body.npz")
     shaped = body.shape()
     top = largest_weights(body.weights, weights)
-    pose = np.zeros((55, 3))
-    pose[JOINT_INDEX["left_shoulder"], 2], pose[JOINT_INDEX["right_shoulder"], 2] = -ARMS_DOWN_RAD, ARMS_DOWN_RAD
     low = float(shaped.vertices[:, 1].min())
-    posed = Skeleton(shaped.joints, body.parents).pose(pose.ravel(), translation=(0.0, -low, 0.0))
+    skeleton = Skeleton(shaped.joints, body.parents)
+
+    def posed(number: int) -> Posed:
+        pose, down = np.zeros((55, 3)), ARMS_DOWN_RAD - number * ARMS_STEP_RAD
+        pose[JOINT_INDEX["left_shoulder"], 2], pose[JOINT_INDEX["right_shoulder"], 2] = -down, down
+        found = skeleton.pose(pose.ravel(), translation=(0.0, -low, 0.0))
+        return Posed(found.matrices.copy(), found.joints.copy(), found.feature.copy())
+
     view = np.eye(4)
     view[:3, 3] = (0.0, -HEIGHT_M, -DISTANCE_M)
     return Fixture(
         shaped=shaped,
-        posed=posed,
+        poses=tuple(map(posed, range(INPUTS))),
         arrays=mesh_arrays(shaped.vertices, body.faces, body.uv, body.uv_faces, top.joints, top.weights),
-        joints=posed.matrices.copy(),
         view=view,
         projection=_projection(),
         texture=_texture(channels),
@@ -126,17 +136,23 @@ def ground_truth(bundle: Bundle) -> tuple[Any, Any]:
     return SampleRenderer(bundle.shaped_body(), look=look_of(bundle.manifest.provenance)), image_error
 
 
-def interleaved_ms(variants: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, list[float]]:
+def interleaved_ms(
+    variants: Mapping[str, Callable[[int], object]],
+    repeats: int,
+    prepare: Callable[[int], object] = lambda _: None,
+) -> dict[str, list[float]]:
     """Return milliseconds of each variant in each of `repeats` rounds, after a warm-up.
 
-    A round runs each variant once.
+    A round runs each variant once, with the number of the round, from 0: it says which input and which slot. `prepare`
+    is called with the same number before each, and is not timed.
     """
     times: dict[str, list[float]] = {name: [] for name in variants}
-    for round_number in range(-WARM_UP, repeats):
+    for number in range(WARM_UP + repeats):
         for name, run in variants.items():
+            prepare(number)
             start = time.perf_counter_ns()
-            run()
-            if round_number >= 0:
+            run(number)
+            if number >= WARM_UP:
                 times[name].append((time.perf_counter_ns() - start) / 1e6)
     return times
 

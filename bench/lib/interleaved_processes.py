@@ -1,7 +1,8 @@
 """Variants of inference that run interleaved, each in a process of its own: no variant's threads disturb another's.
 
 Rule: only one process computes at a time; the others wait on a pipe. An answer that is text is an error message. The
-processes end with the block that started them.
+processes end with the block that started them. As in a run, no input is the one before, and slots alternate: what
+repeats is found in caches. An input is put into its slot before the time counts.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
+from itertools import cycle, islice
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -21,6 +24,8 @@ from trilane.errors import TrilaneError
 
 START_S = 300.0
 WARM_UP = 3
+#: Number of inputs that take turns, and of slots that they go through.
+INPUTS, SLOTS = 5, 2
 
 
 def answer_of(pipe: Connection, name: str, wait_s: float) -> Any:
@@ -118,41 +123,52 @@ def serve(pipe: Connection, variant: ProcessVariant) -> None:
     """Run the child: load, send the start-up time, then run as often as each message says, until `pipe` closes."""
     try:
         begin = time.perf_counter()
-        run = KINDS[variant.kind](variant)
+        runs = KINDS[variant.kind](variant)
         pipe.send((time.perf_counter() - begin) * 1e3)
-        for _ in range(WARM_UP):
-            run()
+        _timed(runs, WARM_UP)
         while True:
-            pipe.send(_timed(run, pipe.recv()))
+            pipe.send(_timed(runs, pipe.recv()))
     except (EOFError, BrokenPipeError):
         return
     except Exception as error:
         pipe.send(f"{type(error).__name__}: {error}")
 
 
-def _timed(run: Callable[[], object], count: int) -> list[float]:
+#: A call for each input, which has its slot when the call is taken.
+Runs = Iterator[Callable[[], object]]
+
+
+def _timed(runs: Runs, count: int) -> list[float]:
     times = []
-    for _ in range(count):
+    for run in islice(runs, count):
         begin = time.perf_counter_ns()
         run()
         times.append((time.perf_counter_ns() - begin) / 1e6)
     return times
 
 
-def _runtime(variant: ProcessVariant) -> Callable[[], object]:
-    """Return a call as Trilane runs a network: arrays are bound once."""
+def _runtime(variant: ProcessVariant) -> Runs:
+    """Return calls as Trilane runs a network: the arrays of each slot are bound once."""
     from trilane.avatars.network_file import read_network
-    from trilane.bench.lib.networks import random_tensor
+    from trilane.bench.lib.networks import random_tensors
     from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
 
     network = read_network(variant.network)
-    image = np.zeros((*network.shape[:3], 4), np.uint8)
     session = load_runtime(variant.runtime).load(network, RuntimeOptions(variant.threads or 1, variant.spin))
-    return session.bind([random_tensor(network)], [image]).run
+    tensors = np.empty((SLOTS, *network.shape), np.uint8)
+    images = np.empty((SLOTS, *network.shape[:3], 4), np.uint8)
+    bound = [session.bind([tensor], [image]) for tensor, image in zip(tensors, images, strict=True)]
+
+    def runs() -> Runs:
+        for number, tensor in enumerate(cycle(random_tensors(network, INPUTS))):
+            tensors[number % SLOTS] = tensor
+            yield bound[number % SLOTS].run
+
+    return runs()
 
 
-def _ort_default(variant: ProcessVariant) -> Callable[[], object]:
-    """Return a call as in ONNX Runtime's first example: a session with defaults, `run` with an array."""
+def _ort_default(variant: ProcessVariant) -> Runs:
+    """Return calls as in ONNX Runtime's first example: a session with defaults, `run` with an array."""
     import onnxruntime
 
     settings = onnxruntime.SessionOptions()
@@ -161,26 +177,27 @@ def _ort_default(variant: ProcessVariant) -> Callable[[], object]:
     session = onnxruntime.InferenceSession(str(variant.network), settings, providers=["CPUExecutionProvider"])
     source = session.get_inputs()[0]
     rng = np.random.default_rng(1)
+    shape = (INPUTS, *source.shape)
     if source.type == "tensor(uint8)":
-        feed: Any = rng.integers(0, 256, source.shape, dtype=np.uint8)
+        feeds: Any = rng.integers(0, 256, shape, dtype=np.uint8)
     else:
-        feed = rng.normal(size=source.shape).astype(np.float32)
-    return lambda: session.run(None, {source.name: feed})
+        feeds = rng.normal(size=shape).astype(np.float32)
+    return (partial(session.run, None, {source.name: feed}) for feed in cycle(feeds))
 
 
-def _openvino_default(variant: ProcessVariant) -> Callable[[], object]:
-    """Return a call as in OpenVINO's first example: compile a file, call the model with an array."""
+def _openvino_default(variant: ProcessVariant) -> Runs:
+    """Return calls as in OpenVINO's first example: compile a file, call the model with an array."""
     from trilane.stages.dsp.runtime import quiet_openvino
 
     openvino = quiet_openvino()
     settings = {} if variant.threads is None else {"INFERENCE_NUM_THREADS": variant.threads}
     compiled = openvino.Core().compile_model(str(variant.network), "CPU", settings)
-    feed = np.random.default_rng(1).integers(0, 256, tuple(compiled.input(0).shape), dtype=np.uint8)
+    feeds = np.random.default_rng(1).integers(0, 256, (INPUTS, *compiled.input(0).shape), dtype=np.uint8)
     request = compiled.create_infer_request()
-    return lambda: request.infer({0: feed})
+    return (partial(request.infer, {0: feed}) for feed in cycle(feeds))
 
 
-KINDS: dict[str, Callable[[ProcessVariant], Callable[[], object]]] = {
+KINDS: dict[str, Callable[[ProcessVariant], Runs]] = {
     "runtime": _runtime,
     "ort": _ort_default,
     "openvino": _openvino_default,

@@ -91,9 +91,9 @@ def fixture_of_file(network: NetworkFile, batch: int = 1) -> NetworkFixture:
     return NetworkFixture(label, reshaped(network, *size, batch), facts["parameters"], facts["gmac"])
 
 
-def random_tensor(network: NetworkFile) -> NDArray[np.uint8]:
-    """Return random bytes (N, H, W, C), the same every time."""
-    return np.random.default_rng(1).integers(0, 256, network.shape, dtype=np.uint8)
+def random_tensors(network: NetworkFile, count: int) -> NDArray[np.uint8]:
+    """Return random bytes (`count`, N, H, W, C), the same every time."""
+    return np.random.default_rng(1).integers(0, 256, (count, *network.shape), dtype=np.uint8)
 
 
 def _unet(encoder: str, norm: str, width: int, channels: int) -> tuple[Any, Any]:

@@ -43,7 +43,11 @@ def listed(part: str) -> Iterator[str]:
     for line in PARTS[part]:
         for path in expanded(line):
             above, _, inner = path.rpartition("@")
-            yield from ([above + end for end in listed(inner)] if inner and "@" in path else [path.replace("?", "")])
+            yield from (
+                [above.replace("?", "") + end for end in listed(inner)]
+                if inner and "@" in path
+                else [path.replace("?", "")]
+            )
 
 
 def rows(heading: str) -> list[list[str]]:

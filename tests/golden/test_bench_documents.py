@@ -57,13 +57,13 @@ def test_split_passes_fill_a_tensor_that_is_no_square(gl: Any) -> None:
     mesh = SkinnedMesh(gl, body.arrays)
     split = SplitPass(gl, mesh, body.texture, ENCODING, shape)
     packed = raster.packed_variant(gl, body, shape, deferred=False)
-    placement = raster.Placement(body.joints, body.projection, (0, 0, *shape))
+    placement = raster.Placement(body.joints(0), body.projection, (0, 0, *shape))
     tensors = np.zeros((2, *shape, 8), np.uint8)
     for _ in range(2):  # the second draw begins where the first has left its targets
         gl.disable(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         split.draw(body.view, placement)
         split.read_into(tensors[0].reshape(-1))
-    packed(tensors[1].reshape(-1))
+    packed(tensors[1:].reshape(1, -1), 0)
     steps = np.abs(tensors[0].astype(int) - tensors[1])
     assert steps.max() <= 1 and (steps > 0).mean() < 2e-3 and (tensors[0] != 128).any(axis=(0, 1)).all()
     with pytest.raises(BadInputError):

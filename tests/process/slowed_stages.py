@@ -5,13 +5,14 @@ The runs take turns, in another order each round. By hand, on a quiet machine:
 
     python tests/process/slowed_stages.py OUT ROUNDS -- trilane run --frames 200 --baseline 0 --no-video
 
-prints for each stage the median of frame time over that of the run beside it in which nothing is slowed, and the bound
-that those runs name. OUT: a folder for the runs, which is removed at the end.
+prints for each stage the median of frame time over that of the run beside it in which nothing is slowed, beside the
+cost that those runs say; and the bound that they name. OUT: a folder for the runs, which is removed at the end.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import random
 import shutil
@@ -71,14 +72,19 @@ def main(folder: Path, rounds: int, command: list[str]) -> None:
             cost[stage].append(slow["frame_time_ms"]["mean"] / plain["frame_time_ms"]["mean"] - 1)
             cpu = [report["stages"][stage]["cpu_ms"]["mean"] for report in (slow, plain)]
             grown[stage].append(cpu[0] / cpu[1] - 1)
+    replays = [report["bound"]["slowed"] for report in plains if "slowed" in report["bound"]]
     for stage in stages:
         each = " ".join(f"{value:+.3f}" for value in cost[stage])
         more = statistics.median(grown[stage])
-        print(f"{stage:10} CPU time {more:+.1%}  frame time {statistics.median(cost[stage]):+.1%}  ({each})")
+        said = statistics.median(replay["costs"][stage]["cost"] for replay in replays) if replays else math.nan
+        frame = statistics.median(cost[stage])
+        print(f"{stage:10} CPU time {more:+.1%}  frame time {frame:+.1%}  ({each})  said {said:+.1%}")
     print("costs most:", max(stages, key=lambda stage: statistics.median(cost[stage])))
     bounds = [report["bound"]["stage"] for report in plains]
     named = [PathShare.model_validate(bound).names for bound in bounds]
     print("named:", {name: named.count(name) for name in sorted(set(named))})
+    near = [f"{replay['over_measured']:.3f}" for replay in replays]
+    print(f"replay over run: {' '.join(near)}; trusted {sum(replay['is_trusted'] for replay in replays)}")
     print(f"other programs: {statistics.median(report['other_programs'] for report in plains):.1%} of the cores")
     shutil.rmtree(folder)
 

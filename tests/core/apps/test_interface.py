@@ -153,7 +153,7 @@ def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
         trilane.load_run(" ")
 
 
-BOUND = "dsp 82% of the path, infer 44% of the path"
+BOUND = "dsp 82% of the path (78% to 86%), and of stages most infer 44% of the path"
 
 
 def test_a_notebook_shows_the_error_beside_the_speed_and_nothing_unescaped(folder: Path) -> None:

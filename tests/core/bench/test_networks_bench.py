@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import sys
+from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +16,7 @@ import pytest
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import read_network
 from trilane.bench.lib import interleaved_processes, networks
-from trilane.bench.lib.interleaved_processes import KINDS, ProcessVariant, Runner
+from trilane.bench.lib.interleaved_processes import INPUTS, KINDS, SLOTS, ProcessVariant, Runner
 from trilane.errors import MissingPartError, TrilaneError
 
 
@@ -80,7 +81,7 @@ def test_a_child_loads_warms_up_and_runs_as_often_as_it_is_asked(monkeypatch: py
             ran.append(variant)
             now[0] += len(ran) * 1_000_000
 
-        return run
+        return iter(lambda: run, None)
 
     clock = SimpleNamespace(perf_counter=lambda: now[0] / 1e9, perf_counter_ns=lambda: now[0])
     monkeypatch.setattr(interleaved_processes, "time", clock)
@@ -108,26 +109,37 @@ def network(tiny_quantised: Any, tmp_path: Path) -> Path:
 def test_every_kind_infers_the_same_bytes(network: Path, tiny_float: onnx.ModelProto, tmp_path: Path) -> None:
     """The libraries' first examples, beside a plain session; Trilane's way has nothing to answer."""
     onnxruntime = pytest.importorskip("onnxruntime")
-    source = np.random.default_rng(1).integers(0, 256, (1, 64, 64, 5), dtype=np.uint8)
+    source = np.random.default_rng(1).integers(0, 256, (INPUTS, 1, 64, 64, 5), dtype=np.uint8)[0]
     plain = onnxruntime.InferenceSession(str(network), providers=["CPUExecutionProvider"])
     expected = plain.run(None, {plain.get_inputs()[0].name: source})[0]
     for threads in (1, None):
-        (found,) = KINDS["ort"](ProcessVariant("ort", network, threads=threads))()  # type: ignore[misc]
+        (found,) = next(KINDS["ort"](ProcessVariant("ort", network, threads=threads)))()  # type: ignore[misc]
         assert np.array_equal(found, expected)
-        assert KINDS["runtime"](ProcessVariant("runtime", network, "ort", threads))() is None
+        assert next(KINDS["runtime"](ProcessVariant("runtime", network, "ort", threads)))() is None
     onnx.save(tiny_float, tmp_path / "float.onnx")
-    (found,) = KINDS["ort"](ProcessVariant("ort", tmp_path / "float.onnx"))()  # type: ignore[misc]
-    real = np.random.default_rng(1).normal(size=(1, 5, 64, 64)).astype(np.float32)
+    (found,) = next(KINDS["ort"](ProcessVariant("ort", tmp_path / "float.onnx")))()  # type: ignore[misc]
+    real = np.random.default_rng(1).normal(size=(INPUTS, 1, 5, 64, 64)).astype(np.float32)[0]
     plain = onnxruntime.InferenceSession(str(tmp_path / "float.onnx"), providers=["CPUExecutionProvider"])
     np.testing.assert_allclose(found, plain.run(None, {"tensor": real})[0], atol=1e-6)
+
+
+def test_inputs_take_turns_and_so_do_slots(network: Path) -> None:
+    """Each of INPUTS pictures is another one, and the next round has the same ones; Trilane's way binds SLOTS."""
+    pytest.importorskip("onnxruntime")
+    runs = KINDS["ort"](ProcessVariant("ort", network))
+    pictures = [next(runs)()[0] for _ in range(2 * INPUTS)]  # type: ignore[index]
+    assert len({picture.tobytes() for picture in pictures[:INPUTS]}) == INPUTS
+    assert all(np.array_equal(*pair) for pair in zip(pictures[:INPUTS], pictures[INPUTS:], strict=True))
+    bound = [run.__self__ for run in islice(KINDS["runtime"](ProcessVariant("runtime", network, "ort")), 2 * SLOTS)]  # type: ignore[attr-defined]
+    assert len({id(one) for one in bound}) == SLOTS and bound[:SLOTS] == bound[SLOTS:]
 
 
 @pytest.mark.parametrize("threads", [2, None])
 def test_openvino_infers_nearly_the_same(network: Path, threads: int | None) -> None:
     """Its sums round elsewhere: few bytes are off, by a step or two."""
     pytest.importorskip("openvino")
-    (ours,) = KINDS["ort"](ProcessVariant("ort", network))()  # type: ignore[misc]
-    (theirs,) = KINDS["openvino"](ProcessVariant("openvino", network, threads=threads))().values()  # type: ignore[attr-defined]
+    (ours,) = next(KINDS["ort"](ProcessVariant("ort", network)))()  # type: ignore[misc]
+    (theirs,) = next(KINDS["openvino"](ProcessVariant("openvino", network, threads=threads)))().values()  # type: ignore[attr-defined]
     steps = np.abs(np.asarray(theirs).astype(int) - ours)
     assert (steps > 0).mean() < 0.05 and steps.max() <= 4
 
@@ -139,8 +151,8 @@ def test_a_file_has_the_work_of_its_layers(network: Path) -> None:
     assert fixture.gmac == pytest.approx(sum(9 * side**2 * c_in * c_out for side, c_in, c_out in sizes) / 1e9)
     assert fixture.integer.shape == (3, 64, 64, 5) and fixture.label["size"] == [64, 64]
     assert fixture.label["network"] == read_network(network).where
-    tensor = networks.random_tensor(fixture.integer)  # type: ignore[arg-type]
-    assert tensor.shape == (3, 64, 64, 5) and tensor.dtype == np.uint8 and (tensor.min(), tensor.max()) == (0, 255)
+    tensor = networks.random_tensors(fixture.integer, 2)
+    assert tensor.shape == (2, 3, 64, 64, 5) and tensor.dtype == np.uint8 and (tensor.min(), tensor.max()) == (0, 255)
 
 
 def test_an_untrained_network_is_what_is_asked_for() -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from itertools import count
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,22 +17,24 @@ import pytest
 from trilane.avatars.bundle import load_bundle
 from trilane.bench import filters, several
 from trilane.bench.lib import fixture
+from trilane.body.joints import JOINT_INDEX
 from trilane.errors import BadInputError, MissingPartError
 
 Held = Callable[[str, Any], None]
 
 
 def test_variants_take_turns_and_the_warm_up_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`a` takes 2 s, `b` 3 s, and each its round's number of milliseconds more."""
-    now, rounds, order = [0.0], {"a": count(), "b": count()}, []
+    """`a` takes 2 s, `b` 3 s, and each its round's number of milliseconds more; to prepare takes 7 s."""
+    now, order = [0.0], list[str]()
     monkeypatch.setattr(fixture, "time", SimpleNamespace(perf_counter_ns=lambda: round(now[0] * 1e9)))
 
-    def run(name: str, seconds: float) -> None:
-        order.append(name)
-        now[0] += seconds + next(rounds[name]) / 1000
+    def run(name: str, seconds: float, number: int) -> None:
+        order.append(f"{name}{number}")
+        now[0] += seconds + number / 1000
 
-    times = fixture.interleaved_ms({"a": lambda: run("a", 2.0), "b": lambda: run("b", 3.0)}, 3)
-    assert "".join(order) == "ab" * (5 + 3)
+    variants = {"a": partial(run, "a", 2.0), "b": partial(run, "b", 3.0)}
+    times = fixture.interleaved_ms(variants, 3, partial(run, "p", 7.0))
+    assert order == [f"{name}{number}" for number in range(5 + 3) for name in "papb"]
     assert times["a"] == pytest.approx([2005, 2006, 2007])
     assert times["b"] == pytest.approx([3005, 3006, 3007])
 
@@ -44,8 +46,15 @@ def test_a_summary_is_median_minimum_and_ninetieth_percentile() -> None:
 
 def test_the_standing_body_is_held(held: Held) -> None:
     found = fixture.standing(channels=3)
-    for name in ("joints", "view", "projection", "texture"):
+    for name in ("view", "projection", "texture"):
         held(name, getattr(found, name))
+    held("joints", found.joints(0))
+    places = [posed.joints[JOINT_INDEX["left_wrist"]] for posed in found.poses]
+    assert len(places) == fixture.INPUTS and (np.diff([place[1] for place in places]) > 0.01).all()
+    assert found.joints(fixture.INPUTS + 1) is found.joints(1) is not found.joints(0)
+    assert {(n % fixture.INPUTS, n % fixture.SLOTS) for n in range(fixture.INPUTS * fixture.SLOTS)} == {
+        (number, slot) for number in range(fixture.INPUTS) for slot in range(fixture.SLOTS)
+    }
     held("weights", found.arrays.weight)
     clip = found.projection @ found.view
     world = np.array([0.0, fixture.HEIGHT_M + fixture.FRAME_M / 2, 0.0, 1.0])

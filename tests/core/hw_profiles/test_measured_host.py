@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from statistics import fmean
 from typing import Any
 
 import pytest
@@ -94,9 +95,13 @@ def test_stages_have_their_medians_and_the_scheduler_its_part() -> None:
 
 
 def test_the_error_is_that_of_the_model_and_the_scatter_of_what_was_measured() -> None:
-    assert error_of([5.0]) == MODEL_ERROR == 0.08
-    assert error_of([7.0, 7.0, 7.0]) == pytest.approx(0.08)
-    assert error_of([math.exp(0.0), math.exp(0.1), math.exp(0.2)]) == pytest.approx(math.hypot(0.1, 0.08))
+    """The model's own is at least what `bench placement` found in ten scenes and sizes: predicted over measured of the
+    chosen placement (docs/decisions/placement.md), whose root mean square of logarithms is 0.10."""
+    ratios = (1.13, 1.18, 1.09, 1.09, 1.06, 1.13, 1.15, 1.06, 1.12, 1.04)
+    assert math.sqrt(fmean(math.log(ratio) ** 2 for ratio in ratios)) == pytest.approx(MODEL_ERROR, abs=0.01)
+    assert error_of([5.0]) == MODEL_ERROR
+    assert error_of([7.0, 7.0, 7.0]) == pytest.approx(MODEL_ERROR)
+    assert error_of([math.exp(0.0), math.exp(0.1), math.exp(0.2)]) == pytest.approx(math.hypot(0.1, MODEL_ERROR))
 
 
 def test_a_prediction_of_what_was_measured_has_its_interval() -> None:

@@ -19,6 +19,7 @@ from trilane.avatars.bundle import load_bundle
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.application import REFERENCE
 from trilane.hw_profiles.graph_file import read_graph
+from trilane.hw_profiles.host_model import MODEL_ERROR
 from trilane.hw_profiles.network_work import Network, count_work
 from trilane.hw_profiles.profile_files import load_profile
 from trilane.machine import Machine
@@ -268,7 +269,7 @@ def test_an_avatar_has_what_a_run_of_it_is_placed_by(rehearsed: Any, tiny_bundle
     assert rehearsed["request"].avatar == str(tiny_bundle) and rehearsed["driver"] == "{'vendor': 'Mesa'}"
     assert (network.height, network.width, network.channels) == (96, 64, 5)
     found: Any = chip.units["dsp"].measured
-    assert set(found.slower) == {1, 2} and found.error == pytest.approx(0.08)
+    assert set(found.slower) == {1, 2} and found.error == pytest.approx(MODEL_ERROR)
     assert found.said == "measured on this machine at noon: frames of a run, one at a time, with ort"
     assert chip.application.composite_ms.or_else(0) == 1.0
     assert said == [this_machine.MEASURING.format("the stages")]

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from support.compared_runs import simulated, write_run
+from trilane.apps.cli.compare_table import sweep_lines
 from trilane.apps.compare.compared_sweeps import SweepComparison, compare_sweeps
 from trilane.apps.compare.difference import Finding
 from trilane.errors import BadInputError
@@ -67,6 +68,32 @@ def test_trials_of_equal_configuration_are_paired(sweep: SweepOf) -> None:
     assert found.verdict.startswith("frame time differs in 1 of 2 trials, 1 of them slower; over all +9.")
     assert [found.slower_than(limit) for limit in (0.15, 0.25)] == [[Finding.SAME, Finding.DIFFERS], [Finding.SAME] * 2]
     assert compared(base, base).verdict.startswith("no difference in any of 4 trials; over all +0.0 %")
+
+
+def told_bound(name: str) -> dict[str, Any]:
+    share = {"name": name, "share": 0.6, "share_low": 0.5, "share_high": 0.7, "rivals": []}
+    return {"bottleneck": name, "bound": {"unit": share, "stage": {**share, "name": "infer"}}}
+
+
+def test_the_bound_of_either_sweep_is_named_and_in_how_many_trials_it_changed(sweep: SweepOf) -> None:
+    """Of three trials the bound stays in one, changes in one, and is not known of one in the other sweep."""
+    base, other = (sweep(name, {64: SAME, 96: SAME, 128: SAME}, folders=False) for name in ("base", "other"))
+    bounded = {base: ["dsp", "dsp", "gpu"], other: ["dsp", "gpu", ""]}
+    for folder, names in bounded.items():
+        records = [json.loads(line) for line in (folder / "trials.jsonl").read_text().splitlines()]
+        for record, name in zip(records, names, strict=True):
+            record["result"] |= told_bound(name) if name else {"bottleneck": None, "bound": None}
+        (folder / "trials.jsonl").write_text("".join(f"{json.dumps(record)}\n" for record in records))
+    found = compared(base, other)
+    assert [pair.bounds.outcome for pair in found.pairs] == [Finding.SAME, Finding.DIFFERS, Finding.UNKNOWN]
+    assert found.bound == (
+        "bound: dsp in 1 of 3 runs, gpu in 1 of 3 runs, not known in 1 of 3 runs; was dsp in 2 of 3 runs, gpu in 1 of "
+        "3 runs; changed in 1 of 3 trials, of 1 it cannot be told"
+    )
+    assert found.bound in list(sweep_lines(found, show_all=False))
+    trials = found.as_json()["trials"]
+    assert [trial["bound"]["outcome"] for trial in trials] == ["no difference", "differs", "cannot tell"]
+    assert trials[1]["bound"]["other"][0]["unit"]["name"] == "gpu"
 
 
 def test_repeats_of_a_configuration_stand_for_it_together(sweep: SweepOf) -> None:
