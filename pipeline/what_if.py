@@ -103,7 +103,8 @@ class WhatIf:
 
     def __init__(self, graph: Graph, settings: Settings, places: Placement) -> None:
         self._graph, self._settings, self._places = graph, settings, places
-        self._is_known = set(graph.units) <= places.keys() and not settings.asked and not settings.arrivals_ns
+        is_timed_here = not settings.asked and not settings.arrivals_ns
+        self._is_known = graph.is_chain and set(graph.units) <= places.keys() and is_timed_here
         self._open: dict[int, dict[str, Need]] = {}
         self._presented: list[Mapping[str, Need]] = []
         self._blocks: list[_Block] = []
@@ -112,7 +113,7 @@ class WhatIf:
         self._handed_ns: list[int] = []
 
     def add(self, explained: ExplainedJob) -> None:
-        """Take the next job that has ended."""
+        """Count a job; jobs come in the order of their ends."""
         if not self._is_known:
             return
         job = explained.job
