@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import Any, Final, NamedTuple
 from zlib import crc32
 
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_file import GraphFile
-from trilane.hw_profiles.host_model import MODEL_ERROR
+from trilane.hw_profiles.host_model import MODEL_ERROR, UNMEASURED
 from trilane.hw_profiles.network_time import interval, price, spread_of
 from trilane.hw_profiles.profile_files import HOST
 from trilane.hw_profiles.rates import FrameInterval, holding
@@ -53,14 +54,15 @@ class StagePrice:
     """The time of a job of a stage.
 
     `source`: where it comes from. `spread`: standard deviation of the logarithm of its error; 0 for times that the file
-    gives. `low_ms`, `high_ms`: 80 % interval of the mean. `why`: reasons for its width.
+    gives. `low_ms`, `high_ms`: 80 % interval of the mean; None where nobody knows the error. `why`: reasons for its
+    width, or why there is none.
     """
 
     time: StageTime
     source: str
     spread: float = 0.0
-    low_ms: float = 0.0
-    high_ms: float = 0.0
+    low_ms: float | None = None
+    high_ms: float | None = None
     why: tuple[str, ...] = ()
 
     @property
@@ -82,6 +84,8 @@ def network_price(chip: Profile, graph: GraphFile, unit: UnitName, performance_p
     time = price(chip, graph.work, unit, corners_of(chip, performance_profile))
     around = interval(chip, graph.work, time)
     source = f"{chip.name}, {unit} in {chip.units[unit].precision}"
+    if chip.name == HOST and chip.units[unit].measured is None:
+        return StagePrice(StageTime(mean=time.total_ms), source, why=(UNMEASURED,))
     spread = spread_of(around) if around.low_ms > 0 else 0.0
     return StagePrice(StageTime(mean=time.total_ms), source, spread, around.low_ms, around.high_ms, around.why)
 
@@ -126,7 +130,8 @@ def prices_of(
     """
     found = {}
     for name, stage in file.stages.items():
-        known = given_price(file, name) or measured_price(file, name, measured)
+        known = None if stage.time_ms is None else given_price(file, name)
+        known = known or measured_price(file, name, measured) or given_price(file, name)
         if known is None and isinstance(stage, OnnxStage):
             unit = next(each for each in UNITS if each == file.hardware(stage.unit))
             known = network_price(chip_for(name, graphs[name], unit), graphs[name], unit, performance_profile)
@@ -208,6 +213,18 @@ def predict_file(
     }
     if file.run.fps is not None:
         answer["rate"] = {**holding(file.run.fps, needs), "sentence": _sentence(file.run.fps, needs)}
+    return answer if all(each.low_ms is not None for each in prices.values()) else _without_intervals(answer)
+
+
+def _without_intervals(answer: dict[str, Any]) -> dict[str, Any]:
+    """Return the prediction with null for its intervals, as the error of a stage is unknown."""
+    for key in ("needs_ms", "frame_time_ms", "latency_ms"):
+        answer[key] = {**answer[key], "low": None, "high": None}
+    if rate := answer.get("rate"):
+        words = rate["words"].partition(",")[0]
+        holds = f"{'yes' if rate['holds'] else 'no'}; {_short(answer['needs_ms']['mean'])} ms"
+        sentence = f"holds {rate['fps']:g} fps: {holds} of {_short(1e3 / rate['fps'])} ms (no interval)"
+        answer["rate"] = {**rate, "words": words, "sentence": sentence, "reserve_low": None, "reserve_high": None}
     return answer
 
 
@@ -239,17 +256,26 @@ def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], graph: Graph, s
         return FrameInterval(ms, ms, ms)
     rng = np.random.default_rng([seed, 1])
     found = []
-    for _ in range(DRAWS):
-        factors = _factors(prices, rng)
-        drawn = {name: round(ns * factors[name]) for name, ns in times.items()}
+    for factors in _factors(prices, rng, DRAWS):
+        drawn = {name: round(ns * factors.get(name, 1.0)) for name, ns in times.items()}
         found.append(float(period_bound(graph, drawn, in_flight).period_ns / bound_ns))
     low, high = np.percentile(found, QUANTILES)
     return FrameInterval(ms, float(ms * low), float(ms * high))
 
 
-def _factors(prices: Mapping[str, StagePrice], rng: np.random.Generator) -> dict[str, float]:
-    """Draw by how much the model of the chip may be wrong for each stage."""
-    return {name: math.exp(each.spread * rng.standard_normal()) for name, each in prices.items()}
+def _factors(prices: Mapping[str, StagePrice], rng: np.random.Generator, count: int) -> list[dict[str, float]]:
+    """Draw `count` times by how much the model of the chip may be wrong for each stage.
+
+    Each stage meets each of `count` equally likely ranges once, in a random order (a Latin hypercube), so that few
+    draws give good quantiles.
+    """
+    normal = NormalDist()
+    middles = [normal.inv_cdf((place + 0.5) / count) for place in range(count)]
+    orders = {name: rng.permutation(count).tolist() for name, each in prices.items() if each.spread}
+    return [
+        {name: math.exp(prices[name].spread * middles[order[draw]]) for name, order in orders.items()}
+        for draw in range(count)
+    ]
 
 
 def _intervals(
@@ -273,7 +299,7 @@ def _intervals(
     settings = settings_of(file, count, seed, hang_ns=NEVER_HANGS_NS)
     whole, *runs = [
         simulate(graph, settings, _Drawn(prices, seed, factors)).report
-        for factors in ({}, *(_factors(prices, rng) for _ in range(SIMULATIONS)))
+        for factors in ({}, *_factors(prices, rng, SIMULATIONS))
     ]
 
     def around(key: str, mean: float) -> dict[str, float]:

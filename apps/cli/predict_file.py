@@ -61,6 +61,10 @@ def _show(console: Console, answer: Mapping[str, Any]) -> None:
     console.print(f"bound           {_ms(answer['period_ms'])} a frame{limit}", soft_wrap=True)
     console.print(_stages(answer))
     console.print(_units(answer))
+    for reason in dict.fromkeys(
+        reason for row in answer["stages"].values() if row["low_ms"] is None for reason in row["why"]
+    ):
+        console.print(f"no interval     {reason}", soft_wrap=True)
     for name, row in answer.get("streams", {}).items():
         age, behind = row["age_ms"], row["frames_behind"]
         said = (
@@ -70,12 +74,17 @@ def _show(console: Console, answer: Mapping[str, Any]) -> None:
 
 
 def _ms(value: float) -> str:
-    return f"{value:.4g} ms"
+    return f"{_digits(value)} ms"
 
 
-def _span(low: float, high: float, share: str = ", 80 %") -> str:
-    """Return an interval in brackets; nothing where it is a point."""
-    return "" if low == high else f" ({low:.4g} to {high:.4g}{share})"
+def _digits(value: float) -> str:
+    """Return four digits, without an exponent."""
+    return f"{value:.4g}" if value < 1e4 else f"{value:.0f}"
+
+
+def _span(low: float | None, high: float | None, share: str = ", 80 %") -> str:
+    """Return an interval in brackets; nothing where it is a point or unknown."""
+    return "" if low == high or low is None or high is None else f" ({_digits(low)} to {_digits(high)}{share})"
 
 
 def _stages(answer: Mapping[str, Any]) -> Table:
@@ -83,8 +92,8 @@ def _stages(answer: Mapping[str, Any]) -> Table:
 
     table = Table("stage", "unit", "alone, ms", "in the run, ms", "waits, ms", "time from")
     for name, row in answer["stages"].items():
-        times = (f"{row[key]['mean']:.4g}" for key in ("service_ms", "wait_ms"))
-        alone = f"{row['alone_ms']:.4g}{_span(row['low_ms'], row['high_ms'], '')}"
+        times = (_digits(row[key]["mean"]) for key in ("service_ms", "wait_ms"))
+        alone = f"{_digits(row['alone_ms'])}{_span(row['low_ms'], row['high_ms'], '')}"
         table.add_row(name, row["unit"], alone, *times, row["source"])
     return table
 
@@ -108,10 +117,10 @@ def _what_ifs(answers: list[dict[str, Any]]) -> Table:
         rate = answer.get("rate")
         table.add_row(
             escape(without_controls(answer["what_if"])) or "the file",
-            f"{answer['frame_time_ms']['mean']:.4g}",
+            _digits(answer["frame_time_ms"]["mean"]),
             f"{answer['fps']:.1f}",
-            f"{answer['latency_ms']['mean']:.4g}",
-            f"{answer['needs_ms']['mean']:.4g}",
+            _digits(answer["latency_ms"]["mean"]),
+            _digits(answer["needs_ms"]["mean"]),
             f"{sum(answer['frames']['dropped'].values())}",
             "-" if rate is None else rate["sentence"].partition(": ")[2].partition(";")[0],
         )

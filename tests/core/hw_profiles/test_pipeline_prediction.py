@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from math import log, sqrt
+from math import sqrt
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
@@ -213,11 +213,22 @@ def test_a_network_has_the_time_that_it_has_by_itself(
     assert row["source"] == f"snapdragon-8-gen-3, {unit} in {alone['precision']}"
     frame = document["pipelines"][0]["frame_time_ms"]
     assert frame["mean"] == pytest.approx(alone["network_ms"], abs=1e-5)
-    # The 10 % point of 200 draws has a standard error of sqrt(0.1 * 0.9 / 200) / density = 0.121 deviations.
-    spread = log(alone["high_ms"] / alone["low_ms"]) / 2 / 1.2816
+    # The 10 % point lies between two of 200 equally likely ranges.
     for end in ("low", "high"):
-        assert abs(log(frame[end] / frame["mean"]) - log(alone[f"{end}_ms"] / alone["network_ms"])) < 3 * 0.121 * spread
+        assert frame[end] / frame["mean"] == pytest.approx(alone[f"{end}_ms"] / alone["network_ms"], rel=0.01)
     assert document["machine"]["profile"] == "snapdragon-8-gen-3"
+
+
+def test_this_machine_unmeasured_has_no_interval(documents: Predict) -> None:
+    """Nothing measures its GPU, so its speeds are assumed, as for a network by itself."""
+    text = "[run]\nfps = 1000" + NETWORK.replace("UNIT", "gpu")
+    answer = documents(text, "--profile", "host")["pipelines"][0]
+    for times in (answer["needs_ms"], answer["frame_time_ms"], answer["latency_ms"]):
+        assert (times["low"], times["high"]) == (None, None)
+    row, rate = answer["stages"]["seg"], answer["rate"]
+    assert (row["low_ms"], rate["reserve_low"]) == (None, None)
+    assert rate["sentence"].endswith("of 1 ms (no interval)")
+    assert "assumed" in row["why"][0]
 
 
 def test_a_time_of_the_file_overrides_the_networks_and_needs_no_chip(documents: Predict) -> None:
@@ -331,11 +342,13 @@ def test_measured_times_are_those_of_a_run_and_on_a_chip_times_their_scale(
     file = read_pipeline(write_file(tmp_path, text))
 
     def service(stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
-        return {"frame": 2, "depth": 20 - 10 * (frame % 2)}[stage] * 1_000_000
+        return {"frame": 3, "depth": 20 - 10 * (frame % 2)}[stage] * 1_000_000
 
     done = simulate(graph_of(file, edge_rules(file)), Settings(40), service, keep=True)
     run = write_run(tmp_path / "run", done)
-    here = documents(text, "--measured", str(run))["pipelines"][0]["stages"]["depth"]
+    rows = documents(text, "--measured", str(run))["pipelines"][0]["stages"]
+    here = rows["depth"]
+    assert rows["frame"]["alone_ms"] == 3  # not 2, which the file only asks for
     assert (here["alone_ms"], here["service_ms"]["max"]) == (15, 20)
     assert here["low_ms"] < 15 < here["high_ms"]
     chip = documents(text, "--measured", str(run), "--profile", "snapdragon-888")["pipelines"][0]["stages"]["depth"]
