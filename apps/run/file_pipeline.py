@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from trilane.apps.check.port_types import PortTypes, port_types, read_networks, value_type
+from trilane.apps.check.port_types import PortTypes, data_inputs, port_types, read_networks, value_type
 from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_file import GraphFile
 from trilane.hw_profiles.host import settings_of, usable_cores
@@ -196,7 +196,7 @@ def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str
         key: value for key, value in stage.model_dump(mode="json").items() if key not in common and value is not None
     }
     if isinstance(stage, OnnxStage):
-        values = [(value.name, value_type(value)) for value in networks[name].model.graph.input]
+        values = [(value.name, value_type(value)) for value in data_inputs(networks[name])]
         keys["inputs"] = {}
         for each, found in values:
             if found is None:
