@@ -58,6 +58,9 @@ class Track(Protocol):
     def waiting(self, stage: str) -> list[int]:
         """Return the frames that wait for a stage, the oldest first."""
 
+    def late(self, unit: str) -> list[str]:
+        """Return the stages whose work is not there, for the oldest frame of which a stage of the unit has others."""
+
     def stop(self) -> None:
         """Note that the source is about to forget the frames that wait in it."""
 
@@ -118,6 +121,9 @@ class ChainTrack:
             if self._frame(frame, now_ns).skips == is_bypass:
                 return Gone(frame, self._leave(frame, now_ns))
         return Gone(UNKNOWN, now_ns)
+
+    def late(self, unit: str) -> list[str]:  # noqa: ARG002 - no stage of a chain joins anything
+        return []
 
     def stop(self) -> None:
         """Do nothing: what waits in the source of a chain is not in flight."""
@@ -240,6 +246,16 @@ class GraphTrack:
             self._admit(now_ns)  # it waited for a stage without inputs, so nothing was heard of it yet
         self._heard_ns.pop(found, None)
         return Gone(found, self.frames.pop(found).release_ns)
+
+    def late(self, unit: str) -> list[str]:
+        for frame in self.frames.values():
+            for stage in self._stages:
+                if stage.unit.name != unit or not self._waits(frame, stage):
+                    continue
+                missing = [place for place in stage.after if frame.todo >> place & 1]
+                if 0 < len(missing) < len(stage.after):
+                    return [self._stages[place].name for place in missing]
+        return []
 
     def stop(self) -> None:
         if self._is_fed:
