@@ -39,7 +39,7 @@ from trilane.scheduler.events import (
     UnitReady,
 )
 from trilane.scheduler.frame_source import Source
-from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.ledger import JOIN, JobRecord
 from trilane.scheduler.state import FrameState
 
 SOURCE: Final = "source"
@@ -256,6 +256,7 @@ class Timeline:
         if self._cutter is not None:
             self._cutter.account(now_ns, unit, account)
         unit.enter(now_ns, account)
+        unit.late = ",".join(self._track.late(name)) if account == JOIN else ""
 
     def _work(self, worked: Worked) -> list[Fact]:
         job = worked.job

@@ -61,6 +61,9 @@ class Track(Protocol):
     def waiting(self, stage: str) -> list[int]:
         """Return the frames that wait for a stage, the oldest first."""
 
+    def late(self, unit: str) -> list[str]:
+        """Return the stages whose work is not there, for the oldest frame of which a stage of the unit has others."""
+
 
 class ChainTrack:
     """The frames of a chain."""
@@ -122,6 +125,10 @@ class ChainTrack:
                 return Gone(frame, self._leave(frame, now_ns))
         return Gone(UNKNOWN, now_ns)
 
+    def late(self, _unit: str) -> list[str]:
+        """Return none: no stage of a chain joins anything."""
+        return []
+
     def _frame(self, number: int, now_ns: int) -> FrameState:
         """Return a frame in flight; where the journal lacks its begin, make one that is known from now on."""
         if (frame := self.frames.get(number)) is None:
@@ -177,6 +184,15 @@ class GraphTrack:
         state = self._named[stage]
         frames = [state.input.frame[slot] for slot in state.waiting] if state.input is not None else []
         return [*frames, *(frame for frame, _ in self._core.source.queue)] if not state.before else frames
+
+    def late(self, unit: str) -> list[str]:
+        stages = self._core.flow.stages
+        for frame in self._core.frames.values():
+            for stage in self._core.units[unit].stages:
+                missing = [stages[place].name for place in stage.after if frame.todo >> place & 1]
+                if frame.todo & ~frame.begun & stage.bit and 0 < len(missing) < len(stage.after):
+                    return missing
+        return []
 
     def begin(self, job: Job, now_ns: int) -> int:  # noqa: ARG002 - a chain needs the time
         heard = self._heard_ns.get(job.frame, {})

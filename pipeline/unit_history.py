@@ -63,13 +63,18 @@ class Handed(NamedTuple):
 
 
 class IdleSlice(NamedTuple):
-    """A piece of time in which no job ran on the unit. `preempted_ns`: part of it in which the unit had no core."""
+    """A piece of time in which no job ran on the unit.
+
+    `preempted_ns`: part of it in which the unit had no core.
+    `late`: for JOIN, the stages whose work was not there when it began, joined by commas.
+    """
 
     unit: str
     cause: str
     begin_ns: int
     end_ns: int
     preempted_ns: int = 0
+    late: str = ""
 
 
 class UnitHistory:
@@ -78,6 +83,7 @@ class UnitHistory:
     `kept`: number of last jobs and of last changes that are remembered to explain waits.
     `held`: jobs that the unit has, the running one first.
     `account`: account of the ledger that gets the unit's time without a job.
+    `late`: stages that it waits for, joined by commas, while `account` is that of joins.
     `is_up`: whether the unit's process is up and ready, and no kill is under way.
     `stopped_ns`: last time at which its process was seen stopped by a signal; 0: never.
     """
@@ -86,12 +92,13 @@ class UnitHistory:
         self.name = name
         self.held: deque[Handed] = deque()
         self.account = ledger.STARVED
+        self.late = ""
         self.is_up = self._is_ending = False
         self.stopped_ns = 0
         self._down_ns: int | None = None  # start of the time in which its process is down, after it was up
         self._jobs: deque[JobRecord] = deque(maxlen=kept)
         self._changes: deque[tuple[int, str]] = deque(maxlen=kept)
-        self._idle_cause = ""
+        self._idle_cause = self._idle_late = ""
         self._cut_ns = 0
 
     # its process
@@ -225,8 +232,9 @@ class UnitHistory:
         """
         if cause != self._idle_cause:
             if self._idle_cause and now_ns > self._cut_ns:
-                yield IdleSlice(self.name, self._idle_cause, self._cut_ns, now_ns)
+                yield IdleSlice(self.name, self._idle_cause, self._cut_ns, now_ns, late=self._idle_late)
             self._idle_cause, self._cut_ns = cause, now_ns
+            self._idle_late = self.late if cause == JOIN else ""
 
     def cut(self, job: JobRecord) -> Iterator[IdleSlice]:
         """Yield the piece between the job before and this one.

@@ -319,7 +319,7 @@ class _UnitTracks:
         track = self._units[unit]
         for begin_ns, end_ns, piece in self._tiles[unit].take(rest=rest):
             if isinstance(piece, IdleSlice):
-                notes = _if_any(preempted_ns=piece.preempted_ns)
+                notes = _if_any(preempted_ns=piece.preempted_ns, late=piece.late)
                 self._sink.slice(track, begin_ns, end_ns, piece.cause, notes)
             else:
                 flow = FlowArrow(self._flows_from + piece.frame, piece.stage in self._begins, piece.stage in self._ends)
@@ -337,14 +337,14 @@ class _UnitTracks:
             self._sink.count(self._counters[key], job.begin_ns, value)
 
 
-def _notes_of(job: JobRecord) -> dict[str, int]:
+def _notes_of(job: JobRecord) -> dict[str, int | str]:
     lost = _if_any(preempted_ns=job.preempted_ns, asleep_ns=job.asleep_ns)
     return {"frame": job.frame, "wait_us": (job.begin_ns - job.ready_ns) // NS_PER_US, **lost}
 
 
-def _if_any(**times_ns: int) -> dict[str, int]:
-    """Return those that are not 0."""
-    return {name: ns for name, ns in times_ns.items() if ns}
+def _if_any(**notes: int | str) -> dict[str, int | str]:
+    """Return those that are neither 0 nor empty."""
+    return {name: value for name, value in notes.items() if value}
 
 
 class Tiles(Generic[Item]):

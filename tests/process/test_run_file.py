@@ -145,7 +145,8 @@ def test_a_file_that_cannot_be_run_says_which_stage_and_why(
     done = cli("run", "street.toml", "--out", "run", "--frames", "5")
     assert done.returncode == code, done.stderr
     assert said in " ".join(done.stderr.split())
-    assert not (folder / "run").exists()
+    if code == 2:  # else a frame may have been presented before
+        assert not (folder / "run").exists()
 
 
 @pytest.mark.parametrize("option", ["--size=128", "--dashboard", "--no-video", "--check=3"])

@@ -80,7 +80,8 @@ def told(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     def dropped(flow: Flow, frame: int, behind: StageState, before: StageState | None, cause: DropCause) -> None:
         readers = before.name if before is not None else ",".join(each.name for each in behind.readers)
         writer = "source" if behind is before else behind.name
-        found.append((frame, flow.frames[frame].release_ns, str(Drop(f"{writer}->{readers}", cause))))
+        if not flow.frames[frame].is_presented:
+            found.append((frame, flow.frames[frame].release_ns, str(Drop(f"{writer}->{readers}", cause))))
 
     def lost(flow: Flow, frame: int, loss: Loss) -> None:
         if not flow.frames[frame].is_presented:

@@ -6,8 +6,9 @@ from trilane.apps.explain.joins import Joins, said
 from trilane.pipeline.critical_path import WORK, Budget, Paths
 from trilane.pipeline.journal import Stepped, Worked, journal_of
 from trilane.pipeline.timeline import ExplainedJob, Timeline
+from trilane.pipeline.unit_history import JOIN, IdleSlice
 from trilane.scheduler.events import Graph, Input, Settings, StageSpec
-from trilane.scheduler.virtual import simulate
+from trilane.scheduler.virtual import Simulation, simulate
 
 MS = 1_000_000
 STAGES = (
@@ -20,14 +21,19 @@ GRAPH = Graph(STAGES, ("double",) * 3, "composite")
 TIMES = {"frame": 2, "depth": 14, "seg": 10, "composite": 3}
 
 
-def explained(settings: Settings) -> tuple[list[ExplainedJob], Timeline]:
-    """The jobs of a run; every fifth frame takes seg 10 ms longer."""
-    made = simulate(
+def simulated(settings: Settings) -> Simulation:
+    """A run in which every fifth frame takes seg 10 ms longer."""
+    return simulate(
         GRAPH,
         settings,
         lambda stage, _unit, frame, _begin: (TIMES[stage] + 10 * (stage == "seg" and frame % 5 == 0)) * MS,
         keep=True,
     )
+
+
+def explained(settings: Settings) -> tuple[list[ExplainedJob], Timeline]:
+    """The jobs of such a run."""
+    made = simulated(settings)
     assert made.recording is not None
     timeline = Timeline(GRAPH, made.recording.settings, waits=True)
     records = list(journal_of(made.recording, made.jobs, {}, made.report))
@@ -51,6 +57,19 @@ def test_a_join_waited_for_what_came_last_of_each_frame() -> None:
         "composite waited for depth in 32 of 40 jobs, 4.00 ms after the others; "
         "for seg in 8 of 40 jobs, 6.00 ms after the others"
     )
+
+
+def test_an_idle_unit_says_which_stage_its_join_waits_for() -> None:
+    """The CPU waits from the end of what came first to the end of what came last: 4 ms for depth, or 6 ms for seg."""
+    settings = Settings(10, "sequential", in_flight=1)
+    made = simulated(settings)
+    assert made.recording is not None
+    timeline = Timeline(GRAPH, settings, idle=True)
+    records = list(journal_of(made.recording, made.jobs, {}, made.report))
+    facts = [*(fact for record in records[1:] for fact in timeline.add(record)), *timeline.end()]
+    joins = [fact for fact in facts if isinstance(fact, IdleSlice) and fact.cause == JOIN]
+    usual, fifth = ("cpu", "depth", 4 * MS), ("cpu", "seg", 6 * MS)
+    assert [(each.unit, each.late, each.end_ns - each.begin_ns) for each in joins] == [fifth, *[usual] * 4] * 2
 
 
 def test_the_critical_path_goes_on_with_the_input_that_came_last() -> None:
