@@ -36,6 +36,7 @@ COMMANDS = {
     "bench": ("trilane.apps.cli.bench", "Measure this machine: raster, readback, crop and more."),
     "accuracy": ("trilane.apps.cli.accuracy", "Compare runtimes on a scene, and with float on hard cases."),
     "predict": ("trilane.apps.cli.predict", "Predict frame time, idleness, heat and energy on a chip."),
+    "init": ("trilane.apps.cli.init", "Write a first pipeline file for networks over a video."),
     "check": ("trilane.apps.cli.check", "Check a pipeline file: its graph, least period and memory."),
     "sweep": ("trilane.apps.cli.sweep", "Try many configurations of a command, on one machine or many."),
     "profiles": ("trilane.apps.cli.profiles", "List, show, check and fit the hardware profiles."),

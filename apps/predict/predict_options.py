@@ -117,7 +117,7 @@ def _watts(limit: float | None) -> float | None:
     return limit
 
 
-def _shape(text: str) -> tuple[str, tuple[int, ...]]:
+def shape_of(text: str) -> tuple[str, tuple[int, ...]]:
     found = re.fullmatch(r"(.+)=(\d{1,9}(?:x\d{1,9})*)", text)
     if found is None or 0 in (sizes := tuple(map(int, found[2].split("x")))):
         raise UnexpectedValue(repr(text), "a name and sizes, such as image=1x3x224x224")
@@ -125,7 +125,7 @@ def _shape(text: str) -> tuple[str, tuple[int, ...]]:
 
 
 def _shapes(texts: tuple[str, ...]) -> tuple[str, ...]:
-    names = [_shape(text)[0] for text in texts]
+    names = [shape_of(text)[0] for text in texts]
     if twice := [name for name in names if names.count(name) > 1]:
         raise UnexpectedValue(f"{twice[0]!r} twice", "each input once")
     return texts
@@ -253,7 +253,7 @@ class PredictOptions(Options):
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Return the shapes of inputs, by name."""
-        return dict(map(_shape, self.input_shape))
+        return dict(map(shape_of, self.input_shape))
 
     @property
     def numbers(self) -> str | None:

@@ -1,0 +1,109 @@
+"""Writes a pipeline file for networks over a video, ready to be run, with sizes and rate read from the files.
+
+Each network looks at every frame of the video, on a branch of its own: a stage `prepare` makes its input, and a stage
+`discard` takes what it finds. A person then joins the branches as the pipeline needs it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from json import dumps
+from pathlib import Path
+
+import av
+
+from trilane.apps.check.port_types import data_inputs, port_types, read_networks
+from trilane.errors import BadInputError, TrilaneError
+from trilane.files import require_file
+from trilane.hw_profiles.graph_file import read_graph
+from trilane.pipeline.description import LONGEST_NAME
+from trilane.pipeline.pipeline_file import read_pipeline
+from trilane.writing import write_bytes
+
+A_VIDEO = "a video that PyAV reads"
+SUFFIXES = len("-in0") + 2  # of names that are made of a network's
+
+
+def write_new_file(
+    out: Path,
+    networks: Sequence[Path],
+    video: Path,
+    unit: str = "dsp",
+    shapes: Mapping[str, Sequence[int]] | None = None,
+) -> str:
+    """Write the file `out`, and return its text.
+
+    `networks`: ONNX files; `video`: video; all lie in the folder of `out`, or in folders in it.
+    `unit`: unit of all networks, cpu, gpu or dsp.
+    `shapes`: sizes of inputs that the networks leave open, by the input's name.
+
+    Raises BadInputError for a file that exists, for files that cannot be read or lie elsewhere, and for a network that
+    does not take pictures; nothing is left behind.
+    """
+    if out.exists():
+        raise BadInputError(out, "a file that exists", "another name, as nothing is overwritten")
+    folder = out.resolve().parent
+    width, height, rate = _video(video)
+    lines = [
+        f"# networks over a video: {len(networks)}; docs/pipeline-file.md has every key",
+        "[run]",
+        f"fps = {rate:g}",
+        "[stages]",
+        f'camera = {{ block = "video", unit = "cpu", path = {_inside(video, folder)}, size = "{width}x{height}" }}',
+    ]
+    names = {"camera"}
+    for network in networks:
+        lines += _branch(network, folder, unit, names, shapes or {})
+    text = "\n".join(lines) + "\n"
+    write_bytes(out, text.encode())
+    try:
+        file = read_pipeline(out)
+        port_types(file, read_networks(file))
+    except TrilaneError:
+        out.unlink()
+        raise
+    return text
+
+
+def _branch(network: Path, folder: Path, unit: str, names: set[str], shapes: Mapping[str, Sequence[int]]) -> list[str]:
+    """Return the lines of a network's stages; `names`: names of stages so far, to which these are added."""
+    inputs = [value.name for value in data_inputs(read_graph(network, dict(shapes)))]
+    stem = re.sub(r"[^\w-]", "-", network.stem, flags=re.ASCII)[: LONGEST_NAME - SUFFIXES] or "network"
+    name = next(each for each in (stem, *(f"{stem}-{n}" for n in range(2, 100))) if each not in names)
+    prepared = [f"{name}-in{place}" if len(inputs) > 1 else f"{name}-in" for place in range(len(inputs))]
+    names |= {name, *prepared, f"{name}-out"}
+    lines = []
+    for stage, port in zip(prepared, inputs, strict=True):
+        of = f", port = {dumps(port)}" if len(inputs) > 1 else ""
+        lines.append(f'{stage} = {{ block = "prepare", unit = "cpu", in = "camera", like = "{name}"{of} }}')
+    reads = f'"{prepared[0]}"'
+    if len(inputs) > 1:
+        reads = "{ " + ", ".join(f'{dumps(p)} = "{s}"' for s, p in zip(prepared, inputs, strict=True)) + " }"
+    open_sizes = {port: "x".join(map(str, shapes[port])) for port in inputs if port in shapes}
+    known = ", ".join(f"{dumps(port)} = {dumps(sizes)}" for port, sizes in open_sizes.items())
+    given = f", shapes = {{ {known} }}" if known else ""
+    lines.append(f'{name} = {{ onnx = {_inside(network, folder)}, unit = "{unit}", in = {reads}{given} }}')
+    first = read_graph(network, dict(shapes)).model.graph.output[0].name
+    lines.append(f'{name}-out = {{ block = "discard", unit = "cpu", in = {dumps(f"{name}.{first}")} }}')
+    return lines
+
+
+def _inside(path: Path, folder: Path) -> str:
+    """Return the path as the file names it, quoted. Raises BadInputError for a path outside of the file's folder."""
+    absolute = Path(path.parent.resolve() / path.name)
+    if not absolute.is_relative_to(folder):
+        remedy = f"write the file into {absolute.parent}, or put a link to {path.name} into {folder}"
+        raise BadInputError(path, f"a file outside of {folder}", "one in the folder of the pipeline file", remedy)
+    return dumps(absolute.relative_to(folder).as_posix(), ensure_ascii=False)
+
+
+def _video(path: Path) -> tuple[int, int, float]:
+    """Return width and height in pixels and the rate of a video. Raises BadInputError."""
+    require_file(path, A_VIDEO)
+    try:
+        with av.open(str(path), metadata_errors="replace") as container:
+            stream = container.streams.video[0]
+            return stream.width, stream.height, round(float(stream.average_rate or stream.guessed_rate or 30), 3)
+    except (av.FFmpegError, IndexError, ValueError) as error:
+        raise BadInputError(path, f"no video: {error}", A_VIDEO) from None
