@@ -13,6 +13,7 @@ import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from heapq import heapify, heappop, heappush
 from math import lcm
 from pathlib import Path
@@ -48,6 +49,7 @@ from trilane.units import UNITS
 
 MOST_BYTES: Final = 16 << 20
 MOST_PERIOD: Final = 100_000  # of a stage, in frames: the least common multiple of all `every` before it
+LIKE: Final = 0.8  # likeness of two names of which one may be a slip, by difflib
 TABLES: Final = ("run", "units", "stages", "edges")
 STAGES: Final = re.compile(rb"""^\s*(\[\s*["']?stages["']?\s*[\].]|["']?stages["']?\s*[.=])""", re.MULTILINE)
 FORM: Final = "a pipeline file, TOML in UTF-8"
@@ -168,16 +170,27 @@ def checked_tables(tables: Mapping[str, Any], path: Path) -> PipelineFile:
     stages = _in_order(stages, path)
     named = list(dict.fromkeys(stage.unit for stage in stages.values()))
     for name, stage in stages.items():
-        if units and stage.unit not in units and stage.unit not in UNITS:
-            known = list(dict.fromkeys([*units, *UNITS]))
-            remedy = did_you_mean(stage.unit, known) or f"add {stage.unit} to [units]"
-            where = f"{path}: stages.{name}.unit"
-            raise BadInputError(where, f"the unknown unit {stage.unit!r}", f"one of {', '.join(known)}", remedy)
+        if meant := _slip(stage.unit, [*units, *UNITS]):
+            where, found = f"{path}: stages.{name}.unit", f"the unknown unit {stage.unit!r}"
+            remedy = f"did you mean {meant!r}? if not, add {stage.unit} = {{}} to [units]"
+            raise BadInputError(where, found, f"one of {', '.join(dict.fromkeys([*units, *UNITS]))}", remedy)
     edges = _table(tables, "edges", path)
     used = {name: units.get(name, UnitKeys()) for name in named}
     file = PipelineFile(path, run, used, stages, edges, tables)
     _check_together(file)
     return file
+
+
+def _slip(unit: str, known: Sequence[str]) -> str:
+    """Return the unit that was most likely meant by a name that is nearly another one; "" for a name of its own.
+
+    Names that differ in a number or a letter at their end, such as gpu and gpu2 or npu_a and npu_b, are no slips.
+    """
+    stem = unit.rstrip("0123456789")
+    if unit in known or any(stem == name.rstrip("0123456789") or unit[:-1] == name[:-1] for name in known):
+        return ""
+    near = get_close_matches(unit, known, 1, LIKE)
+    return near[0] if near else ""
 
 
 def _table(tables: Mapping[str, Any], name: str, path: Path) -> Mapping[str, Any]:

@@ -137,6 +137,36 @@ def test_other_values_are_a_variant_of_the_file(tmp_path: Path) -> None:
         file.changed(["seg=b"])
 
 
+@pytest.mark.parametrize(
+    ("unit", "is_right"),
+    [
+        ("isp", True),
+        ("npu2", True),
+        ("gpu1", True),
+        ("tpu", True),
+        ("cpu_big", True),
+        ("neurral", False),
+        ("gppu", False),
+    ],
+)
+def test_units_exist_by_being_named_but_for_slips(tmp_path: Path, unit: str, is_right: bool) -> None:
+    text = f"""
+    [units]
+    npu = {{ hardware = "dsp" }}
+    neural = {{}}
+    [stages]
+    a = {{ unit = "{unit}", time_ms = 1 }}
+    """
+    path = write_file(tmp_path, text)
+    if is_right:
+        assert list(read_pipeline(path).units) == [unit]
+        return
+    with pytest.raises(BadInputError, match=r"stages.a.unit: found the unknown unit .* did you mean"):
+        read_pipeline(path)
+    path.write_text(text.replace("[stages]", f"{unit} = {{}}\n[stages]"))
+    assert list(read_pipeline(path).units) == [unit]
+
+
 def test_a_scene_is_no_pipeline_file(tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text('motion = "walk.bvh"\n[camera]\nwidth = 3\n')
     assert not is_pipeline_file(tmp_path / "scene.toml")
