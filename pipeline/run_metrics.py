@@ -388,7 +388,6 @@ class PolicyMetrics(Record):
     `stages`: times of each stage, in the order of the pipeline.
     `bytes`: bytes that the stages moved for a presented frame, over all stages that count them; absent where none does.
     `units`: shares of each unit.
-    `streams`: age of what was taken from each stream that has an input of the newest frame, by its stage.
     `efficiency`: work of the slowest unit's jobs, as a share of the time between the first and the last presented
     frame; null for fewer than two.
     `core_efficiency`: the same share for the fullest cores.
@@ -410,7 +409,6 @@ class PolicyMetrics(Record):
     stages: dict[str, StageTimes]
     bytes: MovedInAll | None = None
     units: dict[str, UnitShares]
-    streams: dict[str, NewestTaken] = Field(default={})
     efficiency: float | None = None
     core_efficiency: float | None = None
     machine_efficiency: float | None = None
@@ -430,6 +428,7 @@ class RunMetrics(PolicyMetrics):
     `edge`: edge rule of the scheduler.
     `idle_cores`: whether cores without work stayed awake; on the host clock.
     `other_programs`: share of other programs in the time of the run's cores; null where a unit died.
+    `streams`: age of what was taken from each stream that has an input of the newest frame, by its stage.
     `caps`, `temperature_c`: caps and temperatures of a capped run.
     """
 
@@ -440,6 +439,7 @@ class RunMetrics(PolicyMetrics):
     edge: str = ""
     idle_cores: str = ""
     other_programs: float | None = None
+    streams: dict[str, NewestTaken] = Field(default={})
     caps: Caps | None = None
     temperature_c: Temperature | None = None
 
