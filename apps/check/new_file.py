@@ -13,11 +13,12 @@ from pathlib import Path
 
 import av
 
-from trilane.apps.check.port_types import data_inputs, port_types, read_networks
+from trilane.apps.check.port_types import NETWORK_CHANNELS, data_inputs, port_types, read_networks, value_type
 from trilane.errors import BadInputError, TrilaneError
 from trilane.files import require_file
 from trilane.hw_profiles.graph_file import read_graph
 from trilane.pipeline.description import LONGEST_NAME
+from trilane.pipeline.file_keys import PortType
 from trilane.pipeline.pipeline_file import read_pipeline
 from trilane.writing import write_bytes
 
@@ -68,7 +69,8 @@ def write_new_file(
 
 def _branch(network: Path, folder: Path, unit: str, names: set[str], shapes: Mapping[str, Sequence[int]]) -> list[str]:
     """Return the lines of a network's stages; `names`: names of stages so far, to which these are added."""
-    inputs = [value.name for value in data_inputs(read_graph(network, dict(shapes)))]
+    graph = read_graph(network, dict(shapes))
+    inputs = [_picture_input(network, value.name, value_type(value)) for value in data_inputs(graph)]
     stem = re.sub(r"[^\w-]", "-", network.stem, flags=re.ASCII)[: LONGEST_NAME - SUFFIXES] or "network"
     name = next(each for each in (stem, *(f"{stem}-{n}" for n in range(2, 100))) if each not in names)
     prepared = [f"{name}-in{place}" if len(inputs) > 1 else f"{name}-in" for place in range(len(inputs))]
@@ -84,9 +86,19 @@ def _branch(network: Path, folder: Path, unit: str, names: set[str], shapes: Map
     known = ", ".join(f"{dumps(port)} = {dumps(sizes)}" for port, sizes in open_sizes.items())
     given = f", shapes = {{ {known} }}" if known else ""
     lines.append(f'{name} = {{ onnx = {_inside(network, folder)}, unit = "{unit}", in = {reads}{given} }}')
-    first = read_graph(network, dict(shapes)).model.graph.output[0].name
+    first = graph.model.graph.output[0].name
     lines.append(f'{name}-out = {{ block = "discard", unit = "cpu", in = {dumps(f"{name}.{first}")} }}')
     return lines
+
+
+def _picture_input(network: Path, name: str, of: PortType | None) -> str:
+    """Return the name of an input that is a picture. Raises BadInputError for another one."""
+    shape = of.shape if of is not None else ()
+    if len(shape) != 4 or not {shape[1], shape[3]} & set(NETWORK_CHANNELS):
+        expected = "a picture, 1xCxHxW or 1xHxWxC with 1 or 3 channels"
+        remedy = "write the stages before it by hand (docs/pipeline-file.md)"
+        raise BadInputError(f"{network}: input {name!r}", str(of or "no numbers"), expected, remedy)
+    return name
 
 
 def _inside(path: Path, folder: Path) -> str:

@@ -1,0 +1,100 @@
+"""`trilane init`: the file that it writes is right, says what the files hold, and is never half there."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper
+
+from support.pipeline_files import network
+from trilane.apps.check.new_file import write_new_file
+from trilane.errors import BadInputError
+from trilane.pipeline.pipeline_file import read_pipeline
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with a video of 48 x 32 pixels at 24 frames a second, and a network."""
+    with av.open(str(tmp_path / "clip.mp4"), "w") as container:
+        stream = container.add_stream("mpeg4", rate=Fraction(24), options={"g": "1"})
+        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
+        for level in (0, 80):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((32, 48, 3), level, np.uint8))))
+        container.mux(stream.encode(None))
+    onnx.save(network(16, "heat"), tmp_path / "det net.onnx")
+    return tmp_path
+
+
+def two_inputs(path: Path) -> None:
+    """A network that adds two pictures of 8 x 8."""
+    values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 3, 8, 8]) for name in ("a", "b", "sum")]
+    graph = helper.make_graph([helper.make_node("Add", ["a", "b"], ["sum"])], "g", values[:2], values[2:])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), path)
+
+
+def test_the_file_has_the_sizes_and_the_rate_of_the_files(folder: Path) -> None:
+    two_inputs(folder / "add.onnx")
+    out = folder / "new.toml"
+    text = write_new_file(out, [folder / "det net.onnx", folder / "add.onnx"], folder / "clip.mp4", "gpu")
+    assert out.read_text(encoding="utf-8") == text
+    data = tomllib.loads(text)
+    assert (data["run"], data["stages"]["camera"]["size"]) == ({"fps": 24}, "48x32")
+    file = read_pipeline(out)
+    read = {name: [(each.port, each.stage) for each in stage.inputs] for name, stage in file.stages.items()}
+    assert read == {
+        "camera": [],
+        "det-net-in": [("", "camera")],
+        "det-net": [("", "det-net-in")],
+        "det-net-out": [("", "det-net")],
+        "add-in0": [("", "camera")],
+        "add-in1": [("", "camera")],
+        "add": [("a", "add-in0"), ("b", "add-in1")],
+        "add-out": [("", "add")],
+    }
+    assert {stage.unit for name, stage in file.stages.items() if name in ("det-net", "add")} == {"gpu"}
+
+
+def test_one_network_twice_has_two_names(folder: Path) -> None:
+    write_new_file(folder / "new.toml", [folder / "det net.onnx"] * 2, folder / "clip.mp4")
+    assert {"det-net", "det-net-2"} <= read_pipeline(folder / "new.toml").stages.keys()
+
+
+def _vector(folder: Path) -> list[Path]:
+    values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 10]) for name in ("x", "y")]
+    graph = helper.make_graph([helper.make_node("Relu", ["x"], ["y"])], "g", values[:1], values[1:])
+    path = folder / "vector.onnx"
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), path)
+    return [path]
+
+
+@pytest.mark.parametrize(
+    ("networks", "video", "out", "words"),
+    [
+        (lambda f: [f / "none.onnx"], "clip.mp4", "new.toml", "none.onnx"),
+        (lambda f: [f / "clip.mp4"], "clip.mp4", "new.toml", "clip.mp4"),
+        (lambda f: [f / "det net.onnx"], "det net.onnx", "new.toml", "a video"),
+        (lambda f: [f / "det net.onnx"], "clip.mp4", "sub/new.toml", "outside"),
+        (_vector, "clip.mp4", "new.toml", "vector"),
+    ],
+)
+def test_what_is_wrong_leaves_no_file(
+    folder: Path, networks: Callable[[Path], list[Path]], video: str, out: str, words: str
+) -> None:
+    (folder / "sub").mkdir()
+    with pytest.raises(BadInputError, match=words):
+        write_new_file(folder / out, networks(folder), folder / video)
+    assert not (folder / out).exists()
+
+
+def test_nothing_is_overwritten(folder: Path) -> None:
+    (folder / "new.toml").write_text("mine", encoding="utf-8")
+    with pytest.raises(BadInputError, match="exists"):
+        write_new_file(folder / "new.toml", [folder / "det net.onnx"], folder / "clip.mp4")
+    assert (folder / "new.toml").read_text(encoding="utf-8") == "mine"
