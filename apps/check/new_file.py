@@ -31,7 +31,7 @@ def write_new_file(
     networks: Sequence[Path],
     video: Path,
     unit: str = "dsp",
-    shapes: Mapping[str, Sequence[int]] | None = None,
+    shapes: Mapping[str, tuple[int, ...]] | None = None,
 ) -> str:
     """Write the file `out`, and return its text.
 
@@ -67,7 +67,9 @@ def write_new_file(
     return text
 
 
-def _branch(network: Path, folder: Path, unit: str, names: set[str], shapes: Mapping[str, Sequence[int]]) -> list[str]:
+def _branch(
+    network: Path, folder: Path, unit: str, names: set[str], shapes: Mapping[str, tuple[int, ...]]
+) -> list[str]:
     """Return the lines of a network's stages; `names`: names of stages so far, to which these are added."""
     graph = read_graph(network, dict(shapes))
     inputs = [_picture_input(network, value.name, value_type(value)) for value in data_inputs(graph)]
