@@ -185,7 +185,12 @@ def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str
         key: value for key, value in stage.model_dump(mode="json").items() if key not in common and value is not None
     }
     if isinstance(stage, OnnxStage):
-        values = [(value.name, value_type(value)) for value in networks[name].model.graph.input]
+        graph = networks[name]
+        values = [(value.name, value_type(value)) for value in graph.model.graph.input]
+        if len(values) > 1 and len(values) > len(stage.inputs):
+            found = f"{stage.onnx} without weights: {len(values) - len(stage.inputs)} are inputs without values"
+            remedy = "export it with its weights; `trilane check` and `trilane predict` take it as it is"
+            raise BadInputError(f"{file.path}: stages.{name}.onnx", found, "a network with its weights", remedy)
         keys["inputs"] = {}
         for each, found in values:
             if found is None:
@@ -199,7 +204,10 @@ def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str
 
 
 def _port(file: PipelineFile, name: str, each: StageInput, types: PortTypes) -> str:
-    """Return the port of a stream that an input reads. Raises BadInputError where several are there and none is named."""
+    """Return the port of a stream that an input reads.
+
+    Raises BadInputError where several are there and none is named.
+    """
     ports = types[each.stage]
     if each.from_port or len(ports) == 1:
         chosen = each.from_port or next(iter(ports))

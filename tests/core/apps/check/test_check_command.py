@@ -321,3 +321,18 @@ def test_a_network_of_open_sizes_wants_them_from_the_file(command: Command, tmp_
     assert found, error
     path.write_text(STAGES + NET.replace(" }", ", shapes = { image = '1x3x256x256' } }"))
     command("check", path)
+
+
+def test_a_graph_without_weights_is_fed_its_picture_alone(command: Command, tmp_path: Path) -> None:
+    text = '[stages]\na = { block = "video", unit = "cpu", path = "v.mp4", size = "16x16", time_ms = 1 }\n'
+    path = write_file(tmp_path, text + 'n = { onnx = "bare.onnx", unit = "dsp", in = "a" }')
+    sizes = {"image": (1, 3, 16, 16), "w0": (2, 3, 3, 3), "w1": (2,), "out": (1, 2, 14, 14)}
+    values = {name: onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, sizes[name]) for name in sizes}
+    layer = onnx.helper.make_node("Conv", ["image", "w0", "w1"], ["out"])
+    graph = onnx.helper.make_graph([layer], "bare", [values[name] for name in ("image", "w0", "w1")], [values["out"]])
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8)
+    onnx.save(model, tmp_path / "bare.onnx")
+    command("check", path)
+    command("predict", path, "--profile", "snapdragon-8-gen-3")
+    error = " ".join(command("run", path, "--frames", "2", "--out", tmp_path / "run", code=2)[1].split())
+    assert "stages.n.onnx: found bare.onnx without weights: 2 are inputs without values" in error
