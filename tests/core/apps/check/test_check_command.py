@@ -336,3 +336,11 @@ def test_a_graph_without_weights_is_fed_its_picture_alone(command: Command, tmp_
     command("predict", path, "--profile", "snapdragon-8-gen-3")
     error = " ".join(command("run", path, "--frames", "2", "--out", tmp_path / "run", code=2)[1].split())
     assert "stages.n.onnx: found bare.onnx without weights: 2 are inputs without values" in error
+
+
+def test_a_line_between_stages_of_one_row_passes_over_the_box_between(command: Command, tmp_path: Path) -> None:
+    stages = 'a = { unit = "u", time_ms = 1 }\nb = { unit = "u", in = "a", time_ms = 1 }\n'
+    text = f'[stages]\n{stages}c = {{ unit = "u", in = {{ a = "a", b = "b" }}, time_ms = 1 }}'
+    command("check", write_file(tmp_path, text), "--svg", tmp_path / "graph.svg")
+    paths = re.findall(r"<path d='([^']*)'", (tmp_path / "graph.svg").read_text())
+    assert [" H " in path for path in paths] == [False, True, False]
