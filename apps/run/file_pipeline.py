@@ -30,7 +30,7 @@ from trilane.pipeline.file_keys import (
 from trilane.pipeline.pipeline_file import PipelineFile, stage_inputs
 from trilane.pipeline.ports import payload_bytes
 from trilane.scheduler.places import Place
-from trilane.stages.blocks.video import DEFAULT_FPS, footage
+from trilane.stages.blocks.video import DEFAULT_FPS, Footage, footage
 
 BLOCKS: Final = "trilane.stages.blocks"
 #: Module of each block, where it is not the block's name.
@@ -79,10 +79,20 @@ def frames_of(file: PipelineFile) -> int:
     counts = []
     for stage in file.stages.values():
         if isinstance(stage, VideoBlock) and not stage.is_camera:
-            found = footage(file.folder / stage.path)
+            found = _footage_of(file, stage)
             rate = file.run.fps / found.fps if file.run.fps and found.fps else 1.0
             counts += [max(round(found.pictures * rate), 1)] if found.pictures else []
     return min(counts, default=DEFAULT_FRAMES)
+
+
+def _footage_of(file: PipelineFile, stage: VideoBlock) -> Footage:
+    """Return what the video of a stage holds. Raises BadInputError naming the stage's key."""
+    try:
+        return footage(file.folder / stage.path)
+    except BadInputError as error:
+        name = next(each for each, one in file.stages.items() if one is stage)
+        where = f"{file.path}: stages.{name}.path: {error.where}"
+        raise BadInputError(where, error.found, error.expected, error.remedy) from None
 
 
 def picture_fps(file: PipelineFile) -> float:
@@ -90,7 +100,7 @@ def picture_fps(file: PipelineFile) -> float:
     if file.run.fps is not None:
         return file.run.fps
     videos = [stage for stage in file.stages.values() if isinstance(stage, VideoBlock) and not stage.is_camera]
-    rates = [footage(file.folder / stage.path).fps for stage in videos]
+    rates = [_footage_of(file, stage).fps for stage in videos]
     return next((rate for rate in rates if rate), DEFAULT_FPS)
 
 

@@ -280,7 +280,7 @@ WRONG: dict[str, tuple[str, ...]] = {
         'b = { unit = "u", in = "d", time_ms = 1 }',
         *("stages.b.in", "'d', a discard"),
     ),
-    "no TOML": (STAGES + "b = = 3", "line 3", "invalid value"),
+    "no TOML": (STAGES + "b = = 3", "line 3", "no TOML", "Invalid value"),
 }
 
 
