@@ -167,6 +167,12 @@ def _numbers(model: onnx.ModelProto) -> NumberFormat:
     return "not said" if weights & given else "float"
 
 
+def fed_inputs(graph: GraphFile) -> list[onnx.ValueInfoProto]:
+    """Return the inputs that a frame feeds: in a graph without weights, those that stand for no weight."""
+    weights = constant_tensors(graph.model.graph)
+    return [value for value in graph.model.graph.input if value.name not in weights]
+
+
 def image_network(graph: GraphFile, layout: str) -> Network:
     """Return the graph as the application's network, with its work and the size of its picture.
 
@@ -175,12 +181,7 @@ def image_network(graph: GraphFile, layout: str) -> Network:
     `layout`: layout of the raster stage: `packed` or `split`.
     Raises BadInputError unless the graph has one input, a picture.
     """
-    weights = constant_tensors(graph.model.graph)
-    shapes = [
-        tuple(dim.dim_value for dim in value.type.tensor_type.shape.dim)
-        for value in graph.model.graph.input
-        if value.name not in weights
-    ]
+    shapes = [tuple(dim.dim_value for dim in value.type.tensor_type.shape.dim) for value in fed_inputs(graph)]
     if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][0] != 1 or min(shapes[0][1], shapes[0][3]) > MOST_CHANNELS:
         found = ", ".join("x".join(map(str, shape)) for shape in shapes)
         expected = f"one picture for the application: 1xCxHxW or 1xHxWxC, C at most {MOST_CHANNELS}"

@@ -11,7 +11,7 @@ Rule: all draws follow from the seed, the stage's name and the frame, so that tw
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
 from typing import Any, Final, NamedTuple
@@ -123,10 +123,19 @@ def prices_of(
 ) -> dict[str, StagePrice]:
     """Return the price of every stage: of the file, as measured, or of its network.
 
-    Raises BadInputError naming a stage without one.
+    Raises BadInputError naming the stages without one.
 
     `graphs`: graphs of the networks, by the stage's name.
     """
+    unknown = [
+        name
+        for name, stage in file.stages.items()
+        if not isinstance(stage, OnnxStage)
+        and given_price(file, name) is None
+        and measured_price(file, name, measured) is None
+    ]
+    if unknown:
+        raise _without_a_time(file, unknown, measured)
     found = {}
     for name, stage in file.stages.items():
         known = None if stage.time_ms is None else given_price(file, name)
@@ -134,14 +143,24 @@ def prices_of(
         if known is None and isinstance(stage, OnnxStage):
             unit = next(each for each in UNITS if each == file.hardware(stage.unit))
             known = network_price(chip_for(name, graphs[name], unit), graphs[name], unit, performance_profile)
-        if known is None:
-            what = f"{stage.named_kind} without a time"
-            remedy = "add time_ms = ... to it: what it takes on that chip"
-            if name in measured.times:
-                remedy = f"add time_ms = ... to it, or scale = {{ {measured.chip} = ... }} for its measured time"
-            raise BadInputError(f"{file.path}: stages.{name}", what, "a stage whose time is known", remedy)
+        assert known is not None
         found[name] = known
     return found
+
+
+def _without_a_time(file: PipelineFile, names: Sequence[str], measured: Measured) -> BadInputError:
+    """Return the error for stages without a time: it is about the first, and names the others."""
+    first = names[0]
+    found = f"{file.stages[first].named_kind} without a time"
+    if names[1:]:
+        found += f", as {', '.join(names[1:])}"
+    remedy = "add time_ms = ... to each: what it takes there"
+    if first in measured.times:
+        remedy = f"add time_ms = ... to each, or scale = {{ {measured.chip} = ... }} for its measured time"
+    elif not measured.times:
+        remedy += "; or take the times of a run on this machine: --measured RUN"
+        remedy += "" if measured.chip == HOST else f" and scale = {{ {measured.chip} = ... }} in each"
+    return BadInputError(f"{file.path}: stages.{first}", found, "a stage whose time is known", remedy)
 
 
 def bound_of(file: PipelineFile, prices: Mapping[str, StagePrice]) -> tuple[Graph, Bound]:
@@ -211,7 +230,7 @@ def predict_file(
         "slots": dict(zip(graph.streams, graph.edges, strict=True)),
     }
     if file.run.fps is not None:
-        answer["rate"] = {**holding(file.run.fps, needs), "sentence": _sentence(file.run.fps, needs)}
+        answer["rate"] = {**holding(file.run.fps, needs), "sentence": _sentence(file.run.fps, needs) + _share(file)}
     return answer if all(each.low_ms is not None for each in prices.values()) else _without_intervals(answer)
 
 
@@ -225,6 +244,12 @@ def _without_intervals(answer: dict[str, Any]) -> dict[str, Any]:
         sentence = f"holds {rate['fps']:g} fps: {holds} of {_short(1e3 / rate['fps'])} ms (no interval)"
         answer["rate"] = {**rate, "words": words, "sentence": sentence, "reserve_low": None, "reserve_high": None}
     return answer
+
+
+def _share(file: PipelineFile) -> str:
+    """Say which share of the frames is shown, where `every` leaves some out."""
+    period = file.periods[file.latency_to]
+    return f"; {file.latency_to} has one frame of {period}, by every" if period > 1 else ""
 
 
 def _row(stage: StagePrice) -> dict[str, Any]:

@@ -112,6 +112,7 @@ class PipelineFile:
         tables = dict(self.tables)
         for text in assignments:
             tables = _assigned(tables, text)
+        _check_new_stages(tables, list(self.stages))
         return checked_tables(tables, self.path)
 
 
@@ -146,7 +147,7 @@ def _of_toml(path: Path, message: str) -> BadInputError:
     text = message[: place.start()] if place else message
     if "verwrite" in text or "twice" in text or "mutate" in text or "more than once" in text:
         return BadInputError(where, "the same name twice", "each name once", f"TOML says: {text}")
-    return BadInputError(where, text[:1].lower() + text[1:] or "no TOML", "TOML")
+    return BadInputError(where, "no TOML", "TOML", f"TOML says: {text}" if text else "")
 
 
 def checked_tables(tables: Mapping[str, Any], path: Path) -> PipelineFile:
@@ -444,6 +445,14 @@ def _assigned(tables: Mapping[str, Any], text: str) -> dict[str, Any]:
     except ValueError:
         new = value.strip()
     return _with_value(tables, parts, new)
+
+
+def _check_new_stages(tables: Mapping[str, Any], names: Sequence[str]) -> None:
+    """Refuse a stage that --set names, that the file does not have and that --set does not make."""
+    for name, keys in tables["stages"].items():
+        if name not in names and isinstance(keys, dict) and not {*keys} & {*KINDS}:
+            expected = f"a stage of the file: {', '.join(names)}"
+            raise BadInputError("--set", f"the unknown stage {name!r}", expected, did_you_mean(name, names))
 
 
 def _with_value(tables: Mapping[str, Any], parts: Sequence[str], value: object) -> dict[str, Any]:

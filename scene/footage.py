@@ -99,7 +99,7 @@ def _film_by_clock(clock: Sequence[float]) -> Film:
     rate = [f"{1 / usual:.4g}/s by the times that are their names"]
     gaps = sum(step > GAP * usual for step in steps)
     if gaps:
-        rate.append(f"{gaps} gaps, the longest {1000 * steps[-1]:.0f} ms: the picture before is held")
+        rate.append(f"{gaps} gap{'s' * (gaps > 1)}, the longest {1000 * steps[-1]:.0f} ms: the picture before is held")
     return Film(times, times[-1] + usual, tuple(rate), clock[0])
 
 

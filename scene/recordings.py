@@ -100,4 +100,4 @@ def _gap_notes(times_s: F64) -> tuple[str, ...]:
     wide = steps[steps > GAP * np.median(steps)]
     if not len(wide):
         return ()
-    return (f"{len(wide)} gaps, the longest {wide.max() * 1000:.0f} ms, interpolated across",)
+    return (f"{len(wide)} gap{'s' * (len(wide) > 1)}, the longest {wide.max() * 1000:.0f} ms, interpolated across",)

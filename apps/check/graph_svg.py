@@ -10,6 +10,7 @@ from html import escape
 from typing import Any, Final
 
 COLUMN, LANE, BOX, HEIGHT, LEFT, TOP = 170, 84, 130, 44, 90, 20
+OVER: Final = 10  # pixels above a row of boxes, where a line passes them
 LETTERS: Final = 17  # of a name that fit into a box
 STYLE: Final = "font-family='sans-serif' font-size='12'"
 
@@ -84,4 +85,8 @@ def _line(start: tuple[int, int], end: tuple[int, int], is_latest: bool) -> str:
     dashes = " stroke-dasharray='5 4'" if is_latest else ""
     bend = (x + to_x) // 2
     path = f"M {x} {y} C {bend} {y} {bend} {to_y} {to_x} {to_y}"
+    if y == to_y and to_x - x > COLUMN:  # over the boxes between the two
+        over = y - HEIGHT // 2 - OVER
+        path = f"M {x} {y} C {x + OVER} {over} {x} {over} {x + 2 * OVER} {over} H {to_x - 2 * OVER}"
+        path += f" C {to_x} {over} {to_x - OVER} {over} {to_x} {to_y}"
     return f"<path d='{path}' fill='none' stroke='#6b7280'{dashes}/><circle cx='{to_x}' cy='{to_y}' r='3'/>"

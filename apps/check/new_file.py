@@ -13,10 +13,10 @@ from pathlib import Path
 
 import av
 
-from trilane.apps.check.port_types import NETWORK_CHANNELS, data_inputs, port_types, read_networks, value_type
+from trilane.apps.check.port_types import NETWORK_CHANNELS, port_types, read_networks, value_type
 from trilane.errors import BadInputError, TrilaneError
 from trilane.files import require_file
-from trilane.hw_profiles.graph_file import read_graph
+from trilane.hw_profiles.graph_file import fed_inputs, read_graph
 from trilane.pipeline.description import LONGEST_NAME
 from trilane.pipeline.file_keys import PortType
 from trilane.pipeline.pipeline_file import read_pipeline
@@ -72,7 +72,7 @@ def _branch(
 ) -> list[str]:
     """Return the lines of a network's stages; `names`: names of stages so far, to which these are added."""
     graph = read_graph(network, dict(shapes))
-    inputs = [_picture_input(network, value.name, value_type(value)) for value in data_inputs(graph)]
+    inputs = [_picture_input(network, value.name, value_type(value)) for value in fed_inputs(graph)]
     stem = re.sub(r"[^\w-]", "-", network.stem, flags=re.ASCII)[: LONGEST_NAME - SUFFIXES] or "network"
     name = next(each for each in (stem, *(f"{stem}-{n}" for n in range(2, 100))) if each not in names)
     prepared = [f"{name}-in{place}" if len(inputs) > 1 else f"{name}-in" for place in range(len(inputs))]

@@ -16,8 +16,7 @@ import numpy as np
 import onnx
 
 from trilane.errors import BadInputError, did_you_mean
-from trilane.hw_profiles.graph_file import GraphFile, read_graph
-from trilane.hw_profiles.network_work import constant_tensors
+from trilane.hw_profiles.graph_file import GraphFile, fed_inputs, read_graph
 from trilane.pipeline.file_keys import (
     TYPES,
     EncodeBlock,
@@ -65,31 +64,26 @@ def _read(file: PipelineFile, name: str, stage: OnnxStage) -> GraphFile:
         raise BadInputError(f"{where}.onnx: {error.where}", found, error.expected, remedy) from None
 
 
-def data_inputs(graph: GraphFile) -> list[onnx.ValueInfoProto]:
-    """Return the inputs of a network that are no weights; a graph without values has its weights as inputs."""
-    weights = constant_tensors(graph.model.graph)
-    return [value for value in graph.model.graph.input if value.name not in weights]
-
-
 def _check_names(file: PipelineFile, name: str, stage: OnnxStage, graph: GraphFile) -> None:
-    """Check that each input of a network is fed, and that no other one is."""
-    where, inputs = f"{file.path}: stages.{name}", [value.name for value in data_inputs(graph)]
+    """Check that each input of a network is fed, and that no other one is. A weight without values may be fed."""
+    where, inputs = f"{file.path}: stages.{name}", [value.name for value in graph.model.graph.input]
+    wanted = [value.name for value in fed_inputs(graph)]
     for shape in stage.shapes:
         if shape not in inputs:
             expected = f"one of {', '.join(inputs)}"
             raise BadInputError(f"{where}.shapes.{shape}", "an unknown input", expected, did_you_mean(shape, inputs))
     ports = [each.port for each in stage.inputs]
-    if ports == [""] and len(inputs) == 1:
+    if ports == [""] and len(wanted) == 1:
         return
     for port in ports:
         if port not in inputs:
             found = f"the unknown port {port!r}" if port else "a stage without a port"
-            expected = f"a table with {', '.join(inputs)}"
-            raise BadInputError(f"{where}.in", found, expected, did_you_mean(port, inputs))
-    for each in inputs:
+            expected = f"a table with {', '.join(wanted)}"
+            raise BadInputError(f"{where}.in", found, expected, did_you_mean(port, wanted))
+    for each in wanted:
         if each not in ports:
             found = f"nobody who feeds the input {each!r} of {stage.onnx}"
-            raise BadInputError(f"{where}.in", found, f"a stage for each of {', '.join(inputs)}")
+            raise BadInputError(f"{where}.in", found, f"a stage for each of {', '.join(wanted)}")
 
 
 def _check_output(file: PipelineFile, name: str, each: StageInput, outputs: list[str]) -> None:
@@ -123,7 +117,7 @@ def _written(
     if isinstance(stage, VideoBlock):
         return {"": PortType("u8", (stage.size[1], stage.size[0], 3))}
     if isinstance(stage, PrepareBlock):
-        inputs = data_inputs(networks[stage.like])
+        inputs = fed_inputs(networks[stage.like])
         chosen = [value for value in inputs if stage.port in ("", value.name)]
         wanted = value_type(chosen[0]) if len(chosen) == 1 else None
         return {"": wanted} if wanted else {}
@@ -178,7 +172,7 @@ def _check_inputs(
 
 def _check_network(where: str, found: PortType, each: StageInput, network: GraphFile) -> None:
     """Check what a network's input reads: that type, or a picture where the network takes one."""
-    inputs = data_inputs(network)
+    inputs = network.model.graph.input if each.port else fed_inputs(network)
     value = next(one for one in inputs if each.port in ("", one.name))
     wanted = value_type(value)
     if wanted is None or (found.dtype == wanted.dtype and math.prod(found.shape) == math.prod(wanted.shape)):

@@ -15,7 +15,7 @@ from trilane.apps.explain.explained_run import open_journal
 from trilane.apps.predict.predict_options import PredictOptions
 from trilane.hw_profiles.graph_file import GraphFile
 from trilane.hw_profiles.network_time import in_precision, under_runtime
-from trilane.hw_profiles.pipeline_prediction import NOTHING_MEASURED, Measured, predict_file, prices_of
+from trilane.hw_profiles.pipeline_prediction import Measured, predict_file, prices_of
 from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import Profile
 from trilane.pipeline.file_keys import MOST_SAMPLES, OnnxStage, StageTime
@@ -36,7 +36,7 @@ def predict_asked_file(options: PredictOptions, path: Path, say: Callable[[str],
     file = read_pipeline(path)
     variants = [("", file)] + [(text, file.changed(BETWEEN.split(text))) for text in options.changes]
     chips = _Chips(options, say)
-    measured = _measured(options.measured, chips.name) if options.measured else NOTHING_MEASURED
+    measured = _measured(options.measured, chips.name) if options.measured else Measured({}, "", chips.name)
     answers = [_answer(each, text, options, chips, measured) for text, each in variants]
     chip = chips.used
     return {

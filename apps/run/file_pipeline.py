@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from trilane.apps.check.port_types import PortTypes, data_inputs, port_types, read_networks, value_type
+from trilane.apps.check.port_types import PortTypes, port_types, read_networks, value_type
 from trilane.errors import BadInputError
-from trilane.hw_profiles.graph_file import GraphFile
+from trilane.hw_profiles.graph_file import GraphFile, fed_inputs
 from trilane.hw_profiles.host import settings_of, usable_cores
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
 from trilane.pipeline.description import StageInput as StreamInput
@@ -31,7 +31,7 @@ from trilane.pipeline.file_keys import (
 from trilane.pipeline.pipeline_file import PipelineFile, stage_inputs
 from trilane.pipeline.ports import payload_bytes
 from trilane.scheduler.places import Place
-from trilane.stages.blocks.video import DEFAULT_FPS, footage
+from trilane.stages.blocks.video import DEFAULT_FPS, Footage, footage
 
 BLOCKS: Final = "trilane.stages.blocks"
 #: Module of each block, where it is not the block's name.
@@ -80,10 +80,20 @@ def frames_of(file: PipelineFile) -> int:
     counts = []
     for stage in file.stages.values():
         if isinstance(stage, VideoBlock) and not stage.is_camera:
-            found = footage(file.folder / stage.path)
+            found = _footage_of(file, stage)
             rate = file.run.fps / found.fps if file.run.fps and found.fps else 1.0
             counts += [max(round(found.pictures * rate), 1)] if found.pictures else []
     return min(counts, default=DEFAULT_FRAMES)
+
+
+def _footage_of(file: PipelineFile, stage: VideoBlock) -> Footage:
+    """Return what the video of a stage holds. Raises BadInputError naming the stage's key."""
+    try:
+        return footage(file.folder / stage.path)
+    except BadInputError as error:
+        name = next(each for each, one in file.stages.items() if one is stage)
+        where = f"{file.path}: stages.{name}.path: {error.where}"
+        raise BadInputError(where, error.found, error.expected, error.remedy) from None
 
 
 def picture_fps(file: PipelineFile) -> float:
@@ -91,7 +101,7 @@ def picture_fps(file: PipelineFile) -> float:
     if file.run.fps is not None:
         return file.run.fps
     videos = [stage for stage in file.stages.values() if isinstance(stage, VideoBlock) and not stage.is_camera]
-    rates = [footage(file.folder / stage.path).fps for stage in videos]
+    rates = [_footage_of(file, stage).fps for stage in videos]
     return next((rate for rate in rates if rate), DEFAULT_FPS)
 
 
@@ -196,7 +206,13 @@ def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str
         key: value for key, value in stage.model_dump(mode="json").items() if key not in common and value is not None
     }
     if isinstance(stage, OnnxStage):
-        values = [(value.name, value_type(value)) for value in data_inputs(networks[name])]
+        graph = networks[name]
+        values = [(value.name, value_type(value)) for value in fed_inputs(graph)]
+        held = {each.name for each in graph.model.graph.initializer} | {each for each, _ in values}
+        if bare := [value.name for value in graph.model.graph.input if value.name not in held]:
+            found = f"{stage.onnx} without weights: {len(bare)} are inputs without values"
+            remedy = "export it with its weights; `trilane check` and `trilane predict` take it as it is"
+            raise BadInputError(f"{file.path}: stages.{name}.onnx", found, "a network with its weights", remedy)
         keys["inputs"] = {}
         for each, found in values:
             if found is None:

@@ -37,6 +37,8 @@ class Footage(NamedTuple):
 
 def footage(path: Path) -> Footage:
     """Return what a video file or a folder of pictures holds. Raises BadInputError."""
+    if not path.exists():
+        raise BadInputError(path, "no such file", EXPECTED)
     if path.is_dir():
         return Footage(len(picture_files(path)), None)
     try:

@@ -9,9 +9,8 @@ def best(settings):
     def crop(frame, heat):
         row, column = np.unravel_index(heat[0, 0].argmax(), heat.shape[2:])
         scale = np.array(frame.shape[:2]) / heat.shape[2:]
-        top, left = (np.clip(np.array([row, column]) * scale - side / 2, 0, np.array(frame.shape[:2]) - side)).astype(
-            int
-        )
+        corner = np.array([row, column]) * scale - side / 2
+        top, left = np.clip(corner, 0, np.array(frame.shape[:2]) - side).astype(int)
         box = np.array([[left, top, left + side, top + side]], np.float32)
         return {"picture": frame[top : top + side, left : left + side], "boxes": box}
 

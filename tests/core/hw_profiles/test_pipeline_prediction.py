@@ -281,10 +281,31 @@ def test_newest_inputs_say_their_age(predict: Predict) -> None:
     assert row["frames_behind"] == {"mean": 2.5, "max": 3}
 
 
+def test_a_what_if_for_an_unknown_stage_names_the_file_s_stages(command: Command, tmp_path: Path) -> None:
+    path = write_file(tmp_path, chain("1", "2"))
+    error = " ".join(command("predict", path, "--set", "stages.s9.unit=gpu", code=2)[1].split())
+    assert "--set: found the unknown stage 's9', expected a stage of the file: " in error
+
+
+def test_the_answer_says_when_every_leaves_frames_out(predict: Predict) -> None:
+    text = """
+    [run]
+    fps = 25
+    [stages]
+    a = { unit = "u", time_ms = 2 }
+    b = { unit = "v", in = "a", time_ms = 50, every = 2 }
+    c = { unit = "w", in = { x = "a", y = "b" }, time_ms = 2 }
+    """
+    assert predict(text)["rate"]["sentence"].endswith("c has one frame of 2, by every")
+
+
 def test_a_stage_without_a_time_is_refused_by_name(command: Command, tmp_path: Path) -> None:
     error = " ".join(command("predict", write_file(tmp_path, STREET), code=2)[1].split())
-    assert "stages.camera: found video without a time" in error
-    assert "add time_ms" in error
+    assert "stages.camera: found video without a time, as small, crop, overlay, video, expected" in error
+    assert "add time_ms" in error and "--measured RUN and scale = { snapdragon-888 = ... }" in error
+    options = (tmp_path / "pipeline.toml", "--profile", "host")
+    out, error = command("predict", *options, code=2)
+    assert "measuring" not in out + error and "scale" not in error
     text = STREET.replace("block =", "time_ms = 2, block =")
     error = " ".join(command("predict", write_file(tmp_path, text), code=2)[1].split())
     assert "stages.crop: found python without a time" in error

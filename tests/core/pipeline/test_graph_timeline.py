@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import pytest
@@ -63,19 +64,22 @@ def run(seed: int) -> tuple[Recording, Sequence[JobRecord], dict[str, Any]]:
     return made.recording, made.jobs, made.report
 
 
+def _noted(monkeypatch: pytest.MonkeyPatch, of: type, name: str, note: Callable[..., None]) -> None:
+    """Let a method call `note` with its arguments before it does its work."""
+    real = getattr(of, name)
+
+    def method(self: Any, *args: Any) -> Any:
+        note(self, *args)
+        return real(self, *args)
+
+    monkeypatch.setattr(of, name, method)
+
+
 @pytest.fixture
 def told(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     """What the scheduler does with frames: those presented, dropped and lost, with cause and release."""
     found: list[tuple[Any, ...]] = []
-
-    def noted(of: type, name: str, note: Callable[..., None]) -> None:
-        real = getattr(of, name)
-
-        def method(self: Any, *args: Any) -> Any:
-            note(self, *args)
-            return real(self, *args)
-
-        monkeypatch.setattr(of, name, method)
+    noted = partial(_noted, monkeypatch)
 
     def dropped(flow: Flow, frame: int, behind: StageState, before: StageState | None, cause: DropCause) -> None:
         readers = before.name if before is not None else ",".join(each.name for each in behind.readers)

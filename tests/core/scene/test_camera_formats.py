@@ -397,9 +397,9 @@ def test_any_text_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, t
 def test_real_logs_are_what_they_are(shared_data: Path) -> None:
     arkit = load(shared_data / "camera" / "arkit_camera_pose.txt")
     assert "Y up, device held so that the picture is turned by 90 degrees" in arkit.notes
-    assert any("1 gaps, the longest 33 ms" in note for note in arkit.notes)
+    assert any("1 gap, the longest 33 ms" in note for note in arkit.notes)
     tum = load(shared_data / "camera" / "tum_freiburg1_xyz.txt")
-    assert "Z up" in tum.notes and any("1 gaps, the longest 110 ms" in note for note in tum.notes)
+    assert "Z up" in tum.notes and any("1 gap, the longest 110 ms" in note for note in tum.notes)
     for camera in (arkit, tum):
         assert np.median(matrix_from_quat(camera.quats)[:, 1, 1]) > 0.6
 

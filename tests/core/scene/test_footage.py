@@ -263,7 +263,7 @@ def test_names_that_are_times(names: list[str], began: float) -> None:
     assert film.period_s == pytest.approx(0.100022 + 0.050011, abs=1e-6)
     assert film.rate == ("20/s by the times that are their names",)
     gap = film_of([*names, names[-1].replace("1102.2", "1102.9").replace("9863", "9999")], 10.0)
-    assert gap.rate[1].startswith("1 gaps, the longest ")
+    assert gap.rate[1].startswith("1 gap, the longest ")
 
 
 def test_numbers_that_are_no_times_of_a_clock() -> None:

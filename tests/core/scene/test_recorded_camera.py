@@ -205,7 +205,7 @@ def test_what_the_scene_says_of_the_lens_wins() -> None:
         f"Y up{OF_FIRST}",
         "field of view 36 degrees high, usual",
         "1 samples not finite (first: number 2), interpolated across",
-        "1 gaps, the longest 2000 ms, interpolated across",
+        "1 gap, the longest 2000 ms, interpolated across",
     )
 
 

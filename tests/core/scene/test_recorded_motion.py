@@ -306,7 +306,7 @@ def test_usable_samples_by_hand() -> None:
         [0, 1, 3, 4],
         (
             "1 samples not finite or no rotation (first: number 2), interpolated across",
-            "1 gaps, the longest 2000 ms, interpolated across",
+            "1 gap, the longest 2000 ms, interpolated across",
         ),
     )
     assert usable([0, 1, 1, 0.5, 2, np.nan]) == (
@@ -320,9 +320,9 @@ def test_usable_samples_by_hand() -> None:
 
 def test_a_gap_is_longer_than_one_and_a_half_steps() -> None:
     assert usable([0, 1, 2, 3.5])[1] == ()
-    assert usable([0, 1, 2, 3.51])[1] == ("1 gaps, the longest 1510 ms, interpolated across",)
+    assert usable([0, 1, 2, 3.51])[1] == ("1 gap, the longest 1510 ms, interpolated across",)
     assert usable([0, 9])[1] == ()
-    assert usable([0, 1, 9]) == ([0, 1, 2], ("1 gaps, the longest 8000 ms, interpolated across",))
+    assert usable([0, 1, 9]) == ([0, 1, 2], ("1 gap, the longest 8000 ms, interpolated across",))
 
 
 def test_half_of_the_samples_is_enough() -> None:

@@ -280,7 +280,7 @@ WRONG: dict[str, tuple[str, ...]] = {
         'b = { unit = "u", in = "d", time_ms = 1 }',
         *("stages.b.in", "'d', a discard"),
     ),
-    "no TOML": (STAGES + "b = = 3", "line 3", "invalid value"),
+    "no TOML": (STAGES + "b = = 3", "line 3", "no TOML", "Invalid value"),
 }
 
 
@@ -331,3 +331,26 @@ def test_weights_that_are_inputs_need_no_stage(command: Command, tmp_path: Path)
     model.graph.input.append(onnx.helper.make_tensor_value_info("weights", onnx.TensorProto.FLOAT, sizes))
     onnx.save(model, tmp_path / "seg.onnx")
     assert json.loads(command("check", path, "--json")[0])["stages"][1]["what"] == "seg.onnx"
+
+
+def test_a_graph_without_weights_is_fed_its_picture_alone(command: Command, tmp_path: Path) -> None:
+    text = '[stages]\na = { block = "video", unit = "cpu", path = "v.mp4", size = "16x16", time_ms = 1 }\n'
+    path = write_file(tmp_path, text + 'n = { onnx = "bare.onnx", unit = "dsp", in = "a" }')
+    sizes = {"image": (1, 3, 16, 16), "w0": (2, 3, 3, 3), "w1": (2,), "out": (1, 2, 14, 14)}
+    values = {name: onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, sizes[name]) for name in sizes}
+    layer = onnx.helper.make_node("Conv", ["image", "w0", "w1"], ["out"])
+    graph = onnx.helper.make_graph([layer], "bare", [values[name] for name in ("image", "w0", "w1")], [values["out"]])
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8)
+    onnx.save(model, tmp_path / "bare.onnx")
+    command("check", path)
+    command("predict", path, "--profile", "snapdragon-8-gen-3")
+    error = " ".join(command("run", path, "--frames", "2", "--out", tmp_path / "run", code=2)[1].split())
+    assert "stages.n.onnx: found bare.onnx without weights: 2 are inputs without values" in error
+
+
+def test_a_line_between_stages_of_one_row_passes_over_the_box_between(command: Command, tmp_path: Path) -> None:
+    stages = 'a = { unit = "u", time_ms = 1 }\nb = { unit = "u", in = "a", time_ms = 1 }\n'
+    text = f'[stages]\n{stages}c = {{ unit = "u", in = {{ a = "a", b = "b" }}, time_ms = 1 }}'
+    command("check", write_file(tmp_path, text), "--svg", tmp_path / "graph.svg")
+    paths = re.findall(r"<path d='([^']*)'", (tmp_path / "graph.svg").read_text())
+    assert [" H " in path for path in paths] == [False, True, False]
