@@ -32,6 +32,7 @@ from trilane.pipeline.pipeline_file import PipelineFile
 from trilane.scheduler.events import Graph, Settings
 from trilane.scheduler.period_bound import Bound, period_bound
 from trilane.scheduler.virtual import simulate
+from trilane.transport.slots import edge_rule
 from trilane.units import HOST, NS_PER_MS, UNITS, UnitName
 
 DRAWS: Final = 200
@@ -265,17 +266,23 @@ def _row(stage: StagePrice) -> dict[str, Any]:
 def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], graph: Graph, seed: int) -> FrameInterval:
     """Return the time of a frame of the source when frames never wait for it, with the interval by ignorance.
 
-    The jitter's part is that of a run with an always ready source; 200 draws of the bound have the ignorance.
+    The jitter's part is that of a run with an always ready source; 200 draws of the bound have the ignorance. Streams
+    that leave out frames hold back instead, because a rate holds when every frame is shown. What the run takes for its
+    first half is left out, and it takes no less than the bound: slots fill for as long as hundreds of frames.
     """
     times = {name: each.mean_ns for name, each in prices.items()}
     in_flight = in_flight_of(file)
+    graph = replace(graph, edges=tuple(map(_holding_back, graph.edges)), from_release=False)
     bound_ns = period_bound(graph, times, in_flight).period_ns
     count = VARYING_FRAMES if any(each.time.varies for each in prices.values()) else CONSTANT_FRAMES
-    ready = Settings(count, hang_ns=NEVER_HANGS_NS, in_flight=in_flight)
-    done = simulate(replace(graph, from_release=False), ready, _Drawn(prices, seed)).report
-    presented = done["frames"]["presented"]
-    ms = done["duration_s"] * 1e3 / ready.frames if presented < ready.frames else done["frame_time_ms"]["mean"]
-    ms = max(ms, float(bound_ns) / NS_PER_MS)  # a short run ends with frames that its source is ahead by
+    beat = math.lcm(*file.periods.values())
+    count = -(-count // beat) * beat if beat <= count else count
+    half, whole = (
+        simulate(graph, Settings(each, hang_ns=NEVER_HANGS_NS, in_flight=in_flight), _Drawn(prices, seed)).report
+        for each in (count, 2 * count)
+    )
+    ms = max((whole["duration_s"] - half["duration_s"]) * 1e3 / count, float(bound_ns) / NS_PER_MS)
+    ms = round(ms, 6)
     if not bound_ns or not any(each.spread for each in prices.values()):
         return FrameInterval(ms, ms, ms)
     rng = np.random.default_rng([seed, 1])
@@ -285,6 +292,12 @@ def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], graph: Graph, s
         found.append(float(period_bound(graph, drawn, in_flight).period_ns / bound_ns))
     low, high = np.percentile(found, QUANTILES)
     return FrameInterval(ms, float(ms * low), float(ms * high))
+
+
+def _holding_back(rule: str) -> str:
+    """Return a rule with as many slots whose writer waits for a free one."""
+    known = edge_rule(rule)
+    return f"fifo:{known.slots}" if known.yields else rule
 
 
 def _factors(prices: Mapping[str, StagePrice], rng: np.random.Generator, count: int) -> list[dict[str, float]]:

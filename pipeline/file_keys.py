@@ -28,6 +28,7 @@ MOST_SAMPLES: Final = 1_000_000
 MOST_PORT_BYTES: Final = 256 << 20
 LONGEST_SIDE: Final = 16_384  # of a picture, in pixels
 LONGEST_MS: Final = 3.6e6  # of a stage, an hour
+MOST_SDS: Final = 1000  # standard deviation of a time, in means
 NAME: Final = rf"^[\w-]{{1,{LONGEST_NAME}}}$"
 #: Types of numbers in a port, by NumPy's name.
 TYPES: Final = {
@@ -270,6 +271,9 @@ class StageTime(Keys):
             raise UnexpectedValue(found, "mean with or without sd, exponential, or samples")
         if self.sd and not self.mean:
             raise UnexpectedValue("sd beside mean = 0", "a mean above 0")
+        if self.mean is not None and self.sd > MOST_SDS * self.mean:
+            found = f"sd = {self.sd:g} beside mean = {self.mean:g}"
+            raise UnexpectedValue(found, f"at most {MOST_SDS:,} times the mean")
         return self
 
     @property
@@ -408,16 +412,22 @@ class BlockStage(StageKeys):
     """A built-in block."""
 
     kind = "block"
+    writes_one: ClassVar[bool] = False  # a picture or a tensor, on a port without a name
     block: str = Field(description="Built-in stage: video, prepare, overlay, encode, discard or busy.")
 
     @property
     def named_kind(self) -> str:
         return self.block
 
+    @property
+    def out_ports(self) -> tuple[str, ...] | None:
+        return ("",) if self.writes_one and self.out is None else super().out_ports
+
 
 class VideoBlock(BlockStage):
     """Reads a video, a camera or a folder of pictures."""
 
+    writes_one = True
     in_ports = {}
     path: InsidePath = Field(description="A video, a folder of pictures, or the number of a camera.")
     size: Size = Field(description=f"{SIZE_HELP}; pictures are scaled to it.")
@@ -430,6 +440,7 @@ class VideoBlock(BlockStage):
 class PrepareBlock(BlockStage):
     """Makes of a picture what a network expects."""
 
+    writes_one = True
     in_ports = {"": True}
     like: str = Field(pattern=NAME, description="Network stage for whose input it prepares.")
     port: str = Field(default="", description="Input of that network, if it has several.")
@@ -454,6 +465,7 @@ class PrepareBlock(BlockStage):
 class OverlayBlock(BlockStage):
     """Draws on a picture what networks found."""
 
+    writes_one = True
     in_ports = {"frame": True, "mask": False, "depth": False, "boxes": False}
     alpha: float = Field(default=0.5, ge=0, le=1, description="Weight of what is drawn, 0 to 1.")
 

@@ -130,7 +130,7 @@ def read_pipeline(path: Path) -> PipelineFile:
 
 def is_pipeline_file(path: Path) -> bool:
     """Say whether a file looks like a pipeline file: a .toml with stages. A scene is a .toml too, and has none."""
-    if path.suffix != ".toml":
+    if path.suffix != ".toml" or not path.is_file():  # a pipe with that name would be waited for
         return False
     try:
         with path.open("rb") as file:

@@ -77,6 +77,21 @@ def test_the_chain_of_five(predict: Predict, head: str, frame_ms: float) -> None
     assert predict(chain("2", "3", "5", "4", "1", head=head))["frame_time_ms"]["mean"] == frame_ms
 
 
+@pytest.mark.parametrize("edge", ["triple", "orphan", "double"])
+def test_a_rate_holds_only_where_every_frame_is_shown(predict: Predict, edge: str) -> None:
+    answer = predict(chain("2", "50", head=f'[run]\nfps = 30\nedge = "{edge}"'))
+    assert answer["fps"] == pytest.approx(20, rel=1e-3)
+    assert answer["rate"]["sentence"] == "holds 30 fps: no; 50 ms of 33.3 ms"
+
+
+def test_slots_that_fill_do_not_make_a_pipeline_faster(predict: Predict) -> None:
+    branches = 'a = { unit = "a", time_ms = 10 }\nb = { unit = "b", in = "a", time_ms = 11 }'
+    latest = 'c = { unit = "c", time_ms = 1, in = { a = "a", b = { from = "b", sync = "latest" } } }'
+    answer = predict(f'[run]\nfps = 95\n[stages]\n{branches}\n{latest}\n[edges]\na = "fifo:64"\nb = "fifo:3"')
+    assert answer["needs_ms"]["mean"] == 11
+    assert answer["rate"]["holds"] is False
+
+
 TRACKED = """
 [run]
 frames = 999
@@ -379,3 +394,8 @@ def test_measured_times_are_those_of_a_run_and_on_a_chip_times_their_scale(
     assert "stages.depth: found python without a time" in error
     assert "scale = { snapdragon-8-gen-3 = ... }" in error
     command("predict", tmp_path / "pipeline.toml", "--measured", tmp_path / "none", code=2)
+
+
+def test_what_a_frame_needs_has_no_part_of_the_start(predict: Predict) -> None:
+    stages = 't = { unit = "u", time_ms = 12 }\nd = { unit = "u", in = "t", time_ms = 45, every = 3 }'
+    assert predict(f"[stages]\n{stages}")["needs_ms"]["mean"] == 27

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import random
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -173,3 +175,26 @@ def test_a_scene_is_no_pipeline_file(tmp_path: Path) -> None:
     assert not is_pipeline_file(tmp_path / "none.toml")
     for number, head in enumerate(("[stages]", " [ stages.a ]", '["stages"]', "stages.a = {}", "stages = 3")):
         assert is_pipeline_file(write_file(tmp_path, head, f"{number}.toml"))
+
+
+@pytest.mark.parametrize("source", ["camera", "small", "overlay"])
+def test_a_block_has_one_port_without_a_name(tmp_path: Path, source: str) -> None:
+    reader = f'more = {{ block = "discard", unit = "cpu", in = "{source}.nope" }}'
+    with pytest.raises(BadInputError, match=rf"stages\.more\.in: found the unknown port 'nope' of {source}"):
+        read_pipeline(write_file(tmp_path, f"{STREET}\n{reader}\n"))
+
+
+def test_a_deviation_far_above_the_mean_is_refused(tmp_path: Path) -> None:
+    text = '[stages]\na = { unit = "u", time_ms = { mean = 1e-300, sd = 1 } }'
+    with pytest.raises(BadInputError, match=r"stages\.a\.time_ms: found sd = 1 beside mean = 1e-300"):
+        read_pipeline(write_file(tmp_path, text))
+
+
+def test_a_pipe_is_no_pipeline_file(tmp_path: Path) -> None:
+    """It is not opened: nobody may ever write to it."""
+    os.mkfifo(tmp_path / "pipe.toml")
+    writer = threading.Timer(5, (tmp_path / "pipe.toml").write_text, ["[stages]"])
+    writer.daemon = True
+    writer.start()
+    assert not is_pipeline_file(tmp_path / "pipe.toml")
+    writer.cancel()
