@@ -210,9 +210,9 @@ def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str
         values = [(value.name, value_type(value)) for value in fed_inputs(graph)]
         held = {each.name for each in graph.model.graph.initializer} | {each for each, _ in values}
         if bare := [value.name for value in graph.model.graph.input if value.name not in held]:
-            found = f"{stage.onnx} without weights: {len(bare)} are inputs without values"
+            without = f"{stage.onnx} without weights: {len(bare)} are inputs without values"
             remedy = "export it with its weights; `trilane check` and `trilane predict` take it as it is"
-            raise BadInputError(f"{file.path}: stages.{name}.onnx", found, "a network with its weights", remedy)
+            raise BadInputError(f"{file.path}: stages.{name}.onnx", without, "a network with its weights", remedy)
         keys["inputs"] = {}
         for each, found in values:
             if found is None:
