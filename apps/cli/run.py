@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -83,7 +84,7 @@ def run(
     docs/report.md explains every key, the policies and the edges.
     """
     from trilane.apps.run.asked_run import run_asked
-    from trilane.apps.run.run_file import pipeline_file_of, run_file
+    from trilane.pipeline.pipeline_file import is_pipeline_file
 
     if port is not None and not dashboard:
         raise BadInputError("options", "--port without --dashboard", "both or neither")
@@ -92,7 +93,9 @@ def run(
             "options", "--check with --dashboard", "one of them", "a run that is steered has no reference"
         )
     command = ("trilane", *sys.argv[1:])
-    if pipeline_file_of(options) is not None:
+    if is_pipeline_file(Path(options.scene)):
+        from trilane.apps.run.run_file import run_file
+
         if dashboard:
             raise BadInputError("options", "--dashboard with a pipeline file", "one of them", "`trilane dashboard RUN`")
         outcome = run_file(options, _hooks, command)

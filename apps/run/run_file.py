@@ -46,14 +46,6 @@ from trilane.stages.run_options import RunOptions
 TAKEN: Final = ("frames", "fps", "policy", "edge", "out")
 
 
-def pipeline_file_of(options: RunOptions) -> Path | None:
-    """Return the pipeline file that the options ask for; None for a scene."""
-    from trilane.pipeline.pipeline_file import is_pipeline_file
-
-    path = Path(options.scene)
-    return path if is_pipeline_file(path) else None
-
-
 def run_file(
     options: RunOptions,
     hooks: Callable[[], AbstractContextManager[Hooks]],
