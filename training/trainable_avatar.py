@@ -63,7 +63,7 @@ class TrainableAvatar(nn.Module):
         rounds = self.grid is not None and self.grid.active
         with torch.autocast(x.device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
             output: Tensor = self.grid.painted(self.network, x) if self.grid and rounds else self.network(x)
-        return output.float()
+        return output.float() if self.precision == "bfloat16" else output
 
     def _noisy(self, x: Tensor, deviation: float) -> Tensor:
         return x + deviation * torch.randn_like(x) if self.training and deviation else x
