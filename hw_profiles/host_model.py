@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 from trilane.hw_profiles.application import Plan, stage_times_ms
 from trilane.hw_profiles.host import predictions, rule_placement, unit_rows
 from trilane.hw_profiles.network_work import Network, Work
+from trilane.hw_profiles.rates import without_interval
 from trilane.hw_profiles.reference_networks import CHANNELS_PER_PASS
 from trilane.hw_profiles.schema import Corners, Measured, Profile, Quantity, Unit
 from trilane.hw_profiles.unit_times import time_on
@@ -202,7 +203,7 @@ def with_known_intervals(profile: Profile, unit: UnitName, answer: dict[str, Any
         return _without(answer, OF_POWER)
     known = _without(answer, OF_POWER | OF_TIMES)
     if rate := known.get("rate"):
-        rate["words"] = rate["words"].partition(",")[0]
+        known["rate"] = without_interval(rate)
     return known
 
 

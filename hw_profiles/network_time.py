@@ -223,6 +223,21 @@ def under_runtime(profile: Profile, unit: UnitName, runtime: EngineRuntime | Non
     return profile.model_copy(update={"units": {**profile.units, unit: changed}})
 
 
+class Computes(NamedTuple):
+    """How a network computes: what its file says of its numbers, and the precision and runtime that were asked for."""
+
+    numbers: NumberFormat = "not said"
+    precision: str | None = None
+    runtime: EngineRuntime | None = None
+
+    def on(self, profile: Profile, unit: UnitName) -> Profile:
+        """Return `profile` with `unit` as it runs this network; every prediction prices a network on such a chip.
+
+        Raises BadInputError as `under_runtime`.
+        """
+        return under_runtime(in_precision(profile, unit, self.numbers, self.precision), unit, self.runtime)
+
+
 def predict_network(
     profile: Profile,
     graph: GraphFile,

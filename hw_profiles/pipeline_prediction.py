@@ -24,7 +24,7 @@ from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_file import GraphFile
 from trilane.hw_profiles.host_model import MODEL_ERROR, UNMEASURED
 from trilane.hw_profiles.network_time import interval, price, spread_of
-from trilane.hw_profiles.rates import FrameInterval, holding
+from trilane.hw_profiles.rates import FrameInterval, holding, without_interval
 from trilane.hw_profiles.schema import NORMAL_80, Profile, corners_of
 from trilane.pipeline.file_graph import edge_rules, graph_of, in_flight_of, settings_of, source_ns
 from trilane.pipeline.file_keys import OnnxStage, StageTime
@@ -44,6 +44,8 @@ BLOCK: Final = 4096  # frames whose times are drawn at once
 #: No job hangs in virtual time, however long the file says that it takes.
 NEVER_HANGS_NS: Final = 1 << 60
 QUANTILES: Final = (10, 90)
+#: Of draws at the middles of equally likely ranges, draw i of n stands for the quantile (i + 0.5) / n.
+OF_MIDDLES: Final = "hazen"
 
 #: (name of a stage, its graph, its unit of hardware) -> the chip that computes as this network does.
 ChipFor = Callable[[str, GraphFile, UnitName], Profile]
@@ -231,7 +233,8 @@ def predict_file(
         "slots": dict(zip(graph.streams, graph.edges, strict=True)),
     }
     if file.run.fps is not None:
-        answer["rate"] = {**holding(file.run.fps, needs), "sentence": _sentence(file.run.fps, needs) + _share(file)}
+        rate = holding(file.run.fps, needs)
+        answer["rate"] = {**rate, "sentence": rate["sentence"] + _share(file)}
     return answer if all(each.low_ms is not None for each in prices.values()) else _without_intervals(answer)
 
 
@@ -240,10 +243,7 @@ def _without_intervals(answer: dict[str, Any]) -> dict[str, Any]:
     for key in ("needs_ms", "frame_time_ms", "latency_ms"):
         answer[key] = {**answer[key], "low": None, "high": None}
     if rate := answer.get("rate"):
-        words = rate["words"].partition(",")[0]
-        holds = f"{'yes' if rate['holds'] else 'no'}; {_short(answer['needs_ms']['mean'])} ms"
-        sentence = f"holds {rate['fps']:g} fps: {holds} of {_short(1e3 / rate['fps'])} ms (no interval)"
-        answer["rate"] = {**rate, "words": words, "sentence": sentence, "reserve_low": None, "reserve_high": None}
+        answer["rate"] = without_interval(rate)
     return answer
 
 
@@ -272,7 +272,7 @@ def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], graph: Graph, s
     """
     times = {name: each.mean_ns for name, each in prices.items()}
     in_flight = in_flight_of(file)
-    graph = replace(graph, edges=tuple(map(_holding_back, graph.edges)), from_release=False)
+    graph = replace(graph, edges=tuple(map(holding_back, graph.edges)), from_release=False)
     bound_ns = period_bound(graph, times, in_flight).period_ns
     count = VARYING_FRAMES if any(each.time.varies for each in prices.values()) else CONSTANT_FRAMES
     beat = math.lcm(*file.periods.values())
@@ -290,11 +290,11 @@ def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], graph: Graph, s
     for factors in _factors(prices, rng, DRAWS):
         drawn = {name: round(ns * factors.get(name, 1.0)) for name, ns in times.items()}
         found.append(float(period_bound(graph, drawn, in_flight).period_ns / bound_ns))
-    low, high = np.percentile(found, QUANTILES)
+    low, high = np.percentile(found, QUANTILES, method=OF_MIDDLES)
     return FrameInterval(ms, float(ms * low), float(ms * high))
 
 
-def _holding_back(rule: str) -> str:
+def holding_back(rule: str) -> str:
     """Return a rule with as many slots whose writer waits for a free one."""
     known = edge_rule(rule)
     return f"fifo:{known.slots}" if known.yields else rule
@@ -342,7 +342,9 @@ def _intervals(
     def around(key: str, mean: float) -> dict[str, float]:
         """Return the interval by what errors change in short runs, whose own jitter is the same in each."""
         usual = whole[key]["mean"]
-        low, high = np.percentile([run[key]["mean"] / usual if usual else 1.0 for run in runs], QUANTILES)
+        low, high = np.percentile(
+            [run[key]["mean"] / usual if usual else 1.0 for run in runs], QUANTILES, method=OF_MIDDLES
+        )
         return {"low": float(mean * low), "high": float(mean * high)}
 
     if frames["dropped"]:
@@ -350,18 +352,3 @@ def _intervals(
     least = source_ns(file) / NS_PER_MS
     by_bound = {"low": max(least, needs.low_ms), "high": max(least, needs.high_ms)}
     return by_bound, around("latency_ms", latency_ms)
-
-
-def _sentence(fps: float, needs: FrameInterval) -> str:
-    """Say whether the rate holds: `holds 30 fps: yes; 12-19 ms of 33 ms (80 %)`."""
-    frame_ms = 1e3 / fps
-    holds = "yes" if needs.high_ms <= frame_ms else "no" if needs.low_ms > frame_ms else "perhaps"
-    low, high = _short(needs.low_ms), _short(needs.high_ms)
-    span = f"{low} ms" if low == high else f"{low}-{high} ms"
-    share = "" if needs.low_ms == needs.high_ms else " (80 %)"
-    return f"holds {fps:g} fps: {holds}; {span} of {_short(frame_ms)} ms{share}"
-
-
-def _short(ms: float) -> str:
-    """Return a time with three digits, without an exponent."""
-    return f"{ms:.3g}" if ms < 100 else f"{ms:.0f}"

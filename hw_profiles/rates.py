@@ -52,10 +52,34 @@ def holding(fps: float, times: FrameInterval) -> dict[str, Any]:
         "fps": fps,
         "holds": reserve >= 0,
         "words": words,
+        "sentence": _sentence(fps, times),
         "reserve": reserve,
         "reserve_low": low,
         "reserve_high": high,
     }
+
+
+def without_interval(rate: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the answer of `holding` where nobody knows the error of the frame's time."""
+    ms = (1 - rate["reserve"]) * 1e3 / rate["fps"]
+    holds = f"{'yes' if rate['holds'] else 'no'}; {_short(ms)} ms of {_short(1e3 / rate['fps'])} ms (no interval)"
+    said = {"words": rate["words"].partition(",")[0], "sentence": f"holds {rate['fps']:g} fps: {holds}"}
+    return {**rate, **said, "reserve_low": None, "reserve_high": None}
+
+
+def _sentence(fps: float, times: FrameInterval) -> str:
+    """Say whether the rate holds: `holds 30 fps: yes; 12-19 ms of 33 ms (80 %)`."""
+    frame_ms = 1e3 / fps
+    holds = "yes" if times.high_ms <= frame_ms else "no" if times.low_ms > frame_ms else "perhaps"
+    low, high = _short(times.low_ms), _short(times.high_ms)
+    span = f"{low} ms" if low == high else f"{low}-{high} ms"
+    share = "" if times.low_ms == times.high_ms else " (80 %)"
+    return f"holds {fps:g} fps: {holds}; {span} of {_short(frame_ms)} ms{share}"
+
+
+def _short(ms: float) -> str:
+    """Return a time with three digits, without an exponent."""
+    return f"{ms:.3g}" if ms < 100 else f"{ms:.0f}"
 
 
 class FrameLoad(NamedTuple):

@@ -4,6 +4,7 @@
 adds how much a network slows while others use the memory: it has the bandwidth that they leave (Gables, Hill and Reddi,
 2019). Each avatar's camera, display and composition take `application_use_fraction` all the time, and a network of
 another pipeline on another unit takes its bytes over its time. Jobs of one unit follow each other and never compete.
+A network that nothing slows has the time of `network_time.price`, on a chip that computes as the network does.
 The answer has the keys of report.json where they mean the same.
 """
 
@@ -12,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import (
@@ -26,9 +27,13 @@ from trilane.hw_profiles.application import (
 )
 from trilane.hw_profiles.engine_times import numbers_of, spilled
 from trilane.hw_profiles.host_model import UNMEASURED
+from trilane.hw_profiles.network_time import Computes, interval, price
 from trilane.hw_profiles.network_work import Network
 from trilane.hw_profiles.over_time import Moment, last_fifth, temperatures_of, unit_power_w, warm_up
+from trilane.hw_profiles.pipeline_prediction import holding_back
+from trilane.hw_profiles.rates import FrameInterval, holding, without_interval
 from trilane.hw_profiles.schema import Corners, Profile, Unit, corners_of
+from trilane.hw_profiles.unit_times import time_on
 from trilane.scheduler.events import Graph, Settings, Stop, chain
 from trilane.scheduler.policy import POLICIES, run_settings
 from trilane.scheduler.shared_units import ONE, ROUND_ROBIN, Member, Runs, simulate_beside
@@ -42,6 +47,11 @@ MOST_USE = 0.95
 LEAST_S, LEAST_FRAMES, MOST_S = 10.0, 64, 600.0
 #: How frames are taken by default: only the newest counts, as with a camera; an older one is dropped.
 NEWEST = Variant("latest", "double")
+#: A run of a pipeline that always has a frame ends after MOST_FED frames, about.
+MOST_FED: Final = 1000
+#: Which time of a network counts: the expected one, or an end of its 80 % interval.
+Ends = Literal["expected", "low", "high"]
+ENDS: Final[tuple[Ends, ...]] = ("expected", "low", "high")
 ENDLESS = 1 << 40
 SKIPS = -1
 
@@ -54,7 +64,8 @@ class Tenant:
     number of avatars in view. `frames`: for each frame, the place of its network in `networks`, or `SKIPS`; the list
     starts over after its end. `unit`: unit of the network. `fps`: frames released a second. `variant`: how the stages
     are joined. `is_bare`: whether there is nothing but the network, whose result is due when the next frame comes.
-    `avatars`: number of avatars in view for each of `networks`; empty for one each. Raises BadInputError for a unit or
+    `avatars`: number of avatars in view for each of `networks`; empty for one each. `computes`: how the networks
+    compute. Raises BadInputError for a unit or
     a rate out of range.
     """
 
@@ -67,6 +78,7 @@ class Tenant:
     variant: Variant = NEWEST
     is_bare: bool = False
     avatars: tuple[int, ...] = ()
+    computes: Computes = Computes()
 
     def __post_init__(self) -> None:
         if self.unit not in RUNTIMES:
@@ -82,6 +94,12 @@ class Tenant:
             return chain([(name, self.unit)], self.variant.edge, name)
         return replace(application_graph(self.variant.edge, [(name, self.unit)]), bypass=BYPASS)
 
+    @property
+    def fed_settings(self) -> Settings:
+        """The settings of its scheduler where it always has another frame, and shows all of them."""
+        policy = self.variant.policy
+        return Settings(ENDLESS, Variant().policy if POLICIES[policy].paced else policy, hang_ns=ENDLESS)
+
     def settings(self, display_ns: int) -> Settings:
         """Return the settings of its scheduler: frames without end, at its rate.
 
@@ -95,9 +113,10 @@ class Tenant:
         shown_ns = max(period_ns, display_ns)
         return run_settings(policy, ENDLESS, shown_ns, shown_ns, **limits)
 
-    def plan(self, kind: int) -> Plan:
-        """Return what runs in a frame with the network at place `kind`."""
-        return Plan(self.networks[kind], self.unit, self.variant, avatars=self.avatars[kind] if self.avatars else 1)
+    def plan(self, kind: int, stretch: float = 1.0) -> Plan:
+        """Return what runs in a frame with the network at place `kind`. `stretch`: factor on the network's time."""
+        avatars = self.avatars[kind] if self.avatars else 1
+        return Plan(self.networks[kind], self.unit, self.variant, avatars=avatars, stretch=stretch)
 
     def kind(self, frame: int) -> int:
         """Return the place of the frame's network, or SKIPS."""
@@ -134,21 +153,53 @@ def together(
     `keep`: whether the steps and jobs of each are recorded.
     """
     costs = _Costs(profile, tenants, corners)
-    stop = round(NS_PER_S * _seconds(tenants, costs)), Stop()
-    seats: dict[str, str] = {unit: profile.units[unit].core or unit for unit in UNITS}
-    display_ns = round(NS_PER_MS * profile.application.display_ms.or_else(0.0))
-    members = [
-        Member(
-            tenant.graph, tenant.settings(display_ns), costs.service(number), seats, costs.skips(number), inputs=(stop,)
-        )
-        for number, tenant in enumerate(tenants)
-    ]
-    cores = [unit.core for unit in profile.units.values() if unit.core]
-    runs = simulate_beside(members, turns=turns, divided=cores, speed=costs.speed, keep=keep)
+    runs = _run(profile, tenants, costs, _seconds(tenants, costs), turns, keep=keep)
     seconds = max(run.report["duration_s"] for run in runs)
     shares: list[dict[str, float]] = [{unit: _busy_s(run, unit) / seconds for unit in UNITS} for run in runs]
     busy: dict[str, float] = {unit: sum(each[unit] for each in shares) for unit in UNITS}
     return Together(tuple(runs), costs.mean_ms, busy, tuple(shares))
+
+
+def _run(
+    profile: Profile,
+    tenants: Sequence[Tenant],
+    costs: _Costs,
+    seconds: float,
+    turns: str,
+    *,
+    fed: int | None = None,
+    keep: bool = False,
+) -> Sequence[Simulation]:
+    """Run the `tenants` for `seconds` of virtual time. `fed`: number of the one that always has another frame."""
+    stop = round(NS_PER_S * seconds), Stop()
+    seats: dict[str, str] = {unit: profile.units[unit].core or unit for unit in UNITS}
+    display_ns = round(NS_PER_MS * profile.application.display_ms.or_else(0.0))
+    members = []
+    for number, tenant in enumerate(tenants):
+        graph, settings = tenant.graph, tenant.settings(display_ns)
+        if number == fed:
+            graph = replace(graph, edges=tuple(map(holding_back, graph.edges)))
+            settings = tenant.fed_settings
+        members.append(
+            Member(graph, settings, costs.service(number), seats, costs.skips(number), inputs=(stop,)),
+        )
+    cores = [unit.core for unit in profile.units.values() if unit.core]
+    return simulate_beside(members, turns=turns, divided=cores, speed=costs.speed, keep=keep)
+
+
+def needed(profile: Profile, tenants: Sequence[Tenant], number: int, corners: Corners, turns: str) -> FrameInterval:
+    """Return the time of a frame of tenant `number` if it always had another one, beside the others at their rates.
+
+    The ends are those where all networks take as little, or as long, as their 80 % intervals say: their errors are
+    taken as one, as they are on one chip.
+    """
+    found = []
+    for end in ENDS:
+        costs = _Costs(profile, tenants, corners, end)
+        seconds = min(_seconds(tenants, costs), MOST_FED * max(costs.mean_ms[number].values()) / 1e3)
+        run = _run(profile, tenants, costs, seconds, turns, fed=number)[number]
+        found.append(float(run.report["frame_time_ms"]["mean"]))
+    return FrameInterval(*found)
 
 
 def _busy_s(run: Simulation, unit: str) -> float:
@@ -174,8 +225,11 @@ class _Job(NamedTuple):
 class _Costs:
     """The times of the pipelines' jobs on the chip, and how these jobs slow each other."""
 
-    def __init__(self, profile: Profile, tenants: Sequence[Tenant], corners: Corners) -> None:
-        self._profile, self._tenants, self._corners = profile, tenants, corners
+    def __init__(self, profile: Profile, tenants: Sequence[Tenant], corners: Corners, end: Ends = "expected") -> None:
+        self._memory, self._tenants, self._corners = profile.memory, tenants, corners
+        self._chips = [tenant.computes.on(profile, tenant.unit) for tenant in tenants]
+        self._end: Ends = end
+        self._stretches = cache(self._stretch)
         own = profile.memory.application_use_fraction.or_else(0.0)
         self._always = min(MOST_USE, own * sum(not tenant.is_bare for tenant in tenants))
         self._times = cache(self._stage_ns)
@@ -221,21 +275,34 @@ class _Costs:
     def _demand(self, job: _Job) -> float:
         """Return the share of the bandwidth that a network takes while it runs."""
         tenant = self._tenants[job.tenant]
-        bytes_s = moved_bytes(tenant.networks[job.kind], self._profile.units[tenant.unit])
+        bytes_s = moved_bytes(tenant.networks[job.kind], self._chips[job.tenant].units[tenant.unit])
         bytes_s /= self._infer_ms(job, self._always) / 1e3
-        return bytes_s / (self._profile.memory.bandwidth_gb_s.or_else(10.0) * 1e9)
+        return bytes_s / (self._memory.bandwidth_gb_s.or_else(10.0) * 1e9)
 
     def _network_ms(self, job: _Job, use: float) -> float:
         """Return the milliseconds of a network while the share `use` of the bandwidth is taken."""
         return self._stages_ms(job, use)[INFER[0]]
 
     def _stages_ms(self, job: _Job, use: float) -> dict[str, float]:
-        tenant = self._tenants[job.tenant]
-        used, plan = _used(self._profile, use), tenant.plan(job.kind)
-        times = {stage: ms for (stage, _), ms in stage_times_ms(used, plan, self._corners).items()}
-        if not tenant.is_bare:
-            return times
-        return {INFER[0]: times[INFER[0]] - self._profile.application.handover_ms.or_else(0.0)}
+        tenant, used = self._tenants[job.tenant], _used(self._chips[job.tenant], use)
+        stretch, unit = self._stretches(job), used.units[tenant.unit]
+        if tenant.is_bare:
+            clock = unit.clock(self._corners[UNITS.index(tenant.unit)])
+            time = time_on(unit, used.memory, tenant.networks[job.kind].work, clock, contended=True)
+            return {INFER[0]: stretch * time.total_ms}
+        whole, of_network = (stretch, 1.0) if unit.measured is not None else (1.0, stretch)
+        times = stage_times_ms(used, tenant.plan(job.kind, of_network), self._corners)
+        return {stage: whole * ms for (stage, _), ms in times.items()}
+
+    def _stretch(self, job: _Job) -> float:
+        """Return the factor on a network's time. Where the unit was measured, the other stages have it too."""
+        if self._end == "expected":
+            return 1.0
+        tenant, chip = self._tenants[job.tenant], self._chips[job.tenant]
+        work = tenant.networks[job.kind].work
+        time = price(chip, work, tenant.unit, self._corners)
+        around = interval(chip, work, time)
+        return (around.low_ms if self._end == "low" else around.high_ms) / time.total_ms
 
     def _stage_ns(self, job: _Job) -> dict[str, int]:
         return {stage: round(ms * NS_PER_MS) for stage, ms in self._stages_ms(job, self._always).items()}
@@ -299,8 +366,8 @@ def predict_beside(
             "turns": turns,
         },
         "pipelines": [
-            _row(profile, tenant, number, now, corners, _settled_ms(moments, at, number))
-            for number, tenant in enumerate(tenants)
+            _row(profile, tenants, number, now, corners, turns, _settled_ms(moments, at, number))
+            for number in range(len(tenants))
         ],
         "units": {unit: _unit(unit, now, tenants) for unit in UNITS},
         "units_settled": {unit: _unit(unit, last, tenants) for unit in UNITS},
@@ -318,22 +385,43 @@ def _base_w(profile: Profile) -> float:
     return profile.thermal.base_power_w.or_else(0.0)
 
 
+def _rate(
+    profile: Profile, tenants: Sequence[Tenant], number: int, corners: Corners, turns: str
+) -> dict[str, dict[str, Any]]:
+    """Return `needs_ms` and `rate` of a pipeline; without an interval where this machine was not measured."""
+    needs = needed(profile, tenants, number, corners, turns)
+    rate = holding(tenants[number].fps, needs)
+    if profile.name == HOST and profile.units[INFER[1]].measured is None:
+        return {"needs_ms": {"mean": needs.ms, "low": None, "high": None}, "rate": without_interval(rate)}
+    return {"needs_ms": {"mean": needs.ms, "low": needs.low_ms, "high": needs.high_ms}, "rate": rate}
+
+
 def _row(
-    profile: Profile, tenant: Tenant, number: int, now: Together, corners: Corners, settled_ms: float | None
+    profile: Profile,
+    tenants: Sequence[Tenant],
+    number: int,
+    now: Together,
+    corners: Corners,
+    turns: str,
+    settled_ms: float | None,
 ) -> dict[str, Any]:
-    report = now.runs[number].report
+    tenant = tenants[number]
+    report, chip = now.runs[number].report, tenant.computes.on(profile, tenant.unit)
     alone = together(profile, [tenant], corners).runs[0].report
     return {
         "name": tenant.name,
         "source": tenant.source,
         "kind": "network" if tenant.is_bare else "avatar",
         "unit": tenant.unit,
+        "numbers": tenant.computes.numbers,
+        "precision": chip.units[tenant.unit].precision,
         "rate_fps": tenant.fps,
         "policy": tenant.variant.policy,
         "edge": tenant.variant.edge,
         **_kept(report),
+        **_rate(profile, tenants, number, corners, turns),
         "frame_ms_settled": settled_ms or report["frame_time_ms"]["mean"],
-        "alone": _kept(alone),
+        "alone": {**_kept(alone), **_rate(profile, [tenant], 0, corners, turns)},
         "stages": {stage: {**report["stages"][stage], "alone_ms": ms} for stage, ms in now.stages_ms[number].items()},
         "units": {
             unit: {"busy": row["busy"], "idle": row["idle"], "jobs": row["jobs"]}

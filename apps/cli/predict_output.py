@@ -91,10 +91,32 @@ def show_networks(chip: Profile, options: PredictOptions, answers: list[dict[str
         return
     console = stdout_console()
     console.print(f"{chip.title} (virtual clock), {performance_profile}; nothing else runs; {RANGES}")
+    if len(options.units) > 1:
+        console.print(_compared_units(answers))
+        return
     for answer in answers:
         console.print()
         _print_bare(console, answer, minutes)
         console.print(_operator_table(answer))
+
+
+def _compared_units(answers: list[dict[str, Any]]) -> Table:
+    """Return a row for each network on each unit."""
+    from rich.table import Table
+
+    table = Table("network", "unit", "numbers", "ms", "80 %, ms", "a second", "W", "rate")
+    for answer in answers:
+        table.add_row(
+            Path(answer["file"]).name,
+            answer["unit"],
+            answer["precision"],
+            f"{answer['network_ms']:.2f}",
+            _span(answer["low_ms"], answer["high_ms"], ".2f").strip(" ()") or "-",
+            f"{answer['fps']:.1f}",
+            f"{answer['power']['w']:.2f}",
+            answer["rate"]["sentence"] if "rate" in answer else "-",
+        )
+    return table
 
 
 def _print_bare(console: Console, answer: dict[str, Any], minutes: float) -> None:
@@ -130,8 +152,7 @@ def _size(answer: dict[str, Any]) -> str:
 
 def _print_wanted(console: Console, answer: dict[str, Any]) -> None:
     if rate := answer.get("rate"):
-        name = f"{rate['fps']:g} a second"
-        console.print(f"{name:<16}{rate['words']}")
+        console.print(f"rate            {rate['sentence']}")
         console.print(f"                {_reserve(rate)}")
     if limit := answer.get("power_limit"):
         name = f"within {limit['limit_w']:g} W"

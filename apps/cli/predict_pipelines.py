@@ -37,12 +37,12 @@ def predict_pipelines(options: PredictOptions, as_json: bool) -> None:
 
     scene = str(options.scene)
     chip, variant = load_runnable(options.profile), _variant(options.policy or "", options.edge)
-    if chip.name == HOST:
+    if chip.name == HOST and options.precision is None:
         from trilane.apps.predict.this_machine import with_first
 
         chip = with_first(chip, scene, say)
     with spinner("predicting"):
-        found = tenants([scene, *options.beside], variant)
+        found = tenants([scene, *options.beside], variant, options.numbers)
         answer = predict_beside(chip, found, options.cap, options.minutes, options.governor, options.turns)
         if options.trace is not None:
             _write_trace(chip, found, options, answer, options.trace)
@@ -85,6 +85,10 @@ def _show(answer: dict[str, Any]) -> None:
     console, config = stdout_console(), answer["config"]
     console.print(f"{answer['machine']['title']} (virtual clock), {config['performance_profile']}")
     console.print(_pipelines(answer))
+    for row in answer["pipelines"]:
+        beside = f"{row['rate']['sentence']}; alone {row['alone']['rate']['sentence']}"
+        said = f"{row['name']}, {row['unit']} in {row['precision']}: "
+        console.print(said + (beside if len(answer["pipelines"]) > 1 else row["rate"]["sentence"]), soft_wrap=True)
     console.print(_idle(answer))
     _show_chip(console, answer)
     for note in answer["notes"]:

@@ -14,7 +14,7 @@ from trilane.apps.check.port_types import port_types, read_networks
 from trilane.apps.explain.explained_run import open_journal
 from trilane.apps.predict.predict_options import PredictOptions
 from trilane.hw_profiles.graph_file import GraphFile
-from trilane.hw_profiles.network_time import in_precision, under_runtime
+from trilane.hw_profiles.network_time import Computes
 from trilane.hw_profiles.pipeline_prediction import Measured, predict_file, prices_of
 from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import Profile
@@ -68,7 +68,7 @@ class _Chips:
         key = graph.path, tuple(sorted(stage.shapes.items())), unit, asked
         if key not in self._known:
             chip = self.used = self.used or load_runnable(self.name)
-            chip = under_runtime(in_precision(chip, unit, graph.numbers, asked), unit, options.engine)
+            chip = Computes(graph.numbers, asked, options.engine).on(chip, unit)
             if chip.name == HOST and unit == INFER[1] and asked is None:
                 from trilane.apps.predict.this_machine import with_file
 

@@ -15,6 +15,7 @@ from trilane.avatars.network_file import reshaped
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import LEAST_FPS, MOST_FPS, RUNTIMES, Variant
 from trilane.hw_profiles.graph_file import read_graph
+from trilane.hw_profiles.network_time import Computes
 from trilane.hw_profiles.network_work import Network, count_work
 from trilane.hw_profiles.shared_chip import MOST_TENANTS, NEWEST, SKIPS, Tenant
 from trilane.scene.planner import FrameWork
@@ -76,14 +77,17 @@ def _unit(text: str, asked_for: str) -> UnitName:
     raise BadInputError(_where(text), f"unit {asked_for!r}", " or ".join(RUNTIMES), "without the colon it is the dsp")
 
 
-def tenants(texts: Sequence[str], variant: Variant = NEWEST) -> list[Tenant]:
-    """Return a pipeline for each text, in order. `variant`: policy and edge of the avatars. Raises BadInputError."""
+def tenants(texts: Sequence[str], variant: Variant = NEWEST, precision: str | None = None) -> list[Tenant]:
+    """Return a pipeline for each text, in order. Raises BadInputError.
+
+    `variant`: policy and edge of the avatars. `precision`: int8, fp16 or fp32 for all networks; None: as each says.
+    """
     if len(texts) > MOST_TENANTS:
         raise BadInputError("--beside", f"{len(texts)} pipelines", f"at most {MOST_TENANTS} with the first one")
     read = [asked(text) for text in texts]
     names = _names([Path(each.what).stem for each in read])
     return [
-        _bare(each, name) if each.what.endswith(NETWORK_ENDING) else _avatar(each, name, variant)
+        _bare(each, name, precision) if each.what.endswith(NETWORK_ENDING) else _avatar(each, name, variant, precision)
         for each, name in zip(read, names, strict=True)
     ]
 
@@ -96,13 +100,15 @@ def _names(stems: Sequence[str]) -> list[str]:
     ]
 
 
-def _bare(each: AskedPipeline, name: str) -> Tenant:
+def _bare(each: AskedPipeline, name: str, precision: str | None) -> Tenant:
     path = Path(each.what)
-    network = Network({"network": str(path)}, 1, 1, 1, "packed", read_graph(path).work)
-    return Tenant(name, each.text, (network,), (0,), each.fps or 0.0, each.unit, NEWEST, is_bare=True)
+    graph = read_graph(path)
+    network = Network({"network": str(path)}, 1, 1, 1, "packed", graph.work)
+    computes = Computes(graph.numbers, precision)
+    return Tenant(name, each.text, (network,), (0,), each.fps or 0.0, each.unit, is_bare=True, computes=computes)
 
 
-def _avatar(each: AskedPipeline, name: str, variant: Variant) -> Tenant:
+def _avatar(each: AskedPipeline, name: str, variant: Variant, precision: str | None) -> Tenant:
     checked = configure(RunOptions(scene=each.what, skinning="gpu"), Path.cwd())
     scene, file = checked.config.scene, network_of(checked.assets)
     plan = ScenePlan(checked.config, checked.assets)
@@ -115,7 +121,8 @@ def _avatar(each: AskedPipeline, name: str, variant: Variant) -> Tenant:
     }
     networks, avatars = tuple(by_shape[shape] for shape, _ in distinct), tuple(count for _, count in distinct)
     frames = tuple(SKIPS if one is None else distinct.index(one) for one in seen)
-    return Tenant(name, each.text, networks, frames, each.fps or scene.fps, each.unit, variant, avatars=avatars)
+    fps, computes = each.fps or scene.fps, Computes(precision=precision)
+    return Tenant(name, each.text, networks, frames, fps, each.unit, variant, avatars=avatars, computes=computes)
 
 
 def _own(shape: Sequence[int]) -> Shape:

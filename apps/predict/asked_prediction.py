@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from trilane.apps.predict.predict_options import PredictOptions
 from trilane.errors import BadInputError
-from trilane.units import HOST, INFER
+from trilane.units import HOST, INFER, UnitName
 
 if TYPE_CHECKING:
     from trilane.hw_profiles.application import Plan
@@ -22,25 +22,31 @@ if TYPE_CHECKING:
 def predict_networks(
     chip: Profile, options: PredictOptions, say: Callable[[str], None] = lambda _: None
 ) -> list[dict[str, Any]]:
-    """Predict each network of `options` by itself; this machine first measures them. Raises BadInputError."""
+    """Predict each network of `options` by itself, on each of its units. Raises BadInputError.
+
+    This machine first measures them on the unit that a run has for networks.
+    """
     from trilane.hw_profiles.graph_file import read_graph
-    from trilane.hw_profiles.network_time import in_precision, predict_network, under_runtime
+    from trilane.hw_profiles.network_time import Computes, predict_network
     from trilane.hw_profiles.network_work import constant_tensors
 
-    unit, shapes = options.unit, options.shapes
+    shapes, over = options.shapes, (options.cap, options.minutes, options.governor, options.wanted)
+    units = options.units
     graphs = [read_graph(path, shapes) for path in options.network]
     inputs = {value.name for graph in graphs for value in graph.model.graph.input}
     if missing := [name for name in shapes if name not in inputs]:
         given = inputs.difference(*(constant_tensors(graph.model.graph) for graph in graphs))
         raise BadInputError("--input-shape", f"no input {missing[0]!r}", f"one of {', '.join(sorted(given))}")
-    chips = [in_precision(chip, unit, graph.numbers, options.numbers) for graph in graphs]
-    chips = [under_runtime(each, unit, options.engine) for each in chips]
-    if _is_measured(chip, options):
-        from trilane.apps.predict.this_machine import with_file
+    answers = []
+    for graph in graphs:
+        for unit in units:
+            used = Computes(graph.numbers, options.numbers, options.engine).on(chip, unit)
+            if _is_measured(chip, options, unit):
+                from trilane.apps.predict.this_machine import with_file
 
-        chips = [with_file(each, graph, shapes, say) for each, graph in zip(chips, graphs, strict=True)]
-    over = (options.cap, options.minutes, options.governor, options.wanted)
-    return [predict_network(each, graph, unit, *over) for each, graph in zip(chips, graphs, strict=True)]
+                used = with_file(used, graph, shapes, say)
+            answers.append(predict_network(used, graph, unit, *over))
+    return answers
 
 
 def application_of(
@@ -59,25 +65,25 @@ def application_of(
 def _network_of(chip: Profile, options: PredictOptions, say: Callable[[str], None]) -> tuple[Profile, Network]:
     from trilane.avatars.bundle import load_bundle
     from trilane.hw_profiles.graph_file import image_network, read_graph
-    from trilane.hw_profiles.network_time import in_precision
+    from trilane.hw_profiles.network_time import Computes
     from trilane.hw_profiles.network_work import Network, count_work
     from trilane.hw_profiles.reference_networks import reference_network, spec_of
 
     unit, avatar = options.unit, options.avatar
     if options.network:
         graph = read_graph(options.network[0], options.shapes)
-        named, network = in_precision(chip, unit, graph.numbers, options.numbers), image_network(graph, options.layout)
-        if _is_measured(chip, options):
+        named, network = Computes(graph.numbers, options.numbers).on(chip, unit), image_network(graph, options.layout)
+        if _is_measured(chip, options, unit):
             from trilane.apps.predict.this_machine import with_file_in_application
 
             named = with_file_in_application(named, graph, options.shapes, say)
         return named, network
-    chip = in_precision(chip, unit, "not said", options.numbers)
+    chip = Computes(precision=options.numbers).on(chip, unit)
     if avatar is None:
         cells = options.as_json()
         names = ("encoder", "norm", "size", "channels", "layout")
         return chip, reference_network(spec_of({name: str(cells[name]) for name in names}, "options"))
-    if _is_measured(chip, options):
+    if _is_measured(chip, options, unit):
         from trilane.apps.predict.this_machine import with_avatar
 
         return with_avatar(chip, avatar, say)
@@ -86,9 +92,9 @@ def _network_of(chip: Profile, options: PredictOptions, say: Callable[[str], Non
     return chip, Network({"avatar": avatar}, height, width, channels, options.layout, count_work(file.model))
 
 
-def _is_measured(chip: Profile, options: PredictOptions) -> bool:
-    """Say whether the chip is this machine and would run the network as it was asked for."""
-    return chip.name == HOST and options.unit == INFER[1] and options.precision is None
+def _is_measured(chip: Profile, options: PredictOptions, unit: UnitName) -> bool:
+    """Say whether the chip is this machine and would run the network on `unit` as it was asked for."""
+    return chip.name == HOST and unit == INFER[1] and options.precision is None
 
 
 def answer_of(chip: Profile, plan: Plan, options: PredictOptions) -> dict[str, Any]:

@@ -49,7 +49,10 @@ WHY_IGNORED: Final = {
 OF_A_SCENE: Final = {"scene", "beside", "turns", "profile", "minutes", "policy", "edge", "performance_profile"} | {
     "governor",
     "trace",
+    "precision",
 }
+#: In place of a unit: all of them, to compare them.
+ALL_UNITS: Final = "all"
 #: Options that mean nothing without a pipeline file, and all that mean something beside one.
 OF_A_PIPELINE_ALONE: Final = {"changes", "frames", "measured", "seed"}
 OF_A_PIPELINE: Final = OF_A_PIPELINE_ALONE | {"scene", "profile", "performance_profile", "engine_runtime", "precision"}
@@ -185,7 +188,8 @@ class PredictOptions(Options):
         description="Runtime of a tensor engine for a --network by itself: tflite (if not given) or qnn_dlc.",
     )
     runtime: str = Field(
-        default="dsp", description="Unit of the network: gpu or dsp; cpu too for a --network by itself."
+        default="dsp",
+        description="Unit of the network: gpu or dsp. For a --network by itself also cpu, or all to compare them.",
     )
     minutes: Annotated[Finite, Option(unit="minutes")] = Field(
         default=0.0, ge=0, le=MAX_MINUTES, description="Virtual minutes with heat; 0: the settled state without heat."
@@ -268,13 +272,19 @@ class PredictOptions(Options):
         return next((runtime for runtime in ENGINE_RUNTIMES if runtime == self.engine_runtime), None)
 
     @property
+    def units(self) -> tuple[UnitName, ...]:
+        """Return the units on which each network by itself is predicted. Raises as `unit`."""
+        return UNITS if self.runtime == ALL_UNITS else (self.unit,)
+
+    @property
     def unit(self) -> UnitName:
         """Return the unit of the network. Raises BadInputError for any other word."""
         units: tuple[UnitName, ...] = ("cpu", "gpu", "dsp") if self.is_bare else ("gpu", "dsp")
         for unit in units:
             if unit == self.runtime:
                 return unit
-        raise BadInputError("--runtime", repr(self.runtime), " or ".join(", ".join(units).rsplit(", ", 1)))
+        words = (*units, ALL_UNITS) if self.is_bare else units
+        raise BadInputError("--runtime", repr(self.runtime), " or ".join(", ".join(words).rsplit(", ", 1)))
 
     @property
     def wanted(self) -> Wanted:
@@ -321,6 +331,12 @@ class PredictOptions(Options):
             if option in given and (useless := given & others):
                 found = f"{self._spelt(useless)} beside --{option}"
                 raise BadInputError("options", found, "one or the other", WHY_IGNORED[option])
+        if "engine_runtime" in given and self.runtime == ALL_UNITS:
+            found, remedy = (
+                "--engine-runtime beside --runtime all",
+                "units differ in the runtimes that are known of them",
+            )
+            raise BadInputError("options", found, "one or the other", remedy)
         if "engine_runtime" in given and not self.is_bare:
             remedy = "the application runs as its profile says"
             raise BadInputError("options", "--engine-runtime", "a --network by itself beside it", remedy)

@@ -265,7 +265,10 @@ POWER = {
     "units": {"gpu": {"w": 0.515, "low_w": 0.415, "high_w": 0.625}, "dsp": {"w": 1.5, "low_w": 0.755, "high_w": 2.25}},
     "base": {"w": 1.2, "low_w": 0.6, "high_w": 1.9, "kind": "assumed"},
 }
-RATE = {"fps": 30.0, "holds": True, "words": "holds", "reserve": 0.255, "reserve_low": 0.1, "reserve_high": 0.375}
+RATE = {
+    **{"fps": 30.0, "holds": True, "sentence": "holds 30 fps: yes; 21-30 ms of 33.3 ms (80 %)"},
+    **{"reserve": 0.255, "reserve_low": 0.1, "reserve_high": 0.375},
+}
 LIMIT = {
     **{"limit_w": 3.0, "fps": 28.76, "low_fps": 20.34, "high_fps": 33.3, "power_w": 2.995, "limited_by": "power"},
     "corners": {"gpu": "svs", "dsp": "max"},
@@ -338,7 +341,7 @@ def test_networks_are_shown_with_their_ten_most_expensive_operators(
     asked = PredictOptions(performance_profile="burst", minutes=30.0, fps=30.0, power_limit_w=3.0)
     over = {"fps_settled": 25.55, "fps_start": 40.0, "caps": {"throttled_share": 0.5}, "without_rule": [ODD]}
     heat = {"device_max": 41.25, "junction_max": 77.75}
-    rate = {**RATE, "holds": False, "reserve": -0.5, "reserve_low": -0.75, "reserve_high": -0.255, "words": "no"}
+    rate = {**RATE, "holds": False, "reserve": -0.5, "reserve_low": -0.75, "reserve_high": -0.255, "sentence": "no"}
     answers = [a_network(rate=RATE, temperature_c=heat, **over)]
     answers.append(
         a_network(**over, engine_runtime=None, temperature_c=heat, numbers="not said", rate=rate, power_limit=LIMIT)

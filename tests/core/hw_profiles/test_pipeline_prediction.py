@@ -10,12 +10,13 @@ from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
+import onnx
 import pytest
 
-from support.pipeline_files import CUT, DEPTH, STREET, write_file
+from support.pipeline_files import CUT, DEPTH, STREET, network, write_file
 from support.run_folders import write_run
-from trilane.hw_profiles.pipeline_prediction import _sentence, given_price, predict_file
-from trilane.hw_profiles.rates import FrameInterval
+from trilane.hw_profiles.pipeline_prediction import given_price, predict_file
+from trilane.hw_profiles.rates import FrameInterval, holding
 from trilane.pipeline.file_graph import edge_rules, graph_of
 from trilane.pipeline.pipeline_file import read_pipeline
 from trilane.scheduler.events import Settings
@@ -357,7 +358,41 @@ def test_options_of_a_file_without_one(command: Command) -> None:
     ],
 )
 def test_the_sentence(times: tuple[float, float, float], words: str) -> None:
-    assert _sentence(30, FrameInterval(*times)) == words
+    assert holding(30, FrameInterval(*times))["sentence"] == words
+
+
+@pytest.mark.parametrize("precision", [None, "float", "w8a8"])
+@pytest.mark.parametrize("chip", ["snapdragon-888", "snapdragon-8-gen-3", "agx-orin"])
+def test_a_network_has_one_price_by_itself_as_a_file_and_on_a_chip_that_it_could_share(
+    command: Command, tmp_path: Path, chip: str, precision: str | None
+) -> None:
+    """A network of floats: its time, its interval and its frames at a rate that holds and at one that does not."""
+    path = tmp_path / "net.onnx"
+    onnx.save(network(512, "y", 64), path)
+    asked = ["--profile", chip, "--performance-profile", "burst", "--json"]
+    asked += ["--precision", precision] if precision else []
+    (bare,) = json.loads(command("predict", "--network", path, *asked)[0])["networks"]
+    expected = {"fp16": "fp16", None: bare["precision"], "w8a8": "int8", "float": "fp16"}[precision]
+    assert bare["numbers"] == "float" and bare["precision"] == expected
+    ms, around = bare["network_ms"], [bare["low_ms"], bare["high_ms"]]
+    for fps in (500 / ms, min(2000 / ms, 1000)):
+        rate = f"{fps:.9f}"
+        file = write_file(
+            tmp_path,
+            f'[run]\nfps = {rate}\npolicy = "latest"\n[stages]\n'
+            'src = { unit = "other", time_ms = 0 }\nnet = { onnx = "net.onnx", unit = "dsp", in = "src" }',
+        )
+        of_file = json.loads(command("predict", file, *asked)[0])["pipelines"][0]
+        beside = json.loads(command("predict", f"{path}@{rate}", *asked)[0])["pipelines"][0]
+        assert beside["precision"] == bare["precision"]
+        assert of_file["stages"]["net"]["source"].endswith(f"in {bare['precision']}")
+        for answer, stage in ((of_file, "net"), (beside, "infer")):
+            assert answer["stages"][stage]["service_ms"]["mean"] == pytest.approx(ms, abs=2e-6)
+            assert answer["stages"][stage]["alone_ms"] == pytest.approx(ms, abs=2e-6)
+            assert list(answer["needs_ms"].values()) == pytest.approx([ms, *around], rel=2e-3)
+            assert answer["needs_ms"]["mean"] == pytest.approx(ms, abs=2e-6)
+            assert answer["rate"]["holds"] is (ms <= 1e3 / fps)
+            assert answer["frame_time_ms"]["mean"] == pytest.approx(max(ms, 1e3 / fps), rel=1e-3)
 
 
 def test_the_text(command: Command, tmp_path: Path, check_printed: Callable[[str, str], None]) -> None:
