@@ -13,7 +13,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from trilane.arrays import F64
 from trilane.errors import BadInputError
@@ -236,6 +236,10 @@ class Computes(NamedTuple):
         Raises BadInputError as `under_runtime`.
         """
         return under_runtime(in_precision(profile, unit, self.numbers, self.precision), unit, self.runtime)
+
+
+#: A network whose file says nothing of its numbers, and of which nothing else was asked.
+AS_IT_SAYS: Final = Computes()
 
 
 def predict_network(

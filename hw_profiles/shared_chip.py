@@ -27,7 +27,7 @@ from trilane.hw_profiles.application import (
 )
 from trilane.hw_profiles.engine_times import numbers_of, spilled
 from trilane.hw_profiles.host_model import UNMEASURED
-from trilane.hw_profiles.network_time import Computes, interval, price
+from trilane.hw_profiles.network_time import AS_IT_SAYS, Computes, interval, price
 from trilane.hw_profiles.network_work import Network
 from trilane.hw_profiles.over_time import Moment, last_fifth, temperatures_of, unit_power_w, warm_up
 from trilane.hw_profiles.pipeline_prediction import holding_back
@@ -78,7 +78,7 @@ class Tenant:
     variant: Variant = NEWEST
     is_bare: bool = False
     avatars: tuple[int, ...] = ()
-    computes: Computes = Computes()
+    computes: Computes = AS_IT_SAYS
 
     def __post_init__(self) -> None:
         if self.unit not in RUNTIMES:
@@ -158,6 +158,11 @@ def together(
     shares: list[dict[str, float]] = [{unit: _busy_s(run, unit) / seconds for unit in UNITS} for run in runs]
     busy: dict[str, float] = {unit: sum(each[unit] for each in shares) for unit in UNITS}
     return Together(tuple(runs), costs.mean_ms, busy, tuple(shares))
+
+
+def alone_ms(profile: Profile, tenant: Tenant, corners: Corners) -> Mapping[str, float]:
+    """Return the mean milliseconds of a job by stage, of a pipeline that is alone, over its frames with a network."""
+    return _Costs(profile, [tenant], corners).mean_ms[0]
 
 
 def _run(

@@ -27,7 +27,11 @@ def check_file(path: Path) -> dict[str, Any]:
 
     Raises BadInputError.
     """
-    file = read_pipeline(path)
+    return document_of(read_pipeline(path))
+
+
+def document_of(file: PipelineFile) -> dict[str, Any]:
+    """Return what `check_file` says of a pipeline file that was read."""
     types = port_types(file, read_networks(file))
     prices = {name: price for name in file.stages if (price := given_price(file, name)) is not None}
     known = prices if len(prices) == len(file.stages) else None
@@ -44,7 +48,7 @@ def check_file(path: Path) -> dict[str, Any]:
     memory = [each["memory_bytes"] for each in streams]
     return {
         "schema": 1,
-        "file": str(path),
+        "file": str(file.path),
         "run": file.run.model_dump(mode="json", exclude_defaults=True) | {"policy": file.run.policy},
         "latency_to": file.latency_to,
         "units": {name: {"hardware": file.hardware(name)} for name in file.units},

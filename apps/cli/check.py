@@ -24,23 +24,28 @@ Examples:
   trilane check street.toml
   trilane check street.toml --svg street.svg
   trilane check street.toml --json
+  trilane check default --profile snapdragon-888
 
 \b
 Exit codes:
   0 the file is right, 2 it is not, or no such file
 """
 
-FileArgument = Annotated[Path, typer.Argument(help="Pipeline file (.toml, docs/pipeline-file.md).")]
+FileArgument = Annotated[
+    str, typer.Argument(help="Pipeline file (.toml, docs/pipeline-file.md), or a scene: a name or a file.")
+]
+ProfileOption = Annotated[
+    str | None, typer.Option("--profile", help="Of a scene: chip whose times the stages have, such as snapdragon-888.")
+]
 SvgOption = Annotated[Path | None, typer.Option("--svg", help="Draw the graph here (.svg).")]
 
 
 @app.command(epilog=EPILOG)
-def check(file: FileArgument, svg: SvgOption = None, json: JsonOption = False) -> None:
+def check(file: FileArgument, svg: SvgOption = None, profile: ProfileOption = None, json: JsonOption = False) -> None:
     """Check a pipeline file and print its graph, the least period with the cycle that makes it, and its memory.
 
-    Nothing runs, and no Python of the file is imported.
+    A scene is printed as the pipeline file that its run is. Nothing runs, and no Python of the file is imported.
     """
-    from trilane.apps.check.checked_file import check_file
     from trilane.apps.check.graph_svg import draw_graph
     from trilane.errors import BadInputError
     from trilane.writing import require_writable, write_bytes
@@ -49,11 +54,14 @@ def check(file: FileArgument, svg: SvgOption = None, json: JsonOption = False) -
         if svg.suffix.lower() != ".svg":
             raise BadInputError("--svg", f"'{svg}'", "a name that ends in .svg")
         require_writable(svg)
-    document = check_file(file)
+    document, text = _checked(file, profile)
     if svg is not None:
         write_bytes(svg, draw_graph(document).encode())
     if json:
         print_json(document)
+        return
+    if text:
+        print(text, end="")
         return
     console = stdout_console()
     for line in _head(document):
@@ -63,6 +71,20 @@ def check(file: FileArgument, svg: SvgOption = None, json: JsonOption = False) -
         console.print(_streams(document))
     for line in _tail(document):
         console.print(line, soft_wrap=True, markup=False)
+
+
+def _checked(file: str, profile: str | None) -> tuple[dict[str, Any], str]:
+    """Return the document of a pipeline file or a scene, and a scene's text. Raises BadInputError."""
+    from trilane.apps.check.checked_file import check_file
+    from trilane.apps.check.checked_scene import check_scene, is_scene
+    from trilane.errors import BadInputError
+
+    if is_scene(file):
+        return check_scene(file, profile)
+    if profile is not None:
+        remedy = f"`trilane predict {file} --profile {profile}` prices its stages"
+        raise BadInputError("--profile", f"{profile} beside a pipeline file", "a scene", remedy)
+    return check_file(Path(file)), ""
 
 
 def _head(document: Mapping[str, Any]) -> list[str]:

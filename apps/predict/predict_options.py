@@ -331,15 +331,7 @@ class PredictOptions(Options):
             if option in given and (useless := given & others):
                 found = f"{self._spelt(useless)} beside --{option}"
                 raise BadInputError("options", found, "one or the other", WHY_IGNORED[option])
-        if "engine_runtime" in given and self.runtime == ALL_UNITS:
-            found, remedy = (
-                "--engine-runtime beside --runtime all",
-                "units differ in the runtimes that are known of them",
-            )
-            raise BadInputError("options", found, "one or the other", remedy)
-        if "engine_runtime" in given and not self.is_bare:
-            remedy = "the application runs as its profile says"
-            raise BadInputError("options", "--engine-runtime", "a --network by itself beside it", remedy)
+        self._check_engine()
         if self.is_bare and "table" not in given and (useless := given & OF_THE_APPLICATION):
             found, remedy = f"{self._spelt(useless)} with a network by itself", "they are of the application"
             remedy += ": add --application for it with this network"
@@ -350,6 +342,18 @@ class PredictOptions(Options):
             raise BadInputError("options", found, "one --network", remedy)
         if self.input_shape and not self.network:
             raise BadInputError("options", "--input-shape without --network", "a network whose input it is")
+
+    def _check_engine(self) -> None:
+        given = self.model_fields_set
+        if "engine_runtime" in given and self.runtime == ALL_UNITS:
+            found, remedy = (
+                "--engine-runtime beside --runtime all",
+                "units differ in the runtimes that are known of them",
+            )
+            raise BadInputError("options", found, "one or the other", remedy)
+        if "engine_runtime" in given and not self.is_bare:
+            remedy = "the application runs as its profile says"
+            raise BadInputError("options", "--engine-runtime", "a --network by itself beside it", remedy)
 
     def _check_pipeline_file(self) -> None:
         given = self.model_fields_set

@@ -14,6 +14,12 @@ import onnx
 import pytest
 
 from support.pipeline_files import BRANCHES, CUT, DEPTH, STREET, write_file
+from trilane.apps.check.checked_scene import check_scene
+from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, StageInput, UnitSettings
+from trilane.pipeline.file_graph import edge_rules, graph_of
+from trilane.pipeline.file_text import file_text, tables_of, unsaid
+from trilane.pipeline.pipeline_file import checked_tables, read_pipeline
+from trilane.transport.packets import header_dtype
 
 Command = Callable[..., tuple[str, str]]
 
@@ -354,3 +360,70 @@ def test_a_line_between_stages_of_one_row_passes_over_the_box_between(command: C
     command("check", write_file(tmp_path, text), "--svg", tmp_path / "graph.svg")
     paths = re.findall(r"<path d='([^']*)'", (tmp_path / "graph.svg").read_text())
     assert [" H " in path for path in paths] == [False, True, False]
+
+
+@pytest.mark.parametrize("scene", ["default", "portrait"])
+def test_a_scene_is_printed_as_a_file_with_the_same_streams_and_the_same_least_period(
+    command: Command, tmp_path: Path, scene: str
+) -> None:
+    """On a chip the period is that of the unit with the most work, worked out from the printed times."""
+    document, text = check_scene(scene, "snapdragon-888")
+    path = tmp_path / "printed.toml"
+    path.write_text(text, encoding="utf-8")
+    again = json.loads(command("check", path, "--json")[0])
+    for key in ("run", "latency_to", "units", "stages", "streams", "period_ms", "cycle", "limit", "memory_bytes"):
+        assert again[key] == document[key], key
+    (route,) = document["routes"]
+    assert (route["from"], route["to"], route["past"]) == ("pose", "composite", ["raster", "infer"])
+    assert 0 <= route["share"] < 1 and any("past raster, infer" in each for each in document["notes"])
+    busy: dict[str, float] = {}
+    for stage in document["stages"]:
+        busy[stage["unit"]] = busy.get(stage["unit"], 0.0) + stage["time_ms"]
+    assert document["period_ms"] == pytest.approx(max(busy.values()), abs=1e-9)
+    predicted = json.loads(command("predict", path, "--json")[0])["pipelines"][0]
+    alone = json.loads(command("predict", scene, "--profile", "snapdragon-888", "--json")[0])["pipelines"][0]
+    for name, row in predicted["stages"].items():
+        assert row["alone_ms"] == pytest.approx(alone["stages"][name]["alone_ms"], abs=2e-6)
+    if not route["share"]:
+        assert predicted["needs_ms"]["mean"] == pytest.approx(alone["needs_ms"]["mean"], rel=0.01)
+
+
+def test_a_scene_without_a_chip_has_no_times_and_a_file_is_no_scene(command: Command, tmp_path: Path) -> None:
+    drawing = tmp_path / "default.svg"
+    document = json.loads(command("check", "default", "--svg", drawing, "--json")[0])
+    assert document["period_ms"] is None and document["routes"][0]["share"] is None
+    assert drawing.read_text(encoding="utf-8").count("<title>") == 5
+    (tmp_path / "own.toml").write_text('avatars = [{ bundle = "none" }]\n', encoding="utf-8")
+    assert "none" in command("check", tmp_path / "own.toml", code=2)[1]
+    file = write_file(tmp_path, DEPTH)
+    assert (
+        "found snapdragon-888 beside a pipeline file"
+        in command("check", file, "--profile", "snapdragon-888", code=2)[1]
+    )
+    assert "predict default --profile host" in command("check", "default", "--profile", "host", code=2)[1]
+
+
+def test_a_description_with_forks_joins_and_edges_of_its_own_is_written_as_the_same_graph(tmp_path: Path) -> None:
+    def stage(name: str, *inputs: StageInput, **others: Any) -> PipelineStage:
+        return PipelineStage(name=name, unit=f"u-{name}", factory="some:thing", inputs=inputs, **others)
+
+    from_a, newest = StageInput(stage="a"), StageInput(stage="b", latest=True, max_age_ms=250.0)
+    stages = (stage("a"), stage("b", from_a, every=3), stage("c", from_a, newest, pace_ns=2_000_000))
+    pipeline = Pipeline(
+        stages=stages,
+        edges=(
+            PipelineEdge(payload_bytes=12, rule="fifo:4"),
+            PipelineEdge(payload_bytes=0, header=header_dtype([("x", "<f8")]), rule="triple"),
+        ),
+        units={each.unit: UnitSettings(cores=(0,), threads=1) for each in stages},
+    )
+    tables = tables_of(pipeline, {}, {"a": 1.5})
+    path = tmp_path / "made.toml"
+    path.write_text(file_text(tables, ["one", "two"]), encoding="utf-8")
+    file = read_pipeline(path)
+    assert file == checked_tables(tables, path)
+    rules = edge_rules(file)
+    assert graph_of(file, rules) == pipeline.graph()
+    assert file.stages["a"].own_time is not None and file.stages["b"].own_time is None
+    said = list(unsaid(pipeline))
+    assert [("header" in each, "c 2 ms" in each) for each in said[1:]] == [(True, False), (False, True)]

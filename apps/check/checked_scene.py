@@ -1,0 +1,94 @@
+"""What `trilane check` says of a scene: the avatar's pipeline as a pipeline file, from the description of a run.
+
+Rule: nothing runs here. With a chip the frames of the scene are planned and priced as `trilane predict SCENE` does.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from trilane.apps.check.checked_file import document_of
+from trilane.apps.predict.asked_pipelines import tenants
+from trilane.errors import BadInputError
+from trilane.files import read_bytes
+from trilane.hw_profiles.profile_files import load_runnable
+from trilane.hw_profiles.schema import corners_of
+from trilane.hw_profiles.shared_chip import SKIPS, alone_ms
+from trilane.pipeline.file_text import file_text, routes_of, tables_of, unsaid
+from trilane.pipeline.pipeline_file import FORM, MOST_BYTES, TABLES, checked_tables
+from trilane.scene.schema import scene_names
+from trilane.scheduler.policy import POLICIES
+from trilane.stages.avatar_pipeline import avatar_pipeline
+from trilane.stages.configure import configure
+from trilane.stages.run_options import RunOptions
+from trilane.units import HOST, NS_PER_MS, SUSTAINED
+
+DIGITS: Final = 6  # of a time in ms: the scheduler counts nanoseconds
+
+
+class CheckedScene(NamedTuple):
+    """`document`: as `check_file` returns it, with `routes` and `notes`. `text`: the scene as a pipeline file."""
+
+    document: dict[str, Any]
+    text: str
+
+
+def is_scene(text: str) -> bool:
+    """Say whether somebody means a scene: the name of an included one, or a TOML file without a pipeline's tables."""
+    path = Path(text)
+    if text in scene_names():
+        return True
+    if path.suffix != ".toml" or not path.is_file():
+        return False
+    try:
+        tables = tomllib.loads(read_bytes(path, MOST_BYTES, FORM).decode())
+    except (ValueError, RecursionError):
+        return False
+    return bool(tables) and not {*tables} & {*TABLES}
+
+
+def check_scene(text: str, profile: str | None = None) -> CheckedScene:
+    """Check a scene and return its pipeline. Raises BadInputError, or MissingPartError for a part that a run needs.
+
+    `text`: name of an included scene, or a file. `profile`: chip whose times the stages have; None: they have none.
+    """
+    options = RunOptions(scene=text, skinning="gpu")
+    checked = configure(options, Path.cwd())
+    pipeline, scene = avatar_pipeline(checked.config, checked.assets, options.edge), checked.config.scene
+    run: dict[str, Any] = {"policy": options.policy, "frames": scene.frames}
+    if POLICIES[options.policy].paced:
+        run["fps"] = scene.fps
+    times, share = _priced(text, profile) if profile is not None else ({}, None)
+    routes = [{**each, "share": share} for each in routes_of(pipeline)]
+    notes = [*unsaid(pipeline), *_said(profile, share)]
+    tables = tables_of(pipeline, run, times)
+    document = document_of(checked_tables(tables, Path(f"{scene.name}.toml")))
+    period = document["period_ms"]
+    head = [f"the pipeline of the scene {scene.name}, as `trilane run {text}` runs it"]
+    if period is not None:
+        head.append(f"period {period:.6g} ms or more, by {document['limit']}: {' -> '.join(document['cycle'])}")
+    answer = {**document, "file": text, "imports": [], "routes": routes, "notes": notes}
+    return CheckedScene(answer, file_text(tables, [*head, *notes]))
+
+
+def _priced(text: str, profile: str) -> tuple[Mapping[str, float], float]:
+    """Return the mean time of a job by stage in ms, of frames with a network, and the share of frames without one."""
+    chip = load_runnable(profile)
+    if chip.name == HOST:
+        remedy = f"`trilane predict {text} --profile {HOST}` measures this machine"
+        raise BadInputError("--profile", HOST, "a chip, as nothing runs for a check", remedy)
+    (tenant,) = tenants([text])
+    means = alone_ms(chip, tenant, corners_of(chip, SUSTAINED))
+    rounded = {stage: round(round(ms * NS_PER_MS) / NS_PER_MS, DIGITS) for stage, ms in means.items()}
+    return rounded, tenant.frames.count(SKIPS) / len(tenant.frames)
+
+
+def _said(profile: str | None, share: float | None) -> list[str]:
+    """Say whose times the stages have, and how many frames take the route."""
+    if profile is None or share is None:
+        return ["without times: --profile CHIP has those of a chip"]
+    said = f"times are means of {profile}, {SUSTAINED}, for frames that the network paints"
+    return [said, f"{share:.1%} of the scene's frames need no new picture and take the route"]
