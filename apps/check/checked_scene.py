@@ -61,7 +61,10 @@ def check_scene(text: str, profile: str | None = None) -> CheckedScene:
     run: dict[str, Any] = {"policy": options.policy, "frames": scene.frames}
     if POLICIES[options.policy].paced:
         run["fps"] = scene.fps
-    times, share = _priced(text, profile) if profile is not None else ({}, None)
+    times: Mapping[str, float] = {}
+    share: float | None = None
+    if profile is not None:
+        times, share = _priced(text, profile)
     routes = [{**each, "share": share} for each in routes_of(pipeline)]
     notes = [*unsaid(pipeline), *_said(profile, share)]
     tables = tables_of(pipeline, run, times)
