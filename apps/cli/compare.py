@@ -1,24 +1,26 @@
-"""`trilane compare`: runs, reports and predictions beside each other, and a verdict with its uncertainty.
+"""`trilane compare`: runs, reports and predictions beside each other, a verdict with its uncertainty, and a gate.
 
 Rule: this module reads options and shows; every figure comes from `trilane.apps.compare`.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from trilane.apps.cli.commands import Commands, JsonOption
-from trilane.apps.cli.console import print_json, stderr_console, stdout_console
+from trilane.apps.cli.console import print_json, print_kept, stderr_console
 from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from trilane.apps.compare.comparison import Comparison
-    from trilane.apps.compare.difference import Finding
+    from trilane.apps.compare.gate import Gate, Judged
 
 app = Commands()
 
@@ -29,26 +31,45 @@ Examples:
   trilane compare runs/base runs/one runs/two --all
   trilane compare before.json after.json --json
   trilane compare runs/before runs/after --html difference.html
-  trilane compare runs/main runs/branch --fail-if-slower 5%
+  trilane compare runs/main runs/branch --fail-if slower=5% --fail-if psnr=0.5dB
+  trilane compare runs/main runs/branch --fail-if slower=5% --github
   trilane compare sweeps/main sweeps/branch
+
+\b
+Limits of --fail-if: slower, frame-time, frame-time-p99, latency, latency-p99,
+  instructions, cpu and lost in %, psnr and worst-psnr in dB
+
+\b
+Exit codes with --fail-if:
+  0 no limit is broken, 1 one surely is, 4 it cannot be told;
+  without it 0; 2 wrong usage or bad input
 """
-SLOWER, CANNOT_TELL = 1, 3
-MORE = "more runs of each kind (A1,A2,A3), longer ones, or a machine without other programs tell more"
+BROKEN, CANNOT_TELL = 1, 4
 
 BaseArgument = Annotated[
-    str, typer.Argument(metavar="BASE", help="A run folder, its report.json, a prediction, or a sweep's folder.")
+    str,
+    typer.Argument(
+        metavar="BASE", help="A run folder, its report.json, a prediction, imported times, or a sweep's folder."
+    ),
 ]
 OthersArgument = Annotated[
     list[str], typer.Argument(metavar="OTHER", help="Runs to compare with the base. Runs of one kind: A1,A2,A3.")
 ]
 HtmlOption = Annotated[Path | None, typer.Option("--html", help="Write a page that needs nothing else here.")]
 AllOption = Annotated[bool, typer.Option("--all", help="Show every figure, not only those that differ.")]
-SlowerOption = Annotated[
-    str | None,
+FailIfOption = Annotated[
+    list[str] | None,
     typer.Option(
-        "--fail-if-slower",
-        help="Exit with 1 if frames certainly take longer by more than this, such as 5%; with 3 if uncertain.",
+        "--fail-if",
+        help="Exit with 1 if this limit is surely broken, with 4 if it cannot be told: slower=5%. May be given again.",
     ),
+]
+SlowerOption = Annotated[
+    str | None, typer.Option("--fail-if-slower", help="The old name of --fail-if slower=LIMIT; it goes next version.")
+]
+GithubOption = Annotated[
+    bool,
+    typer.Option("--github", help="Write annotations for GitHub, and a summary to the file of GITHUB_STEP_SUMMARY."),
 ]
 
 
@@ -58,48 +79,93 @@ def compare(
     others: OthersArgument,
     html: HtmlOption = None,
     show_all: AllOption = False,
+    fail_if: FailIfOption = None,
     fail_if_slower: SlowerOption = None,
+    github: GithubOption = False,
     json: JsonOption = False,
 ) -> None:
     """Say what differs between runs, by how much, how sure that is, and the likely cause.
 
-    Every figure of OTHER is shown beside that of BASE with a 95 % interval. The exit code is 0 even if the runs differ
-    or the difference is uncertain. With --fail-if-slower it is 1 if frames certainly take longer by more than that, and
-    3 if this is uncertain. Two sweeps are compared by trials of equal configuration. docs/compare.md explains the
-    method.
+    Every figure of OTHER is shown beside that of BASE with a 95 % interval. With --fail-if the command is a gate: 0 is
+    no worse, 1 is worse, and 4 is that nobody can tell, with the number of runs that would. A run that was disturbed
+    never passes. Two sweeps are compared by trials of equal configuration. docs/compare.md explains the method.
     """
-    limit = _share(fail_if_slower)
+    gates = _gates(fail_if or [], fail_if_slower)
+    if github and not gates:
+        raise BadInputError("options", "--github without a limit", "--fail-if too, such as --fail-if slower=5%")
     if _are_sweeps([base, *others]):
-        _compare_sweeps(base, others, html, show_all, limit, json)
-        return
+        shown, document, judged = _of_sweeps(base, others, html, show_all, gates)
+    else:
+        shown, document, judged = _of_runs(base, others, html, show_all, gates)
+    if github:
+        from trilane.apps.cli.github import write_to_github
+
+        write_to_github(judged, document["verdict"])
+    if json:
+        with suppress(BrokenPipeError):  # the exit code stays that of the gate
+            print_json(document)
+    else:
+        print_kept(shown)
+    _leave(judged)
+
+
+_Answer = tuple[Iterator["str | Table"], dict[str, Any], list["Judged"]]
+
+
+def _of_runs(base: str, others: list[str], html: Path | None, show_all: bool, gates: Sequence[Gate]) -> _Answer:
     from trilane.apps.cli.compare_table import comparison_lines
     from trilane.apps.compare.comparison import compare as compared
     from trilane.apps.compare.comparison import document
+    from trilane.apps.compare.gate import Pair, as_json, judge
     from trilane.apps.compare.sides import read_side
 
     comparisons = compared(read_side(base), [read_side(other) for other in others])
     if html is not None:
         _write_page(html, comparisons)
-    if json:
-        print_json(document(comparisons))
-    else:
-        console = stdout_console()
-        for comparison in comparisons:
-            for part in comparison_lines(comparison, show_all):
-                console.print(part, soft_wrap=isinstance(part, str), markup=False)
-    _leave(limit, [comparison.slower_than(limit) for comparison in comparisons] if limit is not None else [])
+    judged = judge(
+        gates, [Pair(each.other.name, each.base, each.other, each.rows, each.changes) for each in comparisons]
+    )
+    shown = (part for comparison in comparisons for part in comparison_lines(comparison, show_all))
+    return shown, {**document(comparisons), **(as_json(judged) if gates else {})}, judged
 
 
-def _leave(limit: float | None, outcomes: Sequence[Finding]) -> None:
-    """Leave with the exit code that --fail-if-slower asks for."""
-    from trilane.apps.compare.difference import Finding
+def _of_sweeps(base: str, others: list[str], html: Path | None, show_all: bool, gates: Sequence[Gate]) -> _Answer:
+    from trilane.apps.cli.compare_table import sweep_lines
+    from trilane.apps.compare.compared_sweeps import compare_sweeps
+    from trilane.apps.compare.gate import as_json, judge
 
-    if Finding.DIFFERS in outcomes:
-        raise typer.Exit(SLOWER)
-    if limit is not None and Finding.UNKNOWN in outcomes:
-        text = f"cannot tell whether frames take longer by more than {100 * limit:g} %; {MORE}"
-        stderr_console().print(text, soft_wrap=True, markup=False)
-        raise typer.Exit(CANNOT_TELL)
+    if len(others) > 1:
+        raise BadInputError("compare", f"{1 + len(others)} sweeps", "two")
+    if html is not None:
+        remedy = f"`trilane report {base} {others[0]}` draws both on one page"
+        raise BadInputError("options", "--html with sweeps", "runs", remedy)
+    comparison = compare_sweeps(base, others[0])
+    judged = judge(gates, [pair.sides for pair in comparison.pairs])
+    shown = sweep_lines(comparison, show_all)
+    return shown, {**comparison.as_json(), **(as_json(judged) if gates else {})}, judged
+
+
+def _gates(asked: Sequence[str], slower: str | None) -> list[Gate]:
+    from trilane.apps.compare.gate import read_gate
+
+    old = [] if slower is None else [read_gate(f"slower={slower}", "--fail-if-slower")]
+    found = [*map(read_gate, asked), *old]
+    names = [gate.name for gate in found]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise BadInputError("--fail-if", f"{twice} twice", "each metric once")
+    return found
+
+
+def _leave(judged: Sequence[Judged]) -> None:
+    """Say what each limit came to, and leave with the exit code of the gate."""
+    from trilane.apps.compare.gate import Outcome, whole
+
+    several = len({each.name for each in judged}) > 1
+    for each in judged:
+        stderr_console().print(f"{each.name}: {each.said}" if several else each.said, soft_wrap=True, markup=False)
+    codes = {Outcome.KEPT: 0, Outcome.BROKEN: BROKEN, Outcome.UNKNOWN: CANNOT_TELL}
+    if code := codes[whole(judged)]:
+        raise typer.Exit(code)
 
 
 def _are_sweeps(names: list[str]) -> bool:
@@ -111,36 +177,6 @@ def _are_sweeps(names: list[str]) -> bool:
         other = next(name for name in names if name not in sweeps)
         raise BadInputError(other, f"no sweep, beside {sweeps[0]}, which is one", "two sweeps, or runs alone")
     return bool(sweeps)
-
-
-def _compare_sweeps(
-    base: str, others: list[str], html: Path | None, show_all: bool, limit: float | None, json: bool
-) -> None:
-    from trilane.apps.cli.compare_table import sweep_lines
-    from trilane.apps.compare.compared_sweeps import compare_sweeps
-
-    if len(others) > 1:
-        raise BadInputError("compare", f"{1 + len(others)} sweeps", "two")
-    if html is not None:
-        remedy = f"`trilane report {base} {others[0]}` draws both on one page"
-        raise BadInputError("options", "--html with sweeps", "runs", remedy)
-    comparison = compare_sweeps(base, others[0])
-    if json:
-        print_json(comparison.as_json())
-    else:
-        for part in sweep_lines(comparison, show_all):
-            stdout_console().print(part, soft_wrap=isinstance(part, str), markup=False)
-    _leave(limit, comparison.slower_than(limit) if limit is not None else [])
-
-
-def _share(text: str | None) -> float | None:
-    """Return 0.05 for `5%` and for `5 %`."""
-    if text is None:
-        return None
-    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*%", text)
-    if found is None:
-        raise BadInputError("--fail-if-slower", repr(text), "a percentage such as 5%")
-    return float(found[1]) / 100
 
 
 def _write_page(path: Path, comparisons: list[Comparison]) -> None:

@@ -30,6 +30,7 @@ def comparison_lines(comparison: Comparison, show_all: bool) -> Iterator[str | T
     """Yield texts and tables of one comparison. `show_all`: also show figures that do not differ."""
     yield f"{comparison.other.name} beside {comparison.base.name}"
     yield f"verdict: {comparison.verdict}"
+    yield from comparison.unsure
     if said := bounds_text(comparison.bounds):
         yield said
     most = len(comparison.changes) if show_all else MOST_CHANGES

@@ -9,8 +9,8 @@ import errno
 import json
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from typing import IO, TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
@@ -112,6 +112,17 @@ def shown_messages(messages: Sequence[str], failure: str | None) -> list[str]:
     others = [message for message in messages if message != failure]
     more = len(others) - MOST_SHOWN
     return others if more <= 0 else [*others[:MOST_SHOWN], f"{more} more messages: report.json has them"]
+
+
+def print_kept(parts: Iterable[Any]) -> None:
+    """Print texts and tables on stdout, each text on one line. A reader that leaves early changes no exit code."""
+    console = stdout_console()
+    with console.capture() as written:
+        for part in parts:
+            console.print(part, soft_wrap=isinstance(part, str), markup=False)
+    with suppress(BrokenPipeError):
+        sys.stdout.write(written.get())
+        sys.stdout.flush()
 
 
 def print_json(document: Mapping[str, Any]) -> None:

@@ -57,7 +57,8 @@ Examples:
 \b
 Exit codes:
   0 done, 1 the run failed, 2 wrong usage or bad input,
-  3 something is not installed, 130 interrupted
+  3 something is not installed, 4 it cannot be told (compare --fail-if),
+  130 interrupted
 """
 
 

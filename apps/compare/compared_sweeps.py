@@ -20,10 +20,10 @@ from trilane.apps.compare.comparison import (
     bound_of_runs,
     bounds_of,
     change_of,
-    exceeds,
     interval_of,
 )
 from trilane.apps.compare.difference import ALPHA, LEAST_FRAMES, Difference, Finding, combined, rejected
+from trilane.apps.compare.gate import Pair
 from trilane.apps.compare.rows import BUSY_MACHINE, FRAME_TIME, MS, Figure, rows_of
 from trilane.apps.compare.sides import Change, ComparedRun, RunKind, Side, changes, read_told
 from trilane.apps.run.report import Report
@@ -45,8 +45,8 @@ class TrialPair:
     """One configuration in both sweeps.
 
     `name`: name of its first trial in the base. `runs`: number of runs a side. `frame_time`: mean frame time of both.
-    `differs`: whether the test of all pairs together calls it different. `changes`: changes of machine and settings.
-    `bounds`: what bounded its runs.
+    `differs`: whether the test of all pairs together calls it different. `sides`: its figures of both sides, to be
+    judged. `bounds`: what bounded its runs.
     """
 
     name: str
@@ -54,7 +54,7 @@ class TrialPair:
     runs: int
     frame_time: Difference
     differs: bool
-    changes: tuple[Change, ...]
+    sides: Pair
     bounds: Bounds
 
     @property
@@ -106,10 +106,6 @@ class SweepComparison:
         told = f", of {unsure} it cannot be told" if unsure else ""
         of = f"changed in {changed} of {len(found)} trial{'s' * (len(found) > 1)}{told}"
         return f"bound: {bound_of_runs(other)}; was {bound_of_runs(base)}; {of}"
-
-    def slower_than(self, limit: float) -> list[Finding]:
-        """Return whether each pair's frame time is longer by more than the share `limit`: DIFFERS if it surely is."""
-        return [exceeds(pair.frame_time, limit, differs=pair.differs) for pair in self.pairs]
 
     def as_json(self) -> dict[str, Any]:
         """Return what `trilane compare --json` prints for two sweeps."""
@@ -174,7 +170,8 @@ def _compared(
     found: Sequence[_Found],
     left: Mapping[str, tuple[str, ...]],
 ) -> SweepComparison:
-    rows = [_frame_time(first, second) for _, first, second, _ in found]
+    sides = [_pair(name, first, second) for name, first, second, _ in found]
+    rows = [each.rows[MEAN] for each in sides]
     fallen = iter(rejected([row.probability for row in rows if row.probability is not None]))
     pairs = tuple(
         TrialPair(
@@ -183,22 +180,22 @@ def _compared(
             len(first.runs),
             row,
             row.probability is not None and next(fallen),
-            tuple(changes(first.runs[0].document, second.runs[0].document)),
+            each,
             bounds_of(first, second),
         )
-        for (name, first, second, options), row in zip(found, rows, strict=True)
+        for (name, first, second, options), row, each in zip(found, rows, sides, strict=True)
     )
-    shared = tuple(each for each in pairs[0].changes if all(each in pair.changes for pair in pairs))
+    shared = tuple(each for each in sides[0].changes if all(each in pair.changes for pair in sides))
     documents = [told.document for _, *sides, _ in found for side in sides for told in side.runs]
     return SweepComparison(base, other, pairs, combined(rows), left, shared, tuple(_notes(documents)))
 
 
-def _frame_time(base: Side, other: Side) -> Difference:
-    """Return the difference of the mean frame times. Raises BadInputError for trials that have none."""
-    row = rows_of(base, other).get(MEAN)
-    if row is None:
+def _pair(name: str, base: Side, other: Side) -> Pair:
+    """Return the figures of a trial. Raises BadInputError for one without frame times."""
+    rows = rows_of(base, other)
+    if MEAN not in rows:
         raise BadInputError(base.name, "trials without a frame time", "a sweep of `run` or `predict`")
-    return row
+    return Pair(name, base, other, rows, tuple(changes(base.runs[0].document, other.runs[0].document)))
 
 
 def _configurations(folder: Path) -> dict[str, dict[int, Mapping[str, Any]]]:

@@ -34,6 +34,8 @@ from trilane.apps.compare.rows import (
 from trilane.apps.compare.run_frames import INSTRUCTION_TIME, INSTRUCTIONS
 from trilane.apps.compare.sides import Change, ComparedRun, RunKind, Side, changes
 from trilane.apps.explain.reasons import bound_text
+from trilane.apps.run.trust import trust_of
+from trilane.errors import BadInputError
 
 SCHEMA: Final = 1
 METHOD: Final = (
@@ -122,12 +124,18 @@ class Comparison:
     bounds: Bounds
     notes: tuple[str, ...]
 
+    @property
+    def unsure(self) -> tuple[str, ...]:
+        """Why a run is not to be trusted, a sentence for each such run."""
+        return tuple(spoilt((*self.base.runs, *self.other.runs)))
+
     def as_json(self) -> dict[str, Any]:
         """Return one entry of `comparisons`."""
         return {
             "run": self.other.name,
             "verdict": self.verdict,
             "outcome": str(self.whole),
+            "unsure": list(self.unsure),
             "bound": self.bounds.as_json(),
             "changes": [change._asdict() for change in self.changes],
             "rows": [_row_document(figure, self) for figure in self.rows],
@@ -145,20 +153,6 @@ class Comparison:
         """Return the finding for one of the `rows`."""
         row = self.rows[figure]
         return row.outcome(differs=figure in self.differing, margin=margin_of(figure, row))
-
-    def slower_than(self, limit: float) -> Finding:
-        """Return whether the mean frame time is longer by more than the share `limit`: DIFFERS where it surely is."""
-        figure = next(each for each in self.rows if each[:4] == (FRAME_TIME, "", "", "mean"))
-        return exceeds(self.rows[figure], limit, differs=figure in self.differing)
-
-
-def exceeds(row: Difference, limit: float, *, differs: bool) -> Finding:
-    """Return whether a change is surely above `limit`, surely not, or neither."""
-    if row.low is None or row.high is None:
-        return Finding.UNKNOWN
-    if differs and row.low > limit:
-        return Finding.DIFFERS
-    return Finding.SAME if row.high <= limit else Finding.UNKNOWN
 
 
 def compare(base: Side, others: Sequence[Side]) -> list[Comparison]:
@@ -184,6 +178,9 @@ def document(comparisons: Sequence[Comparison]) -> dict[str, Any]:
 
 def _compared(base: Side, other: Side) -> Comparison:
     rows = rows_of(base, other)
+    if not rows:
+        names = ", ".join([*base.runs[0].document["stages"]][:8])
+        raise BadInputError(other.name, f"no time that {base.name} has too", f"a measurement with a name of: {names}")
     first = named(rows)
     differing = _differing(rows, first)
     if differing:
@@ -217,10 +214,19 @@ def _notes(base: Side, other: Side) -> list[str]:
     return notes + [f"{name}: {text}" for name, told in runs.items() for text in _about(told)]
 
 
+def spoilt(runs: Sequence[ComparedRun]) -> Iterator[str]:
+    """Yield why a run is not to be trusted. A prediction or an imported time is taken as it is."""
+    for told in runs:
+        if told.kind in (RunKind.RUN, RunKind.REPORT) and not (trust := trust_of(told.document)).trusted:
+            yield f"{told.name} is {trust.said}"
+
+
 def _about(told: ComparedRun) -> Iterator[str]:
     """Yield remarks on the data of a run."""
     if told.kind is RunKind.REPORT:
         yield "a report without a journal, so only summaries are compared, each as uncertain as the mean frame time"
+    if told.kind is RunKind.TIMES:
+        yield "imported times, so only what has a name on both sides is compared; nobody knows what else ran"
     if told.kind is RunKind.PREDICTION:
         yield "computed by a model, with the error that it expects of itself"
     if told.frames is None:

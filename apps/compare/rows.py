@@ -26,7 +26,7 @@ from trilane.apps.compare.difference import (
     student_quantile,
     unsure,
 )
-from trilane.apps.compare.run_frames import INSTRUCTION_TIME, INSTRUCTIONS, Key
+from trilane.apps.compare.run_frames import CPU, INSTRUCTION_TIME, INSTRUCTIONS, Key
 from trilane.apps.compare.sides import ComparedRun, RunKind, Side, changes
 from trilane.units import HOST_CLOCK
 
@@ -42,6 +42,7 @@ MEASURES: Final = {
     LATENCY: ("mean", "p50", "p90", "p99"),
     INSTRUCTIONS: ("mean",),
     INSTRUCTION_TIME: ("typical",),
+    CPU: ("typical",),
     WORK: ("typical", "p90", "p99"),
     SERVICE: ("mean", "typical"),
     WAIT: ("mean", "p90"),
@@ -49,7 +50,7 @@ MEASURES: Final = {
     IDLE: ("share",),
 }
 UNITS: Final = {
-    **dict.fromkeys((FRAME_TIME, LATENCY, WORK, SERVICE, WAIT), MS),
+    **dict.fromkeys((FRAME_TIME, LATENCY, CPU, WORK, SERVICE, WAIT), MS),
     **dict.fromkeys((BUSY, IDLE), SHARE),
     INSTRUCTIONS: "",
     INSTRUCTION_TIME: NS,
@@ -120,7 +121,7 @@ def named(rows: Rows) -> list[Figure]:
             return figure.statistic == "typical" and figure.of not in counted
         if figure.measure == SERVICE:
             return figure.statistic == "mean" and figure.of not in worked
-        return figure.measure not in (WAIT, BUSY, IDLE)
+        return figure.measure not in (CPU, WAIT, BUSY, IDLE)
 
     return [figure for figure in rows if is_named(figure)]
 
@@ -156,8 +157,8 @@ def _difference(base: Side, other: Side, key: Key, statistic: str, chance: Chanc
 
 def _of_frames(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figure, Difference]]:
     for key in _shared(base, other):
-        if key.measure == INSTRUCTION_TIME and key.of in noise.held:
-            continue  # the stage sleeps until its time is over, so the time says nothing of its instructions
+        if key.measure in (INSTRUCTION_TIME, CPU) and key.of in noise.held:
+            continue  # the stage waits until its time is over, so the time says nothing of its program
         for statistic in MEASURES.get(key.measure, ("mean",)):
             change = _difference(base, other, key, statistic, _chance(key.measure, key.of, statistic, noise))
             yield Figure(*key, statistic, UNITS.get(key.measure, BYTES)), change
@@ -168,7 +169,7 @@ def _chance(measure: str, of: str, statistic: str, noise: Noise) -> Chance:
         return noise.of_share()
     if measure == WAIT:
         return noise.of_wait(statistic)
-    if measure in (WORK, INSTRUCTION_TIME) or (measure == SERVICE and of in noise.held):
+    if measure in (CPU, WORK, INSTRUCTION_TIME) or (measure == SERVICE and of in noise.held):
         return noise.of_work(of, statistic)
     if measure == INSTRUCTIONS:
         return noise.of_count()
@@ -211,6 +212,9 @@ def _relative_variance(base: Side, other: Side) -> float | None:
 
 
 def _deviation_of(told: ComparedRun) -> float | None:
+    if told.kind is RunKind.TIMES:
+        deviation: float | None = told.document["deviation"]
+        return deviation
     times = told.document["frame_time_ms"]
     low, high, quantile = (
         (times["low"], times["high"], Z_80)
@@ -227,6 +231,7 @@ def _summaries(document: Mapping[str, Any]) -> dict[Figure, float]:
     for measure, times in ((FRAME_TIME, document["frame_time_ms"]), (LATENCY, document["latency_ms"])):
         found.update(_statistics(measure, "", times, MEASURES[measure]))
     for stage, row in document["stages"].items():
+        found.update(_statistics(CPU, stage, row.get("cpu_ms") or {}, ("mean",)))
         found.update(_statistics(SERVICE, stage, row.get("service_ms", {}), MEASURES[SERVICE]))
         found.update(_statistics(WAIT, stage, row.get("wait_ms", {}), MEASURES[WAIT]))
     for unit, row in document["units"].items():
@@ -264,6 +269,33 @@ def _of_errors(base: Side, other: Side) -> Iterator[tuple[Figure, Difference]]:
         if name in second:
             unit = "dB" if "psnr" in name else ""
             yield Figure(ERROR, name, "", "", unit), judged(value, second[name], 0.0, is_ratio=False)
+
+
+def exact_rows(base: Side, other: Side, key: str, unit: str) -> Rows:
+    """Return the numbers under `key` of the reports, which scatter from run to run alone; empty where one has none.
+
+    Their lists and texts, such as the frames that were checked and against what, have to be the same.
+    """
+    sides = [[told.document.get(key) or {} for told in side.runs] for side in (base, other)]
+    every = [found for side in sides for found in side]
+    alike = {str(sorted((name, value) for name, value in each.items() if _is_about(value))) for each in every}
+    if not all(every) or len(alike) > 1:
+        return {}
+    rows = {}
+    for name in (name for name, value in every[0].items() if isinstance(value, float)):
+        values = [[found[name] for found in side] for side in sides if all(name in found for found in side)]
+        if len(values) < 2:
+            continue
+        if len(every) == 2:
+            row = judged(values[0][0], values[1][0], 0.0, is_ratio=False)
+        else:
+            row = settled(values, [np.array(side) for side in values], 0.0, Chance(freedom=0), is_ratio=False)
+        rows[Figure(key, "", "", name, unit)] = row
+    return rows
+
+
+def _is_about(value: Any) -> bool:
+    return isinstance(value, str | list | tuple | int)
 
 
 def _numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:
@@ -330,13 +362,29 @@ def noise_between(base: Documents, other: Documents, effects: Mapping[str, float
     runs = [*base, *other]
     if all(run["clock"] != HOST_CLOCK for run in runs):
         return Noise(is_real=False)
-    first, second = ([run.get("other_programs") or 0.0 for run in side] for side in (base, other))
-    more = abs(fmean(second) - fmean(first))
-    wall = abs(fmean(map(_left, second)) - fmean(map(_left, first)))
+    first, second = (_others(side) for side in (base, other))
+    more, wall = abs(fmean(second) - fmean(first)), abs(_wall(first, second))
     held = frozenset.intersection(*map(_held, runs))
     free = {stage: ratio for stage, ratio in effects.items() if stage not in held}
     slower = _slower_cores(base[0], other[0], free)
     return Noise(True, (wall, WORK_BESIDE_OTHERS * more, SHARE_BESIDE_OTHERS * more), slower, held)
+
+
+def relief_of(base: Side, other: Side) -> float:
+    """Return the change of times on the clock by other programs' share taken out, as a logarithm.
+
+    It is below 0 where they had more in `other`: frames would take that much less without them, at most.
+    """
+    sides = [[told.document for told in side.runs if told.document["clock"] == HOST_CLOCK] for side in (base, other)]
+    return _wall(*map(_others, sides)) if all(sides) else 0.0
+
+
+def _others(reports: Documents) -> list[float]:
+    return [report.get("other_programs") or 0.0 for report in reports]
+
+
+def _wall(base: Sequence[float], other: Sequence[float]) -> float:
+    return fmean(map(_left, other)) - fmean(map(_left, base))
 
 
 def _left(others: float) -> float:
@@ -370,7 +418,7 @@ def _slower_cores(base: Mapping[str, Any], other: Mapping[str, Any], effects: Ma
 def _stages_by_cores(report: Mapping[str, Any]) -> Iterable[list[str]]:
     found: dict[tuple[int, ...], list[str]] = {}
     for stage, row in report["stages"].items():
-        found.setdefault(tuple(report["units"][row["unit"]].get("cores", ())), []).append(stage)
+        found.setdefault(tuple(report["units"].get(row["unit"], {}).get("cores", ())), []).append(stage)
     return found.values()
 
 

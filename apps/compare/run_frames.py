@@ -24,7 +24,7 @@ from trilane.scheduler.ledger import JobRecord
 from trilane.units import NS_PER_MS
 
 STATES = (BUSY, *IDLE_CAUSES)  # and JOIN where branches meet
-INSTRUCTIONS, INSTRUCTION_TIME = "instructions", "time of an instruction"
+INSTRUCTIONS, INSTRUCTION_TIME, CPU = "instructions", "time of an instruction", "CPU time"
 #: Figures of jobs that stages report or the processor counts -> their measures here.
 REPORTED = {f"bytes_{name}": f"bytes {name.replace('_', ' ')}" for name in ("read", "written", "uploaded", "read_back")}
 REPORTED["instructions"] = INSTRUCTIONS
@@ -148,12 +148,17 @@ def _plain(frames: I64, ns: I64) -> Series:
 
 
 def _stage(name: str, jobs: Sequence[JobRecord]) -> dict[Key, Series]:
-    """Return the times of a stage's jobs: `work` on the core, `service` with time off it, `wait` for the unit."""
+    """Return the times of a stage's jobs: `work` on the core, `service` with time off it, `wait` for the unit.
+
+    The CPU time of all threads is there too, unless the journal is older than it.
+    """
     frames = np.array([job.frame for job in jobs], np.int64)
     service = np.array([job.end_ns - job.begin_ns for job in jobs], np.int64)
     preempted = np.array([job.preempted_ns for job in jobs], np.int64)
     wait = np.array([job.begin_ns - job.ready_ns for job in jobs], np.int64)
-    return {
+    cpu = np.array([job.cpu_ns for job in jobs], np.int64)
+    found = {Key(CPU, name): _plain(frames, cpu)} if cpu.all() else {}
+    return found | {
         Key("work", name): _plain(frames, service - preempted),
         Key("service", name): _plain(frames, service),
         Key("wait", name): _plain(frames, wait),

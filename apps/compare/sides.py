@@ -18,6 +18,7 @@ from pydantic import ValidationError
 from pydantic_core import from_json, to_json
 
 from trilane.apps.compare.difference import STATISTICS
+from trilane.apps.compare.imported_times import MEASUREMENTS, imported
 from trilane.apps.compare.run_frames import Key, RunFrames, read_frames
 from trilane.apps.run.report import MAX_REPORT_BYTES, read_report
 from trilane.apps.watch.followed_run import FollowedRun, RunState, folder_of
@@ -28,7 +29,7 @@ from trilane.pipeline.journal import read_journal
 from trilane.pipeline.reckoning import places_of, reckoned
 from trilane.pipeline.run_metrics import RunMetrics
 
-EXPECTED: Final = "a run folder, its report.json, or what `trilane predict --json` printed"
+EXPECTED: Final = "a run folder, its report.json, or what `trilane predict --json` or `trilane times --json` printed"
 #: Keys that a prediction of the application has and a report lacks.
 OF_A_PREDICTION: Final = ("expected_error", "network", "frame_time_ms", "units", "stages")
 #: Facts of the first record that a report has too.
@@ -54,11 +55,15 @@ ALWAYS_DIFFERENT: Final = ("made.at", "made.command")
 
 
 class RunKind(StrEnum):
-    """The known data of a run. RUN: every frame; REPORT: summaries; PREDICTION: summaries that a model computed."""
+    """The known data of a run.
+
+    RUN: every frame; REPORT: summaries; PREDICTION: summaries that a model computed; TIMES: imported measurements.
+    """
 
     RUN = "run"
     REPORT = "report"
     PREDICTION = "prediction"
+    TIMES = "times"
 
 
 @dataclass(frozen=True)
@@ -114,7 +119,13 @@ def read_told(name: str) -> ComparedRun:
             return _of_folder(name, path)
     except OSError as error:
         raise BadInputError.of_os_error(name, error, EXPECTED) from None
+    return _of_file(name, path)
+
+
+def _of_file(name: str, path: Path) -> ComparedRun:
     found = _document(path)
+    if isinstance(found.get(MEASUREMENTS), list):
+        return ComparedRun(name, RunKind.TIMES, {**imported(found, path), NOT_KNOWN: PARTS})
     if all(key in found for key in OF_A_PREDICTION):
         return ComparedRun(name, RunKind.PREDICTION, found)
     if "networks" in found or "rows" in found:
@@ -132,6 +143,12 @@ def _is_there(text: str) -> bool:
 
 def _of_folder(name: str, path: Path) -> ComparedRun:
     journal = path / JOURNAL
+    saved = [] if os.path.lexists(journal) else sorted(path.glob("*.json"))
+    if saved and not os.path.lexists(path / "report.json"):
+        if len(saved) > 1:
+            found = ", ".join(each.name for each in saved[:4])
+            raise BadInputError(path, f"{len(saved)} documents ({found})", "one prediction", "name its file")
+        return _of_file(name, saved[0])
     if not os.path.lexists(journal):
         return ComparedRun(name, RunKind.REPORT, read_report(path).as_json())
     if os.path.lexists(path / "report.json"):

@@ -1,0 +1,345 @@
+"""A comparison as a gate: each limit is kept, broken, or it cannot be told, with the runs that would tell.
+
+Rule: whoever wants to pass bears the proof. A limit is broken if something surely became worse and more than the limit
+is not excluded. It is kept if more than the limit is excluded, on a machine that was quiet. All else cannot be told.
+
+Time is weighed three ways: frame time with other programs' share taken out, each stage's time and CPU time of a job,
+and its counted instructions. Instructions repeat to 0.1 %, so they alone may keep `slower` where every stage has them
+and no setting changed. The frame time must not contradict them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from math import expm1, inf, log1p, sqrt
+from typing import Any, Final, NamedTuple
+
+from trilane.apps.compare.comparison import change_of, interval_of, name_of, spoilt
+from trilane.apps.compare.difference import Difference, rejected, student_quantile, student_tails
+from trilane.apps.compare.rows import (
+    DROPPED,
+    FRAME_TIME,
+    LATENCY,
+    LOST,
+    SERVICE,
+    WORK,
+    Figure,
+    Rows,
+    exact_rows,
+    relief_of,
+)
+from trilane.apps.compare.run_frames import CPU, INSTRUCTIONS
+from trilane.apps.compare.sides import Change, Side
+from trilane.errors import BadInputError, did_you_mean
+
+#: Probability of a false alarm of all limits of one call together, at most: one side of a 95 % interval.
+FALSE_ALARMS: Final = 0.025
+#: Runs of each side up to which it is computed how many would tell.
+MOST_RUNS: Final = 200
+PERCENT, DECIBELS = "%", "dB"
+#: Share by which a stage's CPU time and its time on the core may differ where one thread does its jobs.
+SAME_TIME: Final = 0.05
+CHECKED: Final = "check"
+#: Measures of which other programs' share is taken out.
+WALL: Final = (FRAME_TIME, LATENCY)
+MOST_SAID: Final = 4
+
+
+class Outcome(StrEnum):
+    """The outcome of a limit."""
+
+    KEPT = "kept"
+    BROKEN = "broken"
+    UNKNOWN = "cannot tell"
+
+
+class Metric(NamedTuple):
+    """A figure that may have a limit.
+
+    `says`: what breaks the limit. `of`: measures and their statistics. `unit`: unit of the limit. `is_timed`: whether
+    other programs change it. `sign`: -1 if less is worse.
+    """
+
+    says: str
+    of: tuple[tuple[str, str], ...]
+    unit: str = PERCENT
+    is_timed: bool = True
+    sign: int = 1
+
+
+#: Name in --fail-if: its metric. A share of the frames has a limit in points of percent.
+METRICS: Final = {
+    "slower": Metric(
+        "frames or the jobs of any stage take longer",
+        (
+            (FRAME_TIME, "mean"),
+            (INSTRUCTIONS, "mean"),
+            (CPU, "typical"),
+            (CPU, "mean"),
+            (WORK, "typical"),
+            (SERVICE, "mean"),
+        ),
+    ),
+    "frame-time": Metric("frames take longer in the mean", ((FRAME_TIME, "mean"),)),
+    "frame-time-p99": Metric("the slowest 1 % of the frames take longer", ((FRAME_TIME, "p99"),)),
+    "latency": Metric("frames are shown later in the mean", ((LATENCY, "mean"),)),
+    "latency-p99": Metric("the latest 1 % of the frames are shown later", ((LATENCY, "p99"),)),
+    "instructions": Metric("a stage executes more instructions", ((INSTRUCTIONS, "mean"),), is_timed=False),
+    "cpu": Metric("a stage takes more CPU time", ((CPU, "typical"), (CPU, "mean"))),
+    "lost": Metric("more of the frames are lost or dropped", ((LOST, "share"), (DROPPED, "share"))),
+    "psnr": Metric("the frames of --check are worse in the mean", ((CHECKED, "psnr_db"),), DECIBELS, False, -1),
+    "worst-psnr": Metric("the worst frame of --check is worse", ((CHECKED, "worst_psnr_db"),), DECIBELS, False, -1),
+}
+#: Why there may be no figure.
+ABSENT: Final = {
+    CHECKED: "not every run was made with --check",
+    INSTRUCTIONS: "not every run has counted instructions (`trilane doctor` says whether this machine counts them)",
+}
+
+
+class Gate(NamedTuple):
+    """A limit of a metric. `limit`: a share, or dB. `text`: as it was asked for."""
+
+    name: str
+    limit: float
+    text: str
+
+    @property
+    def metric(self) -> Metric:
+        return METRICS[self.name]
+
+
+def read_gate(text: str, option: str = "--fail-if") -> Gate:
+    """Read `slower=5%` or `psnr=0.5dB`. Raises BadInputError naming the metrics, or the unit that the metric has."""
+    name, _, value = (part.strip() for part in text.partition("="))
+    if name not in METRICS:
+        expected = f"METRIC=LIMIT with one of {', '.join(METRICS)}"
+        raise BadInputError(option, repr(text), expected, did_you_mean(name, METRICS))
+    unit = METRICS[name].unit
+    found = re.fullmatch(rf"(\d+(?:\.\d+)?)\s*{unit}", value)
+    if found is None:
+        raise BadInputError(option, repr(text), f"{name}= and a number with {unit}, such as {name}=5{unit}")
+    return Gate(name, float(found[1]) / (100 if unit == PERCENT else 1), f"{name}={found[1]}{unit}")
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two sides that are judged. `rows`: their figures. `changes`: settings and facts of the machine that changed."""
+
+    name: str
+    base: Side
+    other: Side
+    rows: Rows
+    changes: Sequence[Change]
+
+
+class Weighed(NamedTuple):
+    """One figure against its limit.
+
+    `least`, `most`: change for the worse that is left when known causes explain all, or none, of it. Logarithms of the
+    ratio where the row is one. `limit`: on the same scale. `probability`: chance that runs of one kind are worse by
+    `least`. `outcome`: of this figure alone. `runs`: runs of each side that would tell, inf for more than `MOST_RUNS`,
+    None where no number does.
+    """
+
+    figure: Figure
+    row: Difference
+    least: float
+    most: float
+    limit: float
+    probability: float
+    outcome: Outcome = Outcome.UNKNOWN
+    runs: float | None = None
+
+    @property
+    def is_near(self) -> bool:
+        """Whether the estimate is at most one deviation above the limit."""
+        return self.row.deviation is not None and self.least - self.row.deviation <= self.limit
+
+    @property
+    def said(self) -> str:
+        """The figure with its change, its interval, and its change with other programs' share taken out."""
+        unit = self.figure.unit
+        change = f"{name_of(self.figure)} {change_of(self.row, unit)}"
+        if self.row.deviation != 0:
+            change += f" ({interval_of(self.row, unit)})"
+        if self.figure.measure not in WALL or self.least == self.most:
+            return change
+        left = self.least if self.least < self.row.effect else self.most
+        return f"{change}, {100 * expm1(left):+.1f} % with other programs' share taken out"
+
+
+class Judged(NamedTuple):
+    """The judgement of one limit for one pair.
+
+    `name`: name of the other side. `reason`: a sentence. `runs`: as in `Weighed`, for all its figures together; None
+    too where more runs do not help or are not needed.
+    """
+
+    gate: Gate
+    name: str
+    outcome: Outcome
+    reason: str
+    figures: tuple[Weighed, ...]
+    runs: float | None = None
+
+    @property
+    def said(self) -> str:
+        """The judgement in one line."""
+        return f"{self.gate.text}: {self.outcome}: {self.reason}"
+
+    def as_json(self) -> dict[str, Any]:
+        """Return one entry of `gates`."""
+        return {
+            "run": self.name,
+            "limit": self.gate.text,
+            "outcome": str(self.outcome),
+            "reason": self.reason,
+            "runs_needed": None if self.runs is None or self.runs == inf else int(self.runs),
+            "figures": [
+                {**each.figure._asdict(), "change": each.row.change, "low": each.row.low, "high": each.row.high}
+                | {"outcome": str(each.outcome)}
+                for each in self.figures
+            ],
+        }
+
+
+def whole(judged: Sequence[Judged]) -> Outcome:
+    """Return the outcome of all limits: one that is broken decides, then one that cannot be told."""
+    found = [each.outcome for each in judged]
+    return next((outcome for outcome in (Outcome.BROKEN, Outcome.UNKNOWN) if outcome in found), Outcome.KEPT)
+
+
+def judge(gates: Sequence[Gate], pairs: Sequence[Pair]) -> list[Judged]:
+    """Judge every limit for every pair. All figures are tested together, so that they raise few false alarms."""
+    asked = [(gate, pair, list(_weighed(gate, pair))) for pair in pairs for gate in gates]
+    every = [each for _, _, figures in asked for each in figures if each.row.deviation]
+    surely = {id(each) for each, falls in zip(every, _rejected(every), strict=True) if falls}
+    found = []
+    for gate, pair, figures in asked:
+        settled = tuple(_settled(each, id(each) in surely, len(every), pair) for each in figures)
+        found.append(_judged(gate, pair, settled))
+    return found
+
+
+def _rejected(every: Sequence[Weighed]) -> list[bool]:
+    return rejected([each.probability for each in every], FALSE_ALARMS)
+
+
+def _weighed(gate: Gate, pair: Pair) -> Iterator[Weighed]:
+    relief, metric = relief_of(pair.base, pair.other), gate.metric
+    rows = exact_rows(pair.base, pair.other, CHECKED, "dB") if metric.of[0][0] == CHECKED else pair.rows
+    works = {figure.of: row for figure, row in rows.items() if (figure.measure, figure.statistic) == (WORK, "typical")}
+    for figure, row in rows.items():
+        if (figure.measure, figure.statistic) not in metric.of or _is_said(figure, row, works.get(figure.of), metric):
+            continue
+        down, up = (min(relief, 0.0), max(relief, 0.0)) if figure.measure in WALL else (-row.explained, row.explained)
+        worse = metric.sign * row.effect
+        least, most = worse + down, worse + up
+        limit = log1p(gate.limit) if row.is_ratio else gate.limit
+        yield Weighed(figure, row, least, most, limit, _chance_of(least, row))
+
+
+def _is_said(figure: Figure, row: Difference, work: Difference | None, metric: Metric) -> bool:
+    """Return whether the stage's `work` says the same: service time always, CPU time where one thread did the job."""
+    if work is None or (WORK, "typical") not in metric.of:
+        return False
+    alike = all(abs(mine - its) <= SAME_TIME * its for mine, its in ((row.base, work.base), (row.other, work.other)))
+    return figure.measure == SERVICE or (figure.measure == CPU and alike)
+
+
+def _chance_of(least: float, row: Difference) -> float:
+    """Return the probability that runs of one kind are worse by `least`: one tail."""
+    if least <= 0 or row.deviation is None:
+        return 1.0
+    return student_tails(least / row.deviation, row.freedom) / 2 if row.deviation else 0.0
+
+
+def _settled(each: Weighed, is_sure: bool, tests: int, pair: Pair) -> Weighed:
+    """Return a figure with its outcome. `is_sure`: whether it is surely worse. `tests`: number of figures tested."""
+    row = each.row
+    if row.deviation is None:
+        return each
+    if each.most + student_quantile(row.freedom) * row.deviation <= each.limit:
+        return each._replace(outcome=Outcome.KEPT)
+    if is_sure or (row.deviation == 0 and each.least > 0):
+        return each._replace(outcome=Outcome.BROKEN)
+    return each._replace(runs=runs_needed(each, (len(pair.base.runs), len(pair.other.runs)), tests))
+
+
+def runs_needed(each: Weighed, sizes: tuple[int, int], tests: int) -> float | None:
+    """Return how many runs of each side would tell, if they scatter as these and their means stay where they are.
+
+    `sizes`: runs of both sides now. `tests`: number of figures that are tested together.
+    """
+    if each.row.deviation is None or (each.most >= each.limit and each.least <= 0):
+        return None
+    of_one = each.row.deviation / sqrt(sum(1 / size for size in sizes))
+    known = each.row.freedom - sum(sizes) + 2
+    for runs in range(max(sizes) + 1, MOST_RUNS + 1):
+        deviation, freedom = of_one * sqrt(2 / runs), known + 2 * (runs - 1)
+        if each.most + student_quantile(freedom) * deviation <= each.limit:
+            return runs
+        if each.least > 0 and student_tails(each.least / deviation, freedom) / 2 <= FALSE_ALARMS / tests:
+            return runs
+    return inf
+
+
+def _judged(gate: Gate, pair: Pair, figures: tuple[Weighed, ...]) -> Judged:
+    worse = [each for each in figures if each.outcome is Outcome.BROKEN]
+    if worse:
+        return Judged(gate, pair.name, Outcome.BROKEN, f"{gate.metric.says}: {_list(worse)}", figures)
+    if not figures:
+        reason = ABSENT.get(gate.metric.of[0][0], "the two sides share no such figure")
+        return Judged(gate, pair.name, Outcome.UNKNOWN, reason, figures)
+    unsure = [*spoilt((*pair.base.runs, *pair.other.runs))]
+    decisive = _decisive(gate, pair, figures)
+    unknown = [each for each in decisive if each.outcome is Outcome.UNKNOWN]
+    if not unknown:
+        if unsure and gate.metric.is_timed:
+            return Judged(gate, pair.name, Outcome.UNKNOWN, f"{'; '.join(unsure)}; repeat it", figures)
+        return Judged(gate, pair.name, Outcome.KEPT, _list(decisive), figures)
+    counts = [each.runs for each in unknown]
+    runs = None if None in counts else max(count for count in counts if count is not None)
+    reason = f"{_list(unknown)}; {_remedy(unknown, runs, unsure)}"
+    return Judged(gate, pair.name, Outcome.UNKNOWN, reason, figures, runs)
+
+
+def _decisive(gate: Gate, pair: Pair, figures: Sequence[Weighed]) -> list[Weighed]:
+    """Return the figures that must keep the limit.
+
+    For `slower` these are the counted instructions, if every stage has them, nothing changed, and the frame time does
+    not contradict them.
+    """
+    counted = [each for each in figures if each.figure.measure == INSTRUCTIONS]
+    frames = [each for each in figures if each.figure.measure == FRAME_TIME]
+    stages = pair.base.runs[0].document["stages"]
+    is_counted = len(counted) == len(stages) > 0 and not pair.changes and gate.name == "slower"
+    if is_counted:
+        return [*counted, *(each for each in frames if not each.is_near)]
+    return [*figures]
+
+
+def _remedy(unknown: Sequence[Weighed], runs: float | None, unsure: Sequence[str]) -> str:
+    if any(each.row.deviation is None for each in unknown):
+        return "more frames tell"
+    quiet = f"; {'; '.join(unsure)}" if unsure else ""
+    if runs is None:
+        return f"other programs or the cores' own speed may explain it, so no number of runs tells: repeat it{quiet}"
+    if runs == inf:
+        return f"more than {MOST_RUNS} runs of each side would be needed (A1,A2,A3){quiet}"
+    return f"about {int(runs)} runs of each side would be needed (A1,A2,A3){quiet}"
+
+
+def _list(figures: Sequence[Weighed]) -> str:
+    first = sorted(figures, key=lambda each: each.limit - each.most)[:MOST_SAID]
+    more = f", {len(figures) - len(first)} more" if len(figures) > len(first) else ""
+    return ", ".join(each.said for each in first) + more
+
+
+def as_json(judged: Sequence[Judged]) -> Mapping[str, Any]:
+    """Return the keys that a gate adds to the output of `trilane compare --json`."""
+    return {"outcome": str(whole(judged)), "gates": [each.as_json() for each in judged]}

@@ -1,0 +1,93 @@
+"""Imported times as a side of a comparison: what `trilane times FILE --json` prints, with the keys of a report.
+
+Rule: each measurement is the time of a job of a stage with its name. So it stands beside a measurement of that name,
+or beside the stage of a run. The only wall time stands for the frame time. Nobody knows the machine's state, so the
+scatter from run to run is that of any run on the host clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import sqrt
+from pathlib import Path
+from statistics import fmean, stdev
+from typing import Annotated, Any, Final
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from trilane.errors import BadInputError
+from trilane.units import HOST_CLOCK
+
+MEASUREMENTS: Final = "measurements"
+EXPECTED: Final = "what `trilane times --json` printed"
+WALL: Final = "wall"
+#: Unit that imported stages stand on; nothing is known of it.
+UNIT: Final = "imported"
+Ms = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class Measurement(BaseModel):
+    """One measured time. `kind`: such as `run`, `layer` or `wall`. `samples_ms`: every value, where the file has it."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, strict=False)
+
+    name: str = Field(min_length=1)
+    kind: str
+    unit: str | None = None
+    count: int | None = Field(default=None, ge=1)
+    mean_ms: Ms
+    p50_ms: Ms | None = None
+    p95_ms: Ms | None = None
+    samples_ms: tuple[Ms, ...] | None = None
+
+    @property
+    def error(self) -> float | None:
+        """Standard error of the mean as a share of it; None where the samples do not show it."""
+        samples = self.samples_ms or ()
+        return stdev(samples) / sqrt(len(samples)) / fmean(samples) if len(samples) > 1 else None
+
+
+def imported(document: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """Return the keys of a report that a comparison reads. Raises BadInputError naming the first wrong key."""
+    rows = [_measurement(row, f"{path}: {MEASUREMENTS}.{place}") for place, row in enumerate(document[MEASUREMENTS])]
+    if not rows:
+        raise BadInputError(f"{path}: {MEASUREMENTS}", "none", "one or more", "`trilane times` reads a profile")
+    names = [row.name for row in rows]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise BadInputError(f"{path}: {MEASUREMENTS}", f"{twice!r} twice", "each name once")
+    frames = _frames(rows)
+    return {
+        "clock": HOST_CLOCK,
+        "stages": {row.name: {"unit": UNIT, "service_ms": _times(row)} for row in rows if row is not frames},
+        "units": {},
+        "config": {},
+        "machine": {},
+        "frame_time_ms": _times(frames) if frames else {},
+        "latency_ms": {},
+        "deviation": _deviation(rows),
+    }
+
+
+def _measurement(row: Any, where: str) -> Measurement:
+    try:
+        return Measurement.model_validate(row)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise BadInputError(f"{where}.{key}".rstrip("."), first["msg"].lower(), EXPECTED) from None
+
+
+def _frames(rows: Sequence[Measurement]) -> Measurement | None:
+    """Return the measurement that stands for a frame: the only wall time."""
+    found = [row for row in rows if row.kind == WALL]
+    return found[0] if len(found) == 1 else None
+
+
+def _times(row: Measurement) -> dict[str, float]:
+    return {"mean": row.mean_ms} | ({} if row.p50_ms is None else {"p50": row.p50_ms})
+
+
+def _deviation(rows: Sequence[Measurement]) -> float | None:
+    """Return the standard error that a comparison takes for every figure: that of the least sure one."""
+    known = [error for row in rows if (error := row.error) is not None]
+    return max(known) if len(known) == len(rows) else None
