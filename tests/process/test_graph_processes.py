@@ -87,5 +87,5 @@ def test_a_unit_killed_again_and_again_in_a_branch_comes_back(unit: str, starter
     ]
     numbers = [fact.frame for fact in facts]
     assert sorted(numbers) == list(range(100)), "each frame is presented or lost, and the journal says which"
-    assert len(timeline.downs) == 5
+    assert len(timeline.downs) in (4, 5), "the run may end before the unit is back from its last death"
     assert max(down.end_ns - down.begin_ns for down in timeline.downs) < 1_000_000_000
