@@ -23,7 +23,7 @@ from trilane.pipeline.memory import BYTES, Assets, add_bytes
 from trilane.pipeline.realtime_clock import ClockGovernor, RealtimeClock
 from trilane.pipeline.rehearsal import Chain, on_rungs
 from trilane.pipeline.result import RunLog, RunResult
-from trilane.pipeline.run_metrics import RunMetrics, metrics_of
+from trilane.pipeline.run_metrics import ProcessorState, RunMetrics, metrics_of
 from trilane.pipeline.run_record import JournalFile, RunRecord, recorded
 from trilane.pipeline.surroundings import (
     beside_units,
@@ -31,6 +31,7 @@ from trilane.pipeline.surroundings import (
     check_open_files,
     check_positive,
     on_cores,
+    processor_of,
     prompt_answers,
     refuse_in_a_unit,
     unit_processes,
@@ -173,9 +174,8 @@ def run_pipeline(
         is_open = requests is not None or controls is not None
         report = core.report(clock="host", requested=core.source.released if is_open else None)
         report["percentiles"] = EXACT if core.ledger.is_exact else SKETCHED
-        report.update(
-            policy=settings.policy, edge=pipeline.rule, idle_cores=idle_cores, other_programs=run.other_programs
-        )
+        report.update(policy=settings.policy, edge=pipeline.rule, idle_cores=idle_cores)
+        report.update(other_programs=run.other_programs, processor=run.processor)
         _add_caps(report, governor)
         for unit, row in report["units"].items():
             row.update(pid=run.pids[unit], **pipeline.units[unit].model_dump(mode="json"))
@@ -215,6 +215,7 @@ class _Run:
         self._interrupts, self._log, self._record = interrupts, log, record
         self.pids: dict[str, int] = {}
         self.other_programs: float | None = None
+        self.processor: ProcessorState | None = None
         self._startup_ms: dict[str, float] = {}
         self._outcome = Outcome(OutcomeKind.ABORTED)
 
@@ -230,13 +231,13 @@ class _Run:
                 few = _spread(settings.frames, FRAMES_ON_RUNGS)
                 self._clock.first += on_rungs(chain, few, len(settings.works), settings.follow)
             chain.frame(0)
-        others = beside_units(self._cores, self.pids)
+        others, processor = beside_units(self._cores, self.pids), processor_of(self._cores)
         self._record.begin(self._clock, lambda: self._processes.pids)
         try:
             self._outcome = run_loop(self._core, self._clock, self._record)
         except UnwrittenError:  # the record keeps it as its `failure`
             self._core.step(self._core.now_ns, (Abort(),))
-        self.other_programs = others(self._processes.pids)
+        self.other_programs, self.processor = others(self._processes.pids), processor()
         self._clock.finish()
         if self._outcome.kind is OutcomeKind.GAVE_UP:
             unit = self._outcome.unit

@@ -279,6 +279,18 @@ class Temperature(Record):
     sensor: float | None = None
 
 
+class ProcessorState(Record):
+    """The state of the run's cores as the kernel shows it; a field is null where the kernel does not show it.
+
+    `clock_begin_ghz`, `clock_end_ghz`: clock of the fastest core before the first frame and after the last, in GHz.
+    `throttles`: how often heat slowed a core down in between.
+    """
+
+    clock_begin_ghz: float | None = None
+    clock_end_ghz: float | None = None
+    throttles: int | None = None
+
+
 class SlowedCost(Record):
     """What it costs when jobs take longer by `Slowed.by`, found by replaying the run (`trilane.pipeline.what_if`).
 
@@ -428,6 +440,7 @@ class RunMetrics(PolicyMetrics):
     `edge`: edge rule of the scheduler.
     `idle_cores`: whether cores without work stayed awake; on the host clock.
     `other_programs`: share of other programs in the time of the run's cores; null where a unit died.
+    `processor`: clock and throttling of the run's cores; null in virtual time and in reports of an older Trilane.
     `streams`: age of what was taken from each stream that has an input of the newest frame, by its stage.
     `caps`, `temperature_c`: caps and temperatures of a capped run.
     """
@@ -439,6 +452,7 @@ class RunMetrics(PolicyMetrics):
     edge: str = ""
     idle_cores: str = ""
     other_programs: float | None = None
+    processor: ProcessorState | None = None
     streams: dict[str, NewestTaken] = Field(default={})
     caps: Caps | None = None
     temperature_c: Temperature | None = None

@@ -23,6 +23,7 @@ from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline import fork_server
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.memory import Assets, edge_regions, share_assets
+from trilane.pipeline.run_metrics import ProcessorState
 from trilane.pipeline.unit_processes import UnitProcesses
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.transport.wakeup import DEFAULT, SHORTEST_NS, use_slice
@@ -105,6 +106,19 @@ def beside_units(cores: Sequence[int], pids: Mapping[str, int]) -> Callable[[Map
         return None
 
     return share
+
+
+def processor_of(cores: Sequence[int]) -> Callable[[], ProcessorState]:
+    """Look at the clock and the throttling of `cores` now. Return a function that looks again and gives both."""
+    clock, throttles = machine.here.core_clock_ghz(cores), machine.here.throttles(cores)
+
+    def state() -> ProcessorState:
+        now = machine.here.throttles(cores)
+        grown = None if now is None or throttles is None else now - throttles
+        end = machine.here.core_clock_ghz(cores)
+        return ProcessorState(clock_begin_ghz=clock, clock_end_ghz=end, throttles=grown)
+
+    return state
 
 
 def busy_s(stat: str, cores: Sequence[int]) -> float:

@@ -39,6 +39,7 @@ SOURCES = {
     "machine_efficiency": MEASURED,
     "bound": COMPUTED,
     "other_programs": MEASURED,
+    "processor": MEASURED,
     "caps": COMPUTED,
     "temperature_c": COMPUTED,
     "temperature_c.sensor": MEASURED,

@@ -73,6 +73,19 @@ class Machine:
         frequency = psutil.cpu_freq()
         return (frequency.max or frequency.current) / 1e3 if frequency else 0.0
 
+    def core_clock_ghz(self, cores: Iterable[int]) -> float | None:
+        """Return the present clock of the fastest of `cores` in GHz; None where the kernel does not show it."""
+        folder = self.sys / "devices/system/cpu"
+        texts = [_text_of(folder / f"cpu{core}/cpufreq/scaling_cur_freq") for core in cores]
+        return max((int(text) / 1e6 for text in texts if text.isdecimal()), default=None)
+
+    def throttles(self, cores: Iterable[int]) -> int | None:
+        """Return how often heat has slowed `cores` down since the system began; None where the kernel counts none."""
+        folder = self.sys / "devices/system/cpu"
+        texts = [_text_of(folder / f"cpu{core}/thermal_throttle/core_throttle_count") for core in cores]
+        counts = [int(text) for text in texts if text.isdecimal()]
+        return sum(counts) if counts else None
+
     def sensor_c(self) -> float | None:
         """Return the temperature of the hottest sensor in degrees Celsius; None on a machine without sensors."""
         by_chip: dict[str, list[Any]] = getattr(psutil, "sensors_temperatures", dict)()

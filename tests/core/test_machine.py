@@ -48,6 +48,17 @@ def test_the_highest_clock_comes_first(monkeypatch: pytest.MonkeyPatch, told: An
     assert Machine().clock_ghz() == ghz
 
 
+def test_clock_and_throttling_are_those_of_the_cores_that_are_asked_for(tmp_path: Path) -> None:
+    for core, (khz, count) in enumerate([(1_200_000, 3), (3_400_000, 4), (4_000_000, 100)]):
+        for name, value in (("cpufreq/scaling_cur_freq", khz), ("thermal_throttle/core_throttle_count", count)):
+            file = tmp_path / f"sys/devices/system/cpu/cpu{core}" / name
+            file.parent.mkdir(parents=True)
+            file.write_text(f"{value}\n", encoding="utf-8")
+    machine = Machine(tmp_path)
+    assert (machine.core_clock_ghz([0, 1]), machine.throttles([0, 1])) == (3.4, 7)
+    assert (machine.core_clock_ghz([7]), machine.throttles([7])) == (None, None)
+
+
 def test_the_hottest_sensor_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     chips = {"a": [SimpleNamespace(current=40.0), SimpleNamespace(current=55.5)], "b": [SimpleNamespace(current=50.0)]}
     for found, hottest in ((chips, 55.5), ({}, None)):

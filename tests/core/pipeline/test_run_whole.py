@@ -30,7 +30,7 @@ from trilane.pipeline.journal import (
 )
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import DdSketch
-from trilane.pipeline.run_metrics import metrics_of
+from trilane.pipeline.run_metrics import ProcessorState, metrics_of
 from trilane.pipeline.run_record import JournalFile
 from trilane.scheduler.events import Outcome, OutcomeKind, Settings, StageAlone
 from trilane.scheduler.virtual import VirtualDriver
@@ -109,6 +109,7 @@ def world(monkeypatch: pytest.MonkeyPatch) -> World:
         ("start_units", lambda *_: {"left": 1.5, "right": 2.5}),
         ("close_units", lambda *_: None),
         ("beside_units", lambda cores, pids: lambda now: 0.25 if (cores, pids == now) == ([0, 1, 3], True) else None),
+        ("processor_of", lambda cores: lambda: ProcessorState(throttles=len(cores))),
     ):
         monkeypatch.setattr(run, name, part)
     monkeypatch.setattr(cpu_use, "counts_run_delay", lambda: True)
@@ -132,6 +133,7 @@ def test_the_report_of_a_run() -> None:
     assert (report.clock, report.policy, report.edge) == ("host", "pipelined", "double")
     assert report.idle_cores == "kept awake"
     assert (report.frame_time_ms.mean, report.other_programs) == (4.0, 0.25)
+    assert report.processor == ProcessorState(throttles=3)
     assert report.deadline_misses == 0
     # of 4 ms right works 4 and left 2; each may run on two cores, and they have three in all
     assert report.efficiency == pytest.approx(1 - 1 / (59 * 4))  # but for the way out of the last frame
