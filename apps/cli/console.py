@@ -9,16 +9,19 @@ import errno
 import json
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import IO, TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
 #: C0, DEL and C1, as Python writes them.
 #: Most messages of a run that are shown at its end.
 MOST_SHOWN = 5
+#: Colours of the first word of a verdict.
+STYLES = {"PASS": "bold green", "FAIL": "bold red"}
 _WRITTEN_OUT = {code: repr(chr(code))[1:-1] for code in (*range(0x20), *range(0x7F, 0xA0))}
 
 
@@ -118,6 +121,22 @@ def print_json(document: Mapping[str, Any]) -> None:
     """Print `document` as JSON on stdout. Raises ValueError for NaN and infinities, which JSON cannot hold."""
     sys.stdout.write(json.dumps(document, indent=1, allow_nan=False) + "\n")
     sys.stdout.flush()
+
+
+def verdict_table(lines: Iterable[Sequence[str]]) -> Table:
+    """Return the lines of a verdict, each a label and a text; a long line continues below its own text."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(show_header=False, box=None, padding=(0, 1, 0, 0))
+    for label, text in lines:
+        table.add_row(Text(label, style=STYLES.get(label, "bold")), Text(without_controls(text)))
+    return table
+
+
+def print_verdict(lines: Iterable[Sequence[str]]) -> None:
+    """Print the lines of a verdict on stdout."""
+    stdout_console().print(verdict_table(lines))
 
 
 def print_facts(facts: Mapping[str, Any], as_json: bool) -> None:
