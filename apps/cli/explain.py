@@ -277,7 +277,7 @@ def _explain_folder(folder: Path, slowest: int, jobs: Path | None, as_json: bool
 
 def _show_run(document: Mapping[str, Any]) -> None:
     console = stdout_console()
-    if document["verdict"]:
+    if document["verdict"] and not document["remark"]:
         print_verdict(document["verdict"]["lines"])
         console.print()
     for line in _head(document):

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from trilane.apps.cli.console import verdict_table
+from trilane.apps.cli.console import verdict_text
 from trilane.apps.cli.run_table import DASH, NEEDED, TOO_FEW, accuracy_line
 from trilane.apps.watch.figures import MomentFigures, Moved, UnitFigures
 from trilane.apps.watch.followed_run import RunState
@@ -34,15 +34,15 @@ PERCENTILES = ("p50", "p90", "p95", "p99")
 MIB = 1 << 20
 
 
-def screen(look: RunLook) -> Group:
-    """Return everything, for a terminal."""
+def screen(look: RunLook, width: int) -> Group:
+    """Return everything, for a terminal of `width` columns."""
     from rich.console import Group
     from rich.text import Text
 
     figures = look.figures
     lines = [f"note at {note.t_ms / 1000:.1f} s: {note.text}" for note in figures.notes]
     below = "\n".join([*lines, *errors(figures), _sources(figures), FEW.strip()])
-    verdict = verdict_table(figures.verdict["lines"]) if figures.verdict else Text(NO_VERDICT)
+    verdict = verdict_text(figures.verdict["lines"], width) if figures.verdict else Text(NO_VERDICT)
     return Group(
         Text(_title(look)),
         verdict,

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from trilane.apps.predict.predict_options import PredictOptions
+from trilane.apps.run.verdict_facts import predicted_verdict
 from trilane.errors import BadInputError
 from trilane.units import HOST, INFER
 
@@ -40,7 +41,8 @@ def predict_networks(
 
         chips = [with_file(each, graph, shapes, say) for each, graph in zip(chips, graphs, strict=True)]
     over = (options.cap, options.minutes, options.governor, options.wanted)
-    return [predict_network(each, graph, unit, *over) for each, graph in zip(chips, graphs, strict=True)]
+    answers = [predict_network(each, graph, unit, *over) for each, graph in zip(chips, graphs, strict=True)]
+    return [answer | {"verdict": predicted_verdict(answer).shown()} for answer in answers]
 
 
 def application_of(
@@ -99,4 +101,4 @@ def answer_of(chip: Profile, plan: Plan, options: PredictOptions) -> dict[str, A
     answer = predictions.predict(chip, plan, cap, options.minutes, options.governor, wanted)
     if options.what_if:
         answer["alternatives"] = predictions.what_if(chip, plan.network, plan.runtime, cap, wanted.fps)
-    return answer
+    return answer | {"verdict": predicted_verdict(answer).shown()}

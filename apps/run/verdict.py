@@ -209,10 +209,10 @@ def _held(facts: Facts) -> str:
 def _times(facts: Facts) -> str:
     if facts.rate is None or facts.frame_ms is None:
         return ""
-    slow = f" ({facts.slow[0]} {facts.slow[1]:.1f})" if facts.slow else ""
+    slow = f" ({facts.slow[0]} {_ms(facts.slow[1])})" if facts.slow else ""
     latency = f", latency {_number(facts.latency_ms)} ms" if facts.latency_ms is not None else ""
     alone = f"; one at a time: {_number(facts.alone[0])} fps, {_number(facts.alone[1])} ms" if facts.alone else ""
-    return f"{facts.frame_ms:.1f} ms a frame{slow}{latency}{alone}"
+    return f"{_ms(facts.frame_ms)} ms a frame{slow}{latency}{alone}"
 
 
 def _bound(facts: Facts) -> str:
@@ -221,8 +221,9 @@ def _bound(facts: Facts) -> str:
     if bound is None:
         return UNKNOWN
     where = "a frame" if facts.is_computed else "on the critical path"
-    of_path = f"of {facts.frame_ms:.1f} ms {where}" if facts.frame_ms else "of the critical path"
-    parts = [f"{bound.unit}: {_stages(bound, is_own=True)}{of_path} ({_percent(bound.share)})"]
+    of_path = f"of {_ms(facts.frame_ms)} ms {where}" if facts.frame_ms else "of the critical path"
+    part = f"{_ms(bound.share * facts.frame_ms)} " if facts.frame_ms else ""
+    parts = [f"{bound.unit}: {_stages(bound, is_own=True) or part}{of_path} ({_percent(bound.share)})"]
     if bound.unit in MEANINGS:
         parts.append(MEANINGS[bound.unit])
     if bound.cost is not None:
@@ -239,8 +240,12 @@ def _bound(facts: Facts) -> str:
 def _stages(bound: Bound, *, is_own: bool) -> str:
     """Return the stages of the bound's unit, or those of other units, with their ms; a space stands behind."""
     rows = [(stage, ms) for stage, ms in bound.stages.items() if (stage in bound.of_unit) == is_own]
-    said = " + ".join(stage if ms is None else f"{stage} {ms:.1f}" for stage, ms in rows)
+    said = " + ".join(stage if ms is None else f"{stage} {_ms(ms)}" for stage, ms in rows)
     return f"{said} " if said else ""
+
+
+def _ms(value: float) -> str:
+    return f"{value:.2f}" if value < 1 else f"{value:.1f}"
 
 
 def _percent(share: float) -> str:

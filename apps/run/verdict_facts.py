@@ -69,7 +69,7 @@ def facts_of(document: Mapping[str, Any], folder: str = "", *, goes_on: bool = F
         latency_ms=latency.get("mean"),
         alone=(baseline["fps"], baseline["latency_ms"]["mean"]) if baseline else None,
         bound=bound,
-        idle={unit: (1 - row["busy"], _causes(row["idle"])) for unit, row in document["units"].items()},
+        idle={unit: (1 - row["busy"], _causes(row["idle"])) for unit, row in document.get("units", {}).items()},
         image=_image(document),
         tries=() if goes_on else tuple(_tries(document, bound, target, folder)),
         source=SO_FAR if goes_on else "",
@@ -107,7 +107,7 @@ def bound_of(document: Mapping[str, Any]) -> Bound | None:
     if not bound:
         return None
     unit, stage = bound["unit"], bound.get("stage")
-    of_unit = frozenset(name for name, row in document["stages"].items() if row["unit"] == unit["name"])
+    of_unit = frozenset(name for name, row in document.get("stages", {}).items() if row["unit"] == unit["name"])
     shares = bound.get("stages") or ({stage["name"]: stage["share"]} if stage else {})
     frame_ms = (document.get("frame_time_ms") or {}).get("mean")
     first = [stage["name"]] if stage else []
@@ -117,7 +117,7 @@ def bound_of(document: Mapping[str, Any]) -> Bound | None:
     return Bound(
         unit["name"],
         {name: shares[name] * frame_ms if frame_ms and name in shares else None for name in named},
-        unit["share"],
+        unit.get("share", 0.0),
         unit.get("cost"),
         unit.get("rivals") or (),
         of_unit,
@@ -174,15 +174,15 @@ def _shorter(document: Mapping[str, Any], bound: Bound | None) -> Iterator[str]:
     """Yield what makes the bound shorter; nothing where the run waits for its frames."""
     if document.get("policy") == "sequential" and len(document["units"]) > 1:
         yield "--policy pipelined: the units then work at once"
-    stage = next(iter(bound.stages), "") if bound else ""
-    if not stage or bound is None or bound.unit == "release":
-        return
+    if bound is None or bound.unit not in document["units"] or not bound.stages:
+        return  # the time is no unit's: other programs', the rate's, the policy's
+    stage = next(iter(bound.stages))
     if pipeline := (document.get("config") or {}).get("pipeline"):
         units = [unit for unit in document["units"] if unit != document["stages"][stage]["unit"]]
         if units:
             yield f"trilane predict {pipeline['file']} --set stages.{stage}.unit={units[0]}"
         return
-    yield f"{stage}: {SHORTER.get(stage, 'less work, or a unit of its own')}"
+    yield f"{stage}: {SHORTER.get(stage, 'less work, or a unit of its own')}".replace("`", "")
 
 
 def predicted_verdict(answer: Mapping[str, Any]) -> Verdict:
@@ -267,5 +267,5 @@ def _predicted_tries(answer: Mapping[str, Any], is_slow: bool) -> Iterator[str]:
         yield f"--precision w8a8 in place of {answer['precision']}"
     elif is_slow:
         yield "a smaller network, or another --profile"
-    else:
+    elif not answer.get("temperature_c"):
         yield "--minutes 30: what heat leaves of it"
