@@ -153,8 +153,6 @@ def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
         trilane.load_run(" ")
 
 
-
-
 def test_a_notebook_shows_the_error_beside_the_speed_and_nothing_unescaped(folder: Path) -> None:
     report = read_report(folder)
     shown = trilane.load_run(folder)._repr_html_()
