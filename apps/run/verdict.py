@@ -272,7 +272,7 @@ def slow_percentile(times: Mapping[str, Any]) -> tuple[str, float] | None:
 
 
 def _number(value: float | None) -> str:
-    """Return three digits or so, such as `96`, `9.6` and `30`."""
+    """Return three digits, such as `96.2`, `4.42` and `30`; more in front of the point where there are more."""
     if value is None:
         return UNKNOWN
-    return f"{value:.0f}" if value >= 20 or value == round(value) else f"{value:.1f}"
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"

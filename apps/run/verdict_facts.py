@@ -195,14 +195,14 @@ def predicted_verdict(answer: Mapping[str, Any]) -> Verdict:
     config = answer.get("config") or {}
     target = float((answer.get("rate") or {}).get("fps") or config.get("fps") or TARGET_FPS)
     low, high = times.get("low"), times.get("high")
-    ends = (None, None) if low is None or high is None or not low else (1e3 / high, 1e3 / low)
+    least, most = (None, None) if low is None or high is None or not low else (1e3 / high, 1e3 / low)
     units = answer.get("units") or {}
     return judged(
         Facts(
-            Rate(1e3 / times["mean"], *ends, "80 %"),
+            Rate(1e3 / times["mean"], least, most, "80 %"),
             target,
             None,
-            _trust_in(ends, target),
+            _trust_in(least, most, target),
             frame_ms=times["mean"],
             latency_ms=(answer.get("latency_ms") or {}).get("mean"),
             bound=_predicted_bound(answer, times["mean"]),
@@ -225,8 +225,7 @@ def _needed(answer: Mapping[str, Any]) -> dict[str, Any]:
     return dict(answer.get("needs_ms") or answer["frame_time_ms"])
 
 
-def _trust_in(ends: tuple[float | None, float | None], target: float) -> Trust:
-    low, high = ends
+def _trust_in(low: float | None, high: float | None, target: float) -> Trust:
     if low is None or high is None:
         return Trust(False, ("computed, with an unknown error",))
     if low < target <= high:

@@ -15,7 +15,9 @@ import re
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,7 +31,7 @@ PICTURE_S, PICTURES_A_SECOND, PICTURE_SIZE = 6.0, 5, (960, 600)
 RUN: Final = ("run", "--frames", "120", "--baseline", "30", "--check", "2")
 PLACE: Final = "runs/first"
 VERDICT_LINES: Final = 7
-COLOURS: Final = 64
+COLOURS: Final = 128
 SETTLES_MS: Final = 5000
 BLOCK: Final = r"(<!-- {name}: written by make readme -->\n)(.*?)(<!-- end of {name} -->)"
 
@@ -42,12 +44,14 @@ def block(text: str, name: str) -> str:
     return str(found[0][1])
 
 
+def _marked(name: str, content: str) -> str:
+    return f"<!-- {name}: written by make readme -->\n{content}<!-- end of {name} -->"
+
+
 def filled(text: str, contents: dict[str, str]) -> str:
     """`text` with the content of each block."""
     for name, content in contents.items():
-        block(text, name)
-        pattern = BLOCK.format(name=re.escape(name))
-        text = re.sub(pattern, lambda found, new=content: f"{found[1]}{new}{found[3]}", text, flags=re.DOTALL)
+        text = text.replace(_marked(name, block(text, name)), _marked(name, content))
     return text
 
 
@@ -57,10 +61,11 @@ def claim() -> str:
     rows = re.findall(r"^\| `\w+` \| (\d+) \| (\d+) % \|", page, re.MULTILINE)
     errors, count = [int(error) for _, error in rows], sum(int(count) for count, _ in rows)
     networks = re.findall(r"latencies of (\d+) networks", page)[0]
+    how = "[how, and where it is worse](docs/predict.md#how-far-off-it-is)"
     return (
         f"Latencies of networks on Snapdragon chips are predicted to within **{min(errors)} to {max(errors)} % in the "
-        f"median**,\nagainst {count} published rows of {networks} networks. Each row is predicted by a fit that has not "
-        "seen its network\n([how, and where it is worse](docs/predict.md#how-far-off-it-is)).\n"
+        f"median**,\nagainst {count} published rows of {networks} networks. "
+        f"Each row is predicted by a fit that has not seen its network\n({how}).\n"
     )
 
 
@@ -106,7 +111,7 @@ def film(folder: str) -> None:
     from playwright.sync_api import sync_playwright
 
     command = [sys.executable, "-m", "trilane", "dashboard", folder]
-    shots: list[Image.Image] = []
+    shots: list[tuple[float, Image.Image]] = []
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as served, sync_playwright() as driver:
         try:
             assert served.stderr is not None
@@ -118,14 +123,18 @@ def film(folder: str) -> None:
             page.wait_for_timeout(SETTLES_MS)
             page.locator("#seek").fill("0")
             page.locator("#seek-play").click()
-            for _ in range(round(PICTURE_S * PICTURES_A_SECOND)):
+            begin_s = time.monotonic()
+            while time.monotonic() < begin_s + PICTURE_S:
                 page.wait_for_timeout(1000 / PICTURES_A_SECOND)
                 picture = Image.open(io.BytesIO(page.screenshot())).convert("RGB").resize(PICTURE_SIZE)
-                shots.append(picture.quantize(COLOURS))
+                shots.append((time.monotonic(), picture.quantize(COLOURS)))
             browser.close()
         finally:
             served.terminate()
-    shots[0].save(PICTURE, save_all=True, append_images=shots[1:], duration=1000 // PICTURES_A_SECOND, loop=0)
+    times = [begin_s, *(at_s for at_s, _ in shots)]
+    lasts_ms = [round(1000 * (after - before)) for before, after in pairwise(times)]
+    first, *rest = (picture for _, picture in shots)
+    first.save(PICTURE, save_all=True, append_images=rest, duration=lasts_ms, loop=0)
 
 
 def recorded() -> dict[str, Any]:
