@@ -2,7 +2,7 @@
 # Arguments of `trilane run` go in ARGS: make run ARGS="--frames 60 --size 192"
 SHELL := /bin/bash
 .DELETE_ON_ERROR:
-.PHONY: run test test-all test-rest explore test-machines test-device results setup format clean
+.PHONY: run test test-all test-rest explore test-machines test-device results readme setup format clean
 
 BIN := .venv/bin
 
@@ -47,6 +47,11 @@ results: .venv/ready-all
 	  --csv docs/results/report.csv
 	if [ -d ../shared/data/chips ]; then \
 	  $(BIN)/trilane profiles fit-chips ../shared/data/chips --table docs/predict.md --plot docs/images/chip-errors.png; fi
+
+# The figures and outputs in README.md, from a run, predictions and committed results; the picture of the dashboard too.
+# Some minutes in which the machine should do nothing else. A test holds that they are as written.
+readme: .venv/ready-all
+	PYTHONPATH=tests $(BIN)/python tests/support/readme.py --measured
 
 setup: .venv/ready-run
 

@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.apps.explain.explained_run import COLUMNS, explain_run, figure_names, job_rows, open_journal
-from trilane.apps.explain.reasons import bound_text
 from trilane.apps.predict.predict_options import OF_A_PIPELINE_ALONE, PredictOptions
 from trilane.apps.run.asked_run import run_asked
 from trilane.apps.run.report import Report, read_report
+from trilane.apps.run.verdict import Verdict
+from trilane.apps.run.verdict_facts import predicted_verdict, verdict_of
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
 from trilane.figure_sources import COMPUTED, MEASURED, NO_FIGURES
 from trilane.options import Options
@@ -62,7 +63,12 @@ class Run:
         self.folder, self.report = folder, report
 
     def __repr__(self) -> str:
-        return f"<Run {self.folder}: {self.report.frames.presented} frames, {self.report.frame_time_ms.mean:.2f} ms>"
+        return f"Run {self.folder}\n{self.verdict}"
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """The verdict: whether the run holds its rate, what bounds it, whether its machine was quiet, what to try."""
+        return verdict_of(self.report, str(self.folder))
 
     def _repr_html_(self) -> str:
         return run_html(self.report, str(self.folder))
@@ -200,7 +206,7 @@ def _signature(
 run.__signature__ = _signature(run, RunOptions, RunOptions.model_fields, DEFAULTS)  # type: ignore[attr-defined]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Prediction:
     """A hardware profile's prediction for an application or a network; every figure is computed.
 
@@ -236,10 +242,18 @@ class Prediction:
         found: Mapping[str, Any] = self.document.get("units", {})
         return found
 
+    def __repr__(self) -> str:
+        return f"{self.what} on {self.profile}\n{self.verdict}"
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """The verdict: whether the rate is held on the chip, what bounds it, how sure that is, what to try."""
+        return predicted_verdict(self.document)
+
     def _repr_html_(self) -> str:
         busy = ", ".join(f"{unit} {row['busy']:.0%}" for unit, row in self.units.items())
         around = "" if self.low_ms is None else f" (80 %: {self.low_ms:.2f} to {self.high_ms:.2f})"
-        rows = {
+        rows = dict(self.verdict.lines()) | {
             "frame time": f"{self.frame_ms:.2f} ms{around}",
             "rate": f"{self.fps:.1f} frames a second{', as the display shows them' if self.is_display_capped else ''}",
             "latency": "" if self.latency_ms is None else f"{self.latency_ms:.1f} ms",
@@ -306,8 +320,9 @@ def table(title: str, rows: Iterable[Row]) -> str:
 
 
 def run_html(report: Report, folder: str) -> str:
-    """Write the figures of a run that people ask for first, its speed with the machine and the avatar's error."""
-    return table(f"Run {folder}", _run_rows(report))
+    """Write the verdict and the figures of a run that people ask for first, with the machine and the avatar's error."""
+    verdict = [(label, text, "") for label, text in verdict_of(report, folder).lines()]
+    return table(f"Run {folder}", [*verdict, *_run_rows(report)])
 
 
 def _run_rows(report: Report) -> Iterable[Row]:
@@ -323,8 +338,6 @@ def _run_rows(report: Report) -> Iterable[Row]:
     yield "latency", f"p50 {latency.p50:.1f} ms, p95 {latency.p95:.1f} ms", measured
     counts = f"{frames.presented} presented, {frames.lost} lost, {sum(frames.dropped.values())} dropped"
     yield "frames", counts + (f", {frames.not_begun} not begun" if frames.not_begun else ""), measured
-    if report.bound is not None:
-        yield "bound", bound_text(report.bound.model_dump()), measured
     for unit, shares in report.units.items():
         idle = ", ".join(f"{cause} {share:.0%}" for cause, share in shares.idle if share)
         yield unit, f"busy {shares.busy:.0%}; {idle}", measured

@@ -438,6 +438,12 @@ class Budget:
         low, high = (None, None) if half is None else (max(share - half, 0.0), min(share + half, 1.0))
         return {"name": name, "share": share, "share_low": low, "share_high": high}
 
+    def shares(self, name_of: Mapping[Part, str]) -> dict[str, float]:
+        """Return the share of each name in the path, the largest first."""
+        total = sum(self.ns_of.values())
+        sums = _by_name(self.ns_of, name_of)
+        return {name: ns / total for name, ns in sorted(sums.items(), key=lambda row: -row[1])}
+
     def _half_width(self, name_of: Mapping[Part, str], name: str, other: str = "") -> float | None:
         """Return half the interval of a share, or of its difference from the share of `other`."""
         blocks = [(_by_name(block, name_of), max(sum(block.values()), 1)) for block in self._blocks]

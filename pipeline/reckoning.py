@@ -160,6 +160,7 @@ def _bound(budget: Budget, unit_of: Mapping[str, str], slowed: Slowed | None) ->
             bound[kind] = {**budget.share(names[kind], name), **_costs_most(of, name)}
         if any((path[kind] or {}).get("name") != bound[kind]["name"] for kind in costs):
             bound["path"] = path
+    bound["stages"] = budget.shares(names["stage"])
     if slowed is not None:
         bound["slowed"] = {
             "by": SLOWER,

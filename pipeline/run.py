@@ -124,7 +124,7 @@ def run_pipeline(
     frame that would be late is given less work (`trilane.scheduler.work_ladder`), and the first stage is told
     (`SteppedStage`).
     `follow`: names of the stages whose time follows the work.
-    `settings`: all that the scheduler is asked, in place of `frames` and of the options above.
+    `settings`: all that the scheduler is asked, in place of `frames` and of the options above but `fps`.
     `requests`: queue through which others ask for frames, at most `frames`; it is closed when this returns.
     `controls`: queue of what others ask of the run, closed when this returns. At the run's end, the frames that it has
     released count as requested.
@@ -147,7 +147,7 @@ def run_pipeline(
         settings = _stepped(_settings(policy, frames, fps, pace_fps, hang_ns, latch_ms, requests), works, follow)
         target_ns = 0 if settings.deadline_ns else round(NS_PER_S / fps)
     else:
-        target_ns = 0 if settings.deadline_ns else settings.period_ns
+        target_ns = 0 if settings.deadline_ns else settings.period_ns or round(NS_PER_S / fps)
     if not pipeline.graph().is_chain and (settings.latch_ns or settings.works or requests is not None):
         expected = "a chain of stages, or none of latching, a ladder of work and requests for frames"
         raise BadInputError("the run's settings", "a pipeline with stages that have a list of inputs", expected)

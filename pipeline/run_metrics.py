@@ -380,10 +380,12 @@ class Bound(PathShares):
     `unit`: the unit; its name is the report's `bottleneck`.
     `stage`: the stage; null where no stage bounded the run.
     `path`: what has most of the path; absent where it has the same names.
+    `stages`: share of each stage in the path, the largest first; absent in reports of an older Trilane.
     `slowed`: what slowing each stage costs; absent where the run was not replayed.
     """
 
     path: PathShares | None = None
+    stages: dict[str, float] = Field(default={})
     slowed: Slowed | None = None
 
 

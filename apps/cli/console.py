@@ -11,14 +11,19 @@ import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from textwrap import wrap
 from typing import IO, TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.text import Text
 
 #: C0, DEL and C1, as Python writes them.
 #: Most messages of a run that are shown at its end.
 MOST_SHOWN = 5
+INDENT = 6  # letters before the text of a verdict's line
+#: Colours of the first word of a verdict.
+STYLES = {"PASS": "bold green", "FAIL": "bold red"}
 _WRITTEN_OUT = {code: repr(chr(code))[1:-1] for code in (*range(0x20), *range(0x7F, 0xA0))}
 
 
@@ -129,6 +134,25 @@ def print_json(document: Mapping[str, Any]) -> None:
     """Print `document` as JSON on stdout. Raises ValueError for NaN and infinities, which JSON cannot hold."""
     sys.stdout.write(json.dumps(document, indent=1, allow_nan=False) + "\n")
     sys.stdout.flush()
+
+
+def verdict_text(lines: Iterable[Sequence[str]], width: int) -> Text:
+    """Return the lines of a verdict, each a label and a text; a long line continues below its own text."""
+    from rich.text import Text
+
+    found = Text()
+    for label, said in lines:
+        first, *rest = wrap(without_controls(said), width - INDENT, break_long_words=False, break_on_hyphens=False)
+        found.append(f"{label:<{INDENT}}", STYLES.get(label, "bold"))
+        found.append("\n".join([first, *(" " * INDENT + each for each in rest)]) + "\n")
+    found.rstrip()
+    return found
+
+
+def print_verdict(lines: Iterable[Sequence[str]]) -> None:
+    """Print the lines of a verdict on stdout."""
+    console = stdout_console()
+    console.print(verdict_text(lines, console.width), soft_wrap=True)
 
 
 def print_facts(facts: Mapping[str, Any], as_json: bool) -> None:

@@ -20,6 +20,7 @@ from trilane.apps.cli.commands import (
 )
 from trilane.apps.cli.console import (
     print_json,
+    print_verdict,
     shown_messages,
     spinner,
     stderr_console,
@@ -276,6 +277,9 @@ def _explain_folder(folder: Path, slowest: int, jobs: Path | None, as_json: bool
 
 def _show_run(document: Mapping[str, Any]) -> None:
     console = stdout_console()
+    if document["verdict"] and not document["remark"]:
+        print_verdict(document["verdict"]["lines"])
+        console.print()
     for line in _head(document):
         console.print(line, soft_wrap=True, markup=False)
     if not document["budget"]:

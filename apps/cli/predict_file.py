@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from trilane.apps.cli.console import print_json, say, spinner, stdout_console, without_controls
+from trilane.apps.cli.console import print_json, print_verdict, say, spinner, stdout_console, without_controls
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -43,6 +43,7 @@ def predict_pipeline_file(options: PredictOptions, path: Path, as_json: bool) ->
 
 
 def _show(console: Console, answer: Mapping[str, Any]) -> None:
+    print_verdict(answer["verdict"]["lines"])
     frame, latency, frames, needs = (answer[key] for key in ("frame_time_ms", "latency_ms", "frames", "needs_ms"))
     if rate := answer.get("rate"):
         console.print(rate["sentence"])

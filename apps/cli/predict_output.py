@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from trilane.apps.cli.console import print_json, stdout_console
+from trilane.apps.cli.console import print_json, print_verdict, stdout_console
 from trilane.units import BURST, SUSTAINED
 
 if TYPE_CHECKING:
@@ -125,6 +125,7 @@ def _print_bare(console: Console, answer: dict[str, Any], minutes: float) -> Non
     console.print(
         f"{Path(answer['file']).name} on the {answer['unit']} in {answer['precision']}{under}{said}: {_size(answer)}"
     )
+    print_verdict(answer["verdict"]["lines"])
     if minutes:
         _print_settled(console, answer, minutes)
     span = _span(answer["low_ms"], answer["high_ms"], ".2f", " ms")
@@ -212,6 +213,7 @@ def show_answer(answer: dict[str, Any], as_json: bool) -> None:
         print_json(answer)
         return
     console = stdout_console()
+    print_verdict(answer["verdict"]["lines"])
     _print_network(console, answer)
     _print_times(console, answer)
     if answer["temperature_c"]:

@@ -27,7 +27,7 @@ Examples:
   trilane report runs prediction.json --json
 """
 SHOWN = (
-    *("name", "frame_ms", "low_ms", "high_ms"),
+    *("name", "verdict", "bound", "trust", "frame_ms", "low_ms", "high_ms"),
     *("psnr_db", "worst_psnr_db", "p1_psnr_db", "on_frontier", "error_source"),
 )
 
@@ -85,7 +85,7 @@ def _print(entries: list[Entry], rows: list[dict[str, Any]]) -> None:
     from rich.text import Text
 
     times, errors = ("frame, ms", "from, ms", "to, ms"), ("PSNR, dB", "worst", "1st pct.")
-    table = Table("entry", *times, *errors, "frontier", "where the error comes from")
+    table = Table("entry", "verdict", "bound", "trust", *times, *errors, "frontier", "where the error comes from")
     for row in rows:
         table.add_row(*(Text(_shown(row[key])) for key in SHOWN))
     stdout_console().print(table)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from trilane.apps.cli.commands import Commands, JsonOption, PortOption, with_options
-from trilane.apps.cli.console import print_json, shown_messages, stderr_console, stdout_console
+from trilane.apps.cli.console import print_json, print_verdict, shown_messages, stderr_console, stdout_console
 from trilane.errors import BadInputError
 from trilane.stages.run_options import RunOptions
 
@@ -44,6 +44,9 @@ Examples:
   trilane run myscene.toml --background street.mp4 --policy sequential
 """
 
+TableOption = Annotated[
+    bool, typer.Option("--table", help="Print the table of all figures below the verdict (docs/report.md).")
+]
 DashboardOption = Annotated[
     bool, typer.Option("--dashboard", help="Show the run in a browser; without --frames it runs until Ctrl-C.")
 ]
@@ -75,10 +78,16 @@ def _hooks() -> Iterator[Hooks]:
 @app.command(epilog=EPILOG)
 @with_options(RunOptions)
 def run(
-    options: RunOptions, *, dashboard: DashboardOption = False, port: PortOption = None, as_json: JsonOption = False
+    options: RunOptions,
+    *,
+    dashboard: DashboardOption = False,
+    port: PortOption = None,
+    table: TableOption = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Run a scene on the three units and write a run folder.
+    """Run a scene on the three units, write a run folder and print a verdict.
 
+    The verdict says whether the run holds its rate, what bounds it, and whether the machine was quiet.
     The folder holds report.json, video.mp4, contact.png, trace.pftrace (open it at ui.perfetto.dev), events.jsonl and
     journal.msgpack, which is written while the run goes on.
     docs/report.md explains every key, the policies and the edges.
@@ -99,10 +108,10 @@ def run(
         if dashboard:
             raise BadInputError("options", "--dashboard with a pipeline file", "one of them", "`trilane dashboard RUN`")
         outcome = run_file(options, _hooks, command)
-        _print_outcome(outcome, as_json)
+        _print_outcome(outcome, as_json, table)
         raise typer.Exit(outcome.exit_code)
     outcome = _run_live(options, command, port) if dashboard else run_asked(options, _hooks, command)
-    _print_outcome(outcome, as_json)
+    _print_outcome(outcome, as_json, table)
     raise typer.Exit(outcome.exit_code)
 
 
@@ -117,15 +126,19 @@ def _run_live(options: RunOptions, command: tuple[str, ...], port: int | None) -
     )
 
 
-def _print_outcome(outcome: RunOutcome, as_json: bool) -> None:
-    """Print the report or its table on stdout; the folder, and why a run failed, on stderr."""
-    from trilane.apps.cli.run_table import run_table
+def _print_outcome(outcome: RunOutcome, as_json: bool, with_table: bool) -> None:
+    """Print the report or its verdict on stdout; the folder, and why a run failed, on stderr."""
+    from trilane.apps.run.verdict_facts import verdict_of
 
     report = outcome.report
     if as_json:
         print_json(report.as_json())
     else:
-        stdout_console().print(run_table(report))
+        print_verdict(verdict_of(report, str(outcome.folder)).lines())
+        if with_table:
+            from trilane.apps.cli.run_table import run_table
+
+            stdout_console().print(run_table(report))
     stderr_console().print(f"run folder: {outcome.folder}", soft_wrap=True, markup=False)
     for message in shown_messages(report.messages, report.failure):
         stderr_console().print(f"in the run: {message}", soft_wrap=True, markup=False)

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
+from trilane.apps.cli.console import verdict_text
 from trilane.apps.cli.run_table import DASH, NEEDED, TOO_FEW, accuracy_line
-from trilane.apps.explain.reasons import bound_text
 from trilane.apps.watch.figures import MomentFigures, Moved, UnitFigures
 from trilane.apps.watch.followed_run import RunState
 from trilane.apps.watch.live_figures import LEAST, RunLook
@@ -29,20 +29,28 @@ ENDINGS = {
     RunState.KILLED: "killed: its process is gone, and the last line is as far as its journal goes",
     RunState.REMOVED: "removed: it ended before any frame, and its folder is gone",
 }
+NO_VERDICT = "no verdict: fewer than two frames were presented"
 PERCENTILES = ("p50", "p90", "p95", "p99")
 MIB = 1 << 20
 
 
-def screen(look: RunLook) -> Group:
-    """Return everything, for a terminal."""
+def screen(look: RunLook, width: int) -> Group:
+    """Return everything, for a terminal of `width` columns."""
     from rich.console import Group
     from rich.text import Text
 
     figures = look.figures
     lines = [f"note at {note.t_ms / 1000:.1f} s: {note.text}" for note in figures.notes]
     below = "\n".join([*lines, *errors(figures), _sources(figures), FEW.strip()])
+    verdict = verdict_text(figures.verdict["lines"], width) if figures.verdict else Text(NO_VERDICT)
     return Group(
-        Text(_title(look)), _units(figures), _times(figures), _stages(figures), Text(_frames(figures)), Text(below)
+        Text(_title(look)),
+        verdict,
+        _units(figures),
+        _times(figures),
+        _stages(figures),
+        Text(_frames(figures)),
+        Text(below),
     )
 
 
@@ -55,6 +63,7 @@ def line(look: RunLook) -> str:
     frames = figures.frames
     parts = (
         f"{figures.t_ms / 1000:.1f} s",
+        _passed(figures),
         _rate(look),
         f"frame {_three(figures.frame_time_ms)}",
         f"latency {_three(figures.latency_ms)}",
@@ -66,6 +75,10 @@ def line(look: RunLook) -> str:
         _short_error(figures),
     )
     return "; ".join(part for part in parts if part)
+
+
+def _passed(figures: MomentFigures) -> str:
+    return "" if figures.verdict is None else str(figures.verdict["lines"][0][0])
 
 
 def heading(look: RunLook) -> str:
@@ -98,15 +111,7 @@ def _title(look: RunLook) -> str:
         rate = (
             f"{_rate(look)} in the last {figures.window_s:.1f} s, {figures.run_fps:.1f} between the first and the last"
         )
-    # a small terminal cuts off what stands below
-    return f"run {look.name}: {look.state}, {over}; {rate}\navatars: {_short_error(figures)}\n{_bound(look)}"
-
-
-def _bound(look: RunLook) -> str:
-    """Say what bounds the run, or bounded it."""
-    so_far = " so far" if look.state is RunState.GOES_ON else ""
-    bound = look.figures.bound
-    return f"bound{so_far}: {'not known' if bound is None else bound_text(bound)}"
+    return f"run {look.name}: {look.state}, {over}; {rate}"
 
 
 def _rate(look: RunLook) -> str:

@@ -129,9 +129,9 @@ def _show(first: RunLook, rest: Iterator[RunLook]) -> None:
             sys.stdout.flush()
             written = said
         return
-    with Live(screen(first), console=console, auto_refresh=False) as live:
+    with Live(screen(first, console.width), console=console, auto_refresh=False) as live:
         for look in rest:
-            live.update(screen(look), refresh=True)
+            live.update(screen(look, console.width), refresh=True)
 
 
 @app.command(epilog=EPILOG_DASHBOARD)

@@ -55,6 +55,7 @@ EXPECTED = "a run folder, a sweep's folder, a prediction that was saved with --j
 MOST = 10_000
 FIGURES = (
     *("frame_ms", "low_ms", "high_ms", "frames_per_s", "latency_ms"),
+    *("verdict", "bound", "trust"),
     *("psnr_db", "worst_psnr_db", "p1_psnr_db", "on_frontier"),
 )
 SOURCES = ("speed_source", "interval", "error_source", "shows", "clock", "machine", "failure", "command")
@@ -152,8 +153,10 @@ class Entry:
     mean frame time and its interval, None where there is none. `psnr_db`: error, a mean over the frames.
     `worst_psnr_db`, `p1_psnr_db`: worst frame and 1st percentile of a run's own frames. `error_source`: origin of the
     error, or why there is none. `facts`: facts of the machine. `video`: video of a run. `failure`: why there are no
-    figures. `interval`: what the interval holds. `error_of`: `OF_RUN` and its reference, `OF_AVATAR`, or empty.
-    `shows`: what the pictures show. `within`: name of the folder that holds the run, or of its sweep.
+    figures. `verdict`: PASS or FAIL at its rate, empty where none is known. `bound`: the unit and the stages that the
+    verdict names. `trust`: "sure", or UNSURE. `interval`: what the interval holds. `error_of`: `OF_RUN` and its
+    reference, `OF_AVATAR`, or empty. `shows`: what the pictures show. `within`: name of the folder that holds the run,
+    or of its sweep.
     """
 
     name: str
@@ -177,6 +180,9 @@ class Entry:
     error_of: str = ""
     shows: str = ""
     within: str = ""
+    verdict: str = ""
+    bound: str = ""
+    trust: str = ""
 
     @property
     def speed_source(self) -> str:
@@ -219,10 +225,22 @@ def entry_of(
         facts=machine,
         video=video if video is not None and video.is_file() else None,
         failure=_text(document.get("failure") or ""),
+        **_verdict(_mapping(document, "verdict")),
         interval="" if low is None else BY_SCATTER if "mean_low" in times else BY_MODEL,
         error_of=error_of,
         shows=_shows(_mapping(config, "scene")),
     )
+
+
+def _verdict(verdict: Mapping[str, Any]) -> dict[str, str]:
+    """Return the words of a report's or a prediction's `verdict`; empty where a document has none."""
+    if not verdict:
+        return {}
+    bound = _mapping(verdict, "bound")
+    named = f"{bound.get('unit')}: {' + '.join(map(str, _sequence(bound.get('stages'))))}" if bound else ""
+    passed = f"{'PASS' if verdict.get('pass') is True else 'FAIL'} at {_number(verdict.get('target_fps')) or 0:g} fps"
+    trust = "sure" if verdict.get("trusted") is True else "UNSURE"
+    return {"verdict": _text(passed), "bound": _text(named), "trust": trust}
 
 
 def _interval(times: Mapping[str, Any]) -> tuple[float | None, float | None]:

@@ -30,7 +30,9 @@ MEANING = (
     "own frames; of a prediction 80 %, by the model. PSNR is the error of the picture, larger is better, a mean "
     "over frames, beside the worst one and the 1st percentile, which tell what the mean hides. The frontier "
     "holds what nobody beats in both on the same clock and machine, with the same scene and the same kind of error. An "
-    "entry without a known error is in the table and on no frontier."
+    "entry without a known error is in the table and on no frontier. The verdict says whether an entry holds its rate, "
+    "the bound what limits it; UNSURE is a run beside other programs, on a hot or changing processor, or a prediction "
+    "whose interval holds the rate."
 )
 WIDTH, HEIGHT = 720, 400
 LEFT, RIGHT, TOP, BOTTOM = 64, 16, 16, 48

@@ -38,7 +38,7 @@ class RunFacts:
     `name`: name of the run folder. `clock`: host or virtual. `machine`: line for people.
     `fps`, `output` (width, height): rate and size of the scene. `config`: value in force of each control.
     `plan`, `placement`, `accuracy`: as in report.json, with `notes` beside the plan. `bound`: as in report.json, with
-    the efficiencies, for a finished run.
+    the efficiencies, for a finished run. `verdict`: that of a finished run, with its lines.
     """
 
     name: str
@@ -52,6 +52,7 @@ class RunFacts:
     placement: Mapping[str, Any] | None
     accuracy: Mapping[str, Any]
     bound: Mapping[str, Any] | None = None
+    verdict: Mapping[str, Any] | None = None
 
     @classmethod
     def of_row(cls, row: Mapping[str, Any]) -> RunFacts:
@@ -73,6 +74,7 @@ class RunFacts:
     def state(self, state: str, why: str = "") -> dict[str, Any]:
         """Return the message that says what the run does, and under what configuration."""
         facts = {"plan": self.plan, "placement": self.placement, "accuracy": self.accuracy, "bound": self.bound}
+        facts["verdict"] = self.verdict
         return {"type": "state", "is": state, "why": why, "config": self.config, **facts}
 
 
@@ -125,6 +127,8 @@ def facts_of_checked(name: str, checked: Checked, options: RunOptions, machine: 
 
 def facts_of_report(name: str, report: Report) -> RunFacts:
     """Return the facts in the report of a finished run."""
+    from trilane.apps.run.verdict_facts import verdict_of
+
     document = report.as_json()
     scene = document["config"]["scene"]
     caps = document["caps"]
@@ -140,6 +144,7 @@ def facts_of_report(name: str, report: Report) -> RunFacts:
         document.get("placement"),
         document.get("accuracy", {}),
         {key: document.get(key) for key in BOUND} if report.bound is not None else None,
+        verdict_of(report, name).shown(),
     )
 
 

@@ -17,6 +17,7 @@ from typing import Any, Final
 from trilane.apps.explain.joins import Joins
 from trilane.apps.explain.reasons import MOST_SAMPLES, Shown, SlowFrames, Usual, advice, notes, reasons
 from trilane.apps.run.report import Report, read_report
+from trilane.apps.run.verdict_facts import verdict_of
 from trilane.apps.watch.followed_run import CUT_OFF, FollowedRun, RunState
 from trilane.errors import BadInputError, MissingPartError
 from trilane.figure_sources import COMPUTED, MEASURED
@@ -83,11 +84,11 @@ class RunExplanation:
     """Takes the records of a journal after the first; `document` is the explanation.
 
     `begun`: first record of the journal. `report`: report of the run, None while it goes on. `slowest`: number of
-    frames to name.
+    frames to name. `name`: the run's folder.
     """
 
-    def __init__(self, begun: Begun, report: Report | None, slowest: int) -> None:
-        self._begun, self._report, self._places = begun, report, places_of(begun)
+    def __init__(self, begun: Begun, report: Report | None, slowest: int, name: str = "") -> None:
+        self._begun, self._report, self._places, self._name = begun, report, places_of(begun), name
         self._timeline = Timeline(begun.graph, begun.settings, waits=True)
         self._reckoning = Reckoning(begun.graph, begun.settings, self._places, self._timeline)
         self._slow = SlowFrames(begun.graph, self._reckoning.paths, self._reckoning.sharing, slowest)
@@ -132,6 +133,7 @@ class RunExplanation:
             "schema": SCHEMA,
             "clock": clock,
             **self._of_run(),
+            "verdict": None if self._report is None else verdict_of(self._report, self._name).shown(),
             "frames": self._frames,
             "frame_ms": frame_ms,
             **figures,
@@ -205,7 +207,7 @@ def explain_run(folder: Path, slowest: int = 10) -> dict[str, Any]:
     """
     report = read_report(folder) if (folder / "report.json").exists() else None  # there is none while a run goes on
     begun, records = open_journal(folder)
-    explanation, is_whole = RunExplanation(begun, report, slowest), False
+    explanation, is_whole = RunExplanation(begun, report, slowest, str(folder)), False
     for record in records:
         explanation.add(record)
         is_whole = isinstance(record, Ended)

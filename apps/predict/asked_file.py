@@ -13,6 +13,7 @@ from typing import Any, Final
 from trilane.apps.check.port_types import port_types, read_networks
 from trilane.apps.explain.explained_run import open_journal
 from trilane.apps.predict.predict_options import PredictOptions
+from trilane.apps.run.verdict_facts import predicted_verdict
 from trilane.hw_profiles.graph_file import GraphFile
 from trilane.hw_profiles.network_time import Computes
 from trilane.hw_profiles.pipeline_prediction import Measured, predict_file, prices_of
@@ -99,4 +100,5 @@ def _answer(
         return chips.chip_for(stage, graph, unit)
 
     prices = prices_of(file, graphs, chip_for, options.cap, measured)
-    return {"what_if": text, **predict_file(file, prices, options.frames or 0, options.seed)}
+    answer = predict_file(file, prices, options.frames or 0, options.seed)
+    return {"what_if": text, **answer, "verdict": predicted_verdict(answer).shown()}

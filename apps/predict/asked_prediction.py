@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from trilane.apps.predict.predict_options import PredictOptions
+from trilane.apps.run.verdict_facts import predicted_verdict
 from trilane.errors import BadInputError
 from trilane.units import HOST, INFER, UnitName
 
@@ -46,7 +47,7 @@ def predict_networks(
 
                 used = with_file(used, graph, shapes, say)
             answers.append(predict_network(used, graph, unit, *over))
-    return answers
+    return [answer | {"verdict": predicted_verdict(answer).shown()} for answer in answers]
 
 
 def application_of(
@@ -105,4 +106,4 @@ def answer_of(chip: Profile, plan: Plan, options: PredictOptions) -> dict[str, A
     answer = predictions.predict(chip, plan, cap, options.minutes, options.governor, wanted)
     if options.what_if:
         answer["alternatives"] = predictions.what_if(chip, plan.network, plan.runtime, cap, wanted.fps)
-    return answer
+    return answer | {"verdict": predicted_verdict(answer).shown()}

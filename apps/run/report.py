@@ -249,6 +249,30 @@ class Resolution(Record):
     loss_source: str
 
 
+class VerdictBound(Record):
+    """What bounds the frame time. `unit`: the report's `bottleneck`. `stages`: the stage that bounds, then the unit's
+    others with a noticeable part of the critical path. `share`: the unit's share of that path.
+    """
+
+    unit: str
+    stages: tuple[str, ...]
+    share: float
+
+
+class VerdictFacts(Record):
+    """Whether the run holds its rate (`trilane.apps.run.verdict`).
+
+    `passed`: `pass` in the file. `target_fps`: rate that it has to hold, in frames a second.
+    `bound`: null without a path. `trusted`: whether its machine let it be measured. `why`: the reasons in one line.
+    """
+
+    passed: bool = Field(alias="pass")
+    target_fps: float
+    bound: VerdictBound | None
+    trusted: bool
+    why: str
+
+
 OptionValue = str | int | float | bool | tuple[str, ...] | None
 
 
@@ -274,6 +298,7 @@ class Preamble(Record):
 class Report(RunMetrics, Preamble):
     """The whole document: the keys of `Preamble`, the other keys of `RunMetrics`, and these.
 
+    `verdict`: whether the run holds its rate, what bounds it, and whether it can be trusted; absent in older reports.
     `made`: time, command line and Trilane of the run; null where a program ran it.
     `options`: every option of the run by its name, as it was asked for; empty where another Trilane left them out.
     `pids`: process of each unit at the end.
@@ -296,6 +321,7 @@ class Report(RunMetrics, Preamble):
 
     caps: Caps
     temperature_c: Temperature
+    verdict: VerdictFacts | None = None
     made: Made | None = None
     options: dict[str, OptionValue] = Field(default={})
     pids: dict[str, int]

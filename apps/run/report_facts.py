@@ -10,6 +10,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from trilane.apps.run.report import SCHEMA, Report, Resolution, TensorSize
+from trilane.apps.run.verdict import judged
+from trilane.apps.run.verdict_facts import facts_of
 from trilane.avatars.validation import SizeLoss
 from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
 from trilane.machine import here
@@ -46,6 +48,7 @@ SOURCES = {
     "startup_ms": MEASURED,
     "figures": MEASURED,
     "baseline": MEASURED,
+    "verdict": COMPUTED,
     "placement": COMPUTED,
     "placement.times": MEASURED,
     "resolution": MEASURED,
@@ -110,6 +113,8 @@ def report_of(
         "baseline": baseline and _compared(baseline.report),
         **facts,
     }
+    verdict = judged(facts_of(Report.model_validate(document).as_json()))
+    document["verdict"] = verdict.as_json()
     return Report.model_validate(document | {"sources": sources_of(document)})
 
 

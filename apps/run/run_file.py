@@ -106,6 +106,7 @@ def _run(asked: _Asked, folder: RunFolder, told: Hooks, starter: UnitStarter) ->
         result = run_pipeline(
             asked.pipeline,
             asked.settings.frames,
+            fps=asked.config["scene"]["fps"],
             settings=asked.settings,
             journal=JournalFile(folder.work / journal.NAME, facts, sensors),
             starter=starter,

@@ -135,6 +135,7 @@ class MomentFigures:
     `temperature_c`, `duty`: last values by place and by unit. `memory_bytes`: memory of the processes, by unit.
     `notes`: the last few messages.
     `bound`: what bounds the run so far, as in report.json; null before 63 frames, and where it is not looked for.
+    `verdict`: keys of report.json, with `lines` for people; of the run so far while it goes on. Null without times.
     `frame_times`, `latencies`: times of the whole run.
     `began_at`: UTC, ISO 8601; "" where the journal does not say.
     `accuracy`: by avatar, as in report.json; empty where the journal does not say.
@@ -159,6 +160,7 @@ class MomentFigures:
     memory_bytes: Mapping[str, float]
     notes: tuple[Note, ...]
     bound: Mapping[str, Any] | None
+    verdict: Mapping[str, Any] | None
     frame_times: Histogram
     latencies: Histogram
     began_at: str

@@ -10,8 +10,13 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from trilane.apps.run.report import read_report
+from trilane.apps.run.verdict import judged
+from trilane.apps.run.verdict_facts import facts_of, target_fps, verdict_of
 from trilane.apps.watch.figures import (
     DropCount,
     FrameFigures,
@@ -26,7 +31,18 @@ from trilane.apps.watch.figures import (
 from trilane.apps.watch.followed_run import EXPECTED, NO_RECORD, FollowedRun, RunState
 from trilane.errors import BadInputError
 from trilane.figure_sources import COMPUTED, MEASURED
-from trilane.pipeline.journal import Accounted, Begun, Counted, Ended, Record, Said, Sampled, Stepped, Worked
+from trilane.pipeline.journal import (
+    Accounted,
+    Begun,
+    Counted,
+    Ended,
+    Record,
+    Said,
+    Sampled,
+    Stepped,
+    Worked,
+    config_of,
+)
 from trilane.pipeline.reckoning import Reckoning, places_of
 from trilane.pipeline.timeline import EndedJob, ExplainedJob, Presented, Timeline
 from trilane.pipeline.unit_history import BUSY, IDLE_CAUSES, JOIN, NAMES, OVERHEAD, PREEMPTED
@@ -69,7 +85,10 @@ class LiveFigures:
         self._graph, self._facts, self._settings = begun.graph, begun.facts, begun.settings
         self._timeline = line = Timeline(begun.graph, begun.settings, waits=finds_bound)
         self._reckoning = Reckoning(begun.graph, begun.settings, places_of(begun), line) if finds_bound else None
+        self._begun = begun
         self._bound: Mapping[str, Any] | None = None
+        self._report: Mapping[str, Any] | None = None
+        self._late, self._target_ns = 0, NS_PER_S / target_fps({"config": config_of(begun)})
         self._first_ns: int | None = None
         self._last_ns = 0
         self._finished_ns = NEVER
@@ -130,7 +149,7 @@ class LiveFigures:
         clock = str(self._facts.get("clock", ""))
         state = state or (RunState.FINISHED if self._is_over else RunState.GOES_ON)
         goes_on = state is RunState.GOES_ON and not self._is_over
-        return MomentFigures(
+        figures = MomentFigures(
             t_ms=self._since_first_ms(now_ns),
             window_s=window_s,
             run_s=(now_ns - start_ns) / NS_PER_S,
@@ -149,12 +168,35 @@ class LiveFigures:
             memory_bytes=self._values(MEMORY),
             notes=tuple(self._notes),
             bound=self._bound or (self._reckoning.bound if self._reckoning is not None else None),
+            verdict=None,
             frame_times=self._frame_times.now(),
             latencies=self._latencies.now(),
             began_at=str(self._facts.get("began_at", "")),
             accuracy=dict(self._facts.get("accuracy") or {}),
             sources=self._sources(clock),
         )
+        return replace(figures, verdict=self._verdict(figures) if self._timeline.presented > 1 else None)
+
+    def _verdict(self, figures: MomentFigures) -> dict[str, Any]:
+        """Return the verdict of the run so far; of one that is over by the figures of its last record."""
+        document = self._report or {
+            "clock": figures.clock,
+            "policy": self._settings.policy,
+            "frames": {
+                "presented": figures.frames.presented,
+                "lost": sum(figures.frames.lost.values()),
+                "dropped": {f"{drop.edge}:{drop.cause}": drop.frames for drop in figures.frames.dropped},
+            },
+            "fps": figures.run_fps,
+            "deadline_misses": self._late,
+            "frame_time_ms": figures.frame_time_ms,
+            "latency_ms": figures.latency_ms,
+            "bound": figures.bound,
+            "stages": {stage.name: {"unit": stage.unit} for stage in self._graph.stages},
+            "units": {name: asdict(unit.run) for name, unit in figures.units.items()},
+        }
+        known = {"config": config_of(self._begun), "accuracy": figures.accuracy}
+        return judged(facts_of({**document, **known}, goes_on=self._report is None)).shown()
 
     # records
 
@@ -178,6 +220,11 @@ class LiveFigures:
             self._frame_times.add(presented.interval_ns)
         if presented.latency_ns is not None:
             self._latencies.add(presented.latency_ns)
+        deadline_ns = self._settings.deadline_ns
+        if deadline_ns:
+            self._late += presented.end_ns > presented.release_ns + deadline_ns
+        elif presented.interval_ns is not None:
+            self._late += presented.interval_ns > self._target_ns
         self._recent.append(presented)
         while self._recent[0].end_ns < presented.end_ns - WINDOW_NS:
             self._recent.popleft()
@@ -202,7 +249,7 @@ class LiveFigures:
 
     def _add_end(self, ended: Ended) -> None:
         self._last_ns = max(self._last_ns, ended.now_ns)
-        self._is_over, self._bound = True, ended.report.get("bound")
+        self._is_over, self._bound, self._report = True, ended.report.get("bound"), ended.report
 
     # figures
 
@@ -278,12 +325,20 @@ def looks(run: FollowedRun, pause: Callable[[], None]) -> Generator[RunLook]:
             elif figures is not None:
                 figures.add(record)
         if figures is not None:
-            yield RunLook(run.name, state, figures.now(figures.last_ns + run.silent_ns, state))
+            now = figures.now(figures.last_ns + run.silent_ns, state)
+            yield RunLook(run.name, state, _as_reported(now, run.folder) if state is RunState.FINISHED else now)
         elif state is not RunState.GOES_ON:
             raise BadInputError(run.folder, NO_RECORD, EXPECTED)
         if state is not RunState.GOES_ON or (figures is not None and figures.is_over):
             return
         pause()
+
+
+def _as_reported(figures: MomentFigures, folder: Path) -> MomentFigures:
+    """Return the figures with the verdict of the run's report, which knows more than the journal."""
+    if not (folder / "report.json").is_file():
+        return figures
+    return replace(figures, verdict=verdict_of(read_report(folder), str(folder)).shown())
 
 
 class _Span(NamedTuple):

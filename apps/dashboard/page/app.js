@@ -13,6 +13,7 @@ import {
   showSpeed,
   showStages,
   showUnits,
+  showVerdict,
 } from "./panels.js";
 import { causePattern } from "./patterns.js";
 import { openInPerfetto } from "./perfetto.js";
@@ -151,7 +152,10 @@ function showFigures(figures) {
   showStages(figures, run.edges ?? []);
   showDrops(figures);
   showSources(figures);
-  if (!isReported) showBound(figures.bound);
+  if (!isReported) {
+    showBound(figures.bound);
+    showVerdict(figures.verdict);
+  }
 }
 
 // Of a run that goes on as far as it is known, of one that is over as its report has it.
@@ -175,6 +179,7 @@ function stated(message) {
   if ("placement" in message) showFacts(byId("placement"), message.placement);
   isReported = Boolean(message.bound);
   if (isReported) showBound(message.bound);
+  if (message.verdict) showVerdict(message.verdict);
 }
 
 function noted(message) {

@@ -51,6 +51,21 @@ export function showSpeed(figures, accuracy) {
   setText(byId("presented-rest"), `presented; ${lost} lost · ${dropped} dropped · ${rest}`);
 }
 
+// The verdict's lines, as every view of a run has them. A sign beside PASS or FAIL, not its colour alone.
+export function showVerdict(verdict) {
+  const lines = verdict?.lines ?? [];
+  byId("no-verdict").hidden = lines.length > 0;
+  const home = byId("verdict");
+  while (home.children.length > lines.length) home.lastElementChild.remove();
+  while (home.children.length < lines.length) home.append(element("div", {}, element("dt"), element("dd")));
+  lines.forEach(([label, text], place) => {
+    const [term, said] = home.children[place].children;
+    setText(term, label);
+    setText(said, text);
+    home.children[place].dataset.is = label;
+  });
+}
+
 function total(counts) {
   return Object.values(counts ?? {}).reduce((sum, count) => sum + count, 0);
 }

@@ -19,6 +19,8 @@ from support.run_report import make_report
 from support.told_journal import told_journal
 from trilane.apps.cli import watch as cli_top
 from trilane.apps.cli.top_view import line, screen
+from trilane.apps.run.report import Report
+from trilane.apps.run.verdict_facts import verdict_of
 from trilane.apps.watch.followed_run import RunState
 from trilane.apps.watch.live_figures import LiveFigures, RunLook
 from trilane.pipeline.journal import NAME, Counted, Ended, JournalWriter, Record, Stepped
@@ -59,20 +61,23 @@ def test_a_finished_run_is_a_line_where_stdout_is_no_terminal(command: Command, 
 
 def test_the_screen(check_printed: Check) -> None:
     console = Console(file=io.StringIO(), width=120)
-    console.print(screen(RunLook("walk", RunState.FINISHED, FIGURES.now())))
+    console.print(screen(RunLook("walk", RunState.FINISHED, FIGURES.now()), 120))
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert text.count("█") == round(20 * 40 / 90) + round(20 * 20 / 90)  # of 20, by the busy shares of u and v
     check_printed("top-screen", text)
 
 
-def test_what_bounds_the_run_is_named() -> None:
-    figures = replace(FIGURES.now(), bound=make_report()["bound"])
-    named = "dsp 82% of the path (78% to 86%), and of stages most infer 44% of the path"
-    for state, said in ((RunState.GOES_ON, f"bound so far: {named}"), (RunState.KILLED, f"bound: {named}")):
+def test_the_verdict_stands_first_and_in_the_line() -> None:
+    """The bound of the verdict is that of the line: dsp, with 82 % of the path."""
+    verdict = verdict_of(Report.model_validate(make_report()), "runs/walk").shown()
+    figures = replace(FIGURES.now(), bound=make_report()["bound"], verdict=verdict)
+    for state in (RunState.GOES_ON, RunState.KILLED):
         console, look = Console(file=io.StringIO(), width=120), RunLook("walk", state, figures)
-        console.print(screen(look))
-        assert console.file.getvalue().splitlines()[2].rstrip() == said  # type: ignore[attr-defined]
-        assert "; bound dsp 82%; " in line(look)
+        console.print(screen(look, 120))
+        shown = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+        assert shown[1].startswith("PASS  50 fps, at 30 fps 0 of 2 frames late")
+        assert shown[3].startswith("BOUND dsp: infer 8.8 of 20.0 ms on the critical path (82 %)")
+        assert "; PASS; " in line(look) and "; bound dsp 82%; " in line(look)
     assert "bound" not in line(RunLook("walk", RunState.KILLED, FIGURES.now()))
 
 

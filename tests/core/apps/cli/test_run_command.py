@@ -95,7 +95,11 @@ def test_options_arrive_as_they_were_given(
 
 def test_the_table_or_the_document_and_where_the_run_is(runs: Runs, command: Command) -> None:
     out, err = command("run")
-    assert "Scene test: 640x480, tensor size 256" in out
+    assert out.startswith("PASS  50 fps, at 30 fps 0 of 2 frames late\n")
+    assert "Scene test" not in out
+    table = command("run", "--table")[0]
+    assert table.startswith(out)
+    assert "Scene test: 640x480, tensor size 256" in table
     assert err.splitlines() == ["[red] is no markup", "run folder: place"]
     document = json.loads(command("run", "--json")[0])
     assert document == json.loads(json.dumps(Report.model_validate(runs.report).as_json()))
@@ -104,7 +108,7 @@ def test_the_table_or_the_document_and_where_the_run_is(runs: Runs, command: Com
 def test_a_failed_run_says_why_and_ends_with_its_code(runs: Runs, command: Command) -> None:
     runs.report["failure"], runs.exit_code = "the unit [gpu] is gone", 3
     out, err = command("run", code=3)
-    assert "frames per second" in out
+    assert out.startswith("FAIL  the run ended early: the unit [gpu] is gone\n")
     assert err.splitlines()[1:] == ["run folder: place", "the run failed: the unit [gpu] is gone"]
 
 

@@ -1,0 +1,278 @@
+"""The verdict of a run or a prediction: does it hold its rate, what limits it, can it be trusted, what to try.
+
+Rule: pure, and the only place that judges. report.json, the end of `trilane run`, `explain`, `top`, the dashboard,
+notebooks, predictions and pages show what stands here. `trilane.apps.run.verdict_facts` makes the facts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+from trilane.apps.run.trust import Trust
+from trilane.scheduler.stats import samples_needed
+
+#: Frames a second that a run has to hold where neither an option nor its scene or file says a rate.
+TARGET_FPS: Final = 30.0
+#: Share of the frames that may be late, dropped or lost in a run that passes: 99 of 100 frames are in time.
+MOST_LATE: Final = 0.01
+#: Share of a unit's time from which a cause of idle time is named.
+LEAST_NAMED: Final = 0.05
+MOST_CAUSES: Final = 2
+MOST_TRIES: Final = 3
+LABELS: Final = ("PASS", "FAIL")
+UNKNOWN: Final = "not known"
+#: What figures are of that are not a finished run's.
+SO_FAR, COMPUTED = "so far", "computed"
+#: Names of the path that are no unit's -> what they mean to a person.
+MEANINGS: Final = {
+    "release": "no frame was released yet: frames come no more often than was asked for",
+    "other programs": "no job of this run had the core",
+    "overhead": "messages and hand-overs",
+    "held": "the policy or the order of frames",
+}
+
+
+class Rate(NamedTuple):
+    """Frames a second, with the bounds of an interval that holds `share` of the probability; None without one."""
+
+    fps: float
+    low: float | None = None
+    high: float | None = None
+    share: str = "95 %"
+
+
+class Lateness(NamedTuple):
+    """How many frames were not in time.
+
+    `due`: number of frames that had to be in time. `late`: number of those that came late. `dropped`, `lost`: numbers
+    of those that never came.
+    """
+
+    due: int
+    late: int
+    dropped: int = 0
+    lost: int = 0
+
+    @property
+    def missed(self) -> int:
+        return self.late + self.dropped + self.lost
+
+
+class Bound(NamedTuple):
+    """What bounds the frame time, as the report's `bound` names it.
+
+    `unit`: the unit, or what the path was instead. `stages`: the stage that bounds, then the unit's others; to each its
+    ms on the critical path, None where that is not known. `share`: the unit's share of the path. `cost`: growth of the
+    frame time when its jobs take 20 % longer, None where the path alone names the bound. `rivals`: units that may bound
+    as much. `of_unit`: stages of `unit`. `path`: the name that has most of the path, "" where it is `unit`.
+    """
+
+    unit: str
+    stages: Mapping[str, float | None]
+    share: float
+    cost: float | None = None
+    rivals: Sequence[str] = ()
+    of_unit: frozenset[str] = frozenset()
+    path: str = ""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a verdict rests on.
+
+    `rate`: rate, None for fewer than two frames. `target_fps`: rate to hold. `is_held_to_rate`: whether frames came at
+    the target's rate, so the rate itself says nothing. `lateness`: None where frames have no times.
+    `failure`: why the run ended early. `frame_ms`: mean time of a frame. `slow`: name and value of the highest
+    percentile that the frames tell, ms. `latency_ms`: mean latency. `alone`: rate and latency of one frame at a time.
+    `idle`: by unit its idle share and the shares of the causes. `image`: error of the picture in words.
+    `tries`: what the numbers say to try, the most useful first. `source`: "" for a run that is over, else what the
+    figures are of.
+    """
+
+    rate: Rate | None
+    target_fps: float
+    lateness: Lateness | None
+    trust: Trust
+    is_held_to_rate: bool = False
+    failure: str = ""
+    frame_ms: float | None = None
+    slow: tuple[str, float] | None = None
+    latency_ms: float | None = None
+    alone: tuple[float, float] | None = None
+    bound: Bound | None = None
+    idle: Mapping[str, tuple[float, Mapping[str, float]]] | None = None
+    image: str = UNKNOWN
+    tries: Sequence[str] = ()
+    source: str = ""
+
+    @property
+    def is_computed(self) -> bool:
+        return self.source == COMPUTED
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The judgement of `facts`. `passed`: whether the rate is held. `why`: the reasons in one line."""
+
+    facts: Facts
+    passed: bool
+    why: str
+
+    def as_json(self) -> dict[str, Any]:
+        """Return `verdict` of report.json."""
+        bound = self.facts.bound
+        return {
+            "pass": self.passed,
+            "target_fps": self.facts.target_fps,
+            "bound": bound and {"unit": bound.unit, "stages": list(bound.stages), "share": bound.share},
+            "trusted": self.facts.trust.trusted,
+            "why": self.why,
+        }
+
+    def lines(self) -> list[tuple[str, str]]:
+        """Return the verdict's lines for people, each with its label."""
+        facts = self.facts
+        found = (
+            (LABELS[not self.passed], _held(facts)),
+            ("TIME", _times(facts)),
+            ("BOUND", _bound(facts)),
+            ("IDLE", _idle(facts)),
+            ("IMAGE", facts.image),
+            ("TRUST", facts.trust.said),
+            ("TRY", "; ".join(facts.tries[:MOST_TRIES])),
+        )
+        return [(label, text) for label, text in found if text]
+
+    def shown(self) -> dict[str, Any]:
+        """Return what a page needs: `as_json`, and the lines for people."""
+        return {**self.as_json(), "lines": [list(line) for line in self.lines()]}
+
+    def __str__(self) -> str:
+        return "\n".join(f"{label:<5} {text}" for label, text in self.lines())
+
+
+def judged(facts: Facts) -> Verdict:
+    """Return the verdict: a run passes if it ended well, held its rate, and 99 of 100 frames were in time.
+
+    The rate counts where frames come as fast as they can. At a rate from outside only the frames in time count.
+    """
+    against = [reason for reason in (_ended(facts), _too_slow(facts), _too_late(facts)) if reason]
+    said = against or [f"{_number(facts.target_fps)} fps are held"]
+    rate = facts.rate
+    if rate and rate.low is not None and rate.high is not None and rate.low < facts.target_fps <= rate.high:
+        said.append(f"the interval of the rate holds {_number(facts.target_fps)} fps, so another run may differ")
+    return Verdict(facts, not against, "; ".join([*said, *facts.trust.reasons]))
+
+
+def _ended(facts: Facts) -> str:
+    if facts.failure:
+        return f"the run failed: {facts.failure}"
+    return "" if facts.rate else "fewer than two frames were presented"
+
+
+def _too_slow(facts: Facts) -> str:
+    if facts.is_held_to_rate or facts.rate is None or facts.rate.fps >= facts.target_fps:
+        return ""
+    return f"{_number(facts.rate.fps)} of {_number(facts.target_fps)} fps"
+
+
+def _too_late(facts: Facts) -> str:
+    found = facts.lateness
+    if found is None or found.missed <= MOST_LATE * found.due:
+        return ""
+    return f"{_late(found)} at {_number(facts.target_fps)} fps"
+
+
+def _late(found: Lateness) -> str:
+    rest = "".join(f", {count} {what}" for what, count in (("dropped", found.dropped), ("lost", found.lost)) if count)
+    return f"{found.late} of {found.due} frames late{rest}"
+
+
+def _held(facts: Facts) -> str:
+    """Return the rate beside what is asked for, such as `96 fps (92 to 102), at 30 fps 0 of 299 frames late`."""
+    target = f"at {_number(facts.target_fps)} fps"
+    late = f"{target} {_late(facts.lateness)}" if facts.lateness else f"asked for {_number(facts.target_fps)} fps"
+    if facts.failure:
+        return f"the run ended early: {facts.failure}"
+    if facts.rate is None:
+        return "fewer than two frames were presented"
+    around = ""
+    if facts.rate.low is not None and facts.rate.high is not None:
+        share = "" if facts.rate.share == Rate._field_defaults["share"] else f", {facts.rate.share}"
+        around = f" ({_number(facts.rate.low)} to {_number(facts.rate.high)}{share})"
+    source = f" {facts.source}" if facts.source else ""
+    return f"{_number(facts.rate.fps)} fps{around}{source}, {late}"
+
+
+def _times(facts: Facts) -> str:
+    if facts.rate is None or facts.frame_ms is None:
+        return ""
+    slow = f" ({facts.slow[0]} {_ms(facts.slow[1])})" if facts.slow else ""
+    latency = f", latency {_number(facts.latency_ms)} ms" if facts.latency_ms is not None else ""
+    alone = f"; one at a time: {_number(facts.alone[0])} fps, {_number(facts.alone[1])} ms" if facts.alone else ""
+    return f"{_ms(facts.frame_ms)} ms a frame{slow}{latency}{alone}"
+
+
+def _bound(facts: Facts) -> str:
+    """Return what bounds the frame time, with its ms on the critical path and what it costs when it is slower."""
+    bound = facts.bound
+    if bound is None:
+        return UNKNOWN
+    where = "a frame" if facts.is_computed else "on the critical path"
+    of_path = f"of {_ms(facts.frame_ms)} ms {where}" if facts.frame_ms else "of the critical path"
+    part = f"{_ms(bound.share * facts.frame_ms)} " if facts.frame_ms else ""
+    parts = [f"{bound.unit}: {_stages(bound, is_own=True) or part}{of_path} ({_percent(bound.share)})"]
+    if bound.unit in MEANINGS:
+        parts.append(MEANINGS[bound.unit])
+    if bound.cost is not None:
+        parts.append(f"20 % slower, it costs {_percent(bound.cost)}")
+    if bound.rivals:
+        parts.append(f"perhaps {' or '.join(bound.rivals)}")
+    if others := _stages(bound, is_own=False):
+        parts.append(f"of stages most {others.rstrip()}")
+    if bound.path:
+        parts.append(f"most of the path is {bound.path}")
+    return "; ".join(parts)
+
+
+def _stages(bound: Bound, *, is_own: bool) -> str:
+    """Return the stages of the bound's unit, or those of other units, with their ms; a space stands behind."""
+    rows = [(stage, ms) for stage, ms in bound.stages.items() if (stage in bound.of_unit) == is_own]
+    said = " + ".join(stage if ms is None else f"{stage} {_ms(ms)}" for stage, ms in rows)
+    return f"{said} " if said else ""
+
+
+def _ms(value: float) -> str:
+    return f"{value:.2f}" if value < 1 else f"{value:.1f}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"
+
+
+def _idle(facts: Facts) -> str:
+    return ", ".join(_idle_of(unit, *row) for unit, row in (facts.idle or {}).items())
+
+
+def _idle_of(unit: str, share: float, causes: Mapping[str, float]) -> str:
+    named = [cause for cause, part in sorted(causes.items(), key=lambda row: -row[1]) if part >= LEAST_NAMED]
+    why = f" ({', '.join(named[:MOST_CAUSES])})" if named else ""
+    return f"{unit} {_percent(share)}{why}"
+
+
+def slow_percentile(times: Mapping[str, Any]) -> tuple[str, float] | None:
+    """Return name and value of the highest percentile that the samples of `times` tell; else the maximum."""
+    samples = times.get("samples")
+    for name in ("p99", "p95", "p90"):
+        if times.get(name) is not None and (samples is None or samples >= samples_needed(int(name[1:]) / 100)):
+            return name, times[name]
+    return ("max", times["max"]) if times.get("max") is not None else None
+
+
+def _number(value: float | None) -> str:
+    """Return three digits, such as `96.2`, `4.42` and `30`; more in front of the point where there are more."""
+    if value is None:
+        return UNKNOWN
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"

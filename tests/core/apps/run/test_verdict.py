@@ -1,0 +1,155 @@
+"""Verdicts: what passes, by hand; the same bound wherever it is said, in 20 runs; advice that the numbers support."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from support.run_folders import write_run
+from support.run_report import TIMES, make_report
+from trilane.apps.dashboard.finished_view import FinishedView
+from trilane.apps.explain.explained_run import explain_run
+from trilane.apps.interface import load_run
+from trilane.apps.run.report import Report, read_report
+from trilane.apps.run.trust import Trust
+from trilane.apps.run.verdict import Facts, Lateness, Rate, judged
+from trilane.apps.run.verdict_facts import predicted_verdict, verdict_of
+from trilane.apps.watch.followed_run import FollowedRun
+from trilane.apps.watch.live_figures import looks
+from trilane.pipeline.journal import records_of
+from trilane.pipeline.reckoning import reckoned
+from trilane.scheduler.events import Graph, Settings, chain
+from trilane.scheduler.places import Place
+from trilane.scheduler.policy import run_settings
+from trilane.scheduler.virtual import simulate
+
+QUIET = Trust(True, ("quiet machine (other programs 0.4 %)",))
+FAST = Facts(Rate(96.0, 92.0, 102.0), 30.0, Lateness(299, 0), QUIET, frame_ms=10.4)
+US = 1000
+
+
+@pytest.mark.parametrize(
+    ("change", "passed", "why"),
+    [
+        ({}, True, "30 fps are held"),
+        ({"rate": Rate(30.0)}, True, "30 fps are held"),
+        ({"rate": Rate(29.5)}, False, "29.5 of 30 fps"),
+        ({"rate": Rate(31.0, 29.0, 33.0)}, True, "the interval of the rate holds 30 fps, so another run may differ"),
+        ({"rate": Rate(29.9), "is_held_to_rate": True}, True, "30 fps are held"),
+        ({"lateness": Lateness(300, 3)}, True, "30 fps are held"),  # 1 % of them
+        ({"lateness": Lateness(300, 4)}, False, "4 of 300 frames late at 30 fps"),
+        ({"lateness": Lateness(300, 1, 2, 1)}, False, "1 of 300 frames late, 2 dropped, 1 lost at 30 fps"),
+        ({"failure": "gpu is gone"}, False, "the run failed: gpu is gone"),
+        ({"rate": None, "lateness": None}, False, "fewer than two frames were presented"),
+        ({"target_fps": 60.0}, True, "60 fps are held"),
+        ({"target_fps": 97.0}, False, "96 of 97 fps"),
+    ],
+)
+def test_what_passes(change: dict[str, Any], passed: bool, why: str) -> None:
+    verdict = judged(replace(FAST, **change))
+    assert (verdict.passed, verdict.as_json()["pass"]) == (passed, passed)
+    assert why in verdict.why.split("; ")
+    assert verdict.why.endswith("quiet machine (other programs 0.4 %)")
+    assert verdict.lines()[0][0] == ("PASS" if passed else "FAIL")
+
+
+def test_a_machine_that_is_not_quiet_does_not_change_what_passes_but_is_said() -> None:
+    verdict = verdict_of(Report.model_validate(make_report(other_programs=0.27)), "runs/a")
+    lines = dict(verdict.lines())
+    assert (verdict.passed, verdict.as_json()["trusted"]) == (True, False)
+    assert lines["TRUST"] == "UNSURE: other programs took 27 % of its cores"
+    assert lines["TRY"] == "end other programs (27 %) and run again; trilane explain runs/a"
+
+
+def report_of(**changes: Any) -> Report:
+    return Report.model_validate(make_report(other_programs=0.004, **changes))
+
+
+def test_advice_follows_from_the_numbers() -> None:
+    """The stage that bounds a slow run; a later pose where a frame alone is quick; more work where time is left."""
+    slow = report_of(fps=20.0, deadline_misses=2)
+    assert dict(verdict_of(slow, "r").lines())["TRY"].startswith("infer: a smaller --size, or another --runtime; ")
+    two = {unit: make_report()["units"]["dsp"] for unit in ("dsp", "x")}
+    alone = report_of(fps=20.0, policy="sequential", units=two)
+    assert dict(verdict_of(alone, "r").lines())["TRY"].startswith("--policy pipelined: ")
+    baseline = {**make_report()["baseline"], "latency_ms": {**TIMES, "mean": 9.9}}
+    assert "--latch 3" in dict(verdict_of(report_of(baseline=baseline), "r").lines())["TRY"]
+    quick = verdict_of(report_of(fps=90.0), "r")
+    assert "a larger --output: 67 % of each frame's time is left" in dict(quick.lines())["TRY"]
+
+
+def test_a_prediction_is_sure_where_its_interval_is_on_one_side() -> None:
+    """66.7 fps, 50 to 100: above 30 and below 120, but 60 lies within."""
+    stages = {"a": {"unit": "u", "service_ms": {"mean": 9.0}}, "b": {"unit": "v", "service_ms": {"mean": 12.0}}}
+    answer = {"frame_time_ms": {"mean": 15.0, "low": 10.0, "high": 20.0}, "stages": stages}
+    for fps, passed, trusted in ((30, True, True), (60, True, False), (120, False, True)):
+        found = predicted_verdict({**answer, "config": {"fps": fps}}).as_json()
+        assert (found["pass"], found["trusted"]) == (passed, trusted)
+        assert found["bound"] == {"unit": "v", "stages": ["b"], "share": 0.8}
+
+
+#: A pipeline like the avatar's, whose stages have units of their own or share them.
+UNIT_OF = {"pose": "cpu", "raster": "gpu", "infer": "dsp", "composite": "gpu", "present": "cpu"}
+SCENES = {
+    "network": {"pose": 200, "raster": 900, "infer": 2600, "composite": 800, "present": 500},
+    "picture": {"pose": 200, "raster": 1300, "infer": 1500, "composite": 2400, "present": 900},
+    "encoder": {"pose": 1500, "raster": 700, "infer": 1600, "composite": 700, "present": 3600},
+    "even": {"pose": 1000, "raster": 1000, "infer": 2000, "composite": 1000, "present": 1000},
+}
+HELD = ("infer", "composite", "present")
+PLACES = {"cpu": Place((0,), 1), "gpu": Place((1,), 1), "dsp": Place((2,), 1)}
+RUNS = [
+    *((scene, policy, "") for scene in SCENES for policy in ("pipelined", "sequential")),
+    *((scene, "pipelined", held) for scene in SCENES for held in HELD),
+]
+
+
+def test_there_are_20_runs() -> None:
+    assert len(set(RUNS)) == 20
+
+
+@pytest.mark.parametrize(("scene", "policy", "held"), RUNS)
+def test_the_bound_is_the_same_wherever_it_is_said(scene: str, policy: str, held: str, tmp_path: Path) -> None:
+    """report.json, `explain`, `top`, the dashboard and Python; a stage held 30 % longer is named where it has most.
+
+    On cores of their own the unit with the most work bounds a pipelined run, and its longest stage is in that unit.
+    """
+    times = {name: us * (13 if name == held else 10) // 10 for name, us in SCENES[scene].items()}
+    graph: Graph = chain(UNIT_OF.items(), "double", "composite")
+    settings: Settings = run_settings(policy, 130, 1_000_000 // 30 * US)
+    run = simulate(graph, settings, lambda stage, *_: times[stage] * US, keep=True)
+    assert run.recording is not None
+    figures = reckoned(graph, settings, PLACES, records_of(run.recording, run.jobs)).figures
+    folder = write_run(tmp_path / "run", run, cores={unit: place.cores for unit, place in PLACES.items()})
+    rows = {name: {**make_report()["stages"]["infer"], "unit": unit} for name, unit in UNIT_OF.items()}
+    report = make_report(**figures, stages=rows, other_programs=0.0)
+    report["config"]["scene"] |= {"fps": 30, "avatars": [{"bundle": "default"}]}
+    verdict = verdict_of(Report.model_validate(report)).as_json()
+    (folder / "report.json").write_text(json.dumps(report | {"verdict": verdict}), encoding="utf-8")
+
+    own = read_report(folder)
+    assert own.verdict is not None and own.verdict.bound is not None
+    bound = own.verdict.bound.as_json()
+    assert (bound["unit"], bound["stages"][0]) == (figures["bottleneck"], figures["bound"]["stage"]["name"])
+    explained = explain_run(folder)
+    assert (explained["bottleneck"], explained["bound"]["stage"]["name"]) == (bound["unit"], bound["stages"][0])
+    (look,) = looks(FollowedRun(folder), lambda: None)
+    view = FinishedView(folder)
+    states = [message for message in view.greeting() if message["type"] == "state"]
+    view.close()
+    shown = (explained["verdict"], look.figures.verdict, states[0]["verdict"], load_run(folder).verdict.as_json())
+    assert [dict(each or {})["bound"] for each in shown] == [bound] * 4
+    assert {json.dumps(each["lines"][2]) for each in shown[:3] if each} == {
+        json.dumps(list(load_run(folder).verdict.lines()[2]))
+    }
+    if policy == "pipelined":
+        by_unit = {unit: sum(us for name, us in times.items() if UNIT_OF[name] == unit) for unit in PLACES}
+        full = [unit for unit, us in by_unit.items() if us == max(by_unit.values())]
+        if held and UNIT_OF[held] in full and len(full) == 1:
+            assert bound["unit"] == UNIT_OF[held]
+            longest = max((name for name in times if UNIT_OF[name] == bound["unit"]), key=times.__getitem__)
+            assert bound["stages"][0] == longest
