@@ -311,7 +311,14 @@ def _plain(console: Any, left: int, whole: int) -> Callable[[Mapping[str, Any]],
 def _line(record: Mapping[str, Any]) -> str:
     took = "" if record["seconds"] is None else f" in {record['seconds']:.1f} s"
     why = f": {record['error']}" if record["error"] else ""
-    return f"{record['status']} {_words(record['options'])}{took}{why}"
+    return f"{record['status']} {_words(record['options'])}{took}{why}{_disturbed(record)}"
+
+
+def _disturbed(record: Mapping[str, Any]) -> str:
+    """Return how often a trial was done again, and why its result is not to be trusted still."""
+    times = record.get("repeated", 0)
+    again = f"; done again {times} {'time' if times == 1 else 'times'}, as the machine was not quiet" if times else ""
+    return again + "".join(f"; UNSURE: {reason}" for reason in record.get("unsure", [])[:1])
 
 
 def _words(options: Mapping[str, Any]) -> str:
@@ -343,6 +350,10 @@ def print_summary(document: Mapping[str, Any], definition: Definition, records: 
     counts = document["counts"]
     text = ", ".join(f"{counts[key]} {key}" for key in ("trials", "done", "failed", "lost", "skipped"))
     stdout_console().print(f"{text}; {document['clock']} clock", markup=False)
+    if again := [row for row in document["trials"] if row.get("repeated")]:
+        unsure = sum(bool(row["unsure"]) for row in again)
+        text = f"the machine was not quiet: runs done again: {len(again)}, UNSURE still: {unsure}"
+        stdout_console().print(text, soft_wrap=True, markup=False)
     errors = Counter((row["status"], row["error"]) for row in document["trials"] if row["error"])
     for (status, error), count in errors.items():
         stdout_console().print(f"{count} {status}: {error}", soft_wrap=True, markup=False)

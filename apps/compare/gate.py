@@ -18,7 +18,7 @@ from math import expm1, inf, log1p, sqrt
 from typing import Any, Final, NamedTuple
 
 from trilane.apps.compare.comparison import change_of, interval_of, name_of, spoilt
-from trilane.apps.compare.difference import Difference, rejected, student_quantile, student_tails
+from trilane.apps.compare.difference import ALPHA, Difference, rejected, student_quantile, student_tails
 from trilane.apps.compare.rows import (
     DROPPED,
     FRAME_TIME,
@@ -35,8 +35,6 @@ from trilane.apps.compare.run_frames import CPU, INSTRUCTIONS
 from trilane.apps.compare.sides import Change, Side
 from trilane.errors import BadInputError, did_you_mean
 
-#: Probability of a false alarm of all limits of one call together, at most: one side of a 95 % interval.
-FALSE_ALARMS: Final = 0.025
 #: Runs of each side up to which it is computed how many would tell.
 MOST_RUNS: Final = 200
 PERCENT, DECIBELS = "%", "dB"
@@ -217,16 +215,13 @@ def judge(gates: Sequence[Gate], pairs: Sequence[Pair]) -> list[Judged]:
     """Judge every limit for every pair. All figures are tested together, so that they raise few false alarms."""
     asked = [(gate, pair, list(_weighed(gate, pair))) for pair in pairs for gate in gates]
     every = [each for _, _, figures in asked for each in figures if each.row.deviation]
-    surely = {id(each) for each, falls in zip(every, _rejected(every), strict=True) if falls}
+    fallen = rejected([each.probability for each in every])
+    surely = {id(each) for each, falls in zip(every, fallen, strict=True) if falls}
     found = []
     for gate, pair, figures in asked:
         settled = tuple(_settled(each, id(each) in surely, len(every), pair) for each in figures)
         found.append(_judged(gate, pair, settled))
     return found
-
-
-def _rejected(every: Sequence[Weighed]) -> list[bool]:
-    return rejected([each.probability for each in every], FALSE_ALARMS)
 
 
 def _weighed(gate: Gate, pair: Pair) -> Iterator[Weighed]:
@@ -283,7 +278,7 @@ def runs_needed(each: Weighed, sizes: tuple[int, int], tests: int) -> float | No
         deviation, freedom = of_one * sqrt(2 / runs), known + 2 * (runs - 1)
         if each.most + student_quantile(freedom) * deviation <= each.limit:
             return runs
-        if each.least > 0 and student_tails(each.least / deviation, freedom) / 2 <= FALSE_ALARMS / tests:
+        if each.least > 0 and student_tails(each.least / deviation, freedom) / 2 <= ALPHA / tests:
             return runs
     return inf
 

@@ -7,10 +7,11 @@ scatter from run to run is that of any run on the host clock.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from math import sqrt
 from pathlib import Path
-from statistics import fmean, stdev
+from statistics import stdev
 from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -23,35 +24,50 @@ EXPECTED: Final = "what `trilane times --json` printed"
 WALL: Final = "wall"
 #: Unit that imported stages stand on; nothing is known of it.
 UNIT: Final = "imported"
-Ms = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Ms = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class Measurement(BaseModel):
-    """One measured time. `kind`: such as `run`, `layer` or `wall`. `samples_ms`: every value, where the file has it."""
+    """One measured time.
 
-    model_config = ConfigDict(extra="ignore", frozen=True, strict=False)
+    `kind`: such as `run`, `layer` or `wall`. `count`, `sd_ms`: number and standard deviation of the values.
+    `samples_ms`: every value, where the file has it. `file`: file that it was read from.
+    """
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
 
     name: str = Field(min_length=1)
     kind: str
-    unit: str | None = None
-    count: int | None = Field(default=None, ge=1)
-    mean_ms: Ms
+    count: int | None = Field(default=None, ge=0)
+    mean_ms: Ms | None = None
+    sd_ms: Ms | None = None
     p50_ms: Ms | None = None
-    p95_ms: Ms | None = None
-    samples_ms: tuple[Ms, ...] | None = None
+    samples_ms: tuple[Ms, ...] = ()
+    file: str = ""
+
+    @property
+    def ms(self) -> float:
+        """The mean, else the median; 0 for a measurement in another unit, such as cycles."""
+        return self.mean_ms or self.p50_ms or 0.0
 
     @property
     def error(self) -> float | None:
-        """Standard error of the mean as a share of it; None where the samples do not show it."""
-        samples = self.samples_ms or ()
-        return stdev(samples) / sqrt(len(samples)) / fmean(samples) if len(samples) > 1 else None
+        """Standard error of the mean as a share of it; None where nothing shows it."""
+        count = len(self.samples_ms) or self.count or 0
+        deviation = stdev(self.samples_ms) if len(self.samples_ms) > 1 else self.sd_ms
+        return None if deviation is None or count < 2 else deviation / sqrt(count) / self.ms
 
 
 def imported(document: Mapping[str, Any], path: Path) -> dict[str, Any]:
     """Return the keys of a report that a comparison reads. Raises BadInputError naming the first wrong key."""
     rows = [_measurement(row, f"{path}: {MEASUREMENTS}.{place}") for place, row in enumerate(document[MEASUREMENTS])]
+    rows = [row for row in rows if row.ms]
     if not rows:
-        raise BadInputError(f"{path}: {MEASUREMENTS}", "none", "one or more", "`trilane times` reads a profile")
+        raise BadInputError(f"{path}: {MEASUREMENTS}", "no time", "one or more", "`trilane times` reads a profile")
+    if len(files := {row.file for row in rows}) > 1:
+        remedy = "give several runs of one kind as A.json,B.json"
+        raise BadInputError(path, f"times of {len(files)} files", "those of one", remedy)
+    rows = _told_apart(rows)
     names = [row.name for row in rows]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise BadInputError(f"{path}: {MEASUREMENTS}", f"{twice!r} twice", "each name once")
@@ -77,6 +93,13 @@ def _measurement(row: Any, where: str) -> Measurement:
         raise BadInputError(f"{where}.{key}".rstrip("."), first["msg"].lower(), EXPECTED) from None
 
 
+def _told_apart(rows: Sequence[Measurement]) -> list[Measurement]:
+    """Return the measurements, with its kind in the name of each whose name another kind has too."""
+    counts = Counter(row.name for row in rows)
+    longer = [row.model_copy(update={"name": f"{row.name} ({row.kind})"}) for row in rows]
+    return [long if counts[row.name] > 1 else row for row, long in zip(rows, longer, strict=True)]
+
+
 def _frames(rows: Sequence[Measurement]) -> Measurement | None:
     """Return the measurement that stands for a frame: the only wall time."""
     found = [row for row in rows if row.kind == WALL]
@@ -84,10 +107,9 @@ def _frames(rows: Sequence[Measurement]) -> Measurement | None:
 
 
 def _times(row: Measurement) -> dict[str, float]:
-    return {"mean": row.mean_ms} | ({} if row.p50_ms is None else {"p50": row.p50_ms})
+    return {"mean": row.ms} | ({} if row.p50_ms is None else {"p50": row.p50_ms})
 
 
 def _deviation(rows: Sequence[Measurement]) -> float | None:
-    """Return the standard error that a comparison takes for every figure: that of the least sure one."""
-    known = [error for row in rows if (error := row.error) is not None]
-    return max(known) if len(known) == len(rows) else None
+    """Return the standard error that a comparison takes for every figure: the largest that is known, None for none."""
+    return max((error for row in rows if (error := row.error) is not None), default=None)

@@ -29,6 +29,7 @@ from typing import Any
 import psutil
 
 from trilane import machine
+from trilane.apps.run.trust import Trust, trust_of
 from trilane.apps.sweep.definition import Trial, TrialClock
 from trilane.apps.sweep.store import SWEEP, Engine, Record
 from trilane.errors import BadInputError, MissingPartError
@@ -38,6 +39,8 @@ from trilane.stages.machine_facts import machine_facts
 PROGRAM = "trilane"
 #: Seconds for a trial to end when asked, before it is killed.
 END_S = 10.0
+#: Times that a run is done again if the machine disturbed it.
+REPEATS = 2
 #: Exit codes of a process that somebody ended: by a signal that its own defects do not cause, or by an interrupt.
 ENDED_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT, -signal.SIGHUP, 130)
 host_facts = cache(machine_facts)
@@ -123,27 +126,63 @@ def _end(processes: list[subprocess.Popen[bytes]]) -> None:
 def perform(trial: Trial, place: TrialPlace, children: Children) -> Record:
     """Do `trial` and return its line of `trials.jsonl` (docs/sweeps.md has the keys).
 
+    A run that the machine disturbed is done again up to `REPEATS` times, and the one that was disturbed least is kept.
     What a lost trial left in the folder is removed. `children`: starts the trial's process.
     """
     began_at, start = machine.here.now().isoformat(timespec="milliseconds"), time.monotonic()
     with tempfile.TemporaryDirectory(prefix="trilane-trial-") as scratch:
         own = (place.folder or Path(scratch)) / trial.id
-        _remove(own)
-        with tempfile.TemporaryFile() as stdout, tempfile.TemporaryFile() as stderr:
-            code = children.run(_command(trial, own, place.program), stdout, stderr, place)
-            out, messages = (_text(file) for file in (stdout, stderr))
-        ended = ended_as(code, out, messages)
-        if ended["status"] == "lost":
-            _remove(own)
+        ended, repeated = _once(trial, own, place, children), 0
+        while repeated < REPEATS and not trust_in(ended).trusted:
+            kept = own.with_name(f"{own.name}.kept")
+            if own.is_dir():
+                own.rename(kept)
+            again, repeated = _once(trial, own, place, children), repeated + 1
+            if again["status"] == "done" and disturbance(again) < disturbance(ended):
+                ended = again
+                shutil.rmtree(kept, ignore_errors=True)
+            elif kept.is_dir():
+                shutil.rmtree(own, ignore_errors=True)
+                kept.rename(own)
+            if again["status"] == "lost":
+                break
+        trust = trust_in(ended)
         has_folder = place.folder is not None and own.is_dir()
     return {
         **about(trial),
         **ended,
+        "repeated": repeated,
+        "unsure": [] if trust.trusted else list(trust.reasons),
         "began_at": began_at,
         "seconds": round(time.monotonic() - start, 3),
         "host": host_facts(),
         "folder": trial.id if has_folder else None,
     }
+
+
+def _once(trial: Trial, own: Path, place: TrialPlace, children: Children) -> Record:
+    """Do `trial` once, with the run folder `own`, and return how it ended."""
+    _remove(own)
+    with tempfile.TemporaryFile() as stdout, tempfile.TemporaryFile() as stderr:
+        code = children.run(_command(trial, own, place.program), stdout, stderr, place)
+        out, messages = (_text(file) for file in (stdout, stderr))
+    ended = ended_as(code, out, messages)
+    if ended["status"] == "lost":
+        _remove(own)
+    return ended
+
+
+def trust_in(ended: Record) -> Trust:
+    """Return whether a trial can be trusted; one that failed, or whose result says nothing of others, is not judged."""
+    result = ended["result"] or {}
+    is_judged = ended["status"] == "done" and "other_programs" in result
+    return trust_of(result) if is_judged else Trust(True, ())
+
+
+def disturbance(ended: Record) -> tuple[bool, float]:
+    """Return how much the machine disturbed a trial: first whether it did, then the share of other programs."""
+    others = (ended["result"] or {}).get("other_programs")
+    return not trust_in(ended).trusted, 1.0 if others is None else others
 
 
 def about(trial: Trial) -> Record:
@@ -183,7 +222,7 @@ def lost(trial: Trial, why: str) -> Record:
     """Return the record of a trial whose worker ended before it could give one."""
     return {
         **about(trial),
-        **{"status": "lost", "exit_code": None, "error": why, "result": None},
+        **{"status": "lost", "exit_code": None, "error": why, "result": None, "repeated": 0, "unsure": []},
         **{"began_at": None, "seconds": None, "host": None, "folder": None},
     }
 

@@ -231,4 +231,6 @@ def row_of(trial: Trial, record: Record | None) -> dict[str, Any]:
         "options": dict(trial.options),
         "repeat": trial.repeat,
         **{key: ended[key] for key in ("status", "exit_code", "error", "seconds")},
+        "repeated": ended.get("repeated", 0),
+        "unsure": ended.get("unsure", []),
     }

@@ -108,6 +108,28 @@ def test_failed_trials_are_kept_and_not_repeated_and_lost_ones_are(tmp_path: Pat
     assert Counter(note["what"] for note in notes(log)) == {"begin": 3, "end": 2}
 
 
+@pytest.mark.parametrize(
+    ("shares", "kept", "calls"),
+    [
+        ("0.02", 0.02, 1),
+        ("0.3,0.04", 0.04, 2),
+        ("0.3,0.1,0.2", 0.1, 3),
+        ("0.1,0.3,0.2", 0.1, 3),
+        ("0.3,0.2,0.01", 0.01, 3),
+    ],
+)
+def test_a_disturbed_run_is_done_again_and_the_least_disturbed_is_kept(
+    tmp_path: Path, log: Path, shares: str, kept: float, calls: int
+) -> None:
+    trial = Trial(("run",), {"n": 1}, ("--others", shares))
+    record = swept(tmp_path / "s", [trial])[trial.id]
+    assert (record["result"]["other_programs"], record["repeated"], record["tries"]) == (kept, calls - 1, 1)
+    assert record["unsure"] == ([] if kept <= 0.05 else ["other programs took 10 % of its cores"])
+    assert (tmp_path / "s" / trial.id / "report.json").read_text() == str(kept)
+    assert sorted(path.name for path in (tmp_path / "s").iterdir() if path.is_dir()) == [trial.id]
+    assert sum(note["what"] == "begin" for note in notes(log)) == calls
+
+
 @pytest.fixture
 def sweep(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
     """Starts the command line, with words besides those of SWEEP; ends it after the test."""

@@ -2,7 +2,8 @@
 
 `SWEEP_TRIAL_LOG` names a file that gets a line when it begins and one when it ends. It takes `SWEEP_TRIAL_WAIT`
 seconds, and ends once `SWEEP_TRIAL_TOGETHER` trials have begun or half a minute has passed. `--code N` ends it with N;
-`--die-once FILE` makes it make FILE and kill itself, unless FILE is there.
+`--die-once FILE` makes it make FILE and kill itself, unless FILE is there. `--others 0.3,0.1` is the share that other
+programs had when it is called first and second.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ def main() -> int:
     for name in ("--die-once", "--out"):
         parser.add_argument(name, type=Path)
     parser.add_argument("--code", type=int, default=0)
+    parser.add_argument("--others", default="")
     asked, other = parser.parse_known_args()
     note("begin", other)
     if asked.out is not None:
@@ -32,10 +34,18 @@ def main() -> int:
     time.sleep(float(os.environ.get("SWEEP_TRIAL_WAIT", "0")))
     wait_for_others(int(os.environ.get("SWEEP_TRIAL_TOGETHER", "1")))
     note("end", other)
-    print(json.dumps({"schema": 1, "words": other, "threads": os.environ.get("OMP_NUM_THREADS")}))
+    others = {"other_programs": share_of(asked.others, asked.out)} if asked.others else {}
+    print(json.dumps({"schema": 1, "words": other, "threads": os.environ.get("OMP_NUM_THREADS"), **others}))
     if asked.code:
         print("before the last line\nerror: as it was asked", file=sys.stderr)
     return int(asked.code)
+
+
+def share_of(shares: str, folder: Path) -> float:
+    """The share of this call, which is kept in the run folder too."""
+    calls = Path(os.environ["SWEEP_TRIAL_LOG"]).read_text().count('"begin"')
+    (folder / "report.json").write_text(shares.split(",")[calls - 1])
+    return float(shares.split(",")[calls - 1])
 
 
 def wait_for_others(count: int) -> None:

@@ -307,6 +307,8 @@ def test_predictions_and_imported_times_are_sides(made: Made, tmp_path: Path, co
     first, same, slow = (saved(tmp_path, f"t{number}.json", times(ms)) for number, ms in enumerate((5.0, 5.0, 10.0)))
     command("compare", first, same, "--fail-if", "slower=5%", code=4)
     command("compare", first, same, "--fail-if", "slower=20%")
+    stated = saved(tmp_path, "stated.json", times(10.0, mean_ms=None, p50_ms=10.0, sd_ms=0.1, samples_ms=[]))
+    command("compare", first, stated, "--fail-if", "slower=5%", code=1)
     out, err = command("compare", first, slow, "--fail-if", "slower=5%", code=1)
     assert "infer takes 100 % longer" in out and "imported times" in " ".join(out.split()) and "service of infer" in err
     out, _ = command("compare", first, made["a"], "--fail-if", "slower=5%", code=1)  # infer takes 9 ms there
@@ -319,8 +321,10 @@ def test_predictions_and_imported_times_are_sides(made: Made, tmp_path: Path, co
         (times(5.0, name="other"), "no time that"),
         (times(5.0, mean_ms=-1), "measurements.0.mean_ms"),
         (times(5.0, samples_ms=[1.0, float("nan")]), "measurements.0.samples_ms.1"),
-        ({"measurements": []}, "measurements: found none"),
-        ({"measurements": [*times(5.0)["measurements"]] * 2}, "'infer' twice"),
+        ({"measurements": []}, "measurements: found no time"),
+        (times(5.0, mean_ms=None, samples_ms=[]), "measurements: found no time"),  # in cycles, say
+        ({"measurements": [row | {"file": name} for name in "ab" for row in times(5.0)["measurements"]]}, "of 2 files"),
+        ({"measurements": [*times(5.0)["measurements"]] * 2}, "'infer (run)' twice"),
         ({"measurements": [7]}, "measurements.0"),
     ],
 )
