@@ -14,6 +14,7 @@ import pytest
 from trilane.apps.cli import predict as cli
 from trilane.apps.cli import predict_output
 from trilane.apps.predict.predict_options import PredictOptions
+from trilane.apps.run.verdict_facts import predicted_verdict
 from trilane.avatars.bundle import load_bundle
 from trilane.hw_profiles import over_time, plot, profile_files, reference_networks
 from trilane.hw_profiles import predict as predictions
@@ -26,6 +27,8 @@ from trilane.units import BURST, SUSTAINED
 Command = Callable[..., tuple[str, str]]
 CHIP = profile_files.load_profile("snapdragon-888").model_copy(update={"name": "chip", "title": "A Chip"})
 
+JUDGED = SimpleNamespace(shown=lambda: {"pass": True})
+
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
@@ -37,6 +40,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
     monkeypatch.setattr(profile_files, "load_runnable", told("profile", CHIP))
     monkeypatch.setattr(predictions, "predict", lambda *given: found.update(predict=given) or {"fps": 12.5})
+    monkeypatch.setattr("trilane.apps.predict.asked_prediction.predicted_verdict", lambda _: JUDGED)
     monkeypatch.setattr(predictions, "what_if", told("what_if", ["alternatives"]))
     monkeypatch.setattr(cli, "draw", told("draw", None))
     monkeypatch.setattr(cli, "show_answer", told("shown", None))
@@ -61,7 +65,7 @@ ASKED: dict[tuple[str, ...], tuple[tuple[Any, ...], dict[str, Any]]] = {
             "profile": ("mine",),
             "what_if": (CHIP, SPEC, "gpu", "power_saver", None),
             "draw": (CHIP, OWN, "power_saver", 2.5, "step_wise", Path("heat.svg")),
-            "shown": ({"fps": 12.5, "alternatives": ["alternatives"]}, True),
+            "shown": ({"fps": 12.5, "alternatives": ["alternatives"], "verdict": JUDGED.shown()}, True),
         },
     ),
     ("--gpu-share", "0.25"): ((replace(USUAL, gpu_share=0.25), SUSTAINED, 0.0, None, NOTHING), {}),
@@ -317,10 +321,15 @@ def everything() -> dict[str, Any]:
 def test_an_answer_is_shown(
     name: str, answer: dict[str, Any], capsys: pytest.CaptureFixture[str], check_printed: Callable[..., None]
 ) -> None:
+    answer = judged(answer)
     predict_output.show_answer(answer, as_json=False)
     check_printed(f"predict-{name}", capsys.readouterr().out)
     predict_output.show_answer(answer, as_json=True)
     assert json.loads(capsys.readouterr().out) == answer
+
+
+def judged(answer: dict[str, Any]) -> dict[str, Any]:
+    return {**answer, "verdict": predicted_verdict(answer).shown()}
 
 
 def a_network(**changes: Any) -> dict[str, Any]:
@@ -346,6 +355,7 @@ def test_networks_are_shown_with_their_ten_most_expensive_operators(
     answers.append(
         a_network(**over, engine_runtime=None, temperature_c=heat, numbers="not said", rate=rate, power_limit=LIMIT)
     )
+    answers = [judged(answer) for answer in answers]
     predict_output.show_networks(CHIP, asked, answers, as_json=False)
     check_printed("predict-networks", capsys.readouterr().out)
     predict_output.show_networks(CHIP, asked, answers, as_json=True)
@@ -363,7 +373,7 @@ def test_networks_are_shown_with_their_ten_most_expensive_operators(
 
 def test_a_limit_below_what_an_idle_device_takes(capsys: pytest.CaptureFixture[str]) -> None:
     limit = {**LIMIT, "fps": 0.0, "low_fps": 0.0, "high_fps": 0.0, "power_w": 3.25}
-    predict_output.show_answer(an_answer(power_limit=limit), as_json=False)
+    predict_output.show_answer(judged(an_answer(power_limit=limit)), as_json=False)
     assert "within 3 W      never: the device takes 3.25 W when no unit works\n" in capsys.readouterr().out
 
 

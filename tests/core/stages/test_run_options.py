@@ -89,7 +89,7 @@ def test_command_line_and_program_have_the_same_options() -> None:
         assert (typed[name].default or ()) == (field.default or ())
         assert programmed.pop(name).default == (0 if name == "baseline_frames" else field.default)
     assert [*programmed] == ["on_progress", "on_message"]
-    assert [*typed][len(RunOptions.model_fields) :] == ["dashboard", "port", "as_json"]
+    assert [*typed][len(RunOptions.model_fields) :] == ["dashboard", "port", "table", "as_json"]
 
 
 def test_an_unknown_option_of_a_program_is_a_type_error() -> None:

@@ -11,7 +11,6 @@ import pytest
 
 from support.run_folders import write_run
 from support.run_report import TIMES, make_report
-from trilane.apps.dashboard.finished_view import FinishedView
 from trilane.apps.explain.explained_run import explain_run
 from trilane.apps.interface import load_run
 from trilane.apps.run.report import Report, read_report
@@ -118,6 +117,9 @@ def test_the_bound_is_the_same_wherever_it_is_said(scene: str, policy: str, held
 
     On cores of their own the unit with the most work bounds a pipelined run, and its longest stage is in that unit.
     """
+    pytest.importorskip("prometheus_client", reason="the extra dashboard is not installed")
+    from trilane.apps.dashboard.finished_view import FinishedView
+
     times = {name: us * (13 if name == held else 10) // 10 for name, us in SCENES[scene].items()}
     graph: Graph = chain(UNIT_OF.items(), "double", "composite")
     settings: Settings = run_settings(policy, 130, 1_000_000 // 30 * US)
