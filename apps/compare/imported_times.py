@@ -1,4 +1,4 @@
-"""Imported times as a side of a comparison: what `trilane times FILE --json` prints, with the keys of a report.
+"""Imported times as a side of a comparison: a JSON file with `measurements`, given the keys of a report.
 
 Rule: each measurement is the time of a job of a stage with its name. So it stands beside a measurement of that name,
 or beside the stage of a run. The only wall time stands for the frame time. Nobody knows the machine's state, so the
@@ -20,7 +20,7 @@ from trilane.errors import BadInputError
 from trilane.units import HOST_CLOCK
 
 MEASUREMENTS: Final = "measurements"
-EXPECTED: Final = "what `trilane times --json` printed"
+EXPECTED: Final = "imported times: JSON with `measurements`, each with `name`, `kind` and `mean_ms`"
 WALL: Final = "wall"
 #: Unit that imported stages stand on; nothing is known of it.
 UNIT: Final = "imported"
@@ -63,7 +63,7 @@ def imported(document: Mapping[str, Any], path: Path) -> dict[str, Any]:
     rows = [_measurement(row, f"{path}: {MEASUREMENTS}.{place}") for place, row in enumerate(document[MEASUREMENTS])]
     rows = [row for row in rows if row.ms]
     if not rows:
-        raise BadInputError(f"{path}: {MEASUREMENTS}", "no time", "one or more", "`trilane times` reads a profile")
+        raise BadInputError(f"{path}: {MEASUREMENTS}", "no time", "one or more", "docs/compare.md has the keys")
     if len(files := {row.file for row in rows}) > 1:
         remedy = "give several runs of one kind as A.json,B.json"
         raise BadInputError(path, f"times of {len(files)} files", "those of one", remedy)

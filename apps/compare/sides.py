@@ -29,7 +29,9 @@ from trilane.pipeline.journal import read_journal
 from trilane.pipeline.reckoning import places_of, reckoned
 from trilane.pipeline.run_metrics import RunMetrics
 
-EXPECTED: Final = "a run folder, its report.json, or what `trilane predict --json` or `trilane times --json` printed"
+EXPECTED: Final = (
+    "a run folder, its report.json, what `trilane predict --json` printed, or a JSON file with `measurements`"
+)
 #: Keys that a prediction of the application has and a report lacks.
 OF_A_PREDICTION: Final = ("expected_error", "network", "frame_time_ms", "units", "stages")
 #: Facts of the first record that a report has too.
