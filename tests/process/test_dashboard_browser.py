@@ -162,7 +162,9 @@ def test_pictures_timeline_and_figures_of_a_live_run(opened: Callable[..., Watch
     with Served(DoubleView()) as served:
         seen = opened(served.url)
         seen.wait_for("() => document.getElementById('picture').dataset.frame > 0")
+        seen.page.locator("#chart-frame-time").scroll_into_view_if_needed(timeout=20000)
         seen.wait_for("() => document.querySelectorAll('#chart-frame-time canvas').length === 1")
+        seen.page.evaluate("() => scrollTo(0, 0)")
         for canvas in ("picture", "timeline"):
             seen.wait_for_other_pixels(canvas, seen.pixels(canvas))
         assert seen.text("#fps") == "60.0"
