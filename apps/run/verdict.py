@@ -199,7 +199,7 @@ def _held(facts: Facts) -> str:
     if facts.rate is None:
         return "fewer than two frames were presented"
     around = ""
-    if facts.rate.low is not None and facts.rate.high is not None:
+    if facts.rate.low is not None and facts.rate.high is not None and facts.rate.low < facts.rate.high:
         share = "" if facts.rate.share == Rate._field_defaults["share"] else f", {facts.rate.share}"
         around = f" ({_number(facts.rate.low)} to {_number(facts.rate.high)}{share})"
     source = f" {facts.source}" if facts.source else ""
