@@ -92,6 +92,6 @@ def _priced(text: str, profile: str) -> tuple[Mapping[str, float], float]:
 def _said(profile: str | None, share: float | None) -> list[str]:
     """Say whose times the stages have, and how many frames take the route."""
     if profile is None or share is None:
-        return ["without times: --profile CHIP has those of a chip"]
+        return ["without times: --profile CHIP adds the times of a chip"]
     said = f"times are means of {profile}, {SUSTAINED}, for frames that the network paints"
     return [said, f"{share:.1%} of the scene's frames need no new picture and take the route"]

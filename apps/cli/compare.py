@@ -86,9 +86,9 @@ def compare(
 ) -> None:
     """Say what differs between runs, by how much, how sure that is, and the likely cause.
 
-    Every figure of OTHER is shown beside that of BASE with a 95 % interval. With --fail-if the command is a gate: 0 is
-    no worse, 1 is worse, and 4 is that nobody can tell, with the number of runs that would. A run that was disturbed
-    never passes. Two sweeps are compared by trials of equal configuration. docs/compare.md explains the method.
+    Each figure of OTHER stands beside the figure of BASE, with a 95 % interval. With --fail-if the command is a gate: 0
+    means no worse, 1 worse, and 4 that nobody can tell; it then says how many runs would tell. A disturbed run never
+    passes. Two sweeps are compared by trials of equal configuration. docs/compare.md explains the method.
     """
     gates = _gates(fail_if or [], fail_if_slower)
     if github and not gates:
@@ -102,7 +102,7 @@ def compare(
 
         write_to_github(judged, document["verdict"])
     if json:
-        with suppress(BrokenPipeError):  # the exit code stays that of the gate
+        with suppress(BrokenPipeError):  # the gate has the exit code
             print_json(document)
     else:
         print_kept(shown)

@@ -41,7 +41,7 @@ PERCENT, DECIBELS = "%", "dB"
 #: Share by which a stage's CPU time and its time on the core may differ where one thread does its jobs.
 SAME_TIME: Final = 0.05
 CHECKED: Final = "check"
-#: Measures of which other programs' share is taken out.
+#: Measures without the share of other programs.
 WALL: Final = (FRAME_TIME, LATENCY)
 MOST_SAID: Final = 4
 

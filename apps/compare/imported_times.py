@@ -1,8 +1,8 @@
 """Imported times as a side of a comparison: a JSON file with `measurements`, given the keys of a report.
 
-Rule: each measurement is the time of a job of a stage with its name. So it stands beside a measurement of that name,
-or beside the stage of a run. The only wall time stands for the frame time. Nobody knows the machine's state, so the
-scatter from run to run is that of any run on the host clock.
+Rule: each measurement is the time of a job of the stage with its name. It stands beside a measurement of that name, or
+beside the stage of a run. The only wall time stands for the frame time. Nobody knows the machine's state, so two
+measurements scatter as any two runs on the host clock.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def imported(document: Mapping[str, Any], path: Path) -> dict[str, Any]:
         raise BadInputError(f"{path}: {MEASUREMENTS}", "no time", "one or more", "docs/compare.md has the keys")
     if len(files := {row.file for row in rows}) > 1:
         remedy = "give several runs of one kind as A.json,B.json"
-        raise BadInputError(path, f"times of {len(files)} files", "those of one", remedy)
+        raise BadInputError(path, f"times of {len(files)} files", "the times of one file", remedy)
     rows = _told_apart(rows)
     names = [row.name for row in rows]
     if twice := next((name for name in names if names.count(name) > 1), None):

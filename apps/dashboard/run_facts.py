@@ -38,7 +38,7 @@ class RunFacts:
     `name`: name of the run folder. `clock`: host or virtual. `machine`: line for people.
     `fps`, `output` (width, height): rate and size of the scene. `config`: value in force of each control.
     `plan`, `placement`, `accuracy`: as in report.json, with `notes` beside the plan. `bound`: as in report.json, with
-    the efficiencies, for a finished run. `verdict`: that of a finished run, with its lines.
+    the efficiencies, for a finished run. `verdict`: verdict of a finished run, with its lines.
     """
 
     name: str

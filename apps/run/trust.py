@@ -22,7 +22,7 @@ CLOCK_CHANGE = 0.1
 class Trust(NamedTuple):
     """The judgement of one run.
 
-    `trusted`: whether its times are those of the program on a quiet machine, or of a model.
+    `trusted`: whether nothing else changed its times: the machine was quiet, or a model computed them.
     `reasons`: sentences without a full stop: why it is not trusted, or the one fact that it rests on.
     """
 

@@ -238,7 +238,7 @@ def _bound(facts: Facts) -> str:
 
 
 def _stages(bound: Bound, *, is_own: bool) -> str:
-    """Return the stages of the bound's unit, or those of other units, with their ms; a space stands behind."""
+    """Return the stages of the bound's unit, or of other units, with their ms and a space at the end."""
     rows = [(stage, ms) for stage, ms in bound.stages.items() if (stage in bound.of_unit) == is_own]
     said = " + ".join(stage if ms is None else f"{stage} {_ms(ms)}" for stage, ms in rows)
     return f"{said} " if said else ""

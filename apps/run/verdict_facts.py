@@ -31,7 +31,7 @@ from trilane.scheduler.policy import POLICIES
 if TYPE_CHECKING:
     from trilane.apps.run.report import Report
 
-#: Latency beside that of one frame alone from which a later pose is worth an attempt.
+#: Latency over the latency of one frame alone. From this ratio on, a later pose is worth an attempt.
 MUCH_LATER: Final = 2.0
 #: Part of a frame's time that has to be left before more work for a frame is proposed.
 MUCH_LEFT: Final = 0.5
