@@ -224,7 +224,7 @@ class PredictOptions(Options):
         default=None, description="File for a drawing of frame rate and temperature (.png, .svg, .pdf)."
     )
     trace: Annotated[Path | None, BeforeValidator(_path)] = Field(
-        default=None, description="File for the simulated run as a trace, for ui.perfetto.dev (docs/trace.md)."
+        default=None, description="File for the simulated run as a trace, for ui.perfetto.dev (docs/explain.md)."
     )
     table: Annotated[Path | None, BeforeValidator(_path)] = Field(
         default=None, description="CSV of configurations: one answer per row."
