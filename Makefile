@@ -2,7 +2,7 @@
 # Arguments of `trilane run` go in ARGS: make run ARGS="--frames 60 --size 192"
 SHELL := /bin/bash
 .DELETE_ON_ERROR:
-.PHONY: run test test-all test-rest explore test-machines test-device results readme setup format clean
+.PHONY: run test test-all test-rest explore test-machines test-device results readme docs setup format clean
 
 BIN := .venv/bin
 
@@ -52,6 +52,9 @@ results: .venv/ready-all
 # Some minutes in which the machine should do nothing else. A test holds that they are as written.
 readme: .venv/ready-all
 	PYTHONPATH=tests $(BIN)/python tests/support/readme.py --measured
+# The documents as a site, in site/; `make test` checks its links.
+docs: .venv/ready-test
+	$(BIN)/mkdocs build --strict
 
 setup: .venv/ready-run
 
@@ -80,4 +83,4 @@ format: .venv/ready-test
 	touch $@
 
 clean:
-	rm -rf .venv build dist
+	rm -rf .venv build dist site
