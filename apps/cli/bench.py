@@ -108,7 +108,7 @@ MEANINGS = {
     "sizes runtime": NAMED_RUNTIME,
     "flicker frames": "Frames that follow each other, from the first on.",
     "flicker runtime": NAMED_RUNTIME,
-    "scene": "A scene that comes with Trilane, or a scene file.",
+    "scene": "A bundled scene, or a scene file.",
     "scenario": "single-stream, multi-stream, server or offline.",
     "seconds": "How long each run lasts.",
     "infer seconds": "How long each network runs on each runtime.",

@@ -333,7 +333,7 @@ class PredictOptions(Options):
                 raise BadInputError("options", found, "one or the other", WHY_IGNORED[option])
         self._check_engine()
         if self.is_bare and "table" not in given and (useless := given & OF_THE_APPLICATION):
-            found, remedy = f"{self._spelt(useless)} with a network by itself", "they are of the application"
+            found, remedy = f"{self._spelt(useless)} with a network by itself", "they belong to the application"
             remedy += ": add --application for it with this network"
             raise BadInputError("options", found, "it without them", remedy)
         if self.application and len(self.network) != 1:

@@ -12,6 +12,7 @@ import sys
 import tomllib
 from collections import Counter
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,8 +25,8 @@ ROOT = Path(__file__).resolve().parents[2]
 RULES_FILE = ROOT / "tests" / "core" / "prose.toml"
 DATA = tomllib.loads(RULES_FILE.read_text(encoding="utf-8"))
 MOST_WORDS, MEAN_WORDS = DATA["most_words"], DATA["mean_words"]
-#: A sentence ends before a capital letter, a bracket, a quotation or code; not after a number of a list or a short word.
-END = re.compile(r"(?<=[.!?])(?<!\b\d\.)(?<!e\.g\.)(?<!i\.e\.)(?<!vs\.)[”\")]*\s+(?=[A-Z“\"(`*√0-9])")
+#: A sentence ends before a capital letter, a bracket, a quotation or code; not after a short word.
+END = re.compile(r"(?<=[.!?])(?<!e\.g\.)(?<!i\.e\.)(?<!vs\.)[”\")]*\s+(?=[A-Z“\"(`*√0-9])")
 WORD = re.compile(r"[^\W_][\w’'.,/:+%°²-]*")
 #: What a string of code needs to be a message: four words, the first of which begins it.
 MESSAGE = re.compile(r"[A-Za-z`'{][^\n]*? [^\n]*? [^\n]*? [^\n]*")
@@ -66,7 +67,7 @@ def sentences(text: str) -> list[str]:
 def page_sentences(page: str) -> Iterator[str]:
     """Every sentence of a page in Markdown, in order, without headings."""
     tokens = MarkdownIt("commonmark").enable("table").parse(page)
-    for before, token in zip(tokens, tokens[1:], strict=False):
+    for before, token in pairwise(tokens):
         if token.type == "inline" and before.type != "heading_open":
             yield from sentences(plain(token))
 
@@ -123,9 +124,16 @@ def findings(where: str, found: list[str]) -> Iterator[Finding]:
             yield Finding(where, "long", sentence)
 
 
+def kind_of(where: str) -> str:
+    """Records of decisions, pages, helps or messages: each kind has its own bound for long sentences."""
+    if where.endswith(".md"):
+        return "records" if where.startswith("docs/decisions/") else "pages"
+    return "helps" if where == "--help" else "messages"
+
+
 def texts() -> dict[str, list[str]]:
     """Path below the repository to the sentences of each page, of the helps, and of each file of code with messages."""
-    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    pages = [ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
     found = {str(page.relative_to(ROOT)): list(page_sentences(page.read_text(encoding="utf-8"))) for page in pages}
     found["--help"] = list(dict.fromkeys(help_sentences()))
     package = ROOT / "src" / "trilane"  # its folders are links
