@@ -82,7 +82,7 @@ MEANINGS = {
     "predict seconds": "How long each network is called by itself.",
     "predict width": "Width of a further network, untrained; 64 is full.",
     "handoff frames": "Hand-overs in each round, of each variant and size.",
-    "judge": "Who evaluates the run: trilane or loadgen.",
+    "judge": "Evaluator of the run: trilane or loadgen.",
     "kib": "Size of the slot in KiB: 256, 1024, 4096 or 16384.",
     "limit_ms": "Longest latency of the server scenario that counts as in time.",
     "finalists": "How many of the fastest placements are measured again; the chosen one and the rule's always are.",

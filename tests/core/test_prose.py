@@ -43,7 +43,7 @@ def test_a_sentence_of_a_page_has_few_words_in_the_mean() -> None:
 def test_a_rule_finds_its_examples_and_not_their_remedies(rule: object) -> None:
     assert isinstance(rule, type(RULES[0]))
     for example in rule.examples:
-        assert rule in {each for each in RULES if each.pattern.search(example)}, example
+        assert rule.pattern.search(example), example
     sound = ["The interval stands beside it.", "If you change a file, begin again.", "What is a unit?", "What it costs."]
     assert [each for each in sound if rule.pattern.search(each)] == []
 

@@ -33,12 +33,16 @@ MESSAGE = re.compile(r"[A-Za-z`'{][^\n]*? [^\n]*? [^\n]*? [^\n]*")
 
 
 class Rule(NamedTuple):
-    """`pattern` finds what `remedy` says how to write; `examples` are sentences that it finds."""
+    """`pattern` finds what `remedy` says how to write; `examples` are sentences that it finds.
+
+    `but_in`: the page that may say it, because it lists such words.
+    """
 
     name: str
     pattern: re.Pattern[str]
     remedy: str
     examples: tuple[str, ...]
+    but_in: str = ""
 
 
 class Finding(NamedTuple):
@@ -50,7 +54,7 @@ class Finding(NamedTuple):
 
 
 RULES = [
-    Rule(each["name"], re.compile(each["pattern"]), each["remedy"], tuple(each["examples"])) for each in DATA["rules"]
+    Rule(**each | {"pattern": re.compile(each["pattern"]), "examples": tuple(each["examples"])}) for each in DATA["rules"]
 ]
 
 
@@ -119,7 +123,7 @@ def words(sentence: str) -> int:
 def findings(where: str, found: list[str]) -> Iterator[Finding]:
     """What the rules find in sentences of one page or file."""
     for sentence in found:
-        yield from (Finding(where, rule.name, sentence) for rule in RULES if rule.pattern.search(sentence))
+        yield from (Finding(where, rule.name, sentence) for rule in RULES if where != rule.but_in and rule.pattern.search(sentence))
         if words(sentence) > MOST_WORDS:
             yield Finding(where, "long", sentence)
 
