@@ -54,7 +54,8 @@ class Finding(NamedTuple):
 
 
 RULES = [
-    Rule(**each | {"pattern": re.compile(each["pattern"]), "examples": tuple(each["examples"])}) for each in DATA["rules"]
+    Rule(**each | {"pattern": re.compile(each["pattern"]), "examples": tuple(each["examples"])})
+    for each in DATA["rules"]
 ]
 
 
@@ -123,7 +124,11 @@ def words(sentence: str) -> int:
 def findings(where: str, found: list[str]) -> Iterator[Finding]:
     """What the rules find in sentences of one page or file."""
     for sentence in found:
-        yield from (Finding(where, rule.name, sentence) for rule in RULES if where != rule.but_in and rule.pattern.search(sentence))
+        yield from (
+            Finding(where, rule.name, sentence)
+            for rule in RULES
+            if where != rule.but_in and rule.pattern.search(sentence)
+        )
         if words(sentence) > MOST_WORDS:
             yield Finding(where, "long", sentence)
 
