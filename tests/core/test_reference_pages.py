@@ -57,7 +57,8 @@ def option_tables() -> Iterator[str]:
                 else each.default
             )
             told = "" if default in ("", False, ()) else f"`{getattr(default, 'value', default)}`"
-            yield f"| `{spelled}` | {cell(getattr(each, 'help', '') or '')} | {cell(values(each, command))} | {cell(told)} |"
+            meaning = cell(getattr(each, "help", "") or "")
+            yield f"| `{spelled}` | {meaning} | {cell(values(each, command))} | {cell(told)} |"
 
 
 def models_in(kind: Any) -> Iterator[type[BaseModel]]:
@@ -120,7 +121,8 @@ def limits(field: Any) -> str:
 def key_tables(model: type[BaseModel], table: str, seen: set[type[BaseModel]]) -> Iterator[str]:
     """A table of keys for each table of a file, what the code says about it first."""
     seen.add(model)
-    yield f"\n### {table}\n\n{cell(inspect.getdoc(model) or '')}\n\n| key | value | range | default |\n|---|---|---|---|"
+    yield f"\n### {table}\n\n{cell(inspect.getdoc(model) or '')}\n"
+    yield "| key | value | range | default |\n|---|---|---|---|"
     below = []
     for key, field in model.model_fields.items():
         inner = [each for each in models_in(field.annotation) if each is not profiles.Quantity]
