@@ -52,6 +52,7 @@ results: .venv/ready-all
 # Some minutes in which the machine should do nothing else. A test holds that they are as written.
 readme: .venv/ready-all
 	PYTHONPATH=tests $(BIN)/python tests/support/readme.py --measured
+
 # The documents as a site, in site/; `make test` checks its links.
 docs: .venv/ready-test
 	$(BIN)/mkdocs build --strict
