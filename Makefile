@@ -2,7 +2,7 @@
 # Arguments of `trilane run` go in ARGS: make run ARGS="--frames 60 --size 192"
 SHELL := /bin/bash
 .DELETE_ON_ERROR:
-.PHONY: run test test-all test-rest explore test-machines test-device results readme setup format clean
+.PHONY: run test test-all test-rest explore test-machines test-device results readme docs setup format clean
 
 BIN := .venv/bin
 
@@ -53,6 +53,10 @@ results: .venv/ready-all
 readme: .venv/ready-all
 	PYTHONPATH=tests $(BIN)/python tests/support/readme.py --measured
 
+# The documents as a site, in site/; `make test` checks its links.
+docs: .venv/ready-test
+	$(BIN)/mkdocs build --strict
+
 setup: .venv/ready-run
 
 format: .venv/ready-test
@@ -80,4 +84,4 @@ format: .venv/ready-test
 	touch $@
 
 clean:
-	rm -rf .venv build dist
+	rm -rf .venv build dist site

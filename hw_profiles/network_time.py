@@ -50,7 +50,7 @@ from trilane.units import BURST, HOST, UNITS, UnitName
 NAMED_FROM = 0.05
 
 #: Reason that is given where the time is only a lower bound.
-INSIDE = "it holds a compiled network, of which only the ends are seen: price the network that it was made from"
+INSIDE = "it holds a compiled network, and only its ends can be seen: price the network that it was made from"
 
 
 class OperatorTime(NamedTuple):

@@ -348,7 +348,7 @@ class StageKeys(Keys):
 
     unit: str = Field(pattern=NAME, description="Unit that does it; a name of your choice.")
     inputs: tuple[StageInput, ...] = Field(
-        default=(), alias="in", description="What it reads: a stage, stage.port, or a table of ports."
+        default=(), alias="in", description="Its inputs: a stage, stage.port, or a table of ports."
     )
     every: int = Field(default=1, ge=1, le=1000, description="3: it takes the first frame, the fourth and so on.")
     out: Annotated[dict[str, PortType] | None, BeforeValidator(_ports)] = Field(

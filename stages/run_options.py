@@ -92,7 +92,7 @@ class RunOptions(Options):
     """The options of `trilane run`, in the order of its help; None leaves what the scene or the avatar says."""
 
     scene: Annotated[Text, Option(is_argument=True)] = Field(
-        default="default", description="A scene file (TOML), or the name of one that comes with Trilane."
+        default="default", description="A scene file (TOML), or the name of a bundled one."
     )
     motion: Text | None = Field(default=None, description="Motion: .bvh, .npz, .npy, .pkl, or builtin:NAME.")
     camera: Text | None = Field(default=None, description="ARKit log, TUM, transforms.json, or builtin:NAME.")

@@ -81,7 +81,7 @@ def accuracy(
     """Compare the runtimes with each other on a scene's frames, or hard cases with their bounds.
 
     The exit code is 1 when a figure exceeds its bound. It is also 1 when the bound of a hard network is too wide to
-    detect a wrong picture: a single colour, a shift by 8 pixels, or red and blue exchanged.
+    detect a wrong picture. Wrong pictures have a single colour, a shift by 8 pixels, or red and blue exchanged.
     """
     from trilane.stages.dsp.runtime import installed
 

@@ -54,8 +54,8 @@ def predict(options: PredictOptions, *, json: JsonOption = False) -> None:
     Without --network, or with --application: the avatar's application. With --network: each network by itself. With a
     pipeline file: that pipeline, by the times of its stages (docs/pipeline-file.md).
 
-    Without --performance-profile, a network by itself has the profile burst, because published latencies have it. So
-    has the profile `host` (this machine), because a run here has no cap.
+    Without --performance-profile, a network by itself has the profile burst, because published latencies have it. The
+    profile `host` (this machine) has it too, because a run here has no cap.
     """
     from trilane.hw_profiles.profile_files import load_runnable
 

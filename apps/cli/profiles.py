@@ -31,7 +31,7 @@ NOT_KNOWN = (
 
 @app.command("list", epilog="\b\nExamples:\n  trilane profiles list\n  trilane profiles list --json")
 def list_profiles(json: JsonOption = False) -> None:
-    """List the profiles that come with Trilane."""
+    """List the bundled profiles."""
     from rich.table import Table
 
     from trilane.hw_profiles.profile_files import load_profile, profile_names

@@ -52,9 +52,9 @@ def report(
 ) -> None:
     """Write one page of many runs, predictions and trials, with the frontier of frame time against error.
 
-    The page is one self-contained file: a table to sort and filter, pictures to lay over each other, the machines, and
-    the command of each entry. An error comes from the run itself (`run --check`), else from its avatar's validation;
-    the table names the source.
+    The page is one self-contained file. It has a table to sort and filter, pictures to lay over each other, the
+    machines, and the command of each entry. An error comes from the run itself (`run --check`), else from its avatar's
+    validation; the table names the source.
     """
     from trilane.apps.compare.overview import read_entries, table_rows, write_csv, write_parquet
     from trilane.apps.compare.overview_page import page

@@ -89,7 +89,7 @@ def run(
 
     The verdict says whether the run holds its rate, what bounds it, and whether the machine was quiet.
     The folder holds report.json, video.mp4, contact.png, trace.pftrace (open it at ui.perfetto.dev), events.jsonl and
-    journal.msgpack, which is written while the run goes on.
+    journal.msgpack. The journal is written while the run goes on.
     docs/report.md explains every key, the policies and the edges.
     """
     from trilane.apps.run.asked_run import run_asked

@@ -164,7 +164,7 @@ def dashboard(run: FolderArgument, port: PortOption = None) -> None:
 def trace(run: RunArgument, chrome_json: ChromeOption = False, out: OutOption = None) -> None:
     """Write the timeline of a run, from its journal, for ui.perfetto.dev or chrome://tracing.
 
-    docs/trace.md says what every track is.
+    docs/explain.md says what every track is.
     """
     from trilane.apps.explain.trace import CHROME_NAME, NAME, write_run
     from trilane.apps.watch.followed_run import RunState, follow

@@ -151,7 +151,7 @@ def compare_sweeps(base: str, other: str) -> SweepComparison:
     left["other_alone"] += [_name(of_other) for key, of_other in second.items() if key not in first]
     if not found:
         missing = f"no trial that {base} has too, done in both"
-        remedy = "both are of one command, with the same options in the same words"
+        remedy = "give two sweeps of one command, with the same options in the same words"
         raise BadInputError(other, missing, "trials of equal configuration", remedy)
     return _compared(base, other, found, {reason: tuple(names) for reason, names in left.items()})
 

@@ -31,7 +31,7 @@ from trilane.units import HOST_CLOCK, NS_PER_MS
 from trilane.writing import write_atomically
 
 SCHEMA = 1
-GOES_ON = "the run still goes on: what follows is of its frames so far"
+GOES_ON = "the run still goes on: the figures cover its frames so far"
 #: Column -> its type, and its value for a job. Times are ns of the run's clock, durations ns; docs/explain.md explains
 #: each column.
 COLUMNS: dict[str, tuple[type, Callable[[ExplainedJob], Any]]] = {

@@ -224,7 +224,7 @@ class PredictOptions(Options):
         default=None, description="File for a drawing of frame rate and temperature (.png, .svg, .pdf)."
     )
     trace: Annotated[Path | None, BeforeValidator(_path)] = Field(
-        default=None, description="File for the simulated run as a trace, for ui.perfetto.dev (docs/trace.md)."
+        default=None, description="File for the simulated run as a trace, for ui.perfetto.dev (docs/explain.md)."
     )
     table: Annotated[Path | None, BeforeValidator(_path)] = Field(
         default=None, description="CSV of configurations: one answer per row."
@@ -333,7 +333,7 @@ class PredictOptions(Options):
                 raise BadInputError("options", found, "one or the other", WHY_IGNORED[option])
         self._check_engine()
         if self.is_bare and "table" not in given and (useless := given & OF_THE_APPLICATION):
-            found, remedy = f"{self._spelt(useless)} with a network by itself", "they are of the application"
+            found, remedy = f"{self._spelt(useless)} with a network by itself", "they belong to the application"
             remedy += ": add --application for it with this network"
             raise BadInputError("options", found, "it without them", remedy)
         if self.application and len(self.network) != 1:

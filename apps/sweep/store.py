@@ -156,7 +156,7 @@ class Store:
         self.done = latest(records)
         ended = sum(is_ended(self.done.get(name)) for name in ids)
         if self.done and ended < len(ids) and not self._resume:
-            found = f"a sweep of which {ended} of {len(ids)} trials are done"
+            found = f"a sweep with {ended} of {len(ids)} trials done"
             raise BadInputError(self.folder, found, "a new folder, or one that is complete", "--resume goes on with it")
 
     def _check_same(self, path: Path, ids: list[str]) -> None:
@@ -165,7 +165,7 @@ class Store:
         except (OSError, ValueError, TypeError, KeyError) as error:
             raise BadInputError(path, f"no description of a sweep ({reason(error)})", "one") from error
         if there != set(ids):
-            found = f"a sweep of {len(there)} trials, {len(there & set(ids))} of which are among these {len(ids)}"
+            found = f"a sweep of {len(there)} trials; {len(there & set(ids))} of them are among these {len(ids)}"
             raise BadInputError(self.folder, found, "the same trials", "choose another --out")
 
     def _close(self) -> None:

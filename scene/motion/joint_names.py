@@ -249,7 +249,7 @@ def match_names(path: Path, names: list[str], joint_map: Mapping[str, str] = NO_
     if missing:
         raise BadInputError(
             path,
-            f"joints {', '.join(names[:6])} …, of which none is {missing[0]}",
+            f"joints {', '.join(names[:6])} …, and none is {missing[0]}",
             f"the joint names of {', '.join(DIALECTS)}",
             f'say which is which in the scene: joint_map = {{{missing[0]} = "...", ...}} for {", ".join(missing)}',
         )

@@ -164,7 +164,7 @@ REFUSED = {
     "input once",
     ("--network", "n", "--policy", "latest", "--batch", "2"): (
         "options: found --batch, --policy with a network by itself, expected it without them; "
-        "they are of the application: add --application for it with this network"
+        "they belong to the application: add --application for it with this network"
     ),
     ("--application",): (
         "options: found --application with 0 networks, expected one --network; "

@@ -271,7 +271,7 @@ def test_a_name_twice_is_the_first_and_a_joint_that_must_be_there_is_named() -> 
         with pytest.raises(BadInputError) as raised:
             match_names(Path("a.bvh"), rest)
         assert str(raised.value) == (
-            f"a.bvh: found joints {', '.join(rest[:6])} …, of which none is {ours}, expected the joint names of "
+            f"a.bvh: found joints {', '.join(rest[:6])} …, and none is {ours}, expected the joint names of "
             f'{", ".join(DIALECTS)}; say which is which in the scene: joint_map = {{{ours} = "...", ...}} for {ours}'
         )
 

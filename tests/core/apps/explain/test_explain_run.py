@@ -283,7 +283,7 @@ def test_a_journal_that_was_cut_off_says_so_first(tmp_path: Path, command: Comma
     for name, said in (
         ("cut", CUT_OFF),
         (f"gone.{10**9 - 1}.partial", CUT_OFF),
-        (f"live.{os.getpid()}.partial", "the run still goes on: what follows is of its frames so far"),
+        (f"live.{os.getpid()}.partial", "the run still goes on: the figures cover its frames so far"),
     ):
         folder = tmp_path / name
         folder.mkdir()

@@ -83,7 +83,7 @@ def test_what_a_folder_is_taken_up_for(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"1 of 3 trials are done.*--resume goes on"):
         opened(folder).__enter__()
     for resume in (True, False):
-        with pytest.raises(BadInputError, match="a sweep of 3 trials, 2 of which are among these 2"):
+        with pytest.raises(BadInputError, match="a sweep of 3 trials; 2 of them are among these 2"):
             opened(folder, TRIALS_3[:2], resume=resume).__enter__()
     with opened(folder, resume=True) as store:
         store.add(record(SECOND, "failed"))
