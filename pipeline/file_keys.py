@@ -379,7 +379,7 @@ class StageKeys(Keys):
     )
     time_ms: StageTime | None = Field(
         default=None,
-        description="Time of a job in ms: a number or { mean, sd }, { exponential }, { samples = [...] }, { from, name }.",
+        description="Time of a job in ms: a number, or a table of mean and sd, exponential, samples, or from and name.",
     )
 
     @property
