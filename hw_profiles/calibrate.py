@@ -97,7 +97,9 @@ class Calibrated:
 
 
 def is_own_table(path: Path) -> bool:
-    """Say whether a table has rows of networks in files, not of the reference networks."""
+    """Say whether a table has rows of networks in files, not of the reference networks. A missing file has none."""
+    if not path.is_file():
+        return False
     lines = [line for line in read_text(path, "a table of measured rows").splitlines() if not line.startswith("#")]
     header = [cell.strip() for cell in next(csv.reader(lines[:1]), [])]
     return {"network", "ms"} <= set(header) and "encoder" not in header
@@ -273,7 +275,7 @@ def _solve(rows: Sequence[_EngineRow], engines: Sequence[EngineName]) -> tuple[F
     """Return the most probable deviations of the log rates (6 x engines,), and their covariance."""
     precision = np.linalg.inv(prior_covariance(engines))
     at, places = np.zeros(len(precision)), [len(RATES) * engines.index(row.engine) for row in rows]
-    damping, (cost, gradient, curvature) = 1e-3, _derivatives(at_zero := at, rows, places, precision)
+    damping, (cost, gradient, curvature) = 1e-3, _derivatives(at, rows, places, precision)
     for _ in range(STEPS):
         step = np.clip(np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), -gradient), -1, 1)
         lower, *derivatives = _derivatives(at + step, rows, places, precision)
@@ -286,7 +288,7 @@ def _solve(rows: Sequence[_EngineRow], engines: Sequence[EngineName]) -> tuple[F
         gradient, curvature = derivatives
         if gain < ENOUGH * (1 + cost):
             break
-    return (at if np.isfinite(at).all() else at_zero), np.linalg.inv(curvature)
+    return at, np.linalg.inv(curvature)
 
 
 def _derivatives(at: F64, rows: Sequence[_EngineRow], places: Sequence[int], precision: F64) -> tuple[float, F64, F64]:

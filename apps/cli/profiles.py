@@ -137,8 +137,8 @@ def fit(
     from trilane.hw_profiles.fit import as_toml, fit_profile
 
     own = is_own_table(source)
-    base = profile or ("snapdragon-888" if own else "snapdragon-888-facts")
-    named = name or ("calibrated" if own else "snapdragon-888")
+    usual = ("snapdragon-888", "calibrated") if own else ("snapdragon-888-facts", "snapdragon-888")
+    base, named = (other if asked is None else asked for asked, other in zip((profile, name), usual, strict=True))
     if not re.fullmatch(r"[\w.-]{1,64}", named):
         raise BadInputError("--name", repr(named), "letters, digits, dots, hyphens and underscores")
     if write is not None and not write.absolute().parent.is_dir():

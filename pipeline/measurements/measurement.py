@@ -29,6 +29,7 @@ CYCLES: Final = "cycles"
 MOST_SAMPLES: Final = 1_000_000  # of a file
 MOST_NAMES: Final = 50_000
 MOST_REFUSED: Final = 1000  # that are listed; the others are counted
+UNNAMED: Final = "unnamed"
 LONGEST_NAME: Final = 300
 LONGEST_MS: Final = 3.6e6
 WARM_UP: Final = 1.5  # first run over the median of the others from which on it looks like a warm-up
@@ -150,7 +151,7 @@ class Found:
         time = self.ms(row, value, unit, kind)
         if time is None:
             return None
-        key = (name[:LONGEST_NAME], kind)
+        key = (name[:LONGEST_NAME] or UNNAMED, kind)
         stated = self._facts.setdefault(key, {"unit": unit, "what": what, **facts})
         if stated["unit"] != unit:
             self.refuse(row, f"in {unit}, but earlier rows of this name are in {stated['unit']}")
@@ -167,7 +168,7 @@ class Found:
         """Take a measurement of which the tool states the figures alone."""
         if len(self._made) >= MOST_NAMES:
             raise BadInputError("the file", f"over {MOST_NAMES} names", "fewer")
-        self._made.append(measurement)
+        self._made.append(replace(measurement, name=measurement.name[:LONGEST_NAME] or UNNAMED))
 
     def take_back(self, names: set[str], row: str, reason: str) -> None:
         """Refuse measurements that were taken before, by name."""

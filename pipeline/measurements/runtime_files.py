@@ -277,7 +277,7 @@ def _of_tensorrt(found: Found, row: str, layer: Mapping[str, Any], count: int | 
     p50 = None if median is None else found.ms(row, median, "ms", "layer", "medianMs")
     share = layer.get("percentage")
     share = share / 100 if isinstance(share, int | float) and 0 <= share <= 100 else None
-    name = str(layer.get("name", ""))[:300]
+    name = str(layer.get("name", ""))
     found.add(Measurement(name, "layer", "ms", "a layer, the mean", (), count, mean, p50_ms=p50, share=share))
     return mean
 
