@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from trilane.errors import BadInputError, MissingPartError, did_you_mean, package_line
+from trilane.errors import BadInputError, MissingPartError, did_you_mean
 from trilane.files import read_text
 from trilane.hw_profiles.calibrate import NamedRow
 from trilane.pipeline.measurements.measurement import Measurement
@@ -82,7 +82,7 @@ def stage_text(path: Path, stage: str, read: Measurements, measurement: Measurem
     try:
         import tomlkit
     except ImportError:
-        raise MissingPartError("writing into a pipeline file needs tomlkit", package_line("tomlkit")) from None
+        raise MissingPartError("writing into a pipeline file needs tomlkit", extra="edit") from None
     file = read_pipeline(path)
     if stage not in file.stages:
         expected = f"one of {', '.join(file.stages)}"

@@ -115,8 +115,8 @@ class Found:
     def number(self, row: str, value: object, what: str = "the time") -> float | None:
         """Return a finite number that is not negative; otherwise refuse the row and return None."""
         if not is_number(value):
-            found = "nothing" if value is None else f"{str(value)[:40]!r}" if isinstance(value, str) else "no number"
-            self.refuse(row, f"{what} is {found}, not a number")
+            text = "nothing" if value is None else repr(value)[:40]
+            self.refuse(row, f"{what} is {text}: a number was expected")
             return None
         number = float(value)  # type: ignore[arg-type]
         if not math.isfinite(number):

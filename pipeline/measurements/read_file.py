@@ -107,9 +107,12 @@ def _of_json(path: Path, text: str) -> Found | None:
     except RecursionError:
         raise BadInputError(path, "lists or tables in each other, too deep", KNOWN) from None
     except ValueError as error:
-        events, cut = _events_by_line(text)
+        events, broken = _events_by_line(text)
         if events:
-            return _of_events(events, cut)
+            found = _of_events(events)
+            for place in broken:
+                found.refuse(place, "no event in JSON: the line is cut off or damaged")
+            return found
         if runtime_files.is_benchmark(text):
             return None
         raise BadInputError(path, f"no JSON ({error})", KNOWN) from None
@@ -153,33 +156,32 @@ def _of_list(document: object) -> Found | None:
     return None
 
 
-def _of_events(events: Sequence[Any], cut: str = "") -> Found:
+def _of_events(events: Sequence[Any]) -> Found:
     """Read events: ONNX Runtime's have the categories Session and Node."""
     categories = {
         each.get("cat") for each in events[:1000] if isinstance(each, dict) and isinstance(each.get("cat"), str)
     }
     if categories & {"Session", "Node"}:
-        return runtime_files.read_ort(events, cut)
-    found = trace_slices.read_chrome(events)
-    if cut:
-        found.refuse(cut, "the file ends in the middle of an event")
-    return found
+        return runtime_files.read_ort(events)
+    return trace_slices.read_chrome(events)
 
 
-def _events_by_line(text: str) -> tuple[list[Any], str]:
-    """Return the events of a list that is cut off, an event a line, and the place of the first line that is none."""
-    events = []
-    lines = [(number, line.strip().rstrip(",")) for number, line in enumerate(text.splitlines(), 1)]
-    lines = [(number, line) for number, line in lines if line not in ("", "[", "]")]
-    for number, line in lines:
+def _events_by_line(text: str) -> tuple[list[Any], list[str]]:
+    """Return the events of a list that is cut off, an event a line, and the places of lines that are none."""
+    events, broken = [], []
+    for number, line in enumerate(text.splitlines(), 1):
+        bare = line.strip().removeprefix("[").removesuffix("]").rstrip(", ")
+        if not bare:
+            continue
         try:
-            event = json.loads(line.removeprefix("["), parse_int=whole_number)
+            event = json.loads(bare, parse_int=whole_number)
         except (ValueError, RecursionError):
-            return events, f"line {number}"
-        if not isinstance(event, dict) or "ph" not in event:
-            return events, f"line {number}"
-        events.append(event)
-    return events, "the last line, without a closing bracket"
+            event = None
+        if isinstance(event, dict) and "ph" in event:
+            events.append(event)
+        else:
+            broken.append(f"line {number}")
+    return events, broken
 
 
 def _read_own(text: str) -> Found:

@@ -78,7 +78,7 @@ class _Slices:
         if unended:
             self._found.skipped["a slice that does not end in the trace"] += unended
 
-    def _packets(self, data: bytes) -> Iterator[TracePacket]:
+    def _packets(self, data: bytes, *, packed: bool = False) -> Iterator[TracePacket]:
         """Yield the packets one by one, so that a long trace is never held as objects. Raises DecodeError."""
         from google.protobuf.message import DecodeError
         from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import TracePacket
@@ -94,10 +94,12 @@ class _Slices:
             packet = TracePacket()
             packet.ParseFromString(data[start : start + size])
             at = start + size
+            if packet.compressed_packets and packed:
+                raise DecodeError("packed packets in packed packets")
             if packet.compressed_packets:
                 unpacker = zlib.decompressobj()
                 inner = unpacker.decompress(packet.compressed_packets, self._left + 1)
-                yield from self._packets(inner)
+                yield from self._packets(inner, packed=True)
             else:
                 yield packet
 
