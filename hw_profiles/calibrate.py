@@ -273,7 +273,8 @@ def _engine_numbers(profile: Profile, unit: UnitName, rows: Sequence[OwnRow]) ->
 
 def _solve(rows: Sequence[_EngineRow], engines: Sequence[EngineName]) -> tuple[F64, F64]:
     """Return the most probable deviations of the log rates (6 x engines,), and their covariance."""
-    precision = np.linalg.inv(prior_covariance(engines))
+    precision: F64 = np.linalg.inv(prior_covariance(engines)).astype(np.float64)
+    at: F64
     at, places = np.zeros(len(precision)), [len(RATES) * engines.index(row.engine) for row in rows]
     damping, (cost, gradient, curvature) = 1e-3, _derivatives(at, rows, places, precision)
     for _ in range(STEPS):
@@ -288,7 +289,7 @@ def _solve(rows: Sequence[_EngineRow], engines: Sequence[EngineName]) -> tuple[F
         gradient, curvature = derivatives
         if gain < ENOUGH * (1 + cost):
             break
-    return at, np.linalg.inv(curvature)
+    return at, np.linalg.inv(curvature).astype(np.float64)
 
 
 def _derivatives(at: F64, rows: Sequence[_EngineRow], places: Sequence[int], precision: F64) -> tuple[float, F64, F64]:

@@ -123,8 +123,12 @@ def check(
 )
 def fit(
     source: Annotated[Path, typer.Option("--from", help="CSV of measured rows (docs/predict.md).")],
-    profile: Annotated[str | None, typer.Option(help="Profile whose numbers are the priors.")] = None,
-    name: Annotated[str | None, typer.Option(help="Name of the fitted profile.")] = None,
+    profile: Annotated[
+        str | None, typer.Option(help="Profile whose numbers are the priors; one of the 888 if not given.")
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the fitted profile; calibrated or snapdragon-888 if not given.")
+    ] = None,
     write: Annotated[Path | None, typer.Option(help="Write the fitted profile here.")] = None,
     networks: Annotated[Path | None, typer.Option(help="Folder of the networks; that of the CSV if not given.")] = None,
     json: JsonOption = False,
@@ -151,7 +155,7 @@ def fit(
         _show(result)
     if write is not None:
         head = {"extends": _beside(base, write), "name": named, "title": _title(result, own)}
-        count = f"{len(result.rows)} own measurements" if own else _counted(result)
+        count = _counted(result)
         write_bytes(write, as_toml(result.numbers, head, f"trilane profiles fit --from {source}", count).encode())
 
 
@@ -165,7 +169,11 @@ def _title(result: ProfileFit | Calibrated, own: bool) -> str:
     return f"{title}, moved to own measurements" if own else title.removesuffix(", before the fit")
 
 
-def _counted(result: Any) -> str:
+def _counted(result: ProfileFit | Calibrated) -> str:
+    from trilane.hw_profiles.fit import ProfileFit
+
+    if not isinstance(result, ProfileFit):
+        return f"{len(result.rows)} own measurements"
     return f"{result.free_count} numbers from {len(result.residuals)} measurements"
 
 

@@ -15,7 +15,7 @@ from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, TypeGuard
 
 import numpy as np
 
@@ -80,9 +80,9 @@ class Measurement:
         return {name: getattr(self, name) for name in (*names, *rest)} | {"samples_ms": list(self.samples_ms)}
 
 
-def is_number(value: object) -> bool:
-    """Say whether a value of a JSON document is a number; true and false are none."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
+def is_finite(value: object) -> TypeGuard[int | float]:
+    """Say whether a value of a JSON document is a finite number; true and false are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 class Found:
@@ -114,11 +114,11 @@ class Found:
 
     def number(self, row: str, value: object, what: str = "the time") -> float | None:
         """Return a finite number that is not negative; otherwise refuse the row and return None."""
-        if not is_number(value):
+        if not isinstance(value, int | float) or isinstance(value, bool):
             text = "nothing" if value is None else repr(value)[:40]
             self.refuse(row, f"{what} is {text}: a number was expected")
             return None
-        number = float(value)  # type: ignore[arg-type]
+        number = float(value)
         if not math.isfinite(number):
             self.refuse(row, f"{what} is {number:g}: a number that is finite was expected")
             return None

@@ -18,7 +18,7 @@ from trilane.pipeline.measurements.measurement import (
     Kind,
     Measurement,
     contradiction,
-    is_number,
+    is_finite,
 )
 
 SINGLE: Final = "SingleStream"
@@ -146,7 +146,7 @@ def _add_result(
         return
     throughput = result["performance_run"].get("throughput")
     rate = throughput.get("value") if isinstance(throughput, dict) else throughput
-    if scenario == SINGLE and is_number(rate) and rate > 0 and abs(rate * mean / 1e3 - 1) > RATE_SLACK:
+    if scenario == SINGLE and is_finite(rate) and rate > 0 and abs(rate * mean / 1e3 - 1) > RATE_SLACK:
         found.refuse(row, f"a mean of {mean:g} ms beside {rate:g} queries a second: a unit is wrong")
         return
     count = loadgen.get("query_count")

@@ -86,9 +86,9 @@ def _about(path: Path, error: BadInputError) -> BadInputError:
 def _of_text(path: Path, text: str) -> Found:
     lines = text.lstrip().splitlines()[:20]
     if text.lstrip()[:1] in ("{", "["):
-        found = _of_json(path, text)
-        if found is not None:
-            return found
+        document = _of_json(path, text)
+        if document is not None:
+            return document
     if vendor_files.is_qnn(lines):
         return vendor_files.read_qnn(text)
     if mlperf_files.TITLE in text:
@@ -109,10 +109,10 @@ def _of_json(path: Path, text: str) -> Found | None:
     except ValueError as error:
         events, broken = _events_by_line(text)
         if events:
-            found = _of_events(events)
+            cut = _of_events(events)
             for place in broken:
-                found.refuse(place, "no event in JSON: the line is cut off or damaged")
-            return found
+                cut.refuse(place, "no event in JSON: the line is cut off or damaged")
+            return cut
         if runtime_files.is_benchmark(text):
             return None
         raise BadInputError(path, f"no JSON ({error})", KNOWN) from None

@@ -45,7 +45,8 @@ def read_ort(events: Sequence[Any]) -> Found:
         if category == "Session" and name in RUNS:
             found.sample(row, name, "run", event.get("dur"), "us", RUNS[name])
         elif category == "Node" and name.endswith(NODE_ENDING):
-            facts = event.get("args") if isinstance(event.get("args"), dict) else {}
+            facts = event.get("args")
+            facts = facts if isinstance(facts, dict) else {}
             hardware, operator = str(facts.get("provider", "")), str(facts.get("op_name", ""))
             what = f"a node, {operator}" if operator else "a node"
             node = name.removesuffix(NODE_ENDING)

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from trilane.errors import BadInputError
-from trilane.pipeline.measurements.measurement import Found, is_number
+from trilane.pipeline.measurements.measurement import Found, is_finite
 
 if TYPE_CHECKING:
     from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import TracePacket
@@ -193,7 +193,7 @@ def read_chrome(events: Sequence[Any]) -> Found:
                 found.sample(row, name, "wall", event.get("dur"), "us", WHAT)
         elif phase in ("B", "E"):
             at = event.get("ts")
-            if not is_number(at):
+            if not is_finite(at):
                 found.refuse(row, "ts is no number")
             elif phase == "B":
                 open_[track].append((name, float(at)))

@@ -12,7 +12,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
-from trilane.pipeline.measurements.measurement import CYCLES, PER_MS, Found, Measurement, falling, is_number
+from trilane.pipeline.measurements.measurement import CYCLES, PER_MS, Found, Measurement, falling, is_finite
 
 QNN_COLUMNS: Final = ("Msg Timestamp", "Message", "Time", "Unit of Measurement", "Timing Source", "Event Level")
 IDENTIFIER: Final = "Event Identifier"
@@ -174,10 +174,10 @@ def read_qhas(document: Mapping[str, Any]) -> Found:
         found.refuse("htp_overall_summary", "no rows")
     for index, summary in enumerate(rows):
         row, name = f"htp_overall_summary.data[{index}]", "" if len(rows) == 1 else f" (htp {index})"
-        more = {key: summary[key] for key in QHAS_MORE if is_number(summary.get(key))}
+        more = {key: value for key in QHAS_MORE if is_finite(value := summary.get(key))}
         time = found.ms(f"{row}: time_us", summary.get("time_us"), "us", "run")
         rate = summary.get("inf_per_s")
-        if time is not None and is_number(rate) and abs(rate * time / 1e3 - 1) > RATE_SLACK:
+        if time is not None and is_finite(rate) and abs(rate * time / 1e3 - 1) > RATE_SLACK:
             found.refuse(f"{row}: time_us", f"{time:g} ms beside {rate:g} inferences a second: a unit is wrong")
             time = None
         elif time is not None:
@@ -191,9 +191,10 @@ def read_qhas(document: Mapping[str, Any]) -> Found:
         elif execute is not None:
             found.add(Measurement(f"graph_execute_us{name}", "run", "us", "the graph alone", mean_ms=execute))
     nodes = {}
-    for index, row in enumerate(_rows(data.get("qnn_op_instances_nodes"))):
-        name = str(row.get("qnn_op", index))
-        cycles = found.number(f"qnn_op_instances_nodes.data[{index}]: {name}", row.get("cycles"), "the count of cycles")
+    for index, node in enumerate(_rows(data.get("qnn_op_instances_nodes"))):
+        name = str(node.get("qnn_op", index))
+        place = f"qnn_op_instances_nodes.data[{index}]: {name}"
+        cycles = found.number(place, node.get("cycles"), "the count of cycles")
         if cycles is not None:
             nodes[name] = cycles
     _add_shares(found, nodes, dict.fromkeys(nodes))

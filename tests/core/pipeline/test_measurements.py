@@ -8,9 +8,11 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from random import Random
 
 import pytest
 
+from support.mutations import mutated
 from trilane.errors import BadInputError
 from trilane.pipeline.measurements.read_file import Measurements, chosen, read_measurements
 
@@ -472,3 +474,19 @@ def test_a_slow_first_run_is_pointed_out(read: Callable[[str], Measurements]) ->
     (one,) = read(json.dumps({"execution_summary": {"all_inference_times": times}})).measurements
     assert one.hint == "the first run took 7.5 times the median: a warm-up?"
     assert one.samples_ms == (30.0, 4.0, 4.1, 3.9)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_changed_files_are_read_or_refused(name: str, tmp_path: Path) -> None:
+    """What is read can be printed as JSON, which has no NaN; what is refused names the file."""
+    suffix = {"qnn": ".csv", "tflite": ".txt", "loadgen": ".txt"}.get(name, ".json")
+    path = tmp_path / f"file{suffix}"
+    for number in range(60):
+        path.write_bytes(mutated(FILES[name].encode(), suffix, Random(f"{name} {number}")))
+        try:
+            found = read_measurements(path)
+        except BadInputError as error:
+            assert str(path) in str(error)
+            continue
+        json.dumps([each.document() for each in found.measurements], allow_nan=False)
+        assert all(each.mean_ms is None or each.mean_ms >= 0 for each in found.measurements)
