@@ -122,17 +122,32 @@ def _show(read: Measurements) -> None:
 
 
 def _table(kind: str, measurements: Sequence[Measurement]) -> Table:
+    """Return a row for each measurement, without the columns that none of them fills."""
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table(kind, "count", "mean", "sd", "p50", "p95", "share", "distribution, ms")
-    for each in measurements:
-        figures = [_figure(value) for value in (each.mean_ms, each.sd_ms, each.p50_ms, each.p95_ms)]
-        share = "" if each.share is None else f"{100 * each.share:.1f} %"
+    cells = [_cells(each) for each in measurements]
+    columns = [name for name in cells[0] if any(row[name] for row in cells)]
+    table = Table(kind)
+    for name in columns:
+        table.add_column(name, no_wrap=True)
+    for each, row in zip(measurements, cells, strict=True):
         label = without_controls(each.name if len(each.name) <= 60 else f"{each.name[:40]}…{each.name[-19:]}")
-        count = "" if each.count is None else str(each.count)
-        table.add_row(escape(label), count, *figures, share, escape(_distribution(each)))
+        table.add_row(escape(label), *(escape(row[name]) for name in columns))
     return table
+
+
+def _cells(each: Measurement) -> dict[str, str]:
+    return {
+        "count": "" if each.count is None else str(each.count),
+        "mean, ms": _figure(each.mean_ms),
+        "sd": _figure(each.sd_ms),
+        "p50": _figure(each.p50_ms),
+        "p95": _figure(each.p95_ms),
+        "share": "" if each.share is None else f"{100 * each.share:.1f} %",
+        "distribution, ms": _distribution(each),
+        "on": without_controls(each.hardware),
+    }
 
 
 def _figure(value: float | None) -> str:
