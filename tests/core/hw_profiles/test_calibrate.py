@@ -128,6 +128,15 @@ def test_one_row_that_is_far_off_moves_little(tables: tuple[dict[str, Any], Path
         assert priced(moved, each) == pytest.approx(each.ms, rel=0.12)
 
 
+def test_a_row_left_out_is_predicted_by_the_others_alone(tables: tuple[dict[str, Any], Path]) -> None:
+    """Two rows of one network contradict each other: each is predicted as the other was measured, not in between."""
+    data, path = tables
+    ms = priced(parse_profile(data, path), row("resnet18"))
+    first, second = calibrate_tables(data, path, [row("resnet18", ms), row("resnet18", 2 * ms)]).rows
+    assert first.after_ms == pytest.approx(2 * ms, rel=0.03)
+    assert second.after_ms == pytest.approx(ms, rel=1e-6)
+
+
 def test_a_unit_without_an_engine_has_one_factor() -> None:
     """With rows that agree, log f = n w / (n w + s^2) log 3, where w = (NU + 1) / (NU + (log 3 - log f)^2 / s^2)."""
     data, path = load_tables("snapdragon-8-gen-3")
