@@ -212,29 +212,28 @@ def _at(data: Mapping[str, Any], key: str) -> dict[str, Any]:
     return quantity
 
 
-def as_toml(result: ProfileFit, name: str, title: str, extends: str, command: str) -> str:
-    """Return the text of a TOML file with the fitted numbers.
+def as_toml(
+    numbers: Mapping[str, tuple[float, float]], head: Mapping[str, str], command: str, measurements: str
+) -> str:
+    """Return the text of a TOML file with fitted numbers.
 
-    `result`: result of the fit.
-    `name`: name of the new profile.
-    `title`: title of the new profile.
-    `extends`: name of the profile that has all other numbers.
+    `numbers`: value and spread of each key.
+    `head`: `extends`, `name` and `title` of the new profile; the profile that it extends has all other numbers.
     `command`: command that made the file; it becomes the source of every number.
+    `measurements`: what the numbers come from, in words.
     """
     lines = [
-        f"# Written by `{command}`: {result.free_count} numbers from {len(result.residuals)} measurements.",
+        f"# Written by `{command}`: {measurements}.",
         "# `spread` is what the fit leaves open, as the standard deviation of the logarithm.",
-        f'extends = "{extends}"',
-        f'name = "{name}"',
-        f"title = {json.dumps(title)}",
+        *(f"{key} = {json.dumps(value)}" for key, value in head.items()),
     ]
     section, source = "", command.removeprefix("trilane ")
-    for key in sorted(result.numbers, key=lambda k: k.rsplit(".", 1)):
+    for key in sorted(numbers, key=lambda k: k.rsplit(".", 1)):
         table, last = key.rsplit(".", 1)
         if table != section:
             lines += ["", f"[{table}]"]
             section = table
-        value, spread = result.numbers[key]
+        value, spread = numbers[key]
         lines.append(
             f'{last} = {{ value = {value:.4g}, kind = "fitted", spread = {spread:.2g}, source = {json.dumps(source)} }}'
         )

@@ -28,6 +28,7 @@ MOST_SAMPLES: Final = 1_000_000
 MOST_PORT_BYTES: Final = 256 << 20
 LONGEST_SIDE: Final = 16_384  # of a picture, in pixels
 LONGEST_MS: Final = 3.6e6  # of a stage, an hour
+ONE_TIME: Final = "mean with or without sd, exponential, samples, or from with or without name"
 MOST_SDS: Final = 1000  # standard deviation of a time, in means
 NAME: Final = rf"^[\w-]{{1,{LONGEST_NAME}}}$"
 #: Types of numbers in a port, by NumPy's name.
@@ -233,8 +234,23 @@ def read_input(port: str, value: object) -> StageInput:
     return StageInput(port, stage, from_port, keys.sync == "latest", keys.max_age_ms or 0.0)
 
 
+def _inside(text: str) -> str:
+    """Refuse a path that leads out of the file's folder; the file may be a stranger's."""
+    normal = posixpath.normpath(text)
+    if not text or "\0" in text or "\\" in text or normal in (".", "..") or normal.startswith(("/", "../")):
+        remedy = "copy the file there, or put a link to it there"
+        raise UnexpectedValue(repr(text), "a path inside the folder of the pipeline file", remedy)
+    return text
+
+
+InsidePath = Annotated[str, Field(max_length=1000), AfterValidator(_inside)]
+
+
 class StageTime(Keys):
-    """The time of one job of a stage, in ms: one of `mean`, `exponential` and `samples`; `sd` beside `mean`."""
+    """The time of one job of a stage, in ms: one of `mean`, `exponential`, `samples` and `source`.
+
+    `sd` stands beside `mean`, `name` beside `source`, which `pipeline_file.py` replaces by the times of that file.
+    """
 
     mean: float | None = Field(default=None, ge=0, le=LONGEST_MS, allow_inf_nan=False, description="Mean, ms.")
     sd: float = Field(
@@ -250,6 +266,15 @@ class StageTime(Keys):
     samples: Annotated[
         tuple[Annotated[float, Field(ge=0, le=LONGEST_MS, allow_inf_nan=False)], ...], BeforeValidator(_as_tuple)
     ] = Field(default=(), description="Measured times, ms; each frame draws one of them.")
+    source: InsidePath | None = Field(
+        default=None, alias="from", description="File of another tool in this folder that has the times."
+    )
+    name: str | None = Field(
+        default=None,
+        min_length=1,
+        max_length=300,
+        description="Measurement of that file, as `trilane times` names it; without it the only run.",
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -257,18 +282,19 @@ class StageTime(Keys):
         if is_number(value):
             return {"mean": value}
         if not isinstance(value, dict):
-            raise UnexpectedValue(shown(value), "a time in ms, or a table of mean and sd, exponential, or samples")
+            raise UnexpectedValue(shown(value), f"a time in ms, or a table of {ONE_TIME}")
         samples = value.get("samples", ())
         if isinstance(samples, list) and not 1 <= len(samples) <= MOST_SAMPLES:
             raise UnexpectedValue(f"{len(samples)} samples", f"1 to {MOST_SAMPLES}")
         return value
 
     @model_validator(mode="after")
-    def _one_of_three(self) -> Self:
-        given = [self.mean is not None, self.exponential is not None, bool(self.samples)]
-        if sum(given) != 1 or (self.sd and self.mean is None):
-            found = ", ".join(name for name in type(self).model_fields if name in self.model_fields_set) or "no key"
-            raise UnexpectedValue(found, "mean with or without sd, exponential, or samples")
+    def _one_of_four(self) -> Self:
+        given = [self.mean is not None, self.exponential is not None, bool(self.samples), self.source is not None]
+        if sum(given) != 1 or (self.sd and self.mean is None) or (self.name and self.source is None):
+            fields = type(self).model_fields.items()
+            found = ", ".join(field.alias or name for name, field in fields if name in self.model_fields_set)
+            raise UnexpectedValue(found or "no key", ONE_TIME)
         if self.sd and not self.mean:
             raise UnexpectedValue("sd beside mean = 0", "a mean above 0")
         if self.mean is not None and self.sd > MOST_SDS * self.mean:
@@ -315,16 +341,6 @@ def _read_size(value: object) -> object:
 Size = Annotated[tuple[int, int], BeforeValidator(_read_size)]
 
 
-def _inside(text: str) -> str:
-    """Refuse a path that leads out of the file's folder; the file may be a stranger's."""
-    normal = posixpath.normpath(text)
-    if not text or "\0" in text or "\\" in text or normal in (".", "..") or normal.startswith(("/", "../")):
-        remedy = "copy the file there, or put a link to it there"
-        raise UnexpectedValue(repr(text), "a path inside the folder of the pipeline file", remedy)
-    return text
-
-
-InsidePath = Annotated[str, Field(max_length=1000), AfterValidator(_inside)]
 SIZE_HELP = "Width and height in pixels, such as '640x480'"
 
 
@@ -363,7 +379,7 @@ class StageKeys(Keys):
     )
     time_ms: StageTime | None = Field(
         default=None,
-        description="Time of a job in ms: a number, { mean, sd }, { exponential } or { samples = [...] }.",
+        description="Time of a job in ms: a number, or a table of mean and sd, exponential, samples, or from and name.",
     )
 
     @property

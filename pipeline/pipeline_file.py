@@ -27,6 +27,8 @@ from trilane.pipeline.file_keys import (
     BLOCKS,
     ENDS,
     KINDS,
+    MOST_SAMPLES,
+    MOST_SDS,
     MOST_STAGES,
     NAME,
     InputKeys,
@@ -41,6 +43,8 @@ from trilane.pipeline.file_keys import (
     read_input,
     shown,
 )
+from trilane.pipeline.measurements.measurement import Measurement
+from trilane.pipeline.measurements.read_file import chosen, read_measurements
 from trilane.scheduler.events import MOST_INPUTS
 from trilane.scheduler.policy import POLICIES
 from trilane.transport.slots import edge_rule
@@ -257,13 +261,30 @@ def _stage(name: str, values: object, path: Path) -> StageKeys:
             raise BadInputError(f"{where}.block", shown(block), f"one of {', '.join(BLOCKS)}", hint)
         model = BLOCKS[block]
     inputs = _inputs(values["in"], f"{where}.in") if "in" in values else ()
-    stage = _checked(model, {**values, "in": inputs}, where)
+    stage = _with_times(_checked(model, {**values, "in": inputs}, where), f"{where}.time_ms", path.parent)
     _check_ports(stage, where)
     if isinstance(stage, OnnxStage) and not (path.parent / stage.onnx).is_file():
         model_path = path.parent / stage.onnx
         found = f"{instead_of_file(model_path)} at {model_path}"
         raise BadInputError(f"{where}.onnx", found, "an ONNX file", f"put {stage.onnx} beside {path.name}")
     return stage
+
+
+def _with_times(stage: StageKeys, where: str, folder: Path) -> StageKeys:
+    """Return the stage with the times of the file that its `time_ms` names, if it names one. Raises BadInputError."""
+    time = stage.time_ms
+    if time is None or time.source is None:
+        return stage
+    one = chosen(read_measurements(folder / time.source), time.name or "", where)
+    return stage.model_copy(update={"time_ms": time_of(one)})
+
+
+def time_of(measurement: Measurement) -> StageTime:
+    """Return a measurement as the time of a stage: its samples, or else its mean and, where it has one, its spread."""
+    if measurement.samples_ms:
+        return StageTime(samples=measurement.samples_ms[:MOST_SAMPLES])
+    mean, sd = measurement.mean_ms or 0.0, measurement.sd_ms or 0.0
+    return StageTime(mean=mean, sd=min(sd, MOST_SDS * mean))
 
 
 def _inputs(value: object, where: str) -> tuple[StageInput, ...]:

@@ -38,6 +38,7 @@ COMMANDS = {
     "predict": ("trilane.apps.cli.predict", "Predict frame time, idleness, heat and energy on a chip."),
     "init": ("trilane.apps.cli.init", "Write a first pipeline file for networks over a video."),
     "check": ("trilane.apps.cli.check", "Check a pipeline file: its graph, least period and memory."),
+    "times": ("trilane.apps.cli.times", "Read what other tools measured: runs, layers, traces."),
     "sweep": ("trilane.apps.cli.sweep", "Try many configurations of a command, on one machine or many."),
     "profiles": ("trilane.apps.cli.profiles", "List, show, check and fit the hardware profiles."),
     "doctor": ("trilane.apps.cli.doctor", "Say what this machine has, what is missing and how to install it."),

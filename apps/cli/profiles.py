@@ -5,19 +5,23 @@ Rule: this module reads options and shows results; every figure comes from `tril
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import Iterable
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from trilane.apps.cli.commands import Commands, JsonOption
-from trilane.apps.cli.console import print_json, stderr_console, stdout_console
+from trilane.apps.cli.console import print_json, stderr_console, stdout_console, without_controls
 from trilane.errors import BadInputError
 from trilane.files import read_text
 from trilane.writing import WRITABLE, write_bytes
 
 if TYPE_CHECKING:
+    from trilane.hw_profiles.calibrate import Calibrated, Checked
     from trilane.hw_profiles.fit import ProfileFit
 
 app = Commands(no_args_is_help=True, help="Hardware profiles.")
@@ -114,32 +118,63 @@ def check(
 
 @app.command(
     epilog="\b\nExamples:\n  trilane profiles fit --from ../shared/data/snapdragon888_measured.csv\n"
-    "  trilane profiles fit --from rows.csv --profile mine.toml --name mine-fitted --write mine-fitted.toml"
+    "  trilane profiles fit --from rows.csv --profile mine.toml --name mine-fitted --write mine-fitted.toml\n"
+    "  trilane profiles fit --from times.csv --profile snapdragon-8-gen-2 --name my-chip --write my-chip.toml"
 )
 def fit(
-    source: Annotated[Path, typer.Option("--from", help="CSV of measured rows.")],
-    profile: Annotated[str, typer.Option(help="Profile whose numbers are the priors.")] = "snapdragon-888-facts",
-    name: Annotated[str, typer.Option(help="Name of the fitted profile.")] = "snapdragon-888",
+    source: Annotated[Path, typer.Option("--from", help="CSV of measured rows (docs/predict.md).")],
+    profile: Annotated[
+        str | None, typer.Option(help="Profile whose numbers are the priors; one of the 888 if not given.")
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the fitted profile; calibrated or snapdragon-888 if not given.")
+    ] = None,
     write: Annotated[Path | None, typer.Option(help="Write the fitted profile here.")] = None,
+    networks: Annotated[Path | None, typer.Option(help="Folder of the networks; that of the CSV if not given.")] = None,
     json: JsonOption = False,
 ) -> None:
-    """Fit a profile to measured rows; print residuals and the error on rows left out."""
+    """Fit a profile to measured rows; print residuals and the error on rows left out.
+
+    Rows `network, ms` move a chip's profile towards them; rows of the reference networks fit efficiencies.
+    """
+    from trilane.hw_profiles.calibrate import calibrate, is_own_table, read_own_rows
     from trilane.hw_profiles.fit import as_toml, fit_profile
 
-    if not re.fullmatch(r"[\w.-]{1,64}", name):
-        raise BadInputError("--name", repr(name), "letters, digits, dots, hyphens and underscores")
+    own = is_own_table(source)
+    usual = ("snapdragon-888", "calibrated") if own else ("snapdragon-888-facts", "snapdragon-888")
+    base, named = (other if asked is None else asked for asked, other in zip((profile, name), usual, strict=True))
+    if not re.fullmatch(r"[\w.-]{1,64}", named):
+        raise BadInputError("--name", repr(named), "letters, digits, dots, hyphens and underscores")
     if write is not None and not write.absolute().parent.is_dir():
         raise BadInputError(write, "no such folder", WRITABLE)
     with stderr_console().status("fitting, each row left out in turn"):
-        result = fit_profile(profile, source)
+        result = calibrate(base, read_own_rows(source, networks or source.parent)) if own else fit_profile(base, source)
     if json:
-        print_json(_fit_document(result))
+        print_json(_document(result))
     else:
-        _show_fit(result)
+        _show(result)
     if write is not None:
-        title = result.data["title"].removesuffix(", before the fit")
-        command = f"trilane profiles fit --from {source}"
-        write_bytes(write, as_toml(result, name, title, profile, command).encode())
+        head = {"extends": _beside(base, write), "name": named, "title": _title(result, own)}
+        count = _counted(result)
+        write_bytes(write, as_toml(result.numbers, head, f"trilane profiles fit --from {source}", count).encode())
+
+
+def _beside(base: str, write: Path) -> str:
+    """Return a profile as `extends` names it: a file relative to the new one."""
+    return os.path.relpath(base, write.absolute().parent) if base.endswith(".toml") else base
+
+
+def _title(result: ProfileFit | Calibrated, own: bool) -> str:
+    title: str = result.data["title"]
+    return f"{title}, moved to own measurements" if own else title.removesuffix(", before the fit")
+
+
+def _counted(result: ProfileFit | Calibrated) -> str:
+    from trilane.hw_profiles.fit import ProfileFit
+
+    if not isinstance(result, ProfileFit):
+        return f"{len(result.rows)} own measurements"
+    return f"{result.free_count} numbers from {len(result.residuals)} measurements"
 
 
 @app.command(
@@ -166,6 +201,80 @@ def fit_chips(
     if plot is not None:
         plot_errors(study, plot)
     stdout_console().print(as_markdown(study), highlight=False)
+
+
+def _document(result: ProfileFit | Calibrated) -> dict[str, Any]:
+    from trilane.hw_profiles.fit import ProfileFit
+
+    return _fit_document(result) if isinstance(result, ProfileFit) else _calibrated_document(result)
+
+
+def _show(result: ProfileFit | Calibrated) -> None:
+    from trilane.hw_profiles.fit import ProfileFit
+
+    if isinstance(result, ProfileFit):
+        _show_fit(result)
+    else:
+        _show_calibrated(result)
+
+
+def _calibrated_document(result: Calibrated) -> dict[str, Any]:
+    return {
+        "measurements": len(result.rows),
+        "median_error_before": _median_error(each.error_before for each in result.rows),
+        "median_error_left_out": _median_error(each.error_after for each in result.rows),
+        "numbers": {key: {"value": v, "spread": s} for key, (v, s) in result.numbers.items()},
+        "rows": [
+            {
+                "row": each.row.place,
+                "network": each.row.network,
+                "unit": each.row.unit,
+                "measured_ms": each.row.ms,
+                "before": _with_interval(each.before_ms, each.before),
+                "left_out": _with_interval(each.after_ms, each.after),
+            }
+            for each in result.rows
+        ],
+    }
+
+
+def _median_error(errors: Iterable[float]) -> float:
+    return median(map(abs, errors))
+
+
+def _with_interval(ms: float, around: Any) -> dict[str, float]:
+    return {"ms": ms, "low_ms": around.low_ms, "high_ms": around.high_ms}
+
+
+def _show_calibrated(result: Calibrated) -> None:
+    from rich.table import Table
+
+    console = stdout_console()
+    title = "each row predicted from the others; 80 % intervals"
+    table = Table("network", "unit", "measured, ms", "before, ms", "error", "left out, ms", "error", title=title)
+    for each in result.rows:
+        table.add_row(*_cells(each))
+    console.print(table)
+    before, after = (_median_error(getattr(row, key) for row in result.rows) for key in ("error_before", "error_after"))
+    console.print(f"median error: {100 * before:.0f} % before, {100 * after:.0f} % on rows left out")
+    numbers = Table("number", "value", "± %")
+    for key, (value, spread) in result.numbers.items():
+        numbers.add_row(key, f"{value:.4g}", f"{100 * spread:.0f}")
+    console.print(numbers)
+
+
+def _cells(each: Checked) -> tuple[str, ...]:
+    from rich.markup import escape
+
+    predictions = (
+        cell
+        for ms, around, error in (
+            (each.before_ms, each.before, each.error_before),
+            (each.after_ms, each.after, each.error_after),
+        )
+        for cell in (f"{ms:.3g} ({around.low_ms:.3g}-{around.high_ms:.3g})", f"{100 * error:+.0f} %")
+    )
+    return (escape(without_controls(each.row.network)), each.row.unit, f"{each.row.ms:.4g}", *predictions)
 
 
 def _fit_document(result: ProfileFit) -> dict[str, Any]:

@@ -152,7 +152,9 @@ def test_a_fitted_profile_is_written(
     monkeypatch.setattr(fit_module, "as_toml", lambda *given: asked.append(given) or "the text\n")
     monkeypatch.chdir(tmp_path)
     command("profiles", "fit", "--from", "r.csv", "--profile", "mine", "--write", "new.toml", *words)
-    assert asked == [(a_fit(), name, "A Chip", "mine", "trilane profiles fit --from r.csv")]
+    head = {"extends": "mine", "name": name, "title": "A Chip"}
+    made = ("trilane profiles fit --from r.csv", "2 numbers from 3 measurements")
+    assert asked == [(a_fit().numbers, head, *made)]
     assert Path("new.toml").read_text() == "the text\n"
 
 

@@ -102,8 +102,8 @@ def test_the_file_of_a_fit() -> None:
         "memory.use": (0.5, 1.0),
         "units.dsp.efficiency.resize": (1234.56, 0.25),
     }
-    fitted = ProfileFit({}, numbers, RESIDUALS, 7)
-    text = as_toml(fitted, "mine", 'The "best"', "base", "trilane profiles fit --from x.csv")
+    head = {"extends": "base", "name": "mine", "title": 'The "best"'}
+    text = as_toml(numbers, head, "trilane profiles fit --from x.csv", "7 numbers from 5 measurements")
     assert text.splitlines()[0] == "# Written by `trilane profiles fit --from x.csv`: 7 numbers from 5 measurements."
 
     def number(value: float, spread: float) -> dict[str, Any]:
@@ -242,7 +242,8 @@ def test_numbers_that_made_the_rows_are_found_again(tmp_path: Path, monkeypatch:
 @pytest.mark.slow
 def test_the_written_profile_can_be_read(fitted: ProfileFit, tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
-    path.write_text(as_toml(fitted, "mine", "Mine", "snapdragon-888-facts", "trilane profiles fit --from x.csv"))
+    head = {"extends": "snapdragon-888-facts", "name": "mine", "title": "Mine"}
+    path.write_text(as_toml(fitted.numbers, head, "trilane profiles fit --from x.csv", "rows"))
     profile = load_profile(str(path))
     assert profile.name == "mine"
     assert not profile.template

@@ -1,0 +1,172 @@
+"""`trilane times`: measurements of other tools as a table with their distribution, JSON, a stage's time or fit rows.
+
+Rule: this module shows and writes what `trilane.apps.times` made; nothing is computed here but bars.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from trilane.apps.cli.commands import Commands, JsonOption
+from trilane.apps.cli.console import print_json, stdout_console, without_controls
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from trilane.pipeline.measurements.measurement import Measurement
+    from trilane.pipeline.measurements.read_file import Measurements
+
+app = Commands()
+
+EPILOG = """\b
+Examples:
+  trilane times profile.csv
+  trilane times onnxruntime_profile.json --name model_run --stage street.toml:segmenter
+  trilane times benchmark.txt --rows chip.csv --network seg.onnx --hardware dsp --precision int8
+  trilane times trace.pftrace --csv samples.csv
+
+\b
+Exit codes:
+  0 done, 2 a file of no known tool or without a usable time
+"""
+BARS, WIDTH = " ▁▂▃▄▅▆▇█", 24
+MOST_ROWS = 40
+
+FilesArgument = Annotated[
+    list[Path], typer.Argument(help="Files of other tools; what each is follows from its content.")
+]
+NameOption = Annotated[str, typer.Option(help="Measurement that --stage or --rows takes; the only run if not given.")]
+StageOption = Annotated[str | None, typer.Option(help="Write it as the time of a stage, FILE.toml:STAGE.")]
+RowsOption = Annotated[Path | None, typer.Option(help="Add it to this table for `trilane profiles fit` (.csv).")]
+NetworkOption = Annotated[str | None, typer.Option(help="Network that was measured, a path beside the table.")]
+HardwareOption = Annotated[str, typer.Option(help="Unit that ran it: cpu, gpu or dsp.")]
+PrecisionOption = Annotated[str, typer.Option(help="int8, fp16 or fp32.")]
+RuntimeOption = Annotated[str, typer.Option(help="Runtime of a tensor engine: tflite or qnn_dlc.")]
+CsvOption = Annotated[Path | None, typer.Option("--csv", help="Write every single time here (.csv).")]
+
+
+@app.command(epilog=EPILOG)
+def times(
+    files: FilesArgument,
+    name: NameOption = "",
+    stage: StageOption = None,
+    rows: RowsOption = None,
+    network: NetworkOption = None,
+    hardware: HardwareOption = "dsp",
+    precision: PrecisionOption = "int8",
+    runtime: RuntimeOption = "tflite",
+    samples: CsvOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Read what other tools measured, say what it is, and refuse what cannot be.
+
+    QNN profiles, QHAS, ONNX Runtime, benchmark_model, LoadGen and MLPerf's app, TensorRT, AI Hub, ExecuTorch, Perfetto.
+    """
+    from trilane.apps.times.imported_times import document, one_of, rows_text, samples_csv, stage_text
+    from trilane.hw_profiles.calibrate import fit_row
+    from trilane.pipeline.measurements.read_file import read_measurements
+    from trilane.writing import write_bytes
+
+    reads = [read_measurements(path) for path in files]
+    written: dict[Path, str] = {}
+    if stage is not None:
+        path, name_of_stage = _stage_of(stage)
+        written[path] = stage_text(path, name_of_stage, *one_of(reads, name))
+    if rows is not None:
+        written[rows] = rows_text(rows, *one_of(reads, name), fit_row(rows, network, hardware, precision, runtime))
+    if samples is not None:
+        written[samples] = samples_csv(reads)
+    for path, text in written.items():
+        write_bytes(path, text.encode())
+    if json:
+        print_json(document(reads))
+        return
+    for read in reads:
+        _show(read)
+    for path in written:
+        stdout_console().print(f"written: {without_controls(str(path))}", markup=False, soft_wrap=True)
+
+
+def _stage_of(text: str) -> tuple[Path, str]:
+    from trilane.errors import BadInputError
+
+    path, colon, stage = text.rpartition(":")
+    if not colon or not path or not stage:
+        raise BadInputError("--stage", repr(text), "FILE.toml:STAGE, such as street.toml:segmenter")
+    return Path(path), stage
+
+
+def _show(read: Measurements) -> None:
+    console = stdout_console()
+    name = without_controls(str(read.path))
+    console.print(f"{name}: {read.tool}: {read.says}", markup=False, soft_wrap=True)
+    for kind in ("run", "wall", "layer"):
+        of_kind = [each for each in read.measurements if each.kind == kind]
+        if kind == "layer":
+            of_kind.sort(key=lambda each: -(each.share or 0) or -(each.mean_ms or 0))
+        if of_kind:
+            console.print(_table(kind, of_kind[:MOST_ROWS]))
+        if len(of_kind) > MOST_ROWS:
+            console.print(f"and {len(of_kind) - MOST_ROWS} more; --json has all")
+    hints = [f"{each.name}: {each.hint}" for each in read.measurements if each.hint]
+    skipped = [f"left aside: {reason} ({count})" for reason, count in read.skipped.items()]
+    refused = [f"refused: {each.row}: {each.reason}" for each in read.refused[:MOST_ROWS]]
+    if read.refused_count > len(refused):
+        refused.append(f"refused: {read.refused_count - len(refused)} more")
+    for line in (*hints, *skipped, *refused):
+        console.print(without_controls(line), markup=False, soft_wrap=True)
+
+
+def _table(kind: str, measurements: Sequence[Measurement]) -> Table:
+    """Return a row for each measurement, without the columns that none of them fills."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    cells = [_cells(each) for each in measurements]
+    columns = [name for name in cells[0] if any(row[name] for row in cells)]
+    table = Table(kind)
+    for name in columns:
+        table.add_column(name, no_wrap=True)
+    for each, row in zip(measurements, cells, strict=True):
+        label = without_controls(each.name if len(each.name) <= 60 else f"{each.name[:40]}…{each.name[-19:]}")
+        table.add_row(escape(label), *(escape(row[name]) for name in columns))
+    return table
+
+
+def _cells(each: Measurement) -> dict[str, str]:
+    return {
+        "count": "" if each.count is None else str(each.count),
+        "mean, ms": _figure(each.mean_ms),
+        "sd": _figure(each.sd_ms),
+        "p50": _figure(each.p50_ms),
+        "p95": _figure(each.p95_ms),
+        "share": "" if each.share is None else f"{100 * each.share:.1f} %",
+        "distribution, ms": _distribution(each),
+        "on": without_controls(each.hardware),
+    }
+
+
+def _figure(value: float | None) -> str:
+    return "" if value is None else f"{value:.4g}"
+
+
+def _distribution(measurement: Measurement) -> str:
+    """Draw the samples as bars from the least to the largest, or the figures of a distribution on a line."""
+    low, high = measurement.min_ms, measurement.max_ms
+    if low is None or high is None or high <= low:
+        return ""
+    if measurement.samples_ms:
+        counts = [0] * WIDTH
+        for ms in measurement.samples_ms:
+            counts[min(int((ms - low) / (high - low) * WIDTH), WIDTH - 1)] += 1
+        most = max(counts)
+        drawn = "".join(BARS[-(-count * (len(BARS) - 1) // most)] for count in counts)
+    else:
+        marks = {each: "|" for each in (measurement.p50_ms, measurement.p95_ms) if each is not None}
+        places = {min(int((at - low) / (high - low) * WIDTH), WIDTH - 1): mark for at, mark in marks.items()}
+        drawn = "".join(places.get(place, "-") for place in range(WIDTH))
+    return f"{low:.3g} {drawn} {high:.3g}"

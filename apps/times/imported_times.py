@@ -1,0 +1,130 @@
+"""What `trilane times` makes of measurements: a document, the time of a stage in a pipeline file, rows for a fit.
+
+    reads = [read_measurements(path) for path in paths]
+    document(reads)
+    stage_text(Path("street.toml"), "seg", read, "RPC (execute) time")
+
+Rule: nothing is written here; each function returns the text of a file, checked as its reader would check it.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from trilane.errors import BadInputError, MissingPartError, did_you_mean
+from trilane.files import read_text
+from trilane.hw_profiles.calibrate import NamedRow
+from trilane.pipeline.measurements.measurement import Measurement
+from trilane.pipeline.measurements.read_file import OWN_COLUMNS, Measurements, chosen
+from trilane.pipeline.pipeline_file import checked_tables, read_pipeline, time_of
+
+MOST_WRITTEN: Final = 10_000  # samples that are written into a pipeline file
+#: Columns of the rows for `trilane profiles fit`.
+FIT_COLUMNS: Final = ("network", "ms", "unit", "precision", "runtime", "source")
+
+
+def document(reads: Sequence[Measurements]) -> dict[str, Any]:
+    """Return all measurements as plain data, each with its file."""
+    return {
+        "files": [
+            {
+                "file": str(read.path),
+                "tool": read.tool,
+                "says": read.says,
+                "refused": read.refused_count,
+                "skipped": dict(read.skipped),
+            }
+            for read in reads
+        ],
+        "measurements": [each.document() | {"file": str(read.path)} for read in reads for each in read.measurements],
+        "refused": [each._asdict() | {"file": str(read.path)} for read in reads for each in read.refused],
+    }
+
+
+def samples_csv(reads: Sequence[Measurements]) -> str:
+    """Return every single time as a row of a CSV, which `trilane times` reads again."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(OWN_COLUMNS)
+    for read in reads:
+        for each in read.measurements:
+            writer.writerows([each.name, each.kind, each.unit, n, ms] for n, ms in enumerate(each.samples_ms))
+    return text.getvalue()
+
+
+def one_of(reads: Sequence[Measurements], name: str) -> tuple[Measurements, Measurement]:
+    """Return the measurement that `name` means, with its file; with an empty name the only run.
+
+    Raises BadInputError for none, and for several files that have it.
+    """
+    holding = [read for read in reads if any(each.name == name for each in read.measurements)] if name else reads
+    if not holding:
+        known = [each.name for read in reads for each in read.measurements]
+        shown = ", ".join(map(repr, known[:8])) + (" …" if len(known) > 8 else "")
+        raise BadInputError("--name", f"the unknown measurement {name!r}", f"one of {shown}", did_you_mean(name, known))
+    if len(holding) > 1:
+        raise BadInputError("FILE", f"{len(holding)} files with such a time", "one", "give the one that is meant")
+    return holding[0], chosen(holding[0], name, "--name")
+
+
+def stage_text(path: Path, stage: str, read: Measurements, measurement: Measurement) -> str:
+    """Return the text of the pipeline file `path` with the measurement as the `time_ms` of `stage`.
+
+    Everything else of the file stays, comments too. A profile in the file's folder is named, others are written out.
+    Raises BadInputError for a stage that is not there or too many samples, MissingPartError without tomlkit.
+    """
+    try:
+        import tomlkit
+    except ImportError:
+        raise MissingPartError("writing into a pipeline file needs tomlkit", extra="edit") from None
+    file = read_pipeline(path)
+    if stage not in file.stages:
+        expected = f"one of {', '.join(file.stages)}"
+        raise BadInputError(f"{path}: stages", f"no stage {stage!r}", expected, did_you_mean(stage, file.stages))
+    tables = tomlkit.parse(read_text(path, "a pipeline file"))
+    tables["stages"][stage]["time_ms"] = _as_toml(path, read, measurement)
+    text = tomlkit.dumps(tables)
+    checked_tables(tomllib.loads(text), path)
+    return text
+
+
+def _as_toml(path: Path, read: Measurements, measurement: Measurement) -> Any:
+    """Return the value of `time_ms` as an inline table."""
+    import tomlkit
+
+    inside = Path(os.path.relpath(read.path.absolute(), path.absolute().parent))
+    time, table = time_of(measurement), tomlkit.inline_table()
+    values: Mapping[str, object]
+    if inside.parts[0] != os.pardir:
+        values = {"from": inside.as_posix(), "name": measurement.name}
+    elif len(time.samples) > MOST_WRITTEN:
+        remedy = f"put {read.path.name} beside {path.name}: the file then names it"
+        raise BadInputError(read.path, f"{len(time.samples)} samples", f"at most {MOST_WRITTEN} to write out", remedy)
+    elif time.samples:
+        values = {"samples": list(time.samples)}
+    else:
+        values = {"mean": time.mean_ms, "sd": time.sd} if time.sd else {"mean": time.mean_ms}
+    table.update(values)
+    return table
+
+
+def rows_text(path: Path, read: Measurements, measurement: Measurement, row: NamedRow) -> str:
+    """Return the text of the table `path` with one row more, its median or else its mean; the table may be new.
+
+    Raises BadInputError for a table with other columns.
+    """
+    before = read_text(path, "a table of rows for the fit") if path.exists() else ",".join(FIT_COLUMNS) + "\n"
+    header = next(csv.reader(before.splitlines()[:1]))
+    if tuple(header) != FIT_COLUMNS:
+        raise BadInputError(path, f"the columns {', '.join(header)}", ", ".join(FIT_COLUMNS))
+    text = io.StringIO()
+    ms = measurement.mean_ms if measurement.p50_ms is None else measurement.p50_ms
+    source = f"{read.path.name}: {measurement.name}"
+    csv.writer(text, lineterminator="\n").writerow([row.network, ms, *row[1:], source])
+    return before.rstrip("\n") + "\n" + text.getvalue()

@@ -1,0 +1,347 @@
+"""Moves a chip's profile towards a handful of own measurements, and says how well rows that were left out are met.
+
+    rows = read_own_rows(Path("chip.csv"), Path("networks"))
+    moved = calibrate("snapdragon-8-gen-2", rows)
+    moved.numbers, moved.rows[0].after
+
+The profile's numbers are the prior. What is not known of another chip is mostly how fast it is in everything, so the
+prior lets all rates move together by CHIP, and each apart by less:
+
+    covariance of two log rates = CHIP^2 + RATE^2 [same rate] + ENGINE^2 [same engine] + OWN^2 [same rate and engine]
+
+The fit minimises, over the deviations d of all log rates from the profile's,
+
+    sum over rows of (NU + 1) log(1 + r^2 / NU) + d' covariance^-1 d,    r = log(predicted / measured) / NOISE,
+
+by Gauss and Newton's method, as `fit_engines.py` does with many rows. A unit without a tensor engine has one factor on
+all its times. Every row is predicted by a fit to the others.
+"""
+
+from __future__ import annotations
+
+import copy
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, Final, NamedTuple, get_args
+
+import numpy as np
+
+from trilane.arrays import F64
+from trilane.errors import BadInputError, did_you_mean
+from trilane.files import read_text
+from trilane.hw_profiles.engine_layers import NAMES, RATES, TERMS
+from trilane.hw_profiles.engine_times import amounts, join, numbers_of
+from trilane.hw_profiles.graph_file import read_graph
+from trilane.hw_profiles.network_time import Interval, in_precision, interval, price, under_runtime
+from trilane.hw_profiles.network_work import Work
+from trilane.hw_profiles.profile_files import load_tables, parse_profile
+from trilane.hw_profiles.schema import KEY_OF_RATE, EngineName, EngineRuntime, Profile, Unit, corners_of
+from trilane.hw_profiles.unit_times import time_on
+from trilane.units import BURST, UNITS, UnitName
+
+#: Spreads of the prior, as standard deviations of logarithms: of a chip's speed, of one rate apart from the others, of
+#: an engine apart from the others, and of a rate of an engine.
+CHIP, RATE, ENGINE, OWN = 1.0, 0.2, 0.2, 0.15
+NOISE, NU = 0.12, 3.0
+STEPS, ENOUGH = 50, 1e-6
+LEAST_ROWS, MOST_ROWS = 2, 1000
+LONGEST_MS = 3.6e6
+RATE_OF_TERM = np.array([RATES.index(TERMS[name]) for name in NAMES])
+PRECISIONS: Final = {"int8": "int8", "w8a8": "int8", "fp16": "fp16", "float": "fp16", "fp32": "fp32"}
+RUNTIMES: Final[tuple[EngineRuntime, ...]] = get_args(EngineRuntime)
+#: Numbers of a unit without a tensor engine: those that a slower unit divides, and those that it multiplies.
+COSTS: Final = ("job_fixed_ms", "operator_fixed_us", "input_ns_per_element", "permute_fixed_ms")
+MOST_EFFICIENCY: Final = 4.0
+
+
+class OwnRow(NamedTuple):
+    """One own measurement. `place`: file and line. `network`: path as the table has it. `ms`: time of a job."""
+
+    place: str
+    network: str
+    work: Work
+    ms: float
+    unit: UnitName
+    precision: str
+    runtime: EngineRuntime
+
+
+class Checked(NamedTuple):
+    """A row beside the profile's prediction of it, and that of the profile moved by all other rows."""
+
+    row: OwnRow
+    before_ms: float
+    before: Interval
+    after_ms: float
+    after: Interval
+
+    @property
+    def error_before(self) -> float:
+        return self.before_ms / self.row.ms - 1
+
+    @property
+    def error_after(self) -> float:
+        return self.after_ms / self.row.ms - 1
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """`numbers`: value and relative spread of each key that moved. `data`: tables of the moved profile."""
+
+    data: Mapping[str, Any]
+    numbers: Mapping[str, tuple[float, float]]
+    rows: tuple[Checked, ...]
+
+
+def is_own_table(path: Path) -> bool:
+    """Say whether a table has rows of networks in files, not of the reference networks. A missing file has none."""
+    if not path.is_file():
+        return False
+    lines = [line for line in read_text(path, "a table of measured rows").splitlines() if not line.startswith("#")]
+    header = [cell.strip() for cell in next(csv.reader(lines[:1]), [])]
+    return {"network", "ms"} <= set(header) and "encoder" not in header
+
+
+def read_own_rows(path: Path, folder: Path) -> list[OwnRow]:
+    """Read own measurements: columns network, ms, and maybe unit, precision and runtime; others are ignored.
+
+    `folder`: folder that the networks' paths are relative to; none leads out of it. Raises BadInputError.
+    """
+    text = read_text(path, "a table of measured rows")
+    numbered = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
+    if not LEAST_ROWS <= len(numbered) - 1 <= MOST_ROWS:
+        raise BadInputError(path, f"{max(len(numbered) - 1, 0)} rows", f"{LEAST_ROWS} to {MOST_ROWS}")
+    header = [cell.strip() for cell in next(csv.reader([numbered[0][1]]))]
+    rows = []
+    for number, line in numbered[1:]:
+        place, cells = f"{path}: line {number}", next(csv.reader([line]), [])
+        if len(cells) != len(header):
+            raise BadInputError(place, f"{len(cells)} cells", f"{len(header)} as in the header")
+        rows.append(_own_row(place, dict(zip(header, (cell.strip() for cell in cells), strict=True)), folder))
+    return rows
+
+
+def _own_row(place: str, cells: Mapping[str, str], folder: Path) -> OwnRow:
+    try:
+        ms = float(cells["ms"])
+    except ValueError:
+        ms = math.nan
+    if not 0 < ms <= LONGEST_MS:
+        raise BadInputError(f"{place}: ms", repr(cells["ms"]), "a time in ms above 0, at most an hour")
+    unit, precision, runtime = (_word(place, cells, *each) for each in WORDS)
+    graph = read_graph(network_file(place, cells["network"], folder))
+    return OwnRow(place, cells["network"], graph.work, ms, unit, PRECISIONS[precision], runtime)  # type: ignore[arg-type]
+
+
+#: Columns that may be left out: what they may say, and what is meant without them.
+WORDS: Final[tuple[tuple[str, Sequence[str], str], ...]] = (
+    ("unit", UNITS, "dsp"),
+    ("precision", tuple(PRECISIONS), "int8"),
+    ("runtime", RUNTIMES, "tflite"),
+)
+
+
+def _word(place: str, cells: Mapping[str, str], column: str, known: Sequence[str], usual: str) -> str:
+    word = cells.get(column) or usual
+    if word not in known:
+        raise BadInputError(f"{place}: {column}", repr(word), f"one of {', '.join(known)}", did_you_mean(word, known))
+    return word
+
+
+def network_file(place: str, name: str, folder: Path) -> Path:
+    """Return the path of a network; `.onnx` may be left out. Raises BadInputError for one outside of `folder`."""
+    inner = PurePosixPath(name)
+    if not name or inner.is_absolute() or ".." in inner.parts or "\0" in name or "\\" in name:
+        expected = f"a path inside {folder}"
+        raise BadInputError(f"{place}: network", repr(name), expected, "--networks names another folder")
+    return folder / (name if inner.suffix == ".onnx" else f"{name}.onnx")
+
+
+def on_chip(profile: Profile, row: OwnRow) -> Profile:
+    """Return the profile with the row's unit in its precision and, with a tensor engine, under its runtime."""
+    chip = in_precision(profile, row.unit, "not said", row.precision)
+    return under_runtime(chip, row.unit, row.runtime) if chip.units[row.unit].engines else chip
+
+
+def calibrate(name: str | Path, rows: Sequence[OwnRow]) -> Calibrated:
+    """Move the profile `name` towards `rows`. Raises BadInputError for a row that the profile cannot predict."""
+    data, path = load_tables(name)
+    return calibrate_tables(data, path, rows)
+
+
+def calibrate_tables(data: Mapping[str, Any], path: Path, rows: Sequence[OwnRow]) -> Calibrated:
+    """Move the tables of a profile towards `rows`. `path`: file of the tables, for messages. Raises BadInputError."""
+    profile = parse_profile(data, path)
+    for row in rows:
+        try:
+            on_chip(profile, row)
+        except BadInputError as error:
+            raise BadInputError(row.place, error.found, error.expected) from None
+    moved, numbers = _moved(data, profile, rows)
+    checked = []
+    for index, row in enumerate(rows):
+        others = _moved(data, profile, [*rows[:index], *rows[index + 1 :]])[0]
+        before, after = _predicted(profile, row), _predicted(parse_profile(others, path), row)
+        checked.append(Checked(row, *before, *after))
+    return Calibrated(moved, numbers, tuple(checked))
+
+
+def _predicted(profile: Profile, row: OwnRow) -> tuple[float, Interval]:
+    chip = on_chip(profile, row)
+    time = price(chip, row.work, row.unit, corners_of(chip, BURST))
+    return time.total_ms, interval(chip, row.work, time)
+
+
+def _moved(
+    data: Mapping[str, Any], profile: Profile, rows: Sequence[OwnRow]
+) -> tuple[dict[str, Any], dict[str, tuple[float, float]]]:
+    """Return the moved tables, and the value and spread of each key that moved."""
+    moved = copy.deepcopy(dict(data))
+    numbers: dict[str, tuple[float, float]] = {}
+    for unit in UNITS:
+        of_unit = [row for row in rows if row.unit == unit]
+        on_engine = [row for row in of_unit if on_chip(profile, row).units[unit].engine is not None]
+        if on_engine:
+            numbers |= _engine_numbers(profile, unit, on_engine)
+        elif of_unit:
+            numbers |= _unit_numbers(profile, unit, of_unit)
+    for key, (value, spread) in numbers.items():
+        table: Any = moved
+        *folders, last = key.split(".")
+        for part in folders:
+            table = table[part]
+        table[last] = {**table[last], "value": value, "spread": spread, "kind": "fitted"}
+    return moved, numbers
+
+
+class _EngineRow:
+    """A row on a tensor engine: its time by the deviations of the six rates (6,), and how it grows with each."""
+
+    def __init__(self, profile: Profile, row: OwnRow) -> None:
+        chip = on_chip(profile, row)
+        unit, self.ms = chip.units[row.unit], row.ms
+        clock = unit.clock(corners_of(chip, BURST)[UNITS.index(row.unit)])
+        assert unit.engine is not None
+        self.engine: EngineName = engine_name(unit)
+        numbers = numbers_of(unit.engine, clock)
+        runs = [layer.op_type not in unit.fallback for layer in row.work.layers.layers]
+        self._costs = amounts(row.work.layers, numbers.room) * numbers.seconds * np.array([*runs, True])[:, None]
+        self._beside_s = 0.0
+        whole = time_on(unit, chip.memory, row.work, clock).total_ms / 1e3
+        self._beside_s = whole - self.predict(np.zeros(len(RATES)))[0] / 1e3
+
+    def predict(self, deviations: F64) -> tuple[float, F64]:
+        """Return the time in ms, and the growth of its logarithm with that of each rate's seconds (6,)."""
+        costs = self._costs * np.exp(deviations)[RATE_OF_TERM]
+        joined, slopes = join(costs[:-1])
+        whole = joined.sum() + costs[-1].sum() + self._beside_s
+        by_term = (costs[:-1] * slopes).sum(axis=0) + costs[-1]
+        by_rate = np.bincount(RATE_OF_TERM, by_term, len(RATES))
+        return 1e3 * float(whole), by_rate / whole
+
+
+def engine_name(unit: Unit) -> EngineName:
+    """Return the name of the tensor engine that a unit runs on."""
+    return next(name for name, engine in unit.engines.items() if engine is unit.engine)
+
+
+def prior_covariance(engines: Sequence[EngineName]) -> F64:
+    """Return the covariance of the log rates of `engines`, six of each in turn."""
+    same_engine = np.kron(np.eye(len(engines)), np.ones((len(RATES), len(RATES))))
+    same_rate = np.kron(np.ones((len(engines), len(engines))), np.eye(len(RATES)))
+    return CHIP**2 + RATE**2 * same_rate + ENGINE**2 * same_engine + OWN**2 * same_engine * same_rate
+
+
+def _engine_numbers(profile: Profile, unit: UnitName, rows: Sequence[OwnRow]) -> dict[str, tuple[float, float]]:
+    """Return the moved rates of all engines of the unit, with their spreads."""
+    engines = list(profile.units[unit].engines)
+    deviations, covariance = _solve([_EngineRow(profile, row) for row in rows], engines)
+    spreads = np.sqrt(np.diag(covariance))
+    numbers = {}
+    for index, engine in enumerate(engines):
+        for rate, (key, _) in KEY_OF_RATE.items():
+            place = index * len(RATES) + RATES.index(rate)
+            value = getattr(profile.units[unit].engines[engine].rates, key).or_else(1.0)
+            # a cost grows with the seconds of a unit, a rate falls
+            factor = math.exp(deviations[place] if key.endswith("_us") else -deviations[place])
+            numbers[f"units.{unit}.engines.{engine}.rates.{key}"] = (value * factor, float(spreads[place]))
+    return numbers
+
+
+def _solve(rows: Sequence[_EngineRow], engines: Sequence[EngineName]) -> tuple[F64, F64]:
+    """Return the most probable deviations of the log rates (6 x engines,), and their covariance."""
+    precision: F64 = np.linalg.inv(prior_covariance(engines)).astype(np.float64)
+    at: F64
+    at, places = np.zeros(len(precision)), [len(RATES) * engines.index(row.engine) for row in rows]
+    damping, (cost, gradient, curvature) = 1e-3, _derivatives(at, rows, places, precision)
+    for _ in range(STEPS):
+        step = np.clip(np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), -gradient), -1, 1)
+        lower, *derivatives = _derivatives(at + step, rows, places, precision)
+        if lower > cost:
+            damping *= 8
+            if damping > 1e6:
+                break
+            continue
+        gain, at, cost, damping = cost - lower, at + step, lower, damping / 5
+        gradient, curvature = derivatives
+        if gain < ENOUGH * (1 + cost):
+            break
+    return at, np.linalg.inv(curvature).astype(np.float64)
+
+
+def _derivatives(at: F64, rows: Sequence[_EngineRow], places: Sequence[int], precision: F64) -> tuple[float, F64, F64]:
+    """Return the cost, half its gradient, and half its curvature as if the predictions were linear."""
+    cost, gradient, curvature = float(at @ precision @ at), precision @ at, precision.copy()
+    for row, place in zip(rows, places, strict=True):
+        span = slice(place, place + len(RATES))
+        ms, growth = row.predict(at[span])
+        miss = math.log(ms / row.ms) / NOISE
+        weight = (NU + 1) / (NU + miss**2)
+        cost += (NU + 1) * math.log1p(miss**2 / NU)
+        gradient[span] += weight * miss * growth / NOISE
+        curvature[span, span] += weight * np.outer(growth, growth) / NOISE**2
+    return cost, gradient, curvature
+
+
+def _unit_numbers(profile: Profile, unit: UnitName, rows: Sequence[OwnRow]) -> dict[str, tuple[float, float]]:
+    """Return the numbers of a unit without a tensor engine, all moved by one factor on its times."""
+    own = profile.units[unit]
+    noise = max(NOISE, own.model_error_fraction.or_else(0.3))
+    misses = np.array([math.log(row.ms / _predicted(profile, row)[0]) for row in rows])
+    slower = 0.0
+    for _ in range(STEPS):
+        weights = (NU + 1) / (NU + ((misses - slower) / noise) ** 2)
+        slower = float((weights * misses).sum() / noise**2 / (weights.sum() / noise**2 + 1 / CHIP**2))
+    factor = math.exp(slower)
+    numbers = {}
+    for key, quantity in own.efficiency:
+        if quantity.value is not None:
+            value = min(quantity.value / factor, MOST_EFFICIENCY)
+            numbers[f"units.{unit}.efficiency.{key}"] = (value, quantity.relative_error)
+    for key in COSTS:
+        quantity = getattr(own, key)
+        if quantity.value is not None:
+            numbers[f"units.{unit}.{key}"] = (quantity.value * factor, quantity.relative_error)
+    return numbers
+
+
+class NamedRow(NamedTuple):
+    """What a row of a table says beside the time, as texts."""
+
+    network: str
+    unit: str
+    precision: str
+    runtime: str
+
+
+def fit_row(table: Path, network: str | None, unit: str, precision: str, runtime: str) -> NamedRow:
+    """Check what a new row of `table` would say, the network's graph too. Raises BadInputError."""
+    if not network:
+        raise BadInputError("--network", "nothing", "the network that was measured", "a path beside the table")
+    cells = {"unit": unit, "precision": precision, "runtime": runtime}
+    words = [_word("--rows", cells, *each) for each in WORDS]
+    read_graph(network_file("--network", network, table.absolute().parent))
+    return NamedRow(network, *words)

@@ -1,0 +1,271 @@
+"""What other tools measured, in one form, and the checks that every number of theirs passes.
+
+    found = Found("QNN profile", "times of each run ...")
+    found.sample("line 16: RPC (execute) time", "RPC (execute) time", "run", 7784, "us")
+    found.measurements, found.refused
+
+Rule: a reader hands each number to `Found`, which converts it to ms and refuses what no tool can have measured. A
+refused number names its row and a reason; the rows beside it stay. Nothing is guessed and nothing is repaired.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any, Final, Literal, NamedTuple, TypeGuard
+
+import numpy as np
+
+from trilane.errors import BadInputError
+
+#: run: one job of a whole network. layer: a part of one. wall: from outside, with whatever else happened meanwhile.
+Kind = Literal["run", "layer", "wall"]
+#: How many of a unit are a millisecond. Division rounds once, so 99091 us are 99.091 ms.
+PER_MS: Final = {"s": 1e-3, "ms": 1.0, "us": 1e3, "ns": 1e6}
+CYCLES: Final = "cycles"
+MOST_SAMPLES: Final = 1_000_000  # of a file
+MOST_NAMES: Final = 50_000
+MOST_REFUSED: Final = 1000  # that are listed; the others are counted
+UNNAMED: Final = "unnamed"
+LONGEST_NAME: Final = 300
+LONGEST_MS: Final = 3.6e6
+WARM_UP: Final = 1.5  # first run over the median of the others from which on it looks like a warm-up
+#: Why a time with a queue in it is no service time.
+QUEUEING: Final = "a wall time that contains queueing is no service time"
+
+
+class Refused(NamedTuple):
+    """A row that was not taken. `row`: its place and name."""
+
+    row: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One measured time.
+
+    `name`: as the tool has it. `unit`: unit of the source: s, ms, us, ns or cycles.
+    `samples_ms`: single times, empty where the tool states figures of them alone. `count`: how many were measured;
+    None where that is not said. `what`: what it contains, in words. `share`: part of all layers, where that is known.
+    `hardware`: unit that did it, as the tool names it. `service`: whether it can be a stage's time.
+    `more`: other figures of the source, by name.
+    """
+
+    name: str
+    kind: Kind
+    unit: str
+    what: str = ""
+    samples_ms: tuple[float, ...] = field(default=(), repr=False)
+    count: int | None = None
+    mean_ms: float | None = None
+    sd_ms: float | None = None
+    min_ms: float | None = None
+    p50_ms: float | None = None
+    p95_ms: float | None = None
+    max_ms: float | None = None
+    share: float | None = None
+    hardware: str = ""
+    service: bool = True
+    hint: str = ""
+    more: dict[str, float] = field(default_factory=dict)
+
+    def document(self) -> dict[str, Any]:
+        """Return the measurement as plain data."""
+        names = ("name", "kind", "unit", "what", "count", "mean_ms", "sd_ms", "min_ms", "p50_ms", "p95_ms", "max_ms")
+        rest = ("share", "hardware", "service", "hint", "more")
+        return {name: getattr(self, name) for name in (*names, *rest)} | {"samples_ms": list(self.samples_ms)}
+
+
+def is_finite(value: object) -> TypeGuard[int | float]:
+    """Say whether a value of a JSON document is a finite number; true and false are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+class Found:
+    """Collects what a reader finds in one file.
+
+    `tool`: name of the format. `says`: what its times are, in a sentence.
+    `refused`: implausible rows. `skipped`: how many rows are of another kind, by reason.
+    """
+
+    def __init__(self, tool: str, says: str) -> None:
+        self.tool, self.says = tool, says
+        self.refused: list[Refused] = []
+        self.refused_count = 0
+        self.skipped: Counter[str] = Counter()
+        self._samples: dict[tuple[str, Kind], list[float]] = defaultdict(list)
+        self._facts: dict[tuple[str, Kind], dict[str, Any]] = {}
+        self._made: list[Measurement] = []
+        self._left = MOST_SAMPLES
+
+    def refuse(self, row: str, reason: str) -> None:
+        """Note a row that is not plausible."""
+        self.refused_count += 1
+        if len(self.refused) < MOST_REFUSED:
+            self.refused.append(Refused(row[:LONGEST_NAME], reason))
+
+    def skip(self, reason: str) -> None:
+        """Count a row that is no time of a run."""
+        self.skipped[reason] += 1
+
+    def number(self, row: str, value: object, what: str = "the time") -> float | None:
+        """Return a finite number that is not negative; otherwise refuse the row and return None."""
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            text = "nothing" if value is None else repr(value)[:40]
+            self.refuse(row, f"{what} is {text}: a number was expected")
+            return None
+        number = float(value)
+        if not math.isfinite(number):
+            self.refuse(row, f"{what} is {number:g}: a number that is finite was expected")
+            return None
+        if number < 0:
+            self.refuse(row, f"{what} is negative ({number:g})")
+            return None
+        return number
+
+    def ms(self, row: str, value: object, unit: str, kind: Kind, what: str = "the time") -> float | None:
+        """Return a time in ms; otherwise refuse the row and return None. A run takes time; a layer may take none."""
+        number = self.number(row, value, what)
+        if number is None:
+            return None
+        time = number / PER_MS[unit]
+        if time > LONGEST_MS:
+            self.refuse(row, f"{what} is {number:g} {unit}, over an hour: is the unit right?")
+            return None
+        if time == 0 and kind != "layer":
+            self.refuse(row, f"{what} is 0: a run takes time")
+            return None
+        return time
+
+    def sample(
+        self, row: str, name: str, kind: Kind, value: object, unit: str, what: str = "", **facts: Any
+    ) -> float | None:
+        """Take one time of `name`; return it in ms, or None where it is refused.
+
+        `facts`: further fields of the measurement, those of its first sample.
+        """
+        time = self.ms(row, value, unit, kind)
+        if time is None:
+            return None
+        key = (name[:LONGEST_NAME] or UNNAMED, kind)
+        stated = self._facts.setdefault(key, {"unit": unit, "what": what, **facts})
+        if stated["unit"] != unit:
+            self.refuse(row, f"in {unit}, but earlier rows of this name are in {stated['unit']}")
+            return None
+        self._left -= 1
+        if self._left < 0 or len(self._facts) > MOST_NAMES:
+            raise BadInputError(
+                "the file", f"over {MOST_SAMPLES} times, or {MOST_NAMES} names", "fewer", "measure for a shorter time"
+            )
+        self._samples[key].append(time)
+        return time
+
+    def add(self, measurement: Measurement) -> None:
+        """Take a measurement of which the tool states the figures alone."""
+        if len(self._made) >= MOST_NAMES:
+            raise BadInputError("the file", f"over {MOST_NAMES} names", "fewer")
+        self._made.append(replace(measurement, name=measurement.name[:LONGEST_NAME] or UNNAMED))
+
+    def take_back(self, names: set[str], row: str, reason: str) -> None:
+        """Refuse measurements that were taken before, by name."""
+        self._made = [each for each in self._made if each.name not in names]
+        self.refuse(row, reason)
+
+    @property
+    def measurements(self) -> list[Measurement]:
+        """All measurements, those with samples first, names as in the file. Layers of one file get their shares."""
+        sampled = [
+            _of_samples(name, kind, values, self._facts[name, kind]) for (name, kind), values in self._samples.items()
+        ]
+        return [*sampled, *_told_apart(self._made)]
+
+
+def _of_samples(name: str, kind: Kind, samples: list[float], facts: dict[str, Any]) -> Measurement:
+    times = np.array(samples)
+    p50, p95 = np.percentile(times, (50, 95))
+    hint = ""
+    if kind == "run" and len(samples) > 2 and samples[0] > WARM_UP * float(np.median(times[1:])):
+        hint = f"the first run took {samples[0] / float(np.median(times[1:])):.1f} times the median: a warm-up?"
+    return Measurement(
+        name,
+        kind,
+        samples_ms=tuple(samples),
+        count=len(samples),
+        mean_ms=math.fsum(samples) / len(samples),
+        sd_ms=float(times.std(ddof=1)) if len(samples) > 1 else None,
+        min_ms=float(times.min()),
+        p50_ms=float(p50),
+        p95_ms=float(p95),
+        max_ms=float(times.max()),
+        hint=hint,
+        **facts,
+    )
+
+
+def _told_apart(made: list[Measurement]) -> list[Measurement]:
+    """Number the measurements that share a name: `net.tflite`, `net.tflite #2`."""
+    seen: Counter[str] = Counter()
+    result = []
+    for each in made:
+        seen[each.name] += 1
+        number = seen[each.name]
+        result.append(each if number == 1 else replace(each, name=f"{each.name} #{number}"))
+    return result
+
+
+class Figures(NamedTuple):
+    """Figures of a distribution in ms, as a tool states them; None where it states none."""
+
+    mean: float | None = None
+    sd: float | None = None
+    low: float | None = None
+    p50: float | None = None
+    p95: float | None = None
+    high: float | None = None
+
+
+#: Relative rounding of a figure that a tool prints with six digits.
+ROUNDING: Final = 2e-5
+
+
+def contradiction(figures: Figures) -> str:
+    """Say which figures contradict each other: the mean and percentiles lie between least and largest; "" if none."""
+    named = [
+        ("the least", figures.low),
+        ("the median", figures.p50),
+        ("p95", figures.p95),
+        ("the largest", figures.high),
+    ]
+    ordered = [(name, value) for name, value in named if value is not None]
+    for (name, value), (next_name, next_value) in pairwise(ordered):
+        if value > next_value * (1 + ROUNDING):
+            return f"{name} ({value:g} ms) is above {next_name} ({next_value:g} ms)"
+    low, high, mean = figures.low, figures.high, figures.mean
+    if mean is not None and low is not None and mean < low * (1 - ROUNDING):
+        return f"the mean ({mean:g} ms) is below the least ({low:g} ms)"
+    if mean is not None and high is not None and mean > high * (1 + ROUNDING):
+        return f"the mean ({mean:g} ms) is above the largest ({high:g} ms)"
+    if None not in (figures.sd, low, high) and figures.sd > (high - low) * (1 + ROUNDING) + 1e-3:  # type: ignore[operator]
+        return f"the standard deviation ({figures.sd:g} ms) is larger than all of the range"
+    return ""
+
+
+def falling(values: Sequence[float], slack: float = 0.0) -> list[int]:
+    """Return the places of the longest series in `values` that never rises by more than the share `slack`.
+
+    What is left out of it does not fit to the most others. Of series as long as each other, the one with the larger
+    values stays: a tool leaves a part out of a time more easily than it adds one.
+    """
+
+    def weight(series: list[int]) -> tuple[int, float]:
+        return len(series), sum(values[place] for place in series)
+
+    longest: list[list[int]] = []
+    for index, value in enumerate(values):
+        before = [series for series in longest if value <= values[series[-1]] * (1 + slack)]
+        longest.append([*max(before, key=weight, default=[]), index])
+    return max(longest, key=weight, default=[])

@@ -1,0 +1,233 @@
+"""Reads the measurements of other tools: finds out by its content what a file is, and has it read.
+
+    read = read_measurements(Path("profile.csv"))
+    read.tool, read.measurements, read.refused
+    chosen(read, "RPC (execute) time", "street.toml: stages.seg.time_ms")
+
+The file may be a stranger's: sizes are checked before anything is made, and a defect becomes one BadInputError.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from trilane.errors import BadInputError, did_you_mean
+from trilane.files import HEAD_BYTES, read_bytes, read_text, require_file, whole_number
+from trilane.pipeline.measurements import mlperf_files, runtime_files, trace_slices, vendor_files
+from trilane.pipeline.measurements.measurement import CYCLES, PER_MS, QUEUEING, Found, Measurement, Refused
+
+MOST_TEXT_BYTES: Final = 64 << 20
+MOST_TRACE_BYTES: Final = 256 << 20
+KNOWN: Final = (
+    "a QNN profile, QHAS, ONNX Runtime profile, benchmark_model log, LoadGen summary, MLPerf app result, TensorRT "
+    "profile, AI Hub profile, ExecuTorch benchmark or Perfetto trace"
+)
+#: Columns of the CSV that `trilane times --csv` writes.
+OWN_COLUMNS: Final = ("name", "kind", "unit", "sample", "ms")
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """What a file says.
+
+    `tool`: its format. `says`: what its times are. `refused`: implausible rows, of which `refused_count` are there in
+    all. `skipped`: how many rows are no times of runs, by reason.
+    """
+
+    path: Path
+    tool: str
+    says: str
+    measurements: tuple[Measurement, ...]
+    refused: tuple[Refused, ...]
+    refused_count: int
+    skipped: Mapping[str, int]
+
+
+def read_measurements(path: Path) -> Measurements:
+    """Read a file of measurements. Raises BadInputError for a file of no known tool, or without any measurement."""
+    found = _found(path)
+    measured = tuple(found.measurements)
+    if not measured:
+        first = f": {found.refused[0].row}: {found.refused[0].reason}" if found.refused else ""
+        raise BadInputError(path, f"a {found.tool} without a usable time{first}", "times of runs or layers")
+    return Measurements(
+        path, found.tool, found.says, measured, tuple(found.refused), found.refused_count, dict(found.skipped)
+    )
+
+
+def _found(path: Path) -> Found:
+    size = require_file(path, KNOWN)
+    try:
+        with path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+        if trace_slices.is_perfetto(head):
+            return trace_slices.read_perfetto(read_bytes(path, MOST_TRACE_BYTES, KNOWN))
+        if size > MOST_TEXT_BYTES:
+            raise BadInputError(path, f"{size} bytes", f"at most {MOST_TEXT_BYTES}", "measure for a shorter time")
+        return _of_text(path, read_text(path, KNOWN))
+    except OSError as error:
+        raise BadInputError.of_os_error(path, error, KNOWN) from None
+    except BadInputError as error:
+        raise _about(path, error) from None
+
+
+def _about(path: Path, error: BadInputError) -> BadInputError:
+    """Return the error with the file's name, which a reader does not know."""
+    if str(path) in error.where:
+        return error
+    return BadInputError(path, f"{error.found} in {error.where}", error.expected, error.remedy)
+
+
+def _of_text(path: Path, text: str) -> Found:
+    lines = text.lstrip().splitlines()[:20]
+    if text.lstrip()[:1] in ("{", "["):
+        document = _of_json(path, text)
+        if document is not None:
+            return document
+    if vendor_files.is_qnn(lines):
+        return vendor_files.read_qnn(text)
+    if mlperf_files.TITLE in text:
+        return mlperf_files.read_loadgen(text)
+    if runtime_files.is_benchmark(text):
+        return runtime_files.read_benchmark(text)
+    if lines and tuple(lines[0].split(",")) == OWN_COLUMNS:
+        return _read_own(text)
+    raise BadInputError(path, f"text that begins with {(lines or [''])[0][:60]!r}", KNOWN)
+
+
+def _of_json(path: Path, text: str) -> Found | None:
+    """Read a JSON document; None where it is none, but may be a text of another kind."""
+    try:
+        document = json.loads(text, parse_int=whole_number)
+    except RecursionError:
+        raise BadInputError(path, "lists or tables in each other, too deep", KNOWN) from None
+    except ValueError as error:
+        events, broken = _events_by_line(text)
+        if events:
+            cut = _of_events(events)
+            for place in broken:
+                cut.refuse(place, "no event in JSON: the line is cut off or damaged")
+            return cut
+        if runtime_files.is_benchmark(text):
+            return None
+        raise BadInputError(path, f"no JSON ({error})", KNOWN) from None
+    found = _of_table(document) if isinstance(document, dict) else _of_list(document)
+    if found is None:
+        keys = f"the keys {', '.join(map(repr, list(document)[:4]))}" if isinstance(document, dict) else "a list"
+        raise BadInputError(path, f"JSON with {keys}, of no known tool", KNOWN)
+    return found
+
+
+def _of_table(document: Mapping[str, Any]) -> Found | None:
+    data = document.get("data")
+    data = data if isinstance(data, dict) else document
+    tables = document and all(isinstance(each, dict) for each in document.values())
+    if "execution_summary" in document or "execution_detail" in document:
+        return vendor_files.read_ai_hub(document)
+    if "htp_overall_summary" in data:
+        return vendor_files.read_qhas(document)
+    results = document.get("results")
+    if isinstance(results, list) and any(isinstance(each, dict) and "loadgen_scenario" in each for each in results):
+        return mlperf_files.read_mlperf_app(document)
+    if isinstance(document.get("cases"), list):
+        return runtime_files.read_executorch(document)
+    if isinstance(document.get("traceEvents"), list):
+        return _of_events(document["traceEvents"])
+    if tables and all(runtime_files.CUT.match(name) for name in document):
+        return runtime_files.read_cut_means(document)
+    return None
+
+
+def _of_list(document: object) -> Found | None:
+    if not isinstance(document, list):
+        return None
+    if runtime_files.is_tensorrt(document):
+        return runtime_files.read_tensorrt(document)
+    tables = [each for each in document[:20] if isinstance(each, dict)]
+    if any("average_time_ms" in each for each in tables):
+        return runtime_files.read_layer_means(document)
+    if any("ph" in each for each in tables):
+        return _of_events(document)
+    return None
+
+
+def _of_events(events: Sequence[Any]) -> Found:
+    """Read events: ONNX Runtime's have the categories Session and Node."""
+    categories = {
+        each.get("cat") for each in events[:1000] if isinstance(each, dict) and isinstance(each.get("cat"), str)
+    }
+    if categories & {"Session", "Node"}:
+        return runtime_files.read_ort(events)
+    return trace_slices.read_chrome(events)
+
+
+def _events_by_line(text: str) -> tuple[list[Any], list[str]]:
+    """Return the events of a list that is cut off, an event a line, and the places of lines that are none."""
+    events, broken = [], []
+    for number, line in enumerate(text.splitlines(), 1):
+        bare = line.strip().removeprefix("[").removesuffix("]").rstrip(", ")
+        if not bare:
+            continue
+        try:
+            event = json.loads(bare, parse_int=whole_number)
+        except (ValueError, RecursionError):
+            event = None
+        if isinstance(event, dict) and "ph" in event:
+            events.append(event)
+        else:
+            broken.append(f"line {number}")
+    return events, broken
+
+
+def _read_own(text: str) -> Found:
+    """Read the CSV that `trilane times --csv` writes."""
+    found = Found("CSV of trilane times", "samples, as another tool measured them")
+    reader = csv.DictReader(text.splitlines())
+    try:
+        for row in reader:
+            place, unit, kind = f"line {reader.line_num}: {row['name']}", str(row["unit"]), row["kind"]
+            if unit not in PER_MS or kind not in ("run", "layer", "wall"):
+                found.refuse(place, f"the unit {unit!r} or the kind {kind!r} is unknown")
+                continue
+            try:
+                value: object = float(str(row["ms"]))
+            except ValueError:
+                value = row["ms"]
+            found.sample(place, str(row["name"]), kind, value, "ms")  # type: ignore[arg-type]
+    except csv.Error as error:
+        found.refuse(f"line {reader.line_num}", f"no CSV: {error}")
+    return found
+
+
+def chosen(read: Measurements, name: str, where: str) -> Measurement:
+    """Return the measurement `name` as the time of a stage; with an empty name the only run.
+
+    `where`: place to name in errors. Raises BadInputError for an unknown name, several runs, or no service time.
+    """
+    if name:
+        found = [each for each in read.measurements if each.name == name]
+        if not found:
+            known = [each.name for each in read.measurements]
+            shown = ", ".join(map(repr, known[:8])) + (" …" if len(known) > 8 else "")
+            raise BadInputError(where, f"no measurement {name!r} in {read.path.name}", shown, did_you_mean(name, known))
+        found.sort(key=lambda each: ("run", "layer", "wall").index(each.kind))
+    else:
+        found = [each for each in read.measurements if each.kind == "run" and each.service]
+        if len(found) != 1:
+            known = [each.name for each in found]
+            shown = ", ".join(map(repr, known[:8])) + (" …" if len(known) > 8 else "")
+            remedy = 'add name = "..." of one of them'
+            raise BadInputError(where, f"{len(found)} runs in {read.path.name}: {shown}", "one", remedy)
+    one = found[0]
+    if one.unit == CYCLES or one.mean_ms is None:
+        raise BadInputError(
+            where, f"{one.name!r}, of which {read.path.name} has only cycles", "a time", "cycles are shares"
+        )
+    if not one.service:
+        raise BadInputError(where, f"{one.name!r}, {one.what}", "a time of a job", QUEUEING)
+    return one

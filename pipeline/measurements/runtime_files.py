@@ -1,0 +1,395 @@
+"""Readers of what runtimes write: ONNX Runtime's profile, `benchmark_model`'s log, TensorRT's layers, ExecuTorch's.
+
+Layouts as the tools write them: ONNX Runtime (`profiler.cc`: a JSON array with an event a line, cut off where the
+session was not closed), TFLite and LiteRT `benchmark_model` (microseconds; operators in ms), `trtexec --exportProfile`
+(ms), and the app benchmarks of react-native-executorch (ms).
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import PurePosixPath
+from typing import Any, Final
+
+from trilane.pipeline.measurements.measurement import (
+    ROUNDING,
+    Figures,
+    Found,
+    Kind,
+    Measurement,
+    contradiction,
+    falling,
+)
+
+#: Events of a session that are runs: what they contain.
+RUNS: Final = {
+    "model_run": "a call of the session",
+    "SequentialExecutor::Execute": "the nodes of a run",
+    "ParallelExecutor::Execute": "the nodes of a run",
+}
+NODE_ENDING: Final = "_kernel_time"
+
+
+def read_ort(events: Sequence[Any]) -> Found:
+    """Read the events of ONNX Runtime's profile."""
+    found = Found("ONNX Runtime profile", "times of each call of the session, and of each node")
+    for index, event in enumerate(events):
+        row = f"event {index}"
+        if not isinstance(event, dict):
+            found.refuse(row, "no table")
+            continue
+        name, category = str(event.get("name", "")), event.get("cat")
+        row = f"{row}: {name}"
+        if category == "Session" and name in RUNS:
+            found.sample(row, name, "run", event.get("dur"), "us", RUNS[name])
+        elif category == "Node" and name.endswith(NODE_ENDING):
+            facts = event.get("args")
+            facts = facts if isinstance(facts, dict) else {}
+            hardware, operator = str(facts.get("provider", "")), str(facts.get("op_name", ""))
+            what = f"a node, {operator}" if operator else "a node"
+            node = name.removesuffix(NODE_ENDING)
+            found.sample(row, node, "layer", event.get("dur"), "us", what, hardware=hardware)
+        elif category == "Session":
+            found.skip("loading and preparing the session")
+        else:
+            found.skip("fences and kernels inside nodes")
+    return found
+
+
+PAIR: Final = re.compile(r"\b(count|first|curr|min|max|avg|std|p5|median|p95)=(\S+)")
+SUMMARY: Final = re.compile(r"Inference timings in us: (.*)")
+GRAPH: Final = re.compile(r"(?:--graph=|Graph: \[)([^\s\]\\]+)")
+LITERT: Final = re.compile(
+    r"Inference \((avg|min|max|std|median|p5|p95)\):\s+(\S+)\s*(us|ms|s)?(?:\s*\((\d+) runs?\))?"
+)
+OF_START: Final = "Benchmark Initialization"
+OPERATORS: Final = "Run Order"
+
+
+def is_benchmark(text: str) -> bool:
+    """Say whether a text has lines of `benchmark_model`."""
+    return re.search(r"\bcount=\d+ (first|curr)=|Inference timings in us:|Inference \(avg\):", text) is not None
+
+
+def read_benchmark(text: str) -> Found:
+    """Read the log of `benchmark_model`, of one benchmark or of many after each other."""
+    return _Benchmark(text).found
+
+
+class _Benchmark:
+    """The log of `benchmark_model`, line by line. The last line of figures before a summary is that of the runs."""
+
+    def __init__(self, text: str) -> None:
+        says = "count, mean, spread and percentiles of the runs, warm-up apart; of operators the mean"
+        self.found = Found("TFLite benchmark_model log", says)
+        self._graph, self._starting, self._in_order, self._columns = "benchmark", False, False, list[str]()
+        self._announced = 0
+        self._figures: tuple[str, dict[str, str]] | None = None
+        self._litert: dict[str, tuple[str, str, str | None, str | None]] = {}
+        for number, line in enumerate(text.splitlines(), 1):
+            self._line(f"line {number}", line)
+        self._flush_litert()
+        self._flush("")
+
+    def _line(self, place: str, line: str) -> None:
+        graph = GRAPH.search(line)
+        if graph:
+            self._flush("")
+            self._announced = 0
+            self._graph = PurePosixPath(graph[1].replace("\\", "/")).name or self._graph
+        if "Running benchmark for at least" in line:
+            self._announced += 1
+        if "Profiling Info for" in line:
+            self._starting = OF_START in line
+        if "===" in line:
+            self._columns = []
+            self._in_order = OPERATORS in line
+        summary, pairs, litert = SUMMARY.search(line), dict(PAIR.findall(line)), LITERT.search(line)
+        if summary:
+            self._flush(place, summary[1])
+        elif "count" in pairs and ("avg" in pairs or "curr" in pairs) and not line.strip().startswith("Memory (bytes)"):
+            self._of_figures(place, line, pairs)
+        elif litert:
+            if litert[1] in self._litert:
+                self._flush_litert()
+            self._litert[litert[1]] = (place, litert[2], litert[3], litert[4])
+        elif "\t" in line and not self._starting:
+            self._operator(place, line)
+
+    def _of_figures(self, place: str, line: str, pairs: dict[str, str]) -> None:
+        if "Timings (microseconds)" in line:
+            if self._starting:
+                self.found.skip("time to start")
+            else:
+                self._take(place, pairs, f"{self._graph}, sum of operators")
+            return
+        if self._figures is not None:  # two such lines in a row: the first one is the warm-up
+            self.found.skip("warm-up")
+        self._figures = (place, pairs)
+
+    def _flush(self, place: str, summary: str = "") -> None:
+        """Take the figures that came last, which the summary repeats in part."""
+        figures, self._figures = self._figures, None
+        stated = re.search(r"Inference \(avg\): ([^\s,]+)", summary)
+        average = _number(stated[1]) if stated else None
+        if figures is None:
+            if summary:
+                self._only_summary(place, average)
+            return
+        row, pairs = figures
+        if not summary and self._announced == 1:
+            self.found.refuse(f"{row}: {self._graph}", "a warm-up: the log ends before the runs do")
+            return
+        mean, name = _number(pairs.get("avg", pairs.get("curr", ""))), f"{row}: {self._graph}"
+        if stated:
+            number = self.found.number(f"{place}: {self._graph}", average, "Inference (avg)")
+            if number is None:
+                return
+            if isinstance(mean, float) and abs(number - mean) > ROUNDING * abs(mean) + 0.5:
+                self.found.refuse(name, f"avg={mean:g}, but {place} says Inference (avg): {number:g}")
+                return
+        self._take(row, pairs, self._graph)
+
+    def _take(self, place: str, pairs: Mapping[str, str], name: str) -> None:
+        """Take a line of figures in us; with one run it has no mean, but the time of that run."""
+        times = {key: _number(value) for key, value in pairs.items() if key != "count"}
+        times.setdefault("avg", times.get("curr", ""))
+        self._add(place, name, _number(pairs["count"]), times, "us")
+
+    def _only_summary(self, place: str, average: object) -> None:
+        row = f"{place}: {self._graph}"
+        time = self.found.ms(row, average, "us", "run", "Inference (avg)")
+        if time is not None:
+            self.found.add(Measurement(self._graph, "run", "us", "runs, the mean alone", mean_ms=time))
+
+    def _flush_litert(self) -> None:
+        """Take the block of figures that newer versions print, each with its unit."""
+        if "avg" not in self._litert:
+            self._litert = {}
+            return
+        place, _, unit, count = self._litert["avg"]
+        times = {key: _number(value) for key, (_, value, _, _) in self._litert.items()}
+        self._litert = {}
+        self._add(place, self._graph, float(count) if count else None, times, unit or "us")
+
+    def _add(self, place: str, name: str, count: object, times: Mapping[str, object], unit: str) -> None:
+        """Add the figures of the runs; refuse them where they contradict each other."""
+        row = f"{place}: {name}"
+        if count is not None and (not isinstance(count, float) or count < 1 or count != count // 1):
+            self.found.refuse(row, f"count is {count}, not a whole number of runs")
+            return
+        ms: dict[str, float] = {}
+        for key, value in times.items():
+            time = self.found.ms(row, value, unit, "layer" if key == "std" else "run", key)
+            if time is None:
+                return
+            ms[key] = time
+        figures = Figures(*(ms.get(key) for key in ("avg", "std", "min", "median", "p95", "max")))
+        wrong = contradiction(figures) or next(
+            (
+                text
+                for key in ("first", "curr", "p5")
+                if key in ms and (text := contradiction(figures._replace(mean=ms[key])))
+            ),
+            "",
+        )
+        if wrong:
+            self.found.refuse(row, wrong)
+            return
+        runs = int(count) if isinstance(count, float) else None
+        self.found.add(
+            Measurement(
+                name, "run", unit, "runs after the warm-up, figures alone", (), runs, figures.mean, figures.sd,
+                figures.low, figures.p50, figures.p95, figures.high,
+            )
+        )  # fmt: skip
+
+    def _operator(self, place: str, line: str) -> None:
+        """Take a row of the table of operators in the order of a run; its columns are named above it."""
+        cells = [cell.strip() for cell in line.strip("\r\n").split("\t")][1:]
+        if any(cell.lower() == "[node type]" for cell in cells):
+            self._columns = [cell.strip("[]").lower() for cell in cells]
+        elif self._columns and self._in_order and len(cells) == len(self._columns):
+            named = dict(zip(self._columns, cells, strict=True))
+            name = f"{named['node type']} {named.get('name', '')}".strip()
+            time = self.found.ms(f"{place}: {name}", _number(named.get("avg ms", "")), "ms", "layer", "avg ms")
+            if time is not None:
+                calls = _number(named.get("times called", ""))
+                more = {"times_called": calls} if isinstance(calls, float) else {}
+                self.found.add(
+                    Measurement(name, "layer", "ms", "an operator, the mean of a call", mean_ms=time, more=more)
+                )
+
+
+def _number(text: str) -> object:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def is_tensorrt(document: Sequence[Any]) -> bool:
+    """Say whether a list is what `trtexec --exportProfile` writes."""
+    tables = [each for each in document[:3] if isinstance(each, dict)]
+    return any("averageMs" in each or "timeMs" in each for each in tables)
+
+
+def read_tensorrt(document: Sequence[Any]) -> Found:
+    """Read the mean time of each layer that TensorRT exports, and their sum."""
+    found = Found("TensorRT profile", "the mean of each layer; their sum is the run without what lies between them")
+    count, whole = None, 0.0
+    for index, layer in enumerate(document):
+        row = f"row {index}"
+        if isinstance(layer, dict) and set(layer) == {"count"}:
+            number = found.number(row, layer["count"], "count")
+            count = int(number) if number and number == int(number) else None
+            if count is None and number is not None:
+                found.refuse(row, f"count is {number:g}, not a whole number of runs")
+            continue
+        if not isinstance(layer, dict):
+            found.refuse(row, "no table")
+            continue
+        time = _of_tensorrt(found, f"{row}: {layer.get('name', '')}", layer, count)
+        if time is not None:
+            whole += time
+    if whole and not found.refused_count:
+        what = "the sum of the layers' means, worked out here"
+        found.add(Measurement("all layers", "run", "ms", what, count=count, mean_ms=whole))
+    return found
+
+
+def _of_tensorrt(found: Found, row: str, layer: Mapping[str, Any], count: int | None) -> float | None:
+    """Add one layer; return its mean in ms, or None where it is refused."""
+    mean = found.ms(row, layer.get("averageMs"), "ms", "layer", "averageMs")
+    if mean is None:
+        return None
+    total, median = layer.get("timeMs"), layer.get("medianMs")
+    if total is not None:
+        number = found.number(row, total, "timeMs")
+        if number is None:
+            return None
+        if count and abs(number / count - mean) > 1e-3 * mean + 1e-5:
+            found.refuse(row, f"averageMs is {mean:g}, but timeMs / count is {number / count:g}")
+            return None
+    p50 = None if median is None else found.ms(row, median, "ms", "layer", "medianMs")
+    share = layer.get("percentage")
+    share = share / 100 if isinstance(share, int | float) and 0 <= share <= 100 else None
+    name = str(layer.get("name", ""))
+    found.add(Measurement(name, "layer", "ms", "a layer, the mean", (), count, mean, p50_ms=p50, share=share))
+    return mean
+
+
+def read_layer_means(document: Sequence[Any]) -> Found:
+    """Read a list of layers with `average_time_ms`, as scripts make of TensorRT's profiles."""
+    found = Found("table of layers' means", "the mean of each layer")
+    for index, layer in enumerate(document):
+        name = str(layer.get("name", index)) if isinstance(layer, dict) else str(index)
+        value = layer.get("average_time_ms") if isinstance(layer, dict) else None
+        time = found.ms(f"row {index}: {name}", value, "ms", "layer", "average_time_ms")
+        if time is not None:
+            found.add(Measurement(name, "layer", "ms", "a layer, the mean", mean_ms=time))
+    return found
+
+
+CUT: Final = re.compile(r"^(.*)_at_(-?\d+)$")
+
+
+def read_cut_means(document: Mapping[str, Any]) -> Found:
+    """Read a table of mean times by place of a cut (`NAME_at_N`). The rest behind a later cut cannot take longer."""
+    found = Found("table of times by cut", "the mean for each place at which a network is cut")
+    rests: dict[str, list[tuple[int, float]]] = defaultdict(list)
+    for name, facts in document.items():
+        key = next((key for key in ("total_time", "mean_time") if key in facts), "")
+        cut = CUT.match(name)
+        if key == "total_time" and facts[key] == 0:
+            found.refuse(name, "the time is 0: a run takes time")
+            continue
+        time = found.ms(name, facts.get(key), "ms", "run", key or "the time")
+        if time is None:
+            continue
+        found.add(
+            Measurement(
+                name,
+                "run",
+                "ms",
+                "a run with this cut" if key == "mean_time" else "the rest behind the cut",
+                mean_ms=time,
+            )
+        )
+        if cut and key == "total_time":
+            rests[cut[1]].append((int(cut[2]), time))
+    for stem, points in rests.items():
+        for place, reason in rising_rests(points):
+            found.take_back({f"{stem}_at_{place}"}, f"{stem}_at_{place}", reason)
+    return found
+
+
+def rising_rests(points: Sequence[tuple[int, float]]) -> Iterator[tuple[int, str]]:
+    """Yield the cuts, each with the reason, that must go for the rest times to fall from cut to cut.
+
+    `points`: place of the cut, and time of the rest in ms. The longest series that never rises stays.
+    """
+    ordered = sorted(points)
+    kept = falling([time for _, time in ordered])
+    for index, (place, time) in enumerate(ordered):
+        if index in kept:
+            continue
+        lower, upper = next(((index, k) for k in kept if k > index and ordered[k][1] > time), (index - 1, index))
+        (cut, before), (later, after) = ordered[lower], ordered[upper]
+        yield place, f"rest times rise again: {before:g} ms behind cut {cut}, {after:g} ms behind the later cut {later}"
+
+
+def read_executorch(document: Mapping[str, Any]) -> Found:
+    """Read the app benchmarks of react-native-executorch: the network's own calls, and the app around them."""
+    says = "runs of each network as its runtime sees them, and wall times of the app around them"
+    found = Found("react-native-executorch benchmarks", says)
+    for index, case in enumerate(document["cases"]):
+        row = f"cases[{index}]"
+        if not isinstance(case, dict):
+            found.refuse(row, "no table")
+            continue
+        name = str(case.get("id", index))
+        if case.get("status") != "ok":
+            found.skip("a case that failed")
+            continue
+        _add_stats(found, f"{row}.pipeline: {name}", f"{name}/pipeline", "wall", case.get("pipeline"))
+        native = case.get("native")
+        methods = native.get("methods") if isinstance(native, dict) else None
+        for method in methods if isinstance(methods, list) else []:
+            if isinstance(method, dict) and method.get("status") == "ok":
+                label = str(method.get("method", ""))
+                _add_stats(found, f"{row}.native.{label}: {name}", f"{name}/{label}", "run", method.get("stats"))
+    return found
+
+
+def _add_stats(found: Found, row: str, name: str, kind: Kind, stats: object) -> None:
+    if not isinstance(stats, dict):
+        found.skip("a case without figures")
+        return
+    ms: dict[str, float | None] = {}
+    for key in ("mean", "stdev", "min", "median", "max", "p90"):
+        if key in stats:
+            ms[key] = found.ms(row, stats[key], "ms", "layer" if key == "stdev" else kind, key)
+            if ms[key] is None:
+                return
+    figures = Figures(ms.get("mean"), ms.get("stdev"), ms.get("min"), ms.get("median"), None, ms.get("max"))
+    wrong = contradiction(figures)
+    if wrong or figures.mean is None:
+        found.refuse(row, wrong or "no mean")
+        return
+    count = stats.get("count")
+    if count is not None and (not isinstance(count, int) or isinstance(count, bool) or count < 1):
+        found.refuse(row, f"count is {count!r}, not a whole number of runs")
+        return
+    what = (
+        "calls of the network in its runtime" if kind == "run" else "wall time of the app, with all around the network"
+    )
+    more = {"p90_ms": ms["p90"]} if ms.get("p90") is not None else {}
+    found.add(
+        Measurement(
+            name, kind, "ms", what, (), count, figures.mean, figures.sd, figures.low, figures.p50, None, figures.high,
+            service=kind == "run", more=more,  # type: ignore[arg-type]
+        )
+    )  # fmt: skip

@@ -1,0 +1,258 @@
+"""Readers of Qualcomm's profiles: the CSV of the QNN execution provider, QHAS summaries, and jobs of AI Hub.
+
+Layouts as the tools write them: the QNN execution provider of ONNX Runtime (`qnn_backend_manager.cc`: seven columns,
+rows appended run after run, identifiers unquoted), QHAS of QAIRT (`htp_overall_summary`), `download_profile()` of
+qai-hub (times in microseconds). Cycles become shares of a run, never times: the clock is not in the file.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final
+
+from trilane.pipeline.measurements.measurement import CYCLES, PER_MS, Found, Measurement, falling, is_finite
+
+QNN_COLUMNS: Final = ("Msg Timestamp", "Message", "Time", "Unit of Measurement", "Timing Source", "Event Level")
+IDENTIFIER: Final = "Event Identifier"
+#: Units of the CSV. Counts, bytes and objects are no times.
+QNN_UNITS: Final = {"US": "us", "MICROSEC": "us", "MS": "ms", "NS": "ns", "S": "s", "CYCLES": CYCLES}
+NO_TIMES: Final = ("COUNT", "BYTES", "OBJECT", "NONE", "INF/SEC", "UNKNOWN", "")
+#: Times of one execution, from the outermost in: each contains the next.
+NESTED: Final = (
+    ("QNN (execute) time", "the whole call, with the way to the accelerator and waiting for it"),
+    ("RPC (execute) time", "the call to the accelerator and back"),
+    ("QNN accelerator (execute) time", "on the accelerator, with acquiring its memory and power"),
+    ("Accelerator (execute) time", "on the accelerator"),
+    ("Accelerator (execute excluding wait) time", "on the accelerator, without waiting"),
+)
+WHAT: Final = dict(NESTED)
+NESTED_SLACK: Final = 0.01  # share by which a time may be longer than one around it
+RATE_SLACK: Final = 0.02  # relative, between a time and the rate that the same file states
+
+
+def is_qnn(lines: Sequence[str]) -> bool:
+    """Say whether one of the first lines is the header of the QNN CSV."""
+    return any(line.lstrip("\ufeff").startswith(",".join(QNN_COLUMNS[:3])) for line in lines[:20])
+
+
+def read_qnn(text: str) -> Found:
+    """Read the CSV of the QNN execution provider, one run or many."""
+    found = Found("QNN profile (CSV)", "times of each run; of its nodes only cycles, which are shares")
+    cycles: dict[str, list[float]] = defaultdict(list)
+    run = _Run(found)
+    for place, cells, identifier in _qnn_rows(text, found):
+        row = f"{place}: {identifier}"
+        unit = cells["Unit of Measurement"].strip().upper()
+        if unit in NO_TIMES:
+            found.skip("a count, not a time")
+        elif unit not in QNN_UNITS:
+            found.refuse(row, f"the unknown unit {unit!r}: expected US or CYCLES")
+        elif ("(cycles)" in identifier.lower()) != (QNN_UNITS[unit] == CYCLES):
+            found.refuse(row, f"the unit is {unit}, but the name says {identifier!r}")
+        else:
+            value = _number_of(cells["Time"])
+            if QNN_UNITS[unit] == CYCLES:
+                _take_cycles(found, row, cells["Event Level"], identifier, value, cycles)
+            elif "execute" not in identifier.lower():
+                found.skip("no time of a run, such as preparing the graph or acquiring memory")
+            else:
+                run.take(row, identifier, value, QNN_UNITS[unit])
+    run.end()
+    _add_cycles(found, cycles)
+    return found
+
+
+def _qnn_rows(text: str, found: Found) -> Iterator[tuple[str, dict[str, str], str]]:
+    """Yield place, cells by column and identifier of each row. A header may come again where files were joined."""
+    header: list[str] = []
+    reader = csv.reader(text.splitlines())
+    while True:
+        try:
+            cells = next(reader)
+        except StopIteration:
+            return
+        except csv.Error as error:
+            found.refuse(f"line {reader.line_num}", f"no CSV: {error}")
+            continue
+        place = f"line {reader.line_num}"
+        if cells and cells[0].strip() == QNN_COLUMNS[0]:
+            header = [cell.strip() for cell in cells]
+            missing = [name for name in (*QNN_COLUMNS[2:4], IDENTIFIER) if name not in header]
+            if missing:
+                found.refuse(place, f"a header without the column {missing[0]!r}")
+                header = []
+        elif header and cells:
+            if len(cells) < len(header):
+                found.refuse(f"{place}: {cells[-1]}", f"{len(cells)} cells of {len(header)}: the row is cut short")
+            elif len(cells) > len(header) and header[-1] != IDENTIFIER:
+                found.refuse(f"{place}: {cells[0]}", f"{len(cells)} cells, {len(header)} in the header")
+            else:
+                # the tool does not quote identifiers, which may have commas
+                named = dict(zip(header, cells, strict=False))
+                last = ",".join(cells[len(header) - 1 :]) if header[-1] == IDENTIFIER else named[IDENTIFIER]
+                yield place, {"Event Level": "", **named}, last.strip()
+
+
+def _number_of(text: str) -> object:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+class _Run:
+    """The times of one execution. They stand in any order; the call as a whole comes last."""
+
+    def __init__(self, found: Found) -> None:
+        self._found = found
+        self._rows: dict[str, tuple[str, float, str]] = {}
+
+    def take(self, row: str, name: str, value: object, unit: str) -> None:
+        if name not in WHAT:
+            self._found.sample(row, name, "run", value, unit, "of a run, as its name says")
+            return
+        if name in self._rows:
+            self.end()
+        if self._found.ms(row, value, unit, "run") is not None:
+            self._rows[name] = (row, float(value), unit)  # type: ignore[arg-type]
+        if name == NESTED[0][0]:
+            self.end()
+
+    def end(self) -> None:
+        """Take the times that fit into each other; refuse those that do not fit to most others."""
+        names = [name for name, _ in NESTED if name in self._rows]
+        ms = [self._rows[name][1] / PER_MS[self._rows[name][2]] for name in names]
+        kept = falling(ms, NESTED_SLACK)
+        for index, name in enumerate(names):
+            row, value, unit = self._rows[name]
+            if index in kept:
+                self._found.sample(row, name, "run", value, unit, WHAT[name])
+                continue
+            around = next((k for k in reversed(kept) if k < index and ms[index] > ms[k]), None)
+            inside = next((k for k in kept if k > index and ms[index] < ms[k]), None)
+            other, word = (names[around], "longer") if around is not None else (names[inside or 0], "shorter")
+            place = "around" if around is not None else "within"
+            self._found.refuse(row, f"{ms[index]:g} ms is {word} than {other!r} {place} it")
+        self._rows = {}
+
+
+def _take_cycles(found: Found, row: str, level: str, name: str, value: object, cycles: dict[str, list[float]]) -> None:
+    number = found.number(row, value, "the count of cycles")
+    if number is not None:
+        cycles[name if level.strip().upper() == "SUB-EVENT" else ""].append(number)
+
+
+def _add_cycles(found: Found, cycles: Mapping[str, Sequence[float]]) -> None:
+    """Add the nodes with their shares in all cycles of the nodes."""
+    nodes = {name: sum(values) / len(values) for name, values in cycles.items() if name}
+    _add_shares(found, nodes, {name: len(cycles[name]) for name in nodes})
+    if cycles.get(""):
+        found.skip("cycles of a run, whose clock is not known")
+
+
+def _add_shares(found: Found, nodes: Mapping[str, float], counts: Mapping[str, int | None], hardware: str = "") -> None:
+    whole = sum(nodes.values())
+    for name, mean in nodes.items():
+        share = mean / whole if whole else None
+        what = "cycles: a share of the run, no time"
+        found.add(
+            Measurement(
+                name, "layer", CYCLES, what, count=counts[name], share=share, service=False, more={"cycles": mean},
+                hardware=hardware,
+            )
+        )  # fmt: skip
+
+
+def read_qhas(document: Mapping[str, Any]) -> Found:
+    """Read the summary of a QHAS analysis."""
+    found = Found("QHAS summary", "the mean time of a run with its traffic; of operators only cycles, which are shares")
+    data = document.get("data", document)
+    rows = _rows(data.get("htp_overall_summary"))
+    if not rows:
+        found.refuse("htp_overall_summary", "no rows")
+    for index, summary in enumerate(rows):
+        row, name = f"htp_overall_summary.data[{index}]", "" if len(rows) == 1 else f" (htp {index})"
+        more = {key: value for key in QHAS_MORE if is_finite(value := summary.get(key))}
+        time = found.ms(f"{row}: time_us", summary.get("time_us"), "us", "run")
+        rate = summary.get("inf_per_s")
+        if time is not None and is_finite(rate) and abs(rate * time / 1e3 - 1) > RATE_SLACK:
+            found.refuse(f"{row}: time_us", f"{time:g} ms beside {rate:g} inferences a second: a unit is wrong")
+            time = None
+        elif time is not None:
+            what = "a run on the accelerator, with what happens around the graph"
+            found.add(Measurement(f"time_us{name}", "run", "us", what, mean_ms=time, more=more))
+        execute = found.ms(f"{row}: graph_execute_us", summary.get("graph_execute_us"), "us", "run")
+        if execute is not None and time is not None and execute > 1.01 * time:
+            found.refuse(
+                f"{row}: graph_execute_us", f"{execute:g} ms, longer than the {time:g} ms of time_us around it"
+            )
+        elif execute is not None:
+            found.add(Measurement(f"graph_execute_us{name}", "run", "us", "the graph alone", mean_ms=execute))
+    nodes = {}
+    for index, node in enumerate(_rows(data.get("qnn_op_instances_nodes"))):
+        name = str(node.get("qnn_op", index))
+        place = f"qnn_op_instances_nodes.data[{index}]: {name}"
+        cycles = found.number(place, node.get("cycles"), "the count of cycles")
+        if cycles is not None:
+            nodes[name] = cycles
+    _add_shares(found, nodes, dict.fromkeys(nodes))
+    return found
+
+
+#: Figures of a QHAS summary that are kept beside its time.
+QHAS_MORE: Final = (
+    "total_dram_read", "total_dram_write", "total_dram", "peak_vtcm_alloc", "percent_utilization", "inf_per_s",
+    "timeline_cycles",
+)  # fmt: skip
+
+
+def _rows(table: object) -> list[dict[str, Any]]:
+    rows = table.get("data") if isinstance(table, dict) else None
+    return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+
+
+def read_ai_hub(document: Mapping[str, Any]) -> Found:
+    """Read what `download_profile()` of AI Hub returns. All its times are microseconds."""
+    found = Found("AI Hub profile", "times of each run on the device, and the mean of each layer")
+    summary = document.get("execution_summary")
+    summary = summary if isinstance(summary, dict) else {}
+    times = summary.get("all_inference_times")
+    for index, value in enumerate(times if isinstance(times, list) else []):
+        row = f"execution_summary.all_inference_times[{index}]"
+        found.sample(row, "all_inference_times", "run", value, "us", "a run on the device, without loading")
+    stated = summary.get("estimated_inference_time")
+    if stated is not None:
+        row = "execution_summary.estimated_inference_time"
+        time = found.ms(row, stated, "us", "run")
+        if time is not None:
+            what = "the time that AI Hub states for a run, from its own estimate"
+            found.add(Measurement("estimated_inference_time", "run", "us", what, mean_ms=time))
+    elif not times:
+        found.refuse("execution_summary", "neither all_inference_times nor estimated_inference_time")
+    for key in ("first_load_time", "warm_load_time", "compile_time"):
+        if key in summary:
+            found.skip("time to load or compile")
+    _add_layers(found, document.get("execution_detail"))
+    return found
+
+
+def _add_layers(found: Found, detail: object) -> None:
+    times: list[tuple[str, str, float]] = []
+    for index, layer in enumerate(detail if isinstance(detail, list) else []):
+        row = f"execution_detail[{index}]"
+        if not isinstance(layer, dict):
+            found.refuse(row, "no table")
+            continue
+        name, hardware = str(layer.get("name", index)), str(layer.get("compute_unit", ""))
+        if layer.get("execution_time") is None:
+            found.skip("a layer without a time")
+            continue
+        time = found.ms(f"{row}: {name}", layer["execution_time"], "us", "layer")
+        if time is not None:
+            times.append((name, hardware, time))
+    whole = sum(time for *_, time in times)
+    for name, hardware, time in times:
+        share = time / whole if whole else None
+        found.add(Measurement(name, "layer", "us", "a layer, the mean", mean_ms=time, share=share, hardware=hardware))

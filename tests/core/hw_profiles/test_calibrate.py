@@ -1,0 +1,214 @@
+"""A profile moved by a handful of own rows: it finds a faster chip, its derivatives are exact, it says its errors."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trilane.errors import BadInputError
+from trilane.hw_profiles import calibrate as module
+from trilane.hw_profiles.calibrate import (
+    CHIP,
+    NOISE,
+    NU,
+    OwnRow,
+    _derivatives,
+    _EngineRow,
+    calibrate,
+    calibrate_tables,
+    on_chip,
+    prior_covariance,
+    read_own_rows,
+)
+from trilane.hw_profiles.network_time import price
+from trilane.hw_profiles.profile_files import load_profile, load_tables, parse_profile
+from trilane.hw_profiles.published_times import WORK, read_latencies
+from trilane.hw_profiles.reference_networks import NetworkSpec, network_work
+from trilane.hw_profiles.schema import KEY_OF_RATE, Profile, corners_of
+from trilane.units import BURST, UnitName
+
+Command = Callable[..., tuple[str, str]]
+CHIP_NAME = "snapdragon-8-gen-2"
+WORKS = {
+    "resnet18": WORK["resnet18"](),
+    **{
+        f"{encoder}-{side}": network_work(NetworkSpec(encoder, "batch", side, side, 8))
+        for encoder in ("resnet18", "mobilenetv2")
+        for side in (128, 512)
+    },
+}
+
+
+def row(
+    network: str, ms: float = 1.0, unit: UnitName = "dsp", runtime: Any = "tflite", precision: str = "int8"
+) -> OwnRow:
+    return OwnRow(network, network, WORKS[network], ms, unit, precision, runtime)
+
+
+def priced(profile: Profile, asked: OwnRow) -> float:
+    chip = on_chip(profile, asked)
+    return price(chip, asked.work, asked.unit, corners_of(chip, BURST)).total_ms
+
+
+def slower(data: dict[str, Any], factor: float) -> dict[str, Any]:
+    """The tables of a chip whose engines take `factor` times as long in everything."""
+    changed = copy.deepcopy(data)
+    for engine in changed["units"]["dsp"]["engines"].values():
+        for key, _ in KEY_OF_RATE.values():
+            engine["rates"][key]["value"] *= factor if key.endswith("_us") else 1 / factor
+    return changed
+
+
+@pytest.fixture(scope="module")
+def tables() -> tuple[dict[str, Any], Path]:
+    return load_tables(CHIP_NAME)
+
+
+def test_a_row_costs_what_the_profile_says(tables: tuple[dict[str, Any], Path]) -> None:
+    """Also where the rates differ: the second implementation is `price` with a profile of those rates."""
+    data, path = tables
+    for asked in (row("resnet18"), row("mobilenetv2-512", runtime="qnn_dlc"), row("resnet18-128", precision="fp16")):
+        mine = _EngineRow(parse_profile(data, path), asked)
+        for factor in (1.0, 1.7):
+            there = priced(parse_profile(slower(data, factor), path), asked)
+            assert mine.predict(np.full(6, np.log(factor)))[0] == pytest.approx(there, rel=1e-9)
+
+
+def test_derivatives_are_those_of_the_cost(tables: tuple[dict[str, Any], Path]) -> None:
+    """By differences: the gradient of half the cost."""
+    rows = [_EngineRow(parse_profile(*tables), row(name, 0.7)) for name in WORKS]
+    precision = np.linalg.inv(prior_covariance(["int8_tflite"]))
+    at, places, step = np.linspace(-0.3, 0.4, 6), [0] * len(rows), 1e-5
+
+    def cost(point: Any) -> float:
+        return _derivatives(point, rows, places, precision)[0]
+
+    found = _derivatives(at, rows, places, precision)[1]
+    moved = [(cost(at + step * unit) - cost(at - step * unit)) / 4 / step for unit in np.eye(6)]
+    assert found == pytest.approx(moved, rel=1e-5)
+
+
+def test_the_prior_lets_all_rates_move_together() -> None:
+    """Of two engines: all share the chip's speed, less is shared by a rate, an engine, and both."""
+    found = prior_covariance(["int8_tflite", "fp16_tflite"])
+    assert found[0, 0] == pytest.approx(1 + 0.04 + 0.04 + 0.0225)
+    assert found[0, 1] == pytest.approx(1 + 0.04)  # another rate of the engine
+    assert found[0, 6] == pytest.approx(1 + 0.04)  # the same rate of the other engine
+    assert found[0, 7] == pytest.approx(1)
+    assert (np.linalg.eigvalsh(found) > 0).all()
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.2])
+def test_a_chip_that_is_faster_in_everything_is_found(factor: float, tables: tuple[dict[str, Any], Path]) -> None:
+    """Five rows of one engine, without noise: every row left out, and an engine without rows, are met closely."""
+    data, path = tables
+    there = parse_profile(slower(data, factor), path)
+    rows = [row(name)._replace(ms=priced(there, row(name))) for name in WORKS]
+    moved = calibrate_tables(data, path, rows)
+    assert median(abs(each.error_before) for each in moved.rows) == pytest.approx(abs(1 / factor - 1), rel=0.01)
+    assert max(abs(each.error_after) for each in moved.rows) < 0.03
+    assert all(each.after.low_ms < each.row.ms < each.after.high_ms for each in moved.rows)
+    other = row("resnet18-512", runtime="qnn_dlc")
+    assert priced(parse_profile(moved.data, path), other) == pytest.approx(priced(there, other), rel=0.05)
+
+
+def test_one_row_that_is_far_off_moves_little(tables: tuple[dict[str, Any], Path]) -> None:
+    data, path = tables
+    profile = parse_profile(data, path)
+    rows = [row(name)._replace(ms=priced(profile, row(name)) * (10 if name == "resnet18" else 1)) for name in WORKS]
+    moved = parse_profile(calibrate_tables(data, path, rows).data, path)
+    for each in rows[1:]:
+        assert priced(moved, each) == pytest.approx(each.ms, rel=0.12)
+
+
+def test_a_row_left_out_is_predicted_by_the_others_alone(tables: tuple[dict[str, Any], Path]) -> None:
+    """Two rows of one network contradict each other: each is predicted as the other was measured, not in between."""
+    data, path = tables
+    ms = priced(parse_profile(data, path), row("resnet18"))
+    first, second = calibrate_tables(data, path, [row("resnet18", ms), row("resnet18", 2 * ms)]).rows
+    assert first.after_ms == pytest.approx(2 * ms, rel=0.03)
+    assert second.after_ms == pytest.approx(ms, rel=1e-6)
+
+
+def test_a_unit_without_an_engine_has_one_factor() -> None:
+    """With rows that agree, log f = n w / (n w + s^2) log 3, where w = (NU + 1) / (NU + (log 3 - log f)^2 / s^2)."""
+    data, path = load_tables("snapdragon-8-gen-3")
+    profile = parse_profile(data, path)
+    rows = [row(name, unit="gpu", precision="fp16") for name in ("resnet18-128", "resnet18-512", "mobilenetv2-512")]
+    rows = [each._replace(ms=3 * priced(profile, each)) for each in rows]
+    noise, there = max(NOISE, profile.units["gpu"].model_error_fraction.or_else(0.3)), 0.0
+    for _ in range(200):
+        weight = 3 * (NU + 1) / (NU + ((np.log(3) - there) / noise) ** 2) / noise**2
+        there = weight * np.log(3) / (weight + 1 / CHIP**2)
+    moved = parse_profile(calibrate_tables(data, path, rows).data, path)
+    for each in rows:
+        assert priced(moved, each) / priced(profile, each) == pytest.approx(np.exp(there), rel=1e-6)
+
+
+TABLE = "network,ms,precision,runtime\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        (TABLE + "a,1,int8,tflite\n", "found 1 rows, expected 2 to 1000"),
+        (TABLE + "a,0,int8,tflite\n" * 2, "line 2: ms: found '0'"),
+        (TABLE + "a,nan,int8,tflite\n" * 2, "line 2: ms: found 'nan'"),
+        (TABLE + "a,1e9,int8,tflite\n" * 2, "line 2: ms: found '1e9'"),
+        (TABLE + "a,1,int4,tflite\n" * 2, "line 2: precision: found 'int4'"),
+        (TABLE + "a,1,int8,tflit\n" * 2, "did you mean 'tflite'?"),
+        (TABLE + "a,1,int8\n" * 2, "line 2: found 3 cells, expected 4"),
+        (TABLE + "../a,1,int8,tflite\n" * 2, "line 2: network: found '../a'"),
+        (TABLE + "/a,1,int8,tflite\n" * 2, "line 2: network: found '/a'"),
+        (TABLE + "a,1,int8,tflite\n" * 2, "a.onnx: found no such file"),
+    ],
+)
+def test_wrong_tables_are_refused(text: str, found: str, tmp_path: Path) -> None:
+    path = tmp_path / "own.csv"
+    path.write_text(text)
+    with pytest.raises(BadInputError) as caught:
+        read_own_rows(path, tmp_path)
+    assert found in str(caught.value)
+
+
+def test_a_row_that_the_profile_cannot_predict_names_its_line() -> None:
+    asked = row("resnet18", precision="fp32")
+    with pytest.raises(BadInputError, match="line 3: found tflite for the dsp"):
+        calibrate(CHIP_NAME, [row("resnet18"), asked._replace(place="line 3")])
+
+
+def test_the_command_fits_and_writes(tmp_path: Path, shared_data: Path, command: Command) -> None:
+    """Five published rows of the 8 Elite on the profile of the 8 Gen 2: the command's errors, and its profile's."""
+    names = ("resnet18", "mobilenet_v2", "quicksrnetlarge", "regnet", "resnet101")
+    known = {each.network: each.ms for each in elite(shared_data)}
+    table = tmp_path / "own.csv"
+    table.write_text("network,ms,precision\n" + "".join(f"{name},{known[name]},w8a8\n" for name in names))
+    mine = tmp_path / "mine.toml"
+    words = ("--from", str(table), "--networks", str(shared_data / "chips/networks"), "--profile", CHIP_NAME)
+    out, _ = command("profiles", "fit", *words, "--name", "mine", "--write", str(mine), "--json")
+    document = json.loads(out)
+    assert [each["network"] for each in document["rows"]] == list(names)
+    assert document["median_error_left_out"] < document["median_error_before"] / 2
+    networks = shared_data / "chips/networks"
+    others = [each for each in elite(shared_data) if each.network not in names]
+    errors: dict[str, list[float]] = {}
+    for profile in (CHIP_NAME, str(mine)):
+        chip = load_profile(profile)
+        for each in others:
+            graph = module.read_graph(networks / f"{each.network}.onnx")
+            asked = OwnRow("", each.network, graph.work, each.ms, "dsp", "int8", "tflite")
+            errors.setdefault(profile, []).append(abs(priced(chip, asked) / each.ms - 1))
+    before, after = (median(found) for found in errors.values())
+    assert after <= before / 2
+
+
+def elite(shared_data: Path) -> list[Any]:
+    rows = read_latencies(shared_data / "chips")
+    return [each for each in rows if each.chip == "8elite" and each.engine == "int8_tflite"]

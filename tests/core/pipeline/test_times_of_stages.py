@@ -1,0 +1,151 @@
+"""A stage's time out of another tool's file: in a pipeline file, and written there by `trilane times`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from trilane.errors import BadInputError
+from trilane.pipeline.pipeline_file import read_pipeline
+
+Command = Callable[..., tuple[str, str]]
+HUB = {"execution_summary": {"all_inference_times": [4000, 5000, 6000]}, "execution_detail": []}
+LOG = "--graph=net.tflite\ncount=50 first=4000 curr=5000 min=3000 max=7000 avg=5000 std=500\n"
+FILE = """# kept
+[stages]
+head = { unit = "gpu", time_ms = 1 }  # this too
+tail = { unit = "dsp", in = "head", time_ms = %s }
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "in").mkdir()
+    for where in (tmp_path, tmp_path / "in"):
+        (where / "hub.json").write_text(json.dumps(HUB))
+        (where / "log.txt").write_text(LOG)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def written(folder: Path, time: str) -> Path:
+    path = folder / "in" / "file.toml"
+    path.write_text(FILE % time)
+    return path
+
+
+def test_samples_or_mean_and_spread(folder: Path) -> None:
+    tail = read_pipeline(written(folder, '{ from = "hub.json" }')).stages["tail"].time_ms
+    assert tail is not None
+    assert tail.samples == (4.0, 5.0, 6.0)
+    tail = read_pipeline(written(folder, '{ from = "log.txt", name = "net.tflite" }')).stages["tail"].time_ms
+    assert tail is not None
+    assert (tail.mean, tail.sd, tail.samples) == (5.0, 0.5, ())
+
+
+def test_a_change_by_hand_reads_it_too(folder: Path) -> None:
+    file = read_pipeline(written(folder, "3")).changed(['stages.head.time_ms={ from = "hub.json" }'])
+    head = file.stages["head"].time_ms
+    assert head is not None
+    assert head.mean_ms == 5.0
+
+
+@pytest.mark.parametrize(
+    ("time", "where", "found"),
+    [
+        ('{ from = "../hub.json" }', "stages.tail.time_ms", "a path inside the folder"),
+        ('{ from = "/etc/passwd" }', "stages.tail.time_ms", "a path inside the folder"),
+        ('{ from = "none.csv" }', "none.csv", "no such file"),
+        ('{ from = "file.toml" }', "file.toml", "text that begins with '# kept'"),
+        ('{ from = "hub.json", name = "all_inference_time" }', "stages.tail.time_ms", "did you mean"),
+        ('{ name = "x" }', "stages.tail.time_ms", "from with or without name"),
+        ('{ from = "hub.json", mean = 3 }', "stages.tail.time_ms", "from with or without name"),
+        ('{ from = "hub.json", nam = "x" }', "stages.tail.time_ms", "did you mean 'name'"),
+        ('{ from = 3 }', "stages.tail.time_ms", "string"),
+    ],
+)  # fmt: skip
+def test_what_is_no_time_is_refused(time: str, where: str, found: str, folder: Path) -> None:
+    with pytest.raises(BadInputError) as caught:
+        read_pipeline(written(folder, time))
+    assert where in caught.value.where
+    assert found in str(caught.value)
+
+
+def test_the_only_run_or_a_name(folder: Path) -> None:
+    two = {"execution_summary": {**HUB["execution_summary"], "estimated_inference_time": 4500}}  # type: ignore[dict-item]
+    (folder / "in" / "hub.json").write_text(json.dumps(two))
+    with pytest.raises(
+        BadInputError, match=r"found 2 runs in hub\.json: 'all_inference_times', 'estimated_inference_time'"
+    ):
+        read_pipeline(written(folder, '{ from = "hub.json" }'))
+
+
+def test_a_stage_is_written_and_all_else_stays(folder: Path, command: Command) -> None:
+    """Beside the file the profile is named; from elsewhere its times are written out."""
+    pytest.importorskip("tomlkit")
+    path = written(folder, "3")
+    command("times", "in/hub.json", "--stage", "in/file.toml:tail")
+    assert path.read_text() == FILE % '{from = "hub.json", name = "all_inference_times"}'
+    command("times", "hub.json", "--stage", "in/file.toml:tail")
+    assert path.read_text() == FILE % "{samples = [4.0, 5.0, 6.0]}"
+    command("times", "log.txt", "--name", "net.tflite", "--stage", "in/file.toml:tail")
+    assert path.read_text() == FILE % "{mean = 5.0, sd = 0.5}"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--stage", "in/file.toml:tial"), "did you mean 'tail'"),
+        (("--stage", "file.toml"), "FILE.toml:STAGE"),
+        (("--stage", "in/file.toml:tail", "--name", "x"), "the unknown measurement 'x'"),
+        (("log.txt", "--stage", "in/file.toml:tail"), "2 files with such a time"),
+        (("--rows", "rows.csv"), "the network that was measured"),
+        (("--rows", "rows.csv", "--network", "../net.onnx"), "a path inside"),
+    ],
+)
+def test_a_wrong_wish_writes_nothing(options: tuple[str, ...], message: str, folder: Path, command: Command) -> None:
+    path = written(folder, "3")
+    _, err = command("times", "hub.json", *options, code=2)
+    assert message in err
+    assert path.read_text() == FILE % "3"
+    assert not (folder / "rows.csv").exists()
+
+
+@pytest.mark.usefixtures("folder")
+def test_every_time_as_a_row_and_back(command: Command) -> None:
+    command("times", "hub.json", "--csv", "samples.csv")
+    out, _ = command("times", "samples.csv", "--json")
+    (one,) = json.loads(out)["measurements"]
+    assert (one["name"], one["kind"], one["samples_ms"]) == ("all_inference_times", "run", [4.0, 5.0, 6.0])
+    assert one["file"] == "samples.csv"
+
+
+def test_the_document(folder: Path, command: Command) -> None:
+    (folder / "hub.json").write_text(json.dumps({"execution_summary": {"all_inference_times": [4000, -1, 6000]}}))
+    document = json.loads(command("times", "hub.json", "log.txt", "--json")[0])
+    first = document["measurements"][0]
+    assert {
+        key: first[key] for key in ("name", "kind", "unit", "count", "mean_ms", "p50_ms", "p95_ms", "samples_ms")
+    } == {
+        "name": "all_inference_times",
+        "kind": "run",
+        "unit": "us",
+        "count": 2,
+        "mean_ms": 5.0,
+        "p50_ms": 5.0,
+        "p95_ms": pytest.approx(5.9),
+        "samples_ms": [4.0, 6.0],
+    }
+    reason = "the time is negative (-1)"
+    assert document["refused"] == [
+        {"row": "execution_summary.all_inference_times[1]", "reason": reason, "file": "hub.json"}
+    ]
+
+
+def test_control_characters_of_a_name_are_written_out(folder: Path, command: Command) -> None:
+    (folder / "log.txt").write_text(LOG.replace("net.tflite", "n\x1b[31m.tflite"))
+    out, _ = command("times", "log.txt")
+    assert "\x1b" not in out

@@ -1,0 +1,152 @@
+"""Slices of traces as samples: rows of Perfetto's own tests, a trace that Trilane writes, Chrome's events, damage."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from google.protobuf import text_format
+from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TracePacket
+
+from trilane.errors import BadInputError
+from trilane.pipeline.measurements.read_file import Measurements, read_measurements
+
+#: google/perfetto, test/trace_processor/diff_tests, `test_slice_self_dur`: two slices, one in the other.
+ATRACE = """
+packet { ftrace_events { cpu: 0
+  event { timestamp: 1000 pid: 10 print { buf: "B|10|ParentSlice" } }
+  event { timestamp: 1200 pid: 10 print { buf: "B|10|ChildSlice" } }
+  event { timestamp: 1500 pid: 10 print { buf: "E|10" } }
+  event { timestamp: 2000 pid: 10 print { buf: "E|10" } }
+} }
+"""
+#: By the comments of track_event.proto and clock_snapshot.proto: a name by number, and a clock of the sequence that
+#: counts microseconds from event to event. Run 1 from 1,001,000 ns for 4 us, run 2 for 6 us.
+INTERNED = """
+packet { trusted_packet_sequence_id: 1 sequence_flags: 1 timestamp: 0
+  clock_snapshot { clocks { clock_id: 64 timestamp: 1000 is_incremental: true unit_multiplier_ns: 1000 }
+                   clocks { clock_id: 6 timestamp: 1000000 } }
+  trace_packet_defaults { timestamp_clock_id: 64 track_event_defaults { track_uuid: 7 } }
+  interned_data { event_names { iid: 3 name: "run" } } }
+packet { trusted_packet_sequence_id: 1 timestamp: 1 track_event { type: TYPE_SLICE_BEGIN name_iid: 3 } }
+packet { trusted_packet_sequence_id: 1 timestamp: 4 track_event { type: TYPE_SLICE_END } }
+packet { trusted_packet_sequence_id: 1 timestamp: 1 track_event { type: TYPE_SLICE_BEGIN name_iid: 3 } }
+packet { trusted_packet_sequence_id: 1 timestamp: 6 track_event { type: TYPE_SLICE_END } }
+"""
+
+
+def binary(text: str) -> bytes:
+    return bytes(text_format.Parse(text, Trace()).SerializeToString())
+
+
+@pytest.fixture
+def read(tmp_path: Path) -> Callable[[bytes], Measurements]:
+    def reader(data: bytes) -> Measurements:
+        path = tmp_path / "file"
+        path.write_bytes(data)
+        return read_measurements(path)
+
+    return reader
+
+
+def samples(found: Measurements) -> dict[str, tuple[float, ...]]:
+    assert {each.kind for each in found.measurements} == {"wall"}
+    return {each.name: each.samples_ms for each in found.measurements}
+
+
+def test_marks_of_a_thread(read: Callable[[bytes], Measurements]) -> None:
+    assert samples(read(binary(ATRACE))) == {"ChildSlice": (3e-4,), "ParentSlice": (1e-3,)}
+
+
+def test_names_by_number_and_clocks_that_count_on(read: Callable[[bytes], Measurements]) -> None:
+    assert samples(read(binary(INTERNED))) == {"run": (0.004, 0.006)}
+
+
+def test_packed_packets(read: Callable[[bytes], Measurements]) -> None:
+    packed = Trace(packet=[TracePacket(compressed_packets=zlib.compress(binary(INTERNED)))]).SerializeToString()
+    assert samples(read(packed)) == {"run": (0.004, 0.006)}
+    twice = Trace(packet=[TracePacket(compressed_packets=zlib.compress(packed))]).SerializeToString()
+    with pytest.raises(BadInputError, match="bytes that do not parse"):
+        read(twice)
+
+
+BROKEN: dict[str, tuple[Callable[[bytes], bytes], str]] = {
+    "cut off": (lambda data: data[:-3], "packet 4: the file is cut off or damaged from here on"),
+    "a length that lies": (lambda data: data + b"\n\xff\xff\x7f\x00", "packet 5: the file is cut off"),
+    "a length without an end": (lambda data: data + b"\n" + b"\xff" * 12, "packet 5: the file is cut off"),
+    "another field": (lambda data: data + b"\x12\x01\x00", "packet 5: the file is cut off"),
+    "a packet of noise": (lambda data: data + b"\n\x04\xff\xff\xff\xff", "packet 5: the file is cut off"),
+    "packed noise": (
+        lambda data: data + Trace(packet=[TracePacket(compressed_packets=b"no zlib")]).SerializeToString(),
+        "packet 5: the file is cut off",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_damage_is_named_and_what_came_before_stays(name: str, read: Callable[[bytes], Measurements]) -> None:
+    change, reason = BROKEN[name]
+    found = read(change(binary(INTERNED)))
+    assert samples(found)["run"][0] == 0.004
+    assert [f"{each.row}: {each.reason}"[: len(reason)] for each in found.refused] == [reason]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ("timestamp: 2000", "timestamp: 999", "it ends 1 ns before it begins"),
+        ("timestamp: 2000", "timestamp: 1000", "a slice without length"),
+        ("timestamp: 2000", "timestamp: 9000000000000000000", "over an hour"),
+        ('timestamp: 2000 pid: 10 print { buf: "E', 'timestamp: 2000 pid: 11 print { buf: "E', "the end of a slice"),
+    ],
+)
+def test_slices_that_cannot_be(old: str, new: str, reason: str, read: Callable[[bytes], Measurements]) -> None:
+    """The slice inside stays."""
+    found = read(binary(ATRACE.replace(old, new)))
+    assert samples(found) == {"ChildSlice": (3e-4,)}
+    said = [each.reason for each in found.refused] + list(found.skipped)
+    assert any(reason in each for each in said), said
+
+
+EVENTS: list[dict[str, Any]] = [
+    {"name": "seg", "ph": "X", "ts": 10, "dur": 4000, "pid": 1, "tid": 1},
+    {"name": "seg", "ph": "B", "ts": 5000, "pid": 1, "tid": 1},
+    {"name": "inner", "ph": "B", "ts": 5100, "pid": 1, "tid": 1},
+    {"ph": "E", "ts": 5600, "pid": 1, "tid": 1},
+    {"ph": "E", "ts": 11000, "pid": 1, "tid": 1},
+    {"name": "process_name", "ph": "M", "pid": 1, "args": {"name": "x"}},
+]
+
+
+@pytest.mark.parametrize("document", [EVENTS, {"traceEvents": EVENTS}], ids=["list", "table"])
+def test_chrome_events(document: Any, read: Callable[[bytes], Measurements]) -> None:
+    assert samples(read(json.dumps(document).encode())) == {"seg": (4.0, 6.0), "inner": (0.5,)}
+
+
+@pytest.mark.parametrize(
+    ("place", "key", "value", "row", "reason"),
+    [
+        (0, "dur", -4000, "event 0: seg", "negative"),
+        (0, "dur", None, "event 0: seg", "nothing"),
+        (0, "dur", "4", "event 0: seg", "a number was expected"),
+        (0, "dur", True, "event 0: seg", "a number was expected"),
+        (0, "dur", float("nan"), "event 0: seg", "finite"),
+        (0, "dur", float("inf"), "event 0: seg", "finite"),
+        (0, "dur", 1e13, "event 0: seg", "over an hour"),
+        (4, "ts", 4000, "event 4: ", "negative"),
+        (4, "ts", "x", "event 4: ", "ts is no number"),
+        (2, "ts", [], "event 2: inner", "ts is no number"),
+    ],
+)
+def test_broken_events(
+    place: int, key: str, value: Any, row: str, reason: str, read: Callable[[bytes], Measurements]
+) -> None:
+    changed = [{**each, key: value} if index == place else each for index, each in enumerate(EVENTS)]
+    found = read(json.dumps(changed).encode())
+    assert [each.row for each in found.refused] == [row]
+    assert reason in found.refused[0].reason
+    assert "seg" in samples(found)
