@@ -255,51 +255,57 @@ def _called(words: list[str]) -> tuple[int, str, str]:
 
 def _print(document: Mapping[str, Any], axes: Sequence[str]) -> None:
     """Print the answer in a line, its command, the frontier, and what failed and was not tried."""
-    from rich.table import Table
-
-    console = stdout_console()
-    said = partial(console.print, soft_wrap=True, markup=False)
-    best, nearest = document["best"], document["nearest"]
-    shown = best or nearest
-    limits = ", ".join(document["keep"])
-    if best is None:
-        said(f"no configuration keeps {limits}" if nearest else "no trial has the figures that are asked for")
-    if shown:
-        head = "best" if best else f"nearest, misses {', '.join(nearest['misses'])}"
-        said(f"{head}: {words_text({name: shown['options'][name] for name in axes})}: {_figures(shown['metrics'])}")
-        said(shlex.join(shown["command"]))
+    _print_answer(document, axes)
     if document["frontier"]:
-        names = [name for name in document["frontier"][0]["metrics"] if _is_shown(name, document)]
-        table = Table(*axes, *map(_headed, names), "keeps", title="frontier")
-        for row in document["frontier"]:
-            cells = [row["options"][name] for name in axes] + [row["metrics"].get(name) for name in names]
-            table.add_row(*map(text, cells), "yes" if row["keeps"] else "no")
-        console.print(table)
+        _print_frontier(document, axes)
     left, rows = document["not_tried"], document["trials"]
     untried = "".join(f"; no trial with {name} {', '.join(map(str, each))}" for name, each in left["values"].items())
+    said = partial(stdout_console().print, soft_wrap=True, markup=False)
     said(f"{len(rows)} of {left['of']} configurations tried, {left['count']} not{untried}; {document['clock']} clock")
     for status in ("failed", "lost", "pruned"):
-        if count := sum(row["status"] == status for row in rows):
-            errors = "; ".join(dict.fromkeys(row["error"] for row in rows if row["status"] == status and row["error"]))
-            said(f"{count} {status}" + (f": {errors}" if errors else ""))
+        these = [row for row in rows if row["status"] == status]
+        errors = "; ".join(dict.fromkeys(row["error"] for row in these if row["error"]))
+        if these:
+            said(f"{len(these)} {status}" + (f": {errors}" if errors else ""))
+
+
+def _print_answer(document: Mapping[str, Any], axes: Sequence[str]) -> None:
+    said = partial(stdout_console().print, soft_wrap=True, markup=False)
+    shown, head = document["best"], "best"
+    if shown is None:
+        shown = document["nearest"]
+        if shown is None:
+            said("no trial has the figures that are asked for")
+            return
+        said(f"no configuration that was tried keeps {', '.join(document['keep'])}")
+        head = f"nearest, misses {', '.join(shown['misses'])}"
+    said(f"{head}: {words_text({name: shown['options'][name] for name in axes})}: {_figures(shown['metrics'])}")
+    said(shlex.join(shown["command"]))
+    for reason in shown["unsure"]:
+        said(f"UNSURE: {reason}")
+
+
+def _print_frontier(document: Mapping[str, Any], axes: Sequence[str]) -> None:
+    from rich.table import Table
+
+    names = document["weighed"]
+    table = Table(*axes, *map(_headed, names), "keeps", title="frontier")
+    for row in document["frontier"]:
+        cells = [row["options"][name] for name in axes] + [row["metrics"][name] for name in names]
+        table.add_row(*map(text, cells), "yes" if row["keeps"] else "no")
+    stdout_console().print(table)
+
+
+def _unit(name: str) -> str:
+    """Return the unit of a figure; empty where its name says it, or where it has none."""
+    from trilane.apps.sweep.tuner import METRICS
+
+    return METRICS[name].unit if name in METRICS and METRICS[name].unit != name else ""
 
 
 def _headed(name: str) -> str:
-    from trilane.apps.sweep.tuner import METRICS
-
-    return f"{name}, {METRICS[name].unit}" if name in METRICS and METRICS[name].unit != name else name
-
-
-def _is_shown(name: str, document: Mapping[str, Any]) -> bool:
-    asked = [*document["goal"], *(each for each in document["keep"])]
-    return name in ("fps", "power", "psnr") or any(each.startswith(name) for each in asked)
+    return f"{name}, {_unit(name)}" if _unit(name) else name
 
 
 def _figures(metrics: Mapping[str, float]) -> str:
-    from trilane.apps.sweep.tuner import METRICS
-
-    units = {name: METRICS[name].unit if name in METRICS else "" for name in metrics}
-    return ", ".join(
-        f"{value:.4g} fps" if name == "fps" else f"{name} {value:.4g} {units[name]}".strip()
-        for name, value in metrics.items()
-    )
+    return ", ".join(f"{name} {value:.4g} {_unit(name)}".strip() for name, value in metrics.items())

@@ -12,7 +12,7 @@ import random
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -23,8 +23,8 @@ from trilane.errors import BadInputError, MissingPartError, did_you_mean
 
 #: Proposals that the search draws by chance before it learns from results.
 DRAWN_FIRST = 10
-#: Proposals in a row that are known already; then an untried configuration is drawn by chance.
-MOST_KNOWN = 20
+#: Proposals in a row that are known already; then the search takes an untried configuration itself.
+MOST_KNOWN = 3
 #: Finished runs before a short one can end a trial.
 RUNS_BEFORE_PRUNING = 4
 #: Finished trials without a figure that was asked for; then the search ends with an error.
@@ -110,12 +110,15 @@ class Aim:
     def names(self) -> tuple[str, ...]:
         return tuple(dict.fromkeys([*self.goals, *(keep.name for keep in self.keeps)]))
 
-    def cost(self, figures: Mapping[str, float], goal: str) -> float:
-        """Return a figure so that less is better."""
-        return -figures[goal] if METRICS[goal].more_is_better else figures[goal]
+    def costs(self, figures: Mapping[str, float], names: Sequence[str]) -> tuple[float, ...]:
+        """Return the figures of `names` so that less of each is better."""
+        return tuple(-figures[name] if self.more_is_better(name) else figures[name] for name in names)
 
     def misses(self, figures: Mapping[str, float]) -> list[float]:
         return [keep.miss(figures[keep.name]) for keep in self.keeps]
+
+    def missed(self, figures: Mapping[str, float]) -> float:
+        return sum(max(0.0, miss) for miss in self.misses(figures))
 
     def keeps_all(self, figures: Mapping[str, float]) -> bool:
         return all(miss <= 0 for miss in self.misses(figures))
@@ -176,6 +179,11 @@ class Space:
             number, found[name] = divmod(number, len(values))
         return found
 
+    def steps(self, one: Mapping[str, int], other: Mapping[str, int]) -> int:
+        """Return how many steps are between two places: neighbours on an ordered axis, any values on another one."""
+        apart = {name: abs(one[name] - other[name]) for name in self.axes}
+        return sum(steps if name in self.ordered else min(steps, 1) for name, steps in apart.items())
+
     def shortened(self, trial: Trial, frames: int) -> Trial:
         """Return `trial` with so few frames: a configuration of its own, which is not among `trials`."""
         options = {**trial.options, FRAMES: frames}
@@ -216,11 +224,18 @@ class Search:
         self._optuna = required_optuna()
         self._chance = random.Random(seed)
         self._given: set[str] = set()
+        self._best: tuple[tuple[float, ...], dict[str, int]] | None = None
+        self._is_near = False
         self._study = self._optuna.create_study(
             directions=["minimize"] * len(aim.goals),
             sampler=self._optuna.samplers.TPESampler(seed=seed, multivariate=True, n_startup_trials=DRAWN_FIRST),
             pruner=self._optuna.pruners.MedianPruner(n_startup_trials=RUNS_BEFORE_PRUNING),
         )
+
+    @property
+    def has_learned(self) -> bool:
+        """Whether any trial had all figures that are asked for."""
+        return self._best is not None
 
     @property
     def left(self) -> int:
@@ -235,11 +250,21 @@ class Search:
                 break
             self._study.tell(asked, state=self._optuna.trial.TrialState.FAIL)
         else:
-            left = [number for number, each in enumerate(self.space.trials) if each.id not in self._given]
-            self._study.enqueue_trial(self.space.places(self._chance.choice(left)))
+            self._study.enqueue_trial(self._untried())
             asked, trial = self._asked()
         self._given.add(trial.id)
         return asked, trial
+
+    def _untried(self) -> dict[str, int]:
+        """Return the places of an untried configuration: in turns the nearest to the best so far, and any by chance."""
+        left = [
+            self.space.places(number) for number, each in enumerate(self.space.trials) if each.id not in self._given
+        ]
+        self._chance.shuffle(left)
+        self._is_near = not self._is_near
+        if self._best is None or not self._is_near:
+            return left[0]
+        return min(left, key=partial(self.space.steps, self._best[1]))
 
     def _asked(self) -> tuple[Any, Trial]:
         asked, places = self._study.ask(), {}
@@ -256,7 +281,7 @@ class Search:
         goal = self.aim.goals[0]
         if goal not in figures:
             return False
-        asked.report(self.aim.cost(figures, goal), frames)
+        asked.report(self.aim.costs(figures, [goal])[0], frames)
         if not asked.should_prune():
             return False
         self._study.tell(asked, state=self._optuna.trial.TrialState.PRUNED)
@@ -273,7 +298,11 @@ class Search:
             return
         for keep, miss in zip(self.aim.keeps, self.aim.misses(figures), strict=True):
             asked.set_constraint(str(keep), miss)
-        self._study.tell(asked, [self.aim.cost(figures, goal) for goal in self.aim.goals])
+        costs = self.aim.costs(figures, self.aim.goals)
+        self._study.tell(asked, costs)
+        rank = (self.aim.missed(figures), *costs)
+        if self._best is None or rank < self._best[0]:
+            self._best = rank, dict(asked.params)
 
 
 def tune(search: Search, do: Do, budget: int, together: int = 1, short: int | None = None) -> Mapping[str, Record]:
@@ -297,7 +326,8 @@ def tune(search: Search, do: Do, budget: int, together: int = 1, short: int | No
         records.update(do([trial for _, trial in batch]) if batch else {})
         for asked, trial in batch:
             search.learn(asked, trial, records.get(trial.id))
-        _require_figures(search.aim, [record for record in records.values() if record["status"] == "done"])
+        if not search.has_learned:
+            _require_figures(search.aim, [record for record in records.values() if record["status"] == "done"])
     return records
 
 
@@ -316,61 +346,54 @@ def _require_figures(aim: Aim, done: Sequence[Record]) -> None:
 
 
 def answer(search: Search, records: Mapping[str, Record]) -> dict[str, Any]:
-    """Return the answer: `best` or, where none keeps all, `nearest`; `frontier`, `trials` and `not_tried`.
+    """Return the answer: `best` or, where none keeps all, `nearest`; `weighed`, `frontier`, `trials`, `not_tried`.
 
     `records`: every known record of the space, those of an earlier search or sweep among them.
     """
     aim, space = search.aim, search.space
-    numbers = {trial.id: number for number, trial in enumerate(space.trials)}
     found = [trial for trial in space.trials if trial.id in records and trial.id not in search.tried]
     ended = [*search.tried.values(), *found]
     known = {trial.id: figures_of(records.get(trial.id), aim.names) for trial in ended}
     judged = [trial for trial in ended if aim.has_all(known[trial.id])]
     weighed = [name for name in WEIGHED if judged and all(name in known[trial.id] for trial in judged)]
     names = list(dict.fromkeys([*aim.names, *weighed]))
-
-    def costs(trial: Trial) -> tuple[float, ...]:
-        figures = known[trial.id]
-        return tuple(-figures[name] if aim.more_is_better(name) else figures[name] for name in names)
-
-    def chosen(trial: Trial) -> dict[str, Any]:
-        figures = known[trial.id]
-        return {
-            "id": trial.id,
-            "command": ["trilane", *trial.command, *trial.words],
-            "options": dict(trial.options),
-            "metrics": figures,
-            "keeps": aim.keeps_all(figures),
-            "misses": [str(keep) for keep in aim.keeps if keep.miss(figures[keep.name]) > 0],
-        }
-
-    def status(trial: Trial) -> str:
-        return "pruned" if trial.id in search.pruned and trial.id not in records else "planned"
-
-    rows = []
-    for trial in ended:
-        row = row_of(trial, records.get(trial.id))
-        keeps = aim.keeps_all(known[trial.id]) if aim.has_all(known[trial.id]) else None
-        rows.append(
-            {**row, "metrics": known[trial.id], "keeps": keeps}
-            | ({"status": status(trial)} if trial.id not in records else {})
-        )
+    costs = {trial.id: aim.costs(known[trial.id], names) for trial in judged}
+    numbers = {trial.id: number for number, trial in enumerate(space.trials)}
     fit = [trial for trial in judged if aim.keeps_all(known[trial.id])]
-    best = min(fit, key=lambda trial: (*costs(trial), numbers[trial.id]), default=None)
-    nearest = min(judged, key=lambda trial: (_missed(aim, known[trial.id]), costs(trial)), default=None)
-    frontier = _frontier({trial.id: costs(trial) for trial in judged})
-    on = [trial for trial in judged if trial.id in frontier]
+    best = min(fit, key=lambda trial: (costs[trial.id], numbers[trial.id]), default=None)
+    nearest = min(judged, key=lambda trial: (aim.missed(known[trial.id]), costs[trial.id]), default=None)
+    on = _frontier(costs)
+
+    def chosen(trial: Trial | None) -> dict[str, Any] | None:
+        return None if trial is None else _chosen(aim, trial, records[trial.id], known[trial.id])
+
     return {
-        "best": None if best is None else chosen(best),
-        "nearest": chosen(nearest) if best is None and nearest is not None else None,
-        "frontier": [chosen(trial) for trial in sorted(on, key=costs)],
-        "trials": rows,
+        "best": chosen(best),
+        "nearest": chosen(nearest) if best is None else None,
+        "weighed": names,
+        "frontier": [chosen(trial) for trial in sorted(judged, key=lambda trial: costs[trial.id]) if trial.id in on],
+        "trials": [_row(search, trial, records.get(trial.id), known[trial.id]) for trial in ended],
         "not_tried": _not_tried(space, ended),
     }
 
 
-def _missed(aim: Aim, figures: Mapping[str, float]) -> float:
-    return sum(max(0.0, miss) for miss in aim.misses(figures))
+def _chosen(aim: Aim, trial: Trial, record: Record, figures: Mapping[str, float]) -> dict[str, Any]:
+    return {
+        "id": trial.id,
+        "command": ["trilane", *trial.command, *trial.words],
+        "options": dict(trial.options),
+        "metrics": dict(figures),
+        "keeps": aim.keeps_all(figures),
+        "misses": [str(keep) for keep, miss in zip(aim.keeps, aim.misses(figures), strict=True) if miss > 0],
+        "unsure": record.get("unsure", []),
+    }
+
+
+def _row(search: Search, trial: Trial, record: Record | None, figures: Mapping[str, float]) -> dict[str, Any]:
+    aim = search.aim
+    keeps = aim.keeps_all(figures) if aim.has_all(figures) else None
+    row = {**row_of(trial, record), "metrics": dict(figures), "keeps": keeps}
+    return {**row, "status": "pruned"} if record is None and trial.id in search.pruned else row
 
 
 def _frontier(costs: Mapping[str, tuple[float, ...]]) -> set[str]:
