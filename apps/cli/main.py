@@ -40,6 +40,7 @@ COMMANDS = {
     "check": ("trilane.apps.cli.check", "Check a pipeline file: its graph, least period and memory."),
     "times": ("trilane.apps.cli.times", "Read what other tools measured: runs, layers, traces."),
     "sweep": ("trilane.apps.cli.sweep", "Try many configurations of a command, on one machine or many."),
+    "tune": ("trilane.apps.cli.tune", "Find the fastest configuration that keeps what is asked, in few trials."),
     "profiles": ("trilane.apps.cli.profiles", "List, show, check and fit the hardware profiles."),
     "doctor": ("trilane.apps.cli.doctor", "Say what this machine has, what is missing and how to install it."),
 }
@@ -133,7 +134,7 @@ def _fail(message: str, code: int, details: tuple[str, ...] = ()) -> NoReturn:
     raise SystemExit(code)
 
 
-def _describe(error: Exception) -> tuple[str, int]:
+def describe(error: Exception) -> tuple[str, int]:
     """Return the sentence and the exit code of an error that no command handled."""
     if isinstance(error, TrilaneError):
         return str(error), error.exit_code
@@ -195,7 +196,7 @@ def main() -> None:
     except Exception as error:
         if debug:
             raise
-        _fail(*_describe(error), error.details if isinstance(error, TrilaneError) else ())
+        _fail(*describe(error), error.details if isinstance(error, TrilaneError) else ())
 
 
 def entry() -> NoReturn:

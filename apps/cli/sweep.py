@@ -100,9 +100,9 @@ def sweep(
     repeated. docs/sweeps.md says more.
     """
     if words[0].endswith(ENDING):
-        name, definition, command = _of_file(words, as_list, random, seed)
+        name, definition, command = of_file(words, as_list, random, seed)
     else:
-        name, definition, command = _of_words(words, as_list, random, seed)
+        name, definition, command = of_words(words, as_list, random, seed)
     trials = _trials(words[0], definition, command)
     if dry_run:
         _print_planned(trials, as_json)
@@ -112,13 +112,13 @@ def sweep(
 
         required_ray()
     else:
-        _require_checks(trials)
-    folder = out or _default_folder(name, trials)
+        require_checks(trials)
+    folder = out or default_folder(name, trials)
     failed = _run(trials, folder, definition, engine, resume, as_json)
     raise typer.Exit(SOME_FAILED if failed else 0)
 
 
-def _of_file(
+def of_file(
     words: Sequence[str], as_list: bool, random: int | None, seed: int | None
 ) -> tuple[str, Definition, SweptCommand]:
     from trilane.apps.cli.sweep_options import SweptCommand
@@ -139,7 +139,7 @@ def _of_file(
     return path.stem, Definition(command.words, options, axes, file.kind, file.count, file.seed, file.repeats), command
 
 
-def _of_words(
+def of_words(
     words: Sequence[str], as_list: bool, random: int | None, seed: int | None
 ) -> tuple[str, Definition, SweptCommand]:
     from trilane.apps.cli.sweep_options import SweptCommand
@@ -171,7 +171,7 @@ def _trials(first: str, definition: Definition, command: SweptCommand) -> list[T
         raise BadInputError(f"{first}: {error.where}", error.found, error.expected, error.remedy) from None
 
 
-def _require_checks(trials: Sequence[Trial]) -> None:
+def require_checks(trials: Sequence[Trial]) -> None:
     """Raise MissingPartError, before the first trial, if the runs cannot be checked as asked.
 
     Each trial reports its other faults itself.
@@ -188,7 +188,7 @@ def _require_checks(trials: Sequence[Trial]) -> None:
             require_parts(load_bundle(each.bundle) for each in requested_scene(asked).avatars)
 
 
-def _default_folder(name: str, trials: Sequence[Trial]) -> Path:
+def default_folder(name: str, trials: Sequence[Trial]) -> Path:
     """Return the same folder for the same trials, so that a rerun finds the finished ones."""
     digest = hashlib.sha256("".join(sorted(trial.id for trial in trials)).encode()).hexdigest()
     return Path("sweeps") / f"{name}-{digest[:8]}"
@@ -201,12 +201,12 @@ def _run(
     from trilane.apps.run.asked_run import made_facts
     from trilane.apps.sweep.store import Store, is_ended, run_sweep, summary
 
-    about = {"made": made_facts(("trilane", *sys.argv[1:])), "definition": _described(definition)}
+    about = {"made": made_facts(("trilane", *sys.argv[1:])), "definition": described(definition)}
     with Store(folder, trials, about, resume=resume) as store:
         before = {name for name, record in store.done.items() if is_ended(record)}
         left = len(trials) - len(before)
         try:
-            with _progress(left, len(trials)) as told, _engine(engine, store) as engine_of:
+            with progress(left, len(trials)) as told, engine_for(engine, store) as engine_of:
                 run_sweep(trials, store, engine_of, told)
         except KeyboardInterrupt:
             _say_interrupted(trials, store)
@@ -222,7 +222,7 @@ def _run(
 
 
 @contextmanager
-def _engine(name: EngineName, store: Store) -> Iterator[Engine]:
+def engine_for(name: EngineName, store: Store) -> Iterator[Engine]:
     if name is EngineName.RAY:
         from trilane.apps.sweep.engines import cluster
 
@@ -234,7 +234,7 @@ def _engine(name: EngineName, store: Store) -> Iterator[Engine]:
     yield partial(run_here, place=TrialPlace(store.folder), inherited=(store.lock,))
 
 
-def _described(definition: Definition) -> dict[str, Any]:
+def described(definition: Definition) -> dict[str, Any]:
     return {
         "command": list(definition.command),
         "options": dict(definition.options),
@@ -271,7 +271,7 @@ def seconds_left(elapsed_s: float, ended: int, left: int) -> float:
 
 
 @contextmanager
-def _progress(left: int, whole: int) -> Iterator[Callable[[Mapping[str, Any]], None]]:
+def progress(left: int, whole: int) -> Iterator[Callable[[Mapping[str, Any]], None]]:
     """Yield a function to call for each trial that ended. `left`: number of the `whole` trials that are not done."""
     console = stderr_console()
     if not console.is_terminal:
@@ -311,7 +311,7 @@ def _plain(console: Any, left: int, whole: int) -> Callable[[Mapping[str, Any]],
 def _line(record: Mapping[str, Any]) -> str:
     took = "" if record["seconds"] is None else f" in {record['seconds']:.1f} s"
     why = f": {record['error']}" if record["error"] else ""
-    return f"{record['status']} {_words(record['options'])}{took}{why}{_disturbed(record)}"
+    return f"{record['status']} {words_text(record['options'])}{took}{why}{_disturbed(record)}"
 
 
 def _disturbed(record: Mapping[str, Any]) -> str:
@@ -321,7 +321,7 @@ def _disturbed(record: Mapping[str, Any]) -> str:
     return again + "".join(f"; UNSURE: {reason}" for reason in record.get("unsure", [])[:1])
 
 
-def _words(options: Mapping[str, Any]) -> str:
+def words_text(options: Mapping[str, Any]) -> str:
     return " ".join(f"{name}={value}" for name, value in options.items())
 
 
@@ -345,7 +345,7 @@ def print_summary(document: Mapping[str, Any], definition: Definition, records: 
     for row in document["trials"]:
         cells = [row["options"][name] for name in axes] + [row[name] for name in repeats]
         figures = [_figure(results[row["id"]], path) for path in shown.values()]
-        table.add_row(*(_text(each) for each in [*cells, row["status"], row["seconds"], *figures]))
+        table.add_row(*(text(each) for each in [*cells, row["status"], row["seconds"], *figures]))
     stdout_console().print(table)
     counts = document["counts"]
     text = ", ".join(f"{counts[key]} {key}" for key in ("trials", "done", "failed", "lost", "skipped"))
@@ -366,7 +366,7 @@ def _figure(result: Mapping[str, Any], path: tuple[str, ...]) -> Any:
     return found
 
 
-def _text(value: Any) -> str:
+def text(value: Any) -> str:
     from rich.markup import escape
 
     if value is None:

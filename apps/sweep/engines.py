@@ -18,7 +18,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -271,6 +271,29 @@ def run_here(trials: Sequence[Trial], place: TrialPlace, inherited: tuple[int, .
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
             children.end()
+
+
+def run_inside(trials: Sequence[Trial], call: Callable[[list[str]], tuple[int, str, str]]) -> Generator[Record]:
+    """Do `trials` of the virtual clock in this process, one after the other, and yield their records as they end.
+
+    `call`: does the command of the words after `trilane` and returns its exit code, stdout and stderr.
+    """
+    for trial in trials:
+        began_at, start = machine.here.now().isoformat(timespec="milliseconds"), time.monotonic()
+        ended = ended_as(*call(trial.arguments))
+        seconds = round(time.monotonic() - start, 3)
+        yield {
+            **about(trial),
+            **ended,
+            **{"repeated": 0, "unsure": [], "began_at": began_at, "seconds": seconds},
+            **{"host": host_facts(), "folder": None},
+        }
+
+
+def at_once_on_ray(clock: TrialClock) -> int:
+    """Return how many trials the connected cluster does together, at least 1."""
+    name = RESOURCE if clock is TrialClock.HOST else "CPU"
+    return max(1, int(required_ray().cluster_resources().get(name, 1)))
 
 
 @contextmanager

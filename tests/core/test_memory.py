@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import pytest
 
 from trilane import machine, memory
-from trilane.apps.cli.main import _describe
+from trilane.apps.cli.main import describe
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
 from trilane.machine import Machine
 from trilane.pipeline import unit_loop
@@ -156,13 +156,13 @@ def test_a_unit_that_ends_before_the_run_where_memory_is_short_says_so(plenty: p
 
 
 def test_an_unexpected_error_is_no_defect_where_memory_is_short(plenty: pytest.MonkeyPatch) -> None:
-    assert _describe(ValueError("x"))[0].endswith("this is a defect of Trilane, --debug shows where")
-    assert _describe(MemoryError("cannot have 3 GB")) == ("memory is short: cannot have 3 GB", 1)
+    assert describe(ValueError("x"))[0].endswith("this is a defect of Trilane, --debug shows where")
+    assert describe(MemoryError("cannot have 3 GB")) == ("memory is short: cannot have 3 GB", 1)
     plenty.setattr(resource, "getrlimit", lambda _kind: (600 * MB, 600 * MB))
-    said, code = _describe(ImportError("failed to map segment from shared object"))
+    said, code = describe(ImportError("failed to map segment from shared object"))
     assert code == 1 and said.startswith("memory is short: each process may have 600 MB of addresses")
     assert said.endswith("; ImportError: failed to map segment from shared object")
-    assert _describe(TrilaneError("its own reason"))[0] == "its own reason"
+    assert describe(TrilaneError("its own reason"))[0] == "its own reason"
 
 
 @pytest.mark.parametrize("limit_mb", [100, 200, 300, 500])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from trilane.apps.cli.sweep import _of_file
+from trilane.apps.cli.sweep import of_file
 from trilane.apps.sweep.definition import trials_of
 from trilane.bench.lib.cast import Cast
 from trilane.stages.configure import configure
@@ -20,7 +20,7 @@ MOST_BYTES = 2_000_000
 
 
 def test_every_trial_of_the_sweep_is_in_the_table_with_its_command() -> None:
-    _, definition, command = _of_file([str(RESULTS / "runs.toml")], False, None, None)
+    _, definition, command = of_file([str(RESULTS / "runs.toml")], False, None, None)
     lines = {trial.line for trial in trials_of(definition, command.words_of)}
     rows = list(csv.DictReader((RESULTS / "report.csv").read_text(encoding="utf-8").splitlines()))
     assert {row["command"] for row in rows} == lines
@@ -36,7 +36,7 @@ def test_the_page_is_small_and_asks_for_nothing() -> None:
 
 
 def test_the_sweep_of_networks_has_60_trials_by_six_axes() -> None:
-    _, definition, command = _of_file([str(EXAMPLES / "network-sweep.toml")], False, None, None)
+    _, definition, command = of_file([str(EXAMPLES / "network-sweep.toml")], False, None, None)
     trials = trials_of(definition, command.words_of)
     assert len({trial.id for trial in trials}) == 60
     assert set(definition.axes) == {"size", "channels", "width", "runtime", "calibration", "edge"}

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from support.doubles import pipeline_of_doubles
-from trilane.apps.cli.main import _describe
+from trilane.apps.cli.main import describe
 from trilane.apps.run import run_folder
 from trilane.apps.run.report import read_report
 from trilane.apps.run.run_job import Hooks, Prepared, RunOutcome, run_to_folder
@@ -126,4 +126,4 @@ def test_a_command_in_a_folder_that_was_removed_says_so(tmp_path: Path) -> None:
         )
         assert done.returncode == 1
         assert done.stderr == "error: the working directory was removed; change to another one\n"
-    assert _describe(FileNotFoundError(2, "No such file or directory")) == ("the system: no such file or directory", 1)
+    assert describe(FileNotFoundError(2, "No such file or directory")) == ("the system: no such file or directory", 1)

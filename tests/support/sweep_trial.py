@@ -3,7 +3,7 @@
 `SWEEP_TRIAL_LOG` names a file that gets a line when it begins and one when it ends. It takes `SWEEP_TRIAL_WAIT`
 seconds, and ends once `SWEEP_TRIAL_TOGETHER` trials have begun or half a minute has passed. `--code N` ends it with N;
 `--die-once FILE` makes it make FILE and kill itself, unless FILE is there. `--others 0.3,0.1` is the share that other
-programs had when it is called first and second.
+programs had when it is called first and second. `--fps N` makes N a figure of its result.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ def main() -> int:
         parser.add_argument(name, type=Path)
     parser.add_argument("--code", type=int, default=0)
     parser.add_argument("--others", default="")
+    parser.add_argument("--fps", type=float)
     asked, other = parser.parse_known_args()
     note("begin", other)
     if asked.out is not None:
@@ -35,7 +36,9 @@ def main() -> int:
     wait_for_others(int(os.environ.get("SWEEP_TRIAL_TOGETHER", "1")))
     note("end", other)
     others = {"other_programs": share_of(asked.others, asked.out)} if asked.others else {}
-    print(json.dumps({"schema": 1, "words": other, "threads": os.environ.get("OMP_NUM_THREADS"), **others}))
+    figures = {"fps": asked.fps} if asked.fps else {}
+    told = {"schema": 1, "words": other, "threads": os.environ.get("OMP_NUM_THREADS")}
+    print(json.dumps({**told, **others, **figures}))
     if asked.code:
         print("before the last line\nerror: as it was asked", file=sys.stderr)
     return int(asked.code)

@@ -1,0 +1,311 @@
+"""`trilane tune`: finds the fastest configuration of a grid that keeps what is asked, in few trials.
+
+Rule: this file talks to the person; `trilane.apps.sweep.tuner` searches. The folder is a sweep's, and so are its
+trials and their engines. Predictions of a chip are made in this process, all other trials in processes of their own.
+"""
+
+from __future__ import annotations
+
+import io
+import shlex
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from trilane.apps.cli.commands import Commands, JsonOption
+from trilane.apps.cli.console import print_json, stderr_console, stdout_console
+from trilane.apps.cli.sweep import (
+    ENDING,
+    INTERRUPTED,
+    EngineName,
+    EngineOption,
+    ResumeOption,
+    default_folder,
+    described,
+    engine_for,
+    of_file,
+    of_words,
+    progress,
+    require_checks,
+    text,
+    words_text,
+)
+from trilane.errors import BadInputError, did_you_mean
+from trilane.units import HOST
+
+if TYPE_CHECKING:
+    from trilane.apps.sweep.definition import Definition, Trial
+    from trilane.apps.sweep.store import Engine, Record, Store
+    from trilane.apps.sweep.tuner import Aim, Search, Space
+
+app = Commands()
+EPILOG = """\b
+Examples:
+  trilane tune docs/examples/chip-tune.toml --on snapdragon-888 --keep 'power<3W' --trials 60
+  trilane tune latency --on snapdragon-8-gen-3 --axis size=128,192,256 --axis edge=single,double --keep 'fps>=30'
+  trilane tune fps run --frames 60 --check 4 --axis size=128,192,256 --axis runtime=ort,openvino --keep 'psnr>=33'
+  trilane tune fps,power docs/examples/chip-sweep.toml --trials 30 --seed 1
+"""
+NOTHING_KEEPS = 1
+
+WordsArgument = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="[GOAL] [FILE|COMMAND]",
+        help="GOAL: fps (if not given), frame, p95, p99, latency, power, energy, psnr or worst-psnr, or several with "
+        "commas. Then a sweep file, or a command with its options, as for sweep; run if none, predict with --on.",
+    ),
+]
+
+KeepOption = Annotated[
+    list[str] | None,
+    typer.Option("--keep", help="A limit, such as 'psnr>=33', 'power<3W' or 'units.dsp.busy<0.9'. Repeat it."),
+]
+
+AxisOption = Annotated[
+    list[str] | None, typer.Option("--axis", help="Values of an option, such as size=128,192,256. Repeat it.")
+]
+
+ChipOption = Annotated[str | None, typer.Option("--on", help="Tune predictions for this hardware profile.")]
+
+TrialsOption = Annotated[int, typer.Option("--trials", min=1, help="Configurations to try.")]
+
+SeedOption = Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of the search.")]
+
+ShortOption = Annotated[
+    int | None,
+    typer.Option("--short", min=1, help="Of run: first a run of so few frames, which ends a trial below the median."),
+]
+
+FolderOption = Annotated[Path | None, typer.Option("--out", help="Folder of the sweep; sweeps/tune-NAME-HASH if none.")]
+
+
+@app.command(epilog=EPILOG, context_settings={"ignore_unknown_options": True})
+def tune(
+    words: WordsArgument,
+    keep: KeepOption = None,
+    on: ChipOption = None,
+    axis: AxisOption = None,
+    trials: TrialsOption = 40,
+    seed: SeedOption = 0,
+    short: ShortOption = None,
+    engine: EngineOption = EngineName.LOCAL,
+    resume: ResumeOption = False,
+    out: FolderOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Find the fastest configuration that keeps what is asked, over the axes of a sweep.
+
+    Prints the best one and its figures, the command that runs it, the frontier, and what was not tried. Its folder is
+    that of a sweep: trilane report shows it, and trilane sweep --resume does the rest. Exit code 1 if nothing keeps
+    the limits. docs/tune.md says more.
+    """
+    from trilane.apps.sweep.tuner import Aim, Search, keep_of
+
+    goals, rest = _goals(words)
+    aim = Aim(goals, tuple(map(keep_of, keep or ())))
+    name, definition, space = _space(rest, axis or [], on)
+    _check_short(short, definition, aim)
+    search = Search(space, aim, seed)
+    if engine is EngineName.RAY:
+        from trilane.apps.sweep.engines import required_ray
+
+        required_ray()
+    else:
+        require_checks(space.trials)
+    folder = out or default_folder(f"tune-{name}", space.trials)
+    document = _tune(search, folder, definition, engine, min(trials, len(space.trials)), short, resume)
+    document["seed"] = seed
+    if as_json:
+        print_json(document)
+    else:
+        _print(document, list(definition.axes))
+    stderr_console().print(f"sweep folder: {folder}", soft_wrap=True, markup=False)
+    raise typer.Exit(NOTHING_KEEPS if document["best"] is None else 0)
+
+
+def _goals(words: Sequence[str]) -> tuple[tuple[str, ...], list[str]]:
+    """Return the goals and the other words. Raises BadInputError for a first word that is neither."""
+    from trilane.apps.sweep.definition import COMMANDS
+    from trilane.apps.sweep.tuner import METRICS
+
+    first = words[0]
+    goals = tuple(dict.fromkeys(first.split(",")))
+    if all(goal in METRICS for goal in goals):
+        return goals, list(words[1:])
+    if first.endswith(ENDING) or first in COMMANDS:
+        return ("fps",), list(words)
+    expected = f"a goal ({', '.join(METRICS)}), a command ({', '.join(COMMANDS)}) or a sweep file ({ENDING})"
+    raise BadInputError("goal", repr(first), expected, did_you_mean(first, [*METRICS, *COMMANDS]))
+
+
+def _space(words: Sequence[str], axes: Sequence[str], chip: str | None) -> tuple[str, Definition, Space]:
+    """Return the name, the definition and the configurations of what is tuned. Raises BadInputError."""
+    from trilane.apps.sweep.tuner import Space
+
+    words = words or ["run" if chip is None else "predict"]
+    is_file = words[0].endswith(ENDING)
+    name, definition, command = (of_file if is_file else of_words)(words, False, None, None)
+    if chip is not None:
+        if definition.command != ("predict",) or "profile" in definition.axes:
+            found = "an axis profile" if "profile" in definition.axes else f"the command {' '.join(definition.command)}"
+            raise BadInputError("--on", found, "predict without it", "a chip is predicted, not run")
+        definition = replace(definition, options={**definition.options, "profile": command.converted("profile", chip)})
+    added = {}
+    for each in axes:
+        option, sign, values = each.partition("=")
+        if not sign or not values:
+            raise BadInputError("--axis", repr(each), "an option and its values, such as size=128,192,256")
+        if option in added:
+            raise BadInputError("--axis", f"{option} twice", "each axis once")
+        added[option] = [command.converted(option, value) for value in values.split(",")]
+    definition = replace(definition, axes={**definition.axes, **added})
+    return name, definition, Space(definition, command.words_of)
+
+
+def _check_short(short: int | None, definition: Definition, aim: Aim) -> None:
+    from trilane.apps.sweep.tuner import FRAMES
+
+    if short is None:
+        return
+    if definition.command != ("run",) or FRAMES in definition.axes:
+        raise BadInputError("--short", f"{' '.join(definition.command)}", "run, whose frames are no axis")
+    if len(aim.goals) > 1:
+        raise BadInputError("--short", f"{len(aim.goals)} goals", "one goal", "a median of several goals is none")
+
+
+def _tune(
+    search: Search,
+    folder: Path,
+    definition: Definition,
+    engine: EngineName,
+    budget: int,
+    short: int | None,
+    resume: bool,
+) -> dict[str, Any]:
+    """Search in the sweep's folder and return the document that `--json` prints."""
+    from trilane.apps.run.asked_run import made_facts
+    from trilane.apps.sweep.store import Store, run_sweep
+    from trilane.apps.sweep.tuner import answer, tune
+
+    space = search.space
+    about = {"made": made_facts(("trilane", *sys.argv[1:])), "definition": described(definition)}
+    steps = budget * (1 if short is None else 2)
+    with Store(folder, space.trials, about, resume=resume) as store:
+
+        def do(trials: Sequence[Trial]) -> Mapping[str, Record]:
+            run_sweep(trials, store, engine_of, told)
+            return {trial.id: store.done[trial.id] for trial in trials}
+
+        try:
+            with progress(steps, steps) as told, _engine(engine, store, space.trials) as (engine_of, together):
+                tune(search, do, budget, together, short)
+        except KeyboardInterrupt:
+            said = f"interrupted: {len(search.tried)} of {budget} configurations are tried; --resume goes on ({folder})"
+            stderr_console().print(said, soft_wrap=True, markup=False)
+            raise typer.Exit(INTERRUPTED) from None
+        known = {trial.id: store.done[trial.id] for trial in space.trials if trial.id in store.done}
+    return {
+        "schema": 1,
+        "clock": str(space.trials[0].kind.clock),
+        "engine": str(engine),
+        "folder": str(store.folder),
+        "goal": list(search.aim.goals),
+        "keep": [str(each) for each in search.aim.keeps],
+        **answer(search, known),
+    }
+
+
+@contextmanager
+def _engine(name: EngineName, store: Store, trials: Sequence[Trial]) -> Iterator[tuple[Engine, int]]:
+    """Give the engine, and how many trials it does together."""
+    from trilane.apps.sweep.engines import at_once, at_once_on_ray, run_inside
+
+    if name is EngineName.LOCAL and all(_is_of_chip(trial) for trial in trials):
+        yield partial(run_inside, call=_called), 1
+        return
+    clock = trials[0].kind.clock
+    with engine_for(name, store) as engine:
+        yield engine, at_once_on_ray(clock) if name is EngineName.RAY else at_once(clock)
+
+
+def _is_of_chip(trial: Trial) -> bool:
+    return trial.command == ("predict",) and trial.options.get("profile") != HOST
+
+
+def _called(words: list[str]) -> tuple[int, str, str]:
+    """Do a command in this process. Return its exit code, stdout and stderr, as its own process would give them."""
+    from trilane.apps.cli.main import command_of, describe
+
+    out, messages = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(messages):
+        try:
+            code = command_of(words[0]).main(args=words[1:], prog_name=words[0], standalone_mode=False)
+        except Exception as error:
+            said, code = describe(error)
+            messages.write(f"error: {said}\n")
+    return code or 0, out.getvalue(), messages.getvalue()
+
+
+def _print(document: Mapping[str, Any], axes: Sequence[str]) -> None:
+    """Print the answer in a line, its command, the frontier, and what failed and was not tried."""
+    _print_answer(document, axes)
+    if document["frontier"]:
+        _print_frontier(document, axes)
+    left, rows = document["not_tried"], document["trials"]
+    untried = "".join(f"; no trial with {name} {', '.join(map(str, each))}" for name, each in left["values"].items())
+    said = partial(stdout_console().print, soft_wrap=True, markup=False)
+    said(f"{len(rows)} of {left['of']} configurations tried, {left['count']} not{untried}; {document['clock']} clock")
+    for status in ("failed", "lost", "pruned"):
+        these = [row for row in rows if row["status"] == status]
+        errors = "; ".join(dict.fromkeys(row["error"] for row in these if row["error"]))
+        if these:
+            said(f"{len(these)} {status}" + (f": {errors}" if errors else ""))
+
+
+def _print_answer(document: Mapping[str, Any], axes: Sequence[str]) -> None:
+    said = partial(stdout_console().print, soft_wrap=True, markup=False)
+    shown, head = document["best"], "best"
+    if shown is None:
+        shown = document["nearest"]
+        if shown is None:
+            said("no trial has the figures that are asked for")
+            return
+        said(f"no configuration that was tried keeps {', '.join(document['keep'])}")
+        head = f"nearest, misses {', '.join(shown['misses'])}"
+    said(f"{head}: {words_text({name: shown['options'][name] for name in axes})}: {_figures(shown['metrics'])}")
+    said(shlex.join(shown["command"]))
+    for reason in shown["unsure"]:
+        said(f"UNSURE: {reason}")
+
+
+def _print_frontier(document: Mapping[str, Any], axes: Sequence[str]) -> None:
+    from rich.table import Table
+
+    names = document["weighed"]
+    table = Table(*axes, *map(_headed, names), "keeps", title="frontier")
+    for row in document["frontier"]:
+        cells = [row["options"][name] for name in axes] + [row["metrics"][name] for name in names]
+        table.add_row(*map(text, cells), "yes" if row["keeps"] else "no")
+    stdout_console().print(table)
+
+
+def _unit(name: str) -> str:
+    """Return the unit of a figure; empty where its name says it, or where it has none."""
+    from trilane.apps.sweep.tuner import METRICS
+
+    return METRICS[name].unit if name in METRICS and METRICS[name].unit != name else ""
+
+
+def _headed(name: str) -> str:
+    return f"{name}, {_unit(name)}" if _unit(name) else name
+
+
+def _figures(metrics: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {value:.4g} {_unit(name)}".strip() for name, value in metrics.items())

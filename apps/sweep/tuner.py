@@ -1,0 +1,420 @@
+"""Tuning: which trials of a sweep's grid to do, so that few of them find the best that keeps what is asked.
+
+Rule: Optuna proposes and this module judges. A trial is the sweep's own, with its name, its engine and its line. The
+same seed, goal and results give the same proposals. A killed search is therefore done again from its start, and the
+trials that ended cost nothing. Nothing here starts a process or writes a file.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+from trilane.apps.compare.overview import entry_of
+from trilane.apps.sweep.definition import Definition, Options, SweepKind, Trial, Value, trials_of
+from trilane.apps.sweep.store import Record, row_of
+from trilane.errors import BadInputError, MissingPartError, did_you_mean
+
+#: Proposals that the search draws by chance before it learns from results.
+DRAWN_FIRST = 10
+#: Proposals in a row that are known already; then the search takes an untried configuration itself.
+MOST_KNOWN = 3
+#: Finished runs before a short one can end a trial.
+RUNS_BEFORE_PRUNING = 4
+#: Finished trials without a figure that was asked for; then the search ends with an error.
+MOST_WITHOUT_FIGURE = 3
+#: A value at a strict limit misses it by this share of the limit.
+AT_LIMIT = 1e-9
+FRAMES = "frames"
+KEEP = re.compile(r"\s*([A-Za-z][\w.-]*)\s*(<=|>=|<|>)\s*([-+]?[\d.]+(?:e[-+]?\d+)?)\s*([A-Za-z]*)\s*", re.IGNORECASE)
+#: Does trials, unless they have ended, and returns their records by name.
+Do = Callable[[Sequence[Trial]], Mapping[str, Record]]
+
+
+class Metric(NamedTuple):
+    """A figure of a result. `path`: its keys in the `--json` document, empty for the PSNR, which has several places."""
+
+    unit: str
+    more_is_better: bool
+    path: tuple[str, ...]
+
+
+METRICS = {
+    "fps": Metric("fps", True, ("fps",)),
+    "frame": Metric("ms", False, ("frame_time_ms", "mean")),
+    "p95": Metric("ms", False, ("frame_time_ms", "p95")),
+    "p99": Metric("ms", False, ("frame_time_ms", "p99")),
+    "latency": Metric("ms", False, ("latency_ms", "mean")),
+    "power": Metric("W", False, ("power_w",)),
+    "energy": Metric("mJ", False, ("energy_mj_per_frame",)),
+    "psnr": Metric("dB", True, ()),
+    "worst-psnr": Metric("dB", True, ("check", "worst_psnr_db")),
+}
+#: Figures that the frontier weighs beside those asked for, where every trial has them.
+WEIGHED = ("psnr", "power")
+
+
+class Keep(NamedTuple):
+    """A limit that the answer keeps. `name`: a metric, or the dotted key of a number in the result."""
+
+    name: str
+    sign: str
+    limit: float
+
+    def __str__(self) -> str:
+        return f"{self.name}{self.sign}{self.limit:g}"
+
+    @property
+    def more_is_better(self) -> bool:
+        return self.sign.startswith(">")
+
+    def miss(self, value: float) -> float:
+        """Return by how much `value` misses the limit, as a share of the limit; 0 or less if it keeps it."""
+        over = (self.limit - value if self.more_is_better else value - self.limit) / (abs(self.limit) or 1.0)
+        return max(over, AT_LIMIT) if over == 0 and "=" not in self.sign else over
+
+
+def keep_of(text: str) -> Keep:
+    """Read a limit such as `psnr>=33dB`. Raises BadInputError."""
+    found = KEEP.fullmatch(text)
+    try:
+        limit = float(found[3]) if found else math.nan
+    except ValueError:
+        limit = math.nan
+    if found is None or not math.isfinite(limit):
+        raise BadInputError("--keep", repr(text), "a figure, a sign and a number, such as 'psnr>=33' or 'power<3W'")
+    name, unit = found[1], found[4]
+    if name not in METRICS and "." not in name:
+        expected = f"one of {', '.join(METRICS)}, or a dotted key of the result such as units.dsp.busy"
+        raise BadInputError("--keep", repr(name), expected, did_you_mean(name, METRICS))
+    own = METRICS[name].unit if name in METRICS else ""
+    if unit and unit.lower() != own.lower():
+        raise BadInputError("--keep", f"{unit!r} in {text!r}", f"{own or 'no unit'}, the unit of {name}")
+    return Keep(name, found[2], limit)
+
+
+@dataclass(frozen=True)
+class Aim:
+    """What is asked: `goals`, names of `METRICS`, the first of which chooses the answer; and the limits it keeps."""
+
+    goals: tuple[str, ...] = ("fps",)
+    keeps: tuple[Keep, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys([*self.goals, *(keep.name for keep in self.keeps)]))
+
+    def costs(self, figures: Mapping[str, float], names: Sequence[str]) -> tuple[float, ...]:
+        """Return the figures of `names` so that less of each is better."""
+        return tuple(-figures[name] if self.more_is_better(name) else figures[name] for name in names)
+
+    def misses(self, figures: Mapping[str, float]) -> list[float]:
+        return [keep.miss(figures[keep.name]) for keep in self.keeps]
+
+    def missed(self, figures: Mapping[str, float]) -> float:
+        return sum(max(0.0, miss) for miss in self.misses(figures))
+
+    def keeps_all(self, figures: Mapping[str, float]) -> bool:
+        return all(miss <= 0 for miss in self.misses(figures))
+
+    def has_all(self, figures: Mapping[str, float]) -> bool:
+        return all(name in figures for name in self.names)
+
+    def more_is_better(self, name: str) -> bool:
+        if name in METRICS:
+            return METRICS[name].more_is_better
+        return any(keep.more_is_better for keep in self.keeps if keep.name == name)
+
+
+def figures_of(record: Record | None, names: Sequence[str] = ()) -> dict[str, float]:
+    """Return the metrics of a trial that is done, and the numbers at the dotted keys among `names`."""
+    result = (record or {}).get("result")
+    if record is None or record["status"] != "done" or not isinstance(result, dict):
+        return {}
+    several = result.get("pipelines")
+    document = several[0] if isinstance(several, list) and several else result
+    paths = {name: METRICS[name].path if name in METRICS else tuple(name.split(".")) for name in (*METRICS, *names)}
+    found = {name: _at(document, path) for name, path in paths.items() if path}
+    found["psnr"] = entry_of("", document).psnr_db
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def _at(found: Any, path: Sequence[str]) -> float | None:
+    for key in path:
+        found = found.get(key) if isinstance(found, dict) else None
+    is_number = isinstance(found, int | float) and not isinstance(found, bool) and math.isfinite(found)
+    return float(found) if is_number else None
+
+
+class Space:
+    """The configurations of a grid: every one is a trial, which the places of its values on the axes find."""
+
+    def __init__(self, definition: Definition, words: Callable[[Options], Sequence[str]]) -> None:
+        """`words`: as for `trials_of`. Raises BadInputError for what is no grid, and for a grid without a choice."""
+        if definition.kind is not SweepKind.GRID or definition.repeats > 1:
+            found = f"kind = '{definition.kind}', repeats = {definition.repeats}"
+            raise BadInputError("sweep", found, "a grid without repeats", "tune chooses by itself what to try")
+        self.trials = trials_of(definition, words)
+        if len(self.trials) < 2:
+            raise BadInputError("axes", "one configuration", "two or more", "--axis edge=single,double is an axis")
+        self.axes = {name: list(values) for name, values in definition.axes.items()}
+        self.words = words
+
+    def at(self, places: Mapping[str, int]) -> Trial:
+        number = 0
+        for name, values in self.axes.items():
+            number = number * len(values) + places[name]
+        return self.trials[number]
+
+    def places(self, number: int) -> dict[str, int]:
+        """Return the places of trial `number`, which `at` takes."""
+        found: dict[str, int] = {}
+        for name, values in reversed(self.axes.items()):
+            number, found[name] = divmod(number, len(values))
+        return found
+
+    def steps(self, one: Mapping[str, int], other: Mapping[str, int]) -> int:
+        """Return how many steps are between two places: neighbours on an ordered axis, any values on another one."""
+        apart = {name: abs(one[name] - other[name]) for name in self.axes}
+        return sum(steps if name in self.ordered else min(steps, 1) for name, steps in apart.items())
+
+    def shortened(self, trial: Trial, frames: int) -> Trial:
+        """Return `trial` with so few frames: a configuration of its own, which is not among `trials`."""
+        options = {**trial.options, FRAMES: frames}
+        return replace(trial, options=options, words=tuple(self.words(options)))
+
+    @cached_property
+    def ordered(self) -> set[str]:
+        """The axes whose values are numbers that rise: a value tells something of its neighbours."""
+        return {name for name, values in self.axes.items() if _rises(values)}
+
+
+def _rises(values: Sequence[Value]) -> bool:
+    try:
+        numbers = [math.nan if isinstance(each, bool | list) else float(each) for each in values]
+    except ValueError:
+        return False
+    return len(numbers) > 1 and all(low < high for low, high in pairwise(numbers))
+
+
+def required_optuna() -> Any:
+    """Return the package `optuna`, which is then silent. Raises MissingPartError without it."""
+    try:
+        import optuna
+    except ImportError as error:
+        raise MissingPartError("tune needs the package optuna", extra="tune") from error
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    return optuna
+
+
+class Search:
+    """Proposals and what came of them. `tried`: the trials that were proposed and ended, in order."""
+
+    def __init__(self, space: Space, aim: Aim, seed: int) -> None:
+        """Raises MissingPartError without Optuna."""
+        self.space, self.aim = space, aim
+        self.tried: dict[str, Trial] = {}
+        self.pruned: set[str] = set()
+        self._optuna = required_optuna()
+        self._chance = random.Random(seed)
+        self._given: set[str] = set()
+        self._best: tuple[tuple[float, ...], dict[str, int]] | None = None
+        self._is_near = False
+        self._study = self._optuna.create_study(
+            directions=["minimize"] * len(aim.goals),
+            sampler=self._optuna.samplers.TPESampler(seed=seed, multivariate=True, n_startup_trials=DRAWN_FIRST),
+            pruner=self._optuna.pruners.MedianPruner(n_startup_trials=RUNS_BEFORE_PRUNING),
+        )
+
+    @property
+    def has_learned(self) -> bool:
+        """Whether any trial had all figures that are asked for."""
+        return self._best is not None
+
+    @property
+    def left(self) -> int:
+        """The number of configurations that were not proposed."""
+        return len(self.space.trials) - len(self._given)
+
+    def propose(self) -> tuple[Any, Trial]:
+        """Return Optuna's trial and a configuration that was not proposed before; one must be left."""
+        for _ in range(MOST_KNOWN):
+            asked, trial = self._asked()
+            if trial.id not in self._given:
+                break
+            self._study.tell(asked, state=self._optuna.trial.TrialState.FAIL)
+        else:
+            self._study.enqueue_trial(self._untried())
+            asked, trial = self._asked()
+        self._given.add(trial.id)
+        return asked, trial
+
+    def _untried(self) -> dict[str, int]:
+        """Return the places of an untried configuration: in turns the nearest to the best so far, and any by chance."""
+        left = [
+            self.space.places(number) for number, each in enumerate(self.space.trials) if each.id not in self._given
+        ]
+        self._chance.shuffle(left)
+        self._is_near = not self._is_near
+        if self._best is None or not self._is_near:
+            return left[0]
+        return min(left, key=partial(self.space.steps, self._best[1]))
+
+    def _asked(self) -> tuple[Any, Trial]:
+        asked, places = self._study.ask(), {}
+        for name, values in self.space.axes.items():
+            if name in self.space.ordered:
+                places[name] = asked.suggest_int(name, 0, len(values) - 1)
+            else:
+                places[name] = asked.suggest_categorical(name, list(range(len(values))))
+        return asked, self.space.at(places)
+
+    def is_hopeless(self, asked: Any, trial: Trial, record: Record, frames: int) -> bool:
+        """Return whether the short run of `trial` ends it: it is worse than the median of the others at that length."""
+        figures = figures_of(record, self.aim.names)
+        goal = self.aim.goals[0]
+        if goal not in figures:
+            return False
+        asked.report(self.aim.costs(figures, [goal])[0], frames)
+        if not asked.should_prune():
+            return False
+        self._study.tell(asked, state=self._optuna.trial.TrialState.PRUNED)
+        self.tried[trial.id] = trial
+        self.pruned.add(trial.id)
+        return True
+
+    def learn(self, asked: Any, trial: Trial, record: Record | None) -> None:
+        """Tell Optuna what came of a trial. One without a figure that is asked for counts as failed."""
+        self.tried[trial.id] = trial
+        figures = figures_of(record, self.aim.names)
+        if not self.aim.has_all(figures):
+            self._study.tell(asked, state=self._optuna.trial.TrialState.FAIL)
+            return
+        for keep, miss in zip(self.aim.keeps, self.aim.misses(figures), strict=True):
+            asked.set_constraint(str(keep), miss)
+        costs = self.aim.costs(figures, self.aim.goals)
+        self._study.tell(asked, costs)
+        rank = (self.aim.missed(figures), *costs)
+        if self._best is None or rank < self._best[0]:
+            self._best = rank, dict(asked.params)
+
+
+def tune(search: Search, do: Do, budget: int, together: int = 1, short: int | None = None) -> Mapping[str, Record]:
+    """Try at most `budget` configurations and return the records of all that were done, by name.
+
+    `together`: configurations that are proposed and done at once. `short`: frames of a run before each run; None for
+    none. Raises BadInputError if no result has a figure that is asked for.
+    """
+    records: dict[str, Record] = {}
+    while len(search.tried) < budget and search.left:
+        count = min(together, budget - len(search.tried), search.left)
+        batch = [search.propose() for _ in range(count)]
+        if short is not None:
+            first = {trial.id: search.space.shortened(trial, short) for _, trial in batch}
+            ended = do(list(first.values()))
+            batch = [
+                (asked, trial)
+                for asked, trial in batch
+                if not search.is_hopeless(asked, trial, ended[first[trial.id].id], short)
+            ]
+        records.update(do([trial for _, trial in batch]) if batch else {})
+        for asked, trial in batch:
+            search.learn(asked, trial, records.get(trial.id))
+        if not search.has_learned:
+            _require_figures(search.aim, [record for record in records.values() if record["status"] == "done"])
+    return records
+
+
+def _require_figures(aim: Aim, done: Sequence[Record]) -> None:
+    if len(done) < MOST_WITHOUT_FIGURE:
+        return
+    known = {name for record in done for name in figures_of(record, aim.names)}
+    for name in aim.names:
+        if name not in known:
+            what = " ".join(done[0]["command"][1:2])
+            remedy = "measure it: tune run with --check 4" if name.endswith("psnr") else ""
+            expected = f"one of {', '.join(sorted(known))}"
+            raise BadInputError(
+                "goal" if name in aim.goals else "--keep", f"{name}, which no {what} has", expected, remedy
+            )
+
+
+def answer(search: Search, records: Mapping[str, Record]) -> dict[str, Any]:
+    """Return the answer: `best` or, where none keeps all, `nearest`; `weighed`, `frontier`, `trials`, `not_tried`.
+
+    `records`: every known record of the space, those of an earlier search or sweep among them.
+    """
+    aim, space = search.aim, search.space
+    found = [trial for trial in space.trials if trial.id in records and trial.id not in search.tried]
+    ended = [*search.tried.values(), *found]
+    known = {trial.id: figures_of(records.get(trial.id), aim.names) for trial in ended}
+    judged = [trial for trial in ended if aim.has_all(known[trial.id])]
+    weighed = [name for name in WEIGHED if judged and all(name in known[trial.id] for trial in judged)]
+    names = list(dict.fromkeys([*aim.names, *weighed]))
+    costs = {trial.id: aim.costs(known[trial.id], names) for trial in judged}
+    numbers = {trial.id: number for number, trial in enumerate(space.trials)}
+    fit = [trial for trial in judged if aim.keeps_all(known[trial.id])]
+    best = min(fit, key=lambda trial: (costs[trial.id], numbers[trial.id]), default=None)
+    nearest = min(judged, key=lambda trial: (aim.missed(known[trial.id]), costs[trial.id]), default=None)
+    on = _frontier(costs)
+
+    def chosen(trial: Trial | None) -> dict[str, Any] | None:
+        return None if trial is None else _chosen(aim, trial, records[trial.id], known[trial.id])
+
+    return {
+        "best": chosen(best),
+        "nearest": chosen(nearest) if best is None else None,
+        "weighed": names,
+        "frontier": [chosen(trial) for trial in sorted(judged, key=lambda trial: costs[trial.id]) if trial.id in on],
+        "trials": [_row(search, trial, records.get(trial.id), known[trial.id]) for trial in ended],
+        "not_tried": _not_tried(space, ended),
+    }
+
+
+def _chosen(aim: Aim, trial: Trial, record: Record, figures: Mapping[str, float]) -> dict[str, Any]:
+    return {
+        "id": trial.id,
+        "command": ["trilane", *trial.command, *trial.words],
+        "options": dict(trial.options),
+        "metrics": dict(figures),
+        "keeps": aim.keeps_all(figures),
+        "misses": [str(keep) for keep, miss in zip(aim.keeps, aim.misses(figures), strict=True) if miss > 0],
+        "unsure": record.get("unsure", []),
+    }
+
+
+def _row(search: Search, trial: Trial, record: Record | None, figures: Mapping[str, float]) -> dict[str, Any]:
+    aim = search.aim
+    keeps = aim.keeps_all(figures) if aim.has_all(figures) else None
+    row = {**row_of(trial, record), "metrics": dict(figures), "keeps": keeps}
+    return {**row, "status": "pruned"} if record is None and trial.id in search.pruned else row
+
+
+def _frontier(costs: Mapping[str, tuple[float, ...]]) -> set[str]:
+    """Return the names that no other one beats: at least as good in every cost, and better in one."""
+
+    def beats(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
+        return one != other and all(a <= b for a, b in zip(one, other, strict=True))
+
+    several = set(costs.values())
+    on = {own for own in several if not any(beats(other, own) for other in several)}
+    return {name for name, own in costs.items() if own in on}
+
+
+def _not_tried(space: Space, ended: Sequence[Trial]) -> dict[str, Any]:
+    """Return how many configurations were not tried, and for each axis the values that no trial had."""
+    values = {
+        name: [each for each in several if all(trial.options[name] != each for trial in ended)]
+        for name, several in space.axes.items()
+    }
+    return {
+        "count": len(space.trials) - len(ended),
+        "of": len(space.trials),
+        "values": {name: left for name, left in values.items() if left},
+    }
