@@ -161,7 +161,7 @@ def run(
 ) -> Run:
     """Run a scene on the three units, each a process of its own, and load what it wrote.
 
-    `scene`: a scene file, or the name of one that comes with Trilane.
+    `scene`: a scene file, the name of one that comes with Trilane, or a pipeline file.
     `options`: fields of `trilane.stages.run_options.RunOptions`; `trilane run --help` explains them. None leaves what
     the scene says. No `sequential` run follows unless `baseline_frames` asks for one.
     `cores` may be a mapping, such as {"dsp": [0, 1]}.
@@ -171,10 +171,11 @@ def run(
     written.
     """
     from trilane.apps.run.run_job import Hooks
+    from trilane.pipeline.pipeline_file import is_pipeline_file
 
     parameters = inspect.signature(run).parameters
     given = inspect.signature(run).bind(scene, **options).arguments
-    asked = RunOptions.checked(DEFAULTS | given)
+    asked = RunOptions.checked(given if is_pipeline_file(Path(scene)) else DEFAULTS | given)
     told = (f"{name}={value!r}" for name, value in given.items() if value != parameters[name].default)
     hooks = Hooks(on_progress or (lambda *_: None), on_message or (lambda _: None))
     outcome = run_asked(asked, lambda: nullcontext(hooks), ("trilane.run", *told))

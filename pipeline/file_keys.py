@@ -30,6 +30,7 @@ LONGEST_SIDE: Final = 16_384  # of a picture, in pixels
 LONGEST_MS: Final = 3.6e6  # of a stage, an hour
 ONE_TIME: Final = "mean with or without sd, exponential, samples, or from with or without name"
 MOST_SDS: Final = 1000  # standard deviation of a time, in means
+RUNTIMES: Final = ("ort", "openvino", "qnn", "cuda")
 NAME: Final = rf"^[\w-]{{1,{LONGEST_NAME}}}$"
 #: Types of numbers in a port, by NumPy's name.
 TYPES: Final = {
@@ -410,6 +411,9 @@ class OnnxStage(StageKeys):
     onnx: InsidePath = Field(description="Network, an ONNX file in this folder.")
     precision: Annotated[str, one_of("int8", "fp16", "fp32")] | None = Field(
         default=None, description="int8, fp16 or fp32 on a chip; as the network says and its unit has it."
+    )
+    runtime: Annotated[str, one_of(*RUNTIMES)] = Field(
+        default="ort", description="What computes it on this machine: ort, openvino, qnn or cuda."
     )
     shapes: dict[str, Annotated[tuple[int, ...], BeforeValidator(_sizes)]] = Field(
         default={}, description="Sizes of inputs that the file leaves open: `{ image = '1x3x224x224' }`."

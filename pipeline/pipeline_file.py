@@ -56,6 +56,8 @@ MOST_PERIOD: Final = 100_000  # of a stage, in frames: the least common multiple
 LIKE: Final = 0.8  # likeness of two names of which one may be a slip, by difflib
 TABLES: Final = ("run", "units", "stages", "edges")
 STAGES: Final = re.compile(rb"""^\s*(\[\s*["']?stages["']?\s*[\].]|["']?stages["']?\s*[.=])""", re.MULTILINE)
+#: A comma between two assignments, not one in a list or a table.
+BETWEEN: Final = re.compile(rf",(?=\s*(?:{'|'.join(TABLES)})\.)")
 FORM: Final = "a pipeline file, TOML in UTF-8"
 #: Tables that a stage's key may hold, by the key.
 INNER: Final[dict[str, type[Keys]]] = {"in": InputKeys, "time_ms": StageTime}
@@ -452,6 +454,11 @@ def _check_stage_together(file: PipelineFile, name: str, stage: StageKeys) -> No
         if each.latest and edge_rule(rule).slots < 2:
             found = f"edge {rule!r} behind {each.stage}, whose newest frame {name} holds"
             raise BadInputError(f"{file.path}: edges.{each.stage}", found, "two slots or more, such as double")
+
+
+def assignments(text: str) -> list[str]:
+    """Return what `--set` gives: one assignment, or several with commas between them."""
+    return BETWEEN.split(text)
 
 
 def _assigned(tables: Mapping[str, Any], text: str) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import U8
@@ -92,6 +93,14 @@ class PortedStage:
         self.writes = _types(self.settings.writes)
         self._inputs: list[list[dict[str, NDArray[Any]]]] = []
         self._outputs: list[dict[str, NDArray[Any]]] = []
+        self._headers: list[list[NDArray[np.void]]] = []
+        self._slots: Sequence[int | None] = ()
+
+    @property
+    def sampled_ns(self) -> int:
+        """The time on CLOCK_MONOTONIC at which the frame in work was sampled; 0 where no input says it."""
+        taken = [of[slot] for of, slot in zip(self._headers, self._slots, strict=True) if slot is not None]
+        return min((int(header["t_sampled_ns"]) for header in taken), default=0)
 
     def bind(self, inputs: Sequence[Any], outputs: Sequence[Packet]) -> None:
         """Make the views of all slots, then call `ready`."""
@@ -101,10 +110,12 @@ class PortedStage:
             for packets, ports in zip(streams, self._streams, strict=True)
         ]
         self._outputs = [views(packet.payload, self.writes) for packet in outputs]
+        self._headers = [[packet.header for packet in packets] for packets in streams]
         self.ready()
 
     def run(self, frame: int, slot_in: Any, slot_out: int | None) -> Mapping[str, float]:
         slots: Sequence[int | None] = slot_in if self.settings.joins else () if slot_in is None else (slot_in,)
+        self._slots = slots
         taken = [None if slot is None else of[slot] for of, slot in zip(self._inputs, slots, strict=True)]
         arrays = [None if (of := taken[each.stream]) is None else of[each.port] for each in self.settings.reads]
         return self.work(frame, arrays, {} if slot_out is None else self._outputs[slot_out])

@@ -92,7 +92,13 @@ class RunOptions(Options):
     """The options of `trilane run`, in the order of its help; None leaves what the scene or the avatar says."""
 
     scene: Annotated[Text, Option(is_argument=True)] = Field(
-        default="default", description="A scene file (TOML), or the name of a bundled one."
+        default="default",
+        description="A scene file (TOML), the name of a bundled one, or a pipeline file.",
+    )
+    changes: Annotated[Texts, Option("--set")] = Field(
+        default=(),
+        description="Change a key of a pipeline file, such as stages.seg.unit=dsp, or several with commas. "
+        "May be given again.",
     )
     motion: Text | None = Field(default=None, description="Motion: .bvh, .npz, .npy, .pkl, or builtin:NAME.")
     camera: Text | None = Field(default=None, description="ARKit log, TUM, transforms.json, or builtin:NAME.")
@@ -186,7 +192,9 @@ class RunOptions(Options):
         return any(value not in (None, AS_IT_IS) for value in (self.width, self.channels, self.calibration))
 
     def check_together(self) -> None:
-        """Raise BadInputError for options of a chip's pace that lack another, or exclude another."""
+        """Raise BadInputError for options that a scene does not take, and that lack or exclude another one."""
+        if self.changes:
+            raise BadInputError("options", "--set without a pipeline file", "a .toml file with [stages] before it")
         if (self.profile is not None) != self.pace:
             found = "--profile without --pace" if self.profile is not None else "--pace without --profile"
             remedy = "give both; `trilane predict --profile` answers without running"

@@ -239,7 +239,7 @@ def validate(
 
     It replaces an earlier validation.
     """
-    from trilane.apps.run.asked_run import made_facts
+    from trilane.apps.run.report_facts import made_facts
     from trilane.avatars.bundle import load_bundle, require_writable_manifest
     from trilane.avatars.validation import no_truth, validation_facts
     from trilane.shapes import shape_buckets

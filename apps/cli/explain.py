@@ -94,8 +94,8 @@ def explain(
 ) -> None:
     """Explain the plan of a scene: what is modelled, what is left out, the error it costs and the work it saves.
 
-    With a run folder, explain the time instead (docs/explain.md): the stage or wait that bounded the frame time, waits of
-    jobs, and causes of slow frames.
+    With a run folder, explain the time instead (docs/explain.md): the stage or wait that bounded the frame time, waits
+    of jobs, and causes of slow frames.
     """
     folder = run_folder(scene)
     _refuse_options(given(ctx), of_a_run=folder is not None)

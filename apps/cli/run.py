@@ -42,6 +42,7 @@ Examples:
   trilane run --dashboard
   trilane run --profile snapdragon-888 --pace --slow-motion 24 --frames 60
   trilane run myscene.toml --background street.mp4 --policy sequential
+  trilane run street.toml --frames 300 --set stages.detector.runtime=openvino
 """
 
 TableOption = Annotated[
@@ -85,7 +86,7 @@ def run(
     table: TableOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run a scene on the three units, write a run folder and print a verdict.
+    """Run a scene or a pipeline file, write a run folder and print a verdict.
 
     The verdict says whether the run holds its rate, what bounds it, and whether the machine was quiet.
     The folder holds report.json, video.mp4, contact.png, trace.pftrace (open it at ui.perfetto.dev), events.jsonl and
@@ -93,7 +94,6 @@ def run(
     docs/report.md explains every key, the policies and the edges.
     """
     from trilane.apps.run.asked_run import run_asked
-    from trilane.pipeline.pipeline_file import is_pipeline_file
 
     if port is not None and not dashboard:
         raise BadInputError("options", "--port without --dashboard", "both or neither")
@@ -102,14 +102,6 @@ def run(
             "options", "--check with --dashboard", "one of them", "a run that is steered has no reference"
         )
     command = ("trilane", *sys.argv[1:])
-    if is_pipeline_file(Path(options.scene)):
-        from trilane.apps.run.run_file import run_file
-
-        if dashboard:
-            raise BadInputError("options", "--dashboard with a pipeline file", "one of them", "`trilane dashboard RUN`")
-        outcome = run_file(options, _hooks, command)
-        _print_outcome(outcome, as_json, table)
-        raise typer.Exit(outcome.exit_code)
     outcome = _run_live(options, command, port) if dashboard else run_asked(options, _hooks, command)
     _print_outcome(outcome, as_json, table)
     raise typer.Exit(outcome.exit_code)
@@ -119,11 +111,16 @@ def _run_live(options: RunOptions, command: tuple[str, ...], port: int | None) -
     from trilane.apps.dashboard.access import require_server
 
     require_server()
+    from trilane.pipeline.pipeline_file import is_pipeline_file
+
+    tell = lambda text: stderr_console().print(text, soft_wrap=True, markup=False)  # noqa: E731
+    if is_pipeline_file(Path(options.scene)):
+        from trilane.apps.dashboard.live_file import run_file_live
+
+        return run_file_live(options, _hooks, command, port, tell)
     from trilane.apps.dashboard.live_run import run_live
 
-    return run_live(
-        options, _hooks, command, port, lambda text: stderr_console().print(text, soft_wrap=True, markup=False)
-    )
+    return run_live(options, _hooks, command, port, tell)
 
 
 def _print_outcome(outcome: RunOutcome, as_json: bool, with_table: bool) -> None:

@@ -198,7 +198,7 @@ def _run(
     trials: Sequence[Trial], folder: Path, definition: Definition, engine: EngineName, resume: bool, as_json: bool
 ) -> bool:
     """Do the remaining trials and print how they ended. Return whether any trial is not done."""
-    from trilane.apps.run.asked_run import made_facts
+    from trilane.apps.run.report_facts import made_facts
     from trilane.apps.sweep.store import Store, is_ended, run_sweep, summary
 
     about = {"made": made_facts(("trilane", *sys.argv[1:])), "definition": described(definition)}
@@ -339,7 +339,7 @@ def print_summary(document: Mapping[str, Any], definition: Definition, records: 
 
     axes = list(definition.axes)
     repeats = ["repeat"] if definition.repeats > 1 else []
-    results = {row["id"]: (records.get(row["id"]) or {}).get("result") or {} for row in document["trials"]}
+    results = {row["id"]: _answer((records.get(row["id"]) or {}).get("result") or {}) for row in document["trials"]}
     shown = FIGURES | (ERRORS if any(result.get("check") for result in results.values()) else {})
     table = Table(*axes, *repeats, "status", "seconds", *shown)
     for row in document["trials"]:
@@ -357,6 +357,12 @@ def print_summary(document: Mapping[str, Any], definition: Definition, records: 
     errors = Counter((row["status"], row["error"]) for row in document["trials"] if row["error"])
     for (status, error), count in errors.items():
         stdout_console().print(f"{count} {status}: {error}", soft_wrap=True, markup=False)
+
+
+def _answer(result: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the figures of a trial: of a pipeline file's prediction those of its last variant, which it is about."""
+    pipelines = result.get("pipelines")
+    return pipelines[-1] if pipelines and "what_if" in pipelines[-1] else result
 
 
 def _figure(result: Mapping[str, Any], path: tuple[str, ...]) -> Any:

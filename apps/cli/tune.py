@@ -190,7 +190,7 @@ def _tune(
     resume: bool,
 ) -> dict[str, Any]:
     """Search in the sweep's folder and return the document that `--json` prints."""
-    from trilane.apps.run.asked_run import made_facts
+    from trilane.apps.run.report_facts import made_facts
     from trilane.apps.sweep.store import Store, run_sweep
     from trilane.apps.sweep.tuner import answer, tune
 

@@ -20,7 +20,7 @@ from trilane.apps.dashboard.access import listen
 from trilane.apps.dashboard.channel import ControlAsked, Message, Refused, RunBegins, ServerLink, StateIs
 from trilane.apps.dashboard.run_facts import OF_A_NEW_RUN, controls_of_run, facts_of_checked
 from trilane.apps.run.asked_run import early_processes, prepare, run_prepared
-from trilane.apps.run.run_job import Hooks, Prepared, RunOutcome, Watched
+from trilane.apps.run.run_job import ENDLESS, Hooks, Prepared, RunOutcome, Watched
 from trilane.apps.watch.followed_run import run_name
 from trilane.avatars.bundle import BUILT_IN, MANIFEST
 from trilane.errors import TrilaneError
@@ -31,7 +31,6 @@ from trilane.stages.dsp.runtime import installed
 from trilane.stages.run_options import RunOptions
 from trilane.units import UNITS
 
-ENDLESS: Final = 1_000_000_000  # frames: a year at 30 a second
 OpenHooks = Callable[[], AbstractContextManager[Hooks]]
 RUNNING, PAUSED, RESTARTING, ENDED, FAILED = "running", "paused", "restarting", "ended", "failed"
 #: Controls that hold the run or let it go: how many frames it may release, and what it does then.

@@ -125,6 +125,24 @@ def facts_of_checked(name: str, checked: Checked, options: RunOptions, machine: 
     )
 
 
+def facts_of_file(name: str, config: Mapping[str, Any], machine: Mapping[str, Any]) -> RunFacts:
+    """Return the facts of a run of a pipeline file that begins. `config`, `machine`: as in report.json."""
+    scene = config["scene"]
+    output = _output(scene)
+    return RunFacts(
+        name,
+        scene["name"],
+        "host",
+        _machine_line(machine),
+        scene["fps"],
+        output,
+        config_in_force(config, {}),
+        {},
+        None,
+        {},
+    )
+
+
 def facts_of_report(name: str, report: Report) -> RunFacts:
     """Return the facts in the report of a finished run."""
     from trilane.apps.run.verdict_facts import verdict_of
@@ -230,17 +248,24 @@ def controls_of_run(
     units: Sequence[str], choices: Mapping[str, Sequence[str]], why_not: Mapping[str, str]
 ) -> tuple[Control, ...]:
     """Return the controls of a run with these `units`. `choices`, `why_not`: by name, for those of OF_A_NEW_RUN."""
-    live = (
-        Control("play", ACTION, True),
-        Control("pause", ACTION, True),
-        Control("step", ACTION, True),
+    camera = (
         Control("orbit", DRAG, True, min=-MOST_DRAG_DEG, max=MOST_DRAG_DEG),
         Control("zoom", NUMBER, True, min=LEAST_ZOOM, max=MOST_ZOOM),
         Control("recentre", ACTION, True),
-        Control("kill", CHOICE, True, choices=tuple(units)),
     )
     restarting = (
         Control(name, CHOICE, False, choices=tuple(choices[name]), why_not=why_not.get(name, ""))
         for name in OF_A_NEW_RUN
     )
-    return (*live, *restarting)
+    *held, kill = controls_of_file(units)
+    return (*held, *camera, kill, *restarting)
+
+
+def controls_of_file(units: Sequence[str]) -> tuple[Control, ...]:
+    """Return the controls of a run of a pipeline file, which has no camera that could be steered."""
+    return (
+        Control("play", ACTION, True),
+        Control("pause", ACTION, True),
+        Control("step", ACTION, True),
+        Control("kill", CHOICE, True, choices=tuple(units)),
+    )

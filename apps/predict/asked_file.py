@@ -5,8 +5,7 @@ Rule: nothing is printed here and no Python of the file is imported. `trilane.hw
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,11 +20,9 @@ from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import Profile
 from trilane.pipeline.file_keys import MOST_SAMPLES, OnnxStage, StageTime
 from trilane.pipeline.journal import Worked
-from trilane.pipeline.pipeline_file import TABLES, PipelineFile, read_pipeline
+from trilane.pipeline.pipeline_file import PipelineFile, assignments, read_pipeline
 from trilane.units import HOST, INFER, NS_PER_MS, UnitName
 
-#: A comma between two assignments, not one in a list or a table.
-BETWEEN: Final = re.compile(rf",(?=\s*(?:{'|'.join(TABLES)})\.)")
 APART: Final = "networks are priced alone: units that work at once share memory and heat, which is not in these times"
 
 
@@ -35,7 +32,7 @@ def predict_asked_file(options: PredictOptions, path: Path, say: Callable[[str],
     `say`: function that is told before something takes seconds.
     """
     file = read_pipeline(path)
-    variants = [("", file)] + [(text, file.changed(BETWEEN.split(text))) for text in options.changes]
+    variants = [("", file)] + [(text, file.changed(assignments(text))) for text in options.changes]
     chips = _Chips(options, say)
     measured = _measured(options.measured, chips.name) if options.measured else Measured({}, "", chips.name)
     answers = [_answer(each, text, options, chips, measured) for text, each in variants]
@@ -58,7 +55,7 @@ class _Chips:
 
     def __init__(self, options: PredictOptions, say: Callable[[str], None]) -> None:
         self._options, self._say = options, say
-        self._known: dict[tuple[Path, tuple[tuple[str, tuple[int, ...]], ...], UnitName, str | None], Profile] = {}
+        self._known: dict[Hashable, Profile] = {}
         is_asked = "profile" in options.model_fields_set
         self.used = load_runnable(options.profile) if is_asked else None
         self.name = self.used.name if self.used else HOST if options.measured else options.profile
@@ -66,14 +63,14 @@ class _Chips:
     def chip_for(self, stage: OnnxStage, graph: GraphFile, unit: UnitName) -> Profile:
         """Return the chip with `unit` as it computes the network of `stage`; this machine measures it first."""
         options, asked = self._options, stage.precision or self._options.numbers
-        key = graph.path, tuple(sorted(stage.shapes.items())), unit, asked
+        key = graph.path, tuple(sorted(stage.shapes.items())), unit, asked, stage.runtime
         if key not in self._known:
             chip = self.used = self.used or load_runnable(self.name)
             chip = Computes(graph.numbers, asked, options.engine).on(chip, unit)
             if chip.name == HOST and unit == INFER[1] and asked is None:
                 from trilane.apps.predict.this_machine import with_file
 
-                chip = with_file(chip, graph, stage.shapes, self._say)
+                chip = with_file(chip, graph, stage.shapes, self._say, runtime=stage.runtime)
             self._known[key] = chip
         return self._known[key]
 

@@ -94,21 +94,27 @@ def with_file_in_application(chip: Profile, graph: GraphFile, shapes: Mapping[st
 
 
 def with_file(
-    chip: Profile, graph: GraphFile, shapes: Mapping[str, Sequence[int]], say: Say, counts: Sequence[int] = ()
+    chip: Profile,
+    graph: GraphFile,
+    shapes: Mapping[str, Sequence[int]],
+    say: Say,
+    counts: Sequence[int] = (),
+    runtime: str = "",
 ) -> Profile:
     """Return `chip`, this machine, with the measured time of the network of a file.
 
     `shapes`: shapes of inputs by name, in place of the file's own. `say`: as in `with_avatar`. `counts`: numbers of
-    threads; if empty, that of the unit for networks.
+    threads; if empty, that of the unit for networks. `runtime`: runtime of the stage of a pipeline file that it is; if
+    empty, the fastest that it may have.
     """
     why = _why_not(chip, graph)
     if why:
         return _unmeasured(chip, why, say)
     cores = usable_cores()
     try:
-        runtime, _ = requested_runtime("auto")
-        threads = counts or (chip.units[NETWORK].threads,)
-        found = calls_of(graph.path, shapes, runtime, threads, cores, lambda: say(MEASURING.format(graph.path.name)))
+        runs = runtime or requested_runtime("auto")[0]
+        threads, told = counts or (chip.units[NETWORK].threads,), lambda: say(MEASURING.format(graph.path.name))
+        found = calls_of(graph.path, shapes, runs, threads, cores, told, as_stage=bool(runtime))
     except TrilaneError as error:
         return _unmeasured(chip, error, say)
     said = f"measured on this machine at {found.at}: calls of the network by itself, with {found.runtime}"

@@ -6,15 +6,13 @@ So functions here import the modules of this process when they need them.
 
 from __future__ import annotations
 
-import subprocess
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from trilane import machine
 from trilane.errors import BadInputError
 from trilane.memory import require_memory
 from trilane.stages.run_options import RunOptions
@@ -23,9 +21,6 @@ if TYPE_CHECKING:
     from trilane.apps.run.run_job import Hooks, Prepared, RunOutcome, Watched
     from trilane.pipeline.unit_starter import UnitStarter
     from trilane.stages.configure import Checked, GlFacts
-
-CHECKOUT = Path(__file__).resolve().parents[2]
-GIT_S = 5.0
 
 
 def run_asked(
@@ -39,6 +34,12 @@ def run_asked(
     `command`: words by which the run was asked for. Raises BadInputError and MissingPartError for what cannot be run,
     TrilaneError when no frame was presented.
     """
+    from trilane.pipeline.pipeline_file import is_pipeline_file
+
+    if is_pipeline_file(Path(options.scene)):
+        from trilane.apps.run.run_file import run_file
+
+        return run_file(options, hooks, command)
     options.check_together()
     with early_processes() as (starter, gl):
         return run_prepared(prepare(options, gl, command), hooks=hooks, starter=starter, gl=gl)
@@ -130,6 +131,7 @@ def run_prepared(
     `hooks`: as in `run_asked`. `starter`, `gl`: fork server and facts that `early_processes` gives. `watched`: viewer
     of the run, if any. Raises what `run_asked` raises.
     """
+    from trilane.apps.run.report_facts import made_facts
     from trilane.apps.run.run_folder import default_place
     from trilane.apps.run.run_job import run_to_folder
     from trilane.stages.configure import required_machine
@@ -145,40 +147,3 @@ def run_prepared(
         except KeyboardInterrupt:
             told.message("interrupted: nothing was written")
             raise
-
-
-def made_facts(command: Sequence[str], checkout: Path = CHECKOUT) -> dict[str, Any]:
-    """Return the keys of `trilane.apps.run.report.Made` as of now; what is not known is null, and nothing is an error.
-
-    `command`: command line, word by word. `checkout`: folder above Trilane's own, a checkout of git or not.
-    """
-    from trilane.stages.machine_facts import package_version
-
-    revision, modified = _revision(checkout)
-    return {
-        "at": machine.here.now().isoformat(timespec="seconds"),
-        "command": list(command),
-        "trilane": package_version("trilane"),
-        "revision": revision,
-        "modified": modified,
-    }
-
-
-def _revision(checkout: Path) -> tuple[str | None, bool | None]:
-    """Return git's revision and whether files that git follows were changed; None for a folder that is no checkout."""
-    git = machine.here.program("git")
-    if git is None or not (checkout / ".git").exists():
-        return None, None
-    revision = _git(git, checkout, "rev-parse", "HEAD")
-    changes = _git(git, checkout, "status", "--porcelain", "--untracked-files=no")
-    return revision, None if revision is None or changes is None else bool(changes)
-
-
-def _git(git: str, checkout: Path, *words: str) -> str | None:
-    """Return what git answers, or None when it cannot."""
-    command = [git, "--no-optional-locks", "-C", str(checkout), *words]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=GIT_S)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return done.stdout.strip() if done.returncode == 0 else None

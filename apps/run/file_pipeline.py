@@ -32,8 +32,10 @@ from trilane.pipeline.pipeline_file import PipelineFile, stage_inputs
 from trilane.pipeline.ports import payload_bytes
 from trilane.scheduler.places import Place
 from trilane.stages.blocks.video import DEFAULT_FPS, Footage, footage
+from trilane.stages.dsp.runtime import resolve
 
 BLOCKS: Final = "trilane.stages.blocks"
+ENCODE: Final = f"{BLOCKS}.encode:build"
 #: Module of each block, where it is not the block's name.
 MODULES: Final = {"busy": "loads", "discard": "loads"}
 SEGMENTS: Final = "segments"  # of the first video, as `trilane.apps.run.run_files` reads them
@@ -43,7 +45,8 @@ TOKEN: Final = {"": PortType("u8", (1,))}  # what a made-up load writes
 def pipeline_of(file: PipelineFile, run_folder: Path) -> Pipeline:
     """Return the pipeline of a checked file; its units' cores are dealt out by `cores_of`.
 
-    `run_folder`: folder in which the run leaves its files. Raises BadInputError naming the key.
+    `run_folder`: folder in which the run leaves its files. Raises BadInputError naming the key, MissingPartError for a
+    runtime that is not installed.
     """
     networks = read_networks(file)
     types = _all_types(file, networks)
@@ -108,11 +111,25 @@ def picture_fps(file: PipelineFile) -> float:
 def picture_size(pipeline: Pipeline) -> dict[str, dict[str, int]]:
     """Return `output`, the size of the pictures that the first stage that encodes reads; empty without such a stage."""
     for stage in pipeline.stages:
-        if stage.factory == f"{BLOCKS}.encode:build":
+        if stage.factory == ENCODE:
             read = stage.settings["reads"][0]
             height, width, _ = port_type(stage.settings["streams"][read["stream"]][read["port"]]).shape
             return {"output": {"width": width, "height": height}}
     return {}
+
+
+def with_window(pipeline: Pipeline, window: Path) -> Pipeline:
+    """Return the pipeline whose first stage that encodes shows its newest picture in `window`."""
+    name = next((stage.name for stage in pipeline.stages if stage.factory == ENCODE), "")
+    stages = tuple(
+        stage
+        if stage.name != name
+        else stage.model_copy(
+            update={"settings": {**stage.settings, "keys": {**stage.settings["keys"], "window": str(window)}}}
+        )
+        for stage in pipeline.stages
+    )
+    return pipeline.model_copy(update={"stages": stages})
 
 
 def segments_of(file: PipelineFile) -> dict[str, str]:
@@ -206,6 +223,7 @@ def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str
         key: value for key, value in stage.model_dump(mode="json").items() if key not in common and value is not None
     }
     if isinstance(stage, OnnxStage):
+        resolve(stage.runtime)
         graph = networks[name]
         values = [(value.name, value_type(value)) for value in fed_inputs(graph)]
         held = {each.name for each in graph.model.graph.initializer} | {each for each, _ in values}

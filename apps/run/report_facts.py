@@ -1,4 +1,4 @@
-"""Builds report.json from the result of a run, with the source of every figure.
+"""Builds report.json from the result of a run, with the source of every figure, and how it was made.
 
 Rule: the longest matching key of `SOURCES` gives the source of a figure, and every figure matches one. The run counts
 the frames of each tensor size; the error of a size comes from the avatars' validation, or is unknown.
@@ -6,8 +6,10 @@ the frames of each tensor size; the error of a size comes from the avatars' vali
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, Final
 
 from trilane.apps.run.report import SCHEMA, Report, Resolution, TensorSize
 from trilane.apps.run.verdict import judged
@@ -20,6 +22,8 @@ from trilane.pipeline.run_metrics import PolicyMetrics, RunMetrics
 from trilane.scene.planner import ALL_WORK
 from trilane.stages.config import RunConfig
 
+CHECKOUT: Final = Path(__file__).resolve().parents[2]
+GIT_S: Final = 5.0
 NO_CAP = "none: every unit works as much as its cores and threads allow"
 #: Key, dotted where it is inside another, to the source of all figures below it.
 SOURCES = {
@@ -200,3 +204,40 @@ def resolution_note(resolution: Resolution) -> str:
 def _said(size: TensorSize) -> str:
     loss = f", {size.psnr_loss_db:.1f} dB worse" if size.psnr_loss_db is not None else ""
     return f"{size.frames} of at most {size.most_pixels} pixels an avatar{loss}"
+
+
+def made_facts(command: Sequence[str], checkout: Path = CHECKOUT) -> dict[str, Any]:
+    """Return the keys of `trilane.apps.run.report.Made` as of now; what is not known is null, and nothing is an error.
+
+    `command`: command line, word by word. `checkout`: folder above Trilane's own, a checkout of git or not.
+    """
+    from trilane.stages.machine_facts import package_version
+
+    revision, modified = _revision(checkout)
+    return {
+        "at": here.now().isoformat(timespec="seconds"),
+        "command": list(command),
+        "trilane": package_version("trilane"),
+        "revision": revision,
+        "modified": modified,
+    }
+
+
+def _revision(checkout: Path) -> tuple[str | None, bool | None]:
+    """Return git's revision and whether files that git follows were changed; None for a folder that is no checkout."""
+    git = here.program("git")
+    if git is None or not (checkout / ".git").exists():
+        return None, None
+    revision = _git(git, checkout, "rev-parse", "HEAD")
+    changes = _git(git, checkout, "status", "--porcelain", "--untracked-files=no")
+    return revision, None if revision is None or changes is None else bool(changes)
+
+
+def _git(git: str, checkout: Path, *words: str) -> str | None:
+    """Return what git answers, or None when it cannot."""
+    command = [git, "--no-optional-locks", "-C", str(checkout), *words]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=GIT_S)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None

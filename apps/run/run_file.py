@@ -6,13 +6,12 @@ Rule: nothing is printed here. The modules of the file's own code are named befo
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
-from trilane.apps.run.asked_run import made_facts
 from trilane.apps.run.file_pipeline import (
     frames_of,
     imports_of,
@@ -21,20 +20,21 @@ from trilane.apps.run.file_pipeline import (
     pipeline_of,
     preload_of,
     segments_of,
+    with_window,
 )
 from trilane.apps.run.report import write_report
-from trilane.apps.run.report_facts import report_of
+from trilane.apps.run.report_facts import made_facts, report_of
 from trilane.apps.run.run_files import VIDEO, join_segments, write_files
 from trilane.apps.run.run_folder import RunFolder, default_place
-from trilane.apps.run.run_job import Hooks, RunOutcome, error_of, exit_code_of, sensors
+from trilane.apps.run.run_job import ENDLESS, Hooks, RunOutcome, error_of, exit_code_of, sensors
 from trilane.errors import BadInputError
 from trilane.memory import require_memory
 from trilane.pipeline import journal
-from trilane.pipeline.controls import Interrupts
+from trilane.pipeline.controls import Interrupts, RunControls
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.file_graph import settings_of
-from trilane.pipeline.file_keys import EncodeBlock
-from trilane.pipeline.pipeline_file import PipelineFile, read_pipeline
+from trilane.pipeline.file_keys import EncodeBlock, OnnxStage
+from trilane.pipeline.pipeline_file import PipelineFile, assignments, read_pipeline
 from trilane.pipeline.result import Failure, RunResult
 from trilane.pipeline.run import HANG_NS, run_pipeline
 from trilane.pipeline.run_record import JournalFile
@@ -42,18 +42,36 @@ from trilane.pipeline.unit_starter import UnitStarter
 from trilane.stages.machine_facts import machine_facts
 from trilane.stages.run_options import RunOptions
 
-#: Options of a run that a pipeline file takes, beside the file itself; each but `out` stands for a key of [run].
-TAKEN: Final = ("frames", "fps", "policy", "edge", "out")
+AUTO: Final = "auto"
+#: Options of a run that stand for keys of [run] of a pipeline file, and all that it takes beside the file itself.
+OF_THE_RUN: Final = ("frames", "fps", "policy", "edge")
+TAKEN: Final = (*OF_THE_RUN, "runtime", "changes", "out")
+
+
+class Watch(Protocol):
+    """Somebody who watches a run and steers it, until it is told to end if the options say no number of frames.
+
+    `controls`: requests to the run.
+    """
+
+    controls: RunControls
+
+    def begins(self, folder: Path, pipeline: Pipeline, facts: Mapping[str, Any]) -> Path:
+        """Hear that a run begins, before its units start, and return the window for its pictures.
+
+        `folder`: folder that the run's journal will be in. `facts`: `config` and `machine` of the report.
+        """
 
 
 def run_file(
     options: RunOptions,
     hooks: Callable[[], AbstractContextManager[Hooks]],
     command: tuple[str, ...] = (),
+    watch: Watch | None = None,
 ) -> RunOutcome:
     """Check the options and the pipeline file, run it and leave its run folder.
 
-    `hooks`, `command`, and the errors raised: as in `trilane.apps.run.asked_run.run_asked`.
+    `hooks`, `command`, and the errors raised: as in `trilane.apps.run.asked_run.run_asked`. `watch`: who watches.
     """
     file = asked_file(options)
     require_memory()
@@ -64,7 +82,7 @@ def run_file(
         with UnitStarter(preload_of(file)) as starter, hooks() as told:
             if modules := imports_of(file):
                 told.message(f"own code: {', '.join(modules)} of {file.folder.absolute()} is imported and run")
-            return _run(_Asked(options, file, pipeline, frames, command), folder, told, starter)
+            return _run(_Asked(options, file, pipeline, frames, command, watch), folder, told, starter)
 
 
 def asked_file(options: RunOptions) -> PipelineFile:
@@ -75,19 +93,27 @@ def asked_file(options: RunOptions) -> PipelineFile:
         raise BadInputError("options", found, f"one of {known}", "it is an option of the avatar's scenes")
     file = read_pipeline(Path(options.scene))
     given = {name: getattr(options, name) for name in TAKEN if name in options.model_fields_set}
-    return file.changed(
-        [f"run.{name}={given[name]}" for name in ("frames", "fps", "policy", "edge") if given.get(name)]
-    )
+    asked = [f"run.{name}={given[name]}" for name in OF_THE_RUN if given.get(name)]
+    if (runtime := given.get("runtime", AUTO)) != AUTO:
+        asked += [f"stages.{name}.runtime={runtime}" for name, one in file.stages.items() if isinstance(one, OnnxStage)]
+    return file.changed([*asked, *(each for text in options.changes for each in assignments(text))])
 
 
 class _Asked:
     """A run that was asked for, and what its report says of it."""
 
     def __init__(
-        self, options: RunOptions, file: PipelineFile, pipeline: Pipeline, frames: int, command: tuple[str, ...]
+        self,
+        options: RunOptions,
+        file: PipelineFile,
+        pipeline: Pipeline,
+        frames: int,
+        command: tuple[str, ...],
+        watch: Watch | None,
     ) -> None:
-        self.options, self.file, self.pipeline = options, file, pipeline
-        self.settings = settings_of(file, frames, hang_ns=HANG_NS)
+        self.options, self.file, self.pipeline, self.watch = options, file, pipeline, watch
+        is_endless = watch is not None and not options.frames and file.run.arrivals is None
+        self.settings = settings_of(file, ENDLESS if is_endless else frames, hang_ns=HANG_NS)
         self.machine, self.made = machine_facts(), made_facts(command)
         units = {unit: each.model_dump(mode="json") for unit, each in pipeline.units.items()}
         self.config: dict[str, Any] = {
@@ -102,13 +128,17 @@ class _Asked:
 def _run(asked: _Asked, folder: RunFolder, told: Hooks, starter: UnitStarter) -> RunOutcome:
     config, file = asked.config, asked.file
     facts = {"config": config, "machine": asked.machine, "made": asked.made}
+    pipeline, watch = asked.pipeline, asked.watch
+    if watch is not None:
+        pipeline = with_window(pipeline, watch.begins(folder.work, pipeline, facts))
     try:
         result = run_pipeline(
-            asked.pipeline,
+            pipeline,
             asked.settings.frames,
             fps=asked.config["scene"]["fps"],
             settings=asked.settings,
             journal=JournalFile(folder.work / journal.NAME, facts, sensors),
+            controls=None if watch is None else watch.controls,
             starter=starter,
             on_progress=lambda presented, requested: told.progress(asked.settings.policy, presented, requested),
             on_message=told.message,

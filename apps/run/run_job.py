@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 
 BASELINE_POLICY = "sequential"
 INTERRUPTED = 130
+ENDLESS = 1_000_000_000  # frames of a run that somebody watches: a year at 30 a second
 NO_VIDEO = "no video, no contact sheet and no checksum: the frames were presented without, as was asked for"
 TRUTH = "the truth: the clothed body that the avatar was trained on"
 FLOAT_PATH = "the float path: float64 body and raster, FP32 network"
@@ -114,7 +115,7 @@ def run_to_folder(
     `target`: folder that does not exist yet.
     `hooks`: callbacks of the run.
     `machine`: result of `machine_facts`.
-    `made`: result of `trilane.apps.run.asked_run.made_facts`; None for a run without a command line.
+    `made`: result of `trilane.apps.run.report_facts.made_facts`; None for a run without a command line.
     `starter`: fork server that was started earlier; without one, the units stay where they were prepared.
     `watched`: viewer of the run, if any. Raises BadInputError when `target` cannot be written. Raises TrilaneError when
     no frame was presented, or when a file could not be written; then the folder stays.

@@ -1,8 +1,8 @@
 """Measures the calls of a network alone on this machine, on distinct inputs, in a process like a unit of a run.
 
 Rule: a measurement is kept with everything that it depends on, so a machine, package or network that changed is
-measured again. A network of integers runs as an avatar's does; any other one runs in ONNX Runtime, with its own number
-types.
+measured again. A network of integers runs as an avatar's does. Any other one runs with its own number types: in ONNX
+Runtime, or in the runtime of the stage that it is in a pipeline file.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from onnx import TensorProto
 
 from trilane.avatars.network_file import NetworkFile, parse_network, read_network
 from trilane.cache import cached_arrays
@@ -30,16 +31,16 @@ from trilane.transport.packets import Packet
 CACHE = "network-calls-1"
 UNIT, STAGE = "dsp", "infer"
 CALLS, INPUTS = 100, 4
-#: NumPy types by ONNX Runtime's names of the number types that an input may have.
-NUMBERS: Mapping[str, type[np.generic]] = {
-    "tensor(float)": np.float32,
-    "tensor(float16)": np.float16,
-    "tensor(double)": np.float64,
-    "tensor(uint8)": np.uint8,
-    "tensor(int8)": np.int8,
-    "tensor(int32)": np.int32,
-    "tensor(int64)": np.int64,
-    "tensor(bool)": np.bool_,
+#: NumPy types by ONNX's names of the number types that an input may have.
+NUMBERS: Mapping[int, type[np.generic]] = {
+    TensorProto.FLOAT: np.float32,
+    TensorProto.FLOAT16: np.float16,
+    TensorProto.DOUBLE: np.float64,
+    TensorProto.UINT8: np.uint8,
+    TensorProto.INT8: np.int8,
+    TensorProto.INT32: np.int32,
+    TensorProto.INT64: np.int64,
+    TensorProto.BOOL: np.bool_,
 }
 ORT = "ort"
 Shapes = Mapping[str, Sequence[int]]
@@ -57,21 +58,29 @@ class Calls(NamedTuple):
 
 
 def calls_of(
-    path: Path, shapes: Shapes, runtime: str, counts: Sequence[int], cores: Sequence[int], say: Callable[[], None]
+    path: Path,
+    shapes: Shapes,
+    runtime: str,
+    counts: Sequence[int],
+    cores: Sequence[int],
+    say: Callable[[], None],
+    as_stage: bool = False,
 ) -> Calls:
     """Measure how long calls of the network in `path` take, without the time in which they had no core.
 
-    `shapes`: shapes of inputs by name, in place of the file's. `runtime`: runtime of a network of integers. `counts`:
-    numbers of threads. `cores`: cores to run on, the last ones first. `say`: is called before this takes seconds.
+    `shapes`: shapes of inputs by name, in place of the file's. `runtime`: runtime of a network of integers; other ones
+    run in ONNX Runtime. `counts`: numbers of threads. `cores`: cores to run on, the last ones first. `say`: is called
+    before this takes seconds. `as_stage`: whether any network runs in `runtime`, as a stage of a pipeline file does.
     Raises BadInputError for a file that cannot be read, TrilaneError when the network cannot be run.
     """
-    runs = runtime if not shapes and _integers(path) is not None else ORT
-    asked = [runs, str([*cores]), str([*counts]), str(sorted(shapes.items()))]
+    is_avatar = not as_stage and not shapes and _integers(path) is not None
+    runs = runtime if as_stage or is_avatar else ORT
+    asked = [runs, *([STAGE] if as_stage else []), str([*cores]), str([*counts]), str(sorted(shapes.items()))]
     facts = [str(cpu_facts()), *versions_with(RUNTIMES[runs].package)]
 
     def measured() -> dict[str, NDArray[Any]]:
         say()
-        found = _measured(path, shapes, runs, counts, cores)
+        found = _measured(path, shapes, runs, counts, cores, is_avatar)
         took_ns = {f"{threads}": np.array(ns, np.int64) for threads, ns in found.items()}
         return {**took_ns, "at_s": np.array(time.time(), np.int64)}
 
@@ -82,9 +91,10 @@ def calls_of(
 
 
 def _measured(
-    path: Path, shapes: Shapes, runtime: str, counts: Sequence[int], cores: Sequence[int]
+    path: Path, shapes: Shapes, runtime: str, counts: Sequence[int], cores: Sequence[int], is_avatar: bool
 ) -> dict[int, Sequence[int]]:
-    settings = {"path": str(path.absolute()), "shapes": {k: list(v) for k, v in shapes.items()}, "runtime": runtime}
+    sizes = {name: list(shape) for name, shape in shapes.items()}
+    settings = {"path": str(path.absolute()), "shapes": sizes, "runtime": runtime, "is_avatar": is_avatar}
     stage = PipelineStage(name=STAGE, unit=UNIT, factory=f"{__name__}:build", settings=settings)
     found = {}
     with UnitStarter((__name__,)) as starter:
@@ -128,35 +138,34 @@ class CallStage:
 def build(settings: Mapping[str, Any], unit: UnitContext) -> CallStage:
     """Build the stage that calls the network in `settings["path"]`. Raises BadInputError, MissingPartError."""
     path, options = Path(settings["path"]), RuntimeOptions(unit.settings.threads, unit.settings.spin)
-    network = None if settings["shapes"] else _integers(path)
-    if network is None:
-        return CallStage(_float_calls(path, settings["shapes"], options))
+    if not settings["is_avatar"]:
+        return CallStage(_calls(path, settings["shapes"], settings["runtime"], options))
+    network = read_network(path)
     session = load_runtime(settings["runtime"]).load(network, options)
     image = np.zeros((*network.shape[:3], 4), np.uint8)
     inputs = [_random(number, network.shape, np.uint8) for number in range(INPUTS)]
     return CallStage([session.bind([each], [image]).run for each in inputs])
 
 
-def _float_calls(path: Path, shapes: Shapes, options: RuntimeOptions) -> list[Callable[[], object]]:
-    """Return calls in ONNX Runtime.
+def _calls(path: Path, shapes: Shapes, runtime: str, options: RuntimeOptions) -> list[Callable[[], object]]:
+    """Return calls of any network, whose outputs nobody gets.
 
-    Raises BadInputError for a graph that it cannot load or whose inputs are no numbers.
+    Raises BadInputError for a graph that the runtime cannot load or whose inputs are no numbers.
     """
-    import onnxruntime
+    from trilane.stages.dsp.any_network import engine_of
 
-    from trilane.stages.dsp.ort import LOAD_ERRORS, PROVIDER, settings_of
-
-    try:
-        model = parse_network(path).SerializeToString()
-        session = onnxruntime.InferenceSession(model, settings_of(options), providers=[PROVIDER])
-    except LOAD_ERRORS as error:
-        raise BadInputError(path, str(error), "a network that ONNX Runtime loads") from error
-    sources = [(each.name, each.type, shapes.get(each.name, each.shape)) for each in session.get_inputs()]
-    for name, kind, shape in sources:
-        if kind not in NUMBERS or not all(isinstance(size, int) and size > 0 for size in shape):
-            raise BadInputError(path, f"input {name} of {kind} {shape}", "numbers, in a fixed shape")
-    feeds = [{name: _random(number, shape, NUMBERS[kind]) for name, kind, shape in sources} for number in range(INPUTS)]
-    return [lambda feed=feed: session.run(None, feed) for feed in feeds]  # type: ignore[misc]
+    graph = parse_network(path).graph
+    held = {each.name for each in graph.initializer}
+    inputs = {each.name: each.type.tensor_type for each in graph.input if each.name not in held}
+    sources = []
+    for name, kind in inputs.items():
+        shape = tuple(shapes.get(name, [size.dim_value for size in kind.shape.dim]))
+        if kind.elem_type not in NUMBERS or 0 in shape:
+            raise BadInputError(path, f"input {name} of type {kind.elem_type}, {shape}", "numbers, in a fixed shape")
+        sources.append((name, shape, NUMBERS[kind.elem_type]))
+    engine = engine_of(path, runtime, {name: shape for name, shape, _ in sources}, options)
+    feeds = [{name: _random(number, shape, kind) for name, shape, kind in sources} for number in range(INPUTS)]
+    return [engine.bound(feed, {}) for feed in feeds]
 
 
 def _random(seed: int, shape: Sequence[int], numbers: type[np.generic]) -> NDArray[Any]:

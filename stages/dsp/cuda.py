@@ -8,6 +8,7 @@ Slots are copied to the GPU and back in every run, because the GPU cannot read t
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
 
 import onnxruntime
@@ -31,15 +32,23 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
     """
     _check_gpu()
     check_integer_layers(network)
+    return OrtSession(gpu_session(network.where, network.model.SerializeToString(), options.device))
+
+
+def gpu_session(where: str, model: str | bytes, device: Mapping[str, str]) -> onnxruntime.InferenceSession:
+    """Return a session on the GPU.
+
+    `where`: names the network in errors. `model`: its file or its bytes. `device`: settings of the CUDA provider.
+    Raises as `load`.
+    """
+    _check_gpu()
     settings = onnxruntime.SessionOptions()
     settings.log_severity_level = ERRORS_ONLY
     settings.add_session_config_entry("session.disable_cpu_ep_fallback", "1")
-    provider = (PROVIDER, dict(options.device))
     try:
-        session = onnxruntime.InferenceSession(network.model.SerializeToString(), settings, providers=[provider])
+        return onnxruntime.InferenceSession(model, settings, providers=[(PROVIDER, dict(device))])
     except LOAD_ERRORS as error:
-        raise BadInputError(network.where, str(error), "a network that runs on the GPU as a whole") from error
-    return OrtSession(session)
+        raise BadInputError(where, str(error), "a network that runs on the GPU as a whole") from error
 
 
 @cache

@@ -38,11 +38,11 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
     device = {**DEFAULTS, **options.device}
     source, compiled = network.model.SerializeToString(), cache_entry("qnn", f"{_key(network, device)}.onnx")
     if compiled is None:
-        return OrtSession(_session(network.where, source, device, {}))
+        return OrtSession(htp_session(network.where, source, device, {}))
     with contextlib.suppress(OSError, BadInputError):  # a missing or damaged file: the network is compiled again
-        return OrtSession(_session(network.where, compiled.read_bytes(), device, {}))
+        return OrtSession(htp_session(network.where, compiled.read_bytes(), device, {}))
     with write_atomically(compiled) as draft:
-        session = _session(network.where, source, device, _context(draft))
+        session = htp_session(network.where, source, device, _context(draft))
     return OrtSession(session)
 
 
@@ -55,7 +55,7 @@ def write_context(network: NetworkFile, soc: str, path: Path) -> None:
         raise BadInputError("soc", repr(soc), f"one of {', '.join(SOCS)}")
     check_integer_layers(network)
     with write_atomically(path) as draft:
-        _session(network.where, network.model.SerializeToString(), SOCS[soc], _context(draft))
+        htp_session(network.where, network.model.SerializeToString(), SOCS[soc], _context(draft))
 
 
 def version() -> str:
@@ -78,7 +78,12 @@ def _context(path: Path) -> dict[str, str]:
     return {"ep.context_enable": "1", "ep.context_embed_mode": "1", "ep.context_file_path": str(path)}
 
 
-def _session(where: str, model: bytes, device: Mapping[str, str], entries: Mapping[str, str]) -> Any:
+def htp_session(where: str, model: str | bytes, device: Mapping[str, str], entries: Mapping[str, str]) -> Any:
+    """Return a session on the HTP.
+
+    `where`: names the network in errors. `model`: its file or its bytes. `device`: settings of the provider. `entries`:
+    further entries of the session. Raises BadInputError when a node does not run there.
+    """
     settings = onnxruntime.SessionOptions()
     settings.log_severity_level = ERRORS_ONLY
     settings.add_provider_for_devices(_devices(), {"backend_path": onnxruntime_qnn.get_qnn_htp_path(), **device})

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from trilane.pipeline import file_keys
+from trilane.stages.dsp.runtime import RUNTIMES
 from trilane.stages.machine_facts import OPTIONAL_PACKAGES
 
 PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -17,3 +19,7 @@ def test_an_optional_package_comes_with_the_extra_that_is_named(package: str) ->
     """`trilane doctor` names the extra that installs it."""
     wanted = PROJECT["optional-dependencies"][OPTIONAL_PACKAGES[package]]
     assert any(line.startswith(package) for line in wanted), wanted
+
+
+def test_a_pipeline_file_knows_every_runtime() -> None:
+    assert set(file_keys.RUNTIMES) == {*RUNTIMES}

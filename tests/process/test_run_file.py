@@ -17,6 +17,8 @@ from onnx import TensorProto, helper, numpy_helper
 
 import trilane
 from trilane.apps.explain.explained_run import explain_run
+from trilane.errors import BadInputError
+from trilane.stages.dsp.runtime import installed
 
 pytestmark = pytest.mark.usefixtures("no_new_process")
 Cli = Callable[..., subprocess.CompletedProcess[str]]
@@ -149,7 +151,7 @@ def test_a_file_that_cannot_be_run_says_which_stage_and_why(
         assert not (folder / "run").exists()
 
 
-@pytest.mark.parametrize("option", ["--size=128", "--dashboard", "--no-video", "--check=3"])
+@pytest.mark.parametrize("option", ["--size=128", "--no-video", "--check=3"])
 def test_options_of_a_scene_are_refused_by_name(option: str, cli: Cli, folder: Path) -> None:
     done = cli("run", "street.toml", option)
     assert done.returncode == 2
@@ -159,8 +161,22 @@ def test_options_of_a_scene_are_refused_by_name(option: str, cli: Cli, folder: P
 
 def test_options_stand_for_keys_of_the_file(cli: Cli) -> None:
     done = cli(
-        "run", "street.toml", "--frames", "4", "--fps", "20", "--policy", "sequential", "--edge", "fifo:3", "--json"
-    )
+        "run", "street.toml", "--frames", "4", "--fps", "20", "--policy", "sequential", "--edge", "fifo:3", "--json",
+        "--set", "stages.slow.every=2,stages.overlay.unit=screen",
+    )  # fmt: skip
     report = json.loads(done.stdout)
     assert (report["policy"], report["edge"], report["frames"]["requested"]) == ("sequential", "fifo:3", 4)
     assert report["config"]["scene"]["fps"] == 20
+    assert (report["stages"]["slow"]["jobs"], report["stages"]["overlay"]["unit"]) == (2, "screen")
+    assert report["options"]["changes"] == ["stages.slow.every=2,stages.overlay.unit=screen"]
+
+
+def test_a_program_runs_a_file_as_the_command_does(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also in another runtime, which computes the same edges."""
+    monkeypatch.chdir(folder)
+    done = trilane.run("street.toml", frames=6, runtime="openvino" if "openvino" in installed() else "ort", out="api")
+    assert (done.report.frames.presented, done.folder) == (6, folder / "api")
+    with pytest.raises(BadInputError, match="--check with a pipeline file"):
+        trilane.run("street.toml", check=2)
+    with pytest.raises(BadInputError, match="--set without a pipeline file"):
+        trilane.run("default", changes=("run.fps=3",))

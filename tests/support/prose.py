@@ -1,7 +1,7 @@
 """Plain English, held by rules: sentences of pages, helps and messages, and what breaks the rules of prose.toml.
 
-Pages are parsed by markdown-it, so code blocks, links' targets and the marks of tables are no prose. Each cell, item and
-paragraph begins a sentence.
+Pages are parsed by markdown-it, so code blocks, links' targets and the marks of tables are no prose. Each cell, item
+and paragraph begins a sentence.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ from trilane.pipeline.rehearsal import Rehearsed
 from trilane.pipeline.stage import UnitContext
 from trilane.scheduler.places import UnitWork
 from trilane.stages import machine_facts
-from trilane.stages.dsp import bare_calls
+from trilane.stages.dsp import any_network, bare_calls
 from trilane.units import BURST
 
 ANY: Any = None
@@ -101,7 +101,7 @@ def test_calls_are_measured_once_and_it_is_said_before(measured: list[Any], netw
     assert (first.took_ns, first.runtime) == (TOOK_NS, "ort")
     assert first == calls(network, lambda: said.append(len(measured)))
     assert said == [0], "once, before anything was measured"
-    assert measured == [(network, {}, "ort", (1, 2), CORES)]
+    assert measured == [(network, {}, "ort", (1, 2), CORES, True)]
 
 
 @pytest.mark.parametrize("changed", ["model", "flags", "cores", "package", "runtime", "network"])
@@ -141,9 +141,17 @@ def test_a_network_of_floats_runs_in_onnx_runtime(measured: list[Any], tmp_path:
     assert measured[0][2] == "ort"
 
 
-def built(path: Path, shapes: Any = None) -> Any:
+@pytest.mark.usefixtures("told")
+def test_a_stage_of_a_pipeline_file_is_measured_in_its_own_runtime(measured: list[Any], network: Path) -> None:
+    """Also a network of integers, and the two measurements are kept apart."""
+    as_stage = lambda runtime: bare_calls.calls_of(network, {}, runtime, (1,), CORES, lambda: None, as_stage=True)  # noqa: E731
+    assert [calls(network).runtime, as_stage("ort").runtime, as_stage("openvino").runtime] == ["ort", "ort", "openvino"]
+    assert [(asked[2], asked[5]) for asked in measured] == [("ort", True), ("ort", False), ("openvino", False)]
+
+
+def built(path: Path, shapes: Any = None, is_avatar: bool = False) -> Any:
     unit = UnitContext("dsp", UnitSettings(cores=(0,), threads=1), {})
-    return bare_calls.build({"path": str(path), "shapes": shapes or {}, "runtime": "ort"}, unit)
+    return bare_calls.build({"path": str(path), "shapes": shapes or {}, "runtime": "ort", "is_avatar": is_avatar}, unit)
 
 
 @pytest.mark.parametrize("kind", [TensorProto.FLOAT, TensorProto.INT64, TensorProto.FLOAT16, TensorProto.UINT8])
@@ -151,31 +159,31 @@ def test_frames_are_calls_with_distinct_inputs_in_turn(
     kind: int, network: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Four, then the first again; a network of integers is bound to them."""
-    import onnxruntime
-
     seen: list[bytes] = []
 
-    class Session:
-        def __init__(self, *args: Any, **options: Any) -> None:
-            self._own = real(*args, **options)
-            self.get_inputs = self._own.get_inputs
+    def bound(engine: any_network.OrtEngine, inputs: dict[str, Any], outputs: dict[str, Any]) -> Callable[[], None]:
+        (given,) = inputs.values()
+        found = np.empty_like(given)
+        call = real(engine, inputs, {**outputs, "y": found})
 
-        def run(self, names: Any, feed: dict[str, Any]) -> None:
-            (given,), (found,) = feed.values(), self._own.run(names, feed)
+        def checked() -> None:
+            call()
             assert np.array_equal(found, given + given.dtype.type(1))
             seen.append(given.tobytes())
 
+        return checked
+
+    class Session:
         def bind(self, inputs: Any, outputs: Any) -> Any:
             assert inputs[0].shape == (1, 64, 64, 5) and outputs[0].shape == (1, 64, 64, 4)
             return SimpleNamespace(run=lambda: seen.append(inputs[0].tobytes()))
 
-    real = onnxruntime.InferenceSession
-    monkeypatch.setattr(onnxruntime, "InferenceSession", Session)
+    real = any_network.OrtEngine.bound
+    monkeypatch.setattr(any_network.OrtEngine, "bound", bound)
     is_ours = kind == TensorProto.UINT8
     if is_ours:
-        own = Session.__new__(Session)
-        monkeypatch.setattr(bare_calls, "load_runtime", lambda _: SimpleNamespace(load=lambda *_: own))
-    stage = built(network if is_ours else float_network(tmp_path / "net.onnx", kind=kind))
+        monkeypatch.setattr(bare_calls, "load_runtime", lambda _: SimpleNamespace(load=lambda *_: Session()))
+    stage = built(network if is_ours else float_network(tmp_path / "net.onnx", kind=kind), is_avatar=is_ours)
     stage.bind([], [])
     for frame in range(5):
         assert stage.run(frame, None, None) == {}
@@ -184,7 +192,7 @@ def test_frames_are_calls_with_distinct_inputs_in_turn(
 
 
 def test_what_is_no_number_or_has_no_shape_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="input x of tensor\\(uint16\\)"):
+    with pytest.raises(BadInputError, match="input x of type 4"):
         built(float_network(tmp_path / "net.onnx", kind=TensorProto.UINT16))
     path = float_network(tmp_path / "open.onnx")
     model = onnx.load(path)
@@ -206,7 +214,7 @@ def test_a_file_has_the_median_of_its_calls(measured: list[Any], network: Path) 
     )
     assert found.said.startswith("measured on this machine at ") and "calls of the network by itself" in found.said
     assert said == [this_machine.MEASURING.format("network.onnx")] and "at most half a minute" in said[0]
-    assert measured[0][3:] == ((1,), CORES)
+    assert measured[0][3:5] == ((1,), CORES)
     both: Any = this_machine.with_file(load_profile("host"), graph, {}, said.append, (1, 2)).units["dsp"].measured
     assert set(both.slower) == {1, 2} and found.error == both.error
 
@@ -221,7 +229,7 @@ def test_what_cannot_be_measured_stays_as_it_is_and_is_said(
     assert this_machine.with_file(host, graph, {}, said.append) == host
     monkeypatch.setattr(this_machine, "LONGEST_CALL_MS", 1e9)
 
-    def fails(*_: object) -> None:
+    def fails(*_: object, **__: object) -> None:
         raise TrilaneError("the unit ended")
 
     monkeypatch.setattr(this_machine, "calls_of", fails)

@@ -17,6 +17,7 @@ from PIL import Image
 from support.ported_stages import Ported
 from trilane.errors import BadInputError, TrilaneError
 from trilane.stages.blocks import loads, network, overlay, own_code, prepare, video
+from trilane.stages.dsp.runtime import installed
 
 RNG = np.random.default_rng(3)
 
@@ -107,6 +108,14 @@ def saved(
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), path)
 
 
+@pytest.fixture(params=["ort", "openvino"])
+def runtime(request: pytest.FixtureRequest) -> str:
+    """A runtime on the cores, where it is installed."""
+    if request.param not in installed():
+        pytest.skip(f"{request.param} is not installed")
+    return str(request.param)
+
+
 @pytest.mark.parametrize(
     ("kind", "port", "dtype"),
     [
@@ -117,7 +126,7 @@ def saved(
     ],
 )
 def test_a_network_reads_and_writes_the_slots_in_its_own_numbers(
-    kind: int, port: str, dtype: type[np.generic], tmp_path: Path
+    kind: int, port: str, dtype: type[np.generic], runtime: str, tmp_path: Path
 ) -> None:
     """Max and Transpose take every type: the network swaps height and width, and cuts off below 3."""
     nodes = [
@@ -125,17 +134,17 @@ def test_a_network_reads_and_writes_the_slots_in_its_own_numbers(
         helper.make_node("Transpose", ["m"], ["y"], perm=[0, 1, 3, 2]),
     ]
     saved(tmp_path / "net.onnx", kind, nodes, {"three": np.array(3, dtype)})
-    keys = {"onnx": "net.onnx", "inputs": {"x0": f"{port} 1x3x2x2"}}
+    keys = {"onnx": "net.onnx", "runtime": runtime, "inputs": {"x0": f"{port} 1x3x2x2"}}
     stage = Ported(network.build, {"": f"{port} 1x3x2x2"}, {"y": f"{port} 1x3x2x2"}, tmp_path, **keys)
     given = np.arange(12).reshape(1, 3, 2, 2).astype(dtype)
     for values in (given, given[:, ::-1]):
         assert (stage(values) == np.maximum(values, 3).transpose(0, 1, 3, 2)).all()
 
 
-def test_a_network_of_two_inputs_takes_them_by_name_and_an_absent_one_as_zeros(tmp_path: Path) -> None:
+def test_a_network_of_two_inputs_takes_them_by_name_and_an_absent_one_as_zeros(runtime: str, tmp_path: Path) -> None:
     nodes = [helper.make_node("Sub", ["x0", "x1"], ["y"])]
     saved(tmp_path / "net.onnx", TensorProto.FLOAT, nodes, {}, inputs=2)
-    keys = {"onnx": "net.onnx", "inputs": {"x0": "f32 1x3x2x2", "x1": "f32 1x3x2x2"}}
+    keys = {"onnx": "net.onnx", "runtime": runtime, "inputs": {"x0": "f32 1x3x2x2", "x1": "f32 1x3x2x2"}}
     reads = {"x1": "f32 1x3x2x2", "x0": "f32 12"}
     stage = Ported(network.build, reads, {"y": "f32 1x3x2x2"}, tmp_path, **keys)
     a, b = RNG.normal(size=(2, 12)).astype(np.float32)
@@ -144,18 +153,32 @@ def test_a_network_of_two_inputs_takes_them_by_name_and_an_absent_one_as_zeros(t
     assert stage(a.reshape(1, 3, 2, 2), b).ravel().tolist() == (b - a).tolist()
 
 
-def test_a_network_takes_a_picture_as_it_is(tmp_path: Path) -> None:
+def test_a_network_takes_a_picture_as_it_is(runtime: str, tmp_path: Path) -> None:
     saved(tmp_path / "net.onnx", TensorProto.FLOAT, [helper.make_node("Identity", ["x0"], ["y"])], {})
-    keys = {"onnx": "net.onnx", "inputs": {"x0": "f32 1x3x2x2"}}
+    keys = {"onnx": "net.onnx", "runtime": runtime, "inputs": {"x0": "f32 1x3x2x2"}}
     stage = Ported(network.build, {"": "u8 2x2x3"}, {"y": "f32 1x3x2x2"}, tmp_path, **keys)
     shown = picture(2, 2)
     assert stage(shown)[0] == pytest.approx(shown.transpose(2, 0, 1) / 255, abs=1e-6)
 
 
-def test_a_file_that_is_no_network_is_refused(tmp_path: Path) -> None:
+def test_a_network_of_several_outputs_writes_those_that_are_read(runtime: str, tmp_path: Path) -> None:
+    values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["rows", 3]) for name in ("x", "y", "z")]
+    nodes = [helper.make_node("Neg", ["x"], ["y"]), helper.make_node("Abs", ["x"], ["z"])]
+    graph = helper.make_graph(nodes, "g", values[:1], values[1:])
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    onnx.save(model, tmp_path / "net.onnx")
+    keys = {"onnx": "net.onnx", "runtime": runtime, "inputs": {"x": "f32 2x3"}}
+    given = np.array([[1, -2, 3], [-4, 5, -6]], np.float32)
+    assert (Ported(network.build, {"": "f32 2x3"}, {"z": "f32 2x3"}, tmp_path, **keys)(given) == np.abs(given)).all()
+    both = Ported(network.build, {"": "f32 2x3"}, {"y": "f32 2x3", "z": "f32 2x3"}, tmp_path, **keys)
+    assert (both(given) == -given).all()
+
+
+def test_a_file_that_is_no_network_is_refused(runtime: str, tmp_path: Path) -> None:
     (tmp_path / "net.onnx").write_bytes(b"\x08\x01")
-    with pytest.raises(BadInputError, match="expected a network that ONNX Runtime loads"):
-        Ported(network.build, {"": "f32 4"}, {"y": "f32 4"}, tmp_path, onnx="net.onnx", inputs={"x": "f32 4"})
+    keys = {"onnx": "net.onnx", "runtime": runtime, "inputs": {"x": "f32 4"}}
+    with pytest.raises(BadInputError, match=r"expected a network that (ONNX Runtime|OpenVINO) loads"):
+        Ported(network.build, {"": "f32 4"}, {"y": "f32 4"}, tmp_path, **keys)
 
 
 # overlay

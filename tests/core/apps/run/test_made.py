@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from trilane import machine
-from trilane.apps.run.asked_run import made_facts
+from trilane.apps.run.report_facts import made_facts
 
 
 def git(folder: Path, *words: str) -> str:

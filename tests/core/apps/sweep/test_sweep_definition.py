@@ -264,3 +264,15 @@ def test_defects_that_are_found_late_name_the_file(tmp_path: Path, text: str, fo
     file.write_text(f"command = 'predict'\n{text}\n")
     with pytest.raises(BadInputError, match=found):
         sweep_command([str(file)], dry_run=True)
+
+
+def test_a_prediction_of_a_pipeline_file_shows_its_variant(capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [
+        {"id": "a", "options": {"set": ["run.fps=60"]}, "repeat": 1, "status": "done", "seconds": 2.0, "error": None}
+    ]
+    counts = dict.fromkeys(("trials", "done", "failed", "lost", "skipped"), 1)
+    pipelines = [{"what_if": "", "fps": 30.0}, {"what_if": "run.fps=60", "fps": 59.5}]
+    records = {"a": {"result": {"pipelines": pipelines}}}
+    document = {"trials": rows, "counts": counts, "clock": "virtual"}
+    print_summary(document, Definition(("predict",), {}, {"set": [["run.fps=60"]]}), records)
+    assert "59.5" in capsys.readouterr().out
