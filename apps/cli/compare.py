@@ -87,7 +87,7 @@ def compare(
     """Say what differs between runs, by how much, how sure that is, and the likely cause.
 
     Each figure of OTHER stands beside the figure of BASE, with a 95 % interval. With --fail-if the command is a gate: 0
-    means no worse, 1 worse, and 4 that nobody can tell; it then says how many runs would tell. A disturbed run never
+    means no worse, 1 worse, and 4 that nobody can tell. It then says how many runs would tell. A disturbed run never
     passes. Two sweeps are compared by trials of equal configuration. docs/compare.md explains the method.
     """
     gates = _gates(fail_if or [], fail_if_slower)

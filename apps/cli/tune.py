@@ -59,7 +59,7 @@ WordsArgument = Annotated[
     typer.Argument(
         metavar="[GOAL] [FILE|COMMAND]",
         help="GOAL: fps (if not given), frame, p95, p99, latency, power, energy, psnr or worst-psnr, or several with "
-        "commas. Then a sweep file, or a command with its options, as for sweep; run if none, predict with --on.",
+        "commas. After it a sweep file, or a command with its options, as for sweep; run if none, predict with --on.",
     ),
 ]
 
