@@ -38,8 +38,8 @@ from trilane.units import HOST, NS_PER_MS, UNITS, UnitName
 DRAWS: Final = 200
 SIMULATIONS: Final = 20
 SIMULATED_FRAMES: Final = 100  # that each of them shows, about
-#: Frames of the run with an always ready source, where all times are constant and where some vary.
-CONSTANT_FRAMES, VARYING_FRAMES = 200, 1000
+#: Frames of the run with an always ready source.
+FED_FRAMES: Final = 1000
 BLOCK: Final = 4096  # frames whose times are drawn at once
 #: No job hangs in virtual time, however long the file says that it takes.
 NEVER_HANGS_NS: Final = 1 << 60
@@ -233,7 +233,8 @@ def predict_file(
         "slots": dict(zip(graph.streams, graph.edges, strict=True)),
     }
     if file.run.fps is not None:
-        rate = holding(file.run.fps, needs)
+        frames = report["frames"]
+        rate = holding(file.run.fps, needs, sum(frames["dropped"].values()), frames["requested"])
         answer["rate"] = {**rate, "sentence": rate["sentence"] + _share(file)}
     return answer if all(each.low_ms is not None for each in prices.values()) else _without_intervals(answer)
 
@@ -274,9 +275,8 @@ def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], graph: Graph, s
     in_flight = in_flight_of(file)
     graph = replace(graph, edges=tuple(map(holding_back, graph.edges)), from_release=False)
     bound_ns = period_bound(graph, times, in_flight).period_ns
-    count = VARYING_FRAMES if any(each.time.varies for each in prices.values()) else CONSTANT_FRAMES
     beat = math.lcm(*file.periods.values())
-    count = -(-count // beat) * beat if beat <= count else count
+    count = -(-FED_FRAMES // beat) * beat if beat <= FED_FRAMES else FED_FRAMES
     half, whole = (
         simulate(graph, Settings(each, hang_ns=NEVER_HANGS_NS, in_flight=in_flight), _Drawn(prices, seed)).report
         for each in (count, 2 * count)

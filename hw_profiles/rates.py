@@ -34,10 +34,11 @@ class FrameInterval(NamedTuple):
     high_ms: float
 
 
-def holding(fps: float, times: FrameInterval) -> dict[str, Any]:
+def holding(fps: float, times: FrameInterval, dropped: int = 0, frames: int = 0) -> dict[str, Any]:
     """Say whether `fps` frames a second hold, in words too. The reserve is the part of a frame's time that is left.
 
-    `times`: time of a frame that never waits for its turn.
+    `times`: time of a frame that never waits for its turn. `dropped`: number of frames, of `frames`, that a run at this
+    rate drops; jitter may drop some although a mean frame fits.
     """
     reserve, high, low = (1 - ms * fps / 1e3 for ms in times)
     if low >= 0:
@@ -52,7 +53,7 @@ def holding(fps: float, times: FrameInterval) -> dict[str, Any]:
         "fps": fps,
         "holds": reserve >= 0,
         "words": words,
-        "sentence": _sentence(fps, times),
+        "sentence": _sentence(fps, times, dropped, frames),
         "reserve": reserve,
         "reserve_low": low,
         "reserve_high": high,
@@ -67,14 +68,17 @@ def without_interval(rate: Mapping[str, Any]) -> dict[str, Any]:
     return {**rate, **said, "reserve_low": None, "reserve_high": None}
 
 
-def _sentence(fps: float, times: FrameInterval) -> str:
+def _sentence(fps: float, times: FrameInterval, dropped: int, frames: int) -> str:
     """Say whether the rate holds: `holds 30 fps: yes; 12-19 ms of 33 ms (80 %)`."""
     frame_ms = 1e3 / fps
     holds = "yes" if times.high_ms <= frame_ms else "no" if times.low_ms > frame_ms else "perhaps"
+    left_out = ""
+    if dropped and holds == "yes":
+        holds, left_out = "not for every frame", f"; {dropped} of {frames} frames are dropped"
     low, high = _short(times.low_ms), _short(times.high_ms)
     span = f"{low} ms" if low == high else f"{low}-{high} ms"
     share = "" if times.low_ms == times.high_ms else " (80 %)"
-    return f"holds {fps:g} fps: {holds}; {span} of {_short(frame_ms)} ms{share}"
+    return f"holds {fps:g} fps: {holds}; {span} of {_short(frame_ms)} ms{share}{left_out}"
 
 
 def _short(ms: float) -> str:

@@ -315,6 +315,23 @@ def test_the_answer_says_when_every_leaves_frames_out(predict: Predict) -> None:
     assert predict(text)["rate"]["sentence"].endswith("c has one frame of 2, by every")
 
 
+def test_a_rate_that_jitter_breaks_is_not_held(predict: Predict) -> None:
+    """Samples of 5 and 19 ms have a mean of 12: at 80 frames a second it fits, but each run of 19 ms lasts too long.
+
+    The same mean without jitter drops none.
+    """
+    head = '[run]\nfps = 80\npolicy = "latest"'
+    jitter, steady = (predict(chain(times, head=head)) for times in ("{ samples = [5, 19] }", "12"))
+    dropped = sum(jitter["frames"]["dropped"].values())
+    assert dropped > 10
+    assert jitter["rate"]["sentence"].startswith("holds 80 fps: not for every frame; ")
+    assert jitter["rate"]["sentence"].endswith(f"; {dropped} of 1000 frames are dropped")
+    assert not jitter["verdict"]["pass"]
+    assert f"{dropped} dropped" in dict(jitter["verdict"]["lines"])["FAIL"]
+    assert steady["rate"]["sentence"] == "holds 80 fps: yes; 12 ms of 12.5 ms"
+    assert steady["verdict"]["pass"]
+
+
 def test_a_stage_without_a_time_is_refused_by_name(command: Command, tmp_path: Path) -> None:
     error = " ".join(command("predict", write_file(tmp_path, STREET), code=2)[1].split())
     assert "stages.camera: found video without a time, as small, crop, overlay, video, expected" in error
