@@ -93,8 +93,8 @@ class PersonSearch:
         towards = self.first_eye - place
         length = np.hypot(towards[0], towards[2])
         s, c = (towards[0] / length, towards[2] / length) if length else (0.0, 1.0)
-        world = points @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).T + place
-        seen = np.einsum("fba,fpb->fpa", self.turns, world - self.eyes[:, None])
+        facing = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+        seen = points @ (facing.T @ self.turns) + (place - self.eyes)[:, None] @ self.turns
         depth = -seen[..., 2]
         ahead = np.maximum(depth, 1e-3)[..., None]
         down = np.array([1.0, -1.0])
@@ -128,7 +128,8 @@ class PersonSearch:
         """The largest share that is found, and its place.
 
         `draws` random places are judged by the body's middle. The best of them climb by random steps, whose length
-        grows with each success and shrinks with each failure; `climbs` places are tried in this.
+        grows with each success and shrinks with each failure; `climbs` places are tried in this, or fewer where one has
+        all moments.
         """
         random = np.random.default_rng(7)
         middles = self.middles[:, None]
@@ -136,7 +137,7 @@ class PersonSearch:
         shares = np.array([(self.outside(place, middles) <= 0).mean() for place in drawn])
         likely = [drawn[k] for k in np.argsort(-shares, kind="stable")[: 3 * CLIMBERS]]
         climbers = sorted(((self.merit(place), 0.2, place) for place in likely), key=lambda one: -one[0])[:CLIMBERS]
-        while climbs > 0:
+        while climbs > 0 and climbers[0][0] < 1:
             for k, (merit, step, place) in enumerate(climbers):
                 reach = step * float(np.linalg.norm(self.eyes.mean(axis=0) - place))
                 tried = place + reach * random.normal(size=3)
