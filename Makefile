@@ -6,6 +6,9 @@ SHELL := /bin/bash
 
 BIN := .venv/bin
 
+# Images of containers often set it: each process of a test, thousands in all, would compile every file once more.
+unexport PYTHONDONTWRITEBYTECODE
+
 # Every check, whatever fails; with ARGS only the tests that it names, as pytest takes them.
 checks = $(if $(ARGS),$(BIN)/pytest $(filter --slow,$(1)) $(ARGS),$(BIN)/python tests/support/checks.py $(1))
 

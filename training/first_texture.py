@@ -25,6 +25,10 @@ LEAST_PIXELS = 200 * 200
 #: A pixel that spans a larger share of the texture than this crosses a UV seam.
 LARGEST_SPAN = 0.03
 LEAST_WEIGHT = 1e-4
+#: A face of less than half this area, in texels, is left out; others reach texels whose weights are this far below 0.
+LEAST_AREA, BEYOND = 1e-9, 0.25
+#: Texels around faces that are looked at together: their weights take some 20 MB.
+TEXELS_AT_ONCE = 1 << 18
 
 
 def first_texture(body: BodyArrays, groups: list[ShapeGroup], side: int, channels: int) -> F32:
@@ -174,17 +178,20 @@ def lay_out(values: F64, faces: Ints, uv: F64, uv_faces: Ints, side: int) -> tup
     image = np.zeros((side, side, values.shape[1]))
     covered = np.zeros((side, side), bool)
     corners = uv[uv_faces] * side - 0.5
-    for corner, face in zip(corners, faces, strict=True):
-        low = np.maximum(np.floor(corner.min(axis=0)).astype(int), 0)
-        high = np.minimum(np.ceil(corner.max(axis=0)).astype(int) + 1, side)
-        if (high <= low).any():
-            continue
-        x, y = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
-        weights = _barycentric(corner, x, y)
-        if weights is None:
-            continue
-        inside = (weights >= -0.25).all(axis=-1)
-        image[y[inside], x[inside]] = weights[inside] @ values[face]
+    low = np.maximum(np.floor(corners.min(axis=1)).astype(np.int64), 0)
+    high = np.minimum(np.ceil(corners.max(axis=1)).astype(np.int64) + 1, side)
+    width, height = np.maximum(high - low, 0).T
+    around = np.where(np.abs(_double_areas(corners)) < LEAST_AREA, 0, width * height)
+    parts = np.flatnonzero(np.diff(np.cumsum(around) // TEXELS_AT_ONCE)) + 1
+    for part in np.split(np.arange(len(faces)), parts):
+        face = np.repeat(part, around[part])
+        place = np.arange(len(face)) - np.repeat(np.cumsum(around[part]) - around[part], around[part])
+        x, y = low[face, 0] + place % width[face], low[face, 1] + place // width[face]
+        weights = _barycentric(corners[part], around[part], x, y)
+        inside = np.logical_and.reduce([weight >= -BEYOND for weight in weights])
+        corner_values = values[faces[face[inside]]]
+        # The last of the faces that share a texel is seen: NumPy keeps the last of repeated indices.
+        image[y[inside], x[inside]] = sum(w[inside, None] * corner_values[:, k] for k, w in enumerate(weights))
         covered[y[inside], x[inside]] = True
     return image, covered
 
@@ -224,14 +231,20 @@ def _pulled(total: F64, weight: F64) -> F64:
     return np.where(weight > 0, mean, coarse)
 
 
-def _barycentric(corner: F64, x: NDArray[Any], y: NDArray[Any]) -> F64 | None:
-    (ax, ay), (bx, by), (cx, cy) = corner
-    area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
-    if abs(area) < 1e-9:
-        return None
-    b = ((x - ax) * (cy - ay) - (cx - ax) * (y - ay)) / area
-    c = ((bx - ax) * (y - ay) - (x - ax) * (by - ay)) / area
-    return np.stack([1 - b - c, b, c], axis=-1)
+def _double_areas(corners: F64) -> F64:
+    """Return twice the signed area (F,) of triangles (F,3,2)."""
+    (bx, by), (cx, cy) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
+    return np.asarray(bx * cy - cx * by)
+
+
+def _barycentric(corners: F64, counts: Ints, x: Ints, y: Ints) -> tuple[F64, F64, F64]:
+    """Return three weights (N,) of points `x`, `y` (N,): `counts` (F,) of them for each of the faces (F,3,2)."""
+    (bx, by), (cx, cy) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
+    area = np.where(counts > 0, bx * cy - cx * by, 1.0)
+    px, py = x - np.repeat(corners[:, 0, 0], counts), y - np.repeat(corners[:, 0, 1], counts)
+    b = px * np.repeat(cy / area, counts) - py * np.repeat(cx / area, counts)
+    c = py * np.repeat(bx / area, counts) - px * np.repeat(by / area, counts)
+    return 1 - b - c, b, c
 
 
 # Fills unknown places of a surface from known ones around them, along the surface and so across its UV seams.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from functools import cache
 
 import pytest
 
@@ -20,23 +21,26 @@ from support.prose import (
     words,
 )
 
-TEXTS = texts()
+#: Read by the first test that asks: every worker imports this file, and one runs it.
+read_texts = cache(texts)
 
 
 def test_no_rule_but_that_of_length_finds_anything() -> None:
-    found = [each for where, told in TEXTS.items() for each in findings(where, told) if each.rule != "long"]
+    found = [each for where, told in read_texts().items() for each in findings(where, told) if each.rule != "long"]
     assert found == [], "\n".join(f"{each.where}: {each.rule}: {each.sentence}" for each in found)
 
 
 def test_long_sentences_only_become_fewer() -> None:
     long = Counter(
-        kind_of(where) for where, told in TEXTS.items() for each in findings(where, told) if each.rule == "long"
+        kind_of(where) for where, told in read_texts().items() for each in findings(where, told) if each.rule == "long"
     )
     assert {kind: count for kind, count in long.items() if count > DATA["most_long"][kind]} == {}
 
 
 def test_a_sentence_of_a_page_has_few_words_in_the_mean() -> None:
-    whole = [each for where, told in TEXTS.items() if where.endswith(".md") for each in told if each[-1] in ".?!:"]
+    whole = [
+        each for where, told in read_texts().items() if where.endswith(".md") for each in told if each[-1] in ".?!:"
+    ]
     lengths = [words(each) for each in whole]
     assert len(lengths) > 3000
     assert sum(lengths) / len(lengths) <= MEAN_WORDS

@@ -34,6 +34,8 @@ STYLE = (["ruff", "check", "."], ["ruff", "format", "--check", "."], ["mypy"])
 FOLDERS = ("process", "conformance", "golden", "core")
 #: No worker takes the place of one that died: with `loadfile` it meets the same test again, and pytest never ends.
 WORKERS = ("--numprocesses", "auto", "--dist", "loadfile", "--max-worker-restart", "0")
+#: A worker has one core. OpenMP takes all in each, and its threads wait for one another where another worker computes.
+ONE_CORE = {"OMP_NUM_THREADS": "1"}
 GROUPS = ([*WORKERS, *(f"tests/{folder}" for folder in FOLDERS)],)
 #: Beside the packages that decide what is skipped: the tests that `make test` skipped here, for `make test-rest`.
 SKIPPED = Path(sys.prefix) / "skipped-tests.txt"
@@ -82,7 +84,7 @@ def check_tests(arguments: Sequence[str], told: Path) -> Outcome:
         *arguments,
     ]
     path = os.pathsep.join(filter(None, (str(TESTS), os.environ.get("PYTHONPATH"))))
-    code = subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, check=False).returncode
+    code = subprocess.run(command, env={**ONE_CORE, **os.environ, "PYTHONPATH": path}, check=False).returncode
     if not told.is_file():
         return Outcome([f"pytest {' '.join(arguments)} (exit code {code}, nothing told)"], complete=False)
     found = json.loads(told.read_text(encoding="utf-8"))

@@ -83,6 +83,8 @@ class PersonSearch:
         self.focal = np.array([[lens.fx, lens.fy] for lens in lenses])
         self.centre = np.array([[lens.cx, lens.cy] for lens in lenses])
         self.size = np.array([[lens.width_px, lens.height_px] for lens in lenses])
+        #: Half pictures from the middle for a metre across at a metre's depth, (F, 2), and where the axis goes through.
+        self.halves, self.middle = 2 * self.focal * [1, -1] / self.size, 2 * self.centre / self.size - 1
         self.middles = self.points.mean(axis=1)
 
     def outside(self, place: F64, points: F64) -> F64:
@@ -93,13 +95,13 @@ class PersonSearch:
         towards = self.first_eye - place
         length = np.hypot(towards[0], towards[2])
         s, c = (towards[0] / length, towards[2] / length) if length else (0.0, 1.0)
-        world = points @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).T + place
-        seen = np.einsum("fba,fpb->fpa", self.turns, world - self.eyes[:, None])
-        depth = -seen[..., 2]
-        ahead = np.maximum(depth, 1e-3)[..., None]
-        down = np.array([1.0, -1.0])
-        pixels = self.focal[:, None] * seen[..., :2] * down / ahead + self.centre[:, None]
-        beyond = np.abs(2 * pixels / self.size[:, None] - 1).max(axis=2) - 1
+        facing = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+        # Rows x, y and z of all points, (F, 3, P): the search asks this some 20,000 times.
+        moved = ((place - self.eyes)[:, None] @ self.turns).swapaxes(1, 2)
+        seen = (facing.T @ self.turns).swapaxes(1, 2) @ points.swapaxes(1, 2) + moved
+        depth = -seen[:, 2]
+        halves = self.halves[..., None] * seen[:, :2] / np.maximum(depth, 1e-3)[:, None] + self.middle[..., None]
+        beyond = np.maximum(np.abs(halves[:, 0]), np.abs(halves[:, 1])) - 1
         return np.asarray(np.where(depth > 0.05, beyond, 9.0).max(axis=1))
 
     def share(self, place: F64) -> float:
@@ -128,7 +130,8 @@ class PersonSearch:
         """The largest share that is found, and its place.
 
         `draws` random places are judged by the body's middle. The best of them climb by random steps, whose length
-        grows with each success and shrinks with each failure; `climbs` places are tried in this.
+        grows with each success and shrinks with each failure; `climbs` places are tried in this, or fewer where one has
+        all moments.
         """
         random = np.random.default_rng(7)
         middles = self.middles[:, None]
@@ -136,7 +139,7 @@ class PersonSearch:
         shares = np.array([(self.outside(place, middles) <= 0).mean() for place in drawn])
         likely = [drawn[k] for k in np.argsort(-shares, kind="stable")[: 3 * CLIMBERS]]
         climbers = sorted(((self.merit(place), 0.2, place) for place in likely), key=lambda one: -one[0])[:CLIMBERS]
-        while climbs > 0:
+        while climbs > 0 and climbers[0][0] < 1:
             for k, (merit, step, place) in enumerate(climbers):
                 reach = step * float(np.linalg.norm(self.eyes.mean(axis=0) - place))
                 tried = place + reach * random.normal(size=3)

@@ -7,6 +7,7 @@ import pytest
 
 pytest.importorskip("scipy")
 
+from trilane.training import first_texture as module
 from trilane.training.first_texture import (
     eigenfunctions,
     fill_along_surface,
@@ -191,6 +192,32 @@ def test_values_are_laid_out_at_texel_centres():
     np.testing.assert_allclose(image[rows, columns, 0], (columns + 0.5) / 20, atol=1e-9)
     assert known[2:12, 2:12].all() and not known[:1].any() and not known[13:].any()
     assert not image[~known].any()
+
+
+@pytest.mark.parametrize("at_once", [1, 300, 1 << 18])
+def test_a_texel_takes_the_last_of_the_faces_over_it(at_once, monkeypatch):
+    """A loop over faces and texels says the same; some faces overlap, leave the image or have no area."""
+    monkeypatch.setattr(module, "TEXELS_AT_ONCE", at_once)
+    rng, side = np.random.default_rng(1), 24
+    middles, values = rng.uniform(-0.1, 1.1, (40, 1, 2)), rng.normal(size=(20, 2))
+    uv = np.vstack([(middles + rng.uniform(-0.1, 0.1, (40, 3, 2))).reshape(-1, 2), np.full((3, 2), 0.5)])
+    uv_faces, faces = np.arange(123).reshape(-1, 3), rng.integers(0, 20, (41, 3))
+    expected, over = np.zeros((side, side, 2)), np.zeros((side, side), bool)
+    for corners, face in zip(uv[uv_faces] * side - 0.5, faces, strict=True):
+        system = np.vstack([corners.T, np.ones(3)])
+        if abs(np.linalg.det(system)) < 1e-9:
+            continue
+        inverse = np.linalg.inv(system)
+        reach = np.stack([corners.min(axis=0), corners.max(axis=0)])
+        for y, x in np.ndindex(side, side):
+            weights = inverse @ [x, y, 1]
+            near = (np.floor(reach[0]) <= [x, y]).all() and ([x, y] <= np.ceil(reach[1])).all()
+            if near and (weights >= -0.25).all():
+                expected[y, x], over[y, x] = weights @ values[face], True
+    image, known = lay_out(values, faces, uv, uv_faces, side)
+    assert over.any() and not over.all()
+    np.testing.assert_array_equal(known, over)
+    np.testing.assert_allclose(image, expected, atol=1e-9)
 
 
 def test_gaps_take_the_mean_of_the_known_texels_of_the_block_round_them():
