@@ -27,8 +27,8 @@ from trilane.scene.rotations import matrix_from_quat, normalised
 MAX_ROWS = 1_000_000
 #: Number of rows that tell what columns hold.
 HEAD = 3000
-#: Units of times, the longest first, in seconds. Poses follow each other by less than 1 s, and are at least LEAST_STEP_S
-#: apart: so the steps of one unit are no steps of another.
+#: Units of times in seconds, the longest first. Poses follow each other by less than 1 s and are at least LEAST_STEP_S
+#: apart, so the steps of one unit are no steps of another.
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 LEAST_STEP_S = 0.9e-3
 #: Poses that follow each other within the first are likely, as of key frames, if the times are those of a clock since
@@ -176,7 +176,7 @@ def units_of(column: NDArray[np.float64]) -> tuple[str, ...]:
         return (clock,) if clock == film or step * SECONDS[clock] <= SURE_STEP_S else (clock, film)
     if film != "ms":
         return (film,)
-    if (finite % 1 == 0).all() and 0 <= finite.min() and finite.max() < MOST_FRAMES:
+    if (finite % 1 == 0).all() and finite.min() >= 0 and finite.max() < MOST_FRAMES:
         return ("s", "ms", FRAMES)
     return ("s",) if step <= SURE_STEP_S else ("s", "ms")
 

@@ -122,7 +122,8 @@ KINECT = centred(640, 480, 517.0)
 def load_tum(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
     """Read a TUM RGB-D trajectory: `time tx ty tz qx qy qz qw` a line, camera to world, metres, seconds.
 
-    Axes are optical. SLAM programs also write their maps in this format, some with times in nanoseconds. Raises BadInputError with the line.
+    Axes are optical. SLAM programs also write their maps in this format, some with times in nanoseconds.
+    Raises BadInputError with the line.
     Format: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats.
     """
     poses = read_pose_table(path, clock, TUM_NAMES, TUM)

@@ -4,8 +4,8 @@
 
 prints a row of Markdown for each outcome of each fault: how often, exit code, first sentence that an undisturbed run
 does not say, whether all frames are counted, and what is left behind. KIND is one of KINDS below; all if none is given.
-CHECKOUT is another source tree whose runs are looked at, such as that of an older commit. COUNT is the number of moments
-at which a fault is tried, ten by default; a table of fewer is for a machine that is slow.
+CHECKOUT is another source tree whose runs are looked at, such as that of an older commit. COUNT is how many moments a
+fault is tried at, ten by default; a table of fewer is for a machine that is slow.
 
 - `processes`: each process is killed, and stopped for `STOPPED_S` seconds, at ten moments from start to end.
 - `signals`: the command gets each signal that ends a process, at ten moments.
