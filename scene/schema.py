@@ -141,7 +141,7 @@ def _camera_axes(text: str) -> str:
 
 
 #: Keys of a camera that say how its file is read.
-FILE_KEYS = ("format", "up_axis", "metres_per_unit", "rate_hz", "axes")
+FILE_KEYS = ("format", "up_axis", "metres_per_unit", "rate_hz", "time_unit", "axes")
 
 
 class CameraSpec(Table):
@@ -150,8 +150,8 @@ class CameraSpec(Table):
     `source`: `builtin:NAME`, a file or a folder. `fov_y_deg`: field of view over the picture's height; None for that of
     the file, or the usual one of its format. `up_axis`: axis that is up in the file's world. `metres_per_unit`: unit of
     its lengths in metres; None for what the file says or what is likely. `rate_hz`: frames a second of a file without
-    times. `axes`: directions in which x, y and z of each pose point, such as `forward-left-up`; `auto`: as the format
-    defines them.
+    times. `time_unit`: unit of a table's times; `frames` for numbers of frames, `auto` for what the times tell. `axes`:
+    directions in which x, y and z of each pose point, such as `forward-left-up`; `auto`: as the format defines them.
     `near_m`, `far_m`: distances of the clip planes; the far one is moved beyond a body that a placed camera films from
     farther off. `place`: whether a camera is placed in the scene (`auto`: a recorded one where it films the avatars, a
     built-in one goes along with them) or stays where it is (`none`).
@@ -163,6 +163,7 @@ class CameraSpec(Table):
     up_axis: Literal["auto", "x", "-x", "y", "-y", "z", "-z"] = "auto"
     metres_per_unit: float | None = Field(default=None, gt=0, le=1e6, allow_inf_nan=False)
     rate_hz: float | None = Field(default=None, ge=1e-3, le=1000, allow_inf_nan=False)
+    time_unit: Literal["auto", "s", "ms", "us", "ns", "frames"] = "auto"
     axes: Annotated[str, AfterValidator(_camera_axes)] = AUTO
     near_m: float = Field(default=0.05, gt=0, allow_inf_nan=False)
     far_m: float = Field(default=100.0, gt=0, allow_inf_nan=False)

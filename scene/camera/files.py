@@ -26,6 +26,7 @@ from trilane.scene.camera.pose_table import (
     MATRIX,
     POSE,
     SAY_ORDER,
+    Clock,
     TableLayout,
     head_of,
     is_index,
@@ -294,16 +295,19 @@ def _price(quats: F64, order: tuple[int, ...], axes: F64) -> float:
     return price_of(matrix_from_quat(normalised(quats[:, order])) @ axes, "z")
 
 
-#: Reader of each format, called with a path and the scene's rate.
-_READERS: dict[str, Callable[[Path, float | None], RawCamera]] = {
+#: Reader of each table, called with a path and the scene's clock.
+_TABLES: dict[str, Callable[[Path, Clock], RawCamera]] = {
     "arkit": load_arkit,
-    "colmap": load_colmap,
     "euroc": load_euroc,
     "kitti": load_kitti,
-    "nerf": load_nerf,
-    "record3d": load_record3d,
     "stray": load_stray,
     "tum": load_tum,
+}
+#: Reader of each other format, called with a path and the scene's rate.
+_OTHERS: dict[str, Callable[[Path, float | None], RawCamera]] = {
+    "colmap": load_colmap,
+    "nerf": load_nerf,
+    "record3d": load_record3d,
 }
 #: Formats that may be folders.
 FOLDERS = ("colmap", "nerf", "record3d", "stray")
@@ -311,6 +315,16 @@ FOLDERS = ("colmap", "nerf", "record3d", "stray")
 
 #: Formats whose poses have OpenGL axes; those of the others are optical.
 OPENGL_KINDS = ("arkit", "nerf", "record3d")
+
+
+def _read(kind: str, path: Path, spec: CameraSpec) -> RawCamera:
+    """Return the content of `path`. Raises BadInputError, also where the scene states a unit of times in vain."""
+    if kind in _TABLES:
+        return _TABLES[kind](path, Clock(spec.rate_hz, spec.time_unit))
+    if spec.time_unit != AUTO:
+        found = f'camera.time_unit = "{spec.time_unit}" with a file that is no table of times'
+        raise BadInputError(path, found, "a table, such as TUM's", "remove it, or set camera.rate_hz")
+    return _OTHERS[kind](path, spec.rate_hz)
 
 
 def _axes(kind: str, stated: str) -> F64:
@@ -349,7 +363,7 @@ def load_camera(spec: CameraSpec, base: Path) -> CameraPath:
     if not (path.is_dir() and guess.kind in FOLDERS):
         require_file(path, EXPECTED)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # non-finite values are left out later
-        raw = _with_axes(_READERS[guess.kind](path, spec.rate_hz), guess.kind, spec.axes)
+        raw = _with_axes(_read(guess.kind, path, spec), guess.kind, spec.axes)
         camera = path_from_recording(raw, str(path), spec)
     reason = guess.reason or "as given"
     taken = f"taken for {camera.detected.format}: {reason}"

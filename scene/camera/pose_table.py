@@ -21,27 +21,36 @@ from numpy.typing import NDArray
 from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.files import read_text
-from trilane.scene.camera.recorded import FILM_RATE_HZ
+from trilane.scene.camera.recorded import AUTO, FILM_RATE_HZ
 from trilane.scene.rotations import matrix_from_quat, normalised
 
 MAX_ROWS = 1_000_000
 #: Number of rows that tell what columns hold.
 HEAD = 3000
-#: With a median step above this, times are in nanoseconds, else in seconds.
-LEAST_STEP_NS = 1e3
-#: A time above this is in nanoseconds whatever the steps are: in seconds it would be 30 million years.
-LEAST_TIME_NS = 1e15
+#: Units of times in seconds, the longest first. Poses follow each other by less than 1 s and are at least LEAST_STEP_S
+#: apart, so the steps of one unit are no steps of another.
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+LEAST_STEP_S = 0.9e-3
+#: Poses that follow each other within the first are likely, as of key frames, if the times are those of a clock since
+#: 1970 or have fractions. Up to the second they may as well have another unit.
+SURE_STEP_S, LONGEST_STEP_S = 3.0, 60.0
+#: Times from 2001 to 2100 are those of a clock; others are those of a device.
+EARLIEST_S, LATEST_S = 1e9, 4.1e9
 #: Number of lines of numbers that tell a table's layout.
 LOOKED_AT = 20
 #: Whole numbers below the first number frames, when at least the second share of their steps is 1.
 MOST_FRAMES, LEAST_GROWING = 1e7, 0.75
 #: Unit of a first column that numbers frames.
 FRAMES = "frames"
+#: The unit of times in a line of column names, such as `timestamp [ns]`, `time (ms)` or `t_us`.
+TIME_UNIT = re.compile(
+    r"\b(?:timestamp|time|t)s?(?:\s*[\[(]\s*(ns|us|ms|s)\s*[\])]|[_ ]?(ns|us|ms)(?![a-z0-9_]))", re.IGNORECASE
+)
 #: Parts that are removed from a column's name: its unit, the frames of EuRoC's symbols, and all but letters and digits.
-UNIT, SYMBOLS, OTHER = re.compile(r"\[[^\[\]]*\]"), re.compile(r"_rs(_r)?_"), re.compile(r"[^a-z0-9]")
+UNIT, SYMBOLS, OTHER = re.compile(r"\[[^\[\]]*\]|\([^()]*\)"), re.compile(r"_rs(_r)?_"), re.compile(r"[^a-z0-9]")
 #: What a column holds, by its name.
 KNOWN = {
-    **{name: "time" for name in ("timestamp", "time", "t", "timestamps", "timestampns")},
+    **{name + unit: "time" for name in ("timestamp", "time", "t", "timestamps") for unit in ("", "ns", "us", "ms")},
     **{name: axis for axis in "xyz" for name in (axis, f"t{axis}", f"p{axis}", f"pos{axis}")},
     **{name: f"q{part}" for part in "wxyz" for name in (f"q{part}", f"rot{part}")},
     **{name: name for name in ("frame", "fx", "fy", "cx", "cy")},
@@ -68,12 +77,14 @@ class TableLayout(NamedTuple):
 
     `columns`: number of columns. `names`: content of each, by KNOWN, "" for others; none without column names.
     `has_commas`: whether commas separate the numbers. `is_ns`: whether the first column has times in nanoseconds.
+    `unit`: unit of the times by the column names, `auto` without one.
     """
 
     columns: int
     names: tuple[str, ...]
     has_commas: bool
     is_ns: bool
+    unit: str = AUTO
 
     @property
     def has_pose(self) -> bool:
@@ -107,21 +118,22 @@ def head_of(path: Path, columns: int, expected: str) -> NDArray[np.float64]:
 def layout_of(path: Path, expected: str) -> TableLayout:
     """Return the layout of the first line of numbers; without such a line it has no columns. Raises BadInputError."""
     names: tuple[str, ...] = ()
+    unit = AUTO
     first: list[str] = []
     times: list[float] = []
     has_commas = False
     for line in read_text(path, expected).splitlines():
         words = words_of(line)
         if found := names_in(line):
-            names = names if times else found
+            names, unit = (names, unit) if times else (found, _unit_in(line))
         elif words:
             first, has_commas = first or words, has_commas or "," in line
             times += _number(words[0])
         if len(times) == LOOKED_AT:
             break
     with np.errstate(over="ignore"):
-        is_ns = bool(times) and (elapsed(np.array(times))[1] > LEAST_STEP_NS or abs(times[0]) > LEAST_TIME_NS)
-    return TableLayout(len(first), names, has_commas, is_ns)
+        is_ns = "ns" in (units_of(np.array(times)) if unit == AUTO else (unit,))
+    return TableLayout(len(first), names, has_commas, is_ns, unit)
 
 
 def _number(word: str) -> list[float]:
@@ -152,18 +164,54 @@ def elapsed(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     return times - finite[0], float(np.median(np.diff(finite)))
 
 
-def in_seconds(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, str]:
-    """Return seconds since the first finite time, their median step, and the unit of `times` (N,), `ns` or `s`."""
-    since, step = elapsed(times)
-    unit, scale = ("ns", 1e-9) if step > LEAST_STEP_NS else ("s", 1.0)
-    return since * scale, step * scale, unit
+def units_of(column: NDArray[np.float64]) -> tuple[str, ...]:
+    """Return the units that the times or frames of a column (N,) may have; several where they do not tell."""
+    if is_index(column):
+        return (FRAMES,)
+    finite = column[np.isfinite(column)]
+    step, middle = elapsed(finite)[1] if len(finite) else 0.0, float(np.median(finite)) if len(finite) else 0.0
+    film = next((unit for unit, second in SECONDS.items() if step * second < 1), "ns")
+    clock = next((unit for unit in SECONDS if _since_1970(middle, unit) and step * SECONDS[unit] < LONGEST_STEP_S), "")
+    if clock:
+        return (clock,) if clock == film or step * SECONDS[clock] <= SURE_STEP_S else (clock, film)
+    if film != "ms":
+        return (film,)
+    if (finite % 1 == 0).all() and finite.min() >= 0 and finite.max() < MOST_FRAMES:
+        return ("s", "ms", FRAMES)
+    return ("s",) if step <= SURE_STEP_S else ("s", "ms")
+
+
+def _since_1970(time: float, unit: str) -> bool:
+    return EARLIEST_S < time * SECONDS[unit] < LATEST_S
+
+
+def _unit_in(line: str) -> str:
+    """Return the unit of times that a line of column names states; `auto` without one."""
+    found = TIME_UNIT.search(line)
+    return (found[1] or found[2]).lower() if found else AUTO
+
+
+class Clock(NamedTuple):
+    """What is known of a table's times beside them.
+
+    `rate_hz`: frames a second, from the scene; None for `usual_hz`. `unit`: unit of the times, `frames` for numbers of
+    frames; `auto` where it follows from them.
+    """
+
+    rate_hz: float | None = None
+    unit: str = AUTO
+    usual_hz: float = FILM_RATE_HZ
+
+    def stated(self, unit: str) -> Clock:
+        """Return this clock with the `unit` of the file's column names, which the scene overrules."""
+        return self if self.unit != AUTO else self._replace(unit=unit)
 
 
 class ColumnTimes(NamedTuple):
     """The times of a column.
 
-    `since_s` (N,): times since the first finite one. `unit`: unit of the column, `s`, `ns` or `frames`. `rate`: rate
-    for notes, such as `, 30/s`; empty where it is unknown.
+    `since_s` (N,): times since the first finite one. `unit`: unit of the column, one of SECONDS or `frames`. `rate`:
+    rate for notes, such as `, 30/s`; empty where it is unknown.
     """
 
     since_s: NDArray[np.float64]
@@ -171,18 +219,27 @@ class ColumnTimes(NamedTuple):
     rate: str
 
 
-def times_of(column: NDArray[np.float64], rate_hz: float | None, usual_hz: float = FILM_RATE_HZ) -> ColumnTimes:
-    """Return the times in the first column of a table, or those of its numbers of frames.
+def times_of(where: str | Path, column: NDArray[np.float64], clock: Clock) -> ColumnTimes:
+    """Return the times in a column (N,) of the table `where`, or those of its numbers of frames.
 
-    `rate_hz`: frames a second, from the scene; None for `usual_hz`.
+    Raises BadInputError where the unit may be another one, or is none for these steps.
     """
-    if is_index(column):
-        rate = rate_hz or usual_hz
-        return ColumnTimes(
-            elapsed(column)[0] / rate, FRAMES, f", {rate:g} a second {'as given' if rate_hz else 'assumed'}"
-        )
-    since, step, unit = in_seconds(column)
-    return ColumnTimes(since, unit, f", {1 / step:.4g}/s" if step > 0 else "")
+    units = units_of(column) if clock.unit == AUTO else (clock.unit,)
+    since, step = elapsed(column)
+    if len(units) > 1:
+        found = f"times that follow each other by {step:.4g}"
+        either = " or ".join(f'"{unit}"' for unit in units)
+        raise BadInputError(where, found, "a unit that follows from them", f"set camera.time_unit to {either}")
+    unit = units[0]
+    if unit == FRAMES:
+        rate = clock.rate_hz or clock.usual_hz
+        how = "as given" if clock.rate_hz else "assumed"
+        return ColumnTimes(since / rate, FRAMES, f", {rate:g} a second {how}")
+    step *= SECONDS[unit]
+    if 0 < step < LEAST_STEP_S:
+        found = f"poses that follow each other by {step:.3g} s, if their times are in {unit}"
+        raise BadInputError(where, found, "1000 a second at most", "camera.time_unit states the unit")
+    return ColumnTimes(since * SECONDS[unit], unit, f", {1 / step:.4g}/s" if step > 0 else "")
 
 
 def is_index(column: NDArray[np.float64]) -> bool:
@@ -219,8 +276,6 @@ USUAL = "as usual"
 SAY_ORDER = "say the order in a first line, such as `timestamp qx qy qz qw tx ty tz`"
 #: Number of columns of a 3x4 matrix.
 MATRIX = 12
-#: Times from 2001 to 2100 are those of a clock; others are those of a device.
-EARLIEST_S, LATEST_S = 1e9, 4.1e9
 #: Largest deviation of a quaternion's length from 1: two digits after the point change it by 0.01 at most.
 MOST_OFF = 0.02
 
@@ -250,12 +305,12 @@ class PoseTable:
 
 
 def read_pose_table(
-    path: Path, rate_hz: float | None, usual: Sequence[str], expected: str, may_have_more: bool = False
+    path: Path, clock: Clock, usual: Sequence[str], expected: str, may_have_more: bool = False
 ) -> PoseTable:
     """Return the poses of `path`.
 
-    `rate_hz`: frames a second, from the scene. `usual`: contents of the columns by the format. `may_have_more`: whether
-    other columns may follow. Raises BadInputError with the line.
+    `usual`: contents of the columns by the format. `may_have_more`: whether other columns may follow. Raises
+    BadInputError with the line.
     """
     layout = layout_of(path, expected)
     names = layout.names if layout.has_pose else tuple(usual)
@@ -265,7 +320,7 @@ def read_pose_table(
         names = fitting if set(POSE) <= set(fitting) else names
     table = read_table(path, len(names), expected)
     time, x, y, z, qw, qx, qy, qz = (table.numbers[:, names.index(name)] for name in POSE)
-    times = times_of(time, rate_hz)
+    times = times_of(path, time, clock.stated(layout.unit))
     quats = np.column_stack([qw, qx, qy, qz])
     _require_quats(path, quats, table)
     turns = matrix_from_quat(normalised(quats))
@@ -287,14 +342,14 @@ class MatrixTable(NamedTuple):
     table: NumberTable
 
 
-def read_matrix_table(path: Path, rate_hz: float | None, usual_hz: float, expected: str) -> MatrixTable:
+def read_matrix_table(path: Path, clock: Clock, expected: str) -> MatrixTable:
     """Return the poses of `path`: 3x4 matrices row by row, maybe with a time or a frame's number before each.
 
-    `rate_hz`: rate of numbered frames, from the scene; None for `usual_hz`. Raises BadInputError with the line.
+    Raises BadInputError with the line.
     """
     columns = MATRIX if layout_of(path, expected).columns == MATRIX else MATRIX + 1
     table = read_table(path, columns, expected)
-    first = times_of(table.numbers[:, 0], rate_hz, usual_hz) if columns > MATRIX else None
+    first = times_of(path, table.numbers[:, 0], clock) if columns > MATRIX else None
     matrices = table.numbers[:, -MATRIX:].reshape(-1, 3, 4)
     return MatrixTable(first, matrices[:, :, :3], matrices[:, :, 3], table)
 
@@ -302,8 +357,9 @@ def read_matrix_table(path: Path, rate_hz: float | None, usual_hz: float, expect
 def _began(times: F64, unit: str) -> float | None:
     """Return the first of `times`, seconds since 1970; None when it is no such time."""
     finite = times[np.isfinite(times)]
-    first = float(finite[0]) * (1e-9 if unit == "ns" else 1.0) if len(finite) else 0.0
-    return first if EARLIEST_S < first < LATEST_S else None
+    if unit not in SECONDS or not len(finite) or not _since_1970(float(finite[0]), unit):
+        return None
+    return float(finite[0]) * SECONDS[unit]
 
 
 def _require_quats(path: Path, quats: F64, table: NumberTable) -> None:

@@ -20,34 +20,33 @@ from trilane.scene.camera.pose_table import (
     FRAMES,
     MATRIX,
     USUAL,
+    Clock,
     MatrixTable,
     PoseTable,
-    elapsed,
     read_matrix_table,
     read_pose_table,
     read_table,
     times_of,
 )
-from trilane.scene.camera.recorded import FILM_RATE_HZ, OPENGL_FROM_OPTICAL, LengthUnit, RawCamera
+from trilane.scene.camera.recorded import AUTO, OPENGL_FROM_OPTICAL, LengthUnit, RawCamera
 from trilane.scene.lens import Bent, Known, Lens, centred, checked_lens, distortion_note, measured_lens, of_opencv
 from trilane.scene.recordings import Detected
 
+ANY_CLOCK = Clock()
 ARKIT_COLUMNS = 13
 ARKIT = "an ARKit log: time and the 12 numbers of a 3x4 matrix a line"
 #: An iPhone's main camera, 26 mm equivalent, on a 16:9 picture: 36 degrees high, 60 wide.
 PHONE = centred(1920, 1080, 540 / math.tan(math.radians(18.0)), Known.LONG)
 
 
-def load_arkit(path: Path, rate_hz: float | None = None) -> RawCamera:
+def load_arkit(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
     """Read an ARKit log: `time r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz` a line, camera to world, metres, Y up.
 
-    Axes are those of the sensor in landscape (x right, y up, looks along -Z). Steps tell nanoseconds from seconds.
-    `rate_hz`: frames a second, from the scene, for files without times; 30 by default. Raises BadInputError with the
-    line.
+    Axes are those of the sensor in landscape (x right, y up, looks along -Z). Raises BadInputError with the line.
     """
-    read = read_matrix_table(path, rate_hz, FILM_RATE_HZ, ARKIT)
+    read = read_matrix_table(path, clock, ARKIT)
     count = len(read.turns)
-    times = read.times or times_of(np.arange(float(count)), rate_hz)
+    times = read.times or times_of(path, np.arange(float(count)), _counted(path, clock))
     notes = (f"ARKit log, {count} poses{times.rate}, time in {times.unit}, camera to world",)
     return RawCamera(
         times.since_s,
@@ -75,15 +74,16 @@ KITTI_TIMES = "times.txt"
 GREY = of_opencv(1241.0, 376.0, 718.856, 718.856, 607.1928, 185.2157)
 
 
-def load_kitti(path: Path, rate_hz: float | None = None) -> RawCamera:
+def load_kitti(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
     """Read KITTI odometry poses: a 3x4 matrix a line, row by row, camera to the first camera's axes, metres.
 
     Axes are optical, so -Y is usually up. Some programs write a frame's number or a time before each matrix.
-    `rate_hz`: frames a second, from the scene. Raises BadInputError with the line.
+    Raises BadInputError with the line.
     Format: https://www.cvlibs.net/datasets/kitti/eval_odometry.php, readme.txt of the development kit.
     """
-    read = read_matrix_table(path, rate_hz, KITTI_HZ, KITTI)
-    times, rate = _kitti_times(path, read, rate_hz)
+    clock = clock._replace(usual_hz=KITTI_HZ)
+    read = read_matrix_table(path, clock, KITTI)
+    times, rate = _kitti_times(path, read, clock)
     notes = (f"KITTI poses, {len(times)}, {rate}, optical axes, camera to the first one",)
     detected = Detected("KITTI poses", f"{MATRIX} columns of numbers", unit="m", rate=rate)
     lens = ((GREY,), "usual for KITTI's cameras")
@@ -91,19 +91,25 @@ def load_kitti(path: Path, rate_hz: float | None = None) -> RawCamera:
     return RawCamera(times, turns, read.places, "-y", *lens, notes, read.table.place_of, detected)
 
 
-def _kitti_times(path: Path, read: MatrixTable, rate_hz: float | None) -> tuple[F64, str]:
+def _kitti_times(path: Path, read: MatrixTable, clock: Clock) -> tuple[F64, str]:
     """Return seconds (N,) of the poses and their source: the file, `times.txt`, the scene or the usual rate."""
     if read.times is not None and read.times.unit != FRAMES:
         return read.times.since_s, f"by the times of the file, in {read.times.unit}"
-    frames = np.arange(float(len(read.turns))) if read.times is None else read.table.numbers[:, 0]
     beside = path.with_name(KITTI_TIMES)
-    if rate_hz is None and beside.is_file() and beside != path:
+    if clock.rate_hz is None and beside.is_file() and beside != path:
         times = read_table(beside, 1, "the time of a pose a line").numbers[:, 0]
-        if len(times) == len(frames):
-            return elapsed(times)[0], f"times by {KITTI_TIMES}"
-    rate = rate_hz or KITTI_HZ
-    how = "as given" if rate_hz else "assumed"
-    return elapsed(frames)[0] / rate, f"{rate:g} a second {how}, as the file has no times"
+        if len(times) == len(read.turns):
+            return times_of(beside, times, clock).since_s, f"times by {KITTI_TIMES}"
+    counted = read.times or times_of(path, np.arange(float(len(read.turns))), _counted(path, clock))
+    return counted.since_s, f"{counted.rate.removeprefix(', ')}, as the file has no times"
+
+
+def _counted(path: Path, clock: Clock) -> Clock:
+    """Return the clock of poses without times. Raises BadInputError where the scene states their unit."""
+    if clock.unit not in (AUTO, FRAMES):
+        found = f'camera.time_unit = "{clock.unit}" with poses without times'
+        raise BadInputError(path, found, "times in the file", "remove it, or set camera.rate_hz")
+    return clock._replace(unit=FRAMES)
 
 
 TUM_NAMES = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
@@ -113,14 +119,14 @@ TUM = "a TUM trajectory: time, tx ty tz, qx qy qz qw a line"
 KINECT = centred(640, 480, 517.0)
 
 
-def load_tum(path: Path, rate_hz: float | None = None) -> RawCamera:
+def load_tum(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
     """Read a TUM RGB-D trajectory: `time tx ty tz qx qy qz qw` a line, camera to world, metres, seconds.
 
     Axes are optical. SLAM programs also write their maps in this format, some with times in nanoseconds.
-    `rate_hz`: frames a second, from the scene. Raises BadInputError with the line.
+    Raises BadInputError with the line.
     Format: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats.
     """
-    poses = read_pose_table(path, rate_hz, TUM_NAMES, TUM)
+    poses = read_pose_table(path, clock, TUM_NAMES, TUM)
     order = "" if poses.order == USUAL else f", columns {poses.order}"
     time = "" if poses.time == "s" else f", time in {poses.time}"
     notes = (f"TUM trajectory, {len(poses.times_s)} poses{poses.rate}{time}{order}, optical axes, camera to world",)
@@ -152,15 +158,15 @@ CAM0 = of_opencv(752.0, 480.0, 458.654, 457.296, 367.215, 248.375)
 SENSOR_KEYS = {"data": 16, "resolution": 2, "intrinsics": 4, "distortion_coefficients": 4}
 
 
-def load_euroc(path: Path, rate_hz: float | None = None) -> RawCamera:
+def load_euroc(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
     """Read EuRoC MAV poses, `data.csv`: time in nanoseconds, place, quaternion `w, x, y, z`, then any other columns.
 
     Poses are those of the device's body. `cam0/sensor.yaml` beside them leads to the camera; without it the body's axes
     are used. Camera axes are optical; the world's Z is up.
-    `rate_hz`: frames a second, from the scene. Raises BadInputError with the line.
+    Raises BadInputError with the line.
     Format: M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.
     """
-    poses = read_pose_table(path, rate_hz, EUROC_NAMES, EUROC, may_have_more=True)
+    poses = read_pose_table(path, clock, EUROC_NAMES, EUROC, may_have_more=True)
     turns, places, lens, source = poses.turns, poses.places, CAM0, "usual for EuRoC's cameras"
     how: tuple[str, ...] = (f"the axes of the poses are taken for the camera's, as there is no {EUROC_SENSOR}",)
     sensor = path.parent.parent / EUROC_SENSOR
@@ -214,16 +220,16 @@ STRAY = "a Stray Scanner odometry.csv: timestamp, frame, x, y, z, qx, qy, qz, qw
 VIDEO_PX, NEAR_PX = (1920.0, 1440.0), 100.0
 
 
-def load_stray(path: Path, rate_hz: float | None = None) -> RawCamera:
+def load_stray(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
     """Read Stray Scanner's `odometry.csv`, or its folder: time, frame, place and quaternion of each frame.
 
     Axes are optical in ARKit's world, which is levelled, Y up, metres. Newer files have a lens for each frame, in
     pixels of the sensor in landscape; `camera_matrix.csv` beside older ones has one for all.
-    `rate_hz`: frames a second, from the scene. Raises BadInputError with the line.
+    Raises BadInputError with the line.
     Format: https://docs.strayrobots.io/apps/scanner/format.html.
     """
     file = path / STRAY_FILE if path.is_dir() else path
-    poses = read_pose_table(file, rate_hz, STRAY_NAMES, STRAY, may_have_more=True)
+    poses = read_pose_table(file, clock, STRAY_NAMES, STRAY, may_have_more=True)
     lenses, source = _stray_lenses(file, poses)
     notes = (f"Stray Scanner, {len(poses.times_s)} poses{poses.rate}, optical axes, camera to world",)
     detected = Detected("Stray Scanner odometry", "its column names", unit="m", rate="by the times of the file")

@@ -1,10 +1,11 @@
 """The table of faults: what `trilane run` says and leaves when something is taken from it.
 
-    python tests/process/fault_table.py [KIND ...] [--source CHECKOUT]
+    python tests/process/fault_table.py [KIND ...] [--source CHECKOUT] [--moments COUNT]
 
 prints a row of Markdown for each outcome of each fault: how often, exit code, first sentence that an undisturbed run
 does not say, whether all frames are counted, and what is left behind. KIND is one of KINDS below; all if none is given.
-CHECKOUT is another source tree whose runs are looked at, such as that of an older commit.
+CHECKOUT is another source tree whose runs are looked at, such as that of an older commit. COUNT is how many moments a
+fault is tried at, ten by default; a table of fewer is for a machine that is slow.
 
 - `processes`: each process is killed, and stopped for `STOPPED_S` seconds, at ten moments from start to end.
 - `signals`: the command gets each signal that ends a process, at ten moments.
@@ -107,9 +108,13 @@ class Started:
 
 @dataclass
 class Table:
-    """Runs with faults and what came of them. `source`: source tree whose runs are looked at."""
+    """Runs with faults and what came of them.
+
+    `source`: source tree whose runs are looked at. `moments`: number of moments at which a fault is tried.
+    """
 
     source: Path
+    moments: int = MOMENTS
     length_s: float = 0.0
     usual: set[str] = field(default_factory=set)
 
@@ -310,8 +315,8 @@ def folders(table: Table) -> None:
 
 
 def _moments(table: Table) -> list[float]:
-    """Return ten times in the length of a run, the start and the end included."""
-    return [table.length_s * (place + 0.5) / MOMENTS for place in range(MOMENTS)]
+    """Return times in the length of a run, the start and the end included."""
+    return [table.length_s * (place + 0.5) / table.moments for place in range(table.moments)]
 
 
 KINDS = {kind.__name__: kind for kind in (processes, signals, memory, disk, filled, files, folders)}
@@ -321,11 +326,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Prints the table of faults.")
     parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"kinds of faults: {', '.join(KINDS)}; all if none")
     parser.add_argument("--source", type=Path, default=ROOT, help="source tree whose runs are looked at")
+    parser.add_argument("--moments", type=int, default=MOMENTS, help="number of moments of each fault (%(default)s)")
     asked = parser.parse_args()
     if unknown := set(asked.kinds) - KINDS.keys():
         parser.error(f"found {', '.join(unknown)}, expected {', '.join(KINDS)}")
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that mounted disks and folders are removed
-    table = Table(asked.source.resolve())
+    table = Table(asked.source.resolve(), asked.moments)
     table.measure()
     for kind in asked.kinds or KINDS:
         KINDS[kind](table)

@@ -24,7 +24,7 @@ from trilane.units import UNITS
 pytestmark = pytest.mark.slow
 
 COUNT = 200
-PATIENCE_S = 60.0
+PATIENCE_S = 240.0
 FEW = ("--policy", "latest", "--fps", "5")  # frames a second, so that the server has time on one core
 CORES = [word for unit in UNITS for word in ("--cores", f"{unit}={min(machine.here.cores())}")]  # so none are tried
 

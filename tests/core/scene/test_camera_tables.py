@@ -100,6 +100,12 @@ def variants(table: F64) -> Iterator[tuple[str, F64]]:
                 swapped = table.copy()
                 swapped[:, [at, other]] = table[:, [other, at]]
                 yield f"{other} and {at} swapped", swapped
+    for unit, second in (("ms", 1e3), ("us", 1e6), ("ns", 1e9)) if columns != 12 else ():
+        for first_s in (0.0, 4.2, 3600.0, 1.7e9):
+            since_s = (table[:, 0] - table[0, 0]) * (1e-9 if columns == 13 else 1.0)
+            yield f"{unit} since {first_s:g} s", np.column_stack([np.round((first_s + since_s) * second), table[:, 1:]])
+    for every in (2, 10):
+        yield f"every {every}th frame's number", np.column_stack([every * index, table[:, 1 if columns != 12 else 0 :]])
     yield "last first", np.roll(table, 1, axis=1)
     yield "first last", np.roll(table, -1, axis=1)
     if columns == 8:
@@ -203,6 +209,37 @@ def test_the_order_of_a_quaternion_is_a_question_that_names_both(tmp_path: Path)
     assert seen_from_the_first(matrix_from_quat(camera.quats), camera.places) == pytest.approx(
         seen_from_the_first(truth.turns, truth.places), abs=1e-6
     )
+
+
+@pytest.mark.parametrize(
+    ("times", "unit", "names"),
+    [
+        (np.arange(COUNT) * 33.0, "ms", "t_ms tx ty tz qx qy qz qw"),
+        (np.arange(COUNT) * 33.0, "ms", "timestamp [ms], tx, ty, tz, qx, qy, qz, qw"),
+        (np.arange(COUNT) * 0.99 + 7, "s", "time (s), tx, ty, tz, qx, qy, qz, qw"),
+        (np.arange(COUNT) * 33e6, "ns", "#timestampns tx ty tz qx qy qz qw"),
+    ],
+)
+def test_a_unit_of_times_is_stated_by_the_scene_or_by_a_column_name(
+    tmp_path: Path, times: F64, unit: str, names: str
+) -> None:
+    """Both are obeyed, and the scene first: tenfold numbers of frames are frames where it says so."""
+    step_s = {"ms": 0.033, "s": 0.99, "ns": 0.033}[unit]
+    text = lines_of(np.column_stack([times, TRUTHS["tum"].table[:, 1:]]), ", " if "," in names else " ")
+    path = tmp_path / "a.txt"
+    path.write_text(f"{names}\n{text}")
+    assert load(path).times_s == pytest.approx(np.arange(COUNT) * step_s)
+    assert load(path, time_unit="frames", rate_hz=50).times_s == pytest.approx((times - times[0]) / 50)
+    path.write_text(text)
+    assert load(path, time_unit=unit).times_s == pytest.approx(np.arange(COUNT) * step_s)
+
+
+def test_a_unit_of_times_is_refused_where_there_are_none(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(nerf_text(pose_z_up(0)))
+    (tmp_path / "00.txt").write_text(lines_of(TRUTHS["kitti"].table))
+    for name, sentence in (("a.json", "a file that is no table of times"), ("00.txt", "poses without times")):
+        with pytest.raises(BadInputError, match=rf'found camera\.time_unit = "ms" with {sentence}'):
+            load(tmp_path / name, time_unit="ms")
 
 
 def test_numbers_of_frames_are_no_seconds(tmp_path: Path) -> None:

@@ -103,15 +103,42 @@ def test_a_phone_held_upright_has_the_long_side_high(tmp_path: Path, quarter: in
     assert camera.notes[1] == f"Y up{turned}"
 
 
-def test_arkit_times_are_told_by_their_steps(tmp_path: Path) -> None:
-    """A median step of 1000 is in seconds, one above it in nanoseconds."""
-    rows = [LOOKS_ALONG_X.format(x=k, y=0, z=0) for k in range(3)]
-    for step, seconds, note in ((1000.0, 1000.0, "0.001/s, time in s"), (1001.0, 1.001e-6, "9.99e+05/s, time in ns")):
-        (tmp_path / "a.txt").write_text(arkit_rows(*(f"{5 + k * step} {row}" for k, row in enumerate(rows))))
-        camera = load(tmp_path / "a.txt")
-        assert camera.times_s == pytest.approx([0, seconds, 2 * seconds])
-        assert camera.notes[0] == f"ARKit log, 3 poses, {note}, camera to world"
-    assert [place[0] for place in camera.places] == [0, 1, 2]
+@pytest.mark.parametrize(
+    ("first", "step", "step_s", "note"),
+    [
+        (5.5, 0.001, 0.001, "1000/s, time in s"),
+        (5.5, 2.5, 2.5, "0.4/s, time in s"),
+        (5.0, 1001.0, 1.001e-3, "999/s, time in us"),
+        (5.0, 999e3, 0.999, "1.001/s, time in us"),
+        (5.0, 1.001e6, 1.001e-3, "999/s, time in ns"),
+        (1.7e9, 30.0, 30.0, None),
+        (1.7e9, 2.0, 2.0, "0.5/s, time in s"),
+        (1.7e12, 33.0, 0.033, "30.3/s, time in ms"),
+        (1.7e15, 2.5e6, 2.5, "0.4/s, time in us"),
+        (1.7e18, 2.5e9, 2.5, "0.4/s, time in ns"),
+        (1.1e12, 16e6, 0.016, "62.5/s, time in ns"),
+        (0.0, 33.0, 0.033, None),
+        (0.5, 33.3, 0.0333, None),
+        (5.0, 0.0005, 0.0, None),
+    ],
+)
+def test_units_of_times_follow_from_their_steps_and_the_calendar(
+    tmp_path: Path, first: float, step: float, step_s: float, note: str | None
+) -> None:
+    """Cameras take 1 to 1000 poses a second, or one in 3 s at least by a clock since 1970 (1.7e9 s is in 2023).
+
+    1.1e12 ns are 18 minutes after a device was switched on; they are no ms of 2004. Others are asked about.
+    """
+    rows = [LOOKS_ALONG_X.format(x=k, y=0, z=0) for k in range(4)]
+    (tmp_path / "a.txt").write_text(arkit_rows(*(f"{first + k * step!r} {row}" for k, row in enumerate(rows))))
+    if note is None:
+        with pytest.raises(BadInputError, match=r"camera\.time_unit"):
+            load(tmp_path / "a.txt")
+        return
+    camera = load(tmp_path / "a.txt")
+    assert camera.times_s == pytest.approx(step_s * np.arange(4), rel=1e-3)
+    assert camera.notes[0] == f"ARKit log, 4 poses, {note}, camera to world"
+    assert [place[0] for place in camera.places] == [0, 1, 2, 3]
 
 
 def test_a_tum_pose_puts_points_at_their_pixels(tmp_path: Path) -> None:
