@@ -28,7 +28,6 @@ from trilane.pipeline.measurements.measurement import (
 SINGLE: Final = "SingleStream"
 SCENARIOS: Final = (SINGLE, "MultiStream", "Server", "Offline")
 TITLE: Final = "MLPerf Results Summary"
-LINE: Final = re.compile(r"^\s*(?P<key>[\w .%/()]+?)\s*:\s*(?P<value>.*)$")
 LATENCY: Final = re.compile(r"(Min|Max|Mean|[\d.]+ percentile) latency \(ns\)")
 PROCESSED: Final = re.compile(r"Processed at least \d+ queries \((\d+)\)")
 RATE_SLACK: Final = 0.25  # relative, between a rate and the time that it is one over
@@ -46,10 +45,10 @@ def read_loadgen(text: str) -> Found:
         if TITLE in line and "Scenario" in facts:
             found.refuse(f"line {number}", "another summary begins: give each its own file")
             break
-        processed, pair = PROCESSED.search(line), LINE.match(line)
+        processed, (key, colon, value) = PROCESSED.search(line), line.partition(":")
         count = int(processed[1]) if processed else count
-        if pair:
-            facts.setdefault(pair["key"], (f"line {number}", pair["value"].strip()))
+        if colon:
+            facts.setdefault(key.strip(), (f"line {number}", value.strip()))
     scenario = facts.get("Scenario", ("", ""))[1].replace(" ", "")
     if scenario not in SCENARIOS:
         found.refuse(facts.get("Scenario", ("Scenario", ""))[0], f"the scenario is {scenario!r}, none of {SCENARIOS}")

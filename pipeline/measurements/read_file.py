@@ -54,7 +54,7 @@ def read_measurements(path: Path) -> Measurements:
     measured = tuple(found.measurements)
     if not measured:
         first = f": {found.refused[0].row}: {found.refused[0].reason}" if found.refused else ""
-        raise BadInputError(path, f"a {found.tool} without a usable time{first}", "times of runs or layers")
+        raise BadInputError(path, f"no usable time in the {found.tool}{first}", "times of runs or layers")
     return Measurements(
         path, found.tool, found.says, measured, tuple(found.refused), found.refused_count, dict(found.skipped)
     )

@@ -465,6 +465,12 @@ def test_a_second_summary_in_one_file_is_named(read: Callable[[str], Measurement
     assert [each.row for each in found.refused] == ["line 13"]
 
 
+def test_a_line_without_an_end_costs_no_more_than_its_length(read: Callable[[str], Measurements]) -> None:
+    """A pattern that tried each beginning and end of a name took minutes for such a line."""
+    text = "a " * 100_000 + "\n" + PUBLIC["loadgen 2.0"].text
+    assert timed(read(text)) == PUBLIC["loadgen 2.0"].timed
+
+
 def test_a_distribution_with_a_long_tail_is_no_wrong_unit(read: Callable[[str], Measurements]) -> None:
     """The app's throughput is one over the 90th percentile, which may be twice the mean."""
     text = PUBLIC["mlperf app 4.0"].text.replace("0.00664158", "0.0035")
