@@ -142,7 +142,12 @@ def figures_of(record: Record | None, names: Sequence[str] = ()) -> dict[str, fl
     paths = {name: METRICS[name].path if name in METRICS else tuple(name.split(".")) for name in (*METRICS, *names)}
     found = {name: _at(document, path) for name, path in paths.items() if path}
     found["psnr"] = entry_of("", document).psnr_db
-    return {name: value for name, value in found.items() if value is not None}
+    return {name: value for name, value in found.items() if value is not None and not _is_no_time(name, value)}
+
+
+def _is_no_time(name: str, value: float) -> bool:
+    """Say whether a time is 0, as that of a run in which no frame was in time: it would be the best of all."""
+    return name in METRICS and METRICS[name].unit == "ms" and value <= 0
 
 
 def _at(found: Any, path: Sequence[str]) -> float | None:

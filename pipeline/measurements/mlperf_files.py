@@ -2,12 +2,16 @@
 
 In SingleStream the next query begins when the last one has ended, so a latency is a service time. In the other
 scenarios queries wait for each other, or are many at once: their latencies are wall times with queueing.
+
+Versions: LoadGen before 1.0 writes `Single Stream` and `Performance`. The app before 4.0 states no latencies, but how
+long all queries took, and before 3.0 its file is a list of results. In SingleStream the app's throughput is one over
+the 90th percentile. Source: the results that mlcommons publishes (mobile_results_v2.1 to v5.0).
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Any, Final
 
@@ -24,10 +28,12 @@ from trilane.pipeline.measurements.measurement import (
 SINGLE: Final = "SingleStream"
 SCENARIOS: Final = (SINGLE, "MultiStream", "Server", "Offline")
 TITLE: Final = "MLPerf Results Summary"
-LINE: Final = re.compile(r"^\s*(?P<key>[\w .%/()]+?)\s*:\s*(?P<value>.*)$")
 LATENCY: Final = re.compile(r"(Min|Max|Mean|[\d.]+ percentile) latency \(ns\)")
 PROCESSED: Final = re.compile(r"Processed at least \d+ queries \((\d+)\)")
-RATE_SLACK: Final = 0.25  # relative: the app's throughput contains what it does between queries
+RATE_SLACK: Final = 0.25  # relative, between a rate and the time that it is one over
+RATE_ROUNDING: Final = 0.005  # of the rates that LoadGen prints
+UNIT_SLACK: Final = 10.0  # between a rate of the 90th percentile and the mean: a wrong unit is further off
+ACCURACY: Final = ("AccuracyOnly", "Accuracy")
 
 
 def read_loadgen(text: str) -> Found:
@@ -36,16 +42,19 @@ def read_loadgen(text: str) -> Found:
     facts: dict[str, tuple[str, str]] = {}
     count = None
     for number, line in enumerate(text.splitlines(), 1):
-        processed, pair = PROCESSED.search(line), LINE.match(line)
+        if TITLE in line and "Scenario" in facts:
+            found.refuse(f"line {number}", "another summary begins: give each its own file")
+            break
+        processed, (key, colon, value) = PROCESSED.search(line), line.partition(":")
         count = int(processed[1]) if processed else count
-        if pair:
-            facts.setdefault(pair["key"], (f"line {number}", pair["value"].strip()))
-    scenario = facts.get("Scenario", ("", ""))[1]
+        if colon:
+            facts.setdefault(key.strip(), (f"line {number}", value.strip()))
+    scenario = facts.get("Scenario", ("", ""))[1].replace(" ", "")
     if scenario not in SCENARIOS:
         found.refuse(facts.get("Scenario", ("Scenario", ""))[0], f"the scenario is {scenario!r}, none of {SCENARIOS}")
         return found
     found.says = _says(scenario)
-    if facts.get("Mode", ("", "PerformanceOnly"))[1] == "AccuracyOnly":
+    if facts.get("Mode", ("", ""))[1] in ACCURACY:
         found.refuse(f"{facts['Mode'][0]}: Mode", "a run for accuracy, whose latencies are not measured with care")
         return found
     _add_latencies(found, scenario, facts, count)
@@ -105,7 +114,9 @@ def _add_latencies(found: Found, scenario: str, facts: Mapping[str, tuple[str, s
 def _of_rate(scenario: str, facts: Mapping[str, tuple[str, str]], mean_ms: float) -> str:
     """Say whether the rate of a SingleStream run contradicts its mean latency."""
     rate = _number(facts.get("QPS w/o loadgen overhead", ("", ""))[1])
-    if scenario == SINGLE and isinstance(rate, float) and rate > 0 and abs(rate * mean_ms / 1e3 - 1) > RATE_SLACK:
+    if scenario != SINGLE or not isinstance(rate, float) or rate <= 0:
+        return ""
+    if abs(rate - 1e3 / mean_ms) > RATE_SLACK * rate + RATE_ROUNDING:
         return f"a mean of {mean_ms:g} ms beside {rate:g} queries a second: a unit is wrong"
     return ""
 
@@ -117,53 +128,92 @@ def _number(text: str) -> object:
         return text
 
 
-def read_mlperf_app(document: Mapping[str, Any]) -> Found:
+def is_mlperf_app(document: object) -> bool:
+    """Say whether a document is one result of MLPerf's mobile app, or a list of them."""
+    several = document if isinstance(document, list) else [document]
+    return any(isinstance(result, dict) and "loadgen_scenario" in result for _, result in _results(several))
+
+
+def _results(documents: Sequence[Any]) -> Iterator[tuple[str, Any]]:
+    """Yield the place and the table of each benchmark."""
+    for number, each in enumerate(documents):
+        results = each.get("results") if isinstance(each, dict) else None
+        for index, result in enumerate(results if isinstance(results, list) else []):
+            yield f"results[{index}]" if len(documents) == 1 else f"[{number}].results[{index}]", result
+
+
+def read_mlperf_app(document: Mapping[str, Any] | Sequence[Any]) -> Found:
     """Read the result file of MLPerf's mobile app. Its latencies are seconds."""
     found = Found("MLPerf app results", "mean latency of each benchmark; service times from SingleStream alone")
-    for index, result in enumerate(document["results"]):
-        row = f"results[{index}]"
+    for row, result in _results(document if isinstance(document, list) else [document]):
         if not isinstance(result, dict):
             found.refuse(row, "no table")
             continue
-        name, scenario = str(result.get("benchmark_id", index)), result.get("loadgen_scenario")
+        name, scenario = str(result.get("benchmark_id", row)), result.get("loadgen_scenario")
         run = result.get("performance_run")
-        loadgen = run.get("loadgen") if isinstance(run, dict) else None
-        if not isinstance(loadgen, dict):
+        if not isinstance(run, dict):
             found.skip("a benchmark without a run for performance")
         elif scenario not in SCENARIOS:
             found.refuse(f"{row}: {name}", f"the scenario is {str(scenario)[:40]!r}, none of {SCENARIOS}")
+        elif isinstance(run.get("loadgen"), dict):
+            _add_result(found, f"{row}: {name}", name, str(scenario), result, run["loadgen"])
+        elif scenario == SINGLE and "measured_samples" in run:
+            _add_result(found, f"{row}: {name}", name, SINGLE, result, _of_older_app(found, f"{row}: {name}", run))
         else:
-            _add_result(found, f"{row}: {name}", name, str(scenario), result, loadgen)
+            found.skip("a benchmark without latencies")
     return found
+
+
+def _of_older_app(found: Found, row: str, run: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what newer versions state of a run: the mean is the time of all queries by their number."""
+    info = run.get("loadgen_info")
+    info = info if isinstance(info, dict) else {}
+    key = "duration" if info else "measured_duration_ms"
+    whole = found.number(row, (info or run).get(key), key)
+    count = run["measured_samples"]
+    is_count = isinstance(count, int) and not isinstance(count, bool) and count > 0
+    mean = None if whole is None else whole / (1.0 if info else 1e3) / (count if is_count else 1)
+    valid = info.get("validity", run.get("loadgen_validity", True))
+    return {"query_count": count, "latency_mean": mean, "is_result_valid": valid, "what": f"{key} by measured_samples"}
 
 
 def _add_result(
     found: Found, row: str, name: str, scenario: str, result: Mapping[str, Any], loadgen: Mapping[str, Any]
 ) -> None:
     kind: Kind = "run" if scenario == SINGLE else "wall"
-    mean = found.ms(row, loadgen.get("latency_mean"), "s", kind, "latency_mean")
+    if loadgen.get("what") and loadgen["latency_mean"] is None:
+        return  # its duration is refused already
+    count = loadgen.get("query_count")
+    if count is not None and (not isinstance(count, int) or isinstance(count, bool) or count < 1):
+        found.refuse(row, f"query_count is {str(count)[:40]}, not a whole number of queries")
+        return
+    mean = found.ms(row, loadgen.get("latency_mean"), "s", kind, loadgen.get("what", "latency_mean"))
+    p90 = found.ms(row, loadgen["latency90"], "s", kind, "latency90") if "latency90" in loadgen else None
     if mean is None:
         return
     throughput = result["performance_run"].get("throughput")
     rate = throughput.get("value") if isinstance(throughput, dict) else throughput
-    if scenario == SINGLE and is_finite(rate) and rate > 0 and abs(rate * mean / 1e3 - 1) > RATE_SLACK:
+    if scenario == SINGLE and is_finite(rate) and rate > 0 and not _fits(rate, mean, p90):
         found.refuse(row, f"a mean of {mean:g} ms beside {rate:g} queries a second: a unit is wrong")
-        return
-    count = loadgen.get("query_count")
-    if count is not None and (not isinstance(count, int) or isinstance(count, bool) or count < 1):
-        found.refuse(row, f"query_count is {str(count)[:40]}, not a whole number of queries")
         return
     single = scenario == SINGLE
     if not single:
         found.refuse(row, f"as a time of a stage: {QUEUEING}, and the scenario is {scenario}")
     settings = result.get("backend_settings")
     hardware = str(settings.get("accelerator_desc", "")) if isinstance(settings, dict) else ""
-    p90 = found.ms(row, loadgen["latency90"], "s", kind, "latency90") if "latency90" in loadgen else None
     more = {} if p90 is None else {"p90_ms": p90}
     hint = "" if loadgen.get("is_result_valid", True) else "LoadGen calls the result invalid"
     what = "a query, one at a time" if single else f"a query under {scenario}, with queueing"
+    what += f": {loadgen['what']}" if "what" in loadgen else ""
     found.add(
         Measurement(
             name, kind, "s", what, count=count, mean_ms=mean, hardware=hardware, service=single, hint=hint, more=more
         )
     )
+
+
+def _fits(rate: float, mean_ms: float, p90_ms: float | None) -> bool:
+    """Say whether a rate is one over the 90th percentile; where that is not stated, not a unit away from the mean."""
+    if p90_ms is not None:
+        return abs(rate * p90_ms / 1e3 - 1) <= RATE_SLACK and mean_ms < UNIT_SLACK * p90_ms < UNIT_SLACK**2 * mean_ms
+    return 1 / UNIT_SLACK < rate * mean_ms / 1e3 < UNIT_SLACK

@@ -54,7 +54,7 @@ def read_measurements(path: Path) -> Measurements:
     measured = tuple(found.measurements)
     if not measured:
         first = f": {found.refused[0].row}: {found.refused[0].reason}" if found.refused else ""
-        raise BadInputError(path, f"a {found.tool} without a usable time{first}", "times of runs or layers")
+        raise BadInputError(path, f"no usable time in the {found.tool}{first}", "times of runs or layers")
     return Measurements(
         path, found.tool, found.says, measured, tuple(found.refused), found.refused_count, dict(found.skipped)
     )
@@ -131,8 +131,7 @@ def _of_table(document: Mapping[str, Any]) -> Found | None:
         return vendor_files.read_ai_hub(document)
     if "htp_overall_summary" in data:
         return vendor_files.read_qhas(document)
-    results = document.get("results")
-    if isinstance(results, list) and any(isinstance(each, dict) and "loadgen_scenario" in each for each in results):
+    if mlperf_files.is_mlperf_app(document):
         return mlperf_files.read_mlperf_app(document)
     if isinstance(document.get("cases"), list):
         return runtime_files.read_executorch(document)
@@ -148,6 +147,8 @@ def _of_list(document: object) -> Found | None:
         return None
     if runtime_files.is_tensorrt(document):
         return runtime_files.read_tensorrt(document)
+    if mlperf_files.is_mlperf_app(document):
+        return mlperf_files.read_mlperf_app(document)
     tables = [each for each in document[:20] if isinstance(each, dict)]
     if any("average_time_ms" in each for each in tables):
         return runtime_files.read_layer_means(document)
@@ -170,8 +171,8 @@ def _events_by_line(text: str) -> tuple[list[Any], list[str]]:
     """Return the events of a list that is cut off, an event a line, and the places of lines that are none."""
     events, broken = [], []
     for number, line in enumerate(text.splitlines(), 1):
-        bare = line.strip().removeprefix("[").removesuffix("]").rstrip(", ")
-        if not bare:
+        bare = line.strip().removeprefix('{"traceEvents":').removeprefix("[").removesuffix("]").rstrip(", ")
+        if bare in ("", "]}", "{", "}"):
             continue
         try:
             event = json.loads(bare, parse_int=whole_number)

@@ -14,6 +14,7 @@ from pathlib import PurePosixPath
 from typing import Any, Final
 
 from trilane.pipeline.measurements.measurement import (
+    PER_MS,
     ROUNDING,
     Figures,
     Found,
@@ -49,7 +50,7 @@ def read_ort(events: Sequence[Any]) -> Found:
             facts = facts if isinstance(facts, dict) else {}
             hardware, operator = str(facts.get("provider", "")), str(facts.get("op_name", ""))
             what = f"a node, {operator}" if operator else "a node"
-            node = name.removesuffix(NODE_ENDING)
+            node = name.removesuffix(NODE_ENDING) or operator  # version 0.4 names no node
             found.sample(row, node, "layer", event.get("dur"), "us", what, hardware=hardware)
         elif category == "Session":
             found.skip("loading and preparing the session")
@@ -96,6 +97,7 @@ class _Benchmark:
     def _line(self, place: str, line: str) -> None:
         graph = GRAPH.search(line)
         if graph:
+            self._flush_litert()
             self._flush("")
             self._announced = 0
             self._graph = PurePosixPath(graph[1].replace("\\", "/")).name or self._graph
@@ -119,6 +121,7 @@ class _Benchmark:
             self._operator(place, line)
 
     def _of_figures(self, place: str, line: str, pairs: dict[str, str]) -> None:
+        self._flush_litert()
         if "Timings (microseconds)" in line:
             if self._starting:
                 self.found.skip("time to start")
@@ -172,7 +175,22 @@ class _Benchmark:
         place, _, unit, count = self._litert["avg"]
         times = {key: _number(value) for key, (_, value, _, _) in self._litert.items()}
         self._litert = {}
+        if self._figures is not None:
+            self._of_block(place, times["avg"], unit or "us")
+            return
         self._add(place, self._graph, float(count) if count else None, times, unit or "us")
+
+    def _of_block(self, place: str, average: object, unit: str) -> None:
+        """Take the line of figures before a block, which repeats them with two digits; refuse what contradicts it."""
+        assert self._figures is not None
+        row, pairs = self._figures
+        mean, factor = _number(pairs.get("avg", "")), PER_MS["us"] / PER_MS[unit]
+        if isinstance(mean, float) and isinstance(average, float) and abs(average * factor - mean) > 0.006 * factor:
+            self._figures = None
+            said = f"avg={mean:g} us, but {place} says Inference (avg): {average:g} {unit}"
+            self.found.refuse(f"{row}: {self._graph}", said)
+            return
+        self._flush("")
 
     def _add(self, place: str, name: str, count: object, times: Mapping[str, object], unit: str) -> None:
         """Add the figures of the runs; refuse them where they contradict each other."""

@@ -1,7 +1,7 @@
 """Named slices of a trace as samples: Perfetto's packets and Chrome's JSON. No trace processor is needed or fetched.
 
-Slices come from track events (with interned names, delta clocks and compressed packets) and from marks of Android's
-atrace in ftrace packets. A slice is a wall time: it contains whatever its thread waited for.
+Slices come from track events (with interned names, delta clocks and compressed packets; those of older Chrome too) and
+from marks of Android's atrace in ftrace packets. A slice is a wall time: it contains whatever its thread waited for.
 Sources: the comments of Perfetto's protos (track_event.proto, clock_snapshot.proto); Chrome's Trace Event Format.
 """
 
@@ -105,7 +105,7 @@ class _Slices:
 
     def _packet(self, packet: TracePacket) -> None:
         sequence = self._sequences[packet.trusted_packet_sequence_id]
-        if packet.sequence_flags & STATE_CLEARED:
+        if packet.sequence_flags & STATE_CLEARED or packet.incremental_state_cleared:
             sequence = self._sequences[packet.trusted_packet_sequence_id] = _Sequence()
         if packet.HasField("trace_packet_defaults"):
             sequence.default_clock = packet.trace_packet_defaults.timestamp_clock_id
@@ -133,11 +133,14 @@ class _Slices:
     def _event(self, packet: TracePacket, sequence: _Sequence) -> None:
         event, at = packet.track_event, self._time(packet, sequence)
         track = ("track", event.track_uuid or sequence.default_track or packet.trusted_packet_sequence_id)
-        if event.type == event.TYPE_SLICE_BEGIN:
-            name = event.name or sequence.names.get(event.name_iid, "")
-            self._open[track].append((name or f"unnamed {event.name_iid}", at))
-        elif event.type == event.TYPE_SLICE_END:
+        phase = event.legacy_event.phase if event.type == event.TYPE_UNSPECIFIED else 0
+        name = event.name or sequence.names.get(event.name_iid, "") or f"unnamed {event.name_iid}"
+        if event.type == event.TYPE_SLICE_BEGIN or phase == ord("B"):
+            self._open[track].append((name, at))
+        elif event.type == event.TYPE_SLICE_END or phase == ord("E"):
             self._end(track, at)
+        elif phase == ord("X"):
+            self._take(name, at, at + 1000 * event.legacy_event.duration_us)
 
     def _mark(self, thread: int, at: int, text: str) -> None:
         """Take a mark of atrace: `B|process|name` begins a slice of the thread, `E` ends its last one."""
@@ -153,13 +156,15 @@ class _Slices:
         if not self._open[track]:
             self._found.skip("the end of a slice that began before the trace")
             return
-        name, begin = self._open[track].pop()
-        if at < begin:
-            self._found.refuse(f"slice {name!r} at {begin} ns", f"it ends {begin - at} ns before it begins")
-        elif at == begin:
+        self._take(*self._open[track].pop(), at)
+
+    def _take(self, name: str, begin: int, end: int) -> None:
+        if end < begin:
+            self._found.refuse(f"slice {name!r} at {begin} ns", f"it ends {begin - end} ns before it begins")
+        elif end == begin:
             self._found.skip("a slice without length")
         else:
-            self._found.sample(f"slice {name!r} at {begin} ns", name, "wall", at - begin, "ns", WHAT)
+            self._found.sample(f"slice {name!r} at {begin} ns", name, "wall", end - begin, "ns", WHAT)
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:
@@ -197,6 +202,8 @@ def read_chrome(events: Sequence[Any]) -> Found:
                 found.refuse(row, "ts is no number")
             elif phase == "B":
                 open_[track].append((name, float(at)))
+            elif open_[track] and name not in ("", open_[track][-1][0]):
+                found.skip("the end of another slice than the one that is open")
             elif open_[track]:
                 name, begin = open_[track].pop()
                 found.sample(row, name, "wall", float(at) - begin, "us", WHAT)

@@ -1,8 +1,10 @@
 """Readers of Qualcomm's profiles: the CSV of the QNN execution provider, QHAS summaries, and jobs of AI Hub.
 
 Layouts as the tools write them: the QNN execution provider of ONNX Runtime (`qnn_backend_manager.cc`: seven columns,
-rows appended run after run, identifiers unquoted), QHAS of QAIRT (`htp_overall_summary`), `download_profile()` of
-qai-hub (times in microseconds). Cycles become shares of a run, never times: the clock is not in the file.
+rows appended run after run, identifiers unquoted); the same table of `qnn-profile-viewer` (lines before it, blanks in
+its header, `EXECUTE` in each row, a row of `qnn-net-run` itself); QHAS of QAIRT (`htp_overall_summary`);
+`download_profile()` of qai-hub (times in microseconds). Cycles become shares of a run, never times: the clock is not
+in the file.
 """
 
 from __future__ import annotations
@@ -20,8 +22,11 @@ IDENTIFIER: Final = "Event Identifier"
 QNN_UNITS: Final = {"US": "us", "MICROSEC": "us", "MS": "ms", "NS": "ns", "S": "s", "CYCLES": CYCLES}
 NO_TIMES: Final = ("COUNT", "BYTES", "OBJECT", "NONE", "INF/SEC", "UNKNOWN", "")
 #: Times of one execution, from the outermost in: each contains the next.
+NET_RUN: Final = "NetRun (execute) time"
+WHOLE: Final = "QNN (execute) time"
 NESTED: Final = (
-    ("QNN (execute) time", "the whole call, with the way to the accelerator and waiting for it"),
+    (NET_RUN, "the whole execution as qnn-net-run sees it, with its input and output"),
+    (WHOLE, "the whole call, with the way to the accelerator and waiting for it"),
     ("RPC (execute) time", "the call to the accelerator and back"),
     ("QNN accelerator (execute) time", "on the accelerator, with acquiring its memory and power"),
     ("Accelerator (execute) time", "on the accelerator"),
@@ -34,7 +39,11 @@ RATE_SLACK: Final = 0.02  # relative, between a time and the rate that the same 
 
 def is_qnn(lines: Sequence[str]) -> bool:
     """Say whether one of the first lines is the header of the QNN CSV."""
-    return any(line.lstrip("\ufeff").startswith(",".join(QNN_COLUMNS[:3])) for line in lines[:20])
+    return any(_names(line.lstrip("\ufeff").split(","))[:3] == list(QNN_COLUMNS[:3]) for line in lines[:20])
+
+
+def _names(cells: Sequence[str]) -> list[str]:
+    return [cell.strip() for cell in cells]
 
 
 def read_qnn(text: str) -> Found:
@@ -49,7 +58,7 @@ def read_qnn(text: str) -> Found:
             found.skip("a count, not a time")
         elif unit not in QNN_UNITS:
             found.refuse(row, f"the unknown unit {unit!r}: expected US or CYCLES")
-        elif ("(cycles)" in identifier.lower()) != (QNN_UNITS[unit] == CYCLES):
+        elif not _fits_name(unit, identifier, cells["Event Level"]):
             found.refuse(row, f"the unit is {unit}, but the name says {identifier!r}")
         else:
             value = _number_of(cells["Time"])
@@ -78,7 +87,7 @@ def _qnn_rows(text: str, found: Found) -> Iterator[tuple[str, dict[str, str], st
             continue
         place = f"line {reader.line_num}"
         if cells and cells[0].strip() == QNN_COLUMNS[0]:
-            header = [cell.strip() for cell in cells]
+            header = _names(cells)
             missing = [name for name in (*QNN_COLUMNS[2:4], IDENTIFIER) if name not in header]
             if missing:
                 found.refuse(place, f"a header without the column {missing[0]!r}")
@@ -92,7 +101,26 @@ def _qnn_rows(text: str, found: Found) -> Iterator[tuple[str, dict[str, str], st
                 # the tool does not quote identifiers, which may have commas
                 named = dict(zip(header, cells, strict=False))
                 last = ",".join(cells[len(header) - 1 :]) if header[-1] == IDENTIFIER else named[IDENTIFIER]
-                yield place, {"Event Level": "", **named}, last.strip()
+                yield place, named, _event(named, last.strip())
+
+
+def _event(named: dict[str, str], identifier: str) -> str:
+    """Return the name of an event. A row of `qnn-net-run` itself names the graph; an event may have no name (NULL)."""
+    for column in ("Event Level", "Message", "Timing Source"):
+        named[column] = named.get(column, "").strip().upper()
+    if named["Message"] == "EXECUTE" and named["Event Level"] == "ROOT":
+        if named["Timing Source"] == "NETRUN":
+            return NET_RUN
+        if identifier.upper() == "NULL":
+            return WHOLE
+    return identifier
+
+
+def _fits_name(unit: str, identifier: str, level: str) -> bool:
+    """Say whether the unit is the one that a name says. Names of nodes may leave `(cycles)` out."""
+    if QNN_UNITS[unit] == CYCLES and level == "SUB-EVENT":
+        return identifier not in WHAT
+    return ("(cycles)" in identifier.lower()) == (QNN_UNITS[unit] == CYCLES)
 
 
 def _number_of(text: str) -> object:
@@ -103,7 +131,7 @@ def _number_of(text: str) -> object:
 
 
 class _Run:
-    """The times of one execution. They stand in any order; the call as a whole comes last."""
+    """The times of one execution, in any order. A name that comes again, or the whole behind parts, ends it."""
 
     def __init__(self, found: Found) -> None:
         self._found = found
@@ -117,7 +145,7 @@ class _Run:
             self.end()
         if self._found.ms(row, value, unit, "run") is not None:
             self._rows[name] = (row, float(value), unit)  # type: ignore[arg-type]
-        if name == NESTED[0][0]:
+        if name == WHOLE and self._rows.keys() - {WHOLE, NET_RUN}:
             self.end()
 
     def end(self) -> None:
@@ -141,7 +169,7 @@ class _Run:
 def _take_cycles(found: Found, row: str, level: str, name: str, value: object, cycles: dict[str, list[float]]) -> None:
     number = found.number(row, value, "the count of cycles")
     if number is not None:
-        cycles[name if level.strip().upper() == "SUB-EVENT" else ""].append(number)
+        cycles[name if level == "SUB-EVENT" else ""].append(number)
 
 
 def _add_cycles(found: Found, cycles: Mapping[str, Sequence[float]]) -> None:

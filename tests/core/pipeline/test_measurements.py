@@ -431,7 +431,7 @@ def test_a_broken_row_is_named_and_the_others_stay(
         ('{"execution_summary": {"estimated_inference_time": ' + "9" * 5000 + "}}", "finite"),
         (
             "Msg Timestamp,Message,Time,Unit of Measurement,Timing Source,Event Level,Event Identifier\n",
-            "without a usable",
+            "no usable time in the QNN profile",
         ),
         ("Msg Timestamp,Message,Time\n0,BACKEND,5\n", "without the column 'Unit of Measurement'"),
         ("name\0", "NUL byte"),

@@ -248,6 +248,12 @@ def test_figures_are_finite_numbers_of_a_trial_that_is_done() -> None:
     assert figures_of(done(trial, {"pipelines": [{"fps": 30.0}, {"fps": 10.0}]})) == {"fps": 30.0}
 
 
+def test_a_latency_of_0_is_no_figure() -> None:
+    """A prediction under `deadline` in which no frame is in time has the latency 0, which would win each search."""
+    result = {"latency_ms": {"mean": 0}, "fps": 14.9}
+    assert figures_of(done(space().trials[0], result)) == {"fps": 14.9}
+
+
 def test_numbers_that_rise_are_ordered_and_places_find_trials() -> None:
     several = space({"a": ["64", "128"], "b": [2, 1], "c": ["x", "y"], "d": [True, False], "e": [1]})
     assert several.ordered == {"a"}
