@@ -17,7 +17,7 @@ from trilane.errors import TrilaneError
 from trilane.pipeline.stage import UnitContext
 from trilane.scene.crop import Rect, crop_projection
 from trilane.shapes import Shape
-from trilane.stages.avatar_assets import distinct, levels_of, quantisation_of, shaped_body, texture_of
+from trilane.stages.avatar_assets import bodies_drawn, distinct, levels_of, quantisation_of, texture_of
 from trilane.stages.config import RunConfig, posed_vertices
 from trilane.stages.gpu.opengl import CONTEXT, checked, counter_of, describe, open_context
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement
@@ -77,7 +77,7 @@ class RasterStage:
                 number = int(avatar["avatar"])
                 placement = _placement(pose, avatar, skinned[number] if skinned else None)
                 self._avatars[number].draw(target, pose["view"], placement)
-                moved.least += self._avatars[number].mesh.pose_bytes
+                moved.least += self._avatars[number].meshes[placement.mesh].pose_bytes
             self._packed.read_into(shape, tensor)
         moved.written += tensor.nbytes
         moved.least += tensor.nbytes
@@ -96,6 +96,7 @@ def _placement(pose: NDArray[np.void], avatar: Any, vertices: NDArray[np.float32
         rect=(top, left, height, width),
         feature=avatar["pose_feature"],
         vertices=vertices,
+        mesh=int(avatar["mesh"]),
     )
 
 
@@ -120,10 +121,10 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> RasterStage:
     levels = [levels_of(unit.assets, number) for number in range(len(folders))]
     deferred = filtering == "linear" and not driver.hardware and all(each is None for each in levels)
     packed = PackedPass(ctx, textures[0].shape[2], quantisation_of(unit.assets, 0), deferred, filtering)
-    drawn = {
-        folder: PackedAvatar(packed, _mesh(ctx, shaped_body(unit.assets, number), config), texture, levels[number])
-        for number, (folder, texture) in enumerate(zip(folders, textures, strict=True))
-    }
+    drawn = {}
+    for number, (folder, texture) in enumerate(zip(folders, textures, strict=True)):
+        whole, *coarser = (_mesh(ctx, body, config) for body in bodies_drawn(config, unit.assets, number))
+        drawn[folder] = PackedAvatar(packed, whole, texture, levels[number], coarser)
     avatars = [drawn[folder] for folder in config.avatar_dirs]
     return RasterStage(packed, avatars, config.buckets, config.posed_vertices)
 

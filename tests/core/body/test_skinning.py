@@ -286,22 +286,23 @@ def test_the_cheapest_level_within_the_budget(errors: list[float], budget: float
 
 def test_far_off_less_is_modelled_than_near(blended: ShapedBody) -> None:
     """The same pose at 3 metres and further off: each level is the first whose bound is within half a pixel."""
-    body = ModelledBody(blended, skins=True, budget_px=0.5)
+    body = ModelledBody([blended], (), skins=True, budget_px=0.5)
     posed = body.skeleton().pose(np.full((JOINTS, 3), 0.3))
-    levels = [body.choose(posed, straight_clip(distance), OUTPUT) for distance in (3.0, 30.0, 300.0, 30000.0)]
-    assert [level for level, _ in levels] == sorted([level for level, _ in levels], reverse=True)
-    assert levels[0][0] == FINEST
-    assert levels[-1][0] == 0
-    assert all(error <= 0.5 for _, error in levels)
+    chosen = [body.choose(posed, straight_clip(distance), OUTPUT) for distance in (3.0, 30.0, 300.0, 30000.0)]
+    levels = [one.level for one in chosen]
+    assert levels == sorted(levels, reverse=True)
+    assert (levels[0], levels[-1]) == (FINEST, 0)
+    assert all(one.error_px <= 0.5 for one in chosen)
 
 
 @pytest.mark.parametrize(("skins", "budget"), [(False, 0.5), (True, 0.0)])
 def test_everything_is_modelled_where_the_gpu_skins_or_nothing_may_be_left_out(
     blended: ShapedBody, skins: bool, budget: float
 ) -> None:
-    body = ModelledBody(blended, skins=skins, budget_px=budget)
+    body = ModelledBody([blended], (), skins=skins, budget_px=budget)
     posed = body.skeleton().pose(np.full((JOINTS, 3), 0.3))
-    assert body.choose(posed, straight_clip(3000.0), OUTPUT) == (FINEST, 0.0)
+    choice = body.choose(posed, straight_clip(3000.0), OUTPUT)
+    assert (choice.level, choice.error_px) == (FINEST, 0.0)
 
 
 def test_a_rectangle_grows_by_the_error() -> None:
