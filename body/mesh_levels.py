@@ -34,8 +34,8 @@ from trilane.body.kinematics import Posed
 #: Error that float32 may add, metres: the rounding of weights, of skinned vertices and of the stored terms.
 ROUNDING_M = 5e-6
 TURNS = JOINTS - 1
-#: About so many rows of terms bound a level: 0.1 ms a frame.
-MOST_ROWS = 1024
+#: About so many rows of terms bound a level.
+MOST_ROWS = 2048
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,11 @@ class MeshLevel:
         turned = np.linalg.norm(posed.feature.reshape(TURNS, 9), axis=1)
         moved = self.rest + self.swing @ (turned / np.float32(np.sqrt(2.0))) + self.blend @ turned
         return float(moved.max()) + ROUNDING_M
+
+    @property
+    def least_m(self) -> float:
+        """Least that `metres` returns in any pose: the largest move at rest."""
+        return float(self.rest.max())
 
     def reduced(self, shaped: ShapedBody) -> ShapedBody:
         """Return `shaped` with the triangles of this level and only the vertices that they use, in the same order."""

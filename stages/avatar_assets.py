@@ -132,7 +132,7 @@ def levels_of(assets: Assets, number: int) -> F32 | None:
 
 
 def mesh_levels_of(assets: Assets, number: int) -> tuple[MeshLevel, ...]:
-    """Return the levels of the mesh of distinct avatar `number`, finest first; none where it has only the whole mesh."""
+    """Return the levels of the mesh of distinct avatar `number`, finest first; maybe none."""
     arrays = _with_prefix(assets, f"meshes{number}/")
     return levels_from_arrays(arrays) if arrays else ()
 

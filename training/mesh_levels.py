@@ -187,8 +187,8 @@ class Corners:
             np.maximum(square, np.einsum("pa,pa->p", apart, apart), out=square)
         return np.asarray(np.sqrt(square))
 
-    def to_lock(self, pairs: Pairs, level: I64, moved: F64, tolerance_m: float) -> Mask:
-        """Return which corners (N,) have to stay, so that the worst pairs come nearer; none when all are near."""
+    def to_lock(self, pairs: Pairs, level: I64, moved: F64, tolerance_m: float, locked: Mask) -> Mask:
+        """Return which corners (N,) have to stay, so that the worst pairs come nearer; `locked` ones do already."""
         bad = np.flatnonzero(moved > tolerance_m)
         bad = bad[np.argsort(-moved[bad])]
         element = pairs.corners[bad, 2] << 32 | pairs.corners[bad, 3]
@@ -206,7 +206,9 @@ class Corners:
         wanted = np.union1d(
             wanted, np.flatnonzero(np.isin(self.chart, gone) & np.isin(np.arange(len(kept)), self.border))
         )
-        return np.isin(self.vertex, self.vertex[wanted])
+        if locked[wanted].all():
+            wanted = self.edges[np.isin(self.edges, pairs.corners[worst]).any(axis=1)].ravel()
+        return locked | np.isin(self.vertex, self.vertex[wanted])
 
     def terms(self, pairs: Pairs) -> tuple[F64, F64, F64]:
         """Return the terms of the bound for each pair: (P,), (P,54), (P,54), metres."""
@@ -267,7 +269,7 @@ def simplify_within(mesh: Corners, tolerance_m: float) -> tuple[I64, Pairs]:
             best = furthest, triangles, pairs
         if furthest <= tolerance_m:
             break
-        more = locked | mesh.to_lock(pairs, triangles, moved, tolerance_m)
+        more = mesh.to_lock(pairs, triangles, moved, tolerance_m, locked)
         if (more == locked).all():
             break
         locked = more

@@ -129,12 +129,18 @@ class ModelledBody:
         if not self.details and not self.levels:
             return Choice(HeldMesh(0), FINEST, 0.0)
         w = least_w(posed, clip, self.detail.reach, self.detail.blend_m(posed))
-        moved = [0.0, *(level.metres(posed) for level in self.levels)]
+        moved = [0.0, *(self._moved_m(level, posed, clip, w, output) for level in self.levels)]
         mesh = hold_mesh([error_px(metres, clip, w, output) for metres in moved], self.budget_px, before)
         details = self.detail.metres(posed) if self.details else [0.0]
         errors = [error_px(metres + moved[mesh.level], clip, w, output) for metres in details]
         level = cheapest_within(errors, self.budget_px)
         return Choice(mesh, level if self.details else FINEST, errors[level])
+
+    def _moved_m(self, level: MeshLevel, posed: Posed, clip: F64, w: float, output: Shape) -> float:
+        """Return the bound of `level` in metres, or its least in any pose where that is beyond the budget already."""
+        if error_px(level.least_m, clip, w, output) > self.budget_px:
+            return level.least_m
+        return level.metres(posed)
 
     def see(
         self, posed: Posed, clip: F64, output: Shape, vertices: F32 | None, moved: ByteCounter, choice: Choice

@@ -255,8 +255,12 @@ def straight_clip(distance: float) -> F64:
 
 
 def test_pixels_by_hand() -> None:
-    """1 cm at W = 2.01: (1 + 1) 0.01 / (2.01 - 0.01) = 0.01 in NDC, which is 3.2 columns and 2.4 rows: 4 pixels."""
-    assert error_px(0.01, straight_clip(5.0), 2.01, OUTPUT) == pytest.approx(4.0)
+    """1 cm at W = 2.01 and a corner of 640x480: J has the rows 320 (1, 0, 1) and 240 (0, 1, 1).
+
+    J J^T is ((204800, 76800), (76800, 115200)), whose larger eigenvalue is 160000 + sqrt(44800^2 + 76800^2). Its root,
+    times 0.01 / (2.01 - 0.01), is 2.4946 pixels.
+    """
+    assert error_px(0.01, straight_clip(5.0), 2.01, OUTPUT) == pytest.approx(2.4946, abs=1e-4)
     assert error_px(0.0, straight_clip(5.0), -1.0, OUTPUT) == 0.0
     assert error_px(0.01, straight_clip(5.0), 0.01, OUTPUT) == math.inf
     assert error_px(0.01, straight_clip(5.0), -3.0, OUTPUT) == math.inf
