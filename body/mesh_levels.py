@@ -23,6 +23,7 @@ Rows of terms are taken in groups, with the largest of each term in the group.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -58,10 +59,17 @@ class MeshLevel:
     def metres(self, posed: Posed) -> float:
         """Return the furthest, in metres, that the level moves a point of the surface in a frame of `Skeleton.pose`."""
         turned = np.linalg.norm(posed.feature.reshape(TURNS, 9), axis=1)
-        moved = self.rest + self.swing @ (turned / np.float32(np.sqrt(2.0))) + self.blend @ turned
+        moved = self.rest + self.swing @ (turned / np.float32(np.sqrt(2.0)))
+        if self.has_blend:
+            moved = moved + self.blend @ turned
         return float(moved.max()) + ROUNDING_M
 
-    @property
+    @cached_property
+    def has_blend(self) -> bool:
+        """Whether pose blend shapes move any vertex."""
+        return bool(self.blend.any())
+
+    @cached_property
     def least_m(self) -> float:
         """Least that `metres` returns in any pose: the largest move at rest."""
         return float(self.rest.max())

@@ -142,21 +142,35 @@ def least_w(posed: Posed, clip: F64, reach: F64, blend_m: float = 0.0) -> float:
     return float((centres - (reach + blend_m) * np.linalg.norm(clip[3, :3]))[reach > 0].min())
 
 
-def error_px(metres: float, clip: ArrayLike, w: float, output: Shape) -> float:
-    """Return the largest error in pixels of a vertex that is wrong by `metres`, in a picture of `output`.
+class Stretch(NamedTuple):
+    """How far a metre in the world is on the picture at W = 1.
 
-    `clip`: projection @ view, (4,4). `w`: least W of the body in clip space. `output`: (height, width). The result is
-    infinite when a vertex may be behind the camera.
+    `pixels`: most pixels. `depth`: most by which it changes W.
+    """
+
+    pixels: float
+    depth: float
+
+
+def stretch_of(clip: ArrayLike, output: Shape) -> Stretch:
+    """Return the stretch of `clip`, projection @ view (4,4), on a picture of `output` (height, width)."""
+    x, y, _, depth = np.asarray(clip, np.float64)[:, :3]
+    sides = output[1] / 2.0, output[0] / 2.0
+    corners = ((x - at_x * depth, y - at_y * depth) for at_x in (-1.0, 1.0) for at_y in (-1.0, 1.0))
+    pixels = max(_stretch(sides[0] * across, sides[1] * up) for across, up in corners)
+    return Stretch(pixels, math.sqrt(depth @ depth))
+
+
+def error_px(metres: float, stretch: Stretch, w: float) -> float:
+    """Return the largest error in pixels of a vertex that is wrong by `metres`.
+
+    `stretch`: that of the picture. `w`: least W of the body in clip space. The result is infinite when a vertex may be
+    behind the camera.
     """
     if metres == 0.0:
         return 0.0
-    x, y, _, depth = np.asarray(clip, np.float64)[:, :3]
-    left = w - metres * math.sqrt(depth @ depth)
-    if left <= 0.0:
-        return math.inf
-    sides = output[1] / 2.0, output[0] / 2.0
-    corners = ((x - at_x * depth, y - at_y * depth) for at_x in (-1.0, 1.0) for at_y in (-1.0, 1.0))
-    return metres * max(_stretch(sides[0] * across, sides[1] * up) for across, up in corners) / left
+    left = w - metres * stretch.depth
+    return metres * stretch.pixels / left if left > 0.0 else math.inf
 
 
 def _stretch(first: F64, second: F64) -> float:

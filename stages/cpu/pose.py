@@ -28,7 +28,7 @@ from trilane.machine import moved_of_kept
 from trilane.pipeline.memory import Assets, ByteCounter
 from trilane.pipeline.stage import Skip, UnitContext
 from trilane.scene.camera_placement import steered
-from trilane.scene.crop import SCREEN, Rect, cheapest_within, error_px, least_w
+from trilane.scene.crop import SCREEN, Rect, Stretch, cheapest_within, error_px, least_w, stretch_of
 from trilane.scene.mover import Mover
 from trilane.scene.planner import FrameWork, HeldMesh, HeldShape, hold_mesh, plan_tensor, shown_by, work_of
 from trilane.scene.tensor_layout import lay_out
@@ -129,16 +129,17 @@ class ModelledBody:
         if not self.details and not self.levels:
             return Choice(HeldMesh(0), FINEST, 0.0)
         w = least_w(posed, clip, self.detail.reach, self.detail.blend_m(posed))
-        moved = [0.0, *(self._moved_m(level, posed, clip, w, output) for level in self.levels)]
-        mesh = hold_mesh([error_px(metres, clip, w, output) for metres in moved], self.budget_px, before)
+        stretch = stretch_of(clip, output)
+        moved = [0.0, *(self._moved_m(level, posed, stretch, w) for level in self.levels)]
+        mesh = hold_mesh([error_px(metres, stretch, w) for metres in moved], self.budget_px, before)
         details = self.detail.metres(posed) if self.details else [0.0]
-        errors = [error_px(metres + moved[mesh.level], clip, w, output) for metres in details]
+        errors = [error_px(metres + moved[mesh.level], stretch, w) for metres in details]
         level = cheapest_within(errors, self.budget_px)
         return Choice(mesh, level if self.details else FINEST, errors[level])
 
-    def _moved_m(self, level: MeshLevel, posed: Posed, clip: F64, w: float, output: Shape) -> float:
+    def _moved_m(self, level: MeshLevel, posed: Posed, stretch: Stretch, w: float) -> float:
         """Return the bound of `level` in metres, or its least in any pose where that is beyond the budget already."""
-        if error_px(level.least_m, clip, w, output) > self.budget_px:
+        if error_px(level.least_m, stretch, w) > self.budget_px:
             return level.least_m
         return level.metres(posed)
 

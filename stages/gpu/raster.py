@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -123,12 +124,19 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> RasterStage:
     packed = PackedPass(ctx, textures[0].shape[2], quantisation_of(unit.assets, 0), deferred, filtering)
     drawn = {}
     for number, (folder, texture) in enumerate(zip(folders, textures, strict=True)):
-        whole, *coarser = (_mesh(ctx, body, config) for body in bodies_drawn(config, unit.assets, number))
+        whole, *coarser = _meshes(ctx, bodies_drawn(config, unit.assets, number), config)
         drawn[folder] = PackedAvatar(packed, whole, texture, levels[number], coarser)
     avatars = [drawn[folder] for folder in config.avatar_dirs]
     return RasterStage(packed, avatars, config.buckets, config.posed_vertices)
 
 
-def _mesh(ctx: Any, shaped: ShapedBody, config: RunConfig) -> Mesh:
-    arrays = avatar_mesh(shaped)
-    return PosedMesh(ctx, arrays) if config.posed_vertices else SkinnedMesh(ctx, arrays, shaped.body.posedirs)
+def _meshes(ctx: Any, bodies: Sequence[ShapedBody], config: RunConfig) -> list[Mesh]:
+    """Return the meshes of a whole body and of its levels. A level of a mesh that encloses a volume does so too.
+
+    Where a level folds over itself, the triangles that face away lie behind others, so it is drawn without them.
+    """
+    whole, *coarser = (avatar_mesh(body) for body in bodies)
+    arrays = [whole, *(replace(level, closed=whole.closed) for level in coarser)]
+    if config.posed_vertices:
+        return [PosedMesh(ctx, one) for one in arrays]
+    return [SkinnedMesh(ctx, one, body.body.posedirs) for one, body in zip(arrays, bodies, strict=True)]

@@ -14,7 +14,7 @@ from trilane.body.joints import JOINT_INDEX, JOINTS
 from trilane.body.kinematics import Posed, Skeleton
 from trilane.body.mesh_levels import ROUNDING_M, MeshLevel, grouped
 from trilane.body.skinning import CpuSkinner
-from trilane.scene.crop import error_px, least_w
+from trilane.scene.crop import error_px, least_w, stretch_of
 
 mesh_levels = pytest.importorskip("trilane.training.mesh_levels", reason="needs scipy")
 
@@ -236,7 +236,7 @@ def check_bounds(included: tuple[ShapedBody, tuple[MeshLevel, ...]], poses: int,
         ends = [np.einsum("nk,nka->na", part, places[rows]) for part, rows in ((shares, own), (others, other))]
         bound = levels[which].metres(posed)
         assert np.linalg.norm(ends[0] - ends[1], axis=1).max() <= bound
-        limit = error_px(bound, clip, least_w(posed, clip, reach), output)
+        limit = error_px(bound, stretch_of(clip, output), least_w(posed, clip, reach))
         if np.isfinite(limit):
             seen = [points @ clip[:, :3].T + clip[:, 3] for points in ends]
             pixels = [points[:, :2] / points[:, 3:] * (320, 240) for points in seen]

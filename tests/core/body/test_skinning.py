@@ -31,7 +31,7 @@ from trilane.body.skinning import (
     posed_vertices,
     weight_error_bound,
 )
-from trilane.scene.crop import Rect, cheapest_within, error_px, least_w
+from trilane.scene.crop import Rect, cheapest_within, error_px, least_w, stretch_of
 from trilane.scene.rotations import about
 from trilane.stages.cpu.pose import FINEST, ModelledBody, widened
 
@@ -156,7 +156,7 @@ def check_bounds(shaped: ShapedBody, poses: int, seed: int) -> None:
             other, also = on_screen(drawn.astype(np.float64), clip)
             both = seen & also
             moved = np.linalg.norm(other - places, axis=1)[both].max(initial=0.0)
-            assert moved <= error_px(bound + ROUNDING_M, clip, w, OUTPUT)
+            assert moved <= error_px(bound + ROUNDING_M, stretch_of(clip, OUTPUT), w)
 
 
 def test_no_pose_and_no_view_breaks_the_bounds(blended: ShapedBody) -> None:
@@ -260,10 +260,11 @@ def test_pixels_by_hand() -> None:
     J J^T is ((204800, 76800), (76800, 115200)), whose larger eigenvalue is 160000 + sqrt(44800^2 + 76800^2). Its root,
     times 0.01 / (2.01 - 0.01), is 2.4946 pixels.
     """
-    assert error_px(0.01, straight_clip(5.0), 2.01, OUTPUT) == pytest.approx(2.4946, abs=1e-4)
-    assert error_px(0.0, straight_clip(5.0), -1.0, OUTPUT) == 0.0
-    assert error_px(0.01, straight_clip(5.0), 0.01, OUTPUT) == math.inf
-    assert error_px(0.01, straight_clip(5.0), -3.0, OUTPUT) == math.inf
+    stretch = stretch_of(straight_clip(5.0), OUTPUT)
+    assert error_px(0.01, stretch, 2.01) == pytest.approx(2.4946, abs=1e-4)
+    assert error_px(0.0, stretch, -1.0) == 0.0
+    assert error_px(0.01, stretch, 0.01) == math.inf
+    assert error_px(0.01, stretch, -3.0) == math.inf
 
 
 def test_the_least_w_by_hand(tiny_shaped: ShapedBody) -> None:
