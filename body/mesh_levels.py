@@ -78,7 +78,6 @@ class MeshLevel:
         """Return `shaped` with the triangles of this level and only the vertices that they use, in the same order."""
         used, corners = np.unique(self.faces, return_inverse=True)
         body = shaped.body
-        rows = {name: getattr(body, name) for name in ("posedirs", "offsets")}
         smaller = replace(
             body,
             v_template=body.v_template[used],
@@ -88,7 +87,8 @@ class MeshLevel:
             weights=body.weights[used],
             faces=corners.reshape(self.faces.shape).astype(np.int32),
             uv_faces=self.uv_faces,
-            **{name: None if array is None else array[used] for name, array in rows.items()},
+            posedirs=None if body.posedirs is None else body.posedirs[used],
+            offsets=None if body.offsets is None else body.offsets[used],
         )
         return ShapedBody(shaped.vertices[used], shaped.joints, smaller)
 
