@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F32
 from trilane.avatars.manifest import ByteRange, Manifest, digests_of, parse_manifest
+from trilane.avatars.mesh_levels import MESH_LEVELS, read_mesh_levels, save_mesh_levels
 from trilane.avatars.network_file import MAX_SIDE, Affine, NetworkFile, read_network
 from trilane.body.body import Body, ShapedBody, load_body
+from trilane.body.mesh_levels import MeshLevel
 from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_npz, read_text, require_file
-from trilane.writing import require_writable, write_bytes, write_folder
+from trilane.writing import require_writable, write_atomically, write_bytes, write_folder
 
 MANIFEST, OFFSETS = "manifest.json", "offsets.npz"
 DEFAULT = "default"
@@ -71,6 +73,14 @@ class Bundle:
     def shaped_body(self) -> ShapedBody:
         """Return the avatar at rest. Raises BadInputError."""
         return self.read_body().shape(self.manifest.betas, self.manifest.expression)
+
+    def read_mesh_levels(self, shaped: ShapedBody) -> tuple[MeshLevel, ...]:
+        """Return the levels of the mesh of `shaped`, finest first; none where the bundle has no file of them.
+
+        Raises BadInputError.
+        """
+        file = self.manifest.mesh_levels
+        return () if file is None else read_mesh_levels(self.folder / file, shaped)
 
     def read_texture(self) -> NDArray[np.float32]:
         """Return the neural texture, (H, W, C) float32, row 0 at v = 0. Raises BadInputError."""
@@ -123,7 +133,7 @@ def load_bundle(name: str | Path) -> Bundle:
         raise BadInputError(folder, "a capture, which avatars are trained on", "an avatar's folder", HOW_TO_TRAIN)
     manifest = parse_manifest(read_text(path, "an avatar's manifest"), path)
     files = {"body": manifest.body, "texture": manifest.texture, "network.file": manifest.network.file}
-    files |= {"offsets": manifest.offsets} if manifest.offsets is not None else {}
+    files |= {key: file for key in ("offsets", "mesh_levels") if (file := getattr(manifest, key)) is not None}
     for key, file in files.items():
         _check_inside(folder, file, f"{path}: {key}")
     return Bundle(folder, manifest)
@@ -149,26 +159,32 @@ def write_bundle(
     scale: Any = None,
     offsets: F32 | None = None,
     levels: NDArray[Any] | None = None,
+    mesh_levels: Sequence[MeshLevel] = (),
 ) -> None:
     """Write a bundle beside `folder`, read it back, then put its files in `folder`.
 
     A validation of other parts than these is left out of the manifest.
 
     `folder`: folder of the bundle; made when it does not exist.
-    `manifest`: manifest to write; this function adds the name of the file of `offsets`.
+    `manifest`: manifest to write; this function adds the names of the files of `offsets` and `mesh_levels`.
     `body`: .npz file to copy.
     `texture`: (H, W, C) float16, or int8 with `scale`.
     `network`: network to write.
     `scale`: scale of each channel of an int8 texture, (C,) float32.
     `offsets`: offsets of the body's vertices at rest, (V,3) metres; None for a body that is drawn bare.
     `levels`: smaller levels of the texture, of its type, see `pack_levels`.
+    `mesh_levels`: levels of the mesh of the body with `offsets`, in the manifest's shape.
     Raises BadInputError when the parts do not fit together; then nothing is written.
     """
     with write_folder(folder) as draft:
         shutil.copyfile(body, draft / manifest.body)
         if offsets is not None:
             save_offsets(draft / OFFSETS, offsets)
-        manifest = manifest.model_copy(update={"offsets": None if offsets is None else OFFSETS})
+        names = {"offsets": None if offsets is None else OFFSETS, "mesh_levels": MESH_LEVELS if mesh_levels else None}
+        manifest = manifest.model_copy(update=names)
+        if mesh_levels:
+            shaped = Bundle(draft, manifest).shaped_body()
+            save_mesh_levels(draft / MESH_LEVELS, shaped, mesh_levels)
         arrays: dict[str, Any] = (
             {"texture": texture} if scale is None else {"texture": texture, "scale": np.asarray(scale, np.float32)}
         )
@@ -177,10 +193,18 @@ def write_bundle(
         onnx.save(network.model, draft / manifest.network.file)
         (draft / MANIFEST).write_bytes(_content(_with_own_validation(manifest, draft)))
         bundle = load_bundle(draft)
-        bundle.read_body()
+        bundle.read_mesh_levels(bundle.shaped_body())
         bundle.read_texture()
         bundle.read_levels()
         bundle.read_network()
+
+
+def add_mesh_levels(bundle: Bundle, levels: Sequence[MeshLevel]) -> None:
+    """Write `levels` of the mesh into the folder of `bundle`, in place of earlier ones. Raises BadInputError."""
+    shaped = bundle.shaped_body()
+    with write_atomically(bundle.folder / MESH_LEVELS) as draft, draft.open("wb") as file:
+        save_mesh_levels(file, shaped, levels)
+    write_manifest(bundle.folder, bundle.manifest.model_copy(update={"mesh_levels": MESH_LEVELS}))
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:

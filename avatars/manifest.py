@@ -71,7 +71,8 @@ class NetworkEntry(_Model):
 class Digests(_Model):
     """SHA-256, hexadecimal, of everything that an avatar's pictures depend on.
 
-    `body`, `texture`, `network`: digests of those files' bytes; offsets count as part of the body.
+    `body`, `texture`, `network`: digests of those files' bytes; offsets count as part of the body. Levels of the mesh
+    do not count: they name their body themselves, and a validation draws the whole mesh.
     `constants`: digest of the manifest's numbers: shape, expression, and the scales and zero points of the network's
     bytes.
     """
@@ -216,12 +217,16 @@ class Validation(Figures):
 
 
 class Manifest(_Model):
-    """`manifest.json`. File names are relative to the bundle's folder; a body without `offsets` is drawn bare."""
+    """`manifest.json`. File names are relative to the bundle's folder; a body without `offsets` is drawn bare.
+
+    `mesh_levels`: levels of the mesh; None where the whole mesh is drawn at every distance.
+    """
 
     schema_version: Literal[1] = 1
     name: str = Field(min_length=1, max_length=100)
     body: FileName = "body.npz"
     offsets: FileName | None = None
+    mesh_levels: FileName | None = None
     texture: FileName = "texture.npz"
     network: NetworkEntry
     betas: tuple[Coefficient, ...] = Field(default=(), max_length=400)

@@ -227,12 +227,12 @@ def _terms(shaped: ShapedBody) -> Arrays:
     return {
         "lever": np.array(lever),
         "change": np.array(change),
-        "blend": np.maximum.reduceat(_blend_reach(shaped)[order], starts, axis=0),
+        "blend": np.maximum.reduceat(blend_reach(shaped)[order], starts, axis=0),
         "reach": np.where(used, distance, 0.0).max(axis=0),
     }
 
 
-def _blend_reach(shaped: ShapedBody) -> F64:
+def blend_reach(shaped: ShapedBody) -> F64:
     """Return how far (V,54), metres, each joint's pose blend shapes can move each vertex at |R - I| = 1."""
     posedirs = shaped.body.posedirs
     if posedirs is None:

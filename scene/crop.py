@@ -2,14 +2,15 @@
 
 Rectangles are x0, y0, x1, y1 in normalised device coordinates, y up; a tensor's pixels are square on the screen.
 
-`error_px` leads from metres to pixels, with a proved bound. For a vertex whose clip coordinates are X, Y, W, an error
-of e metres changes X by at most e |r_x|. Here r_x are the first three numbers of the clip matrix's row of X; Y and W
-are alike. With x = X / W between -1 and 1,
+`error_px` leads from metres to pixels, with a proved bound. A vertex has the clip coordinates X, Y, W. The vectors r_x,
+r_y, r_w are the first three numbers of the clip matrix's rows. With x = X / W and y = Y / W, an error d moves it by
 
-    |x' - x| = |dX - x dW| / |W + dW| <= e (|r_x| + |r_w|) / (W - e |r_w|),
+    (x' - x, y' - y) = J d / (W + r_w . d),   with the rows r_x - x r_w and r_y - y r_w of J,
 
-so the error is at most that, times half the picture's side, for every vertex that is seen. W is the least of the body:
-a skinned vertex is a mean of points that lie no further from the centre of joint j than at rest (`DetailBounds.reach`).
+where x and y count in halves of the picture's sides. The largest stretch of J is convex in (x, y), so no vertex that is
+seen has a larger one than a corner of the picture. The error is at most that, times |d| / (W - |d| |r_w|). W is the
+least of the body: a skinned vertex is a mean of points that lie no further from the centre of joint j than at rest
+(`DetailBounds.reach`).
 """
 
 from __future__ import annotations
@@ -141,20 +142,41 @@ def least_w(posed: Posed, clip: F64, reach: F64, blend_m: float = 0.0) -> float:
     return float((centres - (reach + blend_m) * np.linalg.norm(clip[3, :3]))[reach > 0].min())
 
 
-def error_px(metres: float, clip: ArrayLike, w: float, output: Shape) -> float:
-    """Return the largest error in pixels of a vertex that is wrong by `metres`, in a picture of `output`.
+class Stretch(NamedTuple):
+    """How far a metre in the world is on the picture at W = 1.
 
-    `clip`: projection @ view, (4,4). `w`: least W of the body in clip space. `output`: (height, width). The result is
-    infinite when a vertex may be behind the camera.
+    `pixels`: most pixels. `depth`: most by which it changes W.
+    """
+
+    pixels: float
+    depth: float
+
+
+def stretch_of(clip: ArrayLike, output: Shape) -> Stretch:
+    """Return the stretch of `clip`, projection @ view (4,4), on a picture of `output` (height, width)."""
+    x, y, _, depth = np.asarray(clip, np.float64)[:, :3]
+    sides = output[1] / 2.0, output[0] / 2.0
+    corners = ((x - at_x * depth, y - at_y * depth) for at_x in (-1.0, 1.0) for at_y in (-1.0, 1.0))
+    pixels = max(_stretch(sides[0] * across, sides[1] * up) for across, up in corners)
+    return Stretch(pixels, math.sqrt(depth @ depth))
+
+
+def error_px(metres: float, stretch: Stretch, w: float) -> float:
+    """Return the largest error in pixels of a vertex that is wrong by `metres`.
+
+    `stretch`: that of the picture. `w`: least W of the body in clip space. The result is infinite when a vertex may be
+    behind the camera.
     """
     if metres == 0.0:
         return 0.0
-    rows = np.linalg.norm(np.asarray(clip, np.float64)[:, :3], axis=1)
-    left = w - metres * rows[3]
-    if left <= 0.0:
-        return math.inf
-    x, y = (metres * (rows[axis] + rows[3]) / left * side / 2.0 for axis, side in ((0, output[1]), (1, output[0])))
-    return math.hypot(x, y)
+    left = w - metres * stretch.depth
+    return metres * stretch.pixels / left if left > 0.0 else math.inf
+
+
+def _stretch(first: F64, second: F64) -> float:
+    """Return the largest factor by which the matrix of two rows (3,) makes a vector longer."""
+    a, b, c = float(first @ first), float(second @ second), float(first @ second)
+    return math.sqrt((a + b) / 2.0 + math.hypot((a - b) / 2.0, c))
 
 
 def cheapest_within(errors_px: Sequence[float], budget_px: float) -> int:

@@ -7,6 +7,9 @@ loses the face, much larger it paints ragged edges. So each avatar in view gets 
 to paint. A body that has more pixels on the picture than in its tensor loses detail, so it gets up to `MOST_GROWTH`
 times the pixels (docs/decisions/planner.md has the figures).
 
+**Mesh.** An avatar whose surface may move by less than the error budget is drawn with fewer triangles. `hold_mesh`
+keeps a level while it can, and goes to coarser ones step by step.
+
 **Changes.** A change of shape is seen, so it costs as much as the pixels of `PATIENCE` frames. The scene is known
 ahead: before the run `foreseen_changes` finds the changes that cost least. Each is made while both shapes are good, and
 where nobody is in view or the scene moves fast. A frame whose shape is not good enough gets a good one at once,
@@ -134,6 +137,41 @@ class HeldShape:
     shape: Shape
     foreseen: Shape | None = None
     smaller_for: int = 0
+
+
+#: Share of the error budget below which a coarser level of the mesh does well.
+EASE = 0.8
+
+
+@dataclass(frozen=True)
+class HeldMesh:
+    """The level of an avatar's mesh in use.
+
+    `level`: 0 for the whole mesh. `coarser_for`: number of successive frames for which the next level would have done
+    well.
+    """
+
+    level: int
+    coarser_for: int = 0
+
+
+def hold_mesh(errors_px: Sequence[float], budget_px: float, before: HeldMesh | None) -> HeldMesh:
+    """Return the level of a frame whose levels have the bounds `errors_px`, finest first; the first is always 0.
+
+    A level beyond `budget_px` is left at once, for the coarsest finer one within it. A coarser level is taken one step
+    at a time, after `PATIENCE` frames in which its bound was well within the budget. The first frame takes the coarsest
+    level within the budget.
+    """
+    within = [level for level, error in enumerate(errors_px) if error <= budget_px]
+    if before is None:
+        return HeldMesh(within[-1])
+    if before.level not in within:
+        return HeldMesh(max(level for level in within if level < before.level))
+    coarser = before.level + 1
+    if coarser >= len(errors_px) or errors_px[coarser] > EASE * budget_px:
+        return HeldMesh(before.level)
+    waited = before.coarser_for + 1
+    return HeldMesh(coarser) if waited > PATIENCE else HeldMesh(before.level, waited)
 
 
 @dataclass(frozen=True)

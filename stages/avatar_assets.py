@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F32
 from trilane.avatars.bundle import Bundle
+from trilane.avatars.mesh_levels import levels_from_arrays, levels_to_arrays
 from trilane.avatars.network_file import NetworkFile, check_network
 from trilane.body.body import Body, ShapedBody
+from trilane.body.mesh_levels import MeshLevel
 from trilane.errors import BadInputError
 from trilane.pipeline.memory import Assets
 from trilane.scene.staging import Staged, staged_from_arrays, staged_to_arrays
@@ -35,6 +37,7 @@ class AvatarData:
     """One distinct bundle, loaded.
 
     `texture`: (H,W,C) float32. `levels`: smaller levels of the texture, see `pack_levels`.
+    `mesh_levels`: levels of the mesh, finest first.
     """
 
     bundle: Bundle
@@ -42,12 +45,14 @@ class AvatarData:
     texture: F32
     network: NetworkFile
     levels: F32 | None = None
+    mesh_levels: tuple[MeshLevel, ...] = ()
 
 
 def load_avatar(bundle: Bundle) -> AvatarData:
     """Load everything that a run needs from `bundle`. Raises BadInputError."""
     shaped = bundle.shaped_body()
-    return AvatarData(bundle, shaped, bundle.read_texture(), bundle.read_network(), bundle.read_levels())
+    texture, network, levels = bundle.read_texture(), bundle.read_network(), bundle.read_levels()
+    return AvatarData(bundle, shaped, texture, network, levels, bundle.read_mesh_levels(shaped))
 
 
 #: What helps where two avatars cannot share a tensor.
@@ -84,6 +89,8 @@ def pack_assets(avatars: Sequence[AvatarData], staged: Staged) -> dict[str, NDAr
         arrays |= {f"body{number}/{name}": array for name in BODY_ARRAYS if (array := getattr(body, name)) is not None}
         arrays |= {f"body{number}/{name}": array for name, array in zip(HANDS, body.hand_components, strict=True)}
         arrays[f"avatar{number}/texture"] = avatar.texture
+        if avatar.mesh_levels:
+            arrays |= {f"meshes{number}/{name}": array for name, array in levels_to_arrays(avatar.mesh_levels).items()}
         if avatar.levels is not None:
             arrays[f"avatar{number}/levels"] = avatar.levels
         arrays[f"avatar{number}/input"] = np.array([scale.scale, scale.zero_point])
@@ -122,6 +129,22 @@ def texture_of(assets: Assets, number: int) -> F32:
 def levels_of(assets: Assets, number: int) -> F32 | None:
     """Return smaller levels of the neural texture of distinct avatar `number`, if it has any."""
     return assets.get(f"avatar{number}/levels")
+
+
+def mesh_levels_of(assets: Assets, number: int) -> tuple[MeshLevel, ...]:
+    """Return the levels of the mesh of distinct avatar `number`, finest first; maybe none."""
+    arrays = _with_prefix(assets, f"meshes{number}/")
+    return levels_from_arrays(arrays) if arrays else ()
+
+
+def bodies_drawn(config: RunConfig, assets: Assets, number: int) -> list[ShapedBody]:
+    """Return the bodies of distinct avatar `number` that frames may show: the whole one, then its levels.
+
+    Where everything is modelled it is the whole one alone.
+    """
+    whole = shaped_body(assets, number)
+    levels = mesh_levels_of(assets, number) if config.budget_px else ()
+    return [whole, *(level.reduced(whole) for level in levels)]
 
 
 def quantisation_of(assets: Assets, number: int) -> Quantisation:

@@ -31,11 +31,13 @@ from trilane.units import UnitName
 #: `rect`: crop rectangle x0, y0, x1, y1 in normalised device coordinates, y up: the mesh's rectangle clipped to
 #: [-1, 1], grown to the tensor's aspect so that tensor pixels are square; the grown part may exceed the screen.
 #: `tensor_rect`: top, left, height, width in tensor pixels that the crop rectangle fills.
+#: `mesh`: level of the mesh that is drawn, 0 the whole one, then the avatar's `MeshLevel`s, finest first.
 #: `visible`: 0 when nothing of the avatar is on screen; the other fields are then unspecified.
 AVATAR_DTYPE = np.dtype(
     [
         ("avatar", "<i4"),
         ("visible", "<i4"),
+        ("mesh", "<i4"),
         ("rect", "<f4", (4,)),
         ("tensor_rect", "<i4", (4,)),
         ("joints", "<f4", (JOINTS, 3, 4)),
@@ -73,7 +75,7 @@ def posed_vertices(payload: U8, counts: Sequence[int]) -> list[F32]:
     """Return views (V,3) float32 into the payload of the pose edge, one for each avatar of `counts` vertices.
 
     They hold skinned vertices in the body's order, metres, world space, when the CPU unit skins; an empty payload has
-    none.
+    none. A level of the mesh has fewer vertices and fills the beginning of its view.
     """
     views, start = [], 0
     for count in counts:

@@ -14,11 +14,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.avatars.bundle import TEXTURE_KEYS, Bundle, load_bundle, read_texture, write_bundle
+from trilane.avatars.bundle import (
+    TEXTURE_KEYS,
+    Bundle,
+    add_mesh_levels,
+    load_bundle,
+    read_texture,
+    require_writable_manifest,
+    write_bundle,
+)
 from trilane.avatars.manifest import CAPTURED, UNTRAINED, Manifest, network_entry
 from trilane.avatars.network_file import STRIDE, NetworkFile, check_integer_layers, read_network, reshaped
 from trilane.avatars.validation import refused, validation_facts
 from trilane.body.body import Body, load_body
+from trilane.body.mesh_levels import MeshLevel
 from trilane.errors import BadInputError
 from trilane.files import read_npz
 from trilane.hw_profiles.network_work import graph_facts
@@ -45,18 +54,51 @@ def bundle_facts(bundle: Bundle) -> dict[str, Any]:
     shaped = bundle.shaped_body()
     files = {"body": bundle.body_path, "texture": bundle.texture_path, "network": bundle.network_path}
     files |= {"offsets": bundle.offsets_path} if bundle.offsets_path is not None else {}
+    levels, texture = bundle.read_mesh_levels(shaped), bundle.read_texture()
     return {
         "name": manifest.name,
         "folder": str(bundle.folder),
         "files": {key: {"name": path.name, "bytes": path.stat().st_size} for key, path in files.items()},
-        "body": {"vertices": len(shaped.vertices)},
-        "texture": {"shape": list(bundle.read_texture().shape)},
+        "body": {
+            "vertices": len(shaped.vertices),
+            "triangles": len(shaped.body.faces),
+            "levels": [level_facts(level, len(texture)) for level in levels],
+        },
+        "texture": {"shape": list(texture.shape)},
         "network": {**manifest.network.model_dump(), **network_facts(bundle.read_network())},
         "quantisation": manifest.quantisation,
         "provenance": manifest.provenance,
         "training_command": manifest.training_command,
         "validation": validation_facts(bundle),
     }
+
+
+def level_facts(level: MeshLevel, side: int) -> dict[str, Any]:
+    """Return the size of a level of the mesh, and how far it moves the surface at rest and the texels at its seams.
+
+    `side`: side of the texture in texels.
+    """
+    return {
+        "triangles": len(level.faces),
+        "vertices": len(np.unique(level.faces)),
+        "rest_mm": round(1000 * float(level.rest.max()), 2),
+        "seam_texels": round(level.uv_error * side, 2),
+    }
+
+
+def add_levels(bundle: Bundle) -> dict[str, Any]:
+    """Make the levels of the mesh of `bundle`, write them into its folder, and return facts about them.
+
+    Raises BadInputError, MissingPartError.
+    """
+    from trilane.training.mesh_levels import make_mesh_levels
+
+    require_writable_manifest(bundle.folder)
+    shaped, side = bundle.shaped_body(), len(bundle.read_texture())
+    levels = list(make_mesh_levels(shaped))
+    add_mesh_levels(bundle, levels)
+    facts = [level_facts(level, side) for level in levels]
+    return {"avatar": str(bundle.folder), "triangles": len(shaped.body.faces), "levels": facts}
 
 
 def network_facts(network: NetworkFile) -> dict[str, Any]:
@@ -99,7 +141,8 @@ def assemble(base: Bundle, parts: Parts, out: Path) -> dict[str, Any]:
     offsets = base.read_body().offsets if parts.body is None else None
     arrays = read_npz(source, TEXTURE_KEYS, "a neural texture")
     manifest, scale = _manifest(base, parts, network, out.name), arrays.get("scale")
-    write_bundle(out, manifest, body, arrays["texture"], network, scale, offsets, arrays.get("levels"))
+    levels = base.read_mesh_levels(base.shaped_body()) if parts.body is None else ()
+    write_bundle(out, manifest, body, arrays["texture"], network, scale, offsets, arrays.get("levels"), levels)
     made = load_bundle(out)
     return {
         "avatar": str(out),

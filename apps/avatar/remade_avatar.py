@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 #: Of an untrained network's weights.
 SEED = 0
 #: Grows when this file makes another avatar of the same.
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,8 @@ def _make(bundle: Bundle, recipe: _Recipe, folder: Path) -> None:
         scale = scale[chosen]
     manifest, offsets = _manifest(bundle, recipe, network, quantised), bundle.read_body().offsets
     levels = arrays["levels"][..., chosen] if "levels" in arrays else None
-    write_bundle(folder, manifest, bundle.body_path, texture, network, scale, offsets, levels)
+    meshes = bundle.read_mesh_levels(bundle.shaped_body())
+    write_bundle(folder, manifest, bundle.body_path, texture, network, scale, offsets, levels, meshes)
 
 
 def _manifest(bundle: Bundle, recipe: _Recipe, network: Any, quantised: Quantised) -> Manifest:

@@ -201,13 +201,20 @@ def _image(image: dict[str, Any]) -> str:
 def _modelled(rows: list[dict[str, Any]]) -> str:
     """Return a line for each way in which avatars are modelled, with the largest errors among these avatars."""
     lines = []
-    for modelled in dict.fromkeys(row["modelled"] for row in rows):
-        own = [row for row in rows if row["modelled"] == modelled]
+    for modelled in dict.fromkeys(_model(row) for row in rows):
+        own = [row for row in rows if _model(row) == modelled]
         known = [row["measured_px"] for row in own if row["measured_px"] is not None]
         measured = f"{max(known):.2f}" if known else "-"
         names = ", ".join(row["name"] for row in own)
         lines.append(f"{names}: {modelled}, {max(row['bound_px'] for row in own):.2f} / {measured}")
     return "\n".join(lines)
+
+
+def _model(row: dict[str, Any]) -> str:
+    """Name the level of detail, and the level of the mesh unless it is the whole one."""
+    mesh = row["mesh"]
+    coarser = f"{mesh['triangles']} of {mesh['of']} triangles, " if mesh["level"] else ""
+    return f"{coarser}{row['modelled']}"
 
 
 def _totals(totals: dict[str, Any], config: dict[str, Any]) -> list[str]:

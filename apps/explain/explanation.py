@@ -27,7 +27,7 @@ from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.scene.planner import ALL_WORK, MOST_DENSITY, FrameWork
 from trilane.scheduler.placement import Ranked
 from trilane.shapes import Shape
-from trilane.stages.avatar_assets import distinct, network_of, shaped_body
+from trilane.stages.avatar_assets import distinct, mesh_levels_of, network_of, shaped_body
 from trilane.stages.configure import Checked
 from trilane.stages.cpu.pose import FramePlan
 from trilane.units import HOST, NS_PER_MS, UNITS, UnitName
@@ -98,7 +98,7 @@ def explain(checked: Checked, profile: str, performance_profile: str, most_measu
         "notes": list(checked.notes),
         "sources": {
             "bound_px": BOUND,
-            "measured_px": f"{MEASURED}, at a phase's first frame",
+            "measured_px": f"{MEASURED}, at a phase's first frame, at the vertices that are drawn",
             "pixels, gmac": "counted",
             "ms": COMPUTED,
         },
@@ -114,6 +114,10 @@ class _Bodies:
         bodies = [shaped_body(checked.assets, number).body for number in range(len(folders))]
         self._bodies = [bodies[folders.index(folder)] for folder in checked.config.avatar_dirs]
         self.left_out = cache(self._left_out)
+
+    def triangles(self, avatar: int) -> int:
+        """Return the number of triangles of the whole mesh."""
+        return len(self._bodies[avatar].faces)
 
     def _left_out(self, avatar: int, level: int) -> list[str]:
         return left_out(DETAILS[level], self._bodies[avatar])
@@ -138,6 +142,7 @@ def _avatar(checked: Checked, number: int) -> dict[str, Any]:
         "skinned_on": where,
         "expression": "part of the avatar's shape: it costs nothing per frame",
         "detail": "by its bound in pixels" if where == "cpu" and config.budget_px else "everything",
+        "mesh_levels": len(mesh_levels_of(checked.assets, distinct(config).index(config.avatar_dirs[number]))),
         "texture_filter": config.scene.texture_filter,
     }
 
@@ -163,6 +168,7 @@ def _phase(
                 "avatar": number,
                 "name": names[number],
                 "modelled": DETAILS[one.level].name,
+                "mesh": {"level": one.mesh, "triangles": one.triangles, "of": bodies.triangles(number)},
                 "left_out": bodies.left_out(number, one.level),
                 "bound_px": max(planned.plan.seen[number].error_px for planned in group),
                 "measured_px": error,

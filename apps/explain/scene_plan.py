@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from trilane.arrays import F64
+from trilane.arrays import F64, I64
 from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import CpuSkinner
 from trilane.pipeline.memory import Assets
 from trilane.scene.crop import Rect
 from trilane.shapes import Shape
-from trilane.stages.avatar_assets import distinct, shaped_body, staged_of
+from trilane.stages.avatar_assets import distinct, mesh_levels_of, shaped_body, staged_of
 from trilane.stages.config import RunConfig, pose_dtype, posed_vertices, posed_vertices_bytes
 from trilane.stages.cpu.pose import FramePlan, PoseStage
 from trilane.transport.packets import Packet, SlotLayout, view_packet
@@ -55,6 +55,8 @@ class ScenePlan:
         self._drawn = posed_vertices(self._packet.payload, config.posed_vertices)
         bodies = [shaped_body(assets, number) for number in range(len(distinct(config)))]
         self._bodies = [bodies[distinct(config).index(folder)] for folder in config.avatar_dirs]
+        kept = [_kept(assets, number) for number in range(len(bodies))]
+        self._kept = [kept[distinct(config).index(folder)] for folder in config.avatar_dirs]
         self._skinners = {id(body): CpuSkinner(body) for body in bodies}
         self._staged = staged_of(assets)
 
@@ -70,11 +72,15 @@ class ScenePlan:
         return self._places(self._exact(frame, avatar), frame)
 
     def measured_px(self, frame: int, avatar: int) -> float:
-        """Return the largest distance in pixels by which the last decision, for `frame`, moves a vertex of `avatar`."""
+        """Return the largest distance in pixels by which the last decision, for `frame`, moves a vertex of `avatar`.
+
+        Vertices that the level of the mesh leaves out do not count.
+        """
         if not self._drawn:
             return 0.0
-        exact = self.places(frame, avatar)
-        drawn = self._places(self._drawn[avatar].astype(np.float64), frame)
+        kept = self._kept[avatar][int(self._packet.header["avatars"][avatar]["mesh"])]
+        exact = self.places(frame, avatar)[kept]
+        drawn = self._places(self._drawn[avatar][: len(exact)].astype(np.float64), frame)
         moved = np.linalg.norm(exact - drawn, axis=1)
         return float(np.nanmax(moved, initial=0.0)) if np.isfinite(moved).any() else 0.0
 
@@ -95,13 +101,18 @@ class ScenePlan:
         return np.asarray((places * (1.0, -1.0) + 1.0) / 2.0 * (width, height))
 
 
+def _kept(assets: Assets, number: int) -> list[I64 | slice]:
+    """Return the numbers of the vertices that each level of the mesh of distinct avatar `number` keeps."""
+    return [slice(None), *(np.unique(level.faces).astype(np.int64) for level in mesh_levels_of(assets, number))]
+
+
 def _packet(config: RunConfig) -> Packet:
     layout = SlotLayout(pose_dtype(len(config.avatar_dirs)), posed_vertices_bytes(config.posed_vertices))
     return view_packet(memoryview(bytearray(layout.slot_bytes)), layout)
 
 
 def phases(frames: Sequence[PlannedFrame]) -> list[list[PlannedFrame]]:
-    """Group frames in a row of equal work and tensor shape that model the same avatars at the same levels of detail."""
+    """Group frames in a row of equal work and tensor shape that model the same avatars at the same levels."""
     groups: list[list[PlannedFrame]] = []
     for planned in frames:
         if groups and _kind(groups[-1][-1]) == _kind(planned):
@@ -112,7 +123,7 @@ def phases(frames: Sequence[PlannedFrame]) -> list[list[PlannedFrame]]:
 
 
 def _kind(planned: PlannedFrame) -> tuple[object, ...]:
-    levels = tuple((number, one.level) for number, one in sorted(planned.plan.seen.items()))
+    levels = tuple((number, one.level, one.mesh) for number, one in sorted(planned.plan.seen.items()))
     return planned.plan.work, planned.plan.shape, levels
 
 

@@ -2,7 +2,7 @@
 
 Motion and camera are sampled at the frame's media time, frame / fps; no number that is not finite leaves this stage. A
 frame that shows what an earlier one showed, or nobody, skins nothing and skips the stages that would draw it. Each body
-gets the cheapest level of detail whose error is within the budget of pixels.
+gets a level of its mesh, then the cheapest level of detail with which both errors are within the budget of pixels.
 """
 
 from __future__ import annotations
@@ -21,18 +21,19 @@ from trilane.arrays import F32, F64
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M
 from trilane.body.body import ShapedBody
 from trilane.body.kinematics import Posed, Skeleton
+from trilane.body.mesh_levels import MeshLevel
 from trilane.body.skinning import DETAILS, DetailBounds, FrameSkinner
 from trilane.errors import TrilaneError
 from trilane.machine import moved_of_kept
 from trilane.pipeline.memory import Assets, ByteCounter
 from trilane.pipeline.stage import Skip, UnitContext
 from trilane.scene.camera_placement import steered
-from trilane.scene.crop import SCREEN, Rect, cheapest_within, error_px, least_w
+from trilane.scene.crop import SCREEN, Rect, Stretch, cheapest_within, error_px, least_w, stretch_of
 from trilane.scene.mover import Mover
-from trilane.scene.planner import FrameWork, HeldShape, plan_tensor, shown_by, work_of
+from trilane.scene.planner import FrameWork, HeldMesh, HeldShape, hold_mesh, plan_tensor, shown_by, work_of
 from trilane.scene.tensor_layout import lay_out
 from trilane.shapes import Shape
-from trilane.stages.avatar_assets import distinct, shaped_body, staged_of
+from trilane.stages.avatar_assets import bodies_drawn, distinct, mesh_levels_of, staged_of
 from trilane.stages.config import RunConfig, posed_vertices
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.transport.packets import FRAME_FIELDS, Packet
@@ -44,33 +45,74 @@ FINEST = len(DETAILS) - 1
 class SeenAvatar:
     """An avatar on the screen.
 
-    `level`: an index into `DETAILS`. `error_px`: bound of the level's error on the picture, pixels.
+    `level`: an index into `DETAILS`. `error_px`: bound of the error of both levels on the picture, pixels. `mesh`:
+    level of the mesh, 0 for the whole one. `triangles`: number of triangles that it has.
     """
 
     rect: Rect
     level: int
     error_px: float
+    mesh: int = 0
+    triangles: int = 0
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The choice for an avatar in a frame.
+
+    `mesh`: level of the mesh. `level`: an index into `DETAILS`. `error_px`: bound of the error of both, pixels.
+    """
+
+    mesh: HeldMesh
+    level: int
+    error_px: float
+
+
+class DrawnMesh:
+    """One level of a body's mesh, with what posing it needs.
+
+    `shaped`: the body with the vertices of the level. `skins`: whether the CPU unit skins it. `details`: whether levels
+    of detail may leave something out.
+    """
+
+    def __init__(self, shaped: ShapedBody, skins: bool, details: bool) -> None:
+        self.shaped = shaped
+        self.skinners = self._skinners(details) if skins else []
+        self.moved_to_skin = [moved_of_kept(skinner.constant_bytes) for skinner in self.skinners]
+
+    def _skinners(self, details: bool) -> list[FrameSkinner]:
+        """Return a skinner for each level of detail; the finest for all when nothing may be left out."""
+        if not details:
+            return [FrameSkinner(self.shaped)] * len(DETAILS)
+        return [FrameSkinner(self.shaped, detail) for detail in DETAILS]
+
+    def pose(self, posed: Posed, level: int, vertices: F32, moved: ByteCounter) -> F32:
+        """Skin the body with detail `level` into the beginning of `vertices`, and return that part of it."""
+        own = vertices[: len(self.shaped.vertices)]
+        self.skinners[level].skin_into(posed, own)
+        moved.copied(own.nbytes)
+        moved.read += self.moved_to_skin[level]
+        moved.least += self.moved_to_skin[level] + own.nbytes
+        return own
 
 
 class ModelledBody:
-    """A body that several avatars of a scene may share, with what each level of detail needs.
+    """A body that several avatars of a scene may share, with what each of its levels needs.
 
-    `skins`: whether the CPU unit skins it. `budget_px`: largest error of a level on the picture, pixels; with 0
-    everything is modelled.
+    `bodies`: the whole body, then those of its mesh `levels`. `skins`: whether the CPU unit skins it. `budget_px`:
+    largest error on the picture, pixels; with 0 everything is modelled.
     """
 
-    def __init__(self, shaped: ShapedBody, skins: bool, budget_px: float) -> None:
-        self.shaped = shaped
-        self.bounds = MeshBounds(shaped, standoff_m=CLOTHES_STANDOFF_M)
-        self.budget_px = budget_px if skins else 0.0
-        self.skinners = self._skinners() if skins else []
-        self.moved_to_skin = [moved_of_kept(skinner.constant_bytes) for skinner in self.skinners]
-
-    def _skinners(self) -> list[FrameSkinner]:
-        """Return a skinner for each level; the finest for all when nothing may be left out."""
-        if self.budget_px == 0.0:
-            return [FrameSkinner(self.shaped)] * len(DETAILS)
-        return [FrameSkinner(self.shaped, detail) for detail in DETAILS]
+    def __init__(
+        self, bodies: Sequence[ShapedBody], levels: Sequence[MeshLevel], skins: bool, budget_px: float
+    ) -> None:
+        self.shaped = bodies[0]
+        self.budget_px = budget_px
+        self.details = skins and budget_px > 0.0
+        self.levels = levels if budget_px > 0.0 else ()
+        self.meshes = [DrawnMesh(body, skins, self.details) for body in bodies]
+        # A level lies within its error of the whole mesh, and rectangles are widened by it.
+        self.bounds = MeshBounds(self.shaped, standoff_m=CLOTHES_STANDOFF_M)
 
     @cached_property
     def detail(self) -> DetailBounds:
@@ -79,32 +121,44 @@ class ModelledBody:
     def skeleton(self) -> Skeleton:
         return Skeleton(self.shaped.joints, self.shaped.body.parents)
 
-    def choose(self, posed: Posed, clip: F64, output: Shape) -> tuple[int, float]:
-        """Return the level of detail of a frame, and the bound on its error in pixels of a picture of `output`."""
-        if self.budget_px == 0.0:
-            return FINEST, 0.0
+    def choose(self, posed: Posed, clip: F64, output: Shape, before: HeldMesh | None = None) -> Choice:
+        """Return the levels of a frame, and the bound on their error in pixels of a picture of `output`.
+
+        `before`: level of the mesh in the frame before.
+        """
+        if not self.details and not self.levels:
+            return Choice(HeldMesh(0), FINEST, 0.0)
         w = least_w(posed, clip, self.detail.reach, self.detail.blend_m(posed))
-        errors = [error_px(metres, clip, w, output) for metres in self.detail.metres(posed)]
+        stretch = stretch_of(clip, output)
+        moved = [0.0, *(self._moved_m(level, posed, stretch, w) for level in self.levels)]
+        mesh = hold_mesh([error_px(metres, stretch, w) for metres in moved], self.budget_px, before)
+        details = self.detail.metres(posed) if self.details else [0.0]
+        errors = [error_px(metres + moved[mesh.level], stretch, w) for metres in details]
         level = cheapest_within(errors, self.budget_px)
-        return level, errors[level]
+        return Choice(mesh, level if self.details else FINEST, errors[level])
+
+    def _moved_m(self, level: MeshLevel, posed: Posed, stretch: Stretch, w: float) -> float:
+        """Return the bound of `level` in metres, or its least in any pose where that is beyond the budget already."""
+        if error_px(level.least_m, stretch, w) > self.budget_px:
+            return level.least_m
+        return level.metres(posed)
 
     def see(
-        self, posed: Posed, clip: F64, output: Shape, vertices: F32 | None, moved: ByteCounter
+        self, posed: Posed, clip: F64, output: Shape, vertices: F32 | None, moved: ByteCounter, choice: Choice
     ) -> SeenAvatar | None:
         """Skin the body into `vertices`, if given, and find its rectangle; None when nothing of it is visible.
 
         `posed`: pose of the frame. `clip`: projection @ view, (4,4). `output`: (height, width) of the picture. `moved`:
         counter of the vertices, which are written, then read to find the rectangle, and of what skinning reads from
-        memory.
+        memory. `choice`: what `choose` returned for the frame.
         """
-        level, error = self.choose(posed, clip, output)
-        if vertices is not None:
-            self.skinners[level].skin_into(posed, vertices)
-            moved.copied(vertices.nbytes)
-            moved.read += self.moved_to_skin[level]
-            moved.least += self.moved_to_skin[level] + vertices.nbytes
-        rect = self.bounds.rect(posed, clip, vertices)
-        return None if rect is None else SeenAvatar(widened(rect, error, output), level, error)
+        mesh = self.meshes[choice.mesh.level]
+        own = None if vertices is None else mesh.pose(posed, choice.level, vertices, moved)
+        rect = self.bounds.rect(posed, clip, own)
+        if rect is None:
+            return None
+        grown = widened(rect, choice.error_px, output)
+        return SeenAvatar(grown, choice.level, choice.error_px, choice.mesh.level, len(mesh.shaped.body.faces))
 
 
 def widened(rect: Rect, error_px: float, output: Shape) -> Rect:
@@ -178,7 +232,12 @@ class PoseStage:
         self.plan = FramePlan(FrameWork.NONE, None, None, {})
         folders = distinct(config)
         bodies = {
-            folder: ModelledBody(shaped_body(assets, number), bool(config.posed_vertices), config.budget_px)
+            folder: ModelledBody(
+                bodies_drawn(config, assets, number),
+                mesh_levels_of(assets, number),
+                bool(config.posed_vertices),
+                config.budget_px,
+            )
             for number, folder in enumerate(folders)
         }
         staged = staged_of(assets)
@@ -192,6 +251,7 @@ class PoseStage:
         self._made: dict[FrameWork, _Made] = {}
         self._moved = ByteCounter()
         self._was_seen = [False] * len(self._actors)
+        self._meshes: list[HeldMesh | None] = [None] * len(self._actors)
         self._slots: list[NDArray[np.void]] = []
         self._vertices: list[list[NDArray[np.float32]]] = []
 
@@ -208,8 +268,8 @@ class PoseStage:
         All frames of a fixed plan are full work.
 
         Metrics: `visible`, number of visible avatars; for a full frame `level` of `body.skinning.DETAILS` and
-        `error_px`, the bound on its error on the picture, both of the worst avatar; `density` of a planned tensor; the
-        bytes moved.
+        `error_px`, the bound on the error on the picture, both of the worst avatar; `triangles` of all avatars;
+        `density` of a planned tensor; the bytes moved.
         The least bytes: what was sampled of motions and camera, the header, and the vertices of skinned avatars.
 
         Raises ValueError without `slot_out`, TrilaneError when a number of the frame is not finite.
@@ -339,7 +399,9 @@ class PoseStage:
         _require_finite(posed.matrices, frame, f"joints of avatar {actor.index}")
         seen = None
         if self._was_seen[actor.index] or actor.body.bounds.may_be_seen(posed, clip):
-            seen = actor.body.see(posed, clip, self._output, vertices, self._moved)
+            choice = actor.body.choose(posed, clip, self._output, self._meshes[actor.index])
+            self._meshes[actor.index], avatar["mesh"] = choice.mesh, choice.mesh.level
+            seen = actor.body.see(posed, clip, self._output, vertices, self._moved, choice)
         self._was_seen[actor.index] = seen is not None
         avatar["visible"] = seen is not None
         avatar["joints"], avatar["pose_feature"] = posed.matrices, posed.feature
@@ -362,6 +424,7 @@ def _metrics(plan: FramePlan, moved: ByteCounter) -> Mapping[str, float]:
     if plan.seen:
         metrics["level"] = float(max(one.level for one in plan.seen.values()))
         metrics["error_px"] = max(one.error_px for one in plan.seen.values())
+        metrics["triangles"] = float(sum(one.triangles for one in plan.seen.values()))
     return metrics if plan.density is None else {**metrics, "density": plan.density}
 
 

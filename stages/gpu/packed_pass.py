@@ -100,7 +100,7 @@ class Placement:
     """One avatar in a tensor.
 
     `rect`: top, left, height, width in tensor pixels. `clip_projection` (4,4): projection of its crop. `joints`,
-    `feature`, `vertices`: its pose, as in `BodyPose`.
+    `feature`, `vertices`: its pose, as in `BodyPose`. `mesh`: number of the mesh that is drawn.
     """
 
     joints: F32
@@ -108,6 +108,7 @@ class Placement:
     rect: tuple[int, int, int, int]
     feature: F32 | None = None
     vertices: F32 | None = None
+    mesh: int = 0
 
     @property
     def pose(self) -> BodyPose:
@@ -208,10 +209,19 @@ class PackedPass:
 
 
 class PackedAvatar:
-    """One avatar's mesh and texture, which a `PackedPass` draws."""
+    """One avatar's meshes and texture, which a `PackedPass` draws."""
 
-    def __init__(self, packed: PackedPass, mesh: Mesh, texture: Floats, levels: Floats | None = None) -> None:
+    def __init__(
+        self,
+        packed: PackedPass,
+        mesh: Mesh,
+        texture: Floats,
+        levels: Floats | None = None,
+        coarser: Sequence[Mesh] = (),
+    ) -> None:
         """Upload `texture` (H,W,C) and its smaller `levels`, which a deferred pass cannot read.
+
+        `mesh`, `coarser`: the whole mesh, number 0, and its levels.
 
         Raises BadInputError when FP16 cannot hold a texture, or C is not the pass's number of channels.
         """
@@ -221,17 +231,18 @@ class PackedAvatar:
             check_texture(level, packed.channels)
         if smaller and packed.deferred:
             raise BadInputError("neural texture", "learnt levels", "one level", "draw mesh and texture in one pass")
-        self.mesh, self._ctx = mesh, packed.ctx
+        self.meshes, self._ctx = (mesh, *coarser), packed.ctx
         self._texture = texture_array(packed.ctx, texture, packed.filtering, smaller)
         defines: dict[str, int | str] = {"LAYERS": packed.layers, "WORDS": WORD_TYPES[packed.layers]}
         if packed.deferred:
-            self._geometry = MeshDraw(packed.ctx, mesh, "uv_only.frag")
+            self._draws = [MeshDraw(packed.ctx, one, "uv_only.frag") for one in self.meshes]
             pack = build_program(packed.ctx, "farthest.vert", "packed_tensor.frag", **defines, DEFERRED=1)
             set_uniforms(pack, packed.uniforms)
             self._screen = packed.ctx.vertex_array(pack, [])
         else:
-            self._geometry = MeshDraw(packed.ctx, mesh, "packed_tensor.frag", **defines)
-            self._geometry.set(packed.uniforms)
+            self._draws = [MeshDraw(packed.ctx, one, "packed_tensor.frag", **defines) for one in self.meshes]
+            for draw in self._draws:
+                draw.set(packed.uniforms)
 
     def draw(self, target: Target, view: Floats, placement: Placement) -> None:
         """Draw into `target`, which `PackedPass.begin` has cleared.
@@ -243,11 +254,11 @@ class PackedAvatar:
         top, left, height, width = placement.rect
         box = (left, top, width, height)
         self._texture.use(0)
-        self.mesh.prepare(self._ctx)
+        self.meshes[placement.mesh].prepare(self._ctx)
         first = target.words if target.uv is None else target.uv
         first.use()
         first.viewport = box
-        self._geometry.draw(placement.pose, view, placement.clip_projection)
+        self._draws[placement.mesh].draw(placement.pose, view, placement.clip_projection)
         if target.uv is not None:
             self._write_words(target, box)
 

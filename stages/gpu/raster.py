@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from trilane.errors import TrilaneError
 from trilane.pipeline.stage import UnitContext
 from trilane.scene.crop import Rect, crop_projection
 from trilane.shapes import Shape
-from trilane.stages.avatar_assets import distinct, levels_of, quantisation_of, shaped_body, texture_of
+from trilane.stages.avatar_assets import bodies_drawn, distinct, levels_of, quantisation_of, texture_of
 from trilane.stages.config import RunConfig, posed_vertices
 from trilane.stages.gpu.opengl import CONTEXT, checked, counter_of, describe, open_context
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement
@@ -77,7 +78,7 @@ class RasterStage:
                 number = int(avatar["avatar"])
                 placement = _placement(pose, avatar, skinned[number] if skinned else None)
                 self._avatars[number].draw(target, pose["view"], placement)
-                moved.least += self._avatars[number].mesh.pose_bytes
+                moved.least += self._avatars[number].meshes[placement.mesh].pose_bytes
             self._packed.read_into(shape, tensor)
         moved.written += tensor.nbytes
         moved.least += tensor.nbytes
@@ -96,6 +97,7 @@ def _placement(pose: NDArray[np.void], avatar: Any, vertices: NDArray[np.float32
         rect=(top, left, height, width),
         feature=avatar["pose_feature"],
         vertices=vertices,
+        mesh=int(avatar["mesh"]),
     )
 
 
@@ -120,14 +122,21 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> RasterStage:
     levels = [levels_of(unit.assets, number) for number in range(len(folders))]
     deferred = filtering == "linear" and not driver.hardware and all(each is None for each in levels)
     packed = PackedPass(ctx, textures[0].shape[2], quantisation_of(unit.assets, 0), deferred, filtering)
-    drawn = {
-        folder: PackedAvatar(packed, _mesh(ctx, shaped_body(unit.assets, number), config), texture, levels[number])
-        for number, (folder, texture) in enumerate(zip(folders, textures, strict=True))
-    }
+    drawn = {}
+    for number, (folder, texture) in enumerate(zip(folders, textures, strict=True)):
+        whole, *coarser = _meshes(ctx, bodies_drawn(config, unit.assets, number), config)
+        drawn[folder] = PackedAvatar(packed, whole, texture, levels[number], coarser)
     avatars = [drawn[folder] for folder in config.avatar_dirs]
     return RasterStage(packed, avatars, config.buckets, config.posed_vertices)
 
 
-def _mesh(ctx: Any, shaped: ShapedBody, config: RunConfig) -> Mesh:
-    arrays = avatar_mesh(shaped)
-    return PosedMesh(ctx, arrays) if config.posed_vertices else SkinnedMesh(ctx, arrays, shaped.body.posedirs)
+def _meshes(ctx: Any, bodies: Sequence[ShapedBody], config: RunConfig) -> list[Mesh]:
+    """Return the meshes of a whole body and of its levels. A level of a mesh that encloses a volume does so too.
+
+    Where a level folds over itself, the triangles that face away lie behind others, so it is drawn without them.
+    """
+    whole, *coarser = (avatar_mesh(body) for body in bodies)
+    arrays = [whole, *(replace(level, closed=whole.closed) for level in coarser)]
+    if config.posed_vertices:
+        return [PosedMesh(ctx, one) for one in arrays]
+    return [SkinnedMesh(ctx, one, body.body.posedirs) for one, body in zip(arrays, bodies, strict=True)]

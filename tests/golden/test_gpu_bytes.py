@@ -19,7 +19,7 @@ from trilane.stages.gpu.skinned_mesh import PosedMesh, SkinnedMesh
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 TENSOR, OUTPUT = (96, 64), (240, 320)
-HEADER = 24 + 168 + 4624  # of every packet, of the avatar's, of one avatar
+HEADER = 24 + 168 + 4628 + 4  # of every packet, of the avatar's, of one avatar, to a multiple of 8
 JOINTS, FEATURE, MATRIX = 55 * 12 * 4, 486 * 4, 64
 FRAME, PICTURE = 240 * 320 * 3, 96 * 64 * 4
 BLOBS = 11 * 16

@@ -10,9 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from trilane.bench.lib import float_raster
+from trilane.body.mesh_levels import MeshLevel
 from trilane.body.skinning import FrameSkinner
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement, Quantisation
-from trilane.stages.gpu.skinned_mesh import PosedMesh, SkinnedMesh, mesh_arrays
+from trilane.stages.gpu.skinned_mesh import PosedMesh, SkinnedMesh, avatar_mesh, mesh_arrays
 from trilane.training.sample_renderer import UvBytes, UvRaster
 
 ENCODING = Quantisation(6 / 255, 117)
@@ -250,3 +251,29 @@ def test_vertices_from_the_cpu_unit_give_the_same_tensor(
     assert (np.abs(tensor.reshape(expected.shape) - expected) <= 1).mean() >= 0.999
     with pytest.raises(ValueError, match="vertices"):
         avatar.draw(packed.begin(shape), view[0], Placement(joints, view[1], (0, 0, *shape)))
+
+
+@pytest.mark.parametrize("deferred", [False, True])
+def test_a_level_of_the_mesh_is_drawn_as_a_mesh_of_its_own(
+    gl: Any, person: Any, neural_texture: Any, camera: Camera, deferred: bool
+) -> None:
+    """Every third triangle, with its vertices at the beginning of the whole body's: bit for bit the same."""
+    shaped, none = person.body.shape(), np.zeros((1, 54), np.float32)
+    faces, uv_faces = (rows[::3].copy() for rows in (person.body.faces, person.body.uv_faces))
+    reduced = MeshLevel(faces, uv_faces, none[:, 0], none, none, 0.0).reduced(shaped)
+    view, posed = camera((0.4, 1.2, 3), (0, 0.9, 0)), person.skeleton.pose(random_numbers(2), (0.0, 0.94, 0.0))
+    vertices, shape = np.zeros((len(shaped.vertices), 3), np.float32), (192, 128)
+    FrameSkinner(reduced).skin_into(posed, vertices[: len(reduced.vertices)])
+    packed = PackedPass(gl, 16, ENCODING, deferred)
+    whole, level = (PosedMesh(gl, arrays) for arrays in (person.arrays, avatar_mesh(reduced)))
+    tensors = []
+    for avatar, mesh in (
+        (PackedAvatar(packed, level, neural_texture), 0),
+        (PackedAvatar(packed, whole, neural_texture, coarser=[level]), 1),
+    ):
+        placement = Placement(posed.matrices, view[1], (0, 0, *shape), vertices=vertices, mesh=mesh)
+        avatar.draw(packed.begin(shape), view[0], placement)
+        tensors.append(np.zeros(shape[0] * shape[1] * 16, np.uint8))
+        packed.read_into(shape, tensors[-1])
+    np.testing.assert_array_equal(tensors[0], tensors[1])
+    assert (tensors[0] != ENCODING.zero_point).mean() > 0.03

@@ -31,7 +31,7 @@ from trilane.body.skinning import (
     posed_vertices,
     weight_error_bound,
 )
-from trilane.scene.crop import Rect, cheapest_within, error_px, least_w
+from trilane.scene.crop import Rect, cheapest_within, error_px, least_w, stretch_of
 from trilane.scene.rotations import about
 from trilane.stages.cpu.pose import FINEST, ModelledBody, widened
 
@@ -156,7 +156,7 @@ def check_bounds(shaped: ShapedBody, poses: int, seed: int) -> None:
             other, also = on_screen(drawn.astype(np.float64), clip)
             both = seen & also
             moved = np.linalg.norm(other - places, axis=1)[both].max(initial=0.0)
-            assert moved <= error_px(bound + ROUNDING_M, clip, w, OUTPUT)
+            assert moved <= error_px(bound + ROUNDING_M, stretch_of(clip, OUTPUT), w)
 
 
 def test_no_pose_and_no_view_breaks_the_bounds(blended: ShapedBody) -> None:
@@ -255,11 +255,16 @@ def straight_clip(distance: float) -> F64:
 
 
 def test_pixels_by_hand() -> None:
-    """1 cm at W = 2.01: (1 + 1) 0.01 / (2.01 - 0.01) = 0.01 in NDC, which is 3.2 columns and 2.4 rows: 4 pixels."""
-    assert error_px(0.01, straight_clip(5.0), 2.01, OUTPUT) == pytest.approx(4.0)
-    assert error_px(0.0, straight_clip(5.0), -1.0, OUTPUT) == 0.0
-    assert error_px(0.01, straight_clip(5.0), 0.01, OUTPUT) == math.inf
-    assert error_px(0.01, straight_clip(5.0), -3.0, OUTPUT) == math.inf
+    """1 cm at W = 2.01 and a corner of 640x480: J has the rows 320 (1, 0, 1) and 240 (0, 1, 1).
+
+    J J^T is ((204800, 76800), (76800, 115200)), whose larger eigenvalue is 160000 + sqrt(44800^2 + 76800^2). Its root,
+    times 0.01 / (2.01 - 0.01), is 2.4946 pixels.
+    """
+    stretch = stretch_of(straight_clip(5.0), OUTPUT)
+    assert error_px(0.01, stretch, 2.01) == pytest.approx(2.4946, abs=1e-4)
+    assert error_px(0.0, stretch, -1.0) == 0.0
+    assert error_px(0.01, stretch, 0.01) == math.inf
+    assert error_px(0.01, stretch, -3.0) == math.inf
 
 
 def test_the_least_w_by_hand(tiny_shaped: ShapedBody) -> None:
@@ -286,22 +291,23 @@ def test_the_cheapest_level_within_the_budget(errors: list[float], budget: float
 
 def test_far_off_less_is_modelled_than_near(blended: ShapedBody) -> None:
     """The same pose at 3 metres and further off: each level is the first whose bound is within half a pixel."""
-    body = ModelledBody(blended, skins=True, budget_px=0.5)
+    body = ModelledBody([blended], (), skins=True, budget_px=0.5)
     posed = body.skeleton().pose(np.full((JOINTS, 3), 0.3))
-    levels = [body.choose(posed, straight_clip(distance), OUTPUT) for distance in (3.0, 30.0, 300.0, 30000.0)]
-    assert [level for level, _ in levels] == sorted([level for level, _ in levels], reverse=True)
-    assert levels[0][0] == FINEST
-    assert levels[-1][0] == 0
-    assert all(error <= 0.5 for _, error in levels)
+    chosen = [body.choose(posed, straight_clip(distance), OUTPUT) for distance in (3.0, 30.0, 300.0, 30000.0)]
+    levels = [one.level for one in chosen]
+    assert levels == sorted(levels, reverse=True)
+    assert (levels[0], levels[-1]) == (FINEST, 0)
+    assert all(one.error_px <= 0.5 for one in chosen)
 
 
 @pytest.mark.parametrize(("skins", "budget"), [(False, 0.5), (True, 0.0)])
 def test_everything_is_modelled_where_the_gpu_skins_or_nothing_may_be_left_out(
     blended: ShapedBody, skins: bool, budget: float
 ) -> None:
-    body = ModelledBody(blended, skins=skins, budget_px=budget)
+    body = ModelledBody([blended], (), skins=skins, budget_px=budget)
     posed = body.skeleton().pose(np.full((JOINTS, 3), 0.3))
-    assert body.choose(posed, straight_clip(3000.0), OUTPUT) == (FINEST, 0.0)
+    choice = body.choose(posed, straight_clip(3000.0), OUTPUT)
+    assert (choice.level, choice.error_px) == (FINEST, 0.0)
 
 
 def test_a_rectangle_grows_by_the_error() -> None:

@@ -16,6 +16,7 @@ from trilane.scene.planner import (
     MOST_DENSITY,
     PATIENCE,
     Demand,
+    HeldMesh,
     HeldShape,
     LookAhead,
     ShapeSet,
@@ -23,6 +24,7 @@ from trilane.scene.planner import (
     area,
     choose_shapes,
     foreseen_changes,
+    hold_mesh,
     ideal_shape,
     joined,
     larger_shapes,
@@ -484,3 +486,33 @@ def test_served_and_unserved_frames_add_up(frames: list[tuple[int, int]], memory
     assert chosen.memory_bytes == sum(map(area, chosen.shapes))
     assert chosen.memory_bytes <= memory or len(chosen.shapes) == 1
     assert set(chosen.shapes) <= set(frames)
+
+
+# --- levels of the mesh ----------------------------------------------------------------------------------------------
+
+
+def test_the_first_frame_has_the_coarsest_mesh_within_the_budget() -> None:
+    assert hold_mesh([0.0, 0.2, 0.5, 0.6], 0.5, None) == HeldMesh(2)
+
+
+def test_a_mesh_beyond_the_budget_is_left_at_once_for_the_coarsest_that_is_not() -> None:
+    assert hold_mesh([0.0, 0.4, 0.7, 0.9], 0.5, HeldMesh(3, 4)) == HeldMesh(1)
+    assert hold_mesh([0.0, math.inf, math.inf, math.inf], 0.5, HeldMesh(3)) == HeldMesh(0)
+
+
+def test_a_coarser_mesh_is_taken_step_by_step_after_the_frames_of_patience() -> None:
+    """All three would do at once. Each step waits for ten frames, and the eleventh takes it."""
+    held, levels = HeldMesh(0), []
+    for _ in range(40):
+        held = hold_mesh([0.0, 0.1, 0.2, 0.3], 0.5, held)
+        levels.append(held.level)
+    assert levels == [0] * 10 + [1] * 11 + [2] * 11 + [3] * 8
+
+
+def test_a_mesh_near_the_budget_is_kept_but_not_taken() -> None:
+    """0.45 is within the budget of 0.5 but not within four fifths of it; a frame like that starts the count again."""
+    held = HeldMesh(0)
+    for frame in range(30):
+        held = hold_mesh([0.0, 0.45 if frame % 10 == 9 else 0.3], 0.5, held)
+        assert held.level == 0
+    assert hold_mesh([0.0, 0.45], 0.5, HeldMesh(1)) == HeldMesh(1)

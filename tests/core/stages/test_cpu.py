@@ -124,10 +124,11 @@ def test_a_packet_holds_what_motion_camera_and_layout_give(
     stage, slots = PoseStage(config, assets), [packet(2, posed_vertices_bytes(config.posed_vertices)) for _ in range(2)]
     stage.bind([], slots)
     figures = stage.run(40, None, 1)
-    assert without_bytes(figures) == {"visible": 2.0, "level": 5.0, "error_px": 0.0}
+    triangles = 2.0 * len(body.body.faces)
+    assert without_bytes(figures) == {"visible": 2.0, "level": 5.0, "error_px": 0.0, "triangles": triangles}
     # A camera of 4 x 4, of each avatar 55 x 3 angles and a place, as float64; a header of two avatars; 3 x 4 bytes a
     # vertex, which are read again for the rectangle; and what skinning reads from memory.
-    sampled, header, skin = 128 + 2 * 1344, 24 + 168 + 2 * 4624, 2 * total * 12 if skinned else 0
+    sampled, header, skin = 128 + 2 * 1344, 24 + 168 + 2 * 4628, 2 * total * 12 if skinned else 0
     tables = 2 * 1000 if skinned else 0
     least = sampled + tables + header + skin
     assert [figures[f"bytes_{name}"] for name in ("read", "written", "uploaded", "read_back", "least")] == [

@@ -204,7 +204,7 @@ def test_each_shape_and_slot_has_its_own_session(tiny_bundle):
 
 @pytest.mark.parametrize("kept", [0, 1])
 def test_the_bytes_of_an_inference_are_tensor_picture_and_weights(tiny_bundle, monkeypatch, kept):
-    """A tensor of 128 x 32 with 5 channels, a picture of 4, a header of 4816 bytes, and all that the network keeps."""
+    """A tensor of 128 x 32 with 5 channels, a picture of 4, a header of 4824 bytes, and all that the network keeps."""
     monkeypatch.setattr(infer, "moved_of_kept", lambda size: kept * size)
     stage, inputs, _ = make(tiny_bundle)
     show(inputs[0], (128, 32), [1])
@@ -213,7 +213,7 @@ def test_the_bytes_of_an_inference_are_tensor_picture_and_weights(tiny_bundle, m
     figures = stage.run(0, 0, 0)
     read, written = weights + 128 * 32 * 5, 128 * 32 * 4
     names = ("read", "written", "uploaded", "read_back", "least")
-    assert [figures[f"bytes_{name}"] for name in names] == [4816 + read, 4816 + written, 0, 0, read + written]
+    assert [figures[f"bytes_{name}"] for name in names] == [4824 + read, 4824 + written, 0, 0, read + written]
 
 
 def test_a_device_that_copies_slots_is_given_the_tensor_and_gives_the_picture(tiny_bundle, monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from support.small_pipeline import assets_of, without_bytes
+from trilane.avatars.bundle import add_mesh_levels, load_bundle
+from trilane.body.kinematics import Skeleton
+from trilane.body.mesh_levels import MeshLevel
+from trilane.body.skinning import DETAILS, FrameSkinner
 from trilane.errors import BadInputError
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.stage import Skip, UnitContext
@@ -19,7 +24,8 @@ from trilane.scene.planner import FrameWork, shown_by, work_of
 from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, Scene
 from trilane.scene.tensor_layout import MARGIN_PX, lay_out
 from trilane.shapes import shape_buckets
-from trilane.stages.config import RunConfig, pose_dtype
+from trilane.stages.avatar_assets import staged_of
+from trilane.stages.config import RunConfig, pose_dtype, posed_vertices, posed_vertices_bytes
 from trilane.stages.cpu.pose import PoseStage, build
 from trilane.stages.cpu.present import PresentStage
 from trilane.stages.gpu.composite import DrawnFrames
@@ -113,6 +119,56 @@ def test_edges_are_checked(tiny_bundle: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="needs an output slot"):
         stage.run(0, None, None)
     stage.close()
+
+
+@pytest.mark.parametrize("skins", [False, True])
+def test_a_far_avatar_is_drawn_with_a_level_of_its_mesh(tiny_bundle: Path, tmp_path: Path, skins: bool) -> None:
+    """A level that moves the surface by 2 cm: the middle of the picture shows half a pixel as 3.9 cm at 40 m, and as
+    3 mm at 3 m (480 pixels, 50 deg).
+
+    At 40 m the slot begins with the vertices of the level, which are some of the whole body's.
+    """
+    bundle = load_bundle(shutil.copytree(tiny_bundle, tmp_path / "levelled"))
+    shaped, none = bundle.shaped_body(), np.zeros((1, 54), np.float32)
+    faces, uv_faces = (rows[::40].copy() for rows in (shaped.body.faces, shaped.body.uv_faces))
+    level = MeshLevel(faces, uv_faces, np.array([0.02], np.float32), none, none, 0.0)
+    add_mesh_levels(bundle, [level])
+    used = np.unique(faces)
+    drawn = {}
+    for metres in (3.0, 40.0):
+        standing = AvatarSpec(motion="builtin:t-pose", position=(0.0, 0.0, -metres))
+        still = CameraSpec(source="builtin:static", place="none")
+        made = config(bundle.folder, tmp_path, avatars=(standing,), camera=still)
+        counts = (len(shaped.vertices),) if skins else ()
+        stage = pose_stage(made.model_copy(update={"posed_vertices": counts}))
+        layout = SlotLayout(pose_dtype(1), posed_vertices_bytes(counts))
+        packet = view_packet(memoryview(bytearray(layout.slot_bytes)), layout)
+        stage.bind([], [packet])
+        figures = stage.run(0, None, 0)
+        mesh = int(packet.header["avatars"][0]["mesh"])
+        drawn[metres] = (mesh, figures["triangles"])
+        assert figures["error_px"] <= 0.5
+        if skins and mesh:
+            own, whole = posed_vertices(packet.payload, counts)[0], np.zeros_like(shaped.vertices)
+            mover = staged_of(assets_of(made)).movers[0]
+            pose, place = mover.sample(0.0)
+            posed = Skeleton(shaped.joints, shaped.body.parents).pose(pose, place, mover.world)
+            FrameSkinner(shaped, DETAILS[stage.plan.seen[0].level]).skin_into(posed, whole)
+            np.testing.assert_allclose(own[: len(used)], whole[used], atol=1e-5)
+            assert not own[len(used) :].any()
+    assert drawn == {3.0: (0, len(shaped.body.faces)), 40.0: (1, len(faces))}
+
+
+def test_a_plan_that_models_everything_draws_the_whole_mesh(tiny_bundle: Path, tmp_path: Path) -> None:
+    bundle = load_bundle(shutil.copytree(tiny_bundle, tmp_path / "levelled"))
+    shaped, none = bundle.shaped_body(), np.zeros((1, 54), np.float32)
+    level = MeshLevel(shaped.body.faces[:9], shaped.body.uv_faces[:9], np.zeros(1, np.float32), none, none, 0.0)
+    add_mesh_levels(bundle, [level])
+    for plan, mesh in (("planned", 1), ("fixed", 0), ("full", 0)):
+        stage = pose_stage(config(bundle.folder, tmp_path, plan=plan))
+        packet = bound(stage)
+        stage.run(0, None, 0)
+        assert int(packet.header["avatars"][0]["mesh"]) == mesh
 
 
 sides = st.tuples(st.floats(-1, 0.9), st.floats(0.02, 2)).map(lambda p: (p[0], min(p[0] + p[1], 1.0)))

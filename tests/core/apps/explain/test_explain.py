@@ -139,7 +139,7 @@ def test_a_phase_says_what_is_modelled_and_its_error(document: Any) -> None:
         )
     assert document["sources"] == {
         "bound_px": "proved bound, in pixels of the picture",
-        "measured_px": "measured in this run, at a phase's first frame",
+        "measured_px": "measured in this run, at a phase's first frame, at the vertices that are drawn",
         "pixels, gmac": "counted",
         "ms": "computed",
     }
