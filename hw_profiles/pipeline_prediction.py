@@ -233,8 +233,8 @@ def predict_file(
         "slots": dict(zip(graph.streams, graph.edges, strict=True)),
     }
     if file.run.fps is not None:
-        frames = report["frames"]
-        rate = holding(file.run.fps, needs, sum(frames["dropped"].values()), frames["requested"])
+        counts = report["frames"]
+        rate = holding(file.run.fps, needs, sum(counts["dropped"].values()), counts["requested"])
         answer["rate"] = {**rate, "sentence": rate["sentence"] + _share(file)}
     return answer if all(each.low_ms is not None for each in prices.values()) else _without_intervals(answer)
 

@@ -348,12 +348,12 @@ def print_summary(document: Mapping[str, Any], definition: Definition, records: 
         table.add_row(*(text(each) for each in [*cells, row["status"], row["seconds"], *figures]))
     stdout_console().print(table)
     counts = document["counts"]
-    text = ", ".join(f"{counts[key]} {key}" for key in ("trials", "done", "failed", "lost", "skipped"))
-    stdout_console().print(f"{text}; {document['clock']} clock", markup=False)
+    counted = ", ".join(f"{counts[key]} {key}" for key in ("trials", "done", "failed", "lost", "skipped"))
+    stdout_console().print(f"{counted}; {document['clock']} clock", markup=False)
     if again := [row for row in document["trials"] if row.get("repeated")]:
         unsure = sum(bool(row["unsure"]) for row in again)
-        text = f"the machine was not quiet: runs done again: {len(again)}, UNSURE still: {unsure}"
-        stdout_console().print(text, soft_wrap=True, markup=False)
+        disturbed = f"the machine was not quiet: runs done again: {len(again)}, UNSURE still: {unsure}"
+        stdout_console().print(disturbed, soft_wrap=True, markup=False)
     errors = Counter((row["status"], row["error"]) for row in document["trials"] if row["error"])
     for (status, error), count in errors.items():
         stdout_console().print(f"{count} {status}: {error}", soft_wrap=True, markup=False)

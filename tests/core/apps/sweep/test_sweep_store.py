@@ -80,7 +80,7 @@ def test_what_a_folder_is_taken_up_for(tmp_path: Path) -> None:
         "by a test",
         [trial.id for trial in TRIALS_3],
     )
-    with pytest.raises(BadInputError, match=r"1 of 3 trials are done.*--resume goes on"):
+    with pytest.raises(BadInputError, match=r"1 of 3 trials done.*--resume goes on"):
         opened(folder).__enter__()
     for resume in (True, False):
         with pytest.raises(BadInputError, match="a sweep of 3 trials; 2 of them are among these 2"):
