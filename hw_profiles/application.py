@@ -169,14 +169,14 @@ def split_work(work: Work, share: float) -> tuple[Work, Work]:
 class Steady:
     """The application once it has settled.
 
-    `capped`: whether the display, or a rate, holds it back. `dropped`: share of the frames that are not shown.
+    `latency_ms`: None where no frame is in time. `capped`: whether the display, or a rate, holds it back. `dropped`: share of the frames that are not shown.
     `unit_of`: unit of each stage. `stages_ms`: milliseconds of a job of each stage. `busy`: share of the time in which
     each unit works; `idle`: shares of the rest by cause. Both sum to 1 per unit. Where units share a core, `preempted`
     is the share in which another one of them works on it.
     """
 
     frame_ms: float
-    latency_ms: float
+    latency_ms: float | None
     capped: bool
     unit_of: Mapping[str, UnitName]
     stages_ms: Mapping[str, float]
@@ -280,7 +280,7 @@ def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = Fals
     frame = max(report["frame_time_ms"]["mean"], *times.values()) / batch
     return Steady(
         frame_ms=max(frame, display) if capped else frame,
-        latency_ms=report["latency_ms"]["mean"],
+        latency_ms=report["latency_ms"]["mean"] if report["frames"]["presented"] else None,
         capped=capped,
         unit_of=dict(times.keys()),
         stages_ms={name: ms for (name, _), ms in times.items()},

@@ -247,7 +247,9 @@ def _print_times(console: Console, answer: dict[str, Any]) -> None:
     span = _span(frame["low"], frame["high"], ".1f")
     means = f"{frame['mean']:.1f} ms{span}, {answer['fps']:.1f} fps{capped}"
     console.print(f"{'over all' if answer['config']['minutes'] else 'application':<16}{means}; {stray}")
-    console.print(f"latency         {answer['latency_ms']['mean']:.1f} ms")
+    ms = answer["latency_ms"]["mean"]
+    none = "none: no frame is in time, so the frame time is that of the longest stage"
+    console.print(f"latency         {none if ms is None else f'{ms:.1f} ms'}")
     console.print(f"efficiency      {answer['efficiency']:.2f}")
     _print_wanted(console, answer)
     console.print(f"power           {answer['power_w']:.1f} W, {answer['energy_mj_per_frame']:.0f} mJ a frame")
@@ -274,7 +276,7 @@ def _alternatives_table(answer: dict[str, Any]) -> Table:
     table = Table("what if", "policy", "edge", "frame, ms", "fps", "latency, ms", *(AT_RATE if at_rate else ()))
     for row in rows:
         names = (row["name"], row["policy"], row["edge"])
-        figures = (f"{row['frame_ms']:.1f}", f"{row['fps']:.1f}", f"{row['latency_ms']:.1f}")
+        figures = (f"{row['frame_ms']:.1f}", f"{row['fps']:.1f}", "none" if row["latency_ms"] is None else f"{row['latency_ms']:.1f}")
         table.add_row(*names, *figures, *(_at_rate(row) if at_rate else ()))
     return table
 

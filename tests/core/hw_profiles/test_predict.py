@@ -65,6 +65,18 @@ def test_every_way_of_working_runs_and_accounts_for_its_time(policy: str, edge: 
         assert now.busy[unit] + sum(now.idle[unit].values()) == pytest.approx(1.0)
 
 
+def test_no_frame_in_time_has_no_latency_rather_than_the_least_one() -> None:
+    """A deadline is three periods after the release, so no frame is in time where the network alone takes longer."""
+    profile = load_profile("snapdragon-888")
+    corners = corners_of(profile, SUSTAINED)
+    network = reference_network(NetworkSpec("resnet18", "batch", 1024, 1024, 16))
+    network_ms = steady(profile, Plan(network, "dsp"), corners).stages_ms["infer"]
+    for periods, is_any in ((1.5, True), (3.5, False)):  # periods of a frame that the network takes
+        now = steady(profile, Plan(network, "dsp", Variant("deadline", "double", fps=periods * 1e3 / network_ms)), corners)
+        assert (now.latency_ms is not None, now.dropped < 1) == (is_any, is_any)
+    assert now.frame_ms == pytest.approx(network_ms)
+
+
 def test_two_buffers_make_the_network_the_limit() -> None:
     profile = load_profile("snapdragon-888")
     corners = corners_of(profile, SUSTAINED)
