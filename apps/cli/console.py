@@ -169,21 +169,23 @@ def print_facts(facts: Mapping[str, Any], as_json: bool) -> None:
 
 
 def _written(value: Any) -> str:
-    """Return `value` as it stands in a table: floats with four digits, also in a list of numbers."""
+    """Return `value` as it stands in a table: floats with four digits, also in a list of numbers and a mapping."""
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, list) and all(isinstance(each, int | float) for each in value):
         return f"[{', '.join(map(_written, value))}]"
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_written(each)}" for key, each in value.items())
     return str(value)
 
 
 def _flat(facts: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield rows of a table: keys of inner mappings joined by dots, entries of a list of mappings under their names."""
+    """Yield rows of a table: keys of inner mappings joined by dots, entries of a list of mappings by name or number."""
     for key, value in facts.items():
         if isinstance(value, dict):
             yield from _flat(value, f"{prefix}{key}.")
         elif isinstance(value, list) and value and isinstance(value[0], dict):
-            for entry in value:
-                yield str(entry.get("name")), {k: v for k, v in entry.items() if k != "name"}
+            for number, entry in enumerate(value, 1):
+                yield entry.get("name", f"{prefix}{key}.{number}"), {k: v for k, v in entry.items() if k != "name"}
         else:
             yield prefix + key, value

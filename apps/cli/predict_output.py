@@ -276,7 +276,11 @@ def _alternatives_table(answer: dict[str, Any]) -> Table:
     table = Table("what if", "policy", "edge", "frame, ms", "fps", "latency, ms", *(AT_RATE if at_rate else ()))
     for row in rows:
         names = (row["name"], row["policy"], row["edge"])
-        figures = (f"{row['frame_ms']:.1f}", f"{row['fps']:.1f}", "none" if row["latency_ms"] is None else f"{row['latency_ms']:.1f}")
+        figures = (
+            f"{row['frame_ms']:.1f}",
+            f"{row['fps']:.1f}",
+            "none" if row["latency_ms"] is None else f"{row['latency_ms']:.1f}",
+        )
         table.add_row(*names, *figures, *(_at_rate(row) if at_rate else ()))
     return table
 

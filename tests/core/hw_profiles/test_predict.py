@@ -72,7 +72,9 @@ def test_no_frame_in_time_has_no_latency_rather_than_the_least_one() -> None:
     network = reference_network(NetworkSpec("resnet18", "batch", 1024, 1024, 16))
     network_ms = steady(profile, Plan(network, "dsp"), corners).stages_ms["infer"]
     for periods, is_any in ((1.5, True), (3.5, False)):  # periods of a frame that the network takes
-        now = steady(profile, Plan(network, "dsp", Variant("deadline", "double", fps=periods * 1e3 / network_ms)), corners)
+        now = steady(
+            profile, Plan(network, "dsp", Variant("deadline", "double", fps=periods * 1e3 / network_ms)), corners
+        )
         assert (now.latency_ms is not None, now.dropped < 1) == (is_any, is_any)
     assert now.frame_ms == pytest.approx(network_ms)
 
