@@ -169,10 +169,10 @@ def split_work(work: Work, share: float) -> tuple[Work, Work]:
 class Steady:
     """The application once it has settled.
 
-    `latency_ms`: None where no frame is in time. `capped`: whether the display, or a rate, holds it back. `dropped`: share of the frames that are not shown.
-    `unit_of`: unit of each stage. `stages_ms`: milliseconds of a job of each stage. `busy`: share of the time in which
-    each unit works; `idle`: shares of the rest by cause. Both sum to 1 per unit. Where units share a core, `preempted`
-    is the share in which another one of them works on it.
+    `latency_ms`: None where no frame is in time. `capped`: whether the display, or a rate, holds it back.
+    `dropped`: share of the frames that are not shown. `unit_of`: unit of each stage. `stages_ms`: milliseconds of a
+    job of each stage. `busy`: share of the time in which each unit works; `idle`: shares of the rest by cause. Both
+    sum to 1 per unit. Where units share a core, `preempted` is the share in which another one of them works on it.
     """
 
     frame_ms: float
