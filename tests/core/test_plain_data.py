@@ -25,6 +25,7 @@ CHANGING = {
     "bench.lib.loadgen.LoadGenVerdict",
     "bench.scenario._Player",
     "training.step_loop.TrainingState",
+    "training.mesh_levels.Corners",
     "apps.experiments.error_by_cause._Moved",
     "apps.experiments.error_by_cause._Pooled",
     "hw_profiles.governor.ThermalState",

@@ -97,7 +97,7 @@ CAMERAS = {
     "empty": ("", "an empty file"),
     "wrong columns": ("1 2 3\n4 5 6\n", "3 columns"),
     "no rotation": (
-        "0 1 0 0 0 0 1 0 0 0 0 1 0\n1 1 0 0 0 0 1 0 0 0 0 0 0\n" + "2 0 0 0 0 0 0 0 0 0 0 0 0\n" * 2,
+        "0.0 1 0 0 0 0 1 0 0 0 0 1 0\n0.1 1 0 0 0 0 1 0 0 0 0 0 0\n" + "0.2 0 0 0 0 0 0 0 0 0 0 0 0\n" * 2,
         "first: line 2",
     ),
     "not a number": ("nan nan nan nan nan nan nan nan\n" * 3, "c.txt"),
