@@ -25,7 +25,8 @@ from trilane.hw_profiles.network_work import Network, count_work
 from trilane.hw_profiles.profile_files import load_profile
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
 from trilane.hw_profiles.schema import corners_of
-from trilane.hw_profiles.shared_chip import SKIPS, Tenant, Together, moved_bytes, predict_beside, together
+from trilane.hw_profiles.shared_chip import Together, predict_beside, together
+from trilane.hw_profiles.tenants import SKIPS, Tenant, moved_bytes
 from trilane.scene.planner import FrameWork
 from trilane.units import SUSTAINED
 
@@ -74,7 +75,7 @@ def test_networks_on_two_units_take_memory_from_each_other_while_both_run() -> N
     bandwidth = CHIP.memory.bandwidth_gb_s.or_else(0.0) * 1e9
     tensor = 32 * SIDE * SIDE  # 8 MB, of which the DSP holds 4: half of each travels twice, the first and last whole
     bytes_ = [3 * ADDITIONS * tensor * CHIP.units["gpu"].element_bytes, (ADDITIONS + 1) * tensor]
-    assert [moved_bytes(each.networks[0], CHIP.units[each.unit]) for each in two] == bytes_
+    assert [moved_bytes(each.networks[0].work, CHIP.units[each.unit]) for each in two] == bytes_
     demand = [count / (ms / 1e3) / bandwidth for count, ms in zip(bytes_, alone, strict=True)]
     beside = [time_ms(each, demand[1 - number]) for number, each in enumerate(two)]
     assert all(slow > 1.05 * ms for slow, ms in zip(beside, alone, strict=True))
