@@ -85,9 +85,9 @@ class Pipeline(Protocol):
 
     `name`: its name in reports. `source`: what was asked for. `kind`: avatar, network or pipeline. `fps`: frames
     released a second. `takes_memory`: whether a camera, a display and the composition beside it use the memory all the
-    time. `beat`: it shows one of so many released frames. `graph`: its stages, as the scheduler knows them. `fed`: graph
-    and settings where it always has another frame, and shows all of them. `hardware`: for each of its units the unit of
-    the chip that it is, or its own name.
+    time. `beat`: it shows one of so many released frames, by `every`. `graph`: its stages, as the scheduler knows them.
+    `fed`: graph and settings where it always has another frame, and shows all of them. `hardware`: for each of its
+    units the unit of the chip that it is, or its own name.
     """
 
     @property

@@ -86,9 +86,9 @@ def _show(answer: dict[str, Any]) -> None:
     console.print(f"{answer['machine']['title']} (virtual clock), {config['performance_profile']}")
     console.print(_pipelines(answer))
     for row in answer["pipelines"]:
-        beside = f"{row['rate']['sentence']}; alone {row['alone']['rate']['sentence']}"
+        alone = f"; alone {row['alone']['rate']['sentence']}" if len(answer["pipelines"]) > 1 else ""
         where = "" if row["precision"] is None else f", {row['unit']} in {row['precision']}"
-        console.print(f"{row['name']}{where}: " + (beside if len(answer["pipelines"]) > 1 else row["rate"]["sentence"]), soft_wrap=True)
+        console.print(f"{row['name']}{where}: {row['rate']['sentence']}{alone}", soft_wrap=True)
     console.print(_idle(answer))
     _show_chip(console, answer)
     for note in answer["notes"]:
@@ -97,6 +97,8 @@ def _show(answer: dict[str, Any]) -> None:
 
 def _pipelines(answer: dict[str, Any]) -> Table:
     from rich.table import Table
+
+    from trilane.hw_profiles.rates import wanted_drops
 
     minutes = answer["config"]["minutes"]
     settled = [f"after {minutes:g} min, ms"] if minutes else []
@@ -114,7 +116,7 @@ def _pipelines(answer: dict[str, Any]) -> Table:
             _mean(row["response_ms"]),
             f"{row['in_time']:.1%}",
             f"{row['deadline_misses']}",
-            f"{sum(row['frames']['dropped'].values())}",
+            f"{wanted_drops(row['frames']['dropped'])}",
         )
     return table
 

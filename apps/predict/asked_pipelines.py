@@ -37,7 +37,7 @@ FORM = "SCENE, SCENE@RATE or NETWORK.onnx@RATE, with :gpu or :dsp behind the rat
 
 
 class AskedPipeline(NamedTuple):
-    """A pipeline as typed. `what`: scene or file. `fps`: None for its own rate. `unit`: of the network; None: not said."""
+    """A pipeline as typed. `what`: scene or file. `fps`: None for its own rate. `unit`: of the network, if said."""
 
     text: str
     what: str

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,8 +12,8 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
-from onnx import TensorProto, helper
 
+from support.pipeline_files import ADDITIONS, additions
 from support.trace_reading import read_trace
 from trilane.apps.predict import asked_pipelines as sources
 from trilane.errors import BadInputError
@@ -32,15 +31,7 @@ from trilane.units import SUSTAINED
 
 CHIP = load_profile("snapdragon-888")
 CORNERS = corners_of(CHIP, SUSTAINED)
-SIDE, ADDITIONS = 512, 60
-
-
-def additions(side: int = SIDE) -> onnx.ModelProto:
-    """A network that adds a picture of 32 channels to itself, ADDITIONS times: all traffic, no arithmetic."""
-    names = [f"t{number}" for number in range(ADDITIONS + 1)]
-    values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, (1, 32, side, side)) for name in names]
-    nodes = [helper.make_node("Add", [one, one], [other], other) for one, other in pairwise(names)]
-    return helper.make_model(helper.make_graph(nodes, "g", values[:1], values[-1:], value_info=values[1:-1]))
+SIDE = 512
 
 
 def bare(unit: Any, fps: float = 0.5, side: int = SIDE) -> Tenant:
@@ -285,7 +276,7 @@ def test_heat_is_that_of_all_together() -> None:
 
 def test_what_is_typed_is_read() -> None:
     read = sources.asked
-    assert read("portrait") == ("portrait", "portrait", None, "dsp")
+    assert read("portrait") == ("portrait", "portrait", None, None)
     assert read("a@home.toml")[1:3] == ("a@home.toml", None)
     assert read("a@home.toml@24")[1:3] == ("a@home.toml", 24.0)
     assert read("n@b.onnx@7.5:gpu")[1:] == ("n@b.onnx", 7.5, "gpu")
