@@ -24,8 +24,8 @@ from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_file import GraphFile
 from trilane.hw_profiles.host_model import MODEL_ERROR, UNMEASURED
 from trilane.hw_profiles.network_time import interval, price, spread_of
-from trilane.hw_profiles.rates import FrameInterval, holding, without_interval
-from trilane.hw_profiles.schema import NORMAL_80, Profile, corners_of
+from trilane.hw_profiles.rates import FrameInterval, holding, wanted_drops, without_interval
+from trilane.hw_profiles.schema import NORMAL_80, Corners, Profile
 from trilane.pipeline.file_graph import edge_rules, graph_of, in_flight_of, settings_of, source_ns
 from trilane.pipeline.file_keys import OnnxStage, StageTime
 from trilane.pipeline.pipeline_file import PipelineFile
@@ -57,7 +57,7 @@ class StagePrice:
 
     `source`: where it comes from. `spread`: standard deviation of the logarithm of its error; 0 for times that the file
     gives. `low_ms`, `high_ms`: 80 % interval of the mean; None where nobody knows the error. `why`: reasons for its
-    width, or why there is none.
+    width, or why there is none. `is_modelled`: whether it follows from the network and the chip alone.
     """
 
     time: StageTime
@@ -66,6 +66,7 @@ class StagePrice:
     low_ms: float | None = None
     high_ms: float | None = None
     why: tuple[str, ...] = ()
+    is_modelled: bool = False
 
     @property
     def mean_ns(self) -> int:
@@ -81,21 +82,23 @@ def given_price(file: PipelineFile, name: str) -> StagePrice | None:
     return StagePrice(time, source, low_ms=time.mean_ms, high_ms=time.mean_ms)
 
 
-def network_price(chip: Profile, graph: GraphFile, unit: UnitName, performance_profile: str) -> StagePrice:
+def network_price(chip: Profile, graph: GraphFile, unit: UnitName, corners: Corners) -> StagePrice:
     """Return the price of a network on `unit` of `chip`, which computes in the network's precision."""
-    time = price(chip, graph.work, unit, corners_of(chip, performance_profile))
+    time = price(chip, graph.work, unit, corners)
     around = interval(chip, graph.work, time)
     source = f"{chip.name}, {unit} in {chip.units[unit].precision}"
     if chip.name == HOST and chip.units[unit].measured is None:
-        return StagePrice(StageTime(mean=time.total_ms), source, why=(UNMEASURED,))
+        return StagePrice(StageTime(mean=time.total_ms), source, why=(UNMEASURED,), is_modelled=True)
     spread = spread_of(around) if around.low_ms > 0 else 0.0
-    return StagePrice(StageTime(mean=time.total_ms), source, spread, around.low_ms, around.high_ms, around.why)
+    mean = StageTime(mean=time.total_ms)
+    return StagePrice(mean, source, spread, around.low_ms, around.high_ms, around.why, is_modelled=True)
 
 
 class Measured(NamedTuple):
     """Times of stages in a run of the file on this machine, for the chip that is asked for.
 
-    `times`: by the stage's name. `run`: folder of the run. `chip`: name of the chip, HOST for this machine.
+    `times`: by the stage's name. `run`: folder of the run. `chip`: name of the chip, HOST for this machine; "" where
+    nobody can give a run.
     """
 
     times: Mapping[str, StageTime]
@@ -103,7 +106,7 @@ class Measured(NamedTuple):
     chip: str
 
 
-NOTHING_MEASURED: Final = Measured({}, "", HOST)
+NOTHING_MEASURED: Final = Measured({}, "", "")
 
 
 def measured_price(file: PipelineFile, name: str, measured: Measured) -> StagePrice | None:
@@ -121,14 +124,14 @@ def prices_of(
     file: PipelineFile,
     graphs: Mapping[str, GraphFile],
     chip_for: ChipFor,
-    performance_profile: str,
+    corners_of_chip: Callable[[Profile], Corners],
     measured: Measured = NOTHING_MEASURED,
 ) -> dict[str, StagePrice]:
     """Return the price of every stage: of the file, as measured, or of its network.
 
     Raises BadInputError naming the stages without one.
 
-    `graphs`: graphs of the networks, by the stage's name.
+    `graphs`: graphs of the networks, by the stage's name. `corners_of_chip`: corners of a chip's units.
     """
     unknown = [
         name
@@ -145,7 +148,8 @@ def prices_of(
         known = known or measured_price(file, name, measured) or given_price(file, name)
         if known is None and isinstance(stage, OnnxStage):
             unit = next(each for each in UNITS if each == file.hardware(stage.unit))
-            known = network_price(chip_for(name, graphs[name], unit), graphs[name], unit, performance_profile)
+            chip = chip_for(name, graphs[name], unit)
+            known = network_price(chip, graphs[name], unit, corners_of_chip(chip))
         assert known is not None
         found[name] = known
     return found
@@ -160,7 +164,7 @@ def _without_a_time(file: PipelineFile, names: Sequence[str], measured: Measured
     remedy = "add time_ms = ... to each: what it takes there"
     if first in measured.times:
         remedy = f"add time_ms = ... to each, or scale = {{ {measured.chip} = ... }} for its measured time"
-    elif not measured.times:
+    elif measured.chip and not measured.times:
         remedy += "; or take the times of a run on this machine: --measured RUN"
         remedy += "" if measured.chip == HOST else f" and scale = {{ {measured.chip} = ... }} in each"
     return BadInputError(f"{file.path}: stages.{first}", found, "a stage whose time is known", remedy)
@@ -173,7 +177,7 @@ def bound_of(file: PipelineFile, prices: Mapping[str, StagePrice]) -> tuple[Grap
     return graph, period_bound(graph, times, in_flight_of(file), source_ns(file))
 
 
-class _Drawn:
+class Drawn:
     """The time of each job in ns, as a function for the virtual clock. `factors`: what each stage's time is times."""
 
     def __init__(self, prices: Mapping[str, StagePrice], seed: int, factors: Mapping[str, float] | None = None) -> None:
@@ -216,7 +220,7 @@ def predict_file(
     """
     graph, bound = bound_of(file, prices)
     settings = settings_of(file, frames, seed, hang_ns=NEVER_HANGS_NS)
-    report = simulate(graph, settings, _Drawn(prices, seed)).report
+    report = simulate(graph, settings, Drawn(prices, seed)).report
     needs = _needs(file, prices, graph, seed)
     frame_time, latency = _intervals(file, prices, graph, report, needs, seed)
     answer = {
@@ -234,7 +238,7 @@ def predict_file(
     }
     if file.run.fps is not None:
         counts = report["frames"]
-        rate = holding(file.run.fps, needs, sum(counts["dropped"].values()), counts["requested"])
+        rate = holding(file.run.fps, needs, wanted_drops(counts["dropped"]), counts["requested"])
         answer["rate"] = {**rate, "sentence": rate["sentence"] + _share(file)}
     return answer if all(each.low_ms is not None for each in prices.values()) else _without_intervals(answer)
 
@@ -278,7 +282,7 @@ def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], graph: Graph, s
     beat = math.lcm(*file.periods.values())
     count = -(-FED_FRAMES // beat) * beat if beat <= FED_FRAMES else FED_FRAMES
     half, whole = (
-        simulate(graph, Settings(each, hang_ns=NEVER_HANGS_NS, in_flight=in_flight), _Drawn(prices, seed)).report
+        simulate(graph, Settings(each, hang_ns=NEVER_HANGS_NS, in_flight=in_flight), Drawn(prices, seed)).report
         for each in (count, 2 * count)
     )
     ms = max((whole["duration_s"] - half["duration_s"]) * 1e3 / count, float(bound_ns) / NS_PER_MS)
@@ -335,7 +339,7 @@ def _intervals(
     count = min(frames["requested"], SIMULATED_FRAMES * frames["requested"] // max(frames["presented"], 1))
     settings = settings_of(file, count, seed, hang_ns=NEVER_HANGS_NS)
     whole, *runs = [
-        simulate(graph, settings, _Drawn(prices, seed, factors)).report
+        simulate(graph, settings, Drawn(prices, seed, factors)).report
         for factors in ({}, *_factors(prices, rng, SIMULATIONS))
     ]
 

@@ -13,6 +13,7 @@ from itertools import product
 from typing import Any, NamedTuple
 
 from trilane.hw_profiles.schema import CORNERS, NORMAL_80, Corner, Corners, Profile
+from trilane.scheduler.events import DropCause
 from trilane.units import UNITS, UnitName
 
 
@@ -58,6 +59,14 @@ def holding(fps: float, times: FrameInterval, dropped: int = 0, frames: int = 0)
         "reserve_low": low,
         "reserve_high": high,
     }
+
+
+def wanted_drops(dropped: Mapping[str, int]) -> int:
+    """Return how many frames were dropped although the pipeline wanted them: all but those that `every` leaves out.
+
+    `dropped`: frames by place and cause, as in report.json.
+    """
+    return sum(count for cause, count in dropped.items() if not cause.endswith(f":{DropCause.EVERY.value}"))
 
 
 def without_interval(rate: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from trilane.apps.check.checked_file import document_of
-from trilane.apps.predict.asked_pipelines import tenants
+from trilane.apps.predict.asked_pipelines import asked, avatar
 from trilane.errors import BadInputError
 from trilane.files import read_bytes
 from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import corners_of
-from trilane.hw_profiles.shared_chip import SKIPS, alone_ms
+from trilane.hw_profiles.shared_chip import alone_ms
+from trilane.hw_profiles.tenants import SKIPS
 from trilane.pipeline.file_text import file_text, routes_of, tables_of, unsaid
 from trilane.pipeline.pipeline_file import FORM, MOST_BYTES, TABLES, checked_tables
 from trilane.scene.schema import scene_names
@@ -83,7 +84,7 @@ def _priced(text: str, profile: str) -> tuple[Mapping[str, float], float]:
     if chip.name == HOST:
         remedy = f"`trilane predict {text} --profile {HOST}` measures this machine"
         raise BadInputError("--profile", HOST, "a chip, as nothing runs for a check", remedy)
-    (tenant,) = tenants([text])
+    tenant = avatar(asked(text), text)
     means = alone_ms(chip, tenant, corners_of(chip, SUSTAINED))
     rounded = {stage: round(round(ms * NS_PER_MS) / NS_PER_MS, DIGITS) for stage, ms in means.items()}
     return rounded, tenant.frames.count(SKIPS) / len(tenant.frames)

@@ -41,6 +41,7 @@ Examples:
   trilane predict --table rows.csv --json
   trilane predict portrait --beside default --beside network.onnx@30
   trilane predict street.toml --profile snapdragon-8-gen-3
+  trilane predict portrait --beside street.toml@15
   trilane predict street.toml --set stages.segmenter.unit=gpu --set run.fps=60,run.policy=latest
 """
 PLOT_MINUTES = 30.0

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from trilane.apps.predict.predict_options import PredictOptions
     from trilane.hw_profiles.application import Variant
     from trilane.hw_profiles.schema import Profile
-    from trilane.hw_profiles.shared_chip import Tenant
+    from trilane.hw_profiles.tenants import Pipeline
 
 
 def predict_pipelines(options: PredictOptions, as_json: bool) -> None:
@@ -53,7 +53,7 @@ def predict_pipelines(options: PredictOptions, as_json: bool) -> None:
 
 
 def _write_trace(
-    chip: Profile, found: Sequence[Tenant], options: PredictOptions, answer: Mapping[str, Any], target: Path
+    chip: Profile, found: Sequence[Pipeline], options: PredictOptions, answer: Mapping[str, Any], target: Path
 ) -> None:
     """Write the simulated runs of the pipelines as one trace."""
     from trilane.apps.explain.trace import write_predicted
@@ -68,7 +68,7 @@ def _write_trace(
 def _variant(policy: str, edge: str | None) -> Variant:
     """Return how the avatars' stages are joined. `policy`: "" where none was asked for."""
     from trilane.hw_profiles.application import REFERENCE
-    from trilane.hw_profiles.shared_chip import NEWEST
+    from trilane.hw_profiles.tenants import NEWEST
     from trilane.transport.slots import edge_rule
     from trilane.unexpected_value import UnexpectedValue
 
@@ -86,9 +86,9 @@ def _show(answer: dict[str, Any]) -> None:
     console.print(f"{answer['machine']['title']} (virtual clock), {config['performance_profile']}")
     console.print(_pipelines(answer))
     for row in answer["pipelines"]:
-        beside = f"{row['rate']['sentence']}; alone {row['alone']['rate']['sentence']}"
-        said = f"{row['name']}, {row['unit']} in {row['precision']}: "
-        console.print(said + (beside if len(answer["pipelines"]) > 1 else row["rate"]["sentence"]), soft_wrap=True)
+        alone = f"; alone {row['alone']['rate']['sentence']}" if len(answer["pipelines"]) > 1 else ""
+        where = "" if row["precision"] is None else f", {row['unit']} in {row['precision']}"
+        console.print(f"{row['name']}{where}: {row['rate']['sentence']}{alone}", soft_wrap=True)
     console.print(_idle(answer))
     _show_chip(console, answer)
     for note in answer["notes"]:
@@ -97,6 +97,8 @@ def _show(answer: dict[str, Any]) -> None:
 
 def _pipelines(answer: dict[str, Any]) -> Table:
     from rich.table import Table
+
+    from trilane.hw_profiles.rates import wanted_drops
 
     minutes = answer["config"]["minutes"]
     settled = [f"after {minutes:g} min, ms"] if minutes else []
@@ -114,7 +116,7 @@ def _pipelines(answer: dict[str, Any]) -> Table:
             _mean(row["response_ms"]),
             f"{row['in_time']:.1%}",
             f"{row['deadline_misses']}",
-            f"{sum(row['frames']['dropped'].values())}",
+            f"{wanted_drops(row['frames']['dropped'])}",
         )
     return table
 
@@ -128,13 +130,19 @@ def _idle(answer: dict[str, Any]) -> Table:
     """Return a table of each unit: its busy time for all, and its busy time and idle causes per pipeline."""
     from rich.table import Table
 
-    table = Table("unit", "pipeline", "busy", *IDLE)
-    for unit, row in answer["units"].items():
-        table.add_row(unit, "all", f"{row['busy']:.1%}")
+    rows = [row for one in answer["pipelines"] for row in one["units"].values()]
+    causes = [*IDLE, *(["join"] if any("join" in row["idle"] for row in rows) else [])]
+    table = Table("unit", "pipeline", "busy", *causes)
+    for unit in dict.fromkeys([*answer["units"], *(row["hardware"] for row in rows)]):
+        heads = iter([unit])
+        if unit in answer["units"]:
+            table.add_row(next(heads), "all", f"{answer['units'][unit]['busy']:.1%}")
         for one in answer["pipelines"]:
-            own = one["units"].get(unit)
-            if own is not None:
-                table.add_row("", one["name"], f"{own['busy']:.1%}", *(f"{own['idle'][cause]:.1%}" for cause in IDLE))
+            for name, own in one["units"].items():
+                if own["hardware"] == unit:
+                    said = one["name"] if name == unit else f"{one['name']}: {name}"
+                    shares = (f"{own['idle'].get(cause, 0.0):.1%}" for cause in causes)
+                    table.add_row(next(heads, ""), said, f"{own['busy']:.1%}", *shares)
     return table
 
 

@@ -17,7 +17,7 @@ from trilane.hw_profiles.graph_file import GraphFile
 from trilane.hw_profiles.network_time import Computes
 from trilane.hw_profiles.pipeline_prediction import Measured, predict_file, prices_of
 from trilane.hw_profiles.profile_files import load_runnable
-from trilane.hw_profiles.schema import Profile
+from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.pipeline.file_keys import MOST_SAMPLES, OnnxStage, StageTime
 from trilane.pipeline.journal import Worked
 from trilane.pipeline.pipeline_file import PipelineFile, assignments, read_pipeline
@@ -96,6 +96,6 @@ def _answer(
         assert isinstance(stage, OnnxStage)
         return chips.chip_for(stage, graph, unit)
 
-    prices = prices_of(file, graphs, chip_for, options.cap, measured)
+    prices = prices_of(file, graphs, chip_for, lambda chip: corners_of(chip, options.cap), measured)
     answer = predict_file(file, prices, options.frames or 0, options.seed)
     return {"what_if": text, **answer, "verdict": predicted_verdict(answer).shown()}

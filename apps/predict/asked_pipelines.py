@@ -1,6 +1,7 @@
-"""The pipelines that `trilane predict` puts on one chip, from the command line: scenes, and networks at a rate.
+"""The pipelines that `trilane predict` puts on one chip, from the command line: scenes, networks and pipeline files.
 
-Rule: as in `trilane explain`, a run's pose stage plans each frame of a scene; a network comes from its file.
+Rule: as in `trilane explain`, a run's pose stage plans each frame of a scene; a network comes from its file. A pipeline
+file is read as for `trilane predict FILE.toml`, and no Python of it is imported.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from trilane.apps.check.port_types import port_types, read_networks
 from trilane.apps.explain.scene_plan import ScenePlan
 from trilane.avatars.network_file import reshaped
 from trilane.errors import BadInputError
@@ -17,7 +19,9 @@ from trilane.hw_profiles.application import LEAST_FPS, MOST_FPS, RUNTIMES, Varia
 from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.network_time import Computes
 from trilane.hw_profiles.network_work import Network, count_work
-from trilane.hw_profiles.shared_chip import MOST_TENANTS, NEWEST, SKIPS, Tenant
+from trilane.hw_profiles.shared_chip import MOST_TENANTS
+from trilane.hw_profiles.tenants import NEWEST, SKIPS, FileTenant, Pipeline, Tenant
+from trilane.pipeline.pipeline_file import checked_tables, is_pipeline_file, read_pipeline
 from trilane.scene.planner import FrameWork
 from trilane.scene.schema import ENDING
 from trilane.shapes import Shape
@@ -29,16 +33,21 @@ from trilane.units import INFER, UnitName
 NETWORK_ENDING = ".onnx"
 #: Frames of a scene that are planned, the first ones; they are taken again from the first on.
 MOST_FRAMES = 600
-FORM = "SCENE, SCENE@RATE or NETWORK.onnx@RATE, with :gpu or :dsp behind the rate"
+FORM = "SCENE, SCENE@RATE or NETWORK.onnx@RATE, with :gpu or :dsp behind the rate, or FILE.toml or FILE.toml@RATE"
 
 
 class AskedPipeline(NamedTuple):
-    """A pipeline as typed. `what`: scene or file. `fps`: None for the scene's own rate. `unit`: unit of the network."""
+    """A pipeline as typed. `what`: scene or file. `fps`: None for its own rate. `unit`: of the network, if said."""
 
     text: str
     what: str
     fps: float | None
-    unit: UnitName
+    unit: UnitName | None
+
+    @property
+    def is_file(self) -> bool:
+        """Say whether it is a pipeline file."""
+        return is_pipeline_file(Path(self.what))
 
 
 def asked(text: str) -> AskedPipeline:
@@ -55,8 +64,12 @@ def asked(text: str) -> AskedPipeline:
     if not what:
         raise BadInputError(_where(text), "no scene and no file", FORM)
     number, colon, unit = rate.partition(":")
-    chosen = _unit(text, unit) if colon else INFER[1]
-    return AskedPipeline(text, what, _rate(text, number) if at and what != text else None, chosen)
+    chosen = _unit(text, unit) if colon else None
+    found = AskedPipeline(text, what, _rate(text, number) if at and what != text else None, chosen)
+    if chosen is not None and found.is_file:
+        remedy = f"leave out :{unit}; `unit` of each stage says where it runs"
+        raise BadInputError(_where(text), f"the unit {chosen} for a pipeline file", "its rate alone", remedy)
+    return found
 
 
 def _where(text: str) -> str:
@@ -77,19 +90,23 @@ def _unit(text: str, asked_for: str) -> UnitName:
     raise BadInputError(_where(text), f"unit {asked_for!r}", " or ".join(RUNTIMES), "without the colon it is the dsp")
 
 
-def tenants(texts: Sequence[str], variant: Variant = NEWEST, precision: str | None = None) -> list[Tenant]:
+def tenants(texts: Sequence[str], variant: Variant = NEWEST, precision: str | None = None) -> list[Pipeline]:
     """Return a pipeline for each text, in order. Raises BadInputError.
 
-    `variant`: policy and edge of the avatars. `precision`: int8, fp16 or fp32 for all networks; None: as each says.
+    `variant`: policy and edge of the avatars. `precision`: int8, fp16 or fp32 for all networks, except those of a
+    pipeline file that states one; None: as each says.
     """
     if len(texts) > MOST_TENANTS:
         raise BadInputError("--beside", f"{len(texts)} pipelines", f"at most {MOST_TENANTS} with the first one")
     read = [asked(text) for text in texts]
     names = _names([Path(each.what).stem for each in read])
-    return [
-        _bare(each, name, precision) if each.what.endswith(NETWORK_ENDING) else _avatar(each, name, variant, precision)
-        for each, name in zip(read, names, strict=True)
-    ]
+    return [_tenant(each, name, variant, precision) for each, name in zip(read, names, strict=True)]
+
+
+def _tenant(each: AskedPipeline, name: str, variant: Variant, precision: str | None) -> Pipeline:
+    if each.what.endswith(NETWORK_ENDING):
+        return _bare(each, name, precision)
+    return _of_file(each, name, precision) if each.is_file else avatar(each, name, variant, precision)
 
 
 def _names(stems: Sequence[str]) -> list[str]:
@@ -105,10 +122,22 @@ def _bare(each: AskedPipeline, name: str, precision: str | None) -> Tenant:
     graph = read_graph(path)
     network = Network({"network": str(path)}, 1, 1, 1, "packed", graph.work)
     computes = Computes(graph.numbers, precision)
-    return Tenant(name, each.text, (network,), (0,), each.fps or 0.0, each.unit, is_bare=True, computes=computes)
+    unit = each.unit or INFER[1]
+    return Tenant(name, each.text, (network,), (0,), each.fps or 0.0, unit, is_bare=True, computes=computes)
 
 
-def _avatar(each: AskedPipeline, name: str, variant: Variant, precision: str | None) -> Tenant:
+def _of_file(each: AskedPipeline, name: str, precision: str | None) -> FileTenant:
+    file = read_pipeline(Path(each.what))
+    if each.fps is not None:
+        run = {key: value for key, value in file.tables.get("run", {}).items() if key != "arrivals"}
+        file = checked_tables({**file.tables, "run": {**run, "fps": each.fps}}, file.path)
+    graphs = read_networks(file)
+    port_types(file, graphs)
+    return FileTenant(name, each.text, file, graphs, precision)
+
+
+def avatar(each: AskedPipeline, name: str, variant: Variant = NEWEST, precision: str | None = None) -> Tenant:
+    """Return the pipeline of a scene, every frame planned. Raises BadInputError."""
     checked = configure(RunOptions(scene=each.what, skinning="gpu"), Path.cwd())
     scene, file = checked.config.scene, network_of(checked.assets)
     plan = ScenePlan(checked.config, checked.assets)
@@ -121,8 +150,8 @@ def _avatar(each: AskedPipeline, name: str, variant: Variant, precision: str | N
     }
     networks, avatars = tuple(by_shape[shape] for shape, _ in distinct), tuple(count for _, count in distinct)
     frames = tuple(SKIPS if one is None else distinct.index(one) for one in seen)
-    fps, computes = each.fps or scene.fps, Computes(precision=precision)
-    return Tenant(name, each.text, networks, frames, fps, each.unit, variant, avatars=avatars, computes=computes)
+    fps, unit, computes = each.fps or scene.fps, each.unit or INFER[1], Computes(precision=precision)
+    return Tenant(name, each.text, networks, frames, fps, unit, variant, avatars=avatars, computes=computes)
 
 
 def _own(shape: Sequence[int]) -> Shape:

@@ -155,7 +155,8 @@ class PredictOptions(Options):
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="Of a pipeline file: seed of its random times.")
     beside: Texts = Field(
         default=(),
-        description="Another pipeline on the chip: SCENE, SCENE@RATE, NETWORK.onnx@RATE or @RATE:gpu. Repeat it.",
+        description="Another pipeline on the chip: SCENE, SCENE@RATE, NETWORK.onnx@RATE, @RATE:gpu, or a pipeline file "
+        "(.toml, .toml@RATE). Repeat it.",
     )
     turns: Annotated[str, _either(_turns)] = Field(
         default="round-robin",
@@ -248,10 +249,10 @@ class PredictOptions(Options):
 
     @property
     def pipeline(self) -> Path | None:
-        """Return the pipeline file that is asked for; None for a scene, a network or the application."""
+        """Return the pipeline file that is asked for by itself; None for anything else, and beside other pipelines."""
         from trilane.pipeline.pipeline_file import is_pipeline_file
 
-        path = None if self.scene is None else Path(self.scene)
+        path = None if self.scene is None or self.beside else Path(self.scene)
         return path if path is not None and is_pipeline_file(path) else None
 
     @property
@@ -361,8 +362,8 @@ class PredictOptions(Options):
             found, remedy = f"{self._spelt(useless)} beside a pipeline file", "the file says so itself, or --set does"
             raise BadInputError("options", found, "none of them", remedy)
         if self.pipeline is None and (useless := given & OF_A_PIPELINE_ALONE):
-            found = f"{self._spelt(useless)} without a pipeline file"
-            raise BadInputError("options", found, "a .toml file with [stages] before them")
+            found = f"{self._spelt(useless)} {'with --beside' if self.beside else 'without a pipeline file'}"
+            raise BadInputError("options", found, "a pipeline file by itself, a .toml with [stages]")
 
     def _spelt(self, names: set[str]) -> str:
         return ", ".join(sorted(map(self.spelling, names)))

@@ -72,10 +72,12 @@ def _with_run(chip: Profile, request: RunOptions, say: Say) -> tuple[Profile, Ne
 
 def with_first(chip: Profile, text: str, say: Say) -> Profile:
     """Return `chip`, this machine, with measurements of the first of several pipelines, as it was typed."""
-    what = asked(text).what
-    if what.endswith(NETWORK_ENDING):
-        return with_file(chip, read_graph(Path(what)), {}, say)
-    return _with_run(chip, RunOptions(scene=what), say)[0]
+    first = asked(text)
+    if first.what.endswith(NETWORK_ENDING):
+        return with_file(chip, read_graph(Path(first.what)), {}, say)
+    if first.is_file:
+        return _unmeasured(chip, "the networks of a pipeline file are measured where it stands alone", say)
+    return _with_run(chip, RunOptions(scene=first.what), say)[0]
 
 
 def with_file_in_application(chip: Profile, graph: GraphFile, shapes: Mapping[str, Sequence[int]], say: Say) -> Profile:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,17 @@ def network(side: int, output: str, channels: int = 8) -> onnx.ModelProto:
         [numpy_helper.from_array(weights, "weights")],
     )
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+
+
+ADDITIONS = 60
+
+
+def additions(side: int) -> onnx.ModelProto:
+    """A network that adds a picture of 32 channels to itself, ADDITIONS times: all traffic, no arithmetic."""
+    names = [f"t{number}" for number in range(ADDITIONS + 1)]
+    values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, (1, 32, side, side)) for name in names]
+    nodes = [helper.make_node("Add", [one, one], [other], other) for one, other in pairwise(names)]
+    return helper.make_model(helper.make_graph(nodes, "g", values[:1], values[-1:], value_info=values[1:-1]))
 
 
 def write_file(folder: Path, text: str, name: str = "pipeline.toml") -> Path:

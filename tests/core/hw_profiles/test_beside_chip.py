@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,8 +12,8 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
-from onnx import TensorProto, helper
 
+from support.pipeline_files import ADDITIONS, additions
 from support.trace_reading import read_trace
 from trilane.apps.predict import asked_pipelines as sources
 from trilane.errors import BadInputError
@@ -25,21 +24,14 @@ from trilane.hw_profiles.network_work import Network, count_work
 from trilane.hw_profiles.profile_files import load_profile
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
 from trilane.hw_profiles.schema import corners_of
-from trilane.hw_profiles.shared_chip import SKIPS, Tenant, Together, moved_bytes, predict_beside, together
+from trilane.hw_profiles.shared_chip import Together, predict_beside, together
+from trilane.hw_profiles.tenants import SKIPS, Tenant, moved_bytes
 from trilane.scene.planner import FrameWork
 from trilane.units import SUSTAINED
 
 CHIP = load_profile("snapdragon-888")
 CORNERS = corners_of(CHIP, SUSTAINED)
-SIDE, ADDITIONS = 512, 60
-
-
-def additions(side: int = SIDE) -> onnx.ModelProto:
-    """A network that adds a picture of 32 channels to itself, ADDITIONS times: all traffic, no arithmetic."""
-    names = [f"t{number}" for number in range(ADDITIONS + 1)]
-    values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, (1, 32, side, side)) for name in names]
-    nodes = [helper.make_node("Add", [one, one], [other], other) for one, other in pairwise(names)]
-    return helper.make_model(helper.make_graph(nodes, "g", values[:1], values[-1:], value_info=values[1:-1]))
+SIDE = 512
 
 
 def bare(unit: Any, fps: float = 0.5, side: int = SIDE) -> Tenant:
@@ -74,7 +66,7 @@ def test_networks_on_two_units_take_memory_from_each_other_while_both_run() -> N
     bandwidth = CHIP.memory.bandwidth_gb_s.or_else(0.0) * 1e9
     tensor = 32 * SIDE * SIDE  # 8 MB, of which the DSP holds 4: half of each travels twice, the first and last whole
     bytes_ = [3 * ADDITIONS * tensor * CHIP.units["gpu"].element_bytes, (ADDITIONS + 1) * tensor]
-    assert [moved_bytes(each.networks[0], CHIP.units[each.unit]) for each in two] == bytes_
+    assert [moved_bytes(each.networks[0].work, CHIP.units[each.unit]) for each in two] == bytes_
     demand = [count / (ms / 1e3) / bandwidth for count, ms in zip(bytes_, alone, strict=True)]
     beside = [time_ms(each, demand[1 - number]) for number, each in enumerate(two)]
     assert all(slow > 1.05 * ms for slow, ms in zip(beside, alone, strict=True))
@@ -284,7 +276,7 @@ def test_heat_is_that_of_all_together() -> None:
 
 def test_what_is_typed_is_read() -> None:
     read = sources.asked
-    assert read("portrait") == ("portrait", "portrait", None, "dsp")
+    assert read("portrait") == ("portrait", "portrait", None, None)
     assert read("a@home.toml")[1:3] == ("a@home.toml", None)
     assert read("a@home.toml@24")[1:3] == ("a@home.toml", 24.0)
     assert read("n@b.onnx@7.5:gpu")[1:] == ("n@b.onnx", 7.5, "gpu")

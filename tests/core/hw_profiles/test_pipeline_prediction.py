@@ -347,7 +347,6 @@ def test_a_stage_without_a_time_is_refused_by_name(command: Command, tmp_path: P
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--beside", "default@30"), "--beside beside a pipeline file"),
         (("--fps", "30"), "--fps beside a pipeline file"),
         (("--frames", "0"), "--frames"),
         (("--set", "stages.depth.unti=a"), "did you mean 'unit'?"),

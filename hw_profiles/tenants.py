@@ -1,0 +1,429 @@
+"""Pipelines that can share a chip: scenes, networks by themselves and pipeline files, and what their jobs cost there.
+
+    jobs = tenant.on(profile, corners, "expected", 0.1)
+    jobs.service_ns("infer", "dsp", 7, 0), jobs.mean_ms
+
+Rule: a tenant knows its own stages and times. How several slow each other is the matter of `shared_chip.py`, which asks
+for each job which network it computes, and for a network how long it takes at less bandwidth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Final, Literal, NamedTuple, Protocol
+
+from trilane.errors import BadInputError
+from trilane.hw_profiles.application import (
+    LEAST_FPS,
+    MOST_FPS,
+    RUNTIMES,
+    Plan,
+    Variant,
+    application_graph,
+    stage_times_ms,
+)
+from trilane.hw_profiles.engine_times import numbers_of, spilled
+from trilane.hw_profiles.graph_file import GraphFile
+from trilane.hw_profiles.network_time import AS_IT_SAYS, Computes, interval, price
+from trilane.hw_profiles.network_work import Network, Work
+from trilane.hw_profiles.pipeline_prediction import (
+    FED_FRAMES,
+    NEVER_HANGS_NS,
+    Drawn,
+    StagePrice,
+    holding_back,
+    prices_of,
+)
+from trilane.hw_profiles.schema import Corners, Profile, Unit
+from trilane.hw_profiles.unit_times import time_on
+from trilane.pipeline.file_graph import edge_rules, graph_of, in_flight_of, settings_of
+from trilane.pipeline.file_keys import OnnxStage
+from trilane.pipeline.pipeline_file import PipelineFile
+from trilane.scheduler.events import Graph, Settings, chain
+from trilane.scheduler.policy import POLICIES, run_settings
+from trilane.units import BYPASS, INFER, NS_PER_MS, NS_PER_S, UNITS, UnitName
+
+#: How frames are taken by default: only the newest counts, as with a camera; an older one is dropped.
+NEWEST = Variant("latest", "double")
+#: Which time of a network counts: the expected one, or an end of its 80 % interval.
+Ends = Literal["expected", "low", "high"]
+ENDS: Final[tuple[Ends, ...]] = ("expected", "low", "high")
+ENDLESS = 1 << 40
+SKIPS = -1
+
+
+class Jobs(Protocol):
+    """What the jobs of a pipeline cost on a chip, with its units at given corners.
+
+    `mean_ms`: mean milliseconds of a job by stage if no other pipeline runs. `is_known`: whether the error of every
+    time is known.
+    """
+
+    @property
+    def mean_ms(self) -> Mapping[str, float]: ...
+
+    @property
+    def is_known(self) -> bool: ...
+
+    def service_ns(self, stage: str, unit: str, frame: int, begin_ns: int) -> int:
+        """Return the time of a job if no other pipeline runs."""
+
+    def network(self, stage: str, frame: int) -> Hashable | None:
+        """Return a name of the network that a job computes; None if it computes none."""
+
+    def network_ms(self, network: Any, use: float) -> float:
+        """Return the time of a job with `network` while the share `use` of the memory's bandwidth is taken."""
+
+    def moved_bytes(self, network: Any) -> float:
+        """Return the bytes that `network` moves in a job."""
+
+
+class Pipeline(Protocol):
+    """A pipeline that shares a chip with others.
+
+    `name`: its name in reports. `source`: what was asked for. `kind`: avatar, network or pipeline. `fps`: frames
+    released a second. `takes_memory`: whether a camera, a display and the composition beside it use the memory all the
+    time. `beat`: it shows one of so many released frames, by `every`. `graph`: its stages, as the scheduler knows them.
+    `fed`: graph and settings where it always has another frame, and shows all of them. `hardware`: for each of its
+    units the unit of the chip that it is, or its own name.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def source(self) -> str: ...
+
+    @property
+    def kind(self) -> str: ...
+
+    @property
+    def fps(self) -> float: ...
+
+    @property
+    def takes_memory(self) -> bool: ...
+
+    @property
+    def beat(self) -> int: ...
+
+    @property
+    def graph(self) -> Graph: ...
+
+    @property
+    def fed(self) -> tuple[Graph, Settings]: ...
+
+    @property
+    def hardware(self) -> Mapping[str, str]: ...
+
+    def settings(self, display_ns: int) -> Settings:
+        """Return the settings of its scheduler: frames without end, at its rate.
+
+        `display_ns`: shortest time between two shown frames of an avatar.
+        """
+
+    def skips(self, frame: int, is_fresh: bool) -> bool:
+        """Say whether a frame takes the bypass of the graph."""
+
+    def on(self, profile: Profile, corners: Corners, end: Ends, always: float) -> Jobs:
+        """Return what its jobs cost. `always`: share of the bandwidth that is taken all the time."""
+
+    def facts(self, profile: Profile) -> dict[str, Any]:
+        """Return how it runs, for reports: `unit`, `numbers`, `precision`, `policy` and `edge`."""
+
+
+def check_rate(name: str, fps: float) -> None:
+    """Raise BadInputError for a rate out of range."""
+    if not LEAST_FPS <= fps <= MOST_FPS:
+        raise BadInputError(f"{name}: rate", f"{fps:g}", f"{LEAST_FPS:g} to {MOST_FPS:g} frames a second")
+
+
+@dataclass(frozen=True)
+class Tenant:
+    """An avatar, or a network by itself, as a `Pipeline`.
+
+    `networks`: one network for each shape of the tensor and number of avatars in view. `frames`: for each frame, the
+    place of its network in `networks`, or `SKIPS`; the list starts over after its end. `unit`: unit of the network.
+    `variant`: how the stages are joined. `is_bare`: whether there is nothing but the network, whose result is due when
+    the next frame comes. `avatars`: number of avatars in view for each of `networks`; empty for one each. `computes`:
+    how the networks compute. Raises BadInputError for a unit or a rate out of range.
+    """
+
+    name: str
+    source: str
+    networks: tuple[Network, ...]
+    frames: tuple[int, ...]
+    fps: float
+    unit: UnitName = "dsp"
+    variant: Variant = NEWEST
+    is_bare: bool = False
+    avatars: tuple[int, ...] = ()
+    computes: Computes = AS_IT_SAYS
+
+    def __post_init__(self) -> None:
+        if self.unit not in RUNTIMES:
+            raise BadInputError(f"{self.name}: unit", repr(self.unit), " or ".join(RUNTIMES))
+        check_rate(self.name, self.fps)
+
+    @property
+    def kind(self) -> str:
+        return "network" if self.is_bare else "avatar"
+
+    @property
+    def takes_memory(self) -> bool:
+        return not self.is_bare
+
+    @property
+    def beat(self) -> int:
+        return 1
+
+    @property
+    def hardware(self) -> Mapping[str, str]:
+        return {unit: unit for unit in UNITS}
+
+    @property
+    def graph(self) -> Graph:
+        name, _ = INFER
+        if self.is_bare:
+            return chain([(name, self.unit)], self.variant.edge, name)
+        return replace(application_graph(self.variant.edge, [(name, self.unit)]), bypass=BYPASS)
+
+    @property
+    def fed(self) -> tuple[Graph, Settings]:
+        policy = self.variant.policy
+        settings = Settings(ENDLESS, Variant().policy if POLICIES[policy].paced else policy, hang_ns=ENDLESS)
+        return _always_fed(self.graph), settings
+
+    def settings(self, display_ns: int) -> Settings:
+        policy = self.variant.policy
+        limits: dict[str, Any] = {"in_queue": 0 if POLICIES[policy].newest else 1, "hang_ns": ENDLESS}
+        period_ns = round(NS_PER_S / self.fps)
+        if self.is_bare:
+            return Settings(ENDLESS, policy, period_ns=period_ns, deadline_ns=period_ns, **limits)
+        shown_ns = max(period_ns, display_ns)
+        return run_settings(policy, ENDLESS, shown_ns, shown_ns, **limits)
+
+    def plan(self, kind: int, stretch: float = 1.0) -> Plan:
+        """Return what runs in a frame with the network at place `kind`. `stretch`: factor on the network's time."""
+        avatars = self.avatars[kind] if self.avatars else 1
+        return Plan(self.networks[kind], self.unit, self.variant, avatars=avatars, stretch=stretch)
+
+    def place(self, frame: int) -> int:
+        """Return the place of the frame's network, or SKIPS."""
+        return self.frames[frame % len(self.frames)]
+
+    def skips(self, frame: int, is_fresh: bool) -> bool:  # noqa: ARG002 an older result is never shown again here
+        return self.place(frame) == SKIPS
+
+    def on(self, profile: Profile, corners: Corners, end: Ends, always: float) -> Jobs:
+        return _AvatarJobs(self, self.computes.on(profile, self.unit), corners, end, always)
+
+    def facts(self, profile: Profile) -> dict[str, Any]:
+        return {
+            "unit": self.unit,
+            "numbers": self.computes.numbers,
+            "precision": self.computes.on(profile, self.unit).units[self.unit].precision,
+            "policy": self.variant.policy,
+            "edge": self.variant.edge,
+        }
+
+
+class _AvatarJobs:
+    """`Jobs` of a `Tenant`. `chip`: as its networks compute. A network is named by its place among the tenant's."""
+
+    is_known = True
+
+    def __init__(self, tenant: Tenant, chip: Profile, corners: Corners, end: Ends, always: float) -> None:
+        self._tenant, self._chip, self._corners, self._end = tenant, chip, corners, end
+        self._always = always
+        self._ms: dict[tuple[int, float], dict[str, float]] = {}
+        kinds = [kind for kind in tenant.frames if kind != SKIPS] or [0]
+        each = [self._stages_ms(kind, always) for kind in kinds]
+        # Of the frames with a network; of the first network where no frame has one.
+        self.mean_ms = {stage: sum(times[stage] for times in each) / len(each) for stage in each[0]}
+
+    def service_ns(self, stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
+        return round(self._stages_ms(self._kind(frame), self._always)[stage] * NS_PER_MS)
+
+    def network(self, stage: str, frame: int) -> Hashable | None:
+        return self._kind(frame) if stage == INFER[0] else None
+
+    def network_ms(self, network: int, use: float) -> float:
+        return self._stages_ms(network, use)[INFER[0]]
+
+    def moved_bytes(self, network: int) -> float:
+        tenant = self._tenant
+        return moved_bytes(tenant.networks[network].work, self._chip.units[tenant.unit])
+
+    def _kind(self, frame: int) -> int:
+        return max(self._tenant.place(frame), 0)
+
+    def _stages_ms(self, kind: int, use: float) -> dict[str, float]:
+        if (kind, use) not in self._ms:
+            self._ms[kind, use] = self._made_ms(kind, use)
+        return self._ms[kind, use]
+
+    def _made_ms(self, kind: int, use: float) -> dict[str, float]:
+        tenant, used = self._tenant, _used(self._chip, use)
+        stretch, unit = self._stretch(tenant.networks[kind].work), used.units[tenant.unit]
+        if tenant.is_bare:
+            clock = unit.clock(self._corners[UNITS.index(tenant.unit)])
+            time = time_on(unit, used.memory, tenant.networks[kind].work, clock, contended=True)
+            return {INFER[0]: stretch * time.total_ms}
+        # Where the unit was measured, the other stages were measured with it, so they share its error.
+        whole, of_network = (stretch, 1.0) if unit.measured is not None else (1.0, stretch)
+        times = stage_times_ms(used, tenant.plan(kind, of_network), self._corners)
+        return {stage: whole * ms for (stage, _), ms in times.items()}
+
+    def _stretch(self, work: Work) -> float:
+        """Return the factor on a network's time at this end of its interval."""
+        if self._end == "expected":
+            return 1.0
+        time = price(self._chip, work, self._tenant.unit, self._corners)
+        around = interval(self._chip, work, time)
+        return (around.low_ms if self._end == "low" else around.high_ms) / time.total_ms
+
+
+@dataclass(frozen=True)
+class FileTenant:
+    """A pipeline file, as a `Pipeline`.
+
+    `graphs`: graphs of its networks, by the stage's name. `precision`: int8, fp16 or fp32 for networks whose stage says
+    none; None: as each file says. Raises BadInputError for a file without a rate.
+    """
+
+    name: str
+    source: str
+    file: PipelineFile
+    graphs: Mapping[str, GraphFile]
+    precision: str | None = None
+
+    kind: str = "pipeline"
+    takes_memory: bool = False
+
+    def __post_init__(self) -> None:
+        if self.file.run.fps is None:
+            found = "random arrivals" if self.file.run.arrivals else "no rate"
+            raise BadInputError(f"{self.file.path}: run.fps", found, "frames a second", f"such as {self.file.path}@30")
+        check_rate(self.name, self.fps)
+
+    @property
+    def fps(self) -> float:
+        return float(self.file.run.fps or 0.0)
+
+    @cached_property
+    def hardware(self) -> Mapping[str, str]:
+        return {unit: self.file.hardware(unit) or unit for unit in self.file.units}
+
+    @property
+    def beat(self) -> int:
+        return self.file.periods[self.file.latency_to]
+
+    @cached_property
+    def graph(self) -> Graph:
+        return graph_of(self.file, edge_rules(self.file))
+
+    @property
+    def fed(self) -> tuple[Graph, Settings]:
+        graph = replace(_always_fed(self.graph), from_release=False)
+        # A bound on the frames, because nothing holds back a stage of no time before a `latest` input.
+        frames = 2 * max(FED_FRAMES, self.beat)
+        return graph, Settings(frames, hang_ns=NEVER_HANGS_NS, in_flight=in_flight_of(self.file))
+
+    def settings(self, display_ns: int) -> Settings:  # noqa: ARG002 the file states how its frames are shown
+        return settings_of(self.file, ENDLESS, hang_ns=NEVER_HANGS_NS)
+
+    def skips(self, frame: int, is_fresh: bool) -> bool:  # noqa: ARG002 a pipeline file has no bypass
+        return False
+
+    def on(self, profile: Profile, corners: Corners, end: Ends, always: float) -> Jobs:
+        return _FileJobs(self, profile, corners, end, always)
+
+    def chip(self, stage: str, profile: Profile, unit: UnitName) -> Profile:
+        """Return `profile` with `unit` as it computes the network of `stage`."""
+        keys = self.file.stages[stage]
+        asked = (keys.precision if isinstance(keys, OnnxStage) else None) or self.precision
+        return Computes(self.graphs[stage].numbers, asked).on(profile, unit)
+
+    def facts(self, profile: Profile) -> dict[str, Any]:  # noqa: ARG002 each stage has its own precision
+        run = self.file.run
+        units = dict.fromkeys(self.hardware.values())
+        return {"unit": ", ".join(units), "numbers": None, "precision": None, "policy": run.policy, "edge": run.edge}
+
+
+class _Priced(NamedTuple):
+    """A network that the chip's model prices. `factor`: this end of its interval over the expected time."""
+
+    work: Work
+    chip: Profile
+    unit: UnitName
+    factor: float
+
+
+class _FileJobs:
+    """`Jobs` of a `FileTenant`. A network is named by its stage; one with a `time_ms` of its own takes no bandwidth."""
+
+    def __init__(self, tenant: FileTenant, profile: Profile, corners: Corners, end: Ends, always: float) -> None:
+        self._corners = corners
+        prices = prices_of(
+            tenant.file, tenant.graphs, lambda name, _, unit: tenant.chip(name, profile, unit), lambda _: corners
+        )
+        self.is_known = all(each.low_ms is not None for each in prices.values())
+        factors = {name: _end_over_mean(each, end) for name, each in prices.items()}
+        self._networks = dict(_priced(tenant, prices, profile, factors))
+        used = {name: self.network_ms(name, always) / prices[name].time.mean_ms for name in self._networks}
+        self._drawn = Drawn(prices, 0, {**factors, **used})
+        self.mean_ms = {name: each.time.mean_ms * {**factors, **used}[name] for name, each in prices.items()}
+
+    def service_ns(self, stage: str, unit: str, frame: int, begin_ns: int) -> int:
+        return self._drawn(stage, unit, frame, begin_ns)
+
+    def network(self, stage: str, _frame: int) -> Hashable | None:
+        return stage if stage in self._networks else None
+
+    def network_ms(self, network: str, use: float) -> float:
+        work, chip, unit, factor = self._networks[network]
+        used = _used(chip, use)
+        clock = used.units[unit].clock(self._corners[UNITS.index(unit)])
+        return factor * time_on(used.units[unit], used.memory, work, clock, contended=True).total_ms
+
+    def moved_bytes(self, network: str) -> float:
+        work, chip, unit, _ = self._networks[network]
+        return moved_bytes(work, chip.units[unit])
+
+
+def _priced(
+    tenant: FileTenant, prices: Mapping[str, StagePrice], profile: Profile, factors: Mapping[str, float]
+) -> Iterable[tuple[str, _Priced]]:
+    for name, graph in tenant.graphs.items():
+        unit = next((each for each in UNITS if each == tenant.hardware[tenant.file.stages[name].unit]), None)
+        if prices[name].is_modelled and unit is not None:
+            yield name, _Priced(graph.work, tenant.chip(name, profile, unit), unit, factors[name])
+
+
+def _end_over_mean(stage: StagePrice, end: Ends) -> float:
+    at = {"expected": None, "low": stage.low_ms, "high": stage.high_ms}[end]
+    return 1.0 if at is None or not stage.time.mean_ms else at / stage.time.mean_ms
+
+
+def _always_fed(graph: Graph) -> Graph:
+    """Return a graph whose streams hold back instead of leaving frames out."""
+    return replace(graph, edges=tuple(map(holding_back, graph.edges)))
+
+
+def _used(profile: Profile, use: float) -> Profile:
+    """Return the chip while others take the share `use` of its memory's bandwidth."""
+    fraction = profile.memory.application_use_fraction.model_copy(update={"value": use})
+    memory = profile.memory.model_copy(update={"application_use_fraction": fraction})
+    return profile.model_copy(update={"memory": memory})
+
+
+def moved_bytes(work: Work, unit: Unit) -> float:
+    """Return the bytes that a network moves in a job on `unit`: the elements of every operator, and the weights once.
+
+    A tensor engine moves only what does not stay on the chip.
+    """
+    if unit.engine is not None:
+        return float(sum(spilled(work.layers, numbers_of(unit.engine).room)) + work.weights) * unit.element_bytes
+    return float(work.table[:, 1].sum() + work.weights) * unit.element_bytes
