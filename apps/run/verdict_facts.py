@@ -26,6 +26,7 @@ from trilane.apps.run.verdict import (
     slow_percentile,
 )
 from trilane.figure_sources import NO_FIGURES
+from trilane.hw_profiles.rates import wanted_drops
 from trilane.scheduler.policy import POLICIES
 
 if TYPE_CHECKING:
@@ -94,7 +95,7 @@ def _lateness(document: Mapping[str, Any], *, is_paced: bool) -> Lateness | None
     """Return how many frames were not in time; None where the misses count against another rate."""
     frames, late = document["frames"], document["deadline_misses"]
     if is_paced:
-        dropped = sum(frames["dropped"].values())
+        dropped = wanted_drops(frames["dropped"])
         return Lateness(frames["presented"] + dropped + frames["lost"], late, dropped, frames["lost"])
     if (document.get("pace") or {}).get("slow_motion", 1.0) != 1.0:
         return None

@@ -91,6 +91,18 @@ def test_a_prediction_is_sure_where_its_interval_is_on_one_side() -> None:
         assert found["bound"] == {"unit": "v", "stages": ["b"], "share": 0.8}
 
 
+def test_frames_that_every_leaves_out_are_not_dropped_ones() -> None:
+    """Of 300 frames a stage takes each second one: 147 came, 3 went because they were stale, 1 was late."""
+    dropped = {"a->b:every": 150, "a->b:stale": 3}
+    frames = {"presented": 147, "lost": 0, "dropped": dropped}
+    answer = {
+        "frame_time_ms": {"mean": 15.0},
+        "rate": {"fps": 30, "reserve": 0.5, "reserve_low": 0.4, "reserve_high": 0.6},
+    }
+    found = predicted_verdict({**answer, "cycle": {}, "frames": frames, "deadline_misses": 1})
+    assert "1 of 150 frames late, 3 dropped at 30 fps" in str(found.as_json())
+
+
 #: A pipeline like the avatar's, whose stages have units of their own or share them.
 UNIT_OF = {"pose": "cpu", "raster": "gpu", "infer": "dsp", "composite": "gpu", "present": "cpu"}
 SCENES = {
