@@ -47,11 +47,9 @@ def _show(console: Console, answer: Mapping[str, Any]) -> None:
     frame, latency, frames, needs = (answer[key] for key in ("frame_time_ms", "latency_ms", "frames", "needs_ms"))
     if rate := answer.get("rate"):
         console.print(rate["sentence"])
-    span = _span(frame["low"], frame["high"])
-    console.print(f"frame time      {_ms(frame['mean'])}{span}, p95 {_ms(frame['p95'])}, {answer['fps']:.1f} fps")
-    console.print(
-        f"latency         {_ms(latency['mean'])}{_span(latency['low'], latency['high'])}, p95 {_ms(latency['p95'])}"
-    )
+    rate_said = f", {answer['fps']:.1f} fps" if frame["samples"] else ""
+    console.print(f"frame time      {_of_frames(frame)}{rate_said}")
+    console.print(f"latency         {_of_frames(latency)}")
     dropped = sum(frames["dropped"].values())
     console.print(f"frames          {frames['presented']} of {frames['requested']} presented, {dropped} dropped")
     for cause, count in frames["dropped"].items():
@@ -72,6 +70,12 @@ def _show(console: Console, answer: Mapping[str, Any]) -> None:
             f"{_ms(age['mean'])} old, {behind['mean']:.1f} frames behind" if age["samples"] else "never there in time"
         )
         console.print(f"newest of       {name}: {said}")
+
+
+def _of_frames(times: Mapping[str, Any]) -> str:
+    if not times["samples"]:
+        return "unknown: too few frames were presented"
+    return f"{_ms(times['mean'])}{_span(times['low'], times['high'])}, p95 {_ms(times['p95'])}"
 
 
 def _ms(value: float) -> str:

@@ -199,7 +199,7 @@ def predicted_verdict(answer: Mapping[str, Any]) -> Verdict:
     target = float((answer.get("rate") or {}).get("fps") or config.get("fps") or TARGET_FPS)
     low, high = times.get("low"), times.get("high")
     least, most = (None, None) if low is None or high is None or not low else (1e3 / high, 1e3 / low)
-    units = answer.get("units") or {}
+    units, latency = answer.get("units") or {}, answer.get("latency_ms")
     return judged(
         Facts(
             Rate(1e3 / times["mean"], least, most, "80 %"),
@@ -207,7 +207,7 @@ def predicted_verdict(answer: Mapping[str, Any]) -> Verdict:
             _lateness(answer, is_paced=True) if has_run else None,
             _trust_in(least, most, target),
             frame_ms=times["mean"],
-            latency_ms=(answer.get("latency_ms") or {}).get("mean"),
+            latency_ms=latency["mean"] if latency and latency.get("samples", 1) else None,
             bound=_predicted_bound(answer, times["mean"]),
             idle={unit: (1 - row["busy"], _causes(row["idle"])) for unit, row in units.items()},
             image="trilane accuracy measures it here: a prediction has no pictures",

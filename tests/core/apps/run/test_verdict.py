@@ -103,6 +103,14 @@ def test_frames_that_every_leaves_out_are_not_dropped_ones() -> None:
     assert "1 of 150 frames late, 3 dropped at 30 fps" in str(found.as_json())
 
 
+def test_a_prediction_without_a_presented_frame_has_no_latency() -> None:
+    frames = {"presented": 0, "lost": 0, "dropped": {"a->b:late": 300}}
+    answer = {"frame_time_ms": {"mean": 15.0}, "frames": frames, "latency_ms": {"mean": 0, "samples": 0}}
+    assert "latency" not in dict(predicted_verdict(answer).lines())["TIME"]
+    answer["latency_ms"] = {"mean": 20.5, "samples": 3}
+    assert "latency 20" in dict(predicted_verdict(answer).lines())["TIME"]
+
+
 #: A pipeline like the avatar's, whose stages have units of their own or share them.
 UNIT_OF = {"pose": "cpu", "raster": "gpu", "infer": "dsp", "composite": "gpu", "present": "cpu"}
 SCENES = {
