@@ -89,7 +89,7 @@ def stage_text(path: Path, stage: str, read: Measurements, measurement: Measurem
         raise BadInputError(f"{path}: stages", f"no stage {stage!r}", expected, did_you_mean(stage, file.stages))
     tables = tomlkit.parse(read_text(path, "a pipeline file"))
     tables["stages"][stage]["time_ms"] = _as_toml(path, read, measurement)
-    text = tomlkit.dumps(tables)
+    text: str = tomlkit.dumps(tables)
     checked_tables(tomllib.loads(text), path)
     return text
 
