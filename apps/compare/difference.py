@@ -13,14 +13,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from functools import lru_cache
 from itertools import pairwise
-from math import atan, ceil, cos, erfc, expm1, inf, log, log1p, pi, sin, sqrt
+from math import ceil, expm1, inf, log, log1p, sqrt
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from trilane.arrays import F64, I64, Ints
+from trilane.student import student_quantile, student_tails
 
 LEAST_FRAMES: Final = 50
 MOST_FRAMES: Final = 20_000
@@ -31,7 +31,6 @@ ALIKE: Final = 0.8
 NEGLIGIBLE: Final = 1e-9
 #: The least change that matters: as a share of the base, or, for shares of the time, as a share of the time.
 MATTERS: Final = 0.05
-CONFIDENCE: Final = 0.95
 Reduce = Callable[[F64, F64], float]
 ALPHA = 0.01
 
@@ -290,35 +289,6 @@ def _left_out(series: Series, reduce: Reduce, is_ratio: bool) -> F64:
 def _jackknife(values: F64) -> float:
     """Return the variance of a statistic, from its `values` without each stretch."""
     return float((len(values) - 1) / len(values) * ((values - values.mean()) ** 2).sum())
-
-
-@lru_cache(maxsize=4096)
-def student_tails(t: float, freedom: float) -> float:
-    """Return the probability that Student's t is beyond ±`t`.
-
-    `freedom`: degrees of freedom, a whole number or inf.
-    Abramowitz and Stegun, Handbook of Mathematical Functions, 26.7.3 and 26.7.4.
-    """
-    if freedom == inf or t == inf:
-        return erfc(t / sqrt(2))
-    angle, odd = atan(t / sqrt(freedom)), int(freedom) % 2
-    term = cos(angle) if odd else 1.0
-    total = term if freedom > 1 else 0.0
-    for count in range(2 + odd, int(freedom) - 1, 2):
-        term *= cos(angle) ** 2 * (count - 1) / count
-        total += term
-    inside = 2 / pi * (angle + sin(angle) * total) if odd else sin(angle) * total
-    return max(1 - inside, 0.0)
-
-
-@lru_cache(maxsize=256)
-def student_quantile(freedom: float) -> float:
-    """Return what Student's t exceeds, above or below, with probability 1 - `CONFIDENCE`; found by bisection."""
-    low, high = 0.0, 1e3
-    for _ in range(80):
-        middle = (low + high) / 2
-        low, high = (middle, high) if student_tails(middle, freedom) > 1 - CONFIDENCE else (low, middle)
-    return low
 
 
 def rejected(probabilities: Sequence[float], alpha: float = ALPHA) -> list[bool]:

@@ -18,7 +18,7 @@ from math import expm1, inf, log1p, sqrt
 from typing import Any, Final, NamedTuple
 
 from trilane.apps.compare.comparison import change_of, interval_of, name_of, spoilt
-from trilane.apps.compare.difference import ALPHA, Difference, rejected, student_quantile, student_tails
+from trilane.apps.compare.difference import ALPHA, Difference, rejected
 from trilane.apps.compare.rows import (
     DROPPED,
     FRAME_TIME,
@@ -34,6 +34,7 @@ from trilane.apps.compare.rows import (
 from trilane.apps.compare.run_frames import CPU, INSTRUCTIONS
 from trilane.apps.compare.sides import Change, Side
 from trilane.errors import BadInputError, did_you_mean
+from trilane.student import student_quantile, student_tails
 
 #: Runs of each side up to which it is computed how many would tell.
 MOST_RUNS: Final = 200

@@ -23,6 +23,7 @@ ROWS = (
         "options",
         "shapes",
         "signals",
+        "student",
         "unet_tables",
         "unexpected_value",
         "units",

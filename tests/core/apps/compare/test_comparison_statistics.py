@@ -19,11 +19,10 @@ from trilane.apps.compare.difference import (
     judged,
     rejected,
     settled,
-    student_quantile,
-    student_tails,
     unsure,
 )
 from trilane.arrays import F64
+from trilane.student import student_quantile, student_tails
 
 RUNS = 100
 

@@ -23,13 +23,14 @@ from support.compared_runs import STAGES, on_a_machine, simulated, write_run
 from support.run_report import make_report
 from trilane.apps.cli.github import annotation, summary
 from trilane.apps.compare.comparison import compare
-from trilane.apps.compare.difference import Difference, student_quantile
+from trilane.apps.compare.difference import Difference
 from trilane.apps.compare.gate import METRICS, Outcome, Pair, Weighed, judge, read_gate, runs_needed, whole
 from trilane.apps.compare.rows import FRAME_TIME, MS, Figure
 from trilane.apps.compare.run_frames import frames_of
 from trilane.apps.compare.sides import ComparedRun, RunKind, Side
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import Worked
+from trilane.student import student_quantile
 
 Command = Callable[..., tuple[str, str]]
 QUIET = 0.004
