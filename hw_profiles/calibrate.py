@@ -15,6 +15,15 @@ The fit minimises, over the deviations d of all log rates from the profile's,
 
 by Gauss and Newton's method, as `fit_engines.py` does with many rows. A unit without a tensor engine has one factor on
 all its times. Every row is predicted by a fit to the others.
+
+How far off those predictions are says how much of the error that the profile states is to be expected of this chip.
+Misses z, in units of the stated error, are normal with a variance k^2 that nothing is known of but that the statement,
+k = 1, counts as one row more. So k^2 has a scaled inverse chi-square distribution, and a new row's miss over
+
+    s = ((1 + sum of z^2) / (1 + n))^(1/2)
+
+is Student's t with 1 + n degrees of freedom (Gelman et al., Bayesian Data Analysis, section 2.6). A unit's
+`error_scale` is s times the quantile of t over that of a normal distribution, so 80 % intervals stay such.
 """
 
 from __future__ import annotations
@@ -35,17 +44,29 @@ from trilane.files import read_text
 from trilane.hw_profiles.engine_layers import NAMES, RATES, TERMS
 from trilane.hw_profiles.engine_times import amounts, join, numbers_of
 from trilane.hw_profiles.graph_file import read_graph
-from trilane.hw_profiles.network_time import Interval, in_precision, interval, price, under_runtime
+from trilane.hw_profiles.network_time import Interval, in_precision, interval, price, spread_of, under_runtime
 from trilane.hw_profiles.network_work import Work
 from trilane.hw_profiles.profile_files import load_tables, parse_profile
-from trilane.hw_profiles.schema import KEY_OF_RATE, EngineName, EngineRuntime, Profile, Unit, corners_of
+from trilane.hw_profiles.schema import (
+    KEY_OF_RATE,
+    MOST_ERROR_SCALE,
+    NORMAL_80,
+    EngineName,
+    EngineRuntime,
+    Profile,
+    Unit,
+    corners_of,
+)
 from trilane.hw_profiles.unit_times import time_on
+from trilane.student import student_quantile
 from trilane.units import BURST, UNITS, UnitName
 
 #: Spreads of the prior, as standard deviations of logarithms: of a chip's speed, of one rate apart from the others, of
 #: an engine apart from the others, and of a rate of an engine.
 CHIP, RATE, ENGINE, OWN = 1.0, 0.2, 0.2, 0.15
 NOISE, NU = 0.12, 3.0
+#: How many rows what the profile states of its error counts as.
+STATED_ROWS = 1
 STEPS, ENOUGH = 50, 1e-6
 LEAST_ROWS, MOST_ROWS = 2, 1000
 LONGEST_MS = 3.6e6
@@ -180,13 +201,49 @@ def calibrate_tables(data: Mapping[str, Any], path: Path, rows: Sequence[OwnRow]
             on_chip(profile, row)
         except BadInputError as error:
             raise BadInputError(row.place, error.found, error.expected) from None
-    moved, numbers = _moved(data, profile, rows)
-    checked = []
+    left_out = []
     for index, row in enumerate(rows):
-        others = _moved(data, profile, [*rows[:index], *rows[index + 1 :]])[0]
-        before, after = _predicted(profile, row), _predicted(parse_profile(others, path), row)
-        checked.append(Checked(row, *before, *after))
-    return Calibrated(moved, numbers, tuple(checked))
+        others = with_numbers(data, _moved(profile, [*rows[:index], *rows[index + 1 :]]))
+        left_out.append(Checked(row, *_predicted(profile, row), *_predicted(parse_profile(others, path), row)))
+    checked = tuple(each._replace(after=_scaled(each, error_scale(misses(left_out, each)))) for each in left_out)
+    numbers = _moved(profile, rows) | _error_scales(profile, left_out)
+    return Calibrated(with_numbers(data, numbers), numbers, checked)
+
+
+def misses(left_out: Sequence[Checked], of: Checked | UnitName) -> list[float]:
+    """Return how far off predictions were, as logarithms in units of the stated error.
+
+    `left_out`: rows beside a prediction by a fit to all others, with the interval that the profile states.
+    `of`: a unit, for all its rows; or a row, for all other rows of its unit.
+    A row without others on its unit tells nothing of a fit.
+    """
+    unit = of if isinstance(of, str) else of.row.unit
+    of_unit = [each for each in left_out if each.row.unit == unit]
+    told = of_unit if len(of_unit) > 1 else []
+    return [math.log(each.row.ms / each.after_ms) / spread_of(each.after) for each in told if each is not of]
+
+
+def error_scale(told: Sequence[float]) -> float:
+    """Return how many times the stated error is to be expected after the misses `told`, in units of it."""
+    freedom = STATED_ROWS + len(told)
+    scale = math.sqrt((STATED_ROWS + sum(miss**2 for miss in told)) / freedom)
+    return min(scale * student_quantile(freedom, 0.8) / NORMAL_80, MOST_ERROR_SCALE)
+
+
+def _error_scales(profile: Profile, left_out: Sequence[Checked]) -> dict[str, tuple[float, float]]:
+    """Return the `error_scale` of each unit that has rows, on top of that of the profile."""
+    numbers = {}
+    for unit in dict.fromkeys(each.row.unit for each in left_out):
+        told, stated = misses(left_out, unit), profile.units[unit].error_scale
+        scale = error_scale(told) * (1.0 if stated is None else stated.or_else(1.0))
+        spread = math.sqrt(1 / 2 / (STATED_ROWS + len(told)))  # of the logarithm of a deviation, to first order
+        numbers[f"units.{unit}.error_scale"] = (min(scale, MOST_ERROR_SCALE), spread)
+    return numbers
+
+
+def _scaled(checked: Checked, scale: float) -> Interval:
+    factor = math.exp(NORMAL_80 * scale * spread_of(checked.after))
+    return checked.after._replace(low_ms=checked.after_ms / factor, high_ms=checked.after_ms * factor)
 
 
 def _predicted(profile: Profile, row: OwnRow) -> tuple[float, Interval]:
@@ -195,11 +252,8 @@ def _predicted(profile: Profile, row: OwnRow) -> tuple[float, Interval]:
     return time.total_ms, interval(chip, row.work, time)
 
 
-def _moved(
-    data: Mapping[str, Any], profile: Profile, rows: Sequence[OwnRow]
-) -> tuple[dict[str, Any], dict[str, tuple[float, float]]]:
-    """Return the moved tables, and the value and spread of each key that moved."""
-    moved = copy.deepcopy(dict(data))
+def _moved(profile: Profile, rows: Sequence[OwnRow]) -> dict[str, tuple[float, float]]:
+    """Return the value and spread of each key that moves."""
     numbers: dict[str, tuple[float, float]] = {}
     for unit in UNITS:
         of_unit = [row for row in rows if row.unit == unit]
@@ -208,13 +262,20 @@ def _moved(
             numbers |= _engine_numbers(profile, unit, on_engine)
         elif of_unit:
             numbers |= _unit_numbers(profile, unit, of_unit)
+    return numbers
+
+
+def with_numbers(data: Mapping[str, Any], numbers: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
+    """Return a copy of the tables `data` with the fitted `numbers`."""
+    moved = copy.deepcopy(dict(data))
     for key, (value, spread) in numbers.items():
         table: Any = moved
         *folders, last = key.split(".")
         for part in folders:
             table = table[part]
-        table[last] = {**table[last], "value": value, "spread": spread, "kind": "fitted"}
-    return moved, numbers
+        stated = table.get(last, {"source": "own rows"})
+        table[last] = {**stated, "value": value, "spread": spread, "kind": "fitted"}
+    return moved
 
 
 class _EngineRow:

@@ -155,6 +155,8 @@ def interval(profile: Profile, work: Work, time: NetworkTime) -> Interval:
         why = [f"networks as unlike those of the fit were off by {own:.0%} besides what its numbers leave open"]
         why += [_likeness(job), f"the numbers leave {job.unsure or 0:.0%} open for this one"]
         why += [f"{share:.0%} of it is {term}, known to {spread:.0%}" for term, share, spread in _ill_known(work, unit)]
+    if unit.measured is None and unit.error_scale is not None:
+        why.append(f"own rows scale the error of its {time.unit} by {unit.error_scale.or_else(1):.2g}")
     odd = sorted({o.op_type for o in work.operators if not o.ruled})
     if odd:
         why.append(f"no rule for {', '.join(odd)}: counted as the movement of its elements")

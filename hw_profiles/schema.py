@@ -22,6 +22,8 @@ Kind = Literal["measured", "published", "fitted", "assumed", "unknown"]
 SPREAD_OF_KIND: dict[str, float] = {"measured": 0.05, "published": 0.1, "fitted": 0.15, "assumed": 0.5, "unknown": 1.0}
 #: Standard deviations from the mean within which 80 % of a normal distribution lie.
 NORMAL_80 = 1.2816
+#: Intervals of more than 20 times the stated error say nothing.
+MOST_ERROR_SCALE = 20.0
 BYTES = {"int8": 1, "fp16": 2, "fp32": 4}
 
 Corners = tuple[Corner, Corner, Corner]
@@ -203,11 +205,12 @@ class Unit(ProfileTable):
     each element of the network's input, `permute_fixed_ms` where the picture comes in several tensors. `corners`: clock
     at each voltage corner as a fraction of the highest. While a job runs the unit takes `power_max_w` times the clock
     fraction to the power of `power_exponent`, and `idle_w` otherwise. `model_error_fraction`: relative error of the
-    roofline itself, apart from that of its numbers. `runtimes`: how many times faster than ONNX Runtime in FP32 each
-    runtime runs an INT8 network; only the host's DSP unit has them. `core`: units with the same text share a core and
-    work in turns, as on a host with too few cores; empty for a unit of its own. `engines`: numbers of a tensor engine
-    by precision and runtime, from which `engine_runtime` chooses; a unit without any is priced by `efficiency`. Only
-    this machine's units have `threads`, which share the peak rates, and `measured`.
+    roofline itself, apart from that of its numbers. `error_scale`: how many times the error that all these numbers
+    state is to be expected, as own rows showed; None without any. `runtimes`: how many times faster than ONNX Runtime
+    in FP32 each runtime runs an INT8 network; only the host's DSP unit has them. `core`: units with the same text share
+    a core and work in turns, as on a host with too few cores; empty for a unit of its own. `engines`: numbers of a
+    tensor engine by precision and runtime, from which `engine_runtime` chooses; a unit without any is priced by
+    `efficiency`. Only this machine's units have `threads`, which share the peak rates, and `measured`.
     """
 
     title: str
@@ -227,6 +230,7 @@ class Unit(ProfileTable):
     fallback_fixed_ms: Cost
     fallback_ns_per_element: Cost
     model_error_fraction: Annotated[Quantity, AfterValidator(_Range(0, 5))]
+    error_scale: Annotated[Quantity, AfterValidator(_Range(0, MOST_ERROR_SCALE))] | None = None
     efficiency: Efficiencies
     runtimes: dict[str, Rate] = {}
     engines: dict[EngineName, Engine] = {}

@@ -74,12 +74,14 @@ def time_on(
 def relative_error(job: JobTime, unit: Unit) -> float:
     """Return the relative error to expect of the time of `job` on `unit`; the measured one where the unit was measured.
 
-    Otherwise it joins the errors of the numbers behind each part of the time with the error of the model itself.
+    Otherwise it joins the errors of the numbers behind each part of the time with the error of the model itself, and
+    scales both as the unit's own rows showed.
     """
     if unit.measured is not None:
         return unit.measured.error
+    scale = 1.0 if unit.error_scale is None else unit.error_scale.or_else(1.0)
     if job.unsure is not None and unit.engine is not None:
-        return math.hypot(job.unsure, unit.engine.error_fraction.or_else(0.5) * job.unlike)
+        return scale * math.hypot(job.unsure, unit.engine.error_fraction.or_else(0.5) * job.unlike)
     computed_from = {
         "fixed": unit.job_fixed_ms,
         "input": unit.input_ns_per_element,
@@ -91,7 +93,7 @@ def relative_error(job: JobTime, unit: Unit) -> float:
     computed_from |= {kind: getattr(unit.efficiency, kind) for kind in CLASSES if kind not in computed_from}
     shares = {part: ms / job.total_ms for part, ms in job.parts.items()}
     variance = sum((shares[part] * quantity.relative_error) ** 2 for part, quantity in computed_from.items())
-    return float((variance + unit.model_error_fraction.or_else(0.5) ** 2) ** 0.5)
+    return scale * float((variance + unit.model_error_fraction.or_else(0.5) ** 2) ** 0.5)
 
 
 def layer_times(

@@ -18,20 +18,23 @@ from trilane.hw_profiles.calibrate import (
     CHIP,
     NOISE,
     NU,
+    Checked,
     OwnRow,
     _derivatives,
     _EngineRow,
     calibrate,
     calibrate_tables,
+    error_scale,
+    misses,
     on_chip,
     prior_covariance,
     read_own_rows,
 )
-from trilane.hw_profiles.network_time import price
+from trilane.hw_profiles.network_time import Interval, interval, price, spread_of
 from trilane.hw_profiles.profile_files import load_profile, load_tables, parse_profile
 from trilane.hw_profiles.published_times import WORK, read_latencies
 from trilane.hw_profiles.reference_networks import NetworkSpec, network_work
-from trilane.hw_profiles.schema import KEY_OF_RATE, Profile, corners_of
+from trilane.hw_profiles.schema import KEY_OF_RATE, MOST_ERROR_SCALE, NORMAL_80, Profile, corners_of
 from trilane.units import BURST, UnitName
 
 Command = Callable[..., tuple[str, str]]
@@ -44,12 +47,17 @@ WORKS = {
         for side in (128, 512)
     },
 }
+MORE_WORKS = {
+    f"{encoder}-{norm}": network_work(NetworkSpec(encoder, norm, 256, 256, 8))
+    for encoder in ("resnet18", "mobilenetv2", "efficientnet-lite0")
+    for norm in ("batch", "instance")
+}
 
 
 def row(
     network: str, ms: float = 1.0, unit: UnitName = "dsp", runtime: Any = "tflite", precision: str = "int8"
 ) -> OwnRow:
-    return OwnRow(network, network, WORKS[network], ms, unit, precision, runtime)
+    return OwnRow(network, network, (WORKS | MORE_WORKS)[network], ms, unit, precision, runtime)
 
 
 def priced(profile: Profile, asked: OwnRow) -> float:
@@ -150,6 +158,103 @@ def test_a_unit_without_an_engine_has_one_factor() -> None:
     moved = parse_profile(calibrate_tables(data, path, rows).data, path)
     for each in rows:
         assert priced(moved, each) / priced(profile, each) == pytest.approx(np.exp(there), rel=1e-6)
+
+
+def test_the_scale_of_the_error_by_hand() -> None:
+    """Without misses t has one degree of freedom, so its quantile is tan(0.4 pi). Misses of 2 and -1: the variance is
+    (1 + 4 + 1) / 3, and t of three degrees is within 1.6377 with 80 % (tables of Student's t)."""
+    assert error_scale([]) == pytest.approx(np.tan(0.4 * np.pi) / NORMAL_80)
+    assert error_scale([2, -1]) == pytest.approx(1.6377 * np.sqrt(2) / NORMAL_80, rel=1e-4)
+    assert error_scale([1.0] * 1000) == pytest.approx(1, rel=2e-3)
+    assert error_scale([1e6, 1e6]) == MOST_ERROR_SCALE
+
+
+@pytest.mark.parametrize("rows", [1, 2, 5, 20])
+def test_intervals_of_chips_of_the_stated_model_hold_in_80_of_100(rows: int) -> None:
+    """A chip's variance is drawn as 1 / chi-square of one degree, and its misses are normal. Whatever was told, the
+    interval then holds with 80 %, so chips whose scale ends at the limit can be left out. The bound is four deviations
+    of the binomial distribution."""
+    rng, chips = np.random.default_rng(rows), 20_000
+    deviations = 1 / np.abs(rng.standard_normal(chips))
+    told, new = rng.standard_normal((rows, chips)) * deviations, rng.standard_normal(chips) * deviations
+    scales = np.array([error_scale(list(each)) for each in told.T])
+    free = scales < MOST_ERROR_SCALE
+    inside = np.abs(new[free]) <= NORMAL_80 * scales[free]
+    assert free.mean() > 0.8
+    assert abs(inside.mean() - 0.8) < 4 * np.sqrt(0.16 / free.sum())
+
+
+def around(low: float, high: float) -> Interval:
+    return Interval(low, high, ())
+
+
+def test_misses_are_those_of_other_rows_of_the_unit() -> None:
+    """Twice as long as predicted, and the interval ends at twice the prediction: NORMAL_80 stated errors."""
+    two = Checked(row("resnet18", 4.0), 1.0, around(1, 1), 2.0, around(1, 4))
+    same = Checked(row("resnet18", 2.0), 1.0, around(1, 1), 2.0, around(1, 4))
+    lonely = Checked(row("resnet18", 9.0, unit="gpu"), 1.0, around(1, 1), 2.0, around(1, 4))
+    left_out = [two, same, lonely]
+    assert misses(left_out, "dsp") == pytest.approx([NORMAL_80, 0])
+    assert misses(left_out, two) == [0]
+    assert misses(left_out, same) == pytest.approx([NORMAL_80])
+    assert misses(left_out, "gpu") == [] == misses(left_out, lonely)
+
+
+def test_the_moved_profile_states_the_scaled_error(tables: tuple[dict[str, Any], Path]) -> None:
+    """Its intervals are `error_scale` times as wide as those of the same profile without."""
+    data, path = tables
+    rows = [row(name, 1.0 + place) for place, name in enumerate(WORKS)]
+    moved = calibrate_tables(data, path, rows)
+    scale, spread = moved.numbers["units.dsp.error_scale"]
+    assert scale > 1 and spread == pytest.approx(np.sqrt(1 / 12))
+    without = copy.deepcopy(dict(moved.data))
+    del without["units"]["dsp"]["error_scale"]
+    asked = row("resnet18-512", runtime="qnn_dlc")
+    wide, narrow = (stated(parse_profile(each, path), asked) for each in (moved.data, without))
+    assert spread_of(wide) == pytest.approx(scale * spread_of(narrow))
+    assert any(f"by {scale:.2g}" in reason for reason in wide.why) and len(wide.why) == len(narrow.why) + 1
+
+
+def test_a_scale_that_the_profile_states_counts(tables: tuple[dict[str, Any], Path]) -> None:
+    """Rows as predicted have no misses, so what is left is the statement: twice the scale if it said 2."""
+    data, path = tables
+    told = copy.deepcopy(data)
+    told["units"]["dsp"]["error_scale"] = {"value": 2.0, "kind": "assumed", "source": "a test"}
+    rows = [row(name)._replace(ms=priced(parse_profile(data, path), row(name))) for name in WORKS]
+    scales = [calibrate_tables(each, path, rows).numbers["units.dsp.error_scale"][0] for each in (data, told)]
+    assert scales == pytest.approx([error_scale([0] * 5), 2 * error_scale([0] * 5)])
+
+
+def stated(profile: Profile, asked: OwnRow) -> Interval:
+    chip = on_chip(profile, asked)
+    return interval(chip, asked.work, price(chip, asked.work, asked.unit, corners_of(chip, BURST)))
+
+
+@pytest.mark.parametrize("times", [0.7, 1, 2])
+def test_a_chip_drawn_from_the_prior_lies_in_its_intervals(times: float, tables: tuple[dict[str, Any], Path]) -> None:
+    """Its rates are drawn from the prior, and its rows are off by so many times the stated error, which the fit is not
+    told. By hand for 0.7: the scale is ((1 + 5 * 0.49) / 6)^(1/2) = 0.76, and t of six degrees is within 1.44, so the
+    interval ends at 1.56 deviations, which is 88 %."""
+    data, path = tables
+    rng, engine = np.random.default_rng(8), "int8_tflite"
+    root = np.linalg.cholesky(prior_covariance([engine]))
+    names, held = [*WORKS, *MORE_WORKS], []
+    for _ in range(30):
+        chip = copy.deepcopy(data)
+        rates = chip["units"]["dsp"]["engines"][engine]["rates"]
+        for (key, _), deviation in zip(KEY_OF_RATE.values(), root @ rng.standard_normal(6), strict=True):
+            rates[key]["value"] *= np.exp(deviation if key.endswith("_us") else -deviation)
+        there = parse_profile(chip, path)
+        rows = []
+        for name in names:
+            noise = times * spread_of(stated(there, row(name))) * rng.standard_normal()
+            rows.append(row(name, priced(there, row(name)) * float(np.exp(noise))))
+        order = rng.permutation(len(rows))
+        moved = parse_profile(calibrate_tables(data, path, [rows[place] for place in order[:5]]).data, path)
+        for place in order[5:]:
+            span = stated(moved, rows[place])
+            held.append(span.low_ms <= rows[place].ms <= span.high_ms)
+    assert 0.7 <= np.mean(held) <= 0.9
 
 
 TABLE = "network,ms,precision,runtime\n"
