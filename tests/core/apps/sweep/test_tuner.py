@@ -99,9 +99,7 @@ def swept(request: pytest.FixtureRequest) -> tuple[Space, dict[str, Record]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("goal", "keeps"), [("latency", ("power<2.5W", "fps>=30")), ("fps", ("power<3W",)), ("energy", ("fps>=30",))]
-)
+@pytest.mark.parametrize(("goal", "keeps"), [("latency", ("power<2.5W", "fps>=30")), ("energy", ("fps>=30",))])
 def test_a_search_comes_within_2_percent_of_a_sweep_of_a_chip(
     goal: str, keeps: tuple[str, ...], swept: tuple[Space, dict[str, Record]]
 ) -> None:
