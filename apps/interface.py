@@ -8,10 +8,11 @@ an HTML table, in which every value is escaped.
 from __future__ import annotations
 
 import inspect
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.apps.explain.explained_run import COLUMNS, explain_run, figure_names, job_rows, open_journal
+from trilane.apps.old_names import in_new_name
 from trilane.apps.predict.predict_options import OF_A_PIPELINE_ALONE, PredictOptions
 from trilane.apps.run.asked_run import run_asked
 from trilane.apps.run.report import Report, read_report
@@ -174,7 +176,7 @@ def run(
     from trilane.pipeline.pipeline_file import is_pipeline_file
 
     parameters = inspect.signature(run).parameters
-    given = inspect.signature(run).bind(scene, **options).arguments
+    given = inspect.signature(run).bind(scene, **_in_new_names("run", options)).arguments
     asked = RunOptions.checked(given if is_pipeline_file(Path(scene)) else DEFAULTS | given)
     told = (f"{name}={value!r}" for name, value in given.items() if value != parameters[name].default)
     hooks = Hooks(on_progress or (lambda *_: None), on_message or (lambda _: None))
@@ -272,16 +274,17 @@ def predict(
 
     `profile`: a hardware profile, by name or file. `options`: fields of
     `trilane.apps.predict.predict_options.PredictOptions` in `PREDICTED`; `trilane predict --help` explains them.
-    `avatar`: the application with this avatar's network. `network`: an ONNX file by itself, or with `application` in
-    the avatar's application. Without either, the application with a network of `encoder`, `norm`, `size`, `channels`.
+    `avatar`: the application with this avatar's network, `default` if not given. `network`: an ONNX file by itself, or
+    with `application` in the avatar's application. `encoder`, `norm`, `size` or `channels`: the published application.
     `on_message(text)`: function that is called before this machine is measured for the profile `host`, which may take
     half a minute.
     Raises BadInputError.
     """
     from trilane.apps.predict import asked_prediction as asked
+    from trilane.avatars.bundle import DEFAULT
     from trilane.hw_profiles.profile_files import load_runnable
 
-    given = inspect.signature(predict).bind(profile, **options).arguments
+    given = inspect.signature(predict).bind(profile, **_in_new_names("predict", options)).arguments
     wanted = PredictOptions.checked({name: value for name, value in given.items() if value is not None})
     wanted.check_together()
     chip, say = load_runnable(wanted.profile), on_message or (lambda _: None)
@@ -294,12 +297,19 @@ def predict(
     chip, plan = asked.application_of(chip, wanted, say)
     answer = asked.answer_of(chip, plan, wanted)
     frame = answer["frame_time_ms"]
-    what = wanted.avatar or (str(wanted.network[0]) if wanted.network else f"{wanted.encoder}, {wanted.size}")
+    published = f"{wanted.encoder}, {wanted.size}" if wanted.is_published else wanted.avatar or DEFAULT
+    what = str(wanted.network[0]) if wanted.network else published
     times = (frame["mean"], frame["low"], frame["high"])
     return Prediction(answer, chip.name, what, *times, answer["latency_ms"]["mean"], answer["power_w"])
 
 
 predict.__signature__ = _signature(predict, PredictOptions, PREDICTED)  # type: ignore[attr-defined]
+
+
+def _in_new_names(command: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of a program with new names for old ones, each of which is a DeprecationWarning."""
+    warned = partial(warnings.warn, category=DeprecationWarning, stacklevel=5)  # at the caller of `run` or `predict`
+    return {in_new_name(command, name, value, warned): value for name, value in options.items()}
 
 
 def _place(where: str, given: str | Path) -> Path:

@@ -24,7 +24,7 @@ from trilane.scheduler.virtual import Simulation, simulate
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import AFTER_INFER, BEFORE_INFER, INFER, LATENCY_TO, NS_PER_MS, UNITS, UnitName
 
-RUNTIMES: tuple[UnitName, ...] = ("gpu", "dsp")
+NETWORK_UNITS: tuple[UnitName, ...] = ("gpu", "dsp")
 PACKED_BYTES_PER_PIXEL = 16
 #: Frames of a simulated run: for shares of time, for a frame time alone, and where dropped frames vary the intervals.
 FRAMES, QUICK_FRAMES, FRAMES_WITH_DROPS = 192, 12, 480
@@ -54,7 +54,7 @@ REFERENCE = Variant()
 class Plan:
     """One application on one chip.
 
-    `network`: network that runs. `runtime`: unit that runs it, gpu or dsp. `variant`: how the stages are joined.
+    `network`: network that runs. `unit`: unit that runs it, gpu or dsp. `variant`: how the stages are joined.
     `gpu_share`: part of the network's products that the GPU does while the DSP does the rest, 0 to below 1. `most_fps`:
     rate that the application is held to, as by a display; None for the display's own. Policies that release frames at a
     rate have the rate in their variant. `stretch`: factor on the network's expected time. `avatars`: number of avatars
@@ -62,7 +62,7 @@ class Plan:
     """
 
     network: Network
-    runtime: UnitName
+    unit: UnitName
     variant: Variant = REFERENCE
     gpu_share: float = 0.0
     most_fps: float | None = None
@@ -70,8 +70,8 @@ class Plan:
     avatars: int = 1
 
     def __post_init__(self) -> None:
-        if self.runtime not in RUNTIMES:
-            raise BadInputError("runtime", repr(self.runtime), "gpu or dsp")
+        if self.unit not in NETWORK_UNITS:
+            raise BadInputError("unit", repr(self.unit), "gpu or dsp")
         if self.variant.policy not in POLICIES:
             raise BadInputError("policy", repr(self.variant.policy), "one of " + ", ".join(POLICIES))
         if not 1 <= self.variant.batch <= 64:
@@ -82,19 +82,19 @@ class Plan:
             raise BadInputError("fps", f"{self.most_fps:g}", f"{LEAST_FPS:g} to {MOST_FPS:g}")
         if self.avatars < 1:
             raise BadInputError("avatars", str(self.avatars), "at least 1")
-        if not 0 <= self.gpu_share < 1 or (self.gpu_share and self.runtime == "gpu"):
-            raise BadInputError("gpu-share", f"{self.gpu_share:g} on {self.runtime}", "0 to below 1, on the dsp")
+        if not 0 <= self.gpu_share < 1 or (self.gpu_share and self.unit == "gpu"):
+            raise BadInputError("gpu-share", f"{self.gpu_share:g} on {self.unit}", "0 to below 1, on the dsp")
 
 
-def isolated_job_time(profile: Profile, network: Network, runtime: UnitName, corners: Corners) -> JobTime:
+def isolated_job_time(profile: Profile, network: Network, unit: UnitName, corners: Corners) -> JobTime:
     """Return the time of one frame's job when the network runs continuously and nothing else does, as in a benchmark.
 
     `profile`: hardware profile of the chip.
     `network`: network that runs.
-    `runtime`: the unit that runs it.
+    `unit`: the unit that runs it.
     `corners`: corner of each unit.
     """
-    return _job(profile, network.work, runtime, corners, contended=False)
+    return _job(profile, network.work, unit, corners, contended=False)
 
 
 def _job(
@@ -142,8 +142,8 @@ def _network_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple[st
     handover = profile.application.handover_ms.or_else(0)
     work, batch = plan.network.work, plan.variant.batch
     if not plan.gpu_share:
-        job = _job(profile, work, plan.runtime, corners, batch=batch)
-        return {("infer", plan.runtime): handover + plan.stretch * job.total_ms}
+        job = _job(profile, work, plan.unit, corners, batch=batch)
+        return {("infer", plan.unit): handover + plan.stretch * job.total_ms}
     head, tail = split_work(work, plan.gpu_share)
     return {
         ("infer_head", "gpu"): handover + plan.stretch * _job(profile, head, "gpu", corners, batch=batch).total_ms,

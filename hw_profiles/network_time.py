@@ -221,7 +221,7 @@ def under_runtime(profile: Profile, unit: UnitName, runtime: EngineRuntime | Non
         ]
         expected = ", or ".join(known) or "a chip with a tensor engine"
         remedy = f"without it the {unit} is priced as its profile says"
-        raise BadInputError("--engine-runtime", found, expected, remedy)
+        raise BadInputError("--runtime", found, expected, remedy)
     return profile.model_copy(update={"units": {**profile.units, unit: changed}})
 
 

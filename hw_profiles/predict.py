@@ -13,8 +13,8 @@ from typing import Any
 
 from trilane.hw_profiles.application import (
     MOST_FPS,
+    NETWORK_UNITS,
     REFERENCE,
-    RUNTIMES,
     Plan,
     Steady,
     Variant,
@@ -88,8 +88,8 @@ def predict(
     moments = over_time(profile, plan, performance_profile, minutes, governor) if minutes else []
     frame = _mean([m.frame_ms for m in moments]) if moments else now.frame_ms
     power = _mean([m.power_w for m in moments]) if moments else _settled_power_w(profile, now, corners)
-    job = isolated_job_time(profile, plan.network, plan.runtime, corners)
-    around = interval(profile, plan.network.work, price(profile, plan.network.work, plan.runtime, corners))
+    job = isolated_job_time(profile, plan.network, plan.unit, corners)
+    around = interval(profile, plan.network.work, price(profile, plan.network.work, plan.unit, corners))
     times = unheld_times(profile, plan, corners, around, job.total_ms)
     answer = {
         "schema": 1,
@@ -119,7 +119,7 @@ def predict(
         **({} if placed is None else {"placement": placed.facts}),
         "notes": _notes(profile, plan, placed),
     }
-    return with_known_intervals(profile, plan.runtime, answer) if profile.name == HOST else answer
+    return with_known_intervals(profile, plan.unit, answer) if profile.name == HOST else answer
 
 
 def predicted_run(
@@ -134,24 +134,24 @@ def predicted_run(
 
 
 def what_if(
-    profile: Profile, network: Network, runtime: UnitName, performance_profile: str, fps: float | None = None
+    profile: Profile, network: Network, unit: UnitName, performance_profile: str, fps: float | None = None
 ) -> list[dict[str, Any]]:
-    """Return the same network under every row of `ALTERNATIVES` that the runtime allows.
+    """Return the same network under every row of `ALTERNATIVES` that the unit allows.
 
     With `fps` it is every policy with every edge at that rate; rows then say whether it holds and at which power.
     `profile`: hardware profile of the chip.
     `network`: network that runs.
-    `runtime`: unit that runs it, gpu or dsp.
+    `unit`: unit that runs it, gpu or dsp.
     `performance_profile`: its name; raises BadInputError for an unknown one.
     `fps`: the rate, frames a second; None for no rate.
     """
     corners = corners_of(profile, performance_profile)
     if fps is not None:
-        return [at_rate(profile, Plan(network, runtime, variant), corners, fps) for variant in every_variant()]
+        return [at_rate(profile, Plan(network, unit, variant), corners, fps) for variant in every_variant()]
     rows = []
     for name, variant, share in ALTERNATIVES:
-        if not share or runtime == "dsp":
-            now = steady(profile, Plan(network, runtime, variant, share), corners)
+        if not share or unit == "dsp":
+            now = steady(profile, Plan(network, unit, variant, share), corners)
             means = {"name": name, "policy": variant.policy, "edge": variant.edge}
             rows.append({**means, "frame_ms": now.frame_ms, "fps": 1e3 / now.frame_ms, "latency_ms": now.latency_ms})
     return rows
@@ -194,7 +194,7 @@ def _settled_on(
 
 def _notes(profile: Profile, plan: Plan, placed: Placed | None) -> list[str]:
     """Return what a reader of the figures must know of the profile, the policy and the placement."""
-    notes, variant, measured = [], plan.variant, profile.units[plan.runtime].measured
+    notes, variant, measured = [], plan.variant, profile.units[plan.unit].measured
     if POLICIES[variant.policy].paced:
         notes.append(
             f"under {variant.policy}, {variant.fps:g} frames are released a second, whether there is room or not"
@@ -219,7 +219,7 @@ def _on_one_core(profile: Profile, one: UnitName, other: UnitName) -> bool:
 
 
 def _expected_error(profile: Profile, plan: Plan, job: JobTime) -> dict[str, float]:
-    error = relative_error(job, profile.units[plan.runtime])
+    error = relative_error(job, profile.units[plan.unit])
     return {"expected_error": error, "confidence": max(0.0, 1 - error)}
 
 
@@ -250,7 +250,7 @@ def _config(plan: Plan, performance_profile: str, minutes: float, governor: str)
         "size": f"{network.height}x{network.width}",
         "channels": network.channels,
         "layout": network.layout,
-        "runtime": plan.runtime,
+        "unit": plan.unit,
         "policy": variant.policy,
         "edge": variant.edge,
         "batch": variant.batch,
@@ -282,16 +282,16 @@ def _mean(values: Sequence[float]) -> float:
 def _row_predictions(profile: Profile, network: Network, corners: Corners, variant: Variant) -> dict[str, Any]:
     predictions: dict[str, Any] = {}
     errors = []
-    for runtime in RUNTIMES:
-        alone = isolated_job_time(profile, network, runtime, corners)
-        frame = steady(profile, Plan(network, runtime, variant), corners, quick=True).frame_ms
+    for unit in NETWORK_UNITS:
+        alone = isolated_job_time(profile, network, unit, corners)
+        frame = steady(profile, Plan(network, unit, variant), corners, quick=True).frame_ms
         low, high = ema_range_ms(profile, frame)
-        errors.append(relative_error(alone, profile.units[runtime]))
-        predictions |= {f"bench_{runtime}_ms": alone.total_ms, f"app_{runtime}_ms": frame}
-        predictions |= {f"app_{runtime}_ms_min": low, f"app_{runtime}_ms_max": high}
-        predictions[f"expected_error_{runtime}"] = errors[-1]
+        errors.append(relative_error(alone, profile.units[unit]))
+        predictions |= {f"bench_{unit}_ms": alone.total_ms, f"app_{unit}_ms": frame}
+        predictions |= {f"app_{unit}_ms_min": low, f"app_{unit}_ms_max": high}
+        predictions[f"expected_error_{unit}"] = errors[-1]
     answer = {**predictions, "confidence": max(0.0, 1 - _mean(errors))}
-    return with_known_intervals(profile, RUNTIMES[-1], answer) if profile.name == HOST else answer
+    return with_known_intervals(profile, NETWORK_UNITS[-1], answer) if profile.name == HOST else answer
 
 
 def _cells(row: ConfigurationRow) -> dict[str, Any]:
@@ -325,7 +325,7 @@ def unheld_times(profile: Profile, plan: Plan, corners: Corners, around: Interva
     display = profile.application.display_ms.model_copy(update={"value": 1e3 / MOST_FPS})
     free = profile.model_copy(update={"application": profile.application.model_copy(update={"display_ms": display})})
     stretches = (1.0, around.low_ms / network_ms, around.high_ms / network_ms)
-    if profile.units[plan.runtime].measured is not None:
+    if profile.units[plan.unit].measured is not None:
         frame_ms = steady(free, _unheld(plan), corners, quick=True).frame_ms
         return FrameInterval(*(stretch * frame_ms for stretch in stretches))
     plans = (replace(_unheld(plan), stretch=stretch) for stretch in stretches)
@@ -368,7 +368,7 @@ def power_of(profile: Profile, plan: Plan, corners: Corners, around: Interval) -
     `around`: interval of the network's time; the busy share of its unit has the same relative error.
     """
     busy = steady(profile, plan, corners).busy
-    return device_power(profile, busy, corners, {plan.runtime: spread_of(around)})
+    return device_power(profile, busy, corners, {plan.unit: spread_of(around)})
 
 
 def _settled_power_w(profile: Profile, now: Steady, corners: Corners) -> float:

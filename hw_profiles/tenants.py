@@ -18,7 +18,7 @@ from trilane.errors import BadInputError
 from trilane.hw_profiles.application import (
     LEAST_FPS,
     MOST_FPS,
-    RUNTIMES,
+    NETWORK_UNITS,
     Plan,
     Variant,
     application_graph,
@@ -162,8 +162,8 @@ class Tenant:
     computes: Computes = AS_IT_SAYS
 
     def __post_init__(self) -> None:
-        if self.unit not in RUNTIMES:
-            raise BadInputError(f"{self.name}: unit", repr(self.unit), " or ".join(RUNTIMES))
+        if self.unit not in NETWORK_UNITS:
+            raise BadInputError(f"{self.name}: unit", repr(self.unit), " or ".join(NETWORK_UNITS))
         check_rate(self.name, self.fps)
 
     @property

@@ -39,6 +39,8 @@ from trilane.units import HOST
 
 ROOM = "room"
 COMMAND_LINE = "command line"
+#: Options of a run that have another name than their key of a scene.
+KEYS = {"picture": "output"}
 
 GlFacts = Callable[[], dict[str, Any] | None]
 
@@ -75,13 +77,14 @@ def requested_scene(options: RunOptions) -> Scene:
     values = load_scene(find_scene(options.scene))
     here = Path.cwd()
     as_keys: dict[str, Callable[[str], Any]] = {
-        "output": _output,
+        "picture": _picture,
         "background": lambda text: located(text, here),
         "camera": lambda text: _camera(values["camera"], located(text, here)),
     }
     for name, value in options:
-        if name in Scene.model_fields and value is not None:
-            values[name] = as_keys[name](value) if name in as_keys else value
+        key = KEYS.get(name, name)
+        if key in Scene.model_fields and value is not None:
+            values[key] = as_keys[name](value) if name in as_keys else value
     first = dict(values["avatars"][0])
     if options.motion is not None:
         first |= {"motion": located(options.motion, here), "up_axis": "auto", "units": "auto"}
@@ -97,11 +100,11 @@ def _camera(values: Mapping[str, Any], source: str) -> dict[str, Any]:
     return {key: value for key, value in values.items() if key not in dropped} | {"source": source}
 
 
-def _output(text: str) -> dict[str, int]:
+def _picture(text: str) -> dict[str, int]:
     """Parse WIDTHxHEIGHT as the scene's `output`. Raises BadInputError."""
     match = re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", text)
     if match is None:
-        raise BadInputError("--output", repr(text), "WIDTHxHEIGHT in pixels, such as 640x480")
+        raise BadInputError("--picture", repr(text), "WIDTHxHEIGHT in pixels, such as 640x480")
     return {"width": int(match[1]), "height": int(match[2])}
 
 

@@ -120,7 +120,7 @@ class RunOptions(Options):
         default=None, description="Number of frames; the scene's if not given."
     )
     fps: Finite | None = Field(default=None, description="Frames a second of the scene's time, and of the video.")
-    output: str | None = Field(default=None, description="Size of the picture in pixels: WIDTHxHEIGHT.")
+    picture: str | None = Field(default=None, description="Size of the picture in pixels: WIDTHxHEIGHT.")
     size: Annotated[Text | None, Option(offered=("auto", "96", "128", "192", "256", "384", "512"))] = Field(
         default=None, description=f"{SIZE_HELP} auto: the size at which the network paints best."
     )

@@ -41,7 +41,7 @@ EPILOG_LEVELS = "\b\nExamples:\n  trilane avatar levels my-avatar"
 EPILOG_CREATE_DATA = """\b
 Examples:
   trilane avatar create-data my-capture
-  trilane avatar create-data noisy --frames 400 --output 1920x1080 --fit-deg 1 --fit-mm 5 --mask-px 3
+  trilane avatar create-data noisy --frames 400 --picture 1920x1080 --fit-deg 1 --fit-mm 5 --mask-px 3
 """
 EPILOG_CHECK_DATA = """\b
 Examples:
@@ -108,7 +108,7 @@ def levels(name: AvatarArgument, json: JsonOption = False) -> None:
 def create_data(
     folder: Annotated[Path, typer.Argument(help="Folder to write; it must not be there yet, or be empty.")],
     frames: Annotated[int, typer.Option(min=4, max=MOST_FRAMES, help="Number of frames, from all sides.")] = 120,
-    output: Annotated[str, typer.Option(help="Size of a frame in pixels: WIDTHxHEIGHT.")] = "1280x720",
+    picture: Annotated[str, typer.Option(help="Size of a frame in pixels: WIDTHxHEIGHT.")] = "1280x720",
     seed: Annotated[int, typer.Option(min=0, help="Seed of poses, views and noise.")] = 1,
     fit_deg: Annotated[
         float, typer.Option(min=0, max=45, help="Turn joints of the fits by up to so many degrees.")
@@ -133,7 +133,7 @@ def create_data(
     from trilane.training.clothing.looks import look_named
     from trilane.writing import write_folder
 
-    recipe = Recipe(frames, _shape(output), seed, fit_deg, fit_mm, mask_px, look)
+    recipe = Recipe(frames, _shape(picture), seed, fit_deg, fit_mm, mask_px, look)
     betas = look_named(look).betas
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise BadInputError(folder, "files" if folder.is_dir() else "a file", "a folder that is not there yet")
@@ -223,11 +223,11 @@ def _state_cost(capture: SyntheticCapture, recipe: Recipe) -> None:
 
 
 def _shape(text: str) -> Shape:
-    """Return (height, width) of `--output`. Raises BadInputError."""
+    """Return (height, width) of `--picture`. Raises BadInputError."""
     match = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", text)
     if match is None or not all(LEAST_SIDE <= int(side) <= MOST_SIDE for side in match.groups()):
         expected = f"WIDTHxHEIGHT in pixels, each from {LEAST_SIDE} to {MOST_SIDE}, such as 1280x720"
-        raise BadInputError("--output", repr(text), expected)
+        raise BadInputError("--picture", repr(text), expected)
     return int(match[2]), int(match[1])
 
 

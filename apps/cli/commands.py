@@ -22,7 +22,6 @@ from trilane.apps.predict.predict_options import ENCODER_HELP, FIXED_SIZE_HELP, 
 from trilane.errors import BadInputError, did_you_mean
 from trilane.options import Options, element_of, expected, kind_of, limits_of, option_of
 from trilane.stages.run_options import AVATARS_HELP, PROFILE_HELP, WIDTH_HELP, RunOptions
-from trilane.units import PerformanceProfile
 
 #: Name of the attribute of a command's function that holds its model of options.
 OPTIONS = "options_model"
@@ -31,6 +30,10 @@ IN_PLAIN_WORDS = {"a valid number": "a number", "a valid integer": "a whole numb
 POLICY_HELP = "sequential, pipelined, latest or deadline."
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")]
 OutFileOption = Annotated[Path, typer.Option("--out", help="File to write.")]
+NewestRunArgument = Annotated[
+    Path | None,
+    typer.Argument(help="Run folder, its journal, or its name below runs/; the newest below runs/ if none is given."),
+]
 PortOption = Annotated[
     int | None, typer.Option(min=1024, max=65535, help="Port of this machine to listen on; a free one if none.")
 ]
@@ -162,21 +165,7 @@ SceneAvatarOption = Annotated[str | None, _described(RunOptions, "avatar")]
 
 SceneSizeOption = Annotated[str | None, _described(RunOptions, "size")]
 
-MotionOption = Annotated[str | None, _described(RunOptions, "motion")]
-
-CameraOption = Annotated[str | None, _described(RunOptions, "camera")]
-
-FpsOption = Annotated[float | None, _described(RunOptions, "fps")]
-
-OutputOption = Annotated[str | None, _described(RunOptions, "output")]
-
-SkinningOption = Annotated[str, _described(RunOptions, "skinning")]
-
-CoresOption = Annotated[list[str] | None, _described(RunOptions, "cores")]
-
 PerformanceProfileOption = typer.Option(help=RunOptions.model_fields["performance_profile"].description)
-
-PerformanceProfileChoice = Annotated[PerformanceProfile, PerformanceProfileOption]
 
 # An avatar and its network.
 AvatarArgument = Annotated[str, typer.Argument(help=AVATARS_HELP)]

@@ -75,6 +75,11 @@ def say(text: str) -> None:
     stderr_console().print(text, soft_wrap=True)
 
 
+def note(text: str) -> None:
+    """Print what a person should know although nothing is wrong, on one line."""
+    stderr_console().print(without_controls(f"note: {text}"), soft_wrap=True, markup=False)
+
+
 @contextmanager
 def stdout_kept() -> Iterator[None]:
     """Redirect file descriptor 1 to stderr inside the block, because the output of libraries is not a result."""

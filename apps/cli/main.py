@@ -17,6 +17,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from trilane.apps.old_names import in_new_names
 from trilane.errors import TrilaneError, install_line, reason
 from trilane.memory import require_memory, shortage
 from trilane.signals import interrupting
@@ -24,24 +25,25 @@ from trilane.signals import interrupting
 #: Command: its module, and the line that `trilane --help` shows for it.
 COMMANDS = {
     "run": ("trilane.apps.cli.run", "Run a scene on the three units and write a run folder."),
-    "dashboard": ("trilane.apps.cli.watch", "Show a finished run in a browser."),
-    "top": ("trilane.apps.cli.watch", "Show the live figures of a run in a terminal."),
-    "trace": ("trilane.apps.cli.watch", "Write the timeline of a run for Perfetto or Chrome."),
-    "report": ("trilane.apps.cli.report", "One page of many runs: what each speed costs in image error."),
-    "compare": ("trilane.apps.cli.compare", "Say what differs between runs, by how much and why."),
-    "explain": ("trilane.apps.cli.explain", "Explain the plan of a scene, or where the time of a run went."),
-    "inspect": ("trilane.apps.cli.inspect", "Say what any file is, what was detected, and what to do about it."),
-    "body": ("trilane.apps.cli.body", "Look into body files, pose them, build one."),
-    "avatar": ("trilane.apps.cli.avatar", "Look into avatars, export and quantise their networks."),
-    "bench": ("trilane.apps.cli.bench", "Measure this machine: raster, readback, crop and more."),
-    "accuracy": ("trilane.apps.cli.accuracy", "Compare runtimes on a scene, and with float on hard cases."),
     "predict": ("trilane.apps.cli.predict", "Predict frame time, idleness, heat and energy on a chip."),
+    "plan": ("trilane.apps.cli.plan", "Say what a scene models, what is left out, and what that saves."),
+    "explain": ("trilane.apps.cli.explain", "Say where the time of a run went."),
+    "show": ("trilane.apps.cli.watch", "Show a finished run in a browser."),
+    "watch": ("trilane.apps.cli.watch", "Show the live figures of a run in a terminal."),
+    "trace": ("trilane.apps.cli.watch", "Write the timeline of a run for Perfetto or Chrome."),
+    "compare": ("trilane.apps.cli.compare", "Say what differs between runs, by how much and why."),
+    "report": ("trilane.apps.cli.report", "One page of many runs: what each speed costs in image error."),
+    "sweep": ("trilane.apps.cli.sweep", "Try many configurations of a command, on one machine or many."),
+    "tune": ("trilane.apps.cli.tune", "Find the fastest configuration that keeps what is asked, in few trials."),
+    "quality": ("trilane.apps.cli.quality", "Compare runtimes on a scene, and with float on hard cases."),
+    "inspect": ("trilane.apps.cli.inspect", "Say what any file is, what was detected, and what to do about it."),
     "init": ("trilane.apps.cli.init", "Write a first pipeline file for networks over a video."),
     "check": ("trilane.apps.cli.check", "Check a pipeline file: its graph, least period and memory."),
     "times": ("trilane.apps.cli.times", "Read what other tools measured: runs, layers, traces."),
-    "sweep": ("trilane.apps.cli.sweep", "Try many configurations of a command, on one machine or many."),
-    "tune": ("trilane.apps.cli.tune", "Find the fastest configuration that keeps what is asked, in few trials."),
+    "avatar": ("trilane.apps.cli.avatar", "Look into avatars, export and quantise their networks."),
+    "body": ("trilane.apps.cli.body", "Look into body files, pose them, build one."),
     "profiles": ("trilane.apps.cli.profiles", "List, show, check and fit the hardware profiles."),
+    "bench": ("trilane.apps.cli.bench", "Measure this machine: raster, readback, crop and more."),
     "doctor": ("trilane.apps.cli.doctor", "Say what this machine has, what is missing and how to install it."),
 }
 
@@ -185,6 +187,18 @@ def _call(arguments: list[str]) -> None:
         raise
 
 
+def _in_new_names(arguments: list[str]) -> list[str]:
+    """Return the command line with new names; each old one is told once, on stderr."""
+    notes: dict[str, None] = {}
+    words = in_new_names(arguments, notes.setdefault)
+    if notes:
+        from trilane.apps.cli.console import note
+
+        for text in notes:
+            note(text)
+    return words
+
+
 def main() -> None:
     """Run the command line of `sys.argv`; leaves by SystemExit with one of the exit codes."""
     if isinstance(sys.stdout, io.TextIOWrapper):
@@ -192,7 +206,7 @@ def main() -> None:
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1
     try:
-        _call(arguments)
+        _call(_in_new_names(arguments))
     except Exception as error:
         if debug:
             raise

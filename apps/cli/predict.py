@@ -25,16 +25,17 @@ app = Commands()
 
 EPILOG = """\b
 Examples:
+  trilane predict
   trilane predict --encoder resnet18 --size 512 --channels 16
-  trilane predict --runtime gpu --norm instance --minutes 30
+  trilane predict --unit gpu --norm instance --minutes 30
   trilane predict --policy pipelined --edge double --what-if
   trilane predict --policy latest --fps 24
   trilane predict --performance-profile burst --minutes 30 --plot temperature.svg
-  trilane predict --avatar default --runtime gpu
+  trilane predict --avatar hiker --unit gpu
   trilane predict --policy latest --fps 24 --trace predicted.pftrace
   trilane predict --network midas.onnx --network unet.onnx --profile snapdragon-8-gen-3
   trilane predict --network net.onnx --input-shape image=1x3x224x224 --precision w8a8
-  trilane predict --network net.onnx --engine-runtime qnn_dlc --performance-profile sustained_high_performance
+  trilane predict --network net.onnx --runtime qnn_dlc --performance-profile sustained_high_performance
   trilane predict --network net.onnx --fps 30 --minutes 30
   trilane predict --network net.onnx --power-limit-w 3
   trilane predict --network unet.onnx --application --fps 30 --what-if
@@ -52,8 +53,9 @@ PLOT_MINUTES = 30.0
 def predict(options: PredictOptions, *, json: JsonOption = False) -> None:
     """Predict frame time, idleness, heat and energy on a chip, with the error to expect.
 
-    Without --network, or with --application: the avatar's application. With --network: each network by itself. With a
-    pipeline file: that pipeline, by the times of its stages (docs/pipeline-file.md).
+    Without options: the avatar, policy and edge of `trilane run`. With --encoder, --norm, --size or --channels: the
+    published application with such a network. With --network: each network by itself, or with --application in the
+    avatar's place. With a pipeline file: that pipeline, by the times of its stages (docs/pipeline-file.md).
 
     Without --performance-profile, a network by itself has the profile burst, because published latencies have it. The
     profile `host` (this machine) has it too, because a run here has no cap.

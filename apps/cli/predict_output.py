@@ -65,7 +65,7 @@ def draw(chip: Profile, plan: Plan, asked: str, minutes: float, governor: str | 
     runs = {name: over_time(chip, plan, name, minutes, governor) for name in names}
     net = plan.network
     size = f"{net.height}x{net.width}x{net.channels}"
-    title = f"{chip.title}\n{', '.join(net.facts.values())}, {size} on the {plan.runtime}"
+    title = f"{chip.title}\n{', '.join(net.facts.values())}, {size} on the {plan.unit}"
     plot_over_time(runs, chip.thermal.skin_limit_c.or_else(0.0), title, path)
 
 
@@ -232,8 +232,9 @@ def _print_network(console: Console, answer: dict[str, Any]) -> None:
     console.print(f"{answer['machine']['title']} (virtual clock), {config['performance_profile']}; {RANGES}")
     console.print(
         f"{name}, {config['size']}x{config['channels']} {config['layout']} "
-        f"on the {config['runtime']}: {network['gmac']:.1f} GMAC, {network['parameters_m']:.1f} M parameters"
+        f"on the {config['unit']}: {network['gmac']:.1f} GMAC, {network['parameters_m']:.1f} M parameters"
     )
+    console.print(f"policy          {config['policy']}, edge {config['edge']}")
     if minutes := config["minutes"]:
         _print_settled(console, answer, minutes)
     span = _span(network["low_ms"], network["high_ms"], ".1f")

@@ -32,7 +32,7 @@ Examples:
   trilane run --motion walk.bvh --camera arkit.txt --frames 200 --json
   trilane run --latch 3
   trilane run --no-video --baseline 0 --frames 1000000
-  trilane run walk-past --policy latest --edge triple --fps 24 --output 1280x720
+  trilane run walk-past --policy latest --edge triple --fps 24 --picture 1280x720
   trilane run --cores cpu=1 --cores gpu=0 --cores dsp=0,1
   trilane run --split /Concat_4_output_0_QuantizeLinear_Output=cpu
   trilane run --performance-profile sustained_high_performance

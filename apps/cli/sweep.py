@@ -59,7 +59,7 @@ WordsArgument = Annotated[
     list[str],
     typer.Argument(
         metavar="FILE|COMMAND",
-        help="A sweep file (TOML), or run, predict, accuracy or bench NAME with its own arguments and options. "
+        help="A sweep file (TOML), or run, predict, quality or bench NAME with its own arguments and options. "
         "An option that is given several times is an axis.",
     ),
 ]
@@ -93,7 +93,7 @@ def sweep(
     dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Try many configurations of run, predict, accuracy or a bench, and keep every result.
+    """Try many configurations of run, predict, quality or a bench, and keep every result.
 
     Every combination of the axes is a trial, which is a process. Its line in trials.jsonl has the command's whole
     --json document. Trials on the host clock run one at a time, predictions on all cores. Finished trials are not
@@ -131,10 +131,11 @@ def of_file(
         raise BadInputError("options", f"--list, --random or --seed beside {path}", "kind, count and seed in the file")
     file = read_sweep(path)
     command = SweptCommand(file.command)
-    options = {name: command.converted(name, value, f"{path}: options") for name, value in file.options.items()}
+    fixed = command.in_new_names({name: (value,) for name, value in file.options.items()}, f"{path}: options")
+    options = {name: command.converted(name, value, f"{path}: options") for name, (value,) in fixed.items()}
     axes = {
         name: [command.converted(name, value, f"{path}: axes") for value in values]
-        for name, values in file.axes.items()
+        for name, values in command.in_new_names(file.axes, f"{path}: axes").items()
     }
     return path.stem, Definition(command.words, options, axes, file.kind, file.count, file.seed, file.repeats), command
 

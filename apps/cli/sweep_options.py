@@ -5,7 +5,7 @@ Rule: no second list of options exists. The command's own parser interprets name
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,10 @@ from typing import Any
 import typer
 
 from trilane.apps.cli.bench import BENCHES, bench_command
+from trilane.apps.cli.console import note
 from trilane.apps.cli.main import command_of
+from trilane.apps.old_names import COMMANDS as OLD_COMMANDS
+from trilane.apps.old_names import in_new_name
 from trilane.apps.sweep.definition import COMMANDS, Options, Value
 from trilane.errors import BadInputError, did_you_mean
 
@@ -32,9 +35,20 @@ class SweptCommand:
     """A command by its words. Raises BadInputError for a command that a sweep cannot try."""
 
     def __init__(self, words: Sequence[str]) -> None:
-        self.words = tuple(words)
+        first = words[0] if words else ""
+        self.words = (OLD_COMMANDS.get(first, first), *words[1:]) if words else ()
         self._command = _command(self.words)
         self._parameters = {_name(each): each for each in self._command.params if _name(each) not in NOT_SWEPT}
+
+    def in_new_names(self, given: Mapping[str, Sequence[Value]], where: str) -> dict[str, Sequence[Value]]:
+        """Return options with their values by new names for old ones. Raises BadInputError for one by both names."""
+        found: dict[str, Sequence[Value]] = {}
+        for old, values in given.items():
+            name = in_new_name(" ".join(self.words), old, next(iter(values), ""), note)
+            if name in found:
+                raise BadInputError(where, f"{name} twice", "it once", f"{old} is its old name" if old != name else "")
+            found[name] = values
+        return found
 
     def values_of(self, tokens: Sequence[str]) -> dict[str, list[Value]]:
         """Return the given values by name, in order. Raises BadInputError.

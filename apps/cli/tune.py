@@ -157,15 +157,17 @@ def _space(words: Sequence[str], axes: Sequence[str], chip: str | None) -> tuple
             found = "an axis profile" if "profile" in definition.axes else f"the command {' '.join(definition.command)}"
             raise BadInputError("--on", found, "predict without it", "a chip is predicted, not run")
         definition = replace(definition, options={**definition.options, "profile": command.converted("profile", chip)})
-    added = {}
+    added: dict[str, list[str]] = {}
     for each in axes:
         option, sign, values = each.partition("=")
         if not sign or not values:
             raise BadInputError("--axis", repr(each), "an option and its values, such as size=128,192,256")
         if option in added:
             raise BadInputError("--axis", f"{option} twice", "each axis once")
-        added[option] = [command.converted(option, value) for value in values.split(",")]
-    definition = replace(definition, axes={**definition.axes, **added})
+        added[option] = values.split(",")
+    named = command.in_new_names(added, "--axis")
+    typed = {option: [command.converted(option, value) for value in values] for option, values in named.items()}
+    definition = replace(definition, axes={**definition.axes, **typed})
     return name, definition, Space(definition, command.words_of)
 
 

@@ -1,4 +1,4 @@
-"""`trilane top`, `trilane dashboard` and `trilane trace`: views of one run, during it or after it.
+"""`trilane watch`, `trilane show` and `trilane trace`: views of one run, during it or after it.
 
 Rule: this file reads options and shows; the figures come from `trilane.apps.watch`, the page from
 `trilane.apps.dashboard`, the trace from `trilane.apps.tracing`.
@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trilane.apps.cli.commands import Commands, PortOption
+from trilane.apps.cli.commands import Commands, NewestRunArgument, PortOption
 from trilane.apps.cli.console import print_json, spinner, stderr_console, stdout_console
 from trilane.errors import BadInputError, MissingPartError
 
@@ -26,19 +26,15 @@ if TYPE_CHECKING:
     from trilane.apps.watch.live_figures import RunLook
 
 app = Commands()
-EPILOG_TOP = """\b
+EPILOG_WATCH = """\b
 Examples:
-  trilane top
-  trilane top runs/walk
-  trilane top walk --wait
-  trilane top --json --interval 5 >> figures.jsonl
-  trilane top runs/walk --once --json
-  trilane top runs/walk --openmetrics
+  trilane watch
+  trilane watch runs/walk
+  trilane watch walk --wait
+  trilane watch --json --interval 5 >> figures.jsonl
+  trilane watch runs/walk --once --json
+  trilane watch runs/walk --openmetrics
 """
-NewestRunArgument = Annotated[
-    Path | None,
-    typer.Argument(help="Run folder, its journal, or its name below runs/; the newest below runs/ if none is given."),
-]
 OnceOption = Annotated[bool, typer.Option("--once", help="Print the figures once, even if the run goes on.")]
 LooksOption = Annotated[
     bool, typer.Option("--json", help="Print a JSON document in a line for each look; with --once, one document.")
@@ -48,24 +44,24 @@ OpenMetricsOption = Annotated[
 ]
 WaitOption = Annotated[bool, typer.Option("--wait", help="Wait for a run that has not begun.")]
 IntervalOption = Annotated[float, typer.Option(min=0.1, max=3600, help="Seconds between two looks.")]
-EPILOG_DASHBOARD = """\b
+EPILOG_SHOW = """\b
 Examples:
-  trilane dashboard runs/20261122T101500Z-default
-  trilane dashboard runs/walk --port 8080
+  trilane show
+  trilane show runs/20261122T101500Z-default
+  trilane show runs/walk --port 8080
 """
-FolderArgument = Annotated[Path, typer.Argument(help="Folder of a run, or its name below runs/.")]
 EPILOG_TRACE = """\b
 Examples:
+  trilane trace
   trilane trace runs/20261122T101500Z-default
   trilane trace walk --chrome-json --out walk.json
 """
-RunArgument = Annotated[Path, typer.Argument(help="Run folder, or its name below runs/.")]
 ChromeOption = Annotated[bool, typer.Option("--chrome-json", help="Chrome's JSON instead of Perfetto's packets.")]
 OutOption = Annotated[Path | None, typer.Option("--out", help="File to write; trace.pftrace or trace.json in RUN.")]
 
 
-@app.command(epilog=EPILOG_TOP)
-def top(
+@app.command(epilog=EPILOG_WATCH)
+def watch(
     run: NewestRunArgument = None,
     once: OnceOption = False,
     json: LooksOption = False,
@@ -115,7 +111,7 @@ def _show(first: RunLook, rest: Iterator[RunLook]) -> None:
     """Show looks on a screen that is redrawn, or line by line where stdout is no terminal."""
     from rich.live import Live
 
-    from trilane.apps.cli.top_view import ending, heading, line, screen
+    from trilane.apps.cli.watch_view import ending, heading, line, screen
 
     console = stdout_console()
     if not console.is_terminal:
@@ -134,8 +130,8 @@ def _show(first: RunLook, rest: Iterator[RunLook]) -> None:
             live.update(screen(look, console.width), refresh=True)
 
 
-@app.command(epilog=EPILOG_DASHBOARD)
-def dashboard(run: FolderArgument, port: PortOption = None) -> None:
+@app.command(epilog=EPILOG_SHOW)
+def show(run: NewestRunArgument = None, port: PortOption = None) -> None:
     """Show a finished run in a browser: its pictures, timeline and figures at any moment.
 
     The page is at the printed address, for this machine alone, until the command is interrupted. For a live run, use
@@ -152,8 +148,8 @@ def dashboard(run: FolderArgument, port: PortOption = None) -> None:
 
     followed = follow(run)
     if followed.state is RunState.GOES_ON:
-        remedy = "`trilane top` shows it; start it with `trilane run --dashboard` to see it in a browser"
-        raise BadInputError(run, "a run that goes on", "one that is over", remedy)
+        remedy = "`trilane watch` shows it; start it with `trilane run --dashboard` to see it in a browser"
+        raise BadInputError(followed.folder, "a run that goes on", "one that is over", remedy)
     with closing(FinishedView(followed.folder)) as view, closing(listen(port)) as place:
         answers = DashboardApp(view, place.port, place.token)
         stderr_console().print(f"dashboard: {place.url}", soft_wrap=True, markup=False)
@@ -161,7 +157,7 @@ def dashboard(run: FolderArgument, port: PortOption = None) -> None:
 
 
 @app.command(epilog=EPILOG_TRACE)
-def trace(run: RunArgument, chrome_json: ChromeOption = False, out: OutOption = None) -> None:
+def trace(run: NewestRunArgument = None, chrome_json: ChromeOption = False, out: OutOption = None) -> None:
     """Write the timeline of a run, from its journal, for ui.perfetto.dev or chrome://tracing.
 
     docs/explain.md says what every track is.
@@ -171,7 +167,9 @@ def trace(run: RunArgument, chrome_json: ChromeOption = False, out: OutOption = 
 
     followed = follow(run)
     if out is None and followed.state is RunState.GOES_ON:
-        raise BadInputError(run, "a run that goes on", "--out FILE for its trace so far", "its folder is its own")
+        raise BadInputError(
+            followed.folder, "a run that goes on", "--out FILE for its trace so far", "its folder is its own"
+        )
     target = out or followed.folder / (CHROME_NAME if chrome_json else NAME)
     with spinner("writing the trace"):
         write_run(followed.whole(), target, chrome=chrome_json)

@@ -111,7 +111,7 @@ def read_side(text: str) -> Side:
 
 
 def read_told(name: str) -> ComparedRun:
-    """Read the run at the path `name`, or the run of this name that `trilane top` finds.
+    """Read the run at the path `name`, or the run of this name that `trilane watch` finds.
 
     Raises BadInputError naming what is missing, cut off or of another schema.
     """

@@ -48,7 +48,7 @@ ALWAYS = ("pose", "composite", "present")
 class PlanExplanation:
     """An explained plan.
 
-    `document`: keys of `trilane explain --json`. `plan`, `first_frames`: plan and first frame of each phase, to be
+    `document`: keys of `trilane plan --json`. `plan`, `first_frames`: plan and first frame of each phase, to be
     drawn.
     """
 

@@ -258,11 +258,11 @@ def part_text(part: Mapping[str, Any]) -> str:
 
 #: Stage of the avatar's pipeline -> what makes its work shorter.
 SHORTER = {
-    "pose": "`--skinning gpu` takes the vertices off the CPU; `trilane explain SCENE` says what a scene models",
+    "pose": "`--skinning gpu` takes the vertices off the CPU; `trilane plan SCENE` says what a scene models",
     "raster": "a smaller `--size` draws fewer texels",
     "infer": "a smaller `--size`, or another `--runtime`",
-    "composite": "a smaller `--output`",
-    "present": "a smaller `--output`: the picture is encoded there",
+    "composite": "a smaller `--picture`",
+    "present": "a smaller `--picture`: the picture is encoded there",
 }
 
 OF_CAUSES = {

@@ -1,6 +1,6 @@
 """The pipelines that `trilane predict` puts on one chip, from the command line: scenes, networks and pipeline files.
 
-Rule: as in `trilane explain`, a run's pose stage plans each frame of a scene; a network comes from its file. A pipeline
+Rule: as in `trilane plan`, a run's pose stage plans each frame of a scene; a network comes from its file. A pipeline
 file is read as for `trilane predict FILE.toml`, and no Python of it is imported.
 """
 
@@ -15,7 +15,7 @@ from trilane.apps.check.port_types import port_types, read_networks
 from trilane.apps.explain.scene_plan import ScenePlan
 from trilane.avatars.network_file import reshaped
 from trilane.errors import BadInputError
-from trilane.hw_profiles.application import LEAST_FPS, MOST_FPS, RUNTIMES, Variant
+from trilane.hw_profiles.application import LEAST_FPS, MOST_FPS, NETWORK_UNITS, Variant
 from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.network_time import Computes
 from trilane.hw_profiles.network_work import Network, count_work
@@ -84,10 +84,12 @@ def _rate(text: str, number: str) -> float:
 
 
 def _unit(text: str, asked_for: str) -> UnitName:
-    for unit in RUNTIMES:
+    for unit in NETWORK_UNITS:
         if unit == asked_for:
             return unit
-    raise BadInputError(_where(text), f"unit {asked_for!r}", " or ".join(RUNTIMES), "without the colon it is the dsp")
+    raise BadInputError(
+        _where(text), f"unit {asked_for!r}", " or ".join(NETWORK_UNITS), "without the colon it is the dsp"
+    )
 
 
 def tenants(texts: Sequence[str], variant: Variant = NEWEST, precision: str | None = None) -> list[Pipeline]:

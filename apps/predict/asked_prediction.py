@@ -7,7 +7,7 @@ measurements of `this_machine.py`. `say`: function that gets a message before so
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from trilane.apps.predict.predict_options import PredictOptions
 from trilane.apps.run.verdict_facts import predicted_verdict
@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from trilane.hw_profiles.application import Plan
     from trilane.hw_profiles.network_work import Network
     from trilane.hw_profiles.schema import Profile
+
+#: Note on a prediction without options that choose network, policy or edge.
+AS_RUN: Final = "the avatar, policy and edge are those of `trilane run` without options"
 
 
 def predict_networks(
@@ -60,17 +63,17 @@ def application_of(
     from trilane.hw_profiles.application import Plan
 
     chip, network = _network_of(chip, options, say)
-    return chip, Plan(network, options.unit, options.variant, options.gpu_share)
+    return chip, Plan(network, options.network_unit, options.variant, options.gpu_share)
 
 
 def _network_of(chip: Profile, options: PredictOptions, say: Callable[[str], None]) -> tuple[Profile, Network]:
-    from trilane.avatars.bundle import load_bundle
+    from trilane.avatars.bundle import DEFAULT, load_bundle
     from trilane.hw_profiles.graph_file import image_network, read_graph
     from trilane.hw_profiles.network_time import Computes
     from trilane.hw_profiles.network_work import Network, count_work
     from trilane.hw_profiles.reference_networks import reference_network, spec_of
 
-    unit, avatar = options.unit, options.avatar
+    unit, avatar = options.network_unit, options.avatar or DEFAULT
     if options.network:
         graph = read_graph(options.network[0], options.shapes)
         named, network = Computes(graph.numbers, options.numbers).on(chip, unit), image_network(graph, options.layout)
@@ -80,7 +83,7 @@ def _network_of(chip: Profile, options: PredictOptions, say: Callable[[str], Non
             named = with_file_in_application(named, graph, options.shapes, say)
         return named, network
     chip = Computes(precision=options.numbers).on(chip, unit)
-    if avatar is None:
+    if options.is_published:
         cells = options.as_json()
         names = ("encoder", "norm", "size", "channels", "layout")
         return chip, reference_network(spec_of({name: str(cells[name]) for name in names}, "options"))
@@ -88,7 +91,7 @@ def _network_of(chip: Profile, options: PredictOptions, say: Callable[[str], Non
         from trilane.apps.predict.this_machine import with_avatar
 
         return with_avatar(chip, avatar, say)
-    file = load_bundle(avatar or "default").read_network()
+    file = load_bundle(avatar).read_network()
     _, height, width, channels = file.shape
     return chip, Network({"avatar": avatar}, height, width, channels, options.layout, count_work(file.model))
 
@@ -105,5 +108,7 @@ def answer_of(chip: Profile, plan: Plan, options: PredictOptions) -> dict[str, A
     cap, wanted = options.cap, options.wanted
     answer = predictions.predict(chip, plan, cap, options.minutes, options.governor, wanted)
     if options.what_if:
-        answer["alternatives"] = predictions.what_if(chip, plan.network, plan.runtime, cap, wanted.fps)
+        answer["alternatives"] = predictions.what_if(chip, plan.network, plan.unit, cap, wanted.fps)
+    if options.is_as_run:
+        answer["notes"] = [AS_RUN, *answer["notes"]]
     return answer | {"verdict": predicted_verdict(answer).shown()}

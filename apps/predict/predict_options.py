@@ -27,9 +27,12 @@ if TYPE_CHECKING:
 
 ENCODER_HELP: Final = "resnet18, mobilenetv2, mobilenetv3 or efficientnet-lite0."
 NORM_HELP: Final = "batch, instance or group."
+#: Begins the help of an option of `OF_A_FILE`.
+PUBLISHED: Final = "Of a published network: "
 FIXED_SIZE_HELP: Final = "Tensor size in pixels: one side, or HEIGHTxWIDTH."
 #: How people call precisions -> as a hardware profile does.
 PRECISIONS: Final = {"w8a8": "int8", "int8": "int8", "float": "fp16", "fp16": "fp16", "fp32": "fp32"}
+#: Options of a network that was published, in place of an avatar's.
 OF_A_FILE: Final = {"encoder", "norm", "size", "channels"}
 OF_THE_APPLICATION: Final = {"layout", "policy", "edge", "batch", "gpu_share", "what_if", "plot", "trace"}
 #: Option: those that have no effect beside it.
@@ -37,7 +40,7 @@ IGNORED: Final = {
     "avatar": OF_A_FILE | {"input_shape"},
     "network": OF_A_FILE | {"avatar"},
     "table": OF_A_FILE
-    | {"layout", "avatar", "network", "application", "runtime", "minutes", "gpu_share", "governor", "what_if", "plot"}
+    | {"layout", "avatar", "network", "application", "unit", "minutes", "gpu_share", "governor", "what_if", "plot"}
     | {"fps", "power_limit_w", "precision", "input_shape", "trace"},
 }
 WHY_IGNORED: Final = {
@@ -55,7 +58,7 @@ OF_A_SCENE: Final = {"scene", "beside", "turns", "profile", "minutes", "policy",
 ALL_UNITS: Final = "all"
 #: Options that mean nothing without a pipeline file, and all that mean something beside one.
 OF_A_PIPELINE_ALONE: Final = {"changes", "frames", "measured", "seed"}
-OF_A_PIPELINE: Final = OF_A_PIPELINE_ALONE | {"scene", "profile", "performance_profile", "engine_runtime", "precision"}
+OF_A_PIPELINE: Final = OF_A_PIPELINE_ALONE | {"scene", "profile", "performance_profile", "runtime", "precision"}
 
 
 def _either(read_words: Callable[[], tuple[str, ...]], expected: str = "") -> AfterValidator:
@@ -69,17 +72,10 @@ def _either(read_words: Callable[[], tuple[str, ...]], expected: str = "") -> Af
     return AfterValidator(known)
 
 
-def _engine_runtimes() -> tuple[str, ...]:
+def _runtimes() -> tuple[str, ...]:
     from trilane.hw_profiles.schema import ENGINE_RUNTIMES
 
     return tuple(ENGINE_RUNTIMES)
-
-
-def _known_engine_runtime(text: str | None) -> str | None:
-    if text is not None and text not in (words := _engine_runtimes()):
-        remedy = f"--runtime {text} names the network's unit" if text in UNITS else ""
-        raise UnexpectedValue(repr(text), " or ".join(words), remedy)
-    return text
 
 
 def _governors() -> tuple[str, ...]:
@@ -163,10 +159,10 @@ class PredictOptions(Options):
         description="Order of pipelines that wait for the same unit: round-robin or deadline.",
     )
     profile: Text = Field(default="snapdragon-888", description=PROFILE_HELP)
-    encoder: str = Field(default="resnet18", description=ENCODER_HELP)
-    norm: str = Field(default="batch", description=NORM_HELP)
-    size: Text = Field(default="512", description=FIXED_SIZE_HELP)
-    channels: int = Field(default=16, description="Channels of the neural texture, 1 to 16.")
+    encoder: str = Field(default="resnet18", description=f"{PUBLISHED}{ENCODER_HELP}")
+    norm: str = Field(default="batch", description=f"{PUBLISHED}{NORM_HELP}")
+    size: Text = Field(default="512", description=f"{PUBLISHED}{FIXED_SIZE_HELP}")
+    channels: int = Field(default=16, description=f"{PUBLISHED}channels of the neural texture, 1 to 16.")
     layout: Annotated[str, _either(lambda: ("packed", "split"))] = Field(
         default="packed", description="packed: one raster pass; split: one for every 4 channels."
     )
@@ -184,11 +180,11 @@ class PredictOptions(Options):
     precision: Annotated[str | None, _either(lambda: tuple(PRECISIONS), "w8a8 (int8), float (fp16) or fp32")] = Field(
         default=None, description="w8a8 (int8), float (fp16) or fp32; by the network and its unit if not given."
     )
-    engine_runtime: Annotated[str | None, AfterValidator(_known_engine_runtime)] = Field(
+    runtime: Annotated[str | None, _either(_runtimes)] = Field(
         default=None,
         description="Runtime of a tensor engine for a --network by itself: tflite (if not given) or qnn_dlc.",
     )
-    runtime: str = Field(
+    unit: str = Field(
         default="dsp",
         description="Unit of the network: gpu or dsp. For a --network by itself also cpu, or all to compare them.",
     )
@@ -197,7 +193,8 @@ class PredictOptions(Options):
     )
     policy: Annotated[str | None, one_of("reference", *POLICIES), Option(synonyms=("--pipelining",))] = Field(
         default=None,
-        description="reference (if not given), or sequential, pipelined (if not given, on host), latest, deadline.",
+        description="pipelined (if not given, as in a run), sequential, latest or deadline. Or reference: that of the "
+        "published application. --encoder, --norm, --size and --channels have reference if not given.",
     )
     edge: str | None = Field(
         default=None, description="Buffers between stages: single, double (if not given), triple, fifo:N, orphan."
@@ -270,22 +267,22 @@ class PredictOptions(Options):
         """Return the runtime of a tensor engine."""
         from trilane.hw_profiles.schema import ENGINE_RUNTIMES
 
-        return next((runtime for runtime in ENGINE_RUNTIMES if runtime == self.engine_runtime), None)
+        return next((runtime for runtime in ENGINE_RUNTIMES if runtime == self.runtime), None)
 
     @property
     def units(self) -> tuple[UnitName, ...]:
-        """Return the units on which each network by itself is predicted. Raises as `unit`."""
-        return UNITS if self.runtime == ALL_UNITS else (self.unit,)
+        """Return the units on which each network by itself is predicted. Raises as `network_unit`."""
+        return UNITS if self.unit == ALL_UNITS else (self.network_unit,)
 
     @property
-    def unit(self) -> UnitName:
+    def network_unit(self) -> UnitName:
         """Return the unit of the network. Raises BadInputError for any other word."""
         units: tuple[UnitName, ...] = ("cpu", "gpu", "dsp") if self.is_bare else ("gpu", "dsp")
         for unit in units:
-            if unit == self.runtime:
+            if unit == self.unit:
                 return unit
         words = (*units, ALL_UNITS) if self.is_bare else units
-        raise BadInputError("--runtime", repr(self.runtime), " or ".join(", ".join(words).rsplit(", ", 1)))
+        raise BadInputError("--unit", repr(self.unit), " or ".join(", ".join(words).rsplit(", ", 1)))
 
     @property
     def wanted(self) -> Wanted:
@@ -295,15 +292,25 @@ class PredictOptions(Options):
         return Wanted(self.fps, self.power_limit_w)
 
     @property
+    def is_published(self) -> bool:
+        """Return whether the application has a network that was published, in place of an avatar's or a file's."""
+        return bool(self.model_fields_set & (OF_A_FILE | {"table"}))
+
+    @property
+    def is_as_run(self) -> bool:
+        """Return whether the prediction is of what `trilane run` runs without options."""
+        return not (self.is_published or self.model_fields_set & {"avatar", "network", "policy", "edge", "batch"})
+
+    @property
     def variant(self) -> Variant:
         """Return how stages are joined.
 
-        Without a policy they are joined as in the published application, or on this machine as in a run. Raises
-        BadInputError for an edge that the published application does not have.
+        Without a policy they are joined as in a run, or for a published network on a chip as in the published
+        application. Raises BadInputError for an edge that the published application does not have.
         """
         from trilane.hw_profiles.application import REFERENCE, Variant
 
-        policy = self.policy or ("pipelined" if self.profile == HOST else "reference")
+        policy = self.policy or ("reference" if self.is_published and self.profile != HOST else "pipelined")
         if policy != "reference":
             rate = {} if self.fps is None else {"fps": self.fps}
             return Variant(policy, self.edge or "double", self.batch, **rate)
@@ -346,15 +353,12 @@ class PredictOptions(Options):
 
     def _check_engine(self) -> None:
         given = self.model_fields_set
-        if "engine_runtime" in given and self.runtime == ALL_UNITS:
-            found, remedy = (
-                "--engine-runtime beside --runtime all",
-                "units differ in the runtimes that are known of them",
-            )
+        if "runtime" in given and self.unit == ALL_UNITS:
+            found, remedy = "--runtime beside --unit all", "units differ in the runtimes that are known of them"
             raise BadInputError("options", found, "one or the other", remedy)
-        if "engine_runtime" in given and not self.is_bare:
+        if "runtime" in given and not self.is_bare:
             remedy = "the application runs as its profile says"
-            raise BadInputError("options", "--engine-runtime", "a --network by itself beside it", remedy)
+            raise BadInputError("options", "--runtime", "a --network by itself beside it", remedy)
 
     def _check_pipeline_file(self) -> None:
         given = self.model_fields_set

@@ -1,6 +1,6 @@
 """The verdict of a run or a prediction: does it hold its rate, what limits it, can it be trusted, what to try.
 
-Rule: pure, and the only place that judges. report.json, the end of `trilane run`, `explain`, `top`, the dashboard,
+Rule: pure, and the only place that judges. report.json, the end of `trilane run`, `explain`, `watch`, the dashboard,
 notebooks, predictions and pages show what stands here. `trilane.apps.run.verdict_facts` makes the facts.
 """
 

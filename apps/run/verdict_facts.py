@@ -167,7 +167,7 @@ def _tries(document: Mapping[str, Any], bound: Bound | None, target: float, fold
     if left >= 0 and baseline and latency.get("mean", 0.0) > MUCH_LATER * baseline["latency_ms"]["mean"] > 0:
         yield "--latch 3 for newer poses: a frame alone takes less than half of the latency"
     if left >= MUCH_LEFT and "pipeline" not in (document.get("config") or {}):
-        yield f"a larger --output: {100 * left:.0f} % of each frame's time is left"
+        yield f"a larger --picture: {100 * left:.0f} % of each frame's time is left"
     yield f"trilane explain {folder or 'RUN'}"
 
 
@@ -210,7 +210,7 @@ def predicted_verdict(answer: Mapping[str, Any]) -> Verdict:
             latency_ms=latency["mean"] if latency and latency.get("samples", 1) else None,
             bound=_predicted_bound(answer, times["mean"]),
             idle={unit: (1 - row["busy"], _causes(row["idle"])) for unit, row in units.items()},
-            image="trilane accuracy measures it here: a prediction has no pictures",
+            image="trilane quality measures it here: a prediction has no pictures",
             tries=tuple(_predicted_tries(answer, times["mean"] * target > 1e3)),
             source=COMPUTED,
         )

@@ -167,7 +167,7 @@ class TriedCommand:
 COMMANDS = {
     "run": TriedCommand(TrialClock.HOST, has_folder=True),
     "predict": TriedCommand(TrialClock.VIRTUAL),
-    "accuracy": TriedCommand(TrialClock.HOST),
+    "quality": TriedCommand(TrialClock.HOST),
     "bench": TriedCommand(TrialClock.HOST),
 }
 

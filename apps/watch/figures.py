@@ -1,4 +1,4 @@
-"""The figures of a moment of a run, as the dashboard, `trilane top` and `/metrics` show them. Rule: plain typed data.
+"""The figures of a moment of a run, as the dashboard, `trilane watch` and `/metrics` show them. Rule: plain typed data.
 
 "The window" is the last `window_s` seconds before the moment, "the run" all time since every unit was ready. `sources`
 says where a figure comes from, and `accuracy` the avatar's error: no speed is shown without them. The bounds of a

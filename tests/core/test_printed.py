@@ -27,7 +27,7 @@ def printed(command: Callable[..., tuple[str, str]]) -> Printed:
 CHIP = ("predict", "--profile", "snapdragon-888", "--encoder", "resnet18")
 COMMANDS = {
     "predict": CHIP,
-    "predict-gpu": (*CHIP, "--runtime", "gpu", "--size", "384x192", "--norm", "instance", "--what-if"),
+    "predict-gpu": (*CHIP, "--unit", "gpu", "--size", "384x192", "--norm", "instance", "--what-if"),
     "predict-burst": (*CHIP, "--performance-profile", "burst", "--minutes", "12", "--policy", "pipelined"),
     "predict-saver": (*CHIP, "--performance-profile", "power_saver", "--edge", "double", "--policy", "latest"),
 }

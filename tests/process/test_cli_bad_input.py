@@ -119,10 +119,10 @@ OPTIONS = {
     "no rate": (["--fps", "0"], "fps", "found 0"),
     "a misspelt edge": (["--edge", "tripel"], "--edge", "found 'tripel', expected single, double, triple, fifo:N or"),
     "too long a queue": (["--edge", "fifo:65"], "--edge", "found 'fifo:65', expected fifo:N with N from 1 to 64"),
-    "an output without height": (["--output", "640"], "--output", "expected WIDTHxHEIGHT in pixels, such as 640x480"),
-    "an odd output": (["--output", "641x480"], "output.width", "found 641, expected a multiple of 2"),
+    "an output without height": (["--picture", "640"], "--picture", "expected WIDTHxHEIGHT in pixels, such as 640x480"),
+    "an odd output": (["--picture", "641x480"], "output.width", "found 641, expected a multiple of 2"),
     "a huge output": (
-        ["--output", "640x4098"],
+        ["--picture", "640x4098"],
         "output.height",
         "found 4098, expected a multiple of 2 from 64 to 4096",
     ),

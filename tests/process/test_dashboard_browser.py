@@ -39,7 +39,7 @@ CORNER = """() => {
 #: At the pace of a chip, in slow motion, so that other programs of the machine hardly change who waits for whom. On the
 #: chip raster and composite take as long as the network: sequential, the DSP works about half as much (docs/power.md).
 PACE = ("--profile", "snapdragon-888", "--pace", "--slow-motion", "128")
-SMALL = ("--size", "128", "--output", "320x240", "--camera", "builtin:static")
+SMALL = ("--size", "128", "--picture", "320x240", "--camera", "builtin:static")
 VISIBLY = 0.8
 #: Columns of the table of the units.
 PROCESS, BUSY_OF_RUN, RESTARTS = 1, 9, 10

@@ -41,7 +41,7 @@ def command(bundle: Path) -> list[str]:
     still = ["--motion", "builtin:t-pose", "--camera", "builtin:static"]
     pace = ["--profile", "snapdragon-888", "--pace", "--slow-motion", "16"]  # 20 frames a second
     base = [sys.executable, "-m", "trilane.apps.cli.main", "run", "--avatar", str(bundle), "--size", "64x64"]
-    return [*base, *still, *pace, "--output", "128x96", "--dashboard", "--json", "--out", "run"]
+    return [*base, *still, *pace, "--picture", "128x96", "--dashboard", "--json", "--out", "run"]
 
 
 @pytest.fixture(scope="module")

@@ -37,7 +37,7 @@ def refusals(server: Server) -> int:
 
 def test_a_run_goes_on_under_malformed_messages_and_each_is_counted(drawable_bundle: Path, tmp_path: Path) -> None:
     """Each is answered with one line and a status of 400 to 499, or closes its WebSocket; no frame is lost."""
-    words = ["run", "--avatar", str(drawable_bundle), "--size", "64x64", "--output", "128x96", "--dashboard", "--json"]
+    words = ["run", "--avatar", str(drawable_bundle), "--size", "64x64", "--picture", "128x96", "--dashboard", "--json"]
     stderr = tmp_path / "stderr"
     with stderr.open("w") as said:
         command = [sys.executable, "-m", "trilane.apps.cli.main", *words, "--out", "run", "--no-video", *FEW, *CORES]

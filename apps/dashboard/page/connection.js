@@ -77,7 +77,7 @@ export class Connection {
     if (this.openedAt !== null && performance.now() - this.openedAt > STEADY_MS) this.retryMs = FIRST_RETRY_MS;
     this.openedAt = null;
     if (this.on.isOver()) {
-      this.on.link("over", "the run is over and its server gone; `trilane dashboard` shows it again");
+      this.on.link("over", "the run is over and its server gone; `trilane show` shows it again");
       return;
     }
     const why = event.reason ? ` (${event.reason})` : "";

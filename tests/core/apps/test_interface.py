@@ -177,8 +177,8 @@ def test_a_notebook_shows_the_error_beside_the_speed_and_nothing_unescaped(folde
     [
         ({}, []),
         (
-            {"policy": "pipelined", "edge": "double", "avatar": "default", "runtime": "gpu"},
-            ["--policy", "pipelined", "--edge", "double", "--avatar", "default", "--runtime", "gpu"],
+            {"policy": "pipelined", "edge": "double", "avatar": "default", "unit": "gpu"},
+            ["--policy", "pipelined", "--edge", "double", "--avatar", "default", "--unit", "gpu"],
         ),
         ({"size": 256, "fps": 20}, ["--size", 256, "--fps", 20]),
         ({"profile": "host", "channels": 4}, ["--profile", "host", "--channels", 4]),
@@ -219,7 +219,7 @@ def test_a_network_by_itself_is_predicted_like_on_the_command_line(tiny_bundle: 
         ({"application": True}, "--application with 0 networks"),
         ({"performance_profile": "turbo"}, "found 'turbo'"),
         ({"profile": "none"}, "none"),
-        ({"runtime": "npu"}, "npu"),
+        ({"unit": "npu"}, "npu"),
         ({"network": "none.onnx"}, "none.onnx"),
     ],
 )

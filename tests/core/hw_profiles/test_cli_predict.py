@@ -39,7 +39,9 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         return lambda *given, **_: found.update({name: given}) or answer
 
     monkeypatch.setattr(profile_files, "load_runnable", told("profile", CHIP))
-    monkeypatch.setattr(predictions, "predict", lambda *given: found.update(predict=given) or {"fps": 12.5})
+    monkeypatch.setattr(
+        predictions, "predict", lambda *given: found.update(predict=given) or {"fps": 12.5, "notes": []}
+    )
     monkeypatch.setattr("trilane.apps.predict.asked_prediction.predicted_verdict", lambda _: JUDGED)
     monkeypatch.setattr(predictions, "what_if", told("what_if", ["alternatives"]))
     monkeypatch.setattr(cli, "draw", told("draw", None))
@@ -49,14 +51,22 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 
 SPEC: Any = NetworkSpec("mobilenetv2", "group", 96, 64, 4, "split")
-USUAL = Plan(NetworkSpec("resnet18", "batch", 512, 512, 16, "packed"), "dsp", REFERENCE, 0.0)  # type: ignore[arg-type]
+DEFAULT = load_bundle("default").read_network()
+AS_A_RUN = Variant("pipelined", "double", 1)
+USUAL = Plan(Network({"avatar": "default"}, *DEFAULT.shape[1:], "packed", count_work(DEFAULT.model)), "dsp", AS_A_RUN)
+PUBLISHED = Plan(NetworkSpec("resnet18", "batch", 512, 512, 16, "packed"), "dsp", REFERENCE)  # type: ignore[arg-type]
 OWN = Plan(SPEC, "gpu", Variant("latest", "triple", 3), 0.0)
 #: Words of a command -> what is asked of the prediction, and of what else.
 ASKED: dict[tuple[str, ...], tuple[tuple[Any, ...], dict[str, Any]]] = {
     (): ((USUAL, SUSTAINED, 0.0, None, NOTHING), {"profile": ("snapdragon-888",)}),
+    ("--encoder", "resnet18"): ((PUBLISHED, SUSTAINED, 0.0, None, NOTHING), {}),
+    ("--size", "512", "--policy", "pipelined"): (
+        (replace(PUBLISHED, variant=AS_A_RUN), SUSTAINED, 0.0, None, NOTHING),
+        {},
+    ),
     (
         *("--profile", "mine", "--encoder", "mobilenetv2", "--norm", "group", "--size", "96x64", "--channels", "4"),
-        *("--layout", "split", "--runtime", "gpu", "--minutes", "2.5", "--policy", "latest", "--edge", "triple"),
+        *("--layout", "split", "--unit", "gpu", "--minutes", "2.5", "--policy", "latest", "--edge", "triple"),
         *("--batch", "3", "--gpu-share", "0", "--performance-profile", "power_saver", "--governor", "step_wise"),
         *("--what-if", "--plot", "heat.svg", "--json"),
     ): (
@@ -65,21 +75,21 @@ ASKED: dict[tuple[str, ...], tuple[tuple[Any, ...], dict[str, Any]]] = {
             "profile": ("mine",),
             "what_if": (CHIP, SPEC, "gpu", "power_saver", None),
             "draw": (CHIP, OWN, "power_saver", 2.5, "step_wise", Path("heat.svg")),
-            "shown": ({"fps": 12.5, "alternatives": ["alternatives"], "verdict": JUDGED.shown()}, True),
+            "shown": ({"fps": 12.5, "notes": [], "alternatives": ["alternatives"], "verdict": JUDGED.shown()}, True),
         },
     ),
     ("--gpu-share", "0.25"): ((replace(USUAL, gpu_share=0.25), SUSTAINED, 0.0, None, NOTHING), {}),
-    ("--plot", "heat.svg", "--policy", "pipelined"): (  # a drawing is of half an hour where no time is given
-        (replace(USUAL, variant=Variant("pipelined", "double", 1)), SUSTAINED, 0.0, None, NOTHING),
+    ("--plot", "heat.svg", "--policy", "sequential"): (  # a drawing is of half an hour where no time is given
+        (replace(USUAL, variant=Variant("sequential", "double", 1)), SUSTAINED, 0.0, None, NOTHING),
         {
             "draw": (
-                *(CHIP, replace(USUAL, variant=Variant("pipelined", "double", 1)), SUSTAINED, 30.0, None),
+                *(CHIP, replace(USUAL, variant=Variant("sequential", "double", 1)), SUSTAINED, 30.0, None),
                 Path("heat.svg"),
             )
         },
     ),
     ("--fps", "24", "--power-limit-w", "3.5", "--what-if"): (
-        (USUAL, SUSTAINED, 0.0, None, Wanted(24.0, 3.5)),
+        (replace(USUAL, variant=AS_A_RUN._replace(fps=24.0)), SUSTAINED, 0.0, None, Wanted(24.0, 3.5)),
         {"what_if": (CHIP, USUAL.network, "dsp", SUSTAINED, 24.0)},
     ),
 }
@@ -130,11 +140,11 @@ def test_networks_by_themselves(
     assert found["networks"][0] == found["networks"][1]
     assert found["networks"][0]["precision"] == "int8" and found["config"]["fps"] == 20
     assert found["config"]["performance_profile"] == BURST, "as published latencies are"
-    capped = json.loads(command(*words, "--performance-profile", SUSTAINED, "--engine-runtime", "qnn_dlc")[0])
+    capped = json.loads(command(*words, "--performance-profile", SUSTAINED, "--runtime", "qnn_dlc")[0])
     assert capped["config"]["performance_profile"] == SUSTAINED
     assert [each["engine_runtime"] for each in capped["networks"]] == ["qnn_dlc"] * 2
     assert found["networks"][0]["engine_runtime"] == "tflite"
-    slow = json.loads(command(*words, "--precision", "float", "--runtime", "cpu")[0])["networks"][0]
+    slow = json.loads(command(*words, "--precision", "float", "--unit", "cpu")[0])["networks"][0]
     assert (slow["precision"], slow["unit"]) == ("fp16", "cpu")
     assert command("predict", "--network", file, "--input-shape", "other=1x2", code=2)[1] == (
         "error: --input-shape: found no input 'other', expected one of tensor\n"
@@ -147,14 +157,14 @@ def test_networks_by_themselves(
 
 @pytest.mark.parametrize(("edge", "batch"), [(None, 1), (REFERENCE.edge, 4)])
 def test_the_reference_keeps_its_edge(edge: str | None, batch: int) -> None:
-    assert PredictOptions(edge=edge, batch=batch).variant == REFERENCE._replace(batch=batch)
+    assert PredictOptions(encoder="resnet18", edge=edge, batch=batch).variant == REFERENCE._replace(batch=batch)
 
 
 ONE = "expected one or the other"
 REFUSED = {
-    ("--runtime", "npu"): "--runtime: found 'npu', expected gpu or dsp",
+    ("--unit", "npu"): "--unit: found 'npu', expected gpu or dsp",
     ("--governor", "x"): "--governor: found 'x', expected step_wise or power_allocator",
-    ("--edge", "triple"): (
+    ("--norm", "batch", "--edge", "triple"): (
         f"--edge: found 'triple', expected {REFERENCE.edge}, which the reference application has; "
         "choose a --policy of your own, such as pipelined"
     ),
@@ -170,17 +180,13 @@ REFUSED = {
         "options: found --application with 0 networks, expected one --network; "
         "it says that the application runs the network of the file"
     ),
-    ("--network", "n", "--engine-runtime", "snpe"): "--engine-runtime: found 'snpe', expected tflite or qnn_dlc",
-    ("--engine-runtime", "gpu"): (
-        "--engine-runtime: found 'gpu', expected tflite or qnn_dlc; --runtime gpu names the network's unit"
-    ),
+    ("--network", "n", "--runtime", "snpe"): "--runtime: found 'snpe', expected tflite or qnn_dlc",
     **{
         ("--minutes", each): f"--minutes: found '{each}', expected minutes, from 0 to 1440"
         for each in ("-1", "nan", "1441", "soon")
     },
-    ("--network", "n", "--application", "--engine-runtime", "tflite"): (
-        "options: found --engine-runtime, expected a --network by itself beside it; "
-        "the application runs as its profile says"
+    ("--network", "n", "--application", "--runtime", "tflite"): (
+        "options: found --runtime, expected a --network by itself beside it; the application runs as its profile says"
     ),
     ("--fps", "0"): "--fps: found 0, expected 0.001 to 1000",
     ("--power-limit-w", "-1"): "--power-limit-w: found -1, expected watts above 0",
@@ -209,7 +215,7 @@ REFUSED = {
             value,
         ): f"options: found --{other} beside --table, {ONE}; each row says so itself"
         for other, value in (
-            *((name, "1") for name in ("avatar", "network", "runtime", "minutes", "gpu-share", "plot")),
+            *((name, "1") for name in ("avatar", "network", "unit", "minutes", "gpu-share", "plot")),
             *(("layout", "split"), ("governor", "step_wise")),
         )
     },
@@ -285,7 +291,7 @@ def an_answer(**changes: Any) -> dict[str, Any]:
         "machine": {"title": "A Chip"},
         "config": {
             **{"encoder": "resnet18", "norm": "batch", "size": "64x32", "channels": 4, "layout": "packed"},
-            **{"runtime": "gpu", "performance_profile": "burst", "minutes": 0.0},
+            **{"unit": "gpu", "policy": "pipelined", "edge": "single", "performance_profile": "burst", "minutes": 0.0},
         },
         "network": {"gmac": 1.25, "parameters_m": 2.35, "alone_ms": 3.45, "low_ms": 3.05, "high_ms": 3.95},
         "frame_time_ms": {"mean": 4.55, "ema20_min": 4.15, "ema20_max": 5.75, "low": 4.25, "high": 4.95},

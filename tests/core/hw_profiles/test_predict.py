@@ -165,13 +165,13 @@ def test_a_table_keeps_its_columns_and_answers_every_row(tmp_path: Path) -> None
         ({"variant": Variant(policy="best")}, "best"),
         ({"variant": Variant(batch=0)}, "batch"),
         ({"gpu_share": 1.0}, "gpu-share"),
-        ({"gpu_share": 0.5, "runtime": "gpu"}, "gpu-share"),
-        ({"runtime": "cpu"}, "cpu"),
+        ({"gpu_share": 0.5, "unit": "gpu"}, "gpu-share"),
+        ({"unit": "cpu"}, "cpu"),
     ],
 )
 def test_a_plan_out_of_range_is_refused(change: dict[str, object], word: str) -> None:
     with pytest.raises(BadInputError, match=word):
-        Plan(**{"network": NETWORK, "runtime": "dsp", **change})  # type: ignore[arg-type]
+        Plan(**{"network": NETWORK, "unit": "dsp", **change})  # type: ignore[arg-type]
 
 
 def test_unknown_names_are_refused() -> None:

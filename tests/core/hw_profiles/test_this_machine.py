@@ -329,7 +329,7 @@ def test_only_what_this_machine_would_run_is_measured(
     monkeypatch.setattr(this_machine, "with_file", lambda chip, *_: asked.append("file") or chip)
     monkeypatch.setattr(this_machine, "with_file_in_application", lambda chip, *_: asked.append("both") or chip)
     chip, files = load_profile(profile), [tiny_bundle / "network.onnx"]
-    same = {"runtime": unit, "precision": precision}
+    same = {"unit": unit, "precision": precision}
     asked_prediction.application_of(chip, PredictOptions(avatar=str(tiny_bundle), **same))
     asked_prediction.application_of(chip, PredictOptions(network=files, application=True, **same))
     asked_prediction.predict_networks(chip, PredictOptions(network=files, **same))
@@ -337,5 +337,6 @@ def test_only_what_this_machine_would_run_is_measured(
 
 
 def test_this_machine_has_the_policy_of_a_run() -> None:
-    assert PredictOptions(profile="host").variant.policy == "pipelined"
-    assert PredictOptions(profile="qcs6490").variant == REFERENCE
+    assert PredictOptions(profile="host", encoder="resnet18").variant.policy == "pipelined"
+    assert PredictOptions(profile="qcs6490", encoder="resnet18").variant == REFERENCE
+    assert PredictOptions(profile="qcs6490").variant == PredictOptions(profile="host").variant

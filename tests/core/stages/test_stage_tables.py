@@ -135,17 +135,17 @@ def test_what_is_packed_is_what_the_units_find(tiny_bundle: Path) -> None:
 # --- options ---------------------------------------------------------------------------------------------------------
 
 
-def test_rate_and_output_are_laid_over_the_scene() -> None:
-    scene = configure.requested_scene(RunOptions(scene="walk-past", fps=24.0, output="320x482"))
+def test_rate_and_picture_are_laid_over_the_scene() -> None:
+    scene = configure.requested_scene(RunOptions(scene="walk-past", fps=24.0, picture="320x482"))
     assert (scene.name, scene.fps, scene.output.width, scene.output.height) == ("walk-past", 24.0, 320, 482)
-    for output, sentence in (
-        ("320", "--output: found '320', expected WIDTHxHEIGHT in pixels, such as 640x480"),
-        ("-2x64", "--output: found '-2x64', expected WIDTHxHEIGHT in pixels, such as 640x480"),
+    for picture, sentence in (
+        ("320", "--picture: found '320', expected WIDTHxHEIGHT in pixels, such as 640x480"),
+        ("-2x64", "--picture: found '-2x64', expected WIDTHxHEIGHT in pixels, such as 640x480"),
         ("62x64", "command line: output.width: found 62, expected a multiple of 2 from 64 to 4096"),
         ("64x67", "command line: output.height: found 67, expected a multiple of 2 from 64 to 4096"),
     ):
         with pytest.raises(BadInputError) as raised:
-            configure.requested_scene(RunOptions(output=output))
+            configure.requested_scene(RunOptions(picture=picture))
         assert str(raised.value) == sentence
 
 

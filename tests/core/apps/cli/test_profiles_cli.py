@@ -45,7 +45,7 @@ def test_predict_answers_for_an_avatar(tiny_bundle: Path, answer: Answer) -> Non
 
 def test_predict_says_what_it_is_of(command: Command) -> None:
     """The settled rate first, the assumed part of the power, and no word that means two things."""
-    text = command("predict", "--performance-profile", "burst", "--minutes", "30")[0]
+    text = command("predict", "--size", "512", "--performance-profile", "burst", "--minutes", "30")[0]
     lines = {line[:16].strip(): line[16:] for line in text.splitlines()}
     settled, first = re.fullmatch(r"([0-9.]+) fps, begins with ([0-9.]+) fps", lines["after 30 min"]).groups()
     assert float(settled) < float(re.search(r"([0-9.]+) fps", lines["over all"])[1]) < float(first)
@@ -56,7 +56,7 @@ def test_predict_says_what_it_is_of(command: Command) -> None:
 
 def test_a_prediction_for_this_machine_is_of_a_run_without_a_cap(answer: Answer) -> None:
     free, capped = (
-        answer("predict", "--profile", "host", *more)
+        answer("predict", "--profile", "host", "--size", "512", *more)
         for more in ((), ("--performance-profile", "sustained_high_performance"))
     )
     assert free["config"]["performance_profile"] == "burst"
@@ -101,11 +101,11 @@ def test_a_bad_table_is_named_with_its_line(text: str, said: str, tmp_path: Path
         (("predict", "--encoder", "vgg"), ("vgg", "resnet18")),
         (("predict", "--size", "500"), ("500", "32")),
         (("predict", "--channels", "0"), ("0", "1 to 16")),
-        (("predict", "--runtime", "npu"), ("npu", "dsp")),
+        (("predict", "--unit", "npu"), ("npu", "dsp")),
         (("predict", "--minutes", "nan"), ("nan",)),
         (("predict", "--policy", "warp"), ("warp", "pipelined")),
         (("predict", "--policy", "pipelined", "--edge", "octuple"), ("octuple", "double")),
-        (("predict", "--edge", "triple"), ("triple", "--policy")),
+        (("predict", "--edge", "triple", "--size", "512"), ("triple", "--policy")),
         (("predict", "--performance-profile", "warp"), ("warp", "burst")),
         (("predict", "--table", "/nope.csv"), ("/nope.csv",)),
         (("predict", "--plot", "heat.bmp"), (".bmp", ".svg")),

@@ -1,4 +1,4 @@
-"""`trilane explain`: phases, costs and totals of a scene, each against the parts that they are put together from."""
+"""`trilane plan`: phases, costs and totals of a scene, each against the parts that they are put together from."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from trilane.apps.cli.explain import app
+from trilane.apps.cli.plan import app
 from trilane.apps.explain.explanation import ALWAYS, PIPELINED, CostModel, least_frame_ms
 from trilane.apps.explain.scene_plan import (
     BODY,
@@ -147,7 +147,7 @@ def test_a_phase_says_what_is_modelled_and_its_error(document: Any) -> None:
 
 def test_a_fixed_size_is_explained_as_such_and_its_picture_named_in_one_line(folder: Path, tmp_path: Path) -> None:
     file = tmp_path / f"{'wide' * 40}.png"
-    result = explained(folder, "--json", "--size", "64x64", "--picture", str(file))
+    result = explained(folder, "--json", "--size", "64x64", "--out", str(file))
     assert file.is_file() and f"picture: {file}" in result.stderr.splitlines()
     rows = json.loads(result.stdout)["phases"]
     assert {tuple(row["tensor"]) for row in rows} == {(64, 64)}
@@ -262,7 +262,10 @@ def test_on_this_machine_units_are_placed_as_in_a_prediction(
 
 def test_what_a_run_may_be_asked_can_be_explained(folder: Path, tmp_path: Path) -> None:
     """The same scene as a run with these options has: its picture, rate, motion and camera, and where it is skinned."""
-    picture, scene = ["--fps", "24", "--output", "200x120"], ["--motion", "builtin:idle", "--camera", "builtin:closeup"]
+    picture, scene = (
+        ["--fps", "24", "--picture", "200x120"],
+        ["--motion", "builtin:idle", "--camera", "builtin:closeup"],
+    )
     options = [*picture, *scene, "--skinning", "gpu", "--frames", "6"]
     document = json.loads(explained(folder, "--json", *options).stdout)
     request = RunOptions(
@@ -273,7 +276,7 @@ def test_what_a_run_may_be_asked_can_be_explained(folder: Path, tmp_path: Path) 
         skinning="gpu",
         runtime="ort",
         fps=24,
-        output="200x120",
+        picture="200x120",
     )
     asked = configure(request, tmp_path)
     plan = ScenePlan(asked.config, asked.assets)
@@ -281,8 +284,8 @@ def test_what_a_run_may_be_asked_can_be_explained(folder: Path, tmp_path: Path) 
     assert (document["config"]["fps"], document["config"]["output"]) == (24, [120, 200])
     assert [row["tensor"] for row in document["phases"]] == [list(group[0].plan.shape or ()) for group in groups]
     assert document["avatars"][0]["skinned_on"] == "gpu"
-    assert "--output: found '12', expected WIDTHxHEIGHT" in str(
-        CliRunner().invoke(app, [str(folder / "small.toml"), "--output", "12"]).exception
+    assert "--picture: found '12', expected WIDTHxHEIGHT" in str(
+        CliRunner().invoke(app, [str(folder / "small.toml"), "--picture", "12"]).exception
     )
 
 
@@ -366,8 +369,8 @@ def test_the_picture_shows_bodies_and_rectangles(checked: Checked, tmp_path: Pat
         (["--profile", "no-such-chip"], "no-such-chip"),
         (["--frames", "0"], "frames: found 0"),
         (["--size", "300"], "a multiple of 32"),
-        (["--picture", "/nowhere/at/all.png"], "/nowhere"),
-        (["--picture", "plan.jpg"], "--picture: found 'plan.jpg', expected a name that ends in .png"),
+        (["--out", "/nowhere/at/all.png"], "/nowhere"),
+        (["--out", "plan.jpg"], "--out: found 'plan.jpg', expected a name that ends in .png"),
     ],
 )
 def test_wrong_options_are_named(folder: Path, options: list[str], words: str) -> None:

@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 
 from support.run_folders import write_run
-from trilane.apps.cli import explain as explain_command
 from trilane.apps.explain.explained_run import COLUMNS, explain_run, write_jobs
 from trilane.apps.explain.reasons import MOST_SAMPLES, EvenSample, Shown, advice, notes
 from trilane.apps.watch.followed_run import CUT_OFF
@@ -197,7 +196,6 @@ def test_parquet_without_its_library_names_the_extra(folder: Path, monkeypatch: 
 @pytest.mark.parametrize(
     ("arguments", "found"),
     [
-        (["--frames", 3], "--frames with a run folder"),
         (["--jobs", "jobs.txt"], "a name that ends in .csv or .parquet"),
         (["--jobs", "none/jobs.csv"], "a place that can be written"),
         (["--slowest", 0], "greater than or equal to 1"),
@@ -205,10 +203,6 @@ def test_parquet_without_its_library_names_the_extra(folder: Path, monkeypatch: 
 )
 def test_what_is_refused_of_a_run(folder: Path, command: Command, arguments: list[Any], found: str) -> None:
     assert found in command("explain", folder, *arguments, code=2)[1]
-
-
-def test_what_is_refused_of_a_scene(command: Command) -> None:
-    assert "--slowest with a scene" in command("explain", "default", "--slowest", 3, code=2)[1]
 
 
 def test_a_run_that_goes_on_is_explained_so_far(folder: Path, tmp_path: Path, command: Command) -> None:
@@ -226,15 +220,15 @@ def test_a_run_that_goes_on_is_explained_so_far(folder: Path, tmp_path: Path, co
 def test_a_run_is_found_by_its_name_below_runs(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
 ) -> None:
-    """Of a run that was killed too; a scene's own name means the scene, and what is neither has the scene's message."""
+    """Of a run that was killed too, and of one with the name of a scene; without a name it is the newest."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runs").mkdir()
     folder.rename("runs/k9.999999999.partial")
     assert "\nRun runs/k9.999999999.partial: scene test" in command("explain", "k9")[0]
-    assert explain_command.run_folder("k9") == Path("runs/k9.999999999.partial")
     Path("runs/k9.999999999.partial").rename("runs/far")
-    assert explain_command.run_folder("far") is None
-    assert "scene: found 'k9'" in command("explain", "k9", code=2)[1]
+    assert "\nRun runs/far: scene test" in command("explain", "far")[0]
+    assert command("explain") == command("explain", "far")
+    assert "k9: found no such run, expected a run folder with a journal" in command("explain", "k9", code=2)[1]
 
 
 def test_a_journal_that_is_a_link_to_nothing_is_said_to_be(folder: Path, command: Command) -> None:

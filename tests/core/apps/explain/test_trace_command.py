@@ -59,10 +59,8 @@ def test_chrome_json_goes_where_it_is_asked_to(runs: Path, command: Command) -> 
 def test_a_run_that_goes_on_has_a_trace_so_far(runs: Path, command: Command) -> None:
     going = runs.rename(runs.with_name(f"walk.{os.getpid()}.partial"))
     _, err = command("trace", "walk", code=2)
-    assert (
-        err
-        == "error: walk: found a run that goes on, expected --out FILE for its trace so far; its folder is its own\n"
-    )
+    found = "found a run that goes on, expected --out FILE for its trace so far; its folder is its own"
+    assert err == f"error: runs/{going.name}: {found}\n"
     command("trace", "walk", "--out", "so-far.pftrace")
     assert read_trace(Path("so-far.pftrace").read_bytes()).of("cpu/present")
     assert [path.name for path in going.iterdir()] == [NAME]

@@ -78,7 +78,7 @@ def test_advice_follows_from_the_numbers() -> None:
     baseline = {**make_report()["baseline"], "latency_ms": {**TIMES, "mean": 9.9}}
     assert "--latch 3" in dict(verdict_of(report_of(baseline=baseline), "r").lines())["TRY"]
     quick = verdict_of(report_of(fps=90.0), "r")
-    assert "a larger --output: 67 % of each frame's time is left" in dict(quick.lines())["TRY"]
+    assert "a larger --picture: 67 % of each frame's time is left" in dict(quick.lines())["TRY"]
 
 
 def test_a_prediction_is_sure_where_its_interval_is_on_one_side() -> None:
@@ -133,7 +133,7 @@ def test_there_are_20_runs() -> None:
 
 @pytest.mark.parametrize(("scene", "policy", "held"), RUNS)
 def test_the_bound_is_the_same_wherever_it_is_said(scene: str, policy: str, held: str, tmp_path: Path) -> None:
-    """report.json, `explain`, `top`, the dashboard and Python; a stage held 30 % longer is named where it has most.
+    """report.json, `explain`, `watch`, the dashboard and Python; a stage held 30 % longer is named where it has most.
 
     On cores of their own the unit with the most work bounds a pipelined run, and its longest stage is in that unit.
     """

@@ -163,13 +163,13 @@ def test_fits_have_the_shape_of_the_look(body: ShapedBody, tmp_path: Path) -> No
 
 def test_the_command_writes_all_or_nothing(tmp_path: Path, command: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(synthetic, "SyntheticCapture", Drawn)
-    words = ("avatar", "create-data", tmp_path / "new", "--frames", 5, "--output", "96x64", "--fit-mm", 2)
+    words = ("avatar", "create-data", tmp_path / "new", "--frames", 5, "--picture", "96x64", "--fit-mm", 2)
     out, err = command(*words)
     assert "MB on the disk" in err and str(tmp_path / "new" / "truth") in out
     assert len(open_capture(tmp_path / "new")) == 5
     assert "expected a folder that is not there yet" in command(*words, code=2)[1]
     for wrong in ("96", "96x63", "5000x600", "96x64x3"):
-        assert "--output: found" in command(*words[:2], tmp_path / "w", "--output", wrong, code=2)[1]
+        assert "--picture: found" in command(*words[:2], tmp_path / "w", "--picture", wrong, code=2)[1]
 
     assert "expected one of default, hiker" in command(*words[:2], tmp_path / "w", "--look", "nobody", code=2)[1]
 
@@ -177,5 +177,5 @@ def test_the_command_writes_all_or_nothing(tmp_path: Path, command: Any, monkeyp
         raise BadInputError("fits", "a defect", "none")
 
     monkeypatch.setattr(synthetic, "_write_shot", break_off)
-    assert "a defect" in command("avatar", "create-data", tmp_path / "other", "--output", "96x64", code=2)[1]
+    assert "a defect" in command("avatar", "create-data", tmp_path / "other", "--picture", "96x64", code=2)[1]
     assert [path.name for path in tmp_path.iterdir()] == ["new"]

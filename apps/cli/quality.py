@@ -1,4 +1,4 @@
-"""`trilane accuracy`: differences between runtimes on a scene, and errors of hard cases beside their bounds.
+"""`trilane quality`: differences between runtimes on a scene, and errors of hard cases beside their bounds.
 
 Rule: this module reads options and shows results; every figure comes from `trilane.apps.experiments`.
 """
@@ -19,10 +19,10 @@ from trilane.errors import BadInputError
 app = Commands()
 EPILOG = """\b
 Examples:
-  trilane accuracy
-  trilane accuracy closeup --frames 20 --runtime ort --runtime openvino
-  trilane accuracy closeup --by-cause --frames 2 --out errors
-  trilane accuracy --hard-cases --json
+  trilane quality
+  trilane quality closeup --frames 20 --runtime ort --runtime openvino
+  trilane quality closeup --by-cause --frames 2 --out errors
+  trilane quality --hard-cases --json
 """
 OUT_OF_BOUNDS = 1
 SCENE, FRAMES, BY_CAUSE_FRAMES = "default", 8, 2
@@ -40,7 +40,7 @@ HEADS = {
 
 
 @app.command(epilog=EPILOG)
-def accuracy(
+def quality(
     scene: SceneArgument = SCENE,
     avatar: SceneAvatarOption = None,
     size: SceneSizeOption = None,

@@ -1,4 +1,4 @@
-"""`trilane top`: what it shows of a run that is over, goes on, was killed or has nothing to show, and how it ends."""
+"""`trilane watch`: what it shows of a run that is over, goes on, was killed or has nothing to show, and how it ends."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rich.console import Console
 from support.run_report import make_report
 from support.told_journal import told_journal
 from trilane.apps.cli import watch as cli_top
-from trilane.apps.cli.top_view import line, screen
+from trilane.apps.cli.watch_view import line, screen
 from trilane.apps.run.report import Report
 from trilane.apps.run.verdict_facts import verdict_of
 from trilane.apps.watch.followed_run import RunState

@@ -1,4 +1,4 @@
-"""`trilane accuracy` as a person runs it."""
+"""`trilane quality` as a person runs it."""
 
 from __future__ import annotations
 

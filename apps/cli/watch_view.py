@@ -1,4 +1,4 @@
-"""Shows one moment of a run in `trilane top`: a screen for a terminal, a line for anything else.
+"""Shows one moment of a run in `trilane watch`: a screen for a terminal, a line for anything else.
 
 Rule: every figure is a field of `MomentFigures`. Each speed is shown with the error of the avatar's pictures, and the
 sources of the figures stand below.

@@ -1,4 +1,4 @@
-"""`trilane accuracy`: figures of runtimes that a test makes up, by hand; what is out of bounds or refused."""
+"""`trilane quality`: figures of runtimes that a test makes up, by hand; what is out of bounds or refused."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.apps.cli import accuracy as cli
+from trilane.apps.cli import quality as cli
 from trilane.apps.experiments import accuracy, hard_cases, hard_numbers
 from trilane.apps.experiments.accuracy import runtime_differences
 from trilane.errors import BadInputError
@@ -52,7 +52,7 @@ def test_what_is_out_of_its_bounds_is_said(
 ) -> None:
     rows["runtimes"] = [ROW | row]
     for words in ((), ("--json",)):
-        _, err = command("accuracy", *words, code=1 if said else 0)
+        _, err = command("quality", *words, code=1 if said else 0)
         assert err.splitlines() == said
 
 
@@ -61,7 +61,7 @@ def test_a_hard_case_that_fails_is_named(passed: bool, rows: dict[str, list[Any]
     row = {**FIGURES, "name": "batch, [odd], ort", "verdict": "above", "passed": passed}
     rows["networks"] = [{**row, "name": "good", "passed": True}, row]
     rows["numbers"] = [{**NUMBER, "verdict": "over", "passed": passed}]
-    out, err = command("accuracy", "--hard-cases", "--json", code=0 if passed else 1)
+    out, err = command("quality", "--hard-cases", "--json", code=0 if passed else 1)
     assert json.loads(out) == {"schema": 1, "hard_cases": [*rows["numbers"], *rows["networks"]]}
     assert err.splitlines() == ([] if passed else ["a [number]: over", "batch, [odd], ort: above"])
 
@@ -70,7 +70,7 @@ def test_each_hard_number_says_where_its_bound_comes_from(rows: dict[str, list[A
     found = [("first", 0.5, "[proof]"), ("second", None, "analysis"), ("third", 0.25, "[proof]")]
     row = {**NUMBER, "verdict": "holds", "passed": True}
     rows["numbers"] = [{**row, "name": name, "error": error, "source": source} for name, error, source in found]
-    lines = command("accuracy", "--hard-cases")[0].splitlines()
+    lines = command("quality", "--hard-cases")[0].splitlines()
     cells = [[cell.strip() for cell in line.split("│")[1:-1]] for line in lines if line.startswith("│")]
     assert [(name, error, mark) for name, error, _, _, mark, *_ in cells] == [
         ("first", "0.5", "[1]"),
@@ -90,7 +90,7 @@ def test_each_hard_number_says_where_its_bound_comes_from(rows: dict[str, list[A
 )
 def test_hard_cases_take_no_scene(words: tuple[str, ...], found: str, command: Command) -> None:
     said = f"found {found} beside it, expected it alone; hard cases have their own inputs"
-    assert command("accuracy", *words, "--hard-cases", code=2) == ("", f"error: --hard-cases: {said}\n")
+    assert command("quality", *words, "--hard-cases", code=2) == ("", f"error: --hard-cases: {said}\n")
 
 
 class Runtime:

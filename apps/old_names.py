@@ -1,0 +1,118 @@
+"""Names of commands and options that have changed: the old ones work for one version more, with a note.
+
+Rule: this table is the only place that has an old name. A command line, an axis of a sweep and an option of a program
+are translated before anything else reads them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+#: Version in which the old names are gone.
+GONE_IN: Final = "0.3"
+
+
+class Renamed(NamedTuple):
+    """An option of `command` that was called `old`; both are written as they are typed.
+
+    `values`: pattern of the values for which `old` has the old meaning, where it has another one now.
+    """
+
+    command: str
+    old: str
+    new: str
+    values: str = ".*"
+
+    def means(self, value: object) -> bool:
+        """Return whether `old` with this value is the old option."""
+        return re.fullmatch(self.values, str(value), re.DOTALL) is not None
+
+
+COMMANDS: Final = {"accuracy": "quality", "dashboard": "show", "top": "watch"}
+OPTIONS: Final = (
+    Renamed("run", "--output", "--picture"),
+    Renamed("plan", "--output", "--picture"),
+    Renamed("plan", "--picture", "--out", r"(?!\d+x\d+$).*"),
+    Renamed("predict", "--engine-runtime", "--runtime"),
+    Renamed("predict", "--runtime", "--unit", "cpu|gpu|dsp|all"),
+    Renamed("avatar create-data", "--output", "--picture"),
+)
+#: Options of `trilane explain`, each with whether a value follows. It had those of `trilane plan` too.
+OF_EXPLAIN: Final = {"--slowest": True, "--jobs": True, "--json": False, "--help": False, "-h": False}
+#: Commands that are given another command with its options.
+WITH_COMMAND: Final = ("sweep", "tune")
+
+Note = Callable[[str], object]
+
+
+def in_new_names(words: Sequence[str], note: Note) -> list[str]:
+    """Return a command line without `trilane`, with new names for old ones. `note` is called for each old name."""
+    if not words:
+        return []
+    first, rest = words[0], list(words[1:])
+    if first in WITH_COMMAND:
+        place = next((place for place, word in enumerate(rest) if word in COMMANDS or _has_options(word)), len(rest))
+        return [first, *rest[:place], *in_new_names(rest[place:], note)]
+    command = COMMANDS.get(first, first)
+    if first == "explain" and _is_of_a_scene(rest):
+        command = "plan"
+    if command != first:
+        what = "`trilane explain` of a scene" if command == "plan" else f"`trilane {first}`"
+        note(_said(what, f"`trilane {command}`"))
+    group = next((each.command for each in OPTIONS if each.command == " ".join([command, *rest[:1]])), command)
+    return [command, *_options(group, rest, note)]
+
+
+def in_new_name(command: str, name: str, value: object, note: Note = lambda _: None) -> str:
+    """Return the name of the option of `command` that `name` means, both without dashes: `output` is `picture`."""
+    for each in OPTIONS:
+        if each.command == command and each.old == f"--{name.replace('_', '-')}" and each.means(value):
+            note(_said(name, each.new.removeprefix("--")))
+            return each.new.removeprefix("--")
+    return name
+
+
+def _options(command: str, words: Sequence[str], note: Note) -> Iterator[str]:
+    """Yield the words of `command` with its options by their new names."""
+    for place, word in enumerate(words):
+        name, equals, own = word.partition("=")
+        value: Any = own if equals else next(iter(words[place + 1 :]), "")
+        new = next((each.new for each in OPTIONS if each[:2] == (command, name) and each.means(value)), None)
+        if new is None:
+            yield word
+        else:
+            note(_said(name, new))
+            yield f"{new}{equals}{own}"
+
+
+def _has_options(command: str) -> bool:
+    return any(each.command == command for each in OPTIONS)
+
+
+def _is_of_a_scene(words: Sequence[str]) -> bool:
+    """Return whether the words after `trilane explain` ask for the plan of a scene."""
+    left, names = iter(words), []
+    for word in left:
+        option, equals, _ = word.partition("=")
+        if not option.startswith("-"):
+            names.append(word)
+        elif option not in OF_EXPLAIN:
+            return True
+        elif OF_EXPLAIN[option] and not equals:
+            next(left, None)
+    return any(map(_is_scene, names))
+
+
+def _is_scene(name: str) -> bool:
+    """Return whether `name` is a scene and no run: the folder of a run may have the name of a scene."""
+    from trilane.apps.watch.followed_run import folder_of
+    from trilane.scene.schema import scene_names
+
+    return name.endswith(".toml") or (name in scene_names() and folder_of(Path(name)) is None)
+
+
+def _said(old: str, new: str) -> str:
+    return f"{old} is called {new} now; the old name is gone in Trilane {GONE_IN}"
