@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-COMMAND = [sys.executable, "-m", "trilane.apps.cli.main", "accuracy"]
+COMMAND = [sys.executable, "-m", "trilane.apps.cli.main", "quality"]
 
 
 def call(*arguments: str) -> subprocess.CompletedProcess[str]:

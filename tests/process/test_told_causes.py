@@ -118,7 +118,7 @@ def test_a_run_takes_the_space_of_its_report_before_it_begins(run: Callable[...,
 def test_a_command_in_a_folder_that_was_removed_says_so(tmp_path: Path) -> None:
     """Other files that are missing keep their own sentence."""
     code = "import os, shutil; shutil.rmtree(os.getcwd()); from trilane.apps.cli.main import entry; entry()"
-    for words in (("run", "--frames", "3"), ("explain", "default")):
+    for words in (("run", "--frames", "3"), ("plan", "default")):
         folder = tmp_path / words[0]
         folder.mkdir()
         done = subprocess.run(

@@ -110,7 +110,7 @@ def film(folder: str) -> None:
     from PIL import Image
     from playwright.sync_api import sync_playwright
 
-    command = [sys.executable, "-m", "trilane", "dashboard", folder]
+    command = [sys.executable, "-m", "trilane", "show", folder]
     shots: list[tuple[float, Image.Image]] = []
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as served, sync_playwright() as driver:
         try:

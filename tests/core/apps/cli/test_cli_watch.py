@@ -17,7 +17,7 @@ from rich.console import Console
 
 from support.run_report import make_report
 from support.told_journal import told_journal
-from trilane.apps.cli import watch as cli_top
+from trilane.apps.cli import watch as cli_watch
 from trilane.apps.cli.watch_view import line, screen
 from trilane.apps.run.report import Report
 from trilane.apps.run.verdict_facts import verdict_of
@@ -56,7 +56,7 @@ def written(folder: str, *records: Record) -> None:
 
 def test_a_finished_run_is_a_line_where_stdout_is_no_terminal(command: Command, check_printed: Check) -> None:
     written("runs/walk", BEGUN, *RECORDS, *END)
-    check_printed("top-lines", command("top")[0])
+    check_printed("top-lines", command("watch")[0])
 
 
 def test_the_screen(check_printed: Check) -> None:
@@ -84,14 +84,14 @@ def test_the_verdict_stands_first_and_in_the_line() -> None:
 def test_a_terminal_is_drawn_anew(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     written("runs/walk", BEGUN, *RECORDS, *END)
     console = Console(file=io.StringIO(), force_terminal=True, width=120)
-    monkeypatch.setattr(cli_top, "stdout_console", lambda: console)
-    assert command("top", "walk")[0] == ""
+    monkeypatch.setattr(cli_watch, "stdout_console", lambda: console)
+    assert command("watch", "walk")[0] == ""
     assert "run walk: finished, over" in console.file.getvalue()  # type: ignore[attr-defined]
 
 
 def test_once_as_json_is_one_document(command: Command) -> None:
     written("runs/walk", BEGUN, *RECORDS, *END)
-    document = json.loads(command("top", "runs/walk", "--once", "--json")[0])
+    document = json.loads(command("watch", "runs/walk", "--once", "--json")[0])
     assert (document.pop("run"), document["state"]) == ("walk", "finished")
     assert document == json.loads(json.dumps(FIGURES.now().as_json()))
 
@@ -112,7 +112,7 @@ def test_a_run_that_goes_on_is_looked_at_until_it_ends(command: Command, monkeyp
             journal.flush()
 
         monkeypatch.setattr(time, "sleep", sleep)
-        out, _ = command("top", "--json", "--interval", "0.5")
+        out, _ = command("watch", "--json", "--interval", "0.5")
     looks = [json.loads(line) for line in out.splitlines()]
     assert [(look["state"], look["frames"]["presented"], look["is_over"]) for look in looks] == [
         ("goes on", 0, False),
@@ -124,7 +124,7 @@ def test_a_run_that_goes_on_is_looked_at_until_it_ends(command: Command, monkeyp
 
 def test_a_run_that_was_killed_is_shown_as_it_was(command: Command) -> None:
     written("runs/walk.999999999.partial", BEGUN, *RECORDS)
-    assert command("top", "walk")[0].startswith("run walk: killed; fps of the last 5 s, ")
+    assert command("watch", "walk")[0].startswith("run walk: killed; fps of the last 5 s, ")
 
 
 def test_a_run_that_is_killed_while_it_is_looked_at_says_so_and_ends(
@@ -142,7 +142,7 @@ def test_a_run_that_is_killed_while_it_is_looked_at_says_so_and_ends(
 
     monkeypatch.setattr(time, "sleep", sleep)
     try:
-        lines = command("top", "walk")[0].splitlines()
+        lines = command("watch", "walk")[0].splitlines()
     finally:
         os.waitpid(process, 0)
     assert lines[0].startswith("run walk: goes on; ")
@@ -155,7 +155,7 @@ def test_a_finished_run_has_the_rate_of_its_report(command: Command) -> None:
     """Two frames, 20 ms apart, in a run of 90 ms: 50 a second, and not the 22 of its whole length."""
     second = Stepped(1080 * MS, (JobDone("v", 3, 1050 * MS, 1060 * MS, 0),), ())
     written("runs/walk", BEGUN, *RECORDS, second, Ended(1090 * MS, {}))
-    out = command("top", "walk")[0]
+    out = command("watch", "walk")[0]
     assert "finished; fps between the first frame and the last, p50" in out
     assert "; 50.0 fps; " in out
 
@@ -163,7 +163,7 @@ def test_a_finished_run_has_the_rate_of_its_report(command: Command) -> None:
 def test_openmetrics(command: Command) -> None:
     pytest.importorskip("prometheus_client")
     written("runs/walk", BEGUN, *RECORDS, *END)
-    out, _ = command("top", "walk", "--openmetrics")
+    out, _ = command("watch", "walk", "--openmetrics")
     assert 'trilane_frames_lost_total{cause="died:v"} 1.0\n' in out
     assert out.endswith("# EOF\n")
 
@@ -171,7 +171,7 @@ def test_openmetrics(command: Command) -> None:
 def test_openmetrics_without_its_library(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     written("runs/walk", BEGUN)
     monkeypatch.setitem(__import__("sys").modules, "trilane.apps.watch.metrics", None)
-    _, err = command("top", "walk", "--openmetrics", code=3)
+    _, err = command("watch", "walk", "--openmetrics", code=3)
     assert "[dashboard]" in err
 
 
@@ -182,7 +182,7 @@ def test_an_interrupt_ends_it_without_a_word(command: Command, monkeypatch: pyte
         raise KeyboardInterrupt
 
     monkeypatch.setattr(time, "sleep", interrupt)
-    out, err = command("top", "walk", code=130)
+    out, err = command("watch", "walk", code=130)
     assert len(out.splitlines()) == 4  # three of the heading, and one look
     assert "Traceback" not in err
 
@@ -198,4 +198,4 @@ def test_an_interrupt_ends_it_without_a_word(command: Command, monkeypatch: pyte
 )
 def test_what_cannot_be_shown_is_refused(command: Command, arguments: list[str], said: str) -> None:
     written("runs/empty")
-    assert said in " ".join(command("top", *arguments, code=2)[1].split())
+    assert said in " ".join(command("watch", *arguments, code=2)[1].split())

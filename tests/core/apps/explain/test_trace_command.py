@@ -85,7 +85,7 @@ def test_a_journal_without_a_record_leaves_the_old_trace(runs: Path, command: Co
     assert (runs / "trace.pftrace").read_bytes() == b"old"
 
 
-@pytest.mark.parametrize("name", ["trace", "top", "explain"])
+@pytest.mark.parametrize("name", ["trace", "watch", "explain"])
 def test_a_pipe_in_the_place_of_a_journal_is_called_so(runs: Path, name: str, command: Command) -> None:
     (runs / NAME).unlink()
     os.mkfifo(runs / NAME)

@@ -179,7 +179,7 @@ def test_the_example_is_a_sweep_of_sixty_trials() -> None:
     command = SweptCommand(file.command)
     axes = {name: [command.converted(name, value) for value in values] for name, values in file.axes.items()}
     trials = trials_of(Definition(command.words, file.options, axes), command.words_of)
-    words = "--profile snapdragon-888 --policy pipelined --size 512 --channels 16 --runtime gpu --edge triple"
+    words = "--profile snapdragon-888 --policy pipelined --size 512 --channels 16 --unit gpu --edge triple"
     assert (len(trials), trials[-1].line) == (60, f"trilane predict {words} --json")
 
 
