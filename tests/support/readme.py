@@ -31,6 +31,8 @@ PICTURE_S, PICTURES_A_SECOND, PICTURE_SIZE = 6.0, 5, (960, 600)
 RUN: Final = ("run", "--frames", "120", "--baseline", "30", "--check", "2")
 PLACE: Final = "runs/first"
 VERDICT_LINES: Final = 7
+#: Speeds of the page, as its control has them.
+RATES: Final = ("1", "0.5", "0.25", "0.1", "0.02")
 COLOURS: Final = 128
 SETTLES_MS: Final = 5000
 BLOCK: Final = r"(<!-- {name}: written by make readme -->\n)(.*?)(<!-- end of {name} -->)"
@@ -122,6 +124,7 @@ def film(folder: str) -> None:
             page.wait_for_selector("#verdict div")
             page.wait_for_timeout(SETTLES_MS)
             page.locator("#seek").fill("0")
+            page.locator("#seek-rate").select_option(_rate(float(page.locator("#seek").get_attribute("max") or 0)))
             page.locator("#seek-play").click()
             begin_s = time.monotonic()
             while time.monotonic() < begin_s + PICTURE_S:
@@ -135,6 +138,11 @@ def film(folder: str) -> None:
     lasts_ms = [round(1000 * (after - before)) for before, after in pairwise(times)]
     first, *rest = (picture for _, picture in shots)
     first.save(PICTURE, save_all=True, append_images=rest, duration=lasts_ms, loop=0)
+
+
+def _rate(run_ms: float) -> str:
+    """The fastest speed of the page at which a run of `run_ms` moves for most of the picture's time."""
+    return next((rate for rate in RATES if run_ms / float(rate) > 800 * PICTURE_S), RATES[-1])
 
 
 def recorded() -> dict[str, Any]:
