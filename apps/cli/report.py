@@ -27,7 +27,7 @@ Examples:
   trilane report runs prediction.json --json
 """
 SHOWN = (
-    *("name", "verdict", "bound", "trust", "frame_ms", "low_ms", "high_ms"),
+    *("name", "verdict", "bound", "trust", "other_programs", "frame_ms", "low_ms", "high_ms"),
     *("psnr_db", "worst_psnr_db", "p1_psnr_db", "on_frontier", "error_source"),
 )
 
@@ -84,11 +84,19 @@ def _print(entries: list[Entry], rows: list[dict[str, Any]]) -> None:
     from rich.table import Table
     from rich.text import Text
 
+    from trilane.apps.compare.overview import told_knees
+
     times, errors = ("frame, ms", "from, ms", "to, ms"), ("PSNR, dB", "worst", "1st pct.")
-    table = Table("entry", "verdict", "bound", "trust", *times, *errors, "frontier", "where the error comes from")
+    table = Table(
+        "entry", "verdict", "bound", "trust", "others", *times, *errors, "frontier", "where the error comes from"
+    )
     for row in rows:
-        table.add_row(*(Text(_shown(row[key])) for key in SHOWN))
+        share = row["other_programs"]
+        shown = row | {"other_programs": None if share is None else f"{100 * share:.1f} %"}
+        table.add_row(*(Text(_shown(shown[key])) for key in SHOWN))
     stdout_console().print(table)
+    for sentence in told_knees(entries):
+        stdout_console().print(sentence, soft_wrap=True, markup=False)
     for entry in entries:
         if entry.failure:
             stdout_console().print(f"{entry.name}: {entry.failure}", soft_wrap=True, markup=False)

@@ -13,11 +13,13 @@ import math
 import re
 import shlex
 from collections import Counter
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
+from trilane.apps.compare.frontier import frontier, knees
 from trilane.apps.run.report import MAX_REPORT_BYTES
 from trilane.apps.sweep.store import TRIALS, read_trials
 from trilane.errors import BadInputError, MissingPartError
@@ -54,11 +56,11 @@ REPORT, VIDEO = "report.json", "video.mp4"
 EXPECTED = "a run folder, a sweep's folder, a prediction that was saved with --json, or a folder of these"
 MOST = 10_000
 FIGURES = (
-    *("frame_ms", "low_ms", "high_ms", "frames_per_s", "latency_ms"),
-    *("verdict", "bound", "trust"),
-    *("psnr_db", "worst_psnr_db", "p1_psnr_db", "on_frontier"),
+    *("frame_ms", "low_ms", "high_ms", "psnr_db", "on_frontier"),
+    *("verdict", "bound", "trust", "other_programs"),
+    *("frames_per_s", "latency_ms", "worst_psnr_db", "p1_psnr_db"),
 )
-SOURCES = ("speed_source", "interval", "error_source", "shows", "clock", "machine", "failure", "command")
+SOURCES = ("speed_source", "interval", "error_source", "shows", "clock", "machine", "failure", "trial", "command")
 
 
 def read_entries(places: Sequence[Path]) -> list[Entry]:
@@ -89,8 +91,9 @@ def _entries(place: Path) -> Iterator[Entry]:
     elif (place / REPORT).is_file():
         yield replace(entry_of(place.name, _document(place / REPORT), place / VIDEO), within=within)
     elif (place / TRIALS).is_file():
-        trials = [_trial(place, trial) for trial in read_trials(place).values()]
-        yield from (replace(trial, within=place.absolute().name) for trial in trials)
+        trials = list(read_trials(place).values())
+        for name, trial in zip(_names(trials), trials, strict=True):
+            yield replace(_trial(place, trial, name), within=place.absolute().name)
     else:
         for folder in sorted(path for path in place.iterdir() if path.is_dir() and path.suffix != ".partial"):
             if (folder / REPORT).is_file() or (folder / TRIALS).is_file():
@@ -118,7 +121,45 @@ def _document(path: Path) -> Mapping[str, Any]:
     return document
 
 
-def _trial(folder: Path, trial: Mapping[str, Any]) -> Entry:
+def _names(trials: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Name trials of one sweep by the options in which they differ, such as `256, openvino`; by their ids if in none.
+
+    A number stands without its option if only one option has numbers. Repeats have their number, other namesakes ids.
+    """
+    options = [dict(_settings(_dict(trial.get("options")))) for trial in trials]
+    keys = [key for key in dict.fromkeys(chain(*options)) if len({each.get(key) for each in options}) > 1]
+    numbers = [key for key in keys if all(_is_number(each.get(key, "")) for each in options)]
+    with_key = set(numbers) if len(numbers) > 1 else set()
+    parts = [[_named(key, each.get(key), key in with_key) for key in keys] for each in options]
+    names = [", ".join(filter(None, each)) for each in parts]
+    repeats = [f"repeat {trial.get('repeat', 1)}" for trial in trials]
+    for own in (repeats, [_text(trial.get("id")) for trial in trials]):
+        counts = Counter(names)
+        names = [
+            ", ".join(filter(None, (name, own[number]))) if counts[name] > 1 else name
+            for number, name in enumerate(names)
+        ]
+    return [name or _text(trial.get("id")) for name, trial in zip(names, trials, strict=True)]
+
+
+def _named(key: str, value: str | None, has_key: bool) -> str:
+    if value is None:
+        return ""
+    if value == "False":
+        return f"no {key}"
+    if value == "True":
+        return key
+    return f"{key} {value}" if has_key else str(value)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
+def _trial(folder: Path, trial: Mapping[str, Any], name: str) -> Entry:
     result = trial.get("result")
     document = dict(result) if isinstance(result, dict) else {}
     document["made"] = {**_dict(document.get("made")), "command": trial.get("command")}
@@ -129,7 +170,8 @@ def _trial(folder: Path, trial: Mapping[str, Any]) -> Entry:
         ended = f"{trial.get('status')}, exit code {trial.get('exit_code')}"
         document["failure"] = f"{ended}: {error}" if error else ended
     video = _video(folder, trial.get("folder"))
-    return entry_of(str(trial.get("id")), document, video, _dict(trial.get("options")))
+    entry = entry_of(name, document, video, _dict(trial.get("options")))
+    return replace(entry, trial=_text(trial.get("id")))
 
 
 def _dict(value: Any) -> dict[str, Any]:
@@ -148,13 +190,15 @@ def _video(folder: Path, name: Any) -> Path | None:
 class Entry:
     """One run, prediction or trial as a row.
 
-    `name`: name of its folder or trial. `clock`: host or virtual. `machine`: the machine in one line. `settings`:
+    `name`: name of its folder, or options in which its trial differs from others. `trial`: id of its trial. `clock`:
+    host or virtual. `machine`: the machine in one line. `settings`:
     settings by dotted key. `command`: words of the command; empty where none is known. `frame_ms`, `low_ms`, `high_ms`:
     mean frame time and its interval, None where there is none. `psnr_db`: error, a mean over the frames.
     `worst_psnr_db`, `p1_psnr_db`: worst frame and 1st percentile of a run's own frames. `error_source`: origin of the
     error, or why there is none. `facts`: facts of the machine. `video`: video of a run. `failure`: why there are no
     figures. `verdict`: PASS or FAIL at its rate, empty where none is known. `bound`: the unit and the stages that the
-    verdict names. `trust`: "sure", or UNSURE. `interval`: what the interval holds. `error_of`: `OF_RUN` and its
+    verdict names. `trust`: "sure", or UNSURE. `other_programs`: share of its cores' time that other programs had, None
+    where nobody knows. `interval`: what the interval holds. `error_of`: `OF_RUN` and its
     reference, `OF_AVATAR`, or empty. `shows`: what the pictures show. `within`: name of the folder that holds the run,
     or of its sweep.
     """
@@ -183,6 +227,8 @@ class Entry:
     verdict: str = ""
     bound: str = ""
     trust: str = ""
+    other_programs: float | None = None
+    trial: str = ""
 
     @property
     def speed_source(self) -> str:
@@ -229,6 +275,7 @@ def entry_of(
         interval="" if low is None else BY_SCATTER if "mean_low" in times else BY_MODEL,
         error_of=error_of,
         shows=_shows(_mapping(config, "scene")),
+        other_programs=_number(document.get("other_programs")),
     )
 
 
@@ -348,36 +395,18 @@ def varied(entries: list[Entry]) -> list[str]:
     return [key for key in keys if len({entry.settings[key] for entry in entries if key in entry.settings}) > 1]
 
 
-class Scored(Protocol):
-    """What can be on a frontier. Less `frame_ms` and more `psnr_db` are better, within one `group`."""
-
-    @property
-    def frame_ms(self) -> float | None: ...
-    @property
-    def psnr_db(self) -> float | None: ...
-    @property
-    def group(self) -> Hashable: ...
-
-
-def frontier(entries: Sequence[Scored]) -> list[bool]:
-    """Return for each entry whether it is on the frontier of frame time against error: no other entry beats it.
-
-    An entry beats another if it is at least as quick and at least as near to the truth, and better in one of these.
-    Equal entries do not beat each other. An entry without a speed or an error is not on the frontier.
-    """
-    on = [False] * len(entries)
-    for group in {entry.group for entry in entries}:
-        rows = [
-            (entry.frame_ms, -entry.psnr_db, number)
-            for number, entry in enumerate(entries)
-            if entry.group == group and entry.frame_ms is not None and entry.psnr_db is not None
-        ]
-        least = (float("inf"), float("inf"))  # the smallest error so far, and its frame time
-        for frame_ms, error, number in sorted(rows):
-            if error < least[0]:
-                least = error, frame_ms
-            on[number] = (error, frame_ms) == least
-    return on
+def told_knees(entries: Sequence[Entry]) -> Iterator[str]:
+    """Yield a sentence for the knee of each group that has one."""
+    for group, number in knees(entries).items():
+        rows = [(each, each.frame_ms, each.psnr_db) for each in entries if each.group == group]
+        known = [(each, ms, db) for each, ms, db in rows if ms is not None and db is not None]
+        ms, db = next((ms, db) for each, ms, db in known if each is entries[number])
+        quickest, best = min(known, key=lambda row: row[1]), max(known, key=lambda row: row[2])
+        yield (
+            f"Knee: {entries[number].name} has {ms:.1f} ms a frame and {db:.1f} dB. The best picture, {best[0].name}, "
+            f"takes {best[1] - ms:.1f} ms more for {best[2] - db:.2f} dB. The quickest, {quickest[0].name}, saves "
+            f"{ms - quickest[1]:.1f} ms and loses {db - quickest[2]:.1f} dB."
+        )
 
 
 def columns(entries: Sequence[Entry]) -> list[str]:
@@ -392,8 +421,7 @@ def table_rows(entries: Sequence[Entry]) -> list[dict[str, Any]]:
         {
             "name": entry.name,
             **{key: entry.settings.get(key) for key in settings},
-            **{key: getattr(entry, key) for key in FIGURES[:-1]},
-            "on_frontier": on,
+            **{key: on if key == "on_frontier" else getattr(entry, key) for key in FIGURES},
             **{key: getattr(entry, key) for key in SOURCES[:-1]},
             "command": shlex.join(entry.command),
         }

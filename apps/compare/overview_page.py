@@ -13,26 +13,31 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 from importlib.resources import files
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import av
 
-from trilane.apps.compare.overview import Entry, columns, frontier, table_rows
+from trilane.apps.compare.frontier import SAME_DB, frontier, knees
+from trilane.apps.compare.overview import Entry, columns, table_rows, told_knees
 
 UNITS = {"frame_ms": "frame, ms", "low_ms": "from, ms", "high_ms": "to, ms", "latency_ms": "latency, ms"}
 UNITS |= {"psnr_db": "PSNR, dB", "worst_psnr_db": "worst frame, dB", "p1_psnr_db": "1st percentile, dB"}
-UNITS |= {"frames_per_s": "frames/s", "on_frontier": "frontier"}
+UNITS |= {"frames_per_s": "frames/s", "on_frontier": "frontier", "other_programs": "other programs"}
 NO_ERROR = "No entry has both a speed and a known error. `trilane run --check N` measures the error of a run."
-LONG = 40  # letters of a cell that is given room
+LONG = 40  # letters of a cell, of which the rest is shown when a person points at it
+SHARES = ("other_programs",)
+LETTER, BESIDE = 7, 12  # width of a letter of a name, and its distance from its dot
 MEANING = (
     "Frame time is the mean between presented frames, from and to its interval: of a run 95 %, by the scatter of its "
     "own frames; of a prediction 80 %, by the model. PSNR is the error of the picture, larger is better, a mean "
     "over frames, beside the worst one and the 1st percentile, which tell what the mean hides. The frontier "
-    "holds what nobody beats in both on the same clock and machine, with the same scene and the same kind of error. An "
-    "entry without a known error is in the table and on no frontier. The verdict says whether an entry holds its rate, "
-    "the bound what limits it; UNSURE is a run beside other programs, on a hot or changing processor, or a prediction "
-    "whose interval holds the rate."
+    "holds what nobody beats in both on the same clock and machine, with the same scene and the same kind of error. "
+    f"Pictures within {SAME_DB} dB count as equal, and so do times whose intervals meet. An entry without a known "
+    "error is in the table and on no frontier. After the knee more time buys little picture. The verdict says whether "
+    "an entry holds its rate, the bound what limits it; UNSURE is a run beside other programs, on a hot or changing "
+    "processor, or a prediction whose interval holds the rate."
 )
 WIDTH, HEIGHT = 720, 400
 LEFT, RIGHT, TOP, BOTTOM = 64, 16, 16, 48
@@ -59,9 +64,10 @@ def page(title: str, entries: Sequence[Entry]) -> str:
 
 
 def _sections(title: str, entries: Sequence[Entry]) -> Iterator[str]:
-    yield f'<p class="note">{escape(MEANING)}</p>'
+    yield from (f'<p class="verdict">{escape(sentence)}</p>' for sentence in told_knees(entries))
     yield f"<h2>Frame time against error</h2>{_drawing(entries)}"
     yield f"<h2>All {len(entries)} entries</h2>{_table(title, entries)}"
+    yield f'<p class="note">{escape(MEANING)}</p>'
     yield from _stills(entries)
     yield f"<h2>Machines</h2>{_machines(entries)}"
 
@@ -69,14 +75,18 @@ def _sections(title: str, entries: Sequence[Entry]) -> Iterator[str]:
 def _drawing(entries: Sequence[Entry]) -> str:
     drawable = [entry for entry in entries if entry.frame_ms is not None and entry.psnr_db is not None]
     groups = list(dict.fromkeys(entry.group for entry in drawable))
+    at_knees = set(knees(entries).values())
     dots = [
-        Dot(entry.name, entry.frame_ms, entry.low_ms, entry.high_ms, entry.psnr_db, on, groups.index(entry.group))
-        for entry, on in zip(entries, frontier(entries), strict=True)
+        Dot(
+            *(entry.name, entry.frame_ms, entry.low_ms, entry.high_ms, entry.psnr_db, on, groups.index(entry.group)),
+            number in at_knees,
+        )
+        for number, (entry, on) in enumerate(zip(entries, frontier(entries), strict=True))
         if entry.frame_ms is not None and entry.psnr_db is not None
     ]
     left_out = len(entries) - len(dots)
     note = f"{left_out} of {len(entries)} have no speed or no known error and are not drawn. " if left_out else ""
-    words = "Filled: on the frontier. A marker's shape is what it is compared with: "
+    words = "Filled: on the frontier; in a ring: the knee. A marker's shape is what it is compared with: "
     legend = "; ".join(f"{marker_name(number)}: {_told(group)}" for number, group in enumerate(groups))
     drawn = scatter(dots, "frame time, ms", "PSNR, dB")
     if not drawn:
@@ -109,12 +119,13 @@ def _table(title: str, entries: Sequence[Entry]) -> str:
 def _cell(name: str, value: Any) -> str:
     if isinstance(value, bool):
         return f"<td>{'yes' if value else ''}</td>"
+    if isinstance(value, float) and name in SHARES:
+        return f'<td class="number" data-value="{value!r}">{100 * value:.1f} %</td>'
     if isinstance(value, float):
         return f'<td class="number" data-value="{value!r}">{value:.2f}</td>'
     text = "" if value is None else escape(str(value))
-    if name == "command":
-        return f'<td class="long"><code>{text}</code></td>'
-    return f'<td class="long">{text}</td>' if len(text) > LONG else f"<td>{text}</td>"
+    shown = f"<code>{text}</code>" if name == "command" else text
+    return f'<td title="{text}">{shown}</td>' if len(text) > LONG else f"<td>{shown}</td>"
 
 
 def _stills(entries: Sequence[Entry]) -> Iterator[str]:
@@ -171,6 +182,7 @@ class Dot(NamedTuple):
     """A dot at `x` and `y`.
 
     `low`, `high`: interval of `x`. `on`: whether it is on the frontier. `group`: number of its marker.
+    `is_knee`: whether it is the knee of its group.
     """
 
     label: str
@@ -180,6 +192,7 @@ class Dot(NamedTuple):
     y: float
     on: bool
     group: int
+    is_knee: bool = False
 
 
 #: Name -> marker. Groups beyond the last marker begin again at the first.
@@ -205,7 +218,12 @@ def scatter(dots: Sequence[Dot], x_title: str, y_title: str) -> str:
         return ""
     xs = [value for dot in dots for value in (dot.x, dot.low, dot.high) if value is not None]
     across, up = _Axis(min(xs), max(xs), LEFT, WIDTH - RIGHT), _Axis(*_reach(dots), HEIGHT - BOTTOM, TOP)
-    parts = [*_grid(across, up), *_steps(dots, across, up), *(_dot(dot, across, up) for dot in dots)]
+    parts = [
+        *_grid(across, up),
+        *_steps(dots, across, up),
+        *(_dot(dot, across, up) for dot in dots),
+        *_names(dots, across, up),
+    ]
     turned = f"translate(14 {(TOP + HEIGHT - BOTTOM) / 2}) rotate(-90)"
     titles = (
         f'<text class="title" x="{(LEFT + WIDTH - RIGHT) / 2}" y="{HEIGHT - 8}">{escape(x_title)}</text>'
@@ -254,7 +272,9 @@ def _grid(across: _Axis, up: _Axis) -> Iterator[str]:
 def _steps(dots: Sequence[Dot], across: _Axis, up: _Axis) -> Iterator[str]:
     """Yield the frontier of each group as steps: the best error at each frame time."""
     for group in sorted({dot.group for dot in dots}):
-        edge = sorted((dot.x, dot.y) for dot in dots if dot.on and dot.group == group)
+        points = sorted((dot.x, dot.y) for dot in dots if dot.on and dot.group == group)
+        bests = accumulate((y for _, y in points), max)
+        edge = [(x, best) for (x, _), best in zip(points, bests, strict=True)]
         if len(edge) > 1:
             path = f"M{across.place(edge[0][0])} {up.place(edge[0][1])}"
             path += "".join(f" H{across.place(x)} V{up.place(y)}" for x, y in edge[1:])
@@ -270,7 +290,24 @@ def _dot(dot: Dot, across: _Axis, up: _Axis) -> str:
     )
     marker = MARKERS[marker_name(dot.group)].format(x=x, y=y, x0=x - 4.5, y0=y - 5)
     title = f"<title>{escape(dot.label)}: {dot.x:.2f} ms, {dot.y:.2f} dB</title>"
-    return f'<g class="{"on" if dot.on else "off"}" tabindex="0">{title}{interval}{marker}</g>'
+    ring = f'<circle class="ring" cx="{x}" cy="{y}" r="10"/>' if dot.is_knee else ""
+    return f'<g class="{"on" if dot.on else "off"}" tabindex="0">{title}{interval}{marker}{ring}</g>'
+
+
+def _names(dots: Sequence[Dot], across: _Axis, up: _Axis) -> Iterator[str]:
+    """Yield the names of knees, then those of the frontier, each where it meets no other name."""
+    taken: list[tuple[float, float, float]] = []  # left, right, base line
+    named = sorted((dot for dot in dots if dot.on or dot.is_knee), key=lambda dot: not dot.is_knee)
+    for dot in named:
+        x, y, wide = across.place(dot.x), up.place(dot.y), LETTER * len(dot.label)
+        left = x + BESIDE if x < (LEFT + WIDTH - RIGHT) / 2 else x - BESIDE - wide
+        for base in (y + 18, y - 9):
+            if all(
+                base > at + 14 or base < at - 14 or left > right or left + wide < begin for begin, right, at in taken
+            ):
+                taken.append((left, left + wide, base))
+                yield f'<text class="name" x="{left:.0f}" y="{base}">{escape(dot.label)}</text>'
+                break
 
 
 def still(video: Path) -> bytes | None:

@@ -1,0 +1,97 @@
+"""Which of many entries are worth a look: the frontier of frame time against error, and its knee.
+
+Rule: pure. A difference that nobody can tell beats nothing: times by their intervals, pictures by `SAME_DB`.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Hashable, Sequence
+from itertools import accumulate
+from typing import Final, NamedTuple, Protocol
+
+#: PSNRs that differ by no more are equal: runtimes that round differently move it that far (docs/networks.md).
+SAME_DB: Final = 0.1
+LEAST_OF_A_KNEE: Final = 3
+
+
+class Scored(Protocol):
+    """What can be on a frontier. Less `frame_ms` and more `psnr_db` are better, within one `group`.
+
+    `low_ms`, `high_ms`: interval of `frame_ms`; None where there is none.
+    """
+
+    @property
+    def frame_ms(self) -> float | None: ...
+    @property
+    def low_ms(self) -> float | None: ...
+    @property
+    def high_ms(self) -> float | None: ...
+    @property
+    def psnr_db(self) -> float | None: ...
+    @property
+    def group(self) -> Hashable: ...
+
+
+class _Point(NamedTuple):
+    """An entry with a speed and an error. `number`: its place among the entries."""
+
+    frame_ms: float
+    low_ms: float
+    high_ms: float
+    psnr_db: float
+    number: int
+
+
+def frontier(entries: Sequence[Scored]) -> list[bool]:
+    """Return for each entry whether it is on the frontier: no other entry of its group beats it.
+
+    An entry beats another in two ways: its picture is better by more than `SAME_DB` and it is no slower; or its
+    picture is equal or better and it is surely quicker, which means that the intervals do not meet. An entry without a
+    speed or an error is not on the frontier.
+    """
+    on = [False] * len(entries)
+    for points in _groups(entries).values():
+        by_mean, by_high = sorted(points), sorted(points, key=lambda point: point.high_ms)
+        means, highs = [point.frame_ms for point in by_mean], [point.high_ms for point in by_high]
+        best_by_mean = list(accumulate((point.psnr_db for point in by_mean), max))
+        best_by_high = list(accumulate((point.psnr_db for point in by_high), max))
+        for point in points:
+            no_slower, quicker = bisect_right(means, point.frame_ms), bisect_left(highs, point.low_ms)
+            beaten = best_by_mean[no_slower - 1] > point.psnr_db + SAME_DB
+            beaten = beaten or (quicker > 0 and best_by_high[quicker - 1] >= point.psnr_db - SAME_DB)
+            on[point.number] = not beaten
+    return on
+
+
+def knees(entries: Sequence[Scored]) -> dict[Hashable, int]:
+    """Return the knee of each group that has one: the number of the entry after which more time buys little picture.
+
+    The knee is the point of the best pictures at each frame time that is farthest above the straight line from the
+    quickest to the best one, both axes scaled to 0..1 (Satopaa et al., "Finding a Kneedle in a Haystack", 2011).
+    """
+    found = {}
+    for group, points in _groups(entries).items():
+        edge: list[_Point] = []
+        for point in sorted(points, key=lambda point: (point.frame_ms, -point.psnr_db)):
+            if not edge or point.psnr_db > edge[-1].psnr_db:
+                edge.append(point)
+        if len(edge) < LEAST_OF_A_KNEE:
+            continue
+        first, last = edge[0], edge[-1]
+        span_ms, span_db = last.frame_ms - first.frame_ms, last.psnr_db - first.psnr_db
+        above = [(p.psnr_db - first.psnr_db) / span_db - (p.frame_ms - first.frame_ms) / span_ms for p in edge]
+        if max(above) > 0:
+            found[group] = edge[above.index(max(above))].number
+    return found
+
+
+def _groups(entries: Sequence[Scored]) -> dict[Hashable, list[_Point]]:
+    """Return the points of each group, in the order of the groups' first entries."""
+    found: dict[Hashable, list[_Point]] = {}
+    for number, entry in enumerate(entries):
+        mean, psnr_db = entry.frame_ms, entry.psnr_db
+        if mean is not None and psnr_db is not None:
+            low, high = (mean if end is None else end for end in (entry.low_ms, entry.high_ms))
+            found.setdefault(entry.group, []).append(_Point(mean, low, high, psnr_db, number))
+    return found
