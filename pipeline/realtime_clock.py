@@ -1,7 +1,7 @@
 """The clock of this machine, for the scheduler's loop. Rule: it waits and does what the core says; it decides nothing.
 
 `wait` turns messages of the units, signals and the governor's duties into events; `perform` turns actions into
-messages. The run's figures include the time for which a viewer held the run, and the run says how much (`HeldTime`).
+messages. Shares of the units include the time for which a viewer held the run, and the run says how much (`HeldTime`).
 """
 
 from __future__ import annotations
@@ -337,4 +337,4 @@ class HeldTime:
         held_s = self.until(now_ns) / NS_PER_S
         if not held_s:
             return ""
-        return f"held for {held_s:.1f} s by who watched it: frame times, rates and shares of the run have that in them"
+        return f"held for {held_s:.1f} s by who watched it: shares of units have that in them, frame times do not"

@@ -50,7 +50,8 @@ class Presented(NamedTuple):
 
     `release_ns`: time of its release.
     `end_ns`: end of its last job.
-    `interval_ns`: time since the end of the frame presented before it; None for the first.
+    `interval_ns`: time since the end of the frame presented before it; None for the first, and if a viewer held the
+    run between the two: a pause is no slow frame.
     `latency_ns`: time from its sampled pose to the end of the stage that the pipeline names; None for a frame that this
     stage does not take.
     `skips`: whether it took the bypass.
@@ -176,6 +177,7 @@ class Timeline:
         self._requested = settings.frames
         self._ended: dict[Key, tuple[Handed, JobDone, Presented | None]] = {}
         self._last_end_ns: int | None = None
+        self._is_held = self._was_held = False
         self._now_ns = 0
         self._cutter = IdleCutter(self.units.values()) if idle else None
         self._handlers: dict[type, Callable[[Any], None]] = {
@@ -183,7 +185,7 @@ class Timeline:
             UnitReady: self._on_ready,
             UnitDied: self._on_died,
             FrameRequest: lambda event: self._source.request(event.frames, self._now_ns),
-            Hold: lambda event: self._source.hold(event.frames, self._now_ns),
+            Hold: self._on_hold,
             Stop: lambda _: self._source.stop(),
             SchedulerStalled: lambda event: self.stalls.append(Span(self._now_ns - event.ns, self._now_ns)),
         }
@@ -326,10 +328,14 @@ class Timeline:
     def _present(self, number: int, frame: FrameState, end_ns: int) -> Presented:
         self.presented += 1
         self.skipped += frame.skips
-        interval_ns = None if self._last_end_ns is None else end_ns - self._last_end_ns
-        self._last_end_ns = end_ns
+        interval_ns = None if self._last_end_ns is None or self._was_held else end_ns - self._last_end_ns
+        self._last_end_ns, self._was_held = end_ns, self._is_held
         latency_ns = frame.latency_ns if frame.latency_ns >= 0 else None
         return Presented(number, frame.release_ns, end_ns, interval_ns, latency_ns, frame.skips, frame.rung)
+
+    def _on_hold(self, event: Hold) -> None:
+        self._source.hold(event.frames, self._now_ns)
+        self._is_held, self._was_held = event.frames >= 0, True
 
     def _on_failed(self, event: JobFailed) -> None:
         handed = self.units[event.unit].take(event.job)

@@ -370,6 +370,7 @@ class Core:
 
     def _on_hold(self, event: Hold) -> None:
         self.source.hold(event.frames, self.now_ns)
+        self.ledger.hold(event.frames >= 0)
         self.flow.mark_roots_dirty()
 
     def _on_abort(self, _event: Abort) -> None:

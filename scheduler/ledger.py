@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import accumulate
 from typing import Any, Final, NamedTuple
 
 from trilane.scheduler.events import NEVER, Drop, Graph, Job, Loss
@@ -151,8 +150,8 @@ class Ledger:
     `rungs`: number of presented frames on each rung of work.
     `rung_switches`: how often a frame had another rung than the frame before.
     `left`: list that gets every frame that leaves the run; None: none is kept.
-    `presented_frames`, `lateness_ns`: numbers and lateness of the presented frames in order; filled only for a run that
-    keeps all values.
+    `presented_frames`, `presented_ns`, `lateness_ns`: numbers, times and lateness of the presented frames in order;
+    filled only for a run that keeps all values.
     """
 
     def __init__(self, graph: Graph, books: Books | None = None) -> None:
@@ -172,8 +171,10 @@ class Ledger:
         self.rung_switches = 0
         self.lateness_ns: list[int] = []
         self.presented_frames: list[int] = []
+        self.presented_ns: list[int] = []
         self._rung = -1
-        self._first_ns = self._last_ns = 0
+        self._last_ns = self._between_ns = 0
+        self._is_held = self._was_held = False
         self._frame_times, self._latency, self._lateness = FrameTimeSamples(sketch), Samples(sketch), Lateness()
 
     def start(self, now_ns: int) -> None:
@@ -237,6 +238,10 @@ class Ledger:
     def restart(self, unit: str) -> None:
         self._units[unit].restarts += 1
 
+    def hold(self, is_held: bool) -> None:
+        """Say whether somebody holds the run from now on. A time between frames with a pause in it is no frame time."""
+        self._is_held, self._was_held = is_held, True
+
     def presented(
         self,
         frame: int,
@@ -260,13 +265,12 @@ class Ledger:
         self.rung_switches += rung != self._rung and self.presented_count > 0
         self._rung = rung
         target_ns = self._books.target_period_ns
-        if self.presented_count:
+        if self.presented_count and not self._was_held:
+            self._between_ns += end_ns - self._last_ns
             self._frame_times.add(end_ns - self._last_ns)
             if target_ns:
                 self._lateness.add(end_ns - self._last_ns - target_ns)
-        else:
-            self._first_ns = end_ns
-        self._last_ns = end_ns
+        self._last_ns, self._was_held = end_ns, self._is_held
         self.presented_count += 1
         if latency_ns >= 0:
             self._latency.add(latency_ns)
@@ -279,6 +283,7 @@ class Ledger:
 
     def _keep(self, frame: int, end_ns: int, deadline_ns: int) -> None:
         self.presented_frames.append(frame)
+        self.presented_ns.append(end_ns)
         if deadline_ns != NEVER:
             self.lateness_ns.append(end_ns - deadline_ns)
 
@@ -298,11 +303,6 @@ class Ledger:
         return dict(sorted((str(drop), count) for drop, count in self.dropped.items()))
 
     @property
-    def presented_ns(self) -> list[int]:
-        """The time at which each frame was presented, in order; only for a run that keeps all values."""
-        return [*accumulate(self._frame_times.samples.kept, initial=self._first_ns)] if self.presented_count else []
-
-    @property
     def latency_ns(self) -> list[int]:
         """The latency of each presented frame, in order; only for a run that keeps all values."""
         return [*self._latency.kept]
@@ -316,7 +316,7 @@ class Ledger:
 
     def report(self, *, clock: str, requested: int, not_begun: int) -> dict[str, Any]:
         """Return the keys of report.json. `not_begun`: number of requested frames that never left the source."""
-        intervals, span_ns = max(self.presented_count - 1, 0), self._last_ns - self._first_ns
+        intervals, span_ns = self._frame_times.samples.count, self._between_ns
         streams = {name: book.row() for name, book in self._newest.items()}
         return {
             "clock": clock,

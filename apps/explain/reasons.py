@@ -138,7 +138,7 @@ class SlowFrames:
         now = shown.presented
         assert now is not None
         before, self._before = self._before, now
-        if before is None:
+        if before is None or now.interval_ns is None:
             return
         begin_ns, end_ns = before.end_ns, now.end_ns
         sums: dict[Part, int] = {}

@@ -97,7 +97,7 @@ class LiveFigures:
         self._jobs, self._restarts = Counter[str](), Counter[str]()
         self._stages = {stage.name: _StageBook() for stage in begun.graph.stages}
         self._recent: deque[Presented] = deque()
-        self._first_end_ns = 0
+        self._between_ns = self._intervals = 0
         self._frame_times, self._latencies = TimeHistogram(), TimeHistogram()
         self._lost: Mapping[str, int] = {}
         self._dropped: Mapping[str, int] = {}
@@ -214,10 +214,10 @@ class LiveFigures:
                 self._finished_ns = step.now_ns
 
     def _add_presented(self, presented: Presented) -> None:
-        if presented.interval_ns is None:
-            self._first_end_ns = presented.end_ns
-        else:
+        if presented.interval_ns is not None:
             self._frame_times.add(presented.interval_ns)
+            self._between_ns += presented.interval_ns
+            self._intervals += 1
         if presented.latency_ns is not None:
             self._latencies.add(presented.latency_ns)
         deadline_ns = self._settings.deadline_ns
@@ -257,8 +257,7 @@ class LiveFigures:
         return 0.0 if self._first_ns is None else (now_ns - self._first_ns) / NS_PER_MS
 
     def _run_fps(self) -> float:
-        span_ns = self._recent[-1].end_ns - self._first_end_ns if self._recent else 0
-        return (self._timeline.presented - 1) * NS_PER_S / span_ns if span_ns else 0.0
+        return self._intervals * NS_PER_S / self._between_ns if self._between_ns else 0.0
 
     def _frame_figures(self) -> FrameFigures:
         line = self._timeline

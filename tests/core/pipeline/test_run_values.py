@@ -259,7 +259,7 @@ def test_steps_within_a_hold_do_not_end_it() -> None:
     for at_s, frames in ((1, 0), (2, 1), (4, -1), (6, 0)):
         held.hear(at_s * S, [Hold(frames)])
     assert [held.until(at_s * S) for at_s in (6, 8)] == [3 * S, 5 * S]
-    assert held.sentence(8 * S).startswith("held for 5.0 s by who watched it: frame times")
+    assert held.sentence(8 * S).startswith("held for 5.0 s by who watched it: shares of units")
 
 
 def test_answers_are_prompt_inside_the_run_alone() -> None:

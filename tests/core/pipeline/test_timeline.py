@@ -84,6 +84,22 @@ def test_a_job_that_ends_before_its_killed_unit_does_counts() -> None:
     assert list(timeline.downs) == [("v", 50, 90)]
 
 
+def test_a_pause_is_no_slow_frame() -> None:
+    """Frames end every 20; the run is held at 70, one more frame comes by itself at 80, and it goes on at 500."""
+    timeline = Timeline(TWO, Settings(9))
+    timeline.add(UP)
+    found, number = [], 0
+    for frame, end_ns in enumerate([40, 60, 80, 520, 540]):
+        for hold_ns, frames in ((70, 0), (500, -1)):
+            if end_ns - 20 <= hold_ns < end_ns:
+                timeline.add(Stepped(hold_ns, (Hold(frames),), ()))
+        timeline.add(Stepped(end_ns - 9, (), (job(number, "a", frame),)))
+        timeline.add(Stepped(end_ns - 5, (JobDone("u", number, 0, end_ns - 6, 1),), (job(number + 1, "b", frame),)))
+        found += told(timeline, [Stepped(end_ns + 1, (JobDone("v", number + 1, 0, end_ns, 0),), ())])
+        number += 2
+    assert [fact.interval_ns for fact in found if isinstance(fact, Presented)] == [None, 20, None, None, 20]
+
+
 def test_a_held_run_releases_what_it_is_asked_for() -> None:
     """A frame every 100; held from 150 on, one is let through at 170, and from 900 on the rate goes on."""
     timeline = Timeline(TWO, Settings(9, period_ns=100))

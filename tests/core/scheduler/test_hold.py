@@ -46,6 +46,10 @@ def test_frames_that_are_taken_at_once_are_held_stepped_and_let_go() -> None:
     assert run.step(12, Hold(-1)) == []  # the unit has its two
     assert run.done(13) == [5]
     assert list(replay(run.recording)) == []
+    assert run.done(14) == [6]
+    assert run.core.ledger.presented_ns == [each * MS for each in (2, 3, 10, 13, 14)]
+    report = run.core.ledger.report(clock="virtual", requested=10, not_begun=0)
+    assert (report["frame_time_ms"]["samples"], report["frame_time_ms"]["max"], report["fps"]) == (1, 1.0, 1000.0)
 
 
 def test_frames_that_are_let_go_before_the_units_are_ready_wait_for_them_without_being_asked_for() -> None:
