@@ -22,9 +22,10 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from trilane.apps.dashboard.access import Asgi, Guard, Refusal, Refusals
 from trilane.apps.dashboard.pages import (
     MOST_BYTES,
+    ChangesSaid,
     Client,
     Clients,
-    ControlSaid,
+    Heard,
     MalformedError,
     PictureAsked,
     Seek,
@@ -130,13 +131,16 @@ class DashboardApp:
                 client.faults += 1
                 self._refuse(client, Refusal.MALFORMED, "", str(error))
 
-    async def _do(self, client: Client, message: PictureAsked | ControlSaid | Seek) -> None:
+    async def _do(self, client: Client, message: Heard) -> None:
         if isinstance(message, PictureAsked):
             client.asks_picture = True
             self._asked.set()
         elif isinstance(message, Seek):
             for answer in await self._view.seek(client, message):
                 client.put(said(answer))
+        elif isinstance(message, ChangesSaid):
+            for name, why in self._view.restart(message).items():
+                self._refuse(client, Refusal.CONTROL, name, why)
         elif why := self._view.control(message):
             self._refuse(client, Refusal.CONTROL, message.name, why)
 

@@ -46,7 +46,7 @@ class RunBegins(NamedTuple):
 
 
 class StateIs(NamedTuple):
-    """To the server: running, paused, restarting, ended or failed, and why."""
+    """To the server: running, paused, restarting, ended or failed, and why. Until its first frame a run is starting."""
 
     state: str
     why: str
@@ -66,9 +66,15 @@ class ControlAsked(NamedTuple):
     value: str | float | None
 
 
-Message = Opened | RunBegins | StateIs | Refused | ControlAsked
+class ChangesAsked(NamedTuple):
+    """A message to the run: somebody requests a new run in which these controls have these values."""
 
-MESSAGES: Final[tuple[type[Any], ...]] = (Opened, RunBegins, StateIs, Refused, ControlAsked)
+    values: Mapping[str, str]
+
+
+Message = Opened | RunBegins | StateIs | Refused | ControlAsked | ChangesAsked
+
+MESSAGES: Final[tuple[type[Any], ...]] = (Opened, RunBegins, StateIs, Refused, ControlAsked, ChangesAsked)
 
 _FIELDS: Final[dict[type[Any], tuple[type | tuple[type, ...], ...]]] = {
     Opened: (str, int, int),
@@ -76,6 +82,7 @@ _FIELDS: Final[dict[type[Any], tuple[type | tuple[type, ...], ...]]] = {
     StateIs: (str, str),
     Refused: (str, str),
     ControlAsked: (str, (str, float, int, type(None))),
+    ChangesAsked: (dict,),
 }
 
 
@@ -153,7 +160,7 @@ class ServerLink:
         place: ServerAddress,
         height: int,
         width: int,
-        hear: Callable[[ControlAsked], None],
+        hear: Callable[[ControlAsked | ChangesAsked], None],
         tell: Callable[[str], None],
     ) -> None:
         self._hear, self._tell = hear, tell
@@ -198,7 +205,7 @@ class ServerLink:
         with contextlib.suppress(EOFError):
             while self._end_fd not in [fd for fd, _ in poller.poll()]:
                 message = self._channel.receive()
-                if isinstance(message, ControlAsked):
+                if isinstance(message, ControlAsked | ChangesAsked):
                     self._hear(message)
             return
         self._tell(SERVER_ENDED)

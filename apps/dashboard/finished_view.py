@@ -21,7 +21,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.apps.dashboard.pages import Client, ControlSaid, Seek, shown
+from trilane.apps.dashboard.pages import ChangesSaid, Client, ControlSaid, Seek, shown
 from trilane.apps.dashboard.run_facts import RunFacts, facts_of_folder
 from trilane.apps.dashboard.view import Message, RunMeter, TimelineRows, described, jpeg_of, note, slices
 from trilane.apps.watch.followed_run import CUT_OFF, FollowedRun, RunState
@@ -78,6 +78,9 @@ class FinishedView:
 
     def control(self, asked: ControlSaid) -> str:  # noqa: ARG002 - a view's signature
         return OVER
+
+    def restart(self, asked: ChangesSaid) -> Mapping[str, str]:
+        return dict.fromkeys(asked.changes, OVER)
 
     async def seek(self, client: Client, to: Seek) -> Iterable[Message]:
         t_ms = min(to.t_ms, self._run.end_ms)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from trilane.apps.dashboard.access import ServerAddress, listen
-from trilane.apps.dashboard.channel import ControlAsked, RunBegins, ServerLink, StateIs
+from trilane.apps.dashboard.channel import ChangesAsked, ControlAsked, RunBegins, ServerLink, StateIs
 from trilane.apps.dashboard.live_run import ENDED, FAILED, HOLDS, RUNNING, OpenHooks
 from trilane.apps.dashboard.run_facts import controls_of_file, facts_of_file
 from trilane.apps.run.run_file import run_file
@@ -54,7 +54,7 @@ def _link(
     place: ServerAddress,
     height: int,
     width: int,
-    hear: Callable[[ControlAsked], None],
+    hear: Callable[[ControlAsked | ChangesAsked], None],
     tell: Callable[[str], None],
 ) -> ServerLink:
     return stack.enter_context(contextlib.closing(ServerLink(place, height, width, hear, tell)))
@@ -67,7 +67,7 @@ class FileWatch:
     function that hears requests, on a thread of its own.
     """
 
-    def __init__(self, link: Callable[[int, int, Callable[[ControlAsked], None]], ServerLink]) -> None:
+    def __init__(self, link: Callable[[int, int, Callable[[ControlAsked | ChangesAsked], None]], ServerLink]) -> None:
         self.controls = RunControls()
         self._make = link
         self._link: ServerLink | None = None
@@ -89,8 +89,10 @@ class FileWatch:
         if self._link is not None:
             self._link.send(StateIs(state, why))
 
-    def do(self, asked: ControlAsked) -> None:
-        """Carry out a request of the page, whose server has already checked name and value."""
+    def do(self, asked: ControlAsked | ChangesAsked) -> None:
+        """Carry out a request of the page, whose server has already checked name and value: it asks for no changes."""
+        if isinstance(asked, ChangesAsked):
+            return
         if asked.control in HOLDS:
             frames, state = HOLDS[asked.control]
             self.controls.hold(frames)

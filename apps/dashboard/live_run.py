@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from trilane.apps.dashboard.access import listen
-from trilane.apps.dashboard.channel import ControlAsked, Message, Refused, RunBegins, ServerLink, StateIs
+from trilane.apps.dashboard.channel import ChangesAsked, ControlAsked, Message, Refused, RunBegins, ServerLink, StateIs
 from trilane.apps.dashboard.run_facts import OF_A_NEW_RUN, controls_of_run, facts_of_checked
 from trilane.apps.run.asked_run import early_processes, prepare, run_prepared
 from trilane.apps.run.run_job import ENDLESS, Hooks, Prepared, RunOutcome, Watched
@@ -36,6 +36,8 @@ RUNNING, PAUSED, RESTARTING, ENDED, FAILED = "running", "paused", "restarting", 
 #: Controls that hold the run or let it go: how many frames it may release, and what it does then.
 HOLDS: Final = {"play": (ALL, RUNNING), "pause": (0, PAUSED), "step": (1, PAUSED)}
 MOST_AVATARS: Final = 20
+#: The page's name for all changes together.
+RESTART: Final = "restart"
 
 
 def run_live(
@@ -99,6 +101,7 @@ class _Runs:
                 self.link.send(StateIs(FAILED if failure else ENDED, failure or ""))
                 return outcome
             self._tell(f"run folder: {outcome.folder}")
+            self.link.send(StateIs(RESTARTING, "the last run is written; the next one is made ready"))
             now, before = following, now
 
     def _run_one(self, prepared: Prepared) -> RunOutcome:
@@ -152,33 +155,36 @@ class Director:
             taken, self._next = self._next, None
             return taken
 
-    def do(self, asked: ControlAsked) -> None:
+    def do(self, asked: ControlAsked | ChangesAsked) -> None:
         """Carry out a request of the page, whose server has already checked name and value."""
         with self._lock:
             controls = self._controls
         if controls is None:
             return
-        if asked.control in HOLDS:
+        if isinstance(asked, ChangesAsked):
+            if all(name in OF_A_NEW_RUN and isinstance(word, str) for name, word in asked.values.items()):
+                self._change(controls, asked.values)
+        elif asked.control in HOLDS:
             frames, state = HOLDS[asked.control]
             controls.hold(frames)
             self._send(StateIs(state, ""))
         elif asked.control == "kill" and asked.value in UNITS:
             controls.kill(str(asked.value))
-        elif asked.control in OF_A_NEW_RUN and isinstance(asked.value, str):
-            self._change(controls, asked.control, asked.value)
 
-    def _change(self, controls: RunControls, name: str, value: str) -> None:
+    def _change(self, controls: RunControls, values: Mapping[str, str]) -> None:
         with self._lock:
             current = self._next or self._now
         assert current is not None
         try:
-            prepared = self._prepare(current.options.changed(**{name: RunOptions.value_of(name, value)}))
+            changes = {name: RunOptions.value_of(name, word) for name, word in values.items()}
+            prepared = self._prepare(current.options.changed(**changes))
         except TrilaneError as error:
-            self._send(Refused(name, str(error)))
+            self._send(Refused(next(iter(values)) if len(values) == 1 else RESTART, str(error)))
             return
         with self._lock:
             self._next = prepared
-        self._send(StateIs(RESTARTING, f"{name.replace('_', ' ')} {value}: the run starts again"))
+        told = ", ".join(f"{name.replace('_', ' ')} {word}" for name, word in values.items())
+        self._send(StateIs(RESTARTING, f"{told}: the frames in flight are finished"))
         controls.stop()
 
 

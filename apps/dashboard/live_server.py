@@ -13,7 +13,7 @@ import socket
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
@@ -21,10 +21,10 @@ from typing import Any, Final
 from PIL import Image
 
 from trilane.apps.dashboard.app import DashboardApp, server
-from trilane.apps.dashboard.channel import ChannelEnd, ControlAsked, Opened, Refused, RunBegins, StateIs
+from trilane.apps.dashboard.channel import ChangesAsked, ChannelEnd, ControlAsked, Opened, Refused, RunBegins, StateIs
 from trilane.apps.dashboard.channel import Message as FromRun
-from trilane.apps.dashboard.pages import Client, ControlSaid, Seek, shown
-from trilane.apps.dashboard.run_facts import OF_THE_CAMERA, Control, RunFacts, Value, control_of
+from trilane.apps.dashboard.pages import ChangesSaid, Client, ControlSaid, Seek, shown
+from trilane.apps.dashboard.run_facts import OF_A_NEW_RUN, OF_THE_CAMERA, Control, RunFacts, Value, control_of
 from trilane.apps.dashboard.view import (
     IdleRow,
     JobRow,
@@ -52,6 +52,8 @@ RECORDS_AT_ONCE: Final = 200
 READ_S: Final = 0.05  # of each look at the journal
 ASKED_A_SECOND: Final = 10
 ACCEPTED: Final = ""
+RUNNING, STARTING, NO_FRAME_YET = "running", "starting", "the units start; no frame yet"
+NO_NEW_RUN: Final = "it needs no new run"
 GOES_ON: Final = "a run that goes on has no other time than now"
 MS: Final = 1e-6  # of a nanosecond
 
@@ -139,7 +141,7 @@ class _LiveView:
     `window`: window into them. `ask`: function that hands a request to the run and returns whether it could.
     """
 
-    def __init__(self, window: LiveWindow, ask: Callable[[ControlAsked], bool]) -> None:
+    def __init__(self, window: LiveWindow, ask: Callable[[ControlAsked | ChangesAsked], bool]) -> None:
         self._window, self._ask = window, ask
         self._steering = Steering()
         self._facts: RunFacts | None = None
@@ -148,6 +150,7 @@ class _LiveView:
         self._followed: FollowedRun | None = None
         self._course: _Course | None = None
         self._state, self._why = "restarting", ""
+        self._is_told_starting = False
         self._told: list[Message] = []
         self._unread: Iterator[Record] = iter(())
         self._is_news = self._is_behind = False
@@ -185,8 +188,8 @@ class _LiveView:
             if self._course is not None:
                 self._course.fresh()
             return ()
-        if self._is_news and self._facts is not None:
-            self._is_news = False
+        if (self._is_news or self._is_told_starting != self._is_starting) and self._facts is not None:
+            self._is_news, self._is_told_starting = False, self._is_starting
             told.append(self._stated(self._facts))
         if self._course is not None:
             told += self._course.fresh()
@@ -210,20 +213,39 @@ class _LiveView:
         return shown(seen.frame, 1e3 * seen.media_s, age_ms, self._jpeg[1])
 
     def control(self, asked: ControlSaid) -> str:
-        control = self._controls.get(asked.name)
-        if control is None:
-            return f"found {asked.name!r}, expected one of {', '.join(self._controls)}"
-        if why := control.refusal(asked.value):
+        if asked.name in OF_A_NEW_RUN and isinstance(asked.value, str):
+            return self._new_run({asked.name: asked.value}).get(asked.name, ACCEPTED)
+        if why := self._refusal(asked.name, asked.value):
             return why
         if asked.name in OF_THE_CAMERA:
             self._steer(asked.name, asked.value)
             return ACCEPTED
+        value = asked.value if not isinstance(asked.value, list) else None
+        return self._hand_over(ControlAsked(asked.name, value))
+
+    def restart(self, asked: ChangesSaid) -> Mapping[str, str]:
+        return self._new_run(asked.changes)
+
+    def _new_run(self, changes: Mapping[str, str]) -> dict[str, str]:
+        """Ask for a run with the changes; returns the reasons against it, by control."""
+        of_another_kind = {name: NO_NEW_RUN for name in changes if name not in OF_A_NEW_RUN}
+        refused = of_another_kind | {name: why for name, word in changes.items() if (why := self._refusal(name, word))}
+        if refused:
+            return refused
+        why = self._hand_over(ChangesAsked(changes))
+        return dict.fromkeys(changes, why) if why else {}
+
+    def _refusal(self, name: str, value: Value) -> str:
+        control = self._controls.get(name)
+        return control.refusal(value) if control else f"found {name!r}, expected one of {', '.join(self._controls)}"
+
+    def _hand_over(self, asked: ControlAsked | ChangesAsked) -> str:
+        """Hand a request to the run; returns why that was not possible."""
         now_s = time.monotonic()
         if len(self._asked_s) == ASKED_A_SECOND and now_s - self._asked_s[0] < 1.0:
             return f"more than {ASKED_A_SECOND} things were asked for within a second"
         self._asked_s.append(now_s)
-        value = asked.value if not isinstance(asked.value, list) else None
-        return ACCEPTED if self._ask(ControlAsked(asked.name, value)) else "the run does not answer"
+        return ACCEPTED if self._ask(asked) else "the run does not answer"
 
     async def seek(self, client: Client, to: Seek) -> Iterable[Message]:  # noqa: ARG002 - a view's signature
         return [{"type": "refused", "control": "seek", "why": GOES_ON}]
@@ -269,7 +291,13 @@ class _LiveView:
         return {"type": "hello", "run": run, "controls": rows, "is_live": True, "span_ms": span}
 
     def _stated(self, facts: RunFacts) -> Message:
-        return {**facts.state(self._state, self._why), "config": self._values(facts)}
+        state, why = (STARTING, NO_FRAME_YET) if self._is_starting else (self._state, self._why)
+        return {**facts.state(state, why), "config": self._values(facts)}
+
+    @property
+    def _is_starting(self) -> bool:
+        """Whether the run goes on and has shown no frame yet."""
+        return self._state == RUNNING and (self._course is None or not self._course.meter.has_frames)
 
     def _values(self, facts: RunFacts) -> dict[str, Any]:
         """Return the value in force of each control that has one."""

@@ -24,6 +24,7 @@ JSON_KIND: Final = 1
 PICTURE_KIND: Final = 2
 MOST_BYTES: Final = 4096
 LONGEST_VALUE: Final = 512
+MOST_CHANGES: Final = 16
 LONGEST_SPAN_MS: Final = 3_600_000.0
 _PICTURE = struct.Struct("<BIdd")
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -146,6 +147,15 @@ class ControlSaid(_PageMessage):
     ) = None
 
 
+class ChangesSaid(_PageMessage):
+    """The page requests a new run with all `changes`, the values of controls by their names."""
+
+    type: Literal["restart"]
+    changes: dict[Annotated[str, Field(max_length=40)], Annotated[str, Field(max_length=LONGEST_VALUE)]] = Field(
+        min_length=1, max_length=MOST_CHANGES
+    )
+
+
 class Seek(_PageMessage):
     """The page requests the part of a finished run from `span_ms` before `t_ms` to `span_ms` after it."""
 
@@ -154,22 +164,22 @@ class Seek(_PageMessage):
     span_ms: Finite = Field(gt=0, le=LONGEST_SPAN_MS)
 
 
-_MESSAGES: TypeAdapter[Any] = TypeAdapter(Annotated[PictureAsked | ControlSaid | Seek, Field(discriminator="type")])
+Heard = PictureAsked | ControlSaid | ChangesSaid | Seek
+_MESSAGES: TypeAdapter[Heard] = TypeAdapter(Annotated[Heard, Field(discriminator="type")])
 
 
 class MalformedError(ValueError):
     """The bytes are nothing that a client may say."""
 
 
-def heard(data: bytes) -> PictureAsked | ControlSaid | Seek:
+def heard(data: bytes) -> Heard:
     """Read a client's message `data`. Raises MalformedError."""
     if data[:1] != bytes([JSON_KIND]):
         raise MalformedError("a kind that no client sends")
     try:
-        message: PictureAsked | ControlSaid | Seek = _MESSAGES.validate_json(data[1:])
+        return _MESSAGES.validate_json(data[1:])
     except ValidationError as error:
         raise MalformedError(error.errors()[0]["msg"]) from None
-    return message
 
 
 def said(message: Mapping[str, Any]) -> bytes:

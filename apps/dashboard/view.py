@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from trilane.apps.dashboard.pages import Client, ControlSaid, Seek
+from trilane.apps.dashboard.pages import ChangesSaid, Client, ControlSaid, Seek
 from trilane.apps.watch.followed_run import RunState
 from trilane.apps.watch.live_figures import LiveFigures
 from trilane.apps.watch.metrics import openmetrics
@@ -50,6 +50,9 @@ class RunView(Protocol):
 
     def control(self, asked: ControlSaid) -> str:
         """Carry out a request, or begin to. Return the reason for a refusal, "" for none."""
+
+    def restart(self, asked: ChangesSaid) -> Mapping[str, str]:
+        """Begin a new run with the changes, or do nothing. Return the reason for each refusal, by control."""
 
     async def seek(self, client: Client, to: Seek) -> Iterable[Message]:
         """Return the messages to `client` about another time of the run."""
@@ -148,6 +151,11 @@ class RunMeter:
     def message(self, now_ns: int | None = None) -> dict[str, Any]:
         """Return the message with the figures at `now_ns`; at the last record where it is None."""
         return {"type": "figures", **self._figures.now(now_ns).as_json()}
+
+    @property
+    def has_frames(self) -> bool:
+        """Whether a frame was presented."""
+        return self._figures.has_frames
 
     def metrics(self, now_ns: int | None = None, state: RunState | None = None) -> str:
         """Return the figures in OpenMetrics, without the end mark. `state`: as of `LiveFigures.now`."""

@@ -253,6 +253,11 @@ class LiveFigures:
 
     # figures
 
+    @property
+    def has_frames(self) -> bool:
+        """Whether a frame was presented."""
+        return self._timeline.presented > 0
+
     def _since_first_ms(self, now_ns: int) -> float:
         return 0.0 if self._first_ns is None else (now_ns - self._first_ns) / NS_PER_MS
 

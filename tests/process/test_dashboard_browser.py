@@ -21,7 +21,7 @@ playwright = pytest.importorskip("playwright.sync_api", reason="the extra browse
 
 from support.dashboard_double import DoubleView, Served  # noqa: E402
 from trilane import machine  # noqa: E402
-from trilane.apps.dashboard.pages import PICTURE_KIND, ControlSaid, Seek  # noqa: E402
+from trilane.apps.dashboard.pages import PICTURE_KIND, ChangesSaid, ControlSaid, Seek  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
@@ -158,6 +158,11 @@ def controls(view: DoubleView, name: str) -> list[Any]:
     return [said.value for said in view.said if isinstance(said, ControlSaid) and said.name == name]
 
 
+def changes(view: DoubleView) -> list[dict[str, str]]:
+    """The changes that the page asked for."""
+    return [said.changes for said in view.said if isinstance(said, ChangesSaid)]
+
+
 def test_pictures_timeline_and_figures_of_a_live_run(opened: Callable[..., Watched]) -> None:
     with Served(DoubleView()) as served:
         seen = opened(served.url)
@@ -220,19 +225,26 @@ def test_controls_act_restart_or_say_why_not(opened: Callable[..., Watched]) -> 
         seen.page.keyboard.press("Space")
         seen.wait_for("() => document.getElementById('state').textContent.includes('running')")
         policy = seen.page.locator("[data-control=policy]")
-        assert policy.get_by_role("button").is_disabled()
+        apply = seen.page.get_by_role("button", name="Apply and restart")
+        assert apply.is_disabled()
         policy.locator("select").select_option("sequential")
-        assert controls(view, "policy") == []
+        assert changes(view) == [] and apply.is_enabled()
         for action, state in (("pause", "paused"), ("play", "running")):  # what is chosen stays, whatever the run says
             seen.page.locator(f"[data-action={action}]").click()
             seen.wait_for(f"() => document.getElementById('state').textContent.includes('{state}')")
             assert policy.locator("select").input_value() == "sequential"
-        policy.get_by_role("button", name="Restart with it: policy").click()
-        seen.wait_until(lambda: controls(view, "policy") == ["sequential"])
-        seen.wait_for("() => document.querySelector('[data-control=policy] button').disabled")
+        edge = seen.page.locator("[data-control=edge] select")
+        edge.select_option("triple")
+        assert "policy sequential, edge triple" in seen.text("#restart-controls")
+        apply.click()
+        seen.wait_until(lambda: changes(view) == [{"policy": "sequential", "edge": "triple"}])
+        seen.wait_for("() => document.querySelector('[data-action=apply]').disabled")
+        edge.select_option("double")
+        seen.page.get_by_role("button", name="Discard").click()
+        assert edge.input_value() == "triple" and apply.is_disabled()
         runtime = seen.page.locator("[data-control=runtime]")
         runtime.locator("select").select_option("ort")
-        runtime.get_by_role("button").click()
+        apply.click()
         runtime.get_by_role("alert").wait_for()
         assert runtime.get_by_role("alert").inner_text() == "refused: ort is not installed"
         assert runtime.locator("select").input_value() == "openvino"
@@ -449,7 +461,7 @@ def test_a_run_is_watched_and_steered(opened: Callable[..., Watched], tmp_path: 
         policy = seen.page.locator("[data-control=policy]")
         assert policy.locator("select").input_value() == "pipelined"
         policy.locator("select").select_option("sequential")
-        policy.get_by_role("button").click()
+        seen.page.get_by_role("button", name="Apply and restart").click()
         seen.wait_for("() => document.getElementById('state').textContent.includes('restarting')")
         seen.wait_for("() => document.getElementById('state').textContent.includes('running')")
         seen.wait_for("() => Number(document.getElementById('run-time').dataset.seconds) < 5")

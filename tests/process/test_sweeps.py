@@ -160,12 +160,15 @@ def until_some_are_done(folder: Path, process: subprocess.Popen[str], count: int
 
 
 def each_done_once(folder: Path, log: Path) -> None:
-    """No trial of the sweep is lost, and none has two lines or went to its end twice."""
+    """No trial of the sweep is lost or has two lines, and each went to its end once.
+
+    But for the one that was at its end when the sweep was ended, before its line was written: it is done again.
+    """
     lines = [json.loads(line) for line in (folder / TRIALS).read_text().splitlines()]
     assert sorted(line["options"]["frames"] for line in lines) == list(range(1, COUNT + 1))
     assert {line["status"] for line in lines} == {"done"}
     ends = Counter(tuple(note["words"]) for note in notes(log) if note["what"] == "end")
-    assert sorted(ends.values()) == [1] * COUNT
+    assert sorted(ends.values()) in ([1] * COUNT, [*[1] * (COUNT - 1), 2])
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])

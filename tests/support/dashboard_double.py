@@ -20,7 +20,7 @@ from PIL import Image, ImageDraw
 
 from trilane.apps.dashboard.access import listen
 from trilane.apps.dashboard.app import DashboardApp, server
-from trilane.apps.dashboard.pages import Client, ControlSaid, Seek, shown
+from trilane.apps.dashboard.pages import ChangesSaid, Client, ControlSaid, Seek, shown
 
 PERIOD_MS = 1000 / 60
 STAGES = (("pose", "cpu"), ("raster", "gpu"), ("infer", "dsp"), ("composite", "gpu"), ("present", "cpu"))
@@ -243,6 +243,15 @@ class DoubleView:
             self.config[asked.name] = asked.value
         self._notes.append(self._state())
         return ""
+
+    def restart(self, asked: ChangesSaid) -> dict[str, str]:
+        """Note it; a new run has the values unless one of them is refused."""
+        self.said.append(asked)
+        if refused := {name: why for name, why in self.refuses.items() if name in asked.changes}:
+            return refused
+        self.config |= asked.changes
+        self._notes.append(self._state())
+        return {}
 
     async def seek(self, _client: Client, to: Seek) -> list[dict[str, Any]]:
         """Slices around the moment, and its figures."""

@@ -32,7 +32,8 @@ const PERCENTILES = ["p50", "p90", "p95", "p99"];
 const STATES = {
   running: "running",
   paused: "paused",
-  restarting: "restarting with the new configuration",
+  starting: "starting",
+  restarting: "restarting",
   ended: "ended",
   failed: "failed",
 };
@@ -58,6 +59,7 @@ const connection = new Connection({
 const controls = new Controls(
   { live: byId("live-controls"), restart: byId("restart-controls"), actions: byId("transport") },
   (name, value) => connection.control(name, value),
+  (changes) => connection.restart(changes),
 );
 const camera = {
   orbit: (dx, dy) => controls.use("orbit", [dx, dy]),

@@ -108,4 +108,8 @@ export class Connection {
   control(name, value = null) {
     return this.send({ type: "control", name, value });
   }
+
+  restart(changes) {
+    return this.send({ type: "restart", changes });
+  }
 }

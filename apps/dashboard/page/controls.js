@@ -8,10 +8,12 @@ const SLIDER_STEPS = 200;
 const AHEAD_MS = 700;
 
 export class Controls {
-  // send(name, value) sends; homes: {live, restart, actions}, the elements that they go into.
-  constructor(homes, send) {
+  // send(name, value) sends, restart(changes) asks for a run with all of them; homes: {live, restart, actions}, the
+  // elements that they go into.
+  constructor(homes, send, restart) {
     this.homes = homes;
     this.send = send;
+    this.restart = restart;
     this.table = new Map();
   }
 
@@ -24,8 +26,42 @@ export class Controls {
       const made = this.#make(control);
       if (made) this.#home(control).append(made);
     }
-    this.homes.restart.closest("section").hidden = this.homes.restart.children.length === 0;
+    const restarts = this.homes.restart.children.length > 0;
+    this.homes.restart.closest("section").hidden = !restarts;
+    this.applies = restarts ? this.#applies() : null;
+    this.applies?.show();
     if (focused) document.querySelector(`[data-control=${CSS.escape(focused)}] :is(select, input, button)`)?.focus();
+  }
+
+  // One bar for all that was chosen: what changes, a button for the restart, and one to choose nothing.
+  #applies() {
+    const apply = element("button", { type: "button", class: "primary", "data-action": "apply", text: "Apply and restart" });
+    const discard = element("button", { type: "button", text: "Discard" });
+    const text = element("span", { class: "hint", role: "status" });
+    const problem = element("p", { class: "problem", role: "alert", hidden: true });
+    apply.addEventListener("click", () => {
+      for (const [name] of this.#pending()) this.refused(name, "");
+      this.refused("restart", "");
+      if (this.restart(Object.fromEntries(this.#pending()))) setText(text, "asked for; the run ends its frames in flight");
+    });
+    discard.addEventListener("click", () => {
+      for (const [name] of this.#pending()) this.table.get(name).show(this.table.get(name).value);
+    });
+    this.table.set("restart", { name: "restart", problem });
+    this.homes.restart.append(element("div", { class: "pair apply" }, apply, discard, text), problem);
+    const show = () => {
+      const pending = this.#pending();
+      apply.disabled = discard.disabled = pending.length === 0;
+      const told = pending.map(([name, value]) => `${words(name)} ${words(value)}`).join(", ");
+      setText(text, told || "nothing chosen that is not in force");
+    };
+    return { show };
+  }
+
+  // [name, value] of each choice that is not in force.
+  #pending() {
+    const chosen = [...this.table.values()].filter((control) => control.isPending);
+    return chosen.map((control) => [control.name, control.field.value]);
   }
 
   #home(control) {
@@ -122,12 +158,9 @@ export class Controls {
       control.show(control.value);
       return this.#shell(control, label, select);
     }
-    const apply = element("button", { type: "button", text: "Restart with it", disabled: true });
-    apply.setAttribute("aria-label", `Restart with it: ${words(control.name)}`);
-    apply.addEventListener("click", () => this.use(control.name, chosen()));
     control.compare = () => {
-      control.isPending = select.value !== String(control.value);
-      apply.disabled = select.disabled || !control.isPending;
+      control.isPending = !select.disabled && select.value !== String(control.value);
+      this.applies?.show();
     };
     select.addEventListener("change", control.compare);
     control.show = (value) => {
@@ -135,7 +168,7 @@ export class Controls {
       control.compare();
     };
     control.show(control.value);
-    return this.#shell(control, label, element("div", { class: "pair" }, select, apply));
+    return this.#shell(control, label, select);
   }
 
   // A value in force that is none of the choices (set on the command line) is one of the list all the same.

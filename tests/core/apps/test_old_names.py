@@ -79,7 +79,7 @@ def test_an_old_name_is_told_once_and_does_the_same(command: Command) -> None:
     assert "Usage: trilane quality" in command("accuracy", "--help")[0]
 
 
-def test_axes_of_a_sweep_file_and_of_a_search(tmp_path: Path, command: Command) -> None:
+def test_axes_of_a_sweep_file(tmp_path: Path, command: Command) -> None:
     file = tmp_path / "old.toml"
     axes = "[axes]\nruntime = ['dsp', 'gpu']\n"
     file.write_text(f"command = 'predict'\n[options]\nsize = 512\n{axes}")
@@ -91,6 +91,10 @@ def test_axes_of_a_sweep_file_and_of_a_search(tmp_path: Path, command: Command) 
     file.write_text("command = 'accuracy'\n[axes]\nscene = ['far', 'closeup']\n")
     trials = command("sweep", file, "--dry-run")[0].splitlines()
     assert [trial.split()[1:4] for trial in trials] == [["trilane", "quality", each] for each in ("far", "closeup")]
+
+
+def test_axes_of_a_search(tmp_path: Path, command: Command) -> None:
+    pytest.importorskip("optuna")
     words = ("latency", "--on", "snapdragon-888", "--axis", "runtime=dsp,gpu", "--axis", "size=256", "--json")
     document = json.loads(command("tune", *words, "--out", tmp_path / "tuned")[0])
     assert {trial["options"]["unit"] for trial in document["trials"]} == {"dsp", "gpu"}

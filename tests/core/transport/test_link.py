@@ -7,6 +7,7 @@ import select
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import psutil
 import pytest
@@ -140,10 +141,18 @@ def test_the_folder_of_a_socket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert psutil.Process().num_fds() == fds - 1
 
 
+@pytest.fixture
+def short_path() -> Iterator[Path]:
+    """A folder whose name is short enough for a socket's, however long that of the tests' folder is."""
+    with TemporaryDirectory(dir="/tmp") as name:  # noqa: S108
+        yield Path(name)
+
+
 def test_only_a_folder_of_ones_own_whose_lock_is_free_is_removed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    short_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Beside it stand one that is locked, one without a lock, and a link; neither lock stays open."""
+    tmp_path = short_path
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     locked = SocketFolder()
     for name in ("trilane-a-stale", "trilane-without", "trilane-z-stale", "elsewhere"):

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from trilane.apps.dashboard import live_run, run_facts
-from trilane.apps.dashboard.channel import ControlAsked, Message, Refused, StateIs
+from trilane.apps.dashboard.channel import ChangesAsked, ControlAsked, Message, Refused, StateIs
 from trilane.apps.dashboard.live_run import Director, _numbered, choices_of, reasons_against
 from trilane.apps.run.run_job import Prepared
 from trilane.errors import BadInputError
@@ -60,29 +60,34 @@ def test_a_new_configuration_is_checked_and_then_the_run_stops(
     run: tuple[Director, RunControls], told: list[Message]
 ) -> None:
     director, controls = run
-    director.do(ControlAsked("policy", "latest"))
-    director.do(ControlAsked("edge", "triple"))  # before the next run has begun: both hold
+    director.do(ChangesAsked({"policy": "latest", "size": "128"}))
+    director.do(ChangesAsked({"edge": "triple"}))  # before the next run has begun: all of them hold
     assert controls.taken() == ([Stop(), Stop()], [])
     assert [type(message) for message in told] == [StateIs, StateIs]
-    assert isinstance(told[0], StateIs) and told[0].state == "restarting" and "policy latest" in told[0].why
+    assert isinstance(told[0], StateIs) and told[0].state == "restarting" and "policy latest, size 128: " in told[0].why
     following = director.take_next()
     assert following is not None and director.take_next() is None
-    assert following.options == RunOptions(policy="latest", edge="triple")
+    assert following.options == RunOptions(policy="latest", size="128", edge="triple")
 
 
 def test_one_that_cannot_be_run_changes_nothing(run: tuple[Director, RunControls], told: list[Message]) -> None:
     director, controls = run
-    director.do(ControlAsked("size", "17"))
+    why = "size: found 17, expected multiples of 32"
+    director.do(ChangesAsked({"size": "17"}))
+    director.do(ChangesAsked({"policy": "latest", "size": "17"}))
     assert controls.taken() == ([], []) and director.take_next() is None
-    assert told == [Refused("size", "size: found 17, expected multiples of 32")]
+    assert told == [Refused("size", why), Refused("restart", why)]
 
 
 @pytest.mark.parametrize(
     "asked",
-    [ControlAsked("reboot", "x"), ControlAsked("policy", None), ControlAsked("size", 96.0), ControlAsked("out", "/")],
+    [
+        *(ControlAsked("reboot", "x"), ControlAsked("policy", "latest"), ControlAsked("out", "/")),
+        *(ChangesAsked({"out": "/"}), ChangesAsked({"policy": "latest", "out": "/"}), ChangesAsked({"size": 96.0})),  # type: ignore[dict-item]
+    ],
 )
 def test_what_is_no_control_of_a_run_does_nothing(
-    run: tuple[Director, RunControls], told: list[Message], asked: ControlAsked
+    run: tuple[Director, RunControls], told: list[Message], asked: ControlAsked | ChangesAsked
 ) -> None:
     director, controls = run
     director.do(asked)
@@ -96,7 +101,7 @@ def test_a_control_changes_its_own_option_alone(run: tuple[Director, RunControls
         ("performance_profile", "burst", RunOptions(avatar="a/b", performance_profile="burst")),
         ("performance_profile", "none", RunOptions(avatar="a/b")),
     ):
-        director.do(ControlAsked(control, value))
+        director.do(ChangesAsked({control: value}))
         following = director.take_next()
         assert following is not None and following.options == expected
         director.begin(following)
@@ -118,7 +123,7 @@ def test_a_word_stands_for_the_value_of_its_option(
     """`bool("False")` is True. A value in force is told as the word that asks for it."""
     monkeypatch.setattr(live_run, "OF_A_NEW_RUN", (name,))
     monkeypatch.setattr(run_facts, "OF_A_NEW_RUN", (name,))
-    run[0].do(ControlAsked(name, word))
+    run[0].do(ChangesAsked({name: word}))
     following = run[0].take_next()
     assert following is not None and following.options == ASKED.changed(**{name: expected})
     config = {"scene": {"size": "64", "avatars": [{"bundle": "default"}]}}
@@ -142,7 +147,7 @@ def test_a_word_that_stands_for_no_value_is_refused(
     said: str,
 ) -> None:
     monkeypatch.setattr(live_run, "OF_A_NEW_RUN", (name,))
-    run[0].do(ControlAsked(name, word))
+    run[0].do(ChangesAsked({name: word}))
     assert (told, run[0].take_next()) == ([Refused(name, said)], None)
 
 

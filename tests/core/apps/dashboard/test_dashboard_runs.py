@@ -10,7 +10,7 @@ import pytest
 
 from trilane import machine
 from trilane.apps.dashboard import access, live_run
-from trilane.apps.dashboard.channel import ControlAsked, Message, Refused, StateIs
+from trilane.apps.dashboard.channel import ChangesAsked, Message, Refused, StateIs
 from trilane.apps.dashboard.live_run import ENDLESS, _Runs
 from trilane.apps.run.run_job import Prepared, Watched
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
@@ -40,7 +40,7 @@ class World:
         return SimpleNamespace(exit_code=exit_code, folder=str(out), report=SimpleNamespace(failure=failure))
 
     def ask(self, policy: str) -> None:
-        self.runs.director.do(ControlAsked("policy", policy))
+        self.runs.director.do(ChangesAsked({"policy": policy}))
 
     def run_all(self, **options: Any) -> Any:
         return self.runs.run_all(prepared(RunOptions(**options)))
@@ -66,7 +66,7 @@ def test_what_the_page_asks_for_follows(monkeypatch: pytest.MonkeyPatch) -> None
     world = World(monkeypatch, lambda: world.ask("latest"), lambda: world.ask("sequential"), lambda: (130, None))
     world.run_all()
     assert [policy for policy, _, _ in world.begun] == ["pipelined", "latest", "sequential"]
-    assert world.states == ["restarting", "restarting", "ended"]
+    assert world.states == ["restarting", "restarting", "restarting", "restarting", "ended"]  # asked for, made ready
     assert len(world.sentences) == 2  # where the runs before the last are
 
 

@@ -10,6 +10,7 @@ import msgpack
 import pytest
 
 from trilane.apps.dashboard.channel import (
+    ChangesAsked,
     ControlAsked,
     Opened,
     Refused,
@@ -70,7 +71,7 @@ def test_the_page_is_told_in_bytes_that_are_written_down() -> None:
 MESSAGES = [
     Opened("token", 480, 640), RunBegins("/runs/a", {"name": "a"}, [{"name": "play"}]), StateIs("paused", ""),
     Refused("size", "found 17"),
-    ControlAsked("zoom", 2.5), ControlAsked("pause", None), ControlAsked("policy", "latest"),
+    ControlAsked("zoom", 2.5), ControlAsked("pause", None), ChangesAsked({"policy": "latest", "size": "128"}),
 ]  # fmt: skip
 
 
@@ -80,7 +81,20 @@ def test_run_and_server_understand_each_other(message: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    "row", [[], [9, "x"], [-6, "x"], ["0"], [2, "paused"], [2, "paused", 1], [0, "t", "480", 640], {"a": 1}, 3, None]
+    "row",
+    [
+        [],
+        [5, "x"],
+        [9, "x"],
+        [-6, "x"],
+        ["0"],
+        [2, "paused"],
+        [2, "paused", 1],
+        [0, "t", "480", 640],
+        {"a": 1},
+        3,
+        None,
+    ],
 )
 def test_bytes_of_no_message_are_refused(row: Any) -> None:
     with pytest.raises(UnexpectedValue):
