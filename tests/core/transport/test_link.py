@@ -144,7 +144,7 @@ def test_the_folder_of_a_socket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 @pytest.fixture
 def short_path() -> Iterator[Path]:
     """A folder whose name is short enough for a socket's, however long that of the tests' folder is."""
-    with TemporaryDirectory(dir="/tmp") as name:  # noqa: S108
+    with TemporaryDirectory(dir="/tmp") as name:
         yield Path(name)
 
 
