@@ -47,13 +47,14 @@ class Lateness(NamedTuple):
     """How many frames were not in time.
 
     `due`: number of frames that had to be in time. `late`: number of those that came late. `dropped`, `lost`: numbers
-    of those that never came.
+    of those that never came. `replaced`: number of frames that gave way to newer ones although nobody asked for a rate.
     """
 
     due: int
     late: int
     dropped: int = 0
     lost: int = 0
+    replaced: int = 0
 
     @property
     def missed(self) -> int:
@@ -186,7 +187,8 @@ def _too_late(facts: Facts) -> str:
 
 
 def _late(found: Lateness) -> str:
-    rest = "".join(f", {count} {what}" for what, count in (("dropped", found.dropped), ("lost", found.lost)) if count)
+    counts = {"dropped": found.dropped, "lost": found.lost, "replaced by newer ones": found.replaced}
+    rest = "".join(f", {count} {what}" for what, count in counts.items() if count)
     return f"{found.late} of {found.due} frames late{rest}"
 
 

@@ -94,12 +94,12 @@ def _is_paced(document: Mapping[str, Any]) -> bool:
 def _lateness(document: Mapping[str, Any], *, is_paced: bool) -> Lateness | None:
     """Return how many frames were not in time; None where the misses count against another rate."""
     frames, late = document["frames"], document["deadline_misses"]
+    dropped = wanted_drops(frames["dropped"])
     if is_paced:
-        dropped = wanted_drops(frames["dropped"])
         return Lateness(frames["presented"] + dropped + frames["lost"], late, dropped, frames["lost"])
     if (document.get("pace") or {}).get("slow_motion", 1.0) != 1.0:
         return None
-    return Lateness(frames["presented"] - 1, late, 0, frames["lost"])
+    return Lateness(frames["presented"] - 1, late, 0, frames["lost"], dropped)
 
 
 def bound_of(document: Mapping[str, Any]) -> Bound | None:

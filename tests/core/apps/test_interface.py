@@ -127,7 +127,7 @@ def test_frames_idle_time_and_events_are_those_of_the_run(folder: Path, simulate
     assert run.events == [(now_ns, event) for now_ns, events, _ in recording.steps for event in events]
     assert sum(isinstance(record, Stepped) for record in run.records()) == len(recording.steps)
     assert run.explain(2)["frames"] == 30
-    assert repr(run).startswith(f"Run {folder}\nPASS  50 fps, at 30 fps 0 of 2 frames late\n")
+    assert repr(run).startswith(f"Run {folder}\nPASS  50 fps, at 30 fps 0 of 2 frames late, 1 replaced by newer ones\n")
 
 
 def test_a_data_frame_has_the_jobs(folder: Path) -> None:

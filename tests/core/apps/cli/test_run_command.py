@@ -95,7 +95,7 @@ def test_options_arrive_as_they_were_given(
 
 def test_the_table_or_the_document_and_where_the_run_is(runs: Runs, command: Command) -> None:
     out, err = command("run")
-    assert out.startswith("PASS  50 fps, at 30 fps 0 of 2 frames late\n")
+    assert out.startswith("PASS  50 fps, at 30 fps 0 of 2 frames late, 1 replaced by newer ones\n")
     assert "Scene test" not in out
     table = command("run", "--table")[0]
     assert table.startswith(out)

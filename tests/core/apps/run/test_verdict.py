@@ -42,6 +42,7 @@ US = 1000
         ({"lateness": Lateness(300, 3)}, True, "30 fps are held"),  # 1 % of them
         ({"lateness": Lateness(300, 4)}, False, "4 of 300 frames late at 30 fps"),
         ({"lateness": Lateness(300, 1, 2, 1)}, False, "1 of 300 frames late, 2 dropped, 1 lost at 30 fps"),
+        ({"lateness": Lateness(34, 0, replaced=85)}, True, "30 fps are held"),  # the rate is of those that were shown
         ({"failure": "gpu is gone"}, False, "the run failed: gpu is gone"),
         ({"rate": None, "lateness": None}, False, "fewer than two frames were presented"),
         ({"target_fps": 60.0}, True, "60 fps are held"),
@@ -89,6 +90,11 @@ def test_a_prediction_is_sure_where_its_interval_is_on_one_side() -> None:
         found = predicted_verdict({**answer, "config": {"fps": fps}}).as_json()
         assert (found["pass"], found["trusted"]) == (passed, trusted)
         assert found["bound"] == {"unit": "v", "stages": ["b"], "share": 0.8}
+
+
+def test_frames_that_gave_way_to_newer_ones_are_told_beside_the_rate() -> None:
+    found = judged(replace(FAST, lateness=Lateness(34, 0, replaced=85)))
+    assert "at 30 fps 0 of 34 frames late, 85 replaced by newer ones" in dict(found.lines())["PASS"]
 
 
 def test_frames_that_every_leaves_out_are_not_dropped_ones() -> None:
