@@ -125,5 +125,6 @@ def _hint(scene: Scene, heights: F64) -> tuple[str, ...]:
         return ()
     return (
         f"the person is only {np.median(heights):.1%} of the picture's height in the median, hard to find: if the "
-        "camera was nearer, its file's unit is smaller than it was taken for; camera.metres_per_unit states it",
+        "camera was nearer, its file's unit is smaller than it was taken for (camera.metres_per_unit states it), or "
+        "the columns of its places are in another order",
     )

@@ -99,7 +99,7 @@ WHICH_MATRIX = (
 
 #: How a table becomes usable, by the columns that other programs save.
 OTHERS = {
-    1: "part the numbers by blanks or commas",
+    1: "part the numbers by blanks, commas or semicolons",
     7: "if these are rotation vectors, as in ARKitScenes, or a place and a quaternion: write time, place and "
     "quaternion of each pose, camera to world, as TUM has them",
     16: "if these are 4x4 matrices, as of Replica: leave the last four columns out, which are 0 0 0 1, for KITTI's 12",

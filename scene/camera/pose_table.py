@@ -8,6 +8,7 @@ camera that looks anywhere.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -127,7 +128,7 @@ def layout_of(path: Path, expected: str) -> TableLayout:
         if found := names_in(line):
             names, unit = (names, unit) if times else (found, _unit_in(line))
         elif words:
-            first, has_commas = first or words, has_commas or "," in line
+            first, has_commas = first or words, has_commas or "," in _parted(line)
             times += _number(words[0])
         if len(times) == LOOKED_AT:
             break
@@ -146,7 +147,7 @@ def _number(word: str) -> list[float]:
 
 def names_in(line: str) -> tuple[str, ...]:
     """Return the contents of the columns if `line`, maybe a comment, names four or more known ones; else nothing."""
-    text = UNIT.sub("", line.strip().lstrip("#"))
+    text = UNIT.sub("", _parted(line.strip().lstrip("#")))
     words = text.split(",") if "," in text else text.split()
     plain = (OTHER.sub("", SYMBOLS.sub("", word.strip().lower())) for word in words)
     names = tuple(KNOWN.get(word, "") for word in plain)
@@ -251,9 +252,14 @@ def is_index(column: NDArray[np.float64]) -> bool:
     return bool(np.median(steps) == 1 and (steps >= 1).mean() >= LEAST_GROWING)
 
 
+def _parted(text: str) -> str:
+    """Return a line with commas between its fields if it has semicolons: its numbers may then have decimal commas."""
+    return text.replace(",", ".").replace(";", ",") if ";" in text else text
+
+
 def words_of(line: str) -> list[str]:
     """Return the fields of a line without its comment."""
-    text = line.split("#", 1)[0]
+    text = _parted(line.split("#", 1)[0])
     if "," not in text:
         return text.split()
     fields = [word for field in text.split(",") for word in field.split() or ["nan"]]
@@ -278,6 +284,9 @@ SAY_ORDER = "say the order in a first line, such as `timestamp qx qy qz qw tx ty
 MATRIX = 12
 #: Largest deviation of a quaternion's length from 1: two digits after the point change it by 0.01 at most.
 MOST_OFF = 0.02
+#: Steps of a clock differ by less than the first share of their median; steps that differ by more than the second are
+#: none of a clock. A column is judged from so many rows on.
+EVEN, UNEVEN, LEAST_OF_A_CLOCK = 0.01, 0.5, 8
 
 
 @dataclass(frozen=True)
@@ -325,6 +334,8 @@ def read_pose_table(
     _require_quats(path, quats, table)
     turns = matrix_from_quat(normalised(quats))
     places = np.column_stack([x, y, z])
+    if not layout.has_pose:
+        _require_times(path, time, places)
     return PoseTable(
         times.since_s, turns, places, times.unit, times.rate, order, names, table, _began(time, times.unit)
     )
@@ -352,6 +363,26 @@ def read_matrix_table(path: Path, clock: Clock, expected: str) -> MatrixTable:
     first = times_of(path, table.numbers[:, 0], clock) if columns > MATRIX else None
     matrices = table.numbers[:, -MATRIX:].reshape(-1, 3, 4)
     return MatrixTable(first, matrices[:, :, :3], matrices[:, :, 3], table)
+
+
+def _require_times(path: Path, times: F64, places: F64) -> None:
+    """Raise BadInputError if a column of `places` (N, 3) is a clock and `times` (N,) are not.
+
+    A clock's steps are all alike. No camera moves so evenly along an axis while it is sampled at uneven times.
+    """
+    if len(times) < LEAST_OF_A_CLOCK or _unevenness(times) < UNEVEN:
+        return
+    even = [name for name, column in zip("xyz", places.T, strict=True) if _unevenness(column) < EVEN]
+    if even:
+        found = f"times whose steps differ, and in the place of {even[0]} numbers that grow by equal steps"
+        raise BadInputError(path, found, "the times in the column of times", SAY_ORDER)
+
+
+def _unevenness(column: F64) -> float:
+    """Return how far steps are from their median, as a share of it; infinity where the column does not grow."""
+    steps = np.diff(column)
+    median = float(np.median(steps))
+    return float(np.abs(steps - median).max() / median) if median > 0 and np.isfinite(steps).all() else math.inf
 
 
 def _began(times: F64, unit: str) -> float | None:

@@ -31,7 +31,9 @@ from support.camera_files import (
 from trilane.errors import BadInputError
 from trilane.scene.camera.colmap import MODELS, checked_camera
 from trilane.scene.camera.path import axes_towards
+from trilane.scene.camera.pose_table import Clock, read_pose_table
 from trilane.scene.camera.recorded import LengthUnit, looked_at_from, metres_per_unit
+from trilane.scene.camera.trajectories import TUM_NAMES
 from trilane.scene.lens import Bent, Lens, distortion_note, largest_px
 from trilane.scene.rotations import about, matrix_from_quat
 from trilane.scene.schema import CameraSpec
@@ -591,3 +593,38 @@ def test_a_wrong_nerf_file_is_refused_in_one_sentence(tmp_path: Path, case: str)
     with pytest.raises(BadInputError) as raised:
         load(path)
     assert f"{path}{sentence}" in str(raised.value)
+
+
+def _pushed_in(rows: int = 40) -> tuple[np.ndarray, np.ndarray]:
+    """Times at 30 a second, and poses x y z qx qy qz qw of a camera that slows down as it comes nearer."""
+    times = np.arange(rows) / 30
+    places = np.column_stack([2 * np.sin(times), np.full(rows, 1.5), 4 - times**2])
+    return times, np.column_stack([places, np.tile([1.0, 0, 0, 0], (rows, 1))])
+
+
+def test_fields_may_be_parted_by_semicolons_with_decimal_commas(tmp_path: Path) -> None:
+    times, poses = _pushed_in()
+    rows = [";".join(f"{value:.6f}" for value in row) for row in np.column_stack([times, poses])]
+    head = "timestamp;tx;ty;tz;qx;qy;qz;qw"
+    found = []
+    for name, lines in {"points": rows, "commas": [row.replace(".", ",") for row in rows]}.items():
+        file = tmp_path / f"{name}.csv"
+        file.write_bytes("\r\n".join(["\ufeff" + head, *lines]).encode())
+        found.append(read_pose_table(file, Clock(None, "auto"), TUM_NAMES, "a table"))
+    np.testing.assert_allclose(found[0].times_s, times, atol=1e-6)
+    np.testing.assert_allclose(found[0].places, poses[:, :3], atol=1e-6)
+    assert np.array_equal(found[0].places, found[1].places)
+
+
+@pytest.mark.parametrize("column", [1, 3])
+def test_times_in_a_column_of_places_are_refused(tmp_path: Path, column: int) -> None:
+    times, poses = _pushed_in()
+    table = np.column_stack([times, poses])
+    table[:, [0, column]] = table[:, [column, 0]] * (1 if column == 1 else -1)
+    table[:, column] = times
+    file = tmp_path / "swapped.txt"
+    np.savetxt(file, table, fmt="%.6f")
+    with pytest.raises(BadInputError, match=f"in the place of {'xyz'[column - 1]} numbers that grow by equal steps"):
+        read_pose_table(file, Clock(None, "auto"), TUM_NAMES, "a table")
+    np.savetxt(file, np.column_stack([times, poses]), fmt="%.6f")
+    assert len(read_pose_table(file, Clock(None, "auto"), TUM_NAMES, "a table").times_s) == len(times)
