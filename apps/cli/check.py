@@ -44,7 +44,7 @@ SvgOption = Annotated[Path | None, typer.Option("--svg", help="Draw the graph he
 def check(file: FileArgument, svg: SvgOption = None, profile: ProfileOption = None, json: JsonOption = False) -> None:
     """Check a pipeline file and print its graph, the least period with the cycle that makes it, and its memory.
 
-    A scene is printed as the pipeline file that its run is. Nothing runs, and no Python of the file is imported.
+    For a scene, the command prints the pipeline file of its run. Nothing runs, and no Python of the file is imported.
     """
     from trilane.apps.check.graph_svg import draw_graph
     from trilane.errors import BadInputError
