@@ -150,7 +150,7 @@ class DoubleView:
         self, is_live: bool = True, refuses: Mapping[str, str] | None = None, trace: Path | None = None
     ) -> None:
         self.is_live, self.refuses, self.trace = is_live, dict(refuses or {}), trace
-        self.said: list[ControlSaid | Seek] = []
+        self.said: list[ControlSaid | ChangesSaid | Seek] = []
         self.state = "running" if is_live else "ended"
         self.turn_deg, self.zoom, self.restarts = 0.0, 1.0, 0
         self.config: dict[str, Any] = {row["name"]: row["value"] for row in CONTROLS if row.get("value") is not None}
