@@ -68,10 +68,18 @@ class Page:
         return self.pictures[-1][1]
 
     def settle(self) -> int:
-        """How many frames are presented once none is in flight, by figures that come after this call."""
-        self.told.pop("figures", None)
-        self.until(lambda: self.told.get("figures", {}).get("frames", {}).get("in_flight") == 0, "frames in flight")
-        return self.presented
+        """How many frames are presented once none is in flight, by figures that come after this call.
+
+        Two figures in turn have to agree: a slow source has moments without a frame in flight while it goes on, and a
+        pause is told before the scheduler has heard of it.
+        """
+        seen = -1
+        while True:
+            self.told.pop("figures", None)
+            self.until(lambda: self.told.get("figures", {}).get("frames", {}).get("in_flight") == 0, "frames in flight")
+            if self.presented == seen:
+                return seen
+            seen = self.presented
 
     @property
     def presented(self) -> int:
