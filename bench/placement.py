@@ -15,13 +15,11 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from trilane.avatars.network_file import reshaped
 from trilane.bench.lib import networks
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.application import Plan, Variant, steady
 from trilane.hw_profiles.host import described, host_cores, rule_placement, settings_of, usable_cores
 from trilane.hw_profiles.host_model import on_cores, place_units
-from trilane.hw_profiles.network_work import Network, count_work
 from trilane.hw_profiles.profile_files import load_profile
 from trilane.hw_profiles.schema import corners_of
 from trilane.pipeline.run_metrics import RunMetrics
@@ -31,7 +29,7 @@ from trilane.scheduler.placement import Ranked, Rules, frame_ns, ranked, worth_t
 from trilane.scheduler.places import CpuCore, Placement
 from trilane.scheduler.stats import median_interval
 from trilane.stages import PRELOAD
-from trilane.stages.avatar_assets import network_of
+from trilane.stages.avatar_assets import networks_of, painting
 from trilane.stages.avatar_pipeline import measured_times, run_avatar, tried
 from trilane.stages.configure import Checked, configure
 from trilane.stages.placing import FIRST, choice, considered, times_rows
@@ -224,10 +222,8 @@ def _interval(prefix: str, values: Sequence[float]) -> dict[str, float]:
 
 def _virtual(checked: Checked, avatar: str, count: int) -> Mapping[str, Any]:
     """Return what virtual time says about the placements on `count` equal cores without siblings."""
-    height, width = min(checked.config.buckets, key=lambda shape: (abs(shape[0] - shape[1]), shape))
-    network = reshaped(network_of(checked.assets), height, width)
-    _, _, _, channels = network.shape
-    work = Network({"avatar": avatar}, height, width, channels, "packed", count_work(network.model))
+    shape = min(checked.config.buckets, key=lambda shape: (abs(shape[0] - shape[1]), shape))
+    work = painting(networks_of(checked.assets), shape, {"avatar": avatar})
     profile, plan = load_profile(HOST), Plan(work, "dsp", Variant(POLICY, EDGE))
     corners = corners_of(profile, BURST)
     placed = place_units(profile, plan, corners, [CpuCore(number, number) for number in range(count)])

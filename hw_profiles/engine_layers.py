@@ -157,6 +157,23 @@ class Layers:
         first = next((i for i, layer in enumerate(self.layers) if layer.name == name), len(self.layers))
         return Layers(self.layers[first:], self.sizes, crossing, self.output)
 
+    def named(self, before: str) -> Layers:
+        """Return the same layers with `before` in front of the names of layers and tensors."""
+
+        def renamed(names: tuple[str, ...]) -> tuple[str, ...]:
+            return tuple(before + name for name in names)
+
+        layers = tuple(
+            layer._replace(
+                name=before + layer.name,
+                reads=renamed(layer.reads),
+                writes=before + layer.writes,
+                more=renamed(layer.more),
+            )
+            for layer in self.layers
+        )
+        return Layers(layers, {before + name: size for name, size in self.sizes.items()}, self.input, self.output)
+
 
 NO_LAYERS = Layers((), {}, 0, 0)
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import prod
@@ -100,6 +100,25 @@ class Work:
     def weights(self) -> int:
         """Weight elements of the whole network."""
         return sum(o.weights for o in self.operators)
+
+
+def one_after_the_other(works: Sequence[Work]) -> Work:
+    """Return the work of a job that runs several networks, each on an input of its own; at least one."""
+    if len(works) == 1:
+        return works[0]
+    parts = [work.layers.named(f"{number}/") for number, work in enumerate(works)]
+    return Work(
+        operators=tuple(operator for work in works for operator in work.operators),
+        input_elements=sum(work.input_elements for work in works),
+        input_tensors=max(work.input_tensors for work in works),
+        output_elements=sum(work.output_elements for work in works),
+        layers=Layers(
+            tuple(layer for part in parts for layer in part.layers),
+            {name: size for part in parts for name, size in part.sizes.items()},
+            sum(part.input for part in parts),
+            sum(part.output for part in parts),
+        ),
+    )
 
 
 class Network(NamedTuple):

@@ -7,6 +7,9 @@ loses the face, much larger it paints ragged edges. So each avatar in view gets 
 to paint. A body that has more pixels on the picture than in its tensor loses detail, so it gets up to `MOST_GROWTH`
 times the pixels (docs/decisions/planner.md has the figures).
 
+Avatars of different networks have a tensor each, of one shape. The budgets of a frame are those of the network that
+needs most, and its density is that of the least dense tensor.
+
 **Mesh.** An avatar whose surface may move by less than the error budget is drawn with fewer triangles. `hold_mesh`
 keeps a level while it can, and goes to coarser ones step by step.
 
@@ -37,7 +40,7 @@ from typing import NamedTuple
 from trilane.arrays import Floats
 from trilane.errors import BadInputError
 from trilane.scene.crop import Rect
-from trilane.scene.tensor_layout import DenseLayout, lay_out_at, tight_shape
+from trilane.scene.tensor_layout import DenseLayout, apart, by_network, lay_out_at, tight_shape
 from trilane.shapes import Shape, shapes_within
 
 
@@ -189,6 +192,7 @@ def plan_tensor(
     budget: TensorBudget,
     before: HeldShape | None,
     foreseen: Shape | None = None,
+    networks: Sequence[int] = (),
 ) -> TensorPlan:
     """Plan the tensor for the avatars at `rects`, at least one.
 
@@ -196,26 +200,46 @@ def plan_tensor(
     `shapes`: shapes that are ready. Where all of them are larger than the budget allows, any may be taken.
     `before`: shape of the frame before, None for the first.
     `foreseen`: shape of this frame by `foreseen_changes`; None where nothing was foreseen.
+    `networks`: network of each avatar at `rects`; empty where one paints all.
     Raises BadInputError when no shape has room for all avatars.
     """
-    fits, good = _fits(rects, output, shapes, budget)
+    fits, good = _fits(rects, networks, output, shapes, budget)
     if not good:
         raise BadInputError("tensor shapes", f"{list(shapes)}", f"room for {len(rects)} avatars", "use a larger --size")
     held = _held(good, before, foreseen)
     return TensorPlan(fits[held.shape], held)
 
 
+def _grouped(rects: Sequence[Rect], networks: Sequence[int]) -> list[list[Rect]]:
+    """Return the rectangles of each network."""
+    return [[rects[place] for place in places] for places in by_network(networks or [0] * len(rects))]
+
+
+def pixels_of(rects: Sequence[Rect], networks: Sequence[int], output: Shape, budget: TensorBudget) -> int:
+    """Return the pixels of a frame's tensor: the most that the avatars of one network may have.
+
+    `networks`: network of each avatar at `rects`; empty where one paints all.
+    """
+    return max(budget.of(own, output) for own in _grouped(rects, networks))
+
+
+def _dense(rects: Sequence[Rect], networks: Sequence[int], output: Shape, shape: Shape) -> DenseLayout | None:
+    """Return the densest layout in tensors of `shape`, one for each network; None without room for all avatars."""
+    return apart(rects, networks or [0] * len(rects), lambda own: lay_out_at(own, output, shape, MOST_DENSITY))
+
+
 def _fits(
-    rects: Sequence[Rect], output: Shape, shapes: Sequence[Shape], budget: TensorBudget
+    rects: Sequence[Rect], networks: Sequence[int], output: Shape, shapes: Sequence[Shape], budget: TensorBudget
 ) -> tuple[dict[Shape, DenseLayout], list[Shape]]:
     """Return the layout in each shape that may be taken and has room for the avatars, and which of the shapes are good.
 
     A good shape is nearly as dense as the densest within the frame's budget. It may be larger than that one, but not
     than the budget of any frame with as many avatars.
     """
-    most, pixels = budget.most_of(len(rects)), budget.of(rects, output)
+    most = budget.most_of(max(map(len, _grouped(rects, networks))))
+    pixels = pixels_of(rects, networks, output, budget)
     allowed = [shape for shape in shapes if area(shape) <= most] or shapes
-    fits = {shape: fit for shape in allowed if (fit := lay_out_at(rects, output, shape, MOST_DENSITY)) is not None}
+    fits = {shape: fit for shape in allowed if (fit := _dense(rects, networks, output, shape)) is not None}
     within = [fit.density for shape, fit in fits.items() if area(shape) <= pixels]
     enough = AS_GOOD * max(within or [fit.density for fit in fits.values()], default=0.0)
     return fits, [shape for shape, fit in fits.items() if fit.density >= enough]
@@ -246,19 +270,29 @@ class LookAhead:
     frame: int
     rects: Mapping[int, Rect]
 
+    def networks(self, of_all: Sequence[int]) -> list[int]:
+        """Return the network of each visible avatar. `of_all`: that of each avatar; empty where one paints all."""
+        return [of_all[number] for number in self.rects] if of_all else []
+
 
 def foreseen_changes(
-    looks: Sequence[LookAhead], output: Shape, shapes: Sequence[Shape], budget: TensorBudget
+    looks: Sequence[LookAhead],
+    output: Shape,
+    shapes: Sequence[Shape],
+    budget: TensorBudget,
+    networks: Sequence[int] = (),
 ) -> tuple[tuple[int, Shape], ...]:
     """Return the shape from the first of `looks` on, at least one, and every change of shape with its frame.
 
+    `networks`: network of each avatar of the scene; empty where one paints all.
     The way through the good shapes is the cheapest in pixels: those of all frames, and the cost of the changes. A shape
     that is not good at a look is left in the first frame after the look before.
     """
     order = sorted(shapes, key=lambda shape: (area(shape), shape))
     costs, origins, needed = dict.fromkeys(order, 0.0), [], []
     for number, look in enumerate(looks):
-        fits, good = _fits(list(look.rects.values()), output, order, budget) if look.rects else ({}, order)
+        of_seen = look.networks(networks)
+        fits, good = _fits([*look.rects.values()], of_seen, output, order, budget) if look.rects else ({}, order)
         before, after = looks[max(number - 1, 0)], looks[min(number + 1, len(looks) - 1)]
         price = PATIENCE * budget.own / (1.0 + _speed(before, look) / FAST) if before.rects and look.rects else 0.0
         ways = {shape: _cheapest_way(shape, costs, fits, price) for shape in good or order}
@@ -302,12 +336,15 @@ def _speed(before: LookAhead, now: LookAhead) -> float:
     return max(moved, default=0.0) / frames
 
 
-def ideal_shape(rects: Sequence[Rect], output: Shape, budget: TensorBudget) -> Shape:
-    """Return the shape in which the avatars at `rects` are densest within the budget; the smallest of equal ones."""
-    pixels = budget.of(rects, output)
-    tight = tight_shape(rects, output, MOST_DENSITY)
-    shapes = [*shapes_within(pixels), *([tight] if area(tight) <= pixels else [])]
-    fits = [(fit.density, shape) for shape in shapes if (fit := lay_out_at(rects, output, shape, MOST_DENSITY))]
+def ideal_shape(rects: Sequence[Rect], output: Shape, budget: TensorBudget, networks: Sequence[int] = ()) -> Shape:
+    """Return the shape in which the avatars at `rects` are densest within the budget; the smallest of equal ones.
+
+    `networks`: network of each of them; empty where one paints all.
+    """
+    pixels = pixels_of(rects, networks, output, budget)
+    tight = [tight_shape(own, output, MOST_DENSITY) for own in _grouped(rects, networks)]
+    shapes = [*shapes_within(pixels), *(shape for shape in tight if area(shape) <= pixels)]
+    fits = [(fit.density, shape) for shape in shapes if (fit := _dense(rects, networks, output, shape))]
     if not fits:
         return max(shapes, key=area)
     return max(fits, key=lambda one: (one[0], -area(one[1]), one[1]))[1]

@@ -6,12 +6,14 @@ on the screen.
 
 `lay_out` fills the tensor: the scale is the largest that the tensor has room for. `lay_out_at` stops at a density. At
 density 1 a tensor pixel is a pixel of the picture, on its grid; the rest of the tensor is background.
+
+Avatars of different networks have a tensor each, all of one shape: `apart` lays them out, network by network.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from trilane.errors import BadInputError
@@ -74,9 +76,7 @@ def lay_out(rects: Sequence[Rect], output: Shape, buckets: Sequence[Shape], marg
     if best is not None and best.scale > 0:
         return TensorLayout(best.shape, _crops(rects, sizes, output, best, margin_px))
     if margin_px == 0:
-        raise BadInputError(
-            "tensor shapes", f"{list(buckets)}", f"room for {len(rects)} avatars", "use a larger --size"
-        )
+        raise _no_room(rects, buckets)
     return lay_out(rects, output, buckets, margin_px // 2)
 
 
@@ -101,6 +101,65 @@ def lay_out_at(
     density = min(best.scale, most_density)
     scaled = _Arrangement(best.shape, best.rows, density)
     return DenseLayout(TensorLayout(shape, _crops(whole, sizes, output, scaled, margin_px)), density)
+
+
+def by_network(networks: Sequence[int]) -> list[list[int]]:
+    """Return the places of the avatars of each network. `networks`: network of each avatar in view."""
+    return [[place for place, one in enumerate(networks) if one == network] for network in sorted(set(networks))]
+
+
+def apart(
+    rects: Sequence[Rect], networks: Sequence[int], lay: Callable[[Sequence[Rect]], DenseLayout | None]
+) -> DenseLayout | None:
+    """Place the avatars of each network in a tensor of its own; None where one of them has no room.
+
+    `rects`, `networks`: mesh rectangle and network of each visible avatar.
+    `lay`: lays out those of one network, always in a tensor of the same shape. The density is the least of theirs.
+    """
+    groups = by_network(networks)
+    found = [lay([rects[place] for place in places]) for places in groups]
+    fits = [one for one in found if one is not None]
+    if len(fits) < len(groups):
+        return None
+    placed = {
+        place: crop
+        for places, one in zip(groups, fits, strict=True)
+        for place, crop in zip(places, one.layout.crops, strict=True)
+    }
+    crops = tuple(placed[place] for place in range(len(rects)))
+    return DenseLayout(TensorLayout(fits[0].layout.shape, crops), min(one.density for one in fits))
+
+
+def lay_out_apart(
+    rects: Sequence[Rect], networks: Sequence[int], output: Shape, buckets: Sequence[Shape]
+) -> TensorLayout:
+    """Place the visible avatars as `lay_out` does, those of each network in a tensor of its own.
+
+    All tensors have the shape in which the least dense one is densest.
+    `networks`: network of each avatar. The other parameters and the errors are those of `lay_out`.
+    """
+    if len(set(networks)) == 1:
+        return lay_out(rects, output, buckets)
+
+    def filled(shape: Shape) -> DenseLayout | None:
+        def lay(own: Sequence[Rect]) -> DenseLayout | None:
+            try:
+                layout = lay_out(own, output, [shape])
+            except BadInputError:
+                return None
+            crop, cell = layout.crops[0]
+            return DenseLayout(layout, cell[2] / (crop.height * output[0] / 2))
+
+        return apart(rects, networks, lay)
+
+    found = [one for shape in buckets if (one := filled(shape)) is not None]
+    if not found:
+        raise _no_room(rects, buckets)
+    return max(found, key=lambda one: one.density).layout
+
+
+def _no_room(rects: Sequence[Rect], buckets: Sequence[Shape]) -> BadInputError:
+    return BadInputError("tensor shapes", f"{list(buckets)}", f"room for {len(rects)} avatars", "use a larger --size")
 
 
 def tight_shape(rects: Sequence[Rect], output: Shape, density: float = 1.0, margin_px: int = MARGIN_PX) -> Shape:

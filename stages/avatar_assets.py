@@ -1,7 +1,7 @@
 """The arrays that the parent has loaded for a scene and its avatars, and that every unit maps.
 
 Rule: files are opened once. Names begin with what they belong to: `body0/` and `avatar0/` of the first distinct bundle,
-`network`, `scene/`.
+`network0/` of the first distinct network, `scene/`.
 """
 
 from __future__ import annotations
@@ -18,16 +18,18 @@ from numpy.typing import NDArray
 from trilane.arrays import F32
 from trilane.avatars.bundle import Bundle
 from trilane.avatars.mesh_levels import levels_from_arrays, levels_to_arrays
-from trilane.avatars.network_file import NetworkFile, check_network
+from trilane.avatars.network_file import NetworkFile, check_network, reshaped
 from trilane.body.body import Body, ShapedBody
 from trilane.body.mesh_levels import MeshLevel
 from trilane.errors import BadInputError
+from trilane.hw_profiles.network_work import Network, count_work, one_after_the_other
 from trilane.pipeline.memory import Assets
 from trilane.scene.staging import Staged, staged_from_arrays, staged_to_arrays
+from trilane.shapes import Shape
 from trilane.stages.config import RunConfig
 from trilane.stages.gpu.packed_pass import Quantisation
 
-NETWORK, NETWORK_PATH, SCENE = "network", "network_path", "scene/"
+SCENE = "scene/"
 HANDS = ("hand_components_left", "hand_components_right")
 BODY_ARRAYS = tuple(field.name for field in fields(Body) if field.name not in ("source", "hand_components"))
 
@@ -55,33 +57,18 @@ def load_avatar(bundle: Bundle) -> AvatarData:
     return AvatarData(bundle, shaped, texture, network, levels, bundle.read_mesh_levels(shaped))
 
 
-#: What helps where two avatars cannot share a tensor.
-APART = "give each avatar a scene of its own, or name one avatar twice"
+def networks_of_avatars(avatars: Sequence[AvatarData]) -> list[int]:
+    """Return the number of the network that paints each of `avatars`.
 
-
-def require_one_tensor(avatars: Sequence[AvatarData]) -> None:
-    """Raise BadInputError unless `avatars` can share a tensor: one network, and one encoding of its input."""
-    first, *others = avatars
-    for other in others:
-        if other.network.digest != first.network.digest:
-            found = "another network than the scene's first avatar has"
-            expected = "one network for all avatars, as they share a tensor"
-            made = f"trilane avatar create {other.bundle.folder} --network {first.bundle.network_path} --out NEW"
-            remedy = f"{APART}; `{made}` makes one with that network, untrained for it"
-            raise BadInputError(other.bundle.network_path, found, expected, remedy)
-        if _encoding(other) != _encoding(first):
-            names = f"{first.bundle.folder} and {other.bundle.folder}"
-            raise BadInputError(
-                names, "networks with different inputs", "avatars that one network can draw together", APART
-            )
-
-
-def _encoding(avatar: AvatarData) -> tuple[Any, ...]:
-    return (avatar.bundle.manifest.network.input, avatar.texture.shape[2])
+    Avatars share a network, and so a tensor, where its file and the encoding of its input are the same.
+    """
+    kinds = [(one.network.digest, one.bundle.manifest.network.input) for one in avatars]
+    known = list(dict.fromkeys(kinds))
+    return [known.index(kind) for kind in kinds]
 
 
 def pack_assets(avatars: Sequence[AvatarData], staged: Staged) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a run: those of each distinct avatar in order, the network's and the scene's."""
+    """Return the arrays of a run: those of each distinct avatar in order, of each distinct network, and the scene's."""
     arrays: dict[str, NDArray[Any]] = {}
     for number, avatar in enumerate(avatars):
         body, scale = avatar.shaped.body, avatar.bundle.manifest.network.input
@@ -94,17 +81,34 @@ def pack_assets(avatars: Sequence[AvatarData], staged: Staged) -> dict[str, NDAr
         if avatar.levels is not None:
             arrays[f"avatar{number}/levels"] = avatar.levels
         arrays[f"avatar{number}/input"] = np.array([scale.scale, scale.zero_point])
-    network = avatars[0].network
-    arrays[NETWORK] = np.frombuffer(network.model.SerializeToString(), np.uint8)
-    arrays[NETWORK_PATH] = np.frombuffer(network.where.encode(), np.uint8)
+    numbers = networks_of_avatars(avatars)
+    for number in range(max(numbers) + 1):
+        network = avatars[numbers.index(number)].network
+        arrays |= {_model(number): _bytes(network), _path(number): np.frombuffer(network.where.encode(), np.uint8)}
     return arrays | {SCENE + name: array for name, array in staged_to_arrays(staged).items()}
 
 
 def with_network(assets: Assets, network: NetworkFile) -> dict[str, NDArray[Any]]:
-    """Return `assets` with another `network` for all avatars, and with the scale and zero point of its input."""
+    """Return `assets` with another `network` for all avatars, and with the scale and zero point of its input.
+
+    Raises BadInputError for avatars of several networks.
+    """
+    only_network_of(assets)
     encoding = np.array([network.input.scale, network.input.zero_point])
     inputs = {name: encoding for name in assets if name.startswith("avatar") and name.endswith("/input")}
-    return {**assets, **inputs, NETWORK: np.frombuffer(network.model.SerializeToString(), np.uint8)}
+    return {**assets, **inputs, _model(0): _bytes(network)}
+
+
+def _model(number: int) -> str:
+    return f"network{number}/model"
+
+
+def _path(number: int) -> str:
+    return f"network{number}/path"
+
+
+def _bytes(network: NetworkFile) -> NDArray[np.uint8]:
+    return np.frombuffer(network.model.SerializeToString(), np.uint8)
 
 
 def distinct(config: RunConfig) -> list[Path]:
@@ -153,10 +157,36 @@ def quantisation_of(assets: Assets, number: int) -> Quantisation:
     return Quantisation(scale, int(zero_point))
 
 
-def network_of(assets: Assets) -> NetworkFile:
-    """Return the network that all avatars share."""
-    model = onnx.load_from_string(assets[NETWORK].tobytes())
-    return check_network(model, assets[NETWORK_PATH].tobytes().decode())
+def networks_of(assets: Assets) -> list[NetworkFile]:
+    """Return the networks that paint the avatars, by number."""
+    numbers = range(sum(name.startswith("network") and name.endswith("/model") for name in assets))
+    return [
+        check_network(onnx.load_from_string(assets[_model(number)].tobytes()), assets[_path(number)].tobytes().decode())
+        for number in numbers
+    ]
+
+
+def painting(networks: Sequence[NetworkFile], shape: Shape, facts: Mapping[str, str]) -> Network:
+    """Return what paints a frame, as one network of the cost model: each of `networks`, on a tensor of `shape`.
+
+    The tensors count as one, as high as all of them. `facts`: what reports call it.
+    """
+    work = one_after_the_other([count_work(reshaped(network, *shape).model) for network in networks])
+    channels = max(network.channels for network in networks)
+    return Network(facts, shape[0] * len(networks), shape[1], channels, "packed", work)
+
+
+def only_network_of(assets: Assets) -> NetworkFile:
+    """Return the network that all avatars share. Raises BadInputError where there are several."""
+    first, *others = networks_of(assets)
+    if others:
+        raise BadInputError(
+            others[0].where,
+            f"one of {len(others) + 1} networks in the scene",
+            "a scene whose avatars share one network, for what this command computes",
+            "name one avatar twice, or take a scene with one of them",
+        )
+    return first
 
 
 def staged_of(assets: Assets) -> Staged:

@@ -26,13 +26,11 @@ from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.places import CpuCore, Place, Placement
 from trilane.shapes import Shape
 from trilane.stages import FACTORIES, PRELOAD
-from trilane.stages.avatar_assets import network_of
-from trilane.stages.config import RunConfig, pose_dtype, posed_vertices_bytes
+from trilane.stages.avatar_assets import only_network_of
+from trilane.stages.config import MAX_CHANNELS, PAINTED_CHANNELS, RunConfig, pose_dtype, posed_vertices_bytes
 from trilane.stages.configure import Checked
 from trilane.stages.dsp.infer import crossing_bytes
 from trilane.units import AFTER_INFER, BEFORE_INFER, BYPASS, LATENCY_TO, UNITS
-
-MAX_CHANNELS = 16  # channels of a tensor: the most that the GPU packs in one pass
 
 
 def avatar_pipeline(config: RunConfig, assets: Assets, edge: str = "double") -> Pipeline:
@@ -49,14 +47,15 @@ def avatar_pipeline(config: RunConfig, assets: Assets, edge: str = "double") -> 
 
 
 def edge_bytes(config: RunConfig, assets: Assets) -> dict[str, int]:
-    """Return the payload bytes of each edge, for the largest tensor that the scene's size allows."""
+    """Return the payload bytes of each edge, for the largest tensors that the scene's size allows."""
     output, names = config.scene.output, config.infer_names
-    crossings = crossing_bytes(config, network_of(assets)) if config.cuts else []
+    pixels = config.max_tensor_pixels * config.network_count
+    crossings = crossing_bytes(config, only_network_of(assets)) if config.cuts else []
     return {
         "pose->raster": posed_vertices_bytes(config.posed_vertices),
-        "raster->infer": config.max_tensor_pixels * MAX_CHANNELS,
+        "raster->infer": pixels * MAX_CHANNELS,
         **{f"{a}->{b}": size for (a, b), size in zip(pairwise(names), crossings, strict=True)},
-        f"{names[-1]}->composite": config.max_tensor_pixels * 4,
+        f"{names[-1]}->composite": pixels * PAINTED_CHANNELS,
         "composite->present": output.width * output.height * 3,
     }
 

@@ -7,7 +7,7 @@ docs/conventions.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +90,10 @@ def posed_vertices_bytes(counts: Sequence[int]) -> int:
     return sum(counts) * 3 * np.dtype(np.float32).itemsize
 
 
+MAX_CHANNELS = 16  # channels of a tensor: the most that the GPU packs in one pass
+PAINTED_CHANNELS = 4  # of a network's picture: red, green, blue, alpha
+
+
 class NetworkCut(StrictModel):
     """A cut of the network at the quantised tensor `at`; the part behind it runs on `unit`."""
 
@@ -105,6 +109,8 @@ class RunConfig(StrictModel):
     `avatar_dirs`: bundle folder of each avatar of the scene.
     `units`: cores and threads of each unit.
     `runtime`: name of the DSP unit's inference runtime.
+    `networks`: number of the network that paints each avatar; empty where one paints all. Each network has a tensor of
+    its own in a slot, all of one shape.
     `shapes`: tensor shapes where the scene plans the tensor; else those of its size are used.
     `changes`: for each of `works`, the times in seconds at which a planned tensor changes, with its shape from then on;
     empty where that was not foreseen.
@@ -124,6 +130,7 @@ class RunConfig(StrictModel):
     avatar_dirs: tuple[Path, ...]
     units: dict[str, UnitSettings]
     runtime: str = "ort"
+    networks: tuple[int, ...] = ()
     shapes: tuple[Shape, ...] = ()
     changes: tuple[tuple[tuple[float, Shape], ...], ...] = ()
     own_pixels: int = 0
@@ -164,6 +171,19 @@ class RunConfig(StrictModel):
         return self.scene.error_budget_px if self.scene.plan == "planned" else 0.0
 
     @property
+    def network_count(self) -> int:
+        """Number of networks, each of which paints some of the avatars."""
+        return len(set(self.networks)) or 1
+
+    def network_of(self, avatar: int) -> int:
+        """Return the number of the network that paints avatar number `avatar`."""
+        return self.networks[avatar] if self.networks else 0
+
+    def networks_of(self, avatars: Iterable[int]) -> tuple[int, ...]:
+        """Return the numbers of the networks that paint `avatars`, given by their numbers."""
+        return tuple(sorted({self.network_of(avatar) for avatar in avatars}))
+
+    @property
     def infer_units(self) -> tuple[str, ...]:
         """Unit of each part of the network, in the order of the parts."""
         return ("dsp", *(cut.unit for cut in self.cuts))
@@ -176,3 +196,12 @@ class RunConfig(StrictModel):
     @property
     def max_tensor_pixels(self) -> int:
         return max(math.prod(shape) for shape in self.buckets)
+
+
+def network_parts(payload: U8, networks: int, shapes: Sequence[Shape], channels: int) -> list[U8]:
+    """Return the part of a slot that belongs to each of so many `networks`.
+
+    `shapes`: shapes that a tensor may have; each part has room for the largest. `channels`: most channels of a pixel.
+    """
+    size = channels * max(math.prod(shape) for shape in shapes)
+    return [payload[number * size : (number + 1) * size] for number in range(networks)]

@@ -29,10 +29,10 @@ from trilane.scene.missing_person import require_person
 from trilane.scene.planner import TensorBudget
 from trilane.scene.schema import BUILT_IN_PREFIX, FILE_KEYS, Scene, find_scene, load_scene, located, scene_from
 from trilane.scene.staging import Staged, stage_scene
-from trilane.stages.avatar_assets import AvatarData, load_avatar, pack_assets, require_one_tensor
+from trilane.stages.avatar_assets import AvatarData, load_avatar, networks_of_avatars, pack_assets
 from trilane.stages.config import NetworkCut, RunConfig
 from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve
-from trilane.stages.foresee import foresee, tensor_works
+from trilane.stages.foresee import Painted, foresee, tensor_works
 from trilane.stages.machine_facts import gl_facts, machine_facts
 from trilane.stages.run_options import RunOptions
 from trilane.units import HOST
@@ -127,26 +127,30 @@ def configure(options: RunOptions, out_dir: Path, gl: GlFacts = gl_facts, *, nee
     bundles = {spec.bundle: load_bundle(spec.bundle) for spec in scene.avatars}
     avatars = {bundle.folder.absolute(): load_avatar(bundle) for bundle in bundles.values()}
     folders = tuple(bundles[spec.bundle].folder.absolute() for spec in scene.avatars)
-    require_one_tensor(list(avatars.values()))
+    numbers = dict(zip(avatars, networks_of_avatars(list(avatars.values())), strict=True))
+    networks = {numbers[folder]: avatar.network for folder, avatar in avatars.items()}
     bodies = [avatars[folder].shaped for folder in folders]
     staged = stage_scene(scene, bodies, Path.cwd(), footage)
     if needs_person:
         require_person(scene, staged, bodies, Path.cwd(), footage)
     _check_pictures(scene, staged)
-    network = avatars[folders[0]].network
-    cuts = requested_cuts(options.split, network)
+    cuts = requested_cuts(options.split, list(networks.values()))
     unit, why = skinning_unit(options.skinning, gl)
-    whole = TensorBudget(network.shape[1] * network.shape[2], scene.most_side**2)
+    own = max(network.shape[1] * network.shape[2] for network in networks.values())
+    whole = TensorBudget(own, scene.most_side**2)
     losses = tuple(size_loss(avatar.bundle) for avatar in avatars.values())
     works, sizes = tensor_works(scene, options.policy, losses)
     budgets = [whole.scaled(work) for work in works]
-    foreseen = foresee(scene, staged, bodies, network, budgets) if scene.plans_tensor else None
+    painters = tuple(numbers[folder] for folder in folders) if len(networks) > 1 else ()
+    painted = Painted(list(networks.values()), painters)
+    foreseen = foresee(scene, staged, bodies, painted, budgets) if scene.plans_tensor else None
     config = RunConfig(
         scene=scene,
         out_dir=out_dir,
         avatar_dirs=folders,
         units=settings_of(rule_placement(usable_cores(), asked)),
         runtime=runtime,
+        networks=painters,
         shapes=foreseen.shapes.shapes if foreseen else (),
         changes=foreseen.changes if foreseen else (),
         own_pixels=whole.own,
@@ -155,10 +159,12 @@ def configure(options: RunOptions, out_dir: Path, gl: GlFacts = gl_facts, *, nee
         cuts=cuts,
     )
     notes = (*staged.notes, f"runtime: {runtime} ({reason})", f"skinning: {unit} unit ({why})")
+    notes += (f"networks: {len(networks)}, each with a tensor and an inference of its own",) if painters else ()
     notes += foreseen.notes(scene.memory_mb) if foreseen else ()
     notes += (sizes,) if sizes else ()
-    drawn = DrawnAs(runtime, scene.size, scene.texture_filter, len(scene.avatars))
-    accuracy = _accuracy(list(avatars.values()), drawn)
+    drawn = DrawnAs(runtime, scene.size, scene.texture_filter)
+    sharing = Counter(numbers[folder] for folder in folders)
+    accuracy = _accuracy([(avatar, sharing[numbers[folder]]) for folder, avatar in avatars.items()], drawn)
     packed = pack_assets(list(avatars.values()), staged)
     return Checked(config, packed, notes, accuracy, asked, losses=losses)
 
@@ -173,8 +179,10 @@ def requested_runtime(asked: str) -> tuple[str, str]:
     return resolve(asked), "as asked"
 
 
-def requested_cuts(texts: Sequence[str], network: NetworkFile) -> tuple[NetworkCut, ...]:
-    """Parse `TENSOR=UNIT` texts as cuts of `network`. Raises BadInputError."""
+def requested_cuts(texts: Sequence[str], networks: Sequence[NetworkFile]) -> tuple[NetworkCut, ...]:
+    """Parse `TENSOR=UNIT` texts as cuts of the one of `networks`. Raises BadInputError, also for several networks."""
+    if texts and len(networks) > 1:
+        raise BadInputError("--split", f"{len(networks)} networks in the scene", "a scene of one network")
     cuts = []
     for text in texts:
         at, _, unit = text.rpartition("=")
@@ -182,7 +190,7 @@ def requested_cuts(texts: Sequence[str], network: NetworkFile) -> tuple[NetworkC
             cuts.append(NetworkCut.model_validate({"at": at, "unit": unit}))
         except ValidationError:
             raise BadInputError("--split", repr(text), "TENSOR=UNIT, with UNIT one of cpu, gpu, dsp") from None
-    split(network, [cut.at for cut in cuts])
+    split(networks[0], [cut.at for cut in cuts])
     return tuple(cuts)
 
 
@@ -203,15 +211,18 @@ def _check_pictures(scene: Scene, staged: Staged) -> None:
         check_pictures(Path(scene.background), scene.fps, scene.frames, staged.camera.path)
 
 
-def _accuracy(avatars: Sequence[AvatarData], drawn: DrawnAs) -> dict[str, Any]:
-    """Return the error of each avatar's pictures by its name; equal names get their folders."""
-    bundles = [avatar.bundle for avatar in avatars]
-    names = Counter(bundle.manifest.name for bundle in bundles)
+def _accuracy(avatars: Sequence[tuple[AvatarData, int]], drawn: DrawnAs) -> dict[str, Any]:
+    """Return the error of each avatar's pictures by its name; equal names get their folders.
+
+    `avatars`: each with the number of avatars in its tensor.
+    """
+    bundles = [(avatar.bundle, sharing) for avatar, sharing in avatars]
+    names = Counter(bundle.manifest.name for bundle, _ in bundles)
     return {
         bundle.manifest.name if names[bundle.manifest.name] == 1 else f"{bundle.manifest.name} in {bundle.folder}": (
-            accuracy_of(bundle, drawn)
+            accuracy_of(bundle, replace(drawn, avatars=sharing))
         )
-        for bundle in bundles
+        for bundle, sharing in bundles
     }
 
 

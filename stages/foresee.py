@@ -37,6 +37,7 @@ from trilane.scene.planner import (
     ideal_shape,
     joined,
     larger_shapes,
+    pixels_of,
     work_of_side,
 )
 from trilane.scene.schema import Scene
@@ -136,13 +137,21 @@ class Foreseen:
         return tuple(notes)
 
 
+@dataclass(frozen=True)
+class Painted:
+    """The `networks` of a scene, and the number of the one that paints each avatar; `by` is empty where one does."""
+
+    networks: Sequence[NetworkFile]
+    by: Sequence[int] = ()
+
+
 def foresee(
-    scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], network: NetworkFile, budgets: Sequence[TensorBudget]
+    scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], painted: Painted, budgets: Sequence[TensorBudget]
 ) -> Foreseen:
     """Return the tensor shapes that `scene` needs.
 
     `bodies`: bodies of its avatars, in order.
-    `network`: network that all of them share.
+    `painted`: networks that paint them.
     `budgets`: budgets of its tensors, the largest first; the run steps down to the others, where memory has room for
     them.
     """
@@ -153,12 +162,14 @@ def foresee(
         LookAhead(frame, rects)
         for frame, rects in zip(frames, foreseen_rects(scene, staged, bodies, frames), strict=True)
     ]
-    seen = [list(look.rects.values()) for look in looks if look.rects]
+    seen = [(list(look.rects.values()), look.networks(painted.by)) for look in looks if look.rects]
     are_close = scene.frames <= MOST_APART * count
-    per_pixel = bytes_per_pixel(network)
+    per_pixel = sum(map(bytes_per_pixel, painted.networks))
     chosen, left_out, changes = ShapeSet((), 0, 0), 0, []
     for budget in budgets:
-        demands = [Demand(ideal_shape(rects, output, budget), budget.of(rects, output)) for rects in seen]
+        demands = [
+            Demand(ideal_shape(rects, output, budget, by), pixels_of(rects, by, output, budget)) for rects, by in seen
+        ]
         anyway = demands or [Demand((STRIDE, STRIDE), budget.own)]
         left = scene.memory_mb * MB - chosen.memory_bytes
         is_smaller = bool(chosen.shapes)
@@ -167,7 +178,8 @@ def foresee(
         left_out += not found.shapes
         if are_close and found.shapes:
             room = int(left / per_pixel) - sum(map(area, found.shapes))
-            larger, foreseen = _foreseen(looks, output, found.shapes, budget, (most - len(found.shapes), room))
+            limits = most - len(found.shapes), room
+            larger, foreseen = _foreseen(looks, output, found.shapes, budget, painted.by, limits)
             found = joined(found, ShapeSet(larger, math.ceil(per_pixel * sum(map(area, larger))), 0))
             changes.append(tuple((frame / scene.fps, shape) for frame, shape in foreseen))
         elif are_close:
@@ -178,16 +190,22 @@ def foresee(
 
 
 def _foreseen(
-    looks: Sequence[LookAhead], output: Shape, shapes: Sequence[Shape], budget: TensorBudget, room: tuple[int, int]
+    looks: Sequence[LookAhead],
+    output: Shape,
+    shapes: Sequence[Shape],
+    budget: TensorBudget,
+    networks: Sequence[int],
+    room: tuple[int, int],
 ) -> tuple[tuple[Shape, ...], tuple[tuple[int, Shape], ...]]:
     """Return further shapes to make ready, which spare changes because they suit more frames, and all changes then.
 
-    `shapes`: shapes that are ready anyway. `room`: most further shapes, and most pixels that they may have together.
+    `shapes`: shapes that are ready anyway. `networks`: network of each avatar; empty where one paints all. `room`: most
+    further shapes, and most pixels that they may have together.
     """
     most = budget.most_of(max(len(look.rects) for look in looks))
     larger = larger_shapes(shapes, most)
     while True:
-        changes = foreseen_changes(looks, output, (*shapes, *larger), budget)
+        changes = foreseen_changes(looks, output, (*shapes, *larger), budget, networks)
         taken = {shape for _, shape in changes}
         used = [shape for shape in larger if shape in taken]
         if len(used) <= room[0] and sum(map(area, used)) <= room[1]:

@@ -37,7 +37,7 @@ from trilane.pipeline.surroundings import OtherPrograms
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.placement import Ranked, Rules, chosen, fastest, frame_ns, ranked, typical, worth_trying
 from trilane.scheduler.places import CpuCore, Place, Placement, Times, UnitWork
-from trilane.stages.avatar_assets import network_of
+from trilane.stages.avatar_assets import networks_of
 from trilane.stages.avatar_pipeline import measured_times, thread_counts, tried
 from trilane.stages.configure import Checked
 from trilane.stages.dsp.runtime import RUNTIMES
@@ -203,8 +203,8 @@ def _made_from(checked: Checked, cores: Sequence[CpuCore], rule: Placement) -> l
     said = config.model_dump_json(exclude={"out_dir", "units", "scene", "pace_ns"})
     scene = config.scene.model_dump_json(exclude={"name", "frames", "fps"})
     machine = [str(cpu_facts()), str([tuple(core) for core in cores]), str(thread_counts(len(cores), rule))]
-    network = network_of(checked.assets).digest
-    return [said, scene, *machine, network, *versions_with(RUNTIMES[config.runtime].package)]
+    networks = [network.digest for network in networks_of(checked.assets)]
+    return [said, scene, *machine, *networks, *versions_with(RUNTIMES[config.runtime].package)]
 
 
 #: Number of rounds in which placements are tried; after TRY_S seconds, only LEAST_ROUNDS are completed.

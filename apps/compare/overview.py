@@ -42,6 +42,7 @@ WITHOUT_KEY = ("name", "background", "output.width", "output.height", "camera.so
 #: Keys of a document's `config` that are no settings, or that the row has under other names.
 NOT_SETTINGS = (
     "avatar_dirs",
+    "networks",
     "shapes",
     "changes",
     "own_pixels",

@@ -18,9 +18,9 @@ from trilane.errors import BadInputError
 from trilane.figure_sources import MEASURED
 from trilane.pipeline.stage import UnitContext
 from trilane.shapes import Shape
-from trilane.stages.avatar_assets import network_of
+from trilane.stages.avatar_assets import networks_of
 from trilane.stages.avatar_pipeline import edge_bytes
-from trilane.stages.config import pose_dtype
+from trilane.stages.config import MAX_CHANNELS, network_parts, pose_dtype
 from trilane.stages.configure import Checked
 from trilane.stages.cpu.pose import build as build_pose
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
@@ -45,13 +45,13 @@ def runtime_differences(checked: Checked, runtimes: Sequence[str], frames: int) 
         raise BadInputError("--frames", str(frames), f"1 to {MAX_FRAMES}")
     if len(set(runtimes)) < 2 or len(set(runtimes)) < len(runtimes):
         raise BadInputError("--runtime", ", ".join(runtimes) or "none", "two or more different runtimes")
-    sessions = _Sessions(network_of(checked.assets), runtimes)
+    sessions = [_Sessions(network, runtimes) for network in networks_of(checked.assets)]
     pairs = list(combinations(runtimes, 2))
     steps_of: dict[tuple[str, str], list[tuple[float, int, int]]] = {pair: [] for pair in pairs}
-    numbers = []
-    for frame, tensor in _tensors(checked, frames):
-        numbers.append(frame)
-        pictures = {name: sessions.picture(name, tensor).astype(np.int16) for name in runtimes}
+    numbers: list[int] = []
+    for frame, network, tensor in _tensors(checked, frames):
+        numbers += [frame] if frame not in numbers else []
+        pictures = {name: sessions[network].picture(name, tensor).astype(np.int16) for name in runtimes}
         for pair in pairs:
             steps = np.abs(pictures[pair[0]] - pictures[pair[1]])
             steps_of[pair].append((float(steps.mean()), int(steps.max()), frame))
@@ -79,7 +79,7 @@ def _row(pair: tuple[str, str], steps: list[tuple[float, int, int]]) -> dict[str
 
 
 class _Sessions:
-    """The network of the scene's first avatar on each runtime, by tensor shape."""
+    """A network on each runtime, by tensor shape."""
 
     def __init__(self, network: NetworkFile, runtimes: Sequence[str]) -> None:
         self._network = network
@@ -100,14 +100,16 @@ class _Sessions:
         return picture
 
 
-def _tensors(checked: Checked, frames: int) -> Iterator[tuple[int, U8]]:
-    """Yield (number, tensor (h,w,C)) of the frames, evenly spread over the scene, that show an avatar."""
+def _tensors(checked: Checked, frames: int) -> Iterator[tuple[int, int, U8]]:
+    """Yield frame, network and tensor (h,w,C) of the frames, evenly spread over the scene, that show an avatar.
+
+    A frame has a tensor for each network that paints somebody in it.
+    """
     total, painter = checked.config.scene.frames, DrawnTensors(checked)
     count = min(frames, total)
     for frame in (index * total // count for index in range(count)):
-        tensor = painter.tensor(frame)
-        if painter.anybody:
-            yield frame, tensor
+        for network, tensor in painter.tensors(frame).items():
+            yield frame, network, tensor
 
 
 class DrawnTensors:
@@ -123,20 +125,24 @@ class DrawnTensors:
         self._raster = build_raster(settings, UnitContext("gpu", config.units["gpu"], assets))
         self._pose.bind([], [self._posed])
         self._raster.bind([self._posed], [self._drawn])
-        self._channels = network_of(assets).channels
+        self._channels = [network.channels for network in networks_of(assets)]
+        self._config = config
 
-    def tensor(self, frame: int) -> U8:
-        """Return the tensor (h, w, C) of frame `frame`, valid until the next call; without avatars it has no pixels."""
+    def tensors(self, frame: int) -> dict[int, U8]:
+        """Return the tensors (h, w, C) of a frame, valid until the next call, by the number of the network.
+
+        A network that paints nobody in the frame has none.
+        """
         self._pose.run(frame, None, 0)
         self._raster.run(frame, 0, 0)
         height, width = self._posed.header["tensor_shape"].tolist()
-        tensor: U8 = self._drawn.payload[: height * width * self._channels].reshape(height, width, self._channels)
-        return tensor
-
-    @property
-    def anybody(self) -> bool:
-        """Whether an avatar is seen in the last frame that was asked for."""
-        return bool(self._posed.header["avatars"]["visible"].any())
+        parts = network_parts(self._drawn.payload, len(self._channels), self._config.buckets, MAX_CHANNELS)
+        seen = [int(avatar["avatar"]) for avatar in self._posed.header["avatars"] if avatar["visible"]]
+        used = [(network, self._channels[network]) for network in self._config.networks_of(seen)]
+        return {
+            network: parts[network][: height * width * channels].reshape(height, width, channels)
+            for network, channels in used
+        }
 
 
 def _packet(avatars: int, payload: int) -> Packet:

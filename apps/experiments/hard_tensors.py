@@ -38,6 +38,7 @@ from trilane.stages.run_options import RunOptions
 SHAPE = (64, 64)
 CHANNELS = 16
 POWER = 2.0**-5
+NO_TENSOR = np.empty(0, np.uint8)
 #: Name -> scale, zero point, and the channels' values: in steps here (halves are exact), as they are in `NUMBERS`.
 STEPS: dict[str, tuple[float, int, Sequence[float]]] = {
     "halves above 0": (POWER, 117, [k + 0.5 for k in range(16)]),
@@ -135,6 +136,12 @@ def _differing(checked: Checked, numbers: list[int]) -> int:
     """Return how many bytes of the tensors differ from those of stages that drew no other frame."""
     used, found = DrawnTensors(checked), 0
     for number in numbers:
-        after, fresh = used.tensor(number), DrawnTensors(checked).tensor(number)
-        found += after.size if after.shape != fresh.shape else int(np.count_nonzero(after != fresh))
+        after, fresh = used.tensors(number), DrawnTensors(checked).tensors(number)
+        for network in after.keys() | fresh.keys():
+            found += _different_bytes(after.get(network, NO_TENSOR), fresh.get(network, NO_TENSOR))
     return found
+
+
+def _different_bytes(one: U8, other: U8) -> int:
+    """Return how many bytes differ; all of the larger tensor for two of different shapes."""
+    return max(one.size, other.size) if one.shape != other.shape else int(np.count_nonzero(one != other))

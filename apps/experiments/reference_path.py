@@ -199,6 +199,7 @@ class ReferencePath:
         self.output: Shape = (config.scene.output.height, config.scene.output.width)
         on_cpu = bool(config.posed_vertices)
         self.avatars = {folder: _avatar(data, config.runtime, on_cpu) for folder, data in self.cast.avatars.items()}
+        self._network_of = config.network_of
 
     @property
     def networks(self) -> list[str]:
@@ -207,6 +208,10 @@ class ReferencePath:
     @property
     def gl(self) -> Any:
         return self.frames.gl
+
+    def network_of(self, seen: CastView) -> int:
+        """Return the number of the network that paints an avatar."""
+        return self._network_of(seen.index)
 
     def frame(self, number: int) -> ReferenceFrame:
         """Return frame `number` by the reference."""
@@ -262,9 +267,14 @@ class ReferenceMoment:
         cells = self._cells()
         if not cells:
             return []
-        light = premultiplied(self._painted(causes))
+        light = {network: premultiplied(painted) for network, painted in self._painted(causes).items()}
         return [
-            placed(light[top : top + height, left : left + width], rect, self._path.output, seen.depth)
+            placed(
+                light[self._path.network_of(seen)][top : top + height, left : left + width],
+                rect,
+                self._path.output,
+                seen.depth,
+            )
             for seen, rect, (top, left, height, width) in cells
         ]
 
@@ -281,25 +291,33 @@ class ReferenceMoment:
         return RasterLayer(box, seen.depth, enlarged(shrunk(painted, times.numerator), times.denominator))
 
     def _cells(self) -> list[tuple[CastView, Rect, Cell]]:
-        """Return the avatars in the run's tensor, each with its crop rectangle and its part of the tensor."""
+        """Return the avatars in the run's tensors, each with its crop rectangle and its part of its tensor."""
         if int(self._header["work"]) != FrameWork.FULL:
             return []
         visible = [row for row in self._header["avatars"] if row["visible"] and int(row["avatar"]) in self.seen]
         return [(self.seen[int(row["avatar"])], Rect(*map(float, row["rect"])), _cell(row)) for row in visible]
 
-    def _painted(self, causes: Causes) -> F32:
-        """Return the picture (h,w,4) of the run's tensor, which all avatars share."""
-        avatar = next(iter(self._path.avatars.values()))
-        return self._paint(avatar, self._tensor(avatar, causes), causes)
+    def _painted(self, causes: Causes) -> dict[int, F32]:
+        """Return the picture (h,w,4) of the run's tensor of each network in use, which its avatars share."""
+        avatars = {self._path.network_of(seen): self._path.avatars[seen.folder] for seen, _, _ in self._cells()}
+        return {
+            network: self._paint(avatar, self._tensor(network, avatar, causes), causes)
+            for network, avatar in avatars.items()
+        }
 
-    def _tensor(self, avatar: _Avatar, causes: Causes) -> F64:
-        """Return the tensor (h,w,C) of the run's shape and crops, in real numbers."""
+    def _tensor(self, network: int, avatar: _Avatar, causes: Causes) -> F64:
+        """Return the tensor (h,w,C) of a network, with the run's shape and crops, in real numbers.
+
+        `avatar`: one of those that it paints.
+        """
         if Cause.RASTER in causes:
-            drawn = self._once("drawn", lambda: self._path.frames.tensor_of(self.number))
+            drawn = self._once(("drawn", network), lambda: self._path.frames.tensor_of(self.number, network))
             return avatar.real(drawn)
         height, width = self._header["tensor_shape"].tolist()
         tensor = np.zeros((height, width, avatar.texture.shape[2]))
         for seen, rect, (top, left, high, wide) in self._cells():
+            if self._path.network_of(seen) != network:
+                continue
             projection, view = _rounded(causes, self._path.cast.projection(self.number), seen.view)
             (clip,) = _rounded(causes, crop_projection(projection, rect) @ view)
             tensor[top : top + high, left : left + wide] = self._drawn(seen, clip, (high, wide), causes)
@@ -326,12 +344,13 @@ class ReferenceMoment:
         return painted
 
     def _composited(self, causes: Causes) -> F64:
-        """Return the frame (h,w,3) by the composite stage, from the network's picture in bytes."""
+        """Return the frame (h,w,3) by the composite stage, from the networks' pictures in bytes."""
         if not self._cells():
             return self.own
-        painted = np.asarray(np.rint(self._painted(causes) * 255), np.uint8)
-        made: F64 = self._once(_digest(painted), lambda: self._path.frames.composited(self.number, painted) / 255.0)
-        return made
+        painted = {one: np.asarray(np.rint(made * 255), np.uint8) for one, made in self._painted(causes).items()}
+        key = _digest(*painted.values())
+        composited: F64 = self._once(key, lambda: self._path.frames.composited(self.number, painted) / 255.0)
+        return composited
 
     def _once(self, key: Hashable, make: Callable[[], Any]) -> Any:
         """Return the result of `make`, which is called once per `key`, so that a cause without effect costs nothing."""

@@ -7,27 +7,26 @@ joints and vertices count for each avatar in view. Every figure says whether it 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 from trilane.apps.explain.scene_plan import PlannedFrame, ScenePlan, phases
 from trilane.apps.run.report_facts import worst_loss
-from trilane.avatars.network_file import NetworkFile, reshaped
+from trilane.avatars.network_file import NetworkFile
 from trilane.body.skinning import DETAILS, left_out
 from trilane.errors import BadInputError
 from trilane.figure_sources import COMPUTED, MEASURED
 from trilane.hw_profiles.application import Plan, Variant, stage_times_ms, steady, workers_of
 from trilane.hw_profiles.host import described, host_cores, usable_cores
 from trilane.hw_profiles.host_model import place_units
-from trilane.hw_profiles.network_work import Network, count_work
 from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.scene.planner import ALL_WORK, MOST_DENSITY, FrameWork
 from trilane.scheduler.placement import Ranked
 from trilane.shapes import Shape
-from trilane.stages.avatar_assets import distinct, mesh_levels_of, network_of, shaped_body
+from trilane.stages.avatar_assets import distinct, mesh_levels_of, networks_of, painting, shaped_body
 from trilane.stages.configure import Checked
 from trilane.stages.cpu.pose import FramePlan
 from trilane.units import HOST, NS_PER_MS, UNITS, UnitName
@@ -40,6 +39,9 @@ WHY = {
     FrameWork.REUSE: "nothing has changed: the picture that is there is shown again",
 }
 PIPELINED = Variant("pipelined", "double")
+#: Numbers of the networks that paint a frame.
+Networks = tuple[int, ...]
+FIRST: Networks = (0,)
 #: Stages that a frame needs even with nobody in view.
 ALWAYS = ("pose", "composite", "present")
 
@@ -65,7 +67,8 @@ def explain(checked: Checked, profile: str, performance_profile: str, most_measu
     Raises BadInputError for an unknown profile.
     """
     scene, plan = checked.config.scene, ScenePlan(checked.config, checked.assets)
-    costs = CostModel(network_of(checked.assets), profile, performance_profile)
+    networks, painters = networks_of(checked.assets), checked.config.networks_of
+    costs = CostModel(networks, profile, performance_profile, painters)
     rows: list[list[float | None]] = []
     frames: list[PlannedFrame] = []
     for frame in range(scene.frames):
@@ -94,7 +97,7 @@ def explain(checked: Checked, profile: str, performance_profile: str, most_measu
         "phases": [_phase(group, errors, costs, names, bodies) for group, errors in zip(groups, rows, strict=True)],
         "image": _image(checked),
         "totals": _totals(frames, costs),
-        "placement": costs.placement(*_usual(frames), checked.asked_cores),
+        "placement": costs.placement(*_usual(frames, costs), checked.asked_cores),
         "notes": list(checked.notes),
         "sources": {
             "bound_px": BOUND,
@@ -177,12 +180,12 @@ def _phase(
         ],
         "why": _why(group),
         "cost": cost.as_json(),
-        "saved": _saved(cost, costs.of(FIXED, len(first.seen))),
+        "saved": _saved(cost, costs.of(FIXED, *costs.in_view(first))),
     }
 
 
 def _cost(plan: FramePlan, costs: CostModel) -> FrameCost:
-    return costs.of(plan.shape, len(plan.seen)) if plan.work is FrameWork.FULL else costs.of(None)
+    return costs.of(plan.shape, *costs.in_view(plan)) if plan.work is FrameWork.FULL else costs.of(None)
 
 
 def _least(group: Sequence[PlannedFrame]) -> float:
@@ -213,16 +216,17 @@ def _saved(cost: FrameCost, fixed: FrameCost) -> dict[str, float]:
     }
 
 
-def _usual(frames: Sequence[PlannedFrame]) -> tuple[Shape | None, int]:
-    """Return the shape of most full frames and the number of avatars in view there; None and 0 without any."""
-    kinds = Counter((one.plan.shape, len(one.plan.seen)) for one in frames if one.plan.work is FrameWork.FULL)
-    return kinds.most_common(1)[0][0] if kinds else (None, 0)
+def _usual(frames: Sequence[PlannedFrame], costs: CostModel) -> tuple[Shape | None, int, Networks]:
+    """Return the shape of most full frames, and what is in view there; None, 0 and the first network without any."""
+    full = [one.plan for one in frames if one.plan.work is FrameWork.FULL]
+    kinds = Counter((plan.shape, *costs.in_view(plan)) for plan in full)
+    return kinds.most_common(1)[0][0] if kinds else (None, 0, FIRST)
 
 
 def _totals(frames: Sequence[PlannedFrame], costs: CostModel) -> dict[str, Any]:
     """Add up all frames, as planned and with the fixed square that shows the same avatars."""
     planned = [_cost(one.plan, costs) for one in frames]
-    fixed = [costs.of(FIXED, len(one.plan.seen)) for one in frames]
+    fixed = [costs.of(FIXED, *costs.in_view(one.plan)) for one in frames]
     return {
         "pixels": sum(cost.pixels for cost in planned),
         "fixed_pixels": sum(cost.pixels for cost in fixed),
@@ -239,7 +243,7 @@ def _totals(frames: Sequence[PlannedFrame], costs: CostModel) -> dict[str, Any]:
 class FrameCost:
     """The cost of one frame.
 
-    `pixels`: pixels of its tensor. `gmac`: products of the network, 1e9. `work_ms`: time of all stages, one after the
+    `pixels`: pixels of its tensors. `gmac`: products of the networks, 1e9. `work_ms`: time of all stages, one after the
     other.
     `frame_ms`: time between frames of its kind when they are pipelined.
     """
@@ -266,31 +270,50 @@ def least_frame_ms(chip: Profile, times: Mapping[tuple[str, UnitName], float]) -
 class CostModel:
     """The costs of frames on the chip `profile`. Raises BadInputError for an unknown profile."""
 
-    def __init__(self, network: NetworkFile, profile: str, performance_profile: str) -> None:
-        self._network, self._chip = network, load_runnable(profile)
+    def __init__(
+        self,
+        networks: Sequence[NetworkFile],
+        profile: str,
+        performance_profile: str,
+        painters: Callable[[Iterable[int]], Networks] = lambda _avatars: FIRST,
+    ) -> None:
+        """Take the chip.
+
+        `painters`: numbers of the networks that paint avatars, given by their numbers.
+        """
+        self._networks, self._chip, self._painters = networks, load_runnable(profile), painters
         self._corners = corners_of(self._chip, performance_profile)
         self.of = cache(self._of)
 
-    def _of(self, shape: Shape | None, avatars: int = 1) -> FrameCost:
-        """Return the cost of a frame whose tensor has `shape`, None for no tensor, with `avatars` avatars in view.
+    def in_view(self, plan: FramePlan) -> tuple[int, Networks]:
+        """Return the number of avatars that a frame shows, and the networks that paint them."""
+        return len(plan.seen), self._painters(plan.seen) or FIRST
 
-        A frame with nobody in view still counts one avatar's pose, because the pose stage looks for somebody.
+    def _of(self, shape: Shape | None, avatars: int = 1, networks: Networks = FIRST) -> FrameCost:
+        """Return the cost of a frame whose tensors have `shape`, None for no tensor, with `avatars` avatars in view.
+
+        `networks`: numbers of the networks that paint them, each on a tensor. A frame with nobody in view still counts
+        one avatar's pose, because the pose stage looks for somebody.
         """
-        plan = self._plan(shape, avatars)
+        plan = self._plan(shape, avatars, networks)
         times = stage_times_ms(self._chip, plan, self._corners)
         if shape is None:
             kept = {key: ms for key, ms in times.items() if key[0] in ALWAYS}
             return FrameCost(0, 0.0, sum(kept.values()), least_frame_ms(self._chip, kept))
         steady_ms = steady(self._chip, plan, self._corners, quick=True).frame_ms
-        return FrameCost(shape[0] * shape[1], plan.network.work.macs / 1e9, sum(times.values()), steady_ms)
+        return FrameCost(plan.network.pixels, plan.network.work.macs / 1e9, sum(times.values()), steady_ms)
 
     def placement(
-        self, shape: Shape | None, avatars: int = 1, asked: Mapping[str, tuple[int, ...]] | None = None
+        self,
+        shape: Shape | None,
+        avatars: int = 1,
+        networks: Networks = FIRST,
+        asked: Mapping[str, tuple[int, ...]] | None = None,
     ) -> dict[str, Any]:
         """Say where the units are best placed for frames of `shape` with `avatars` avatars in view, and why.
 
-        The model of `trilane predict` decides. `asked`: cores of units of this machine. Raises BadInputError when cores
-        of another chip are asked for.
+        The model of `trilane predict` decides. `networks`: as in `of`. `asked`: cores of units of this machine. Raises
+        BadInputError when cores of another chip are asked for.
         """
         asked = asked or {}
         if self._chip.name != HOST:
@@ -301,19 +324,15 @@ class CostModel:
                 "predicted_ms": None,
                 "why": f"each unit of {self._chip.name} is hardware of its own",
             }
-        plan = self._plan(shape, avatars)
+        plan = self._plan(shape, avatars, networks)
         cores = sorted({*usable_cores(), *(core for own in asked.values() for core in own)})
         placed = place_units(self._chip, plan, self._corners, host_cores(cores), asked)
         chosen = {key: placed.facts[key] for key in ("units", "predicted_ms")}
         return {**chosen, "why": f"{described(placed.best.placement)}: {_why_placed(asked, placed.rule)}"}
 
-    def _plan(self, shape: Shape | None, avatars: int) -> Plan:
-        described = self._described(shape or self._network.shape[1:3])
-        return Plan(described, "dsp", PIPELINED, avatars=max(1, avatars))
-
-    def _described(self, shape: Shape) -> Network:
-        work = count_work(reshaped(self._network, *shape).model)
-        return Network({}, *shape, self._network.channels, "packed", work)
+    def _plan(self, shape: Shape | None, avatars: int, networks: Networks) -> Plan:
+        files = [self._networks[number] for number in networks]
+        return Plan(painting(files, shape or files[0].shape[1:3], {}), "dsp", PIPELINED, avatars=max(1, avatars))
 
 
 def _why_placed(asked: Mapping[str, tuple[int, ...]], rule: Ranked) -> str:

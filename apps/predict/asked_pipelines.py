@@ -13,19 +13,18 @@ from typing import NamedTuple
 
 from trilane.apps.check.port_types import port_types, read_networks
 from trilane.apps.explain.scene_plan import ScenePlan
-from trilane.avatars.network_file import reshaped
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import LEAST_FPS, MOST_FPS, NETWORK_UNITS, Variant
 from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.network_time import Computes
-from trilane.hw_profiles.network_work import Network, count_work
+from trilane.hw_profiles.network_work import Network
 from trilane.hw_profiles.shared_chip import MOST_TENANTS
 from trilane.hw_profiles.tenants import NEWEST, SKIPS, FileTenant, Pipeline, Tenant
 from trilane.pipeline.pipeline_file import checked_tables, is_pipeline_file, read_pipeline
 from trilane.scene.planner import FrameWork
 from trilane.scene.schema import ENDING
 from trilane.shapes import Shape
-from trilane.stages.avatar_assets import network_of
+from trilane.stages.avatar_assets import networks_of, painting
 from trilane.stages.configure import configure
 from trilane.stages.run_options import RunOptions
 from trilane.units import INFER, UnitName
@@ -141,16 +140,24 @@ def _of_file(each: AskedPipeline, name: str, precision: str | None) -> FileTenan
 def avatar(each: AskedPipeline, name: str, variant: Variant = NEWEST, precision: str | None = None) -> Tenant:
     """Return the pipeline of a scene, every frame planned. Raises BadInputError."""
     checked = configure(RunOptions(scene=each.what, skinning="gpu"), Path.cwd())
-    scene, file = checked.config.scene, network_of(checked.assets)
+    scene, files = checked.config.scene, networks_of(checked.assets)
     plan = ScenePlan(checked.config, checked.assets)
     plans = [plan.decide(frame).plan for frame in range(min(scene.frames, MOST_FRAMES))]
-    seen = [(one.shape, len(one.seen)) if one.shape and one.work is FrameWork.FULL else None for one in plans]
-    distinct = list(dict.fromkeys(one for one in seen if one is not None)) or [(_own(file.shape), 1)]
-    by_shape = {
-        shape: Network({"scene": each.what}, *shape, file.shape[3], "packed", count_work(reshaped(file, *shape).model))
-        for shape in dict.fromkeys(shape for shape, _ in distinct)
+    seen = [
+        (one.shape, checked.config.networks_of(one.seen), len(one.seen))
+        if one.shape and one.work is FrameWork.FULL
+        else None
+        for one in plans
+    ]
+    distinct = list(dict.fromkeys(one for one in seen if one is not None)) or [(_own(files[0].shape), (0,), 1)]
+    by_kind = {
+        (shape, used): painting([files[number] for number in used], shape, {"scene": each.what})
+        for shape, used, _ in distinct
     }
-    networks, avatars = tuple(by_shape[shape] for shape, _ in distinct), tuple(count for _, count in distinct)
+    networks, avatars = (
+        tuple(by_kind[shape, used] for shape, used, _ in distinct),
+        tuple(count for *_, count in distinct),
+    )
     frames = tuple(SKIPS if one is None else distinct.index(one) for one in seen)
     fps, unit, computes = each.fps or scene.fps, each.unit or INFER[1], Computes(precision=precision)
     return Tenant(name, each.text, networks, frames, fps, unit, variant, avatars=avatars, computes=computes)

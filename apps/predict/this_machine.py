@@ -12,17 +12,16 @@ from pathlib import Path
 from statistics import median
 
 from trilane.apps.predict.asked_pipelines import NETWORK_ENDING, asked
-from trilane.avatars.network_file import reshaped
 from trilane.errors import TrilaneError
 from trilane.hw_profiles.graph_file import GraphFile, read_graph
 from trilane.hw_profiles.host import usable_cores
 from trilane.hw_profiles.host_model import NETWORK, error_of, with_network, with_stages
 from trilane.hw_profiles.network_time import price
-from trilane.hw_profiles.network_work import Network, count_work
+from trilane.hw_profiles.network_work import Network
 from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.stages import PRELOAD
-from trilane.stages.avatar_assets import network_of
+from trilane.stages.avatar_assets import networks_of, painting
 from trilane.stages.avatar_pipeline import one_shape
 from trilane.stages.configure import configure, requested_runtime
 from trilane.stages.dsp.bare_calls import calls_of
@@ -55,9 +54,7 @@ def _with_run(chip: Profile, request: RunOptions, say: Say) -> tuple[Profile, Ne
     `with_avatar`. Raises BadInputError for what cannot be run.
     """
     checked = configure(request, Path.cwd())
-    file, (height, width) = network_of(checked.assets), one_shape(checked.config)
-    work = count_work(reshaped(file, height, width).model)
-    network = Network({"scene": request.scene}, height, width, file.channels, "packed", work)
+    network = painting(networks_of(checked.assets), one_shape(checked.config), {"scene": request.scene})
     try:
         with UnitStarter(PRELOAD) as starter:
             found, at = rehearsed(checked, starter, str(gl_facts()), lambda _: say(MEASURING.format("the stages")))

@@ -14,16 +14,15 @@ from typing import Any
 import numpy as np
 
 from trilane.avatars.bundle import load_bundle
-from trilane.avatars.network_file import reshaped
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import Plan, application_graph, stage_times_ms
-from trilane.hw_profiles.network_work import Network, count_work
 from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import corners_of
 from trilane.scheduler.events import Settings
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.policy import run_settings
 from trilane.scheduler.virtual import simulate
+from trilane.stages.avatar_assets import painting
 from trilane.stages.config import RunConfig
 from trilane.units import BEFORE_INFER, BYPASS, SUSTAINED
 
@@ -57,10 +56,10 @@ def pace_of(config: RunConfig, profile: str, slow_motion: float = 1.0, performan
     if not 0 < slow_motion <= MAX_SLOW_MOTION:
         raise BadInputError("--slow-motion", f"{slow_motion:g}", f"above 0, at most {MAX_SLOW_MOTION:g}")
     chip = load_runnable(profile)
-    height, width = max(config.buckets, key=lambda shape: shape[0] * shape[1])
-    file = load_bundle(config.avatar_dirs[0]).read_network()
-    facts = {"avatar": config.avatar_dirs[0].name}
-    network = Network(facts, height, width, file.shape[3], "packed", count_work(reshaped(file, height, width).model))
+    shape = max(config.buckets, key=lambda shape: shape[0] * shape[1])
+    folders = {config.network_of(number): folder for number, folder in enumerate(config.avatar_dirs)}
+    files = [load_bundle(folder).read_network() for folder in folders.values()]
+    network = painting(files, shape, {"avatar": config.avatar_dirs[0].name})
     plan = Plan(network, "dsp", avatars=len(config.avatar_dirs))
     times = stage_times_ms(chip, plan, corners_of(chip, performance_profile))
     held = {stage: round(ms * slow_motion * 1e6) for (stage, _), ms in times.items()}

@@ -19,8 +19,9 @@ from trilane.pipeline.memory import Assets
 from trilane.pipeline.stage import Skip, UnitContext
 from trilane.pipeline.unit_loop import BoundStage, factory_named
 from trilane.scene.planner import FrameWork
-from trilane.stages.avatar_assets import network_of
+from trilane.stages.avatar_assets import networks_of
 from trilane.stages.avatar_pipeline import avatar_pipeline
+from trilane.stages.config import MAX_CHANNELS, PAINTED_CHANNELS, network_parts
 from trilane.stages.configure import Checked
 from trilane.stages.cpu.pose import PoseStage
 from trilane.stages.gpu.opengl import CONTEXT, open_context
@@ -88,7 +89,8 @@ class AvatarFrames:
         self.units = units_of(pipeline, checked.assets) if units is None else units
         self._chain = StageChain(pipeline, self.units)
         self._composite = len(pipeline.stages) - 2
-        self._channels = network_of(checked.assets).channels
+        self._channels = [network.channels for network in networks_of(checked.assets)]
+        self._buckets = checked.config.buckets
         self._shape = (checked.config.scene.output.height, checked.config.scene.output.width, 3)
 
     def frame(self, number: int) -> U8:
@@ -105,16 +107,26 @@ class AvatarFrames:
         self._chain.run(number, self._composite - 1).payload[:] = 0
         return self._picture(self._chain.go_on(number))
 
-    def tensor_of(self, number: int) -> U8:
-        """Return the tensor (h,w,C) of frame `number`, as its raster stage drew it. Somebody must be seen in it."""
+    def tensor_of(self, number: int, network: int = 0) -> U8:
+        """Return the tensor (h,w,C) of frame `number`, as its raster stage drew it. Somebody must be seen in it.
+
+        `network`: number of the network that reads it.
+        """
         payload = self._chain.run(number, RASTER).payload
-        height, width = self.posed["tensor_shape"].tolist()
-        tensor: U8 = payload[: height * width * self._channels].reshape(height, width, self._channels).copy()
+        (height, width), channels = self.posed["tensor_shape"].tolist(), self._channels[network]
+        own = network_parts(payload, len(self._channels), self._buckets, MAX_CHANNELS)[network]
+        tensor: U8 = own[: height * width * channels].reshape(height, width, channels).copy()
         return tensor
 
-    def composited(self, number: int, painted: U8) -> U8:
-        """Return frame `number`, (h,w,3) uint8, composited with `painted` (h,w,4) in place of the network's output."""
-        self._chain.run(number, self._composite - 1).payload[: painted.size] = painted.reshape(-1)
+    def composited(self, number: int, painted: Mapping[int, U8]) -> U8:
+        """Return frame `number`, (h,w,3) uint8, composited with other pictures in place of the networks' own.
+
+        `painted`: (h,w,4) by the number of the network.
+        """
+        payload = self._chain.run(number, self._composite - 1).payload
+        parts = network_parts(payload, len(self._channels), self._buckets, PAINTED_CHANNELS)
+        for network, picture in painted.items():
+            parts[network][: picture.size] = picture.reshape(-1)
         return self._picture(self._chain.go_on(number))
 
     @property

@@ -31,7 +31,7 @@ from trilane.scene.camera_placement import steered
 from trilane.scene.crop import SCREEN, Rect, Stretch, cheapest_within, error_px, least_w, stretch_of
 from trilane.scene.mover import Mover
 from trilane.scene.planner import FrameWork, HeldMesh, HeldShape, hold_mesh, plan_tensor, shown_by, work_of
-from trilane.scene.tensor_layout import lay_out
+from trilane.scene.tensor_layout import lay_out_apart
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import bodies_drawn, distinct, mesh_levels_of, staged_of
 from trilane.stages.config import RunConfig, posed_vertices
@@ -226,6 +226,7 @@ class PoseStage:
         self._output = (scene.output.height, scene.output.width)
         self._buckets, self._plans_tensor = config.buckets, scene.plans_tensor
         self._budgets, self._changes = config.tensor_budgets, config.changes
+        self._painters = [config.network_of(number) for number in range(len(config.avatar_dirs))]
         self._rung = 0
         self._held: HeldShape | None = None
         self._skips = scene.plan == "planned"
@@ -356,13 +357,14 @@ class PoseStage:
             packet["tensor_shape"] = min(self._buckets, key=lambda shape: shape[0] * shape[1])
             return FramePlan(FrameWork.NONE, None, None, {})
         rects, density = [one.rect for _, one in seen], None
+        painters = [self._painters[int(avatar["avatar"])] for avatar, _ in seen]
         if self._plans_tensor:
             foreseen = self._foreseen(float(packet["media_time_s"]))
             budget = self._budgets[self._rung]
-            plan = plan_tensor(rects, self._output, self._buckets, budget, self._held, foreseen)
+            plan = plan_tensor(rects, self._output, self._buckets, budget, self._held, foreseen, painters)
             layout, density, self._held = plan.dense.layout, plan.dense.density, plan.held
         else:
-            layout = lay_out(rects, self._output, self._buckets)
+            layout = lay_out_apart(rects, painters, self._output, self._buckets)
         packet["tensor_shape"] = layout.shape
         for (avatar, _), (crop, cell) in zip(seen, layout.crops, strict=True):
             avatar["rect"], avatar["tensor_rect"] = crop, cell

@@ -29,8 +29,8 @@ from trilane.machine import moved_of_kept
 from trilane.pipeline.memory import ByteCounter
 from trilane.pipeline.stage import UnitContext
 from trilane.shapes import Shape
-from trilane.stages.avatar_assets import network_of
-from trilane.stages.config import RunConfig
+from trilane.stages.avatar_assets import networks_of
+from trilane.stages.config import MAX_CHANNELS, PAINTED_CHANNELS, RunConfig, network_parts
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, Session, copies_slots, has_device, load_runtime, resolve
 from trilane.transport.packets import Packet
 
@@ -103,7 +103,8 @@ def views(payload: U8, shapes: Shapes) -> dict[str, U8]:
     return found
 
 
-Key = tuple[Shape, int, int]
+#: Number of the network, shape of its tensor, input slot, output slot.
+Key = tuple[int, Shape, int, int]
 #: Runtimes that may compile several networks at the same time.
 LOAD_AT_ONCE = ("openvino", "ort")
 
@@ -132,21 +133,25 @@ class BoundPart:
 
 
 class InferStage:
-    """A `trilane.pipeline.stage.Stage` with one inference a frame; a whole network turns H·W·C bytes into H·W·4.
+    """A `trilane.pipeline.stage.Stage`; a whole network turns H·W·C bytes into H·W·4.
 
-    `network`: network of all avatars, which share the tensor, each in its `tensor_rect`.
-    `part`: number of the part that the configuration's cuts make.
+    A frame has one inference for each network that paints somebody in view.
+
+    `networks`: networks of the avatars. Those of one network share its tensor, each in its `tensor_rect`.
+    `part`: number of the part that the configuration's cuts make of the only network.
     Raises BadInputError, MissingPartError when made or bound.
     """
 
-    def __init__(self, config: RunConfig, network: NetworkFile, part: int = 0) -> None:
+    def __init__(self, config: RunConfig, networks: Sequence[NetworkFile], part: int = 0) -> None:
         self.runtime = resolve(config.runtime)
         self._module = load_runtime(self.runtime)
         self._config, self._part = config, part
         settings = config.units[config.infer_units[part]]
         self._options = RuntimeOptions(settings.threads, settings.spin)
         self._shapes = config.buckets
-        self._network = network
+        self._networks = networks
+        avatars = range(len(config.avatar_dirs))
+        self._painters = np.array([config.network_of(number) for number in avatars])
         self._moved = ByteCounter()
         self._copies = copies_slots(self.runtime)
         self._bindings: dict[Key, BoundPart] = {}
@@ -160,58 +165,71 @@ class InferStage:
         """
         self._inputs, self._outputs = inputs, outputs
         at_once = len(machine.here.cores()) if self.runtime in LOAD_AT_ONCE else 1
+        kinds = list(product(range(len(self._networks)), self._shapes))
         with ThreadPoolExecutor(at_once) as pool:
-            for shape, bindings in zip(self._shapes, pool.map(self._prepare, self._shapes), strict=True):
-                self._bindings |= {(shape, *pair): binding for pair, binding in bindings.items()}
+            for bindings in pool.map(lambda kind: self._prepare(*kind), kinds):
+                self._bindings |= bindings
 
-    def _prepare(self, shape: Shape) -> dict[tuple[int, int], BoundPart]:
-        """Return the part for tensors of `shape` on each pair of slots."""
-        part = parts_for(self._config, self._network, shape)[self._part]
+    def _prepare(self, number: int, shape: Shape) -> dict[Key, BoundPart]:
+        """Return the part of network `number` for tensors of `shape` on each pair of slots."""
+        part = parts_for(self._config, self._networks[number], shape)[self._part]
         session = self._module.load(part, self._options)
-        pairs = product(enumerate(self._inputs), enumerate(self._outputs))
+        sources = [self._own(packet, number, MAX_CHANNELS) for packet in self._inputs]
+        targets = [self._own(packet, number, PAINTED_CHANNELS) for packet in self._outputs]
         weights = 0 if has_device(self.runtime) else moved_of_kept(constant_bytes(part.model))
         bindings = {
-            (i, o): _bound(session, part, source.payload, target.payload, weights) for (i, source), (o, target) in pairs
+            (number, shape, i, o): _bound(session, part, source, target, weights)
+            for (i, source), (o, target) in product(enumerate(sources), enumerate(targets))
         }
         # A session allocates memory in its first run; later runs, those of frames, do not.
-        bindings[0, 0].run(ByteCounter())
+        bindings[number, shape, 0, 0].run(ByteCounter())
         return bindings
 
-    def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
-        """Infer the tensor unless nobody is in view; then the picture is transparent.
+    def _own(self, packet: Packet, number: int, channels: int) -> U8:
+        """Return the part of a slot of network `number`; all of it for the only network, which may be cut."""
+        if len(self._networks) == 1:
+            return packet.payload
+        return network_parts(packet.payload, len(self._networks), self._shapes, channels)[number]
 
-        Figures: `inferred`, 0 or 1, and the bytes moved. The least bytes are the network's input and output, and its
-        weights where they do not fit into the last-level cache.
+    def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
+        """Infer the tensor of each network that paints somebody in view; with nobody in view, pictures are transparent.
+
+        Figures: `inferred`, the number of inferences, and the bytes moved. The least bytes are the networks' inputs and
+        outputs, and their weights where they do not fit into the last-level cache.
         """
         assert slot_in is not None and slot_out is not None
         pose, picture, moved = self._inputs[slot_in].header, self._outputs[slot_out].payload, self._moved
         moved.start(pose.nbytes)
-        if not pose["avatars"]["visible"].any():
+        is_seen = pose["avatars"]["visible"] > 0
+        if not is_seen.any():
             picture[:] = 0
             moved.written += picture.nbytes
             return {"inferred": 0, **moved.figures()}
         height, width = pose["tensor_shape"].tolist()
-        bound = self._binding((height, width), slot_in, slot_out, frame)
-        bound.run(moved)
-        if self._copies:
-            moved.uploaded, moved.read_back = bound.in_bytes, bound.out_bytes
-        return {"inferred": 1, **moved.figures()}
+        numbers = np.unique(self._painters[is_seen]).tolist()
+        for number in numbers:
+            bound = self._binding((number, (height, width), slot_in, slot_out), frame)
+            bound.run(moved)
+            if self._copies:
+                moved.uploaded += bound.in_bytes
+                moved.read_back += bound.out_bytes
+        return {"inferred": len(numbers), **moved.figures()}
 
     @property
     def sessions(self) -> int:
-        """Number of compiled networks that are ready: one for each shape."""
-        return len({shape for shape, _, _ in self._bindings})
+        """Number of compiled networks that are ready: one for each network and shape."""
+        return len({(number, shape) for number, shape, _, _ in self._bindings})
 
     def close(self) -> None:
         """Drop sessions and bindings, which hold views of the slots."""
         self._bindings.clear()
         self._inputs = self._outputs = ()
 
-    def _binding(self, shape: Shape, slot_in: int, slot_out: int, frame: int) -> BoundPart:
+    def _binding(self, key: Key, frame: int) -> BoundPart:
         try:
-            return self._bindings[shape, slot_in, slot_out]
+            return self._bindings[key]
         except KeyError:
-            known = ", ".join(f"{h}x{w}" for h, w in self._shapes)
+            shape, known = key[1], ", ".join(f"{h}x{w}" for h, w in self._shapes)
             raise BadInputError(f"frame {frame}", f"tensor shape {shape[0]}x{shape[1]}", f"one of {known}") from None
 
 
@@ -220,7 +238,7 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> InferStage:
     config = RunConfig.model_validate(settings["config"])
     if has_device(config.runtime):
         unit.use_device(config.runtime)
-    return InferStage(config, network_of(unit.assets), settings["part"])
+    return InferStage(config, networks_of(unit.assets), settings["part"])
 
 
 def _bound(session: Session, part: NetworkPart, source: U8, target: U8, weights: int) -> BoundPart:

@@ -33,7 +33,7 @@ from trilane.scene.planner import FrameWork
 from trilane.scene.schema import PlaneSpec
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, shaped_body, staged_of
-from trilane.stages.config import RunConfig
+from trilane.stages.config import PAINTED_CHANNELS, RunConfig, network_parts
 from trilane.stages.gpu import opengl
 from trilane.stages.gpu.background import Background, open_background
 from trilane.stages.gpu.composite_painters import (
@@ -191,6 +191,7 @@ class CompositeStage:
     `background`: background from files; None for the built-in room.
     `eyes`: places (3,) that the room holds from the first frame on, so that it never grows, not even after a restart.
     `planes`: detected planes to show.
+    `painters`: network of each avatar; empty where one paints all.
     `hud`: whether to show frame, rate and age.
     """
 
@@ -204,6 +205,7 @@ class CompositeStage:
         eyes: Sequence[Floats] = (),
         planes: Sequence[PlaneSpec] = (),
         hud: bool = False,
+        painters: Sequence[int] = (),
     ) -> None:
         self._ctx, self._shape, self._rest, self._background = ctx, shape, rest, background
         colour = ctx.texture(shape[::-1], 4, internal_format=opengl.SRGB8_ALPHA8)
@@ -214,7 +216,8 @@ class CompositeStage:
         self._planes = PlanePainter(ctx, planes) if planes else None
         self._hud = Hud(ctx) if hud else None
         self._shadow = ShadowPainter(ctx, len(DISCS) * len(rest))
-        self._painter = AvatarPainter(ctx, list(shapes))
+        self._shapes, self._network = list(shapes), painters or [0] * len(rest)
+        self._painters = [AvatarPainter(ctx, self._shapes) for _ in set(self._network)]
         self._held: NDArray[np.void] | None = None  # header of the frame whose picture of the avatars was uploaded
         self._shows_background = 0  # number of background pictures so far
         self._drawn = DrawnFrames()
@@ -263,7 +266,7 @@ class CompositeStage:
         return {**{name: float(value) for name, value in said.items()}, **moved.figures()}
 
     def draw(self, pose: NDArray[np.void], image: NDArray[np.uint8]) -> None:
-        """Draw the frame that `pose` and the network's `image` (h * w * 4 bytes or more) describe."""
+        """Draw the frame that `pose` and the networks' `image` (h * w * 4 bytes or more) describe."""
         self._take(pose, image)
         self._draw(pose)
 
@@ -278,10 +281,11 @@ class CompositeStage:
         if int(pose["work"]) == FrameWork.FULL:
             # Copied, because a later frame is written to the same slot.
             self._held = pose.copy()
-            if _visible(pose):
-                shape = _tensor_shape(pose)
-                self._painter.upload(shape, image[: math.prod(shape) * 4])
-                counter_of(self._ctx).least += _cells_bytes(pose)
+            shape, used = _tensor_shape(pose), {self._network[int(avatar["avatar"])] for avatar in _visible(pose)}
+            parts = network_parts(image, len(self._painters), self._shapes, PAINTED_CHANNELS)
+            for network in used:
+                self._painters[network].upload(shape, parts[network][: math.prod(shape) * PAINTED_CHANNELS])
+            counter_of(self._ctx).least += _cells_bytes(pose)
 
     def _holds(self, picture: int) -> bool:
         """Return whether the uploaded picture of the avatars is that of frame `picture`."""
@@ -313,7 +317,8 @@ class CompositeStage:
         for avatar in sorted(visible, key=lambda a: self._depth(pose, a)):
             rect = tuple(float(side) for side in avatar["rect"])
             top, left, height, width = (int(side) for side in avatar["tensor_rect"])
-            self._painter.draw(self._target, shape, rect, (top, left, height, width))
+            painter = self._painters[self._network[int(avatar["avatar"])]]
+            painter.draw(self._target, shape, rect, (top, left, height, width))
 
     def close(self) -> None:
         """Close the background's file."""
@@ -361,4 +366,5 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> CompositeStage:
     driver = describe(ctx)
     if driver.hardware:
         unit.use_device(driver.renderer)
-    return CompositeStage(ctx, shape, config.buckets, joints, background, camera.reach(), scene.planes, scene.hud)
+    eyes, networks = camera.reach(), config.networks
+    return CompositeStage(ctx, shape, config.buckets, joints, background, eyes, scene.planes, scene.hud, networks)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from trilane.pipeline.stage import UnitContext
 from trilane.scene.crop import Rect, crop_projection
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import bodies_drawn, distinct, levels_of, quantisation_of, texture_of
-from trilane.stages.config import RunConfig, posed_vertices
+from trilane.stages.config import MAX_CHANNELS, RunConfig, network_parts, posed_vertices
 from trilane.stages.gpu.opengl import CONTEXT, checked, counter_of, describe, open_context
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import Mesh, PosedMesh, SkinnedMesh, avatar_mesh
@@ -29,18 +30,21 @@ from trilane.transport.packets import Packet
 class RasterStage:
     """The raster stage.
 
-    `avatars[i]`: draws the scene's avatar i. `shapes`: tensor shapes (height, width) that may come.
-    `posed_vertices`: number of skinned vertices of each avatar in the input slot; empty when the GPU skins.
+    `passes`: draws the tensors of each network. `avatars[i]`: draws the scene's avatar i. `shapes`: tensor shapes
+    (height, width) that may come. `posed_vertices`: number of skinned vertices of each avatar in the input slot; empty
+    when the GPU skins. `painters`: network of each avatar; empty where one paints all.
     """
 
     def __init__(
         self,
-        packed: PackedPass,
+        passes: Sequence[PackedPass],
         avatars: Sequence[PackedAvatar],
         shapes: Sequence[Shape],
         posed_vertices: Sequence[int] = (),
+        painters: Sequence[int] = (),
     ) -> None:
-        self._packed, self._avatars, self._shapes, self._counts = packed, avatars, shapes, posed_vertices
+        self._passes, self._avatars, self._shapes, self._counts = passes, avatars, shapes, posed_vertices
+        self._ctx, self._painters = passes[0].ctx, painters or [0] * len(avatars)
         self._vertices: list[list[NDArray[np.float32]]] = []
         self._inputs: Sequence[Packet] = ()
         self._outputs: Sequence[Packet] = ()
@@ -49,39 +53,42 @@ class RasterStage:
         """Keep the slots and make a target for every tensor shape."""
         self._inputs, self._outputs = inputs, outputs
         self._vertices = [posed_vertices(packet.payload, self._counts) for packet in inputs]
-        for shape in self._shapes:
-            self._packed.target(shape)
+        for packed, shape in product(self._passes, self._shapes):
+            packed.target(shape)
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
-        """Write the tensor of frame `frame`, (h,w,C) uint8.
+        """Write the tensor of frame `frame`, (h,w,C) uint8, of each network that paints somebody in view.
 
-        Figures: the bytes moved. The least bytes: for each avatar in view the pose that its mesh takes, and the tensor.
+        Figures: the bytes moved. The least bytes: for each avatar in view the pose that its mesh takes, and the
+        tensors.
 
         Raises TrilaneError when a joint is not a finite number, UnitLostError with the context.
         """
         if slot_in is None or slot_out is None:
             raise ValueError("raster needs an input and an output slot")
-        pose, moved = self._inputs[slot_in].header, counter_of(self._packed.ctx)
+        pose, moved = self._inputs[slot_in].header, counter_of(self._ctx)
         moved.start(pose.nbytes)
         shape = (int(pose["tensor_shape"][0]), int(pose["tensor_shape"][1]))
-        tensor = self._outputs[slot_out].payload[: math.prod(shape) * self._packed.channels]
         visible = [a for a in pose["avatars"][: int(pose["avatar_count"])] if a["visible"]]
-        if not visible:
-            self._packed.background(tensor)
-            moved.written += tensor.nbytes
-            return moved.figures()
         _refuse_nan(frame, visible)
         skinned = self._vertices[slot_in]
-        with checked(self._packed.ctx):
-            target = self._packed.begin(shape)
-            for avatar in visible:
-                number = int(avatar["avatar"])
-                placement = _placement(pose, avatar, skinned[number] if skinned else None)
-                self._avatars[number].draw(target, pose["view"], placement)
-                moved.least += self._avatars[number].meshes[placement.mesh].pose_bytes
-            self._packed.read_into(shape, tensor)
-        moved.written += tensor.nbytes
-        moved.least += tensor.nbytes
+        parts = network_parts(self._outputs[slot_out].payload, len(self._passes), self._shapes, MAX_CHANNELS)
+        for network, (packed, part) in enumerate(zip(self._passes, parts, strict=True)):
+            tensor = part[: math.prod(shape) * packed.channels]
+            own = [avatar for avatar in visible if self._painters[int(avatar["avatar"])] == network]
+            moved.written += tensor.nbytes
+            if not own:
+                packed.background(tensor)
+                continue
+            with checked(self._ctx):
+                target = packed.begin(shape)
+                for avatar in own:
+                    number = int(avatar["avatar"])
+                    placement = _placement(pose, avatar, skinned[number] if skinned else None)
+                    self._avatars[number].draw(target, pose["view"], placement)
+                    moved.least += self._avatars[number].meshes[placement.mesh].pose_bytes
+                packed.read_into(shape, tensor)
+            moved.least += tensor.nbytes
         return moved.figures()
 
     def close(self) -> None:
@@ -121,13 +128,18 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> RasterStage:
         unit.use_device(driver.renderer)
     levels = [levels_of(unit.assets, number) for number in range(len(folders))]
     deferred = filtering == "linear" and not driver.hardware and all(each is None for each in levels)
-    packed = PackedPass(ctx, textures[0].shape[2], quantisation_of(unit.assets, 0), deferred, filtering)
+    passes: dict[int, PackedPass] = {}
     drawn = {}
     for number, (folder, texture) in enumerate(zip(folders, textures, strict=True)):
+        network = config.network_of(config.avatar_dirs.index(folder))
+        if network not in passes:
+            encoding = quantisation_of(unit.assets, number)
+            passes[network] = PackedPass(ctx, texture.shape[2], encoding, deferred, filtering)
         whole, *coarser = _meshes(ctx, bodies_drawn(config, unit.assets, number), config)
-        drawn[folder] = PackedAvatar(packed, whole, texture, levels[number], coarser)
+        drawn[folder] = PackedAvatar(passes[network], whole, texture, levels[number], coarser)
     avatars = [drawn[folder] for folder in config.avatar_dirs]
-    return RasterStage(packed, avatars, config.buckets, config.posed_vertices)
+    in_order = [passes[network] for network in sorted(passes)]
+    return RasterStage(in_order, avatars, config.buckets, config.posed_vertices, config.networks)
 
 
 def _meshes(ctx: Any, bodies: Sequence[ShapedBody], config: RunConfig) -> list[Mesh]:

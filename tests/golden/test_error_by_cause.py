@@ -108,7 +108,7 @@ def test_float64_makes_the_run_s_tensor_but_for_single_steps(moment: ReferenceMo
     """The driver rounds, and snaps vertices to parts of a pixel: of the values on the mesh few are a step off."""
     avatar = next(iter(moment._path.avatars.values()))
     own, driver = (
-        moment._tensor(avatar, up_to(cause)) / avatar.encoding.scale for cause in (Cause.PACKING, Cause.RASTER)
+        moment._tensor(0, avatar, up_to(cause)) / avatar.encoding.scale for cause in (Cause.PACKING, Cause.RASTER)
     )
     both = (own != 0).any(axis=-1) & (driver != 0).any(axis=-1)
     assert both.sum() > 100

@@ -100,7 +100,7 @@ def test_a_tensor_is_read_back_once(
 ) -> None:
     """Where the texture is read last, the target is overwritten to clear it: four words a pixel for three."""
     packed = PackedPass(gl, channels, Quantisation(6 / 255, 117), deferred)
-    stage = RasterStage(packed, [PackedAvatar(packed, person.mesh, neural_texture[:, :, :channels])], [TENSOR])
+    stage = RasterStage([packed], [PackedAvatar(packed, person.mesh, neural_texture[:, :, :channels])], [TENSOR])
     tensor = {16: 98_304, 12: 73_728, 8: 49_152, 4: 24_576}[channels]
     source, target = packet(0), packet(tensor + 64)
     stage.bind([source], [target])
@@ -112,7 +112,7 @@ def test_a_tensor_is_read_back_once(
 
 def test_nobody_in_view_costs_one_fill(gl: Any, person: Any, neural_texture: Any, second: Any) -> None:
     packed = PackedPass(gl, 16, Quantisation(6 / 255, 117), deferred=True)
-    stage = RasterStage(packed, [PackedAvatar(packed, person.mesh, neural_texture)], [TENSOR])
+    stage = RasterStage([packed], [PackedAvatar(packed, person.mesh, neural_texture)], [TENSOR])
     source, target = packet(0), packet(98_304)
     stage.bind([source], [target])
     source.header["avatar_count"], source.header["tensor_shape"] = 1, TENSOR
@@ -127,7 +127,7 @@ def test_vertices_of_the_cpu_are_read_by_corner(
     assert corners > vertices
     packed = PackedPass(gl, 16, Quantisation(6 / 255, 117), deferred=False)
     mesh = PosedMesh(gl, person.arrays)
-    stage = RasterStage(packed, [PackedAvatar(packed, mesh, neural_texture)], [TENSOR], [vertices])
+    stage = RasterStage([packed], [PackedAvatar(packed, mesh, neural_texture)], [TENSOR], [vertices])
     source, target = packet(vertices * 12), packet(98_304)
     stage.bind([source], [target])
     show(source, person.pose(np.zeros(165)), camera((0, 0.9, 3), (0, 0.9, 0), 40, 64 / 96))

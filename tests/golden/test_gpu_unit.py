@@ -51,7 +51,7 @@ def fill_pose(slot: Packet, joints: Any, view: Any, projection: Any, rect: Any, 
 def raster(gl: Any, person: Any, neural_texture: Any) -> tuple[RasterStage, Packet, Packet]:
     """A raster stage with one input and one output slot."""
     packed = PackedPass(gl, 16, ENCODING, deferred=True)
-    stage = RasterStage(packed, [PackedAvatar(packed, person.mesh, neural_texture)], [TENSOR])
+    stage = RasterStage([packed], [PackedAvatar(packed, person.mesh, neural_texture)], [TENSOR])
     source, target = packet(0), packet(TENSOR[0] * TENSOR[1] * 16 + 64)
     stage.bind([source], [target])
     return stage, source, target

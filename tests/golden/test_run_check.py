@@ -69,7 +69,7 @@ class Pictures:
         painted: U8 = rgba[: height * width * 4].reshape(height, width, 4).copy()
         painted[..., 3] = np.rint(painted[..., 3] * ALPHA)
         thin = [replace(layer, light=layer.light * ALPHA) for layer in self.layers]
-        return self.frames.composited(NUMBER, painted), blended(self.background, thin)
+        return self.frames.composited(NUMBER, {0: painted}), blended(self.background, thin)
 
     def shifted(self) -> tuple[U8, U8]:
         return np.roll(self.own, SHIFT, axis=1), np.roll(self.truth, SHIFT, axis=1)

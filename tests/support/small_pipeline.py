@@ -17,7 +17,7 @@ from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, 
 from trilane.pipeline.memory import BYTES, EdgeRegion
 from trilane.pipeline.unit_loop import UnitSpec
 from trilane.scene.staging import stage_scene
-from trilane.stages.avatar_assets import distinct, load_avatar, pack_assets, require_one_tensor
+from trilane.stages.avatar_assets import distinct, load_avatar, pack_assets
 from trilane.stages.config import RunConfig
 from trilane.transport.messages import JobPipeEnd
 from trilane.transport.packets import Packet, SlotLayout, header_dtype, view_packet
@@ -68,7 +68,6 @@ def packets(header: np.dtype[Any], count: int) -> list[Packet]:
 def assets_of(config: RunConfig) -> dict[str, NDArray[Any]]:
     """The arrays that a run of `config` hands to its units, packed by the same functions. Raises BadInputError."""
     avatars = {folder: load_avatar(load_bundle(folder)) for folder in distinct(config)}
-    require_one_tensor(list(avatars.values()))
     staged = stage_scene(config.scene, [avatars[folder].shaped for folder in config.avatar_dirs], Path.cwd())
     return pack_assets(list(avatars.values()), staged)
 

@@ -27,6 +27,7 @@ from trilane.hw_profiles.schema import corners_of
 from trilane.hw_profiles.shared_chip import Together, predict_beside, together
 from trilane.hw_profiles.tenants import SKIPS, Tenant, moved_bytes
 from trilane.scene.planner import FrameWork
+from trilane.stages import avatar_assets
 from trilane.units import SUSTAINED
 
 CHIP = load_profile("snapdragon-888")
@@ -223,7 +224,10 @@ def test_what_is_said_of_a_machine_and_of_turns() -> None:
 
 
 def test_a_scene_is_planned_frame_by_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames of 64x96 and 32x32 with some that skip; a network for each shape and number of avatars, as they come."""
+    """Frames of 64x96 and 32x32 with some that skip; a network for each shape and what is in view, as they come.
+
+    Avatar c has a network of its own, so its frame has two tensors.
+    """
     full, reuse = FrameWork.FULL, FrameWork.REUSE
     wide, small = (64, 96), (32, 32)
     works: list[Any] = [
@@ -239,17 +243,22 @@ def test_a_scene_is_planned_frame_by_frame(monkeypatch: pytest.MonkeyPatch) -> N
         return SimpleNamespace(plan=SimpleNamespace(work=work, shape=shape, seen=seen))
 
     scene = SimpleNamespace(frames=700, fps=24.0)
-    checked = SimpleNamespace(config=SimpleNamespace(scene=scene), assets="assets")
+    config = SimpleNamespace(scene=scene, networks_of=lambda seen: (0, 1) if "c" in seen else (0,))
+    checked = SimpleNamespace(config=config, assets="assets")
     monkeypatch.setattr(sources, "configure", lambda *_: checked)
-    monkeypatch.setattr(sources, "network_of", lambda _: SimpleNamespace(shape=(1, 80, 112, 12)))
+    files = [SimpleNamespace(shape=(1, 80, 112, channels), channels=channels) for channels in (12, 8)]
+    monkeypatch.setattr(sources, "networks_of", lambda _: files)
     monkeypatch.setattr(sources, "ScenePlan", lambda *_: SimpleNamespace(decide=decide))
-    monkeypatch.setattr(sources, "reshaped", lambda _file, *shape: SimpleNamespace(model=shape))
-    monkeypatch.setattr(sources, "count_work", lambda shape: shape)
+    monkeypatch.setattr(avatar_assets, "reshaped", lambda file, *shape: SimpleNamespace(model=(file.channels, *shape)))
+    monkeypatch.setattr(avatar_assets, "count_work", lambda model: model)
+    monkeypatch.setattr(avatar_assets, "one_after_the_other", tuple)
     (found,) = sources.tenants(["home.toml@12:gpu"], Variant("deadline", "single"))
     assert (found.name, found.source, found.fps, found.unit) == ("home", "home.toml@12:gpu", 12.0, "gpu")
     assert (found.variant, found.is_bare) == (Variant("deadline", "single"), False)
-    assert [(each.height, each.width, each.channels) for each in found.networks] == [
-        (*s, 12) for s in (wide, small, wide)
+    assert [(each.height, each.width, each.channels, each.work) for each in found.networks] == [
+        (64, 96, 12, ((12, *wide),)),
+        (64, 32, 12, ((12, *small), (8, *small))),
+        (64, 96, 12, ((12, *wide),)),
     ]
     assert found.networks[0] is found.networks[2] and found.avatars == (1, 3, 2)
     assert found.frames == (0, SKIPS, 1, 2, 0) * 120

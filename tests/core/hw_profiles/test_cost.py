@@ -15,7 +15,7 @@ from onnx import TensorProto, helper
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import isolated_job_time, split_work
-from trilane.hw_profiles.network_work import Operator, Work, count_work
+from trilane.hw_profiles.network_work import Operator, Work, count_work, one_after_the_other
 from trilane.hw_profiles.operator_kinds import CLASSES, has_rule
 from trilane.hw_profiles.profile_files import load_profile
 from trilane.hw_profiles.published_times import PUBLISHED_MS, check_published, resnet18_work, unet_work
@@ -425,3 +425,22 @@ def test_a_published_time_is_compared_with_the_runtime_that_it_is_of() -> None:
     left = profile.model_copy(update={"units": {**profile.units, "dsp": renamed}})
     assert [check.runtime for check in check_published(profile.name, left)] == ["tflite", "tflite"]
     assert check_published("snapdragon-865", profile) == []
+
+
+@pytest.mark.parametrize("unit", ["gpu", "dsp"])
+@pytest.mark.parametrize("chip", ["snapdragon-888", "snapdragon-8-gen-3"])
+def test_networks_one_after_the_other_save_the_fixed_cost_of_a_job_and_nothing_else(chip: str, unit: UnitName) -> None:
+    """Equal names of tensors in both do not meet: what is saved is the same for any pair, and once for each more."""
+    profile = load_profile(chip)
+    small, large = resnet18_work(), unet_work()
+
+    def ms(*works: Work) -> float:
+        return time_on(profile.units[unit], profile.memory, one_after_the_other(works)).total_ms
+
+    saved = ms(small) + ms(large) - ms(small, large)
+    assert 0 < saved < ms(small)
+    assert 2 * ms(small) - ms(small, small) == pytest.approx(saved)
+    assert 2 * ms(small) + ms(large) - ms(small, large, small) == pytest.approx(2 * saved)
+    both = one_after_the_other([small, large])
+    assert (both.macs, both.weights) == (small.macs + large.macs, small.weights + large.weights)
+    assert one_after_the_other([small]) is small

@@ -263,7 +263,7 @@ def rehearsed(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, A
         return Rehearsed(times, took_ns), "noon"
 
     monkeypatch.setattr(this_machine, "configure", configure)
-    monkeypatch.setattr(this_machine, "network_of", lambda assets: assets)
+    monkeypatch.setattr(this_machine, "networks_of", lambda assets: [assets])
     monkeypatch.setattr(this_machine, "rehearsed", rehearse)
     monkeypatch.setattr(this_machine, "one_shape", lambda _: (96, 64))
     monkeypatch.setattr(this_machine, "gl_facts", lambda: {"vendor": "Mesa"})

@@ -31,7 +31,7 @@ from trilane.scene.planner import (
     plan_tensor,
     serves,
 )
-from trilane.scene.tensor_layout import MARGIN_PX, lay_out_at, tight_shape
+from trilane.scene.tensor_layout import MARGIN_PX, lay_out, lay_out_apart, lay_out_at, tight_shape
 from trilane.shapes import shapes_within
 
 OUTPUT = (480, 640)
@@ -274,6 +274,38 @@ def test_no_room_for_all_is_an_error() -> None:
     rects = [pixels(10 * k, 0, 5, 5) for k in range(5)]
     with pytest.raises(BadInputError, match=r"tensor shapes.*room for 5 avatars.*use a larger --size"):
         plan_tensor(rects, OUTPUT, [(32, 32)], TWO, None)
+
+
+def test_bodies_of_two_networks_have_a_tensor_each() -> None:
+    """Each has 128/200 in a square of its own; one above the other they have 127/200 in 256x128."""
+    bodies, shapes = [pixels(0, 0, 100, 200), pixels(300, 0, 200, 100)], [LARGE, TALL, SMALL]
+    together = plan_tensor(bodies, OUTPUT, shapes, TWO, None, networks=[1, 1])
+    assert together.dense.layout.shape == TALL and together.dense.density == pytest.approx(0.635)
+    plan = plan_tensor(bodies, OUTPUT, shapes, TWO, None, networks=[4, 1])
+    assert plan.dense.layout.shape == SMALL and plan.dense.density == pytest.approx(0.64)
+    for (crop, cell), body in zip(plan.dense.layout.crops, bodies, strict=True):
+        alone = lay_out_at([body], OUTPUT, SMALL, MOST_DENSITY)
+        assert alone is not None and (crop, cell) == alone.layout.crops[0]
+
+    def density(shape: tuple[int, int]) -> float:
+        return min(shape[0] / 200, shape[1] / 100, shape[0] / 100, shape[1] / 200)
+
+    ideal = ideal_shape(bodies, OUTPUT, TWO, [0, 1])
+    assert area(ideal) <= TWO.own and density(ideal) == max(map(density, shapes_within(TWO.own)))
+
+
+@given(st.lists(boxes, min_size=2, max_size=4), st.data())
+def test_a_fixed_tensor_of_each_network_is_filled_as_if_it_were_alone(rects: list[Rect], data: st.DataObject) -> None:
+    networks = data.draw(st.lists(st.sampled_from([0, 2]), min_size=len(rects), max_size=len(rects)))
+    buckets = [(512, 256), (256, 512)]
+    layout = lay_out_apart(rects, networks, OUTPUT, buckets)
+    assert layout.shape in buckets
+    for network in set(networks):
+        places = [place for place, one in enumerate(networks) if one == network]
+        own = lay_out([rects[place] for place in places], OUTPUT, [layout.shape])
+        assert [layout.crops[place] for place in places] == list(own.crops)
+    if len(set(networks)) == 1:
+        assert layout == lay_out(rects, OUTPUT, buckets)
 
 
 @given(boxes, SHAPES)

@@ -27,7 +27,7 @@ from trilane.shapes import shape_buckets
 from trilane.stages.avatar_assets import AvatarData, load_avatar
 from trilane.stages.config import RunConfig
 from trilane.stages.configure import configure
-from trilane.stages.foresee import MB, Foreseen, bytes_per_pixel, foresee, foreseen_rects
+from trilane.stages.foresee import MB, Foreseen, Painted, bytes_per_pixel, foresee, foreseen_rects
 from trilane.stages.run_options import RunOptions
 
 OWN = TensorBudget(own=128 * 128, most=512 * 512)
@@ -52,7 +52,7 @@ def test_the_shapes_are_those_of_frames_spread_over_the_scene(
     rows = list(foreseen_rects(scene, place, [avatar.shaped], frames))
     asked: list[Any] = []
     monkeypatch.setattr("trilane.stages.foresee.foreseen_rects", lambda *what: asked.append(what) or iter(rows))
-    found = foresee(scene, place, [avatar.shaped], avatar.network, [OWN])
+    found = foresee(scene, place, [avatar.shaped], Painted([avatar.network]), [OWN])
     assert asked == [(scene, place, [avatar.shaped], frames)] and found.frames == frames
     seen = [list(rects.values()) for rects in rows if rects]
     assert found.seen == len(seen) > 90
@@ -76,7 +76,7 @@ def test_so_many_frames_are_looked_at(
     monkeypatch.setattr("trilane.stages.foresee.foreseen_rects", lambda *what: [{} for _ in what[3]])
     specs = tuple(AvatarSpec(position=(0.5 * k - 2, 0, 0), motion="builtin:idle") for k in range(avatars))
     scene = Scene(size="auto", frames=frames, avatars=specs)
-    found = foresee(scene, staged(scene, avatar), [avatar.shaped] * avatars, avatar.network, [OWN])
+    found = foresee(scene, staged(scene, avatar), [avatar.shaped] * avatars, Painted([avatar.network]), [OWN])
     assert len(found.frames) == looked_at
 
 
@@ -88,14 +88,14 @@ def test_changes_are_foreseen_where_looks_are_half_a_second_apart(
     monkeypatch.setattr("trilane.stages.foresee.foreseen_rects", lambda *what: [{} for _ in what[3]])
     scene = Scene(size="auto", frames=frames, memory_mb=1)
     monkeypatch.setattr("trilane.stages.foresee.bytes_per_pixel", lambda _: MB / 1024)
-    found = foresee(scene, staged(scene, avatar), [avatar.shaped], avatar.network, [OWN, OWN.scaled(563)])
+    found = foresee(scene, staged(scene, avatar), [avatar.shaped], Painted([avatar.network]), [OWN, OWN.scaled(563)])
     assert found.changes == ((((0.0, (32, 32)),),) * 2 if is_foreseen else ())
 
 
 def test_with_nobody_in_view_one_least_shape_is_made_ready(avatar: AvatarData) -> None:
     off, stays = AvatarSpec(position=(0.0, 0.0, 40.0)), CameraSpec(place="none")
     scene = Scene(size="auto", frames=50, avatars=(off,), camera=stays)
-    found = foresee(scene, staged(scene, avatar), [avatar.shaped], avatar.network, [OWN])
+    found = foresee(scene, staged(scene, avatar), [avatar.shaped], Painted([avatar.network]), [OWN])
     assert (found.shapes.shapes, found.seen) == (((32, 32),), 0)
 
 
@@ -127,7 +127,7 @@ def test_smaller_sizes_never_pass_the_memory_of_the_scene(
     assert first > second > third
     pixels = first + second - 1 if room else first
     monkeypatch.setattr("trilane.stages.foresee.bytes_per_pixel", lambda _: (MB - 0.5) / pixels)
-    found = foresee(scene, place, [avatar.shaped], avatar.network, budgets)
+    found = foresee(scene, place, [avatar.shaped], Painted([avatar.network]), budgets)
     assert [prod(shape) for shape in found.shapes.shapes] == ([third, first] if room else [first])
     assert found.shapes.memory_bytes <= MB and found.left_out == (1 if room else 2)
     sizes = f"memory: {found.left_out} of the smaller tensor sizes have no shape within memory_mb 1"

@@ -15,7 +15,6 @@ import onnx
 import pytest
 from onnx import helper
 
-from support.small_pipeline import assets_of
 from trilane import machine
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import constants_of, reshaped
@@ -23,7 +22,7 @@ from trilane.avatars.network_split import cuts, split
 from trilane.errors import BadInputError, MissingPartError, install_line
 from trilane.pipeline.description import UnitSettings
 from trilane.scene.schema import Scene
-from trilane.stages.config import NetworkCut, RunConfig, pose_dtype
+from trilane.stages.config import NetworkCut, RunConfig, network_parts, pose_dtype
 from trilane.stages.dsp import infer, ort, runtime
 from trilane.stages.dsp.infer import InferStage
 from trilane.transport.packets import SlotLayout, view_packet
@@ -136,16 +135,16 @@ def test_three_parts_in_a_row_give_the_bytes_of_the_whole(tiny_bundle: Path) -> 
     slots[0].payload[:] = np.random.default_rng(0).integers(0, 256, edges[0])
     passed = 0
     for number in range(3):
-        stage = InferStage(config, whole, number)
+        stage = InferStage(config, [whole], number)
         stage.bind([slots[number]], [slots[number + 1]])
         slots[number + 1].payload[:] = 77
         assert stage.run(0, 0, 0)["inferred"] == 1
-        passed += len(stage._bindings[shape, 0, 0].passed)
+        passed += len(stage._bindings[0, shape, 0, 0].passed)
         assert stage.sessions == 1
         stage.close()
         assert stage.sessions == 0
     expected = slot(edges[-1], shape)
-    alone = InferStage(configured(tiny_bundle), whole)
+    alone = InferStage(configured(tiny_bundle), [whole])
     alone.bind([slots[0]], [expected])
     alone.run(0, 0, 0)
     assert passed > 0
@@ -165,7 +164,7 @@ def make(folder, avatars=1, size="64", runtime="ort"):
     scene = Scene.model_validate({"size": size, "avatars": [{}] * avatars})
     units = {"dsp": UnitSettings(cores=(0,), threads=1)}
     config = RunConfig(scene=scene, out_dir=folder, avatar_dirs=(folder,) * avatars, units=units, runtime=runtime)
-    stage = InferStage(config, load_bundle(folder).read_network())
+    stage = InferStage(config, [load_bundle(folder).read_network()])
     pixels = config.max_tensor_pixels * avatars
     inputs, outputs = slots(2, avatars, pixels * CHANNELS), slots(2, avatars, pixels * 4)
     stage.bind(inputs, outputs)
@@ -247,19 +246,45 @@ def test_avatars_share_one_inference(tiny_bundle):
     assert (found == run_alone(tiny_bundle, shape, tensor)).all()
 
 
-def test_avatars_of_different_networks_are_refused(tiny_bundle, tmp_path):
+def other_network(folder, tmp_path):
+    """A copy of the bundle in `folder` whose network has other weights."""
     other = tmp_path / "other"
-    shutil.copytree(tiny_bundle, other)
+    shutil.copytree(folder, other)
     model = onnx.load(other / "network.onnx")
-    model.doc_string = "another"
+    weights = next(one for one in model.graph.initializer if len(one.dims) == 4)
+    turned = onnx.numpy_helper.to_array(weights)[::-1].copy()
+    weights.CopyFrom(onnx.numpy_helper.from_array(turned, weights.name))
     onnx.save(model, other / "network.onnx")
-    units = {"dsp": UnitSettings(cores=(0,), threads=1)}
-    scene = Scene.model_validate({"size": "64", "avatars": [{}] * 2})
-    config = RunConfig(scene=scene, out_dir=tmp_path, avatar_dirs=(tiny_bundle, other), units=units)
-    with pytest.raises(BadInputError, match="one network for all avatars") as refused:
-        assets_of(config)
-    made = f"`trilane avatar create {other} --network {tiny_bundle / 'network.onnx'} --out NEW`"
-    assert refused.value.remedy.startswith("give each avatar a scene of its own, or name one avatar twice; " + made)
+    return other
+
+
+@pytest.mark.parametrize(("visible", "inferred"), [([1, 1, 1], [0, 1]), ([0, 1, 0], [1]), ([1, 0, 1], [0])])
+def test_each_network_paints_its_own_tensor(tiny_bundle, tmp_path, visible, inferred):
+    """Three avatars, the second of another network; who is not in view costs no inference."""
+    folders = [tiny_bundle, other_network(tiny_bundle, tmp_path)]
+    networks = [load_bundle(folder).read_network() for folder in folders]
+    scene = Scene.model_validate({"size": "64x64", "avatars": [{}] * 3})
+    config = RunConfig(
+        scene=scene,
+        out_dir=tmp_path,
+        avatar_dirs=(folders[0], folders[1], folders[0]),
+        units={"dsp": UnitSettings(cores=(0,), threads=1)},
+        networks=(0, 1, 0),
+    )
+    stage, shape = InferStage(config, networks), (64, 64)
+    (source,), (target,) = slots(1, 3, 64 * 64 * 16 * 2), slots(1, 3, 64 * 64 * 4 * 2)
+    stage.bind([source], [target])
+    assert stage.sessions == 2
+    tensors = [random_tensor(shape, number) for number in range(2)]
+    for tensor, part in zip(tensors, network_parts(source.payload, 2, [shape], 16), strict=True):
+        part[: tensor.size] = tensor.ravel()
+    target.payload[:] = 7
+    show(source, shape, visible)
+    assert stage.run(0, 0, 0)["inferred"] == len(inferred)
+    expected = [run_alone(folder, shape, tensor) for folder, tensor in zip(folders, tensors, strict=True)]
+    assert (expected[0] != expected[1]).any()
+    for number, part in enumerate(network_parts(target.payload, 2, [shape], 4)):
+        assert (part == (expected[number] if number in inferred else 7)).all()
 
 
 def test_a_shape_that_is_no_bucket_is_named(tiny_bundle):

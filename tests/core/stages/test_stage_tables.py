@@ -115,21 +115,23 @@ def test_what_is_packed_is_what_the_units_find(tiny_bundle: Path) -> None:
     assert (encoding.scale, encoding.zero_point) == (entry.input.scale, entry.input.zero_point)
     encoding = avatar_assets.quantisation_of(assets, 1)
     assert (encoding.scale, encoding.zero_point) == (0.125, 3)
-    network = avatar_assets.network_of(assets)
-    assert network.model == first.network.model and network.where == first.network.where
+    found = avatar_assets.networks_of(assets)
+    assert [(one.model, one.where) for one in found] == [(first.network.model, first.network.where)] * 2
+    with pytest.raises(BadInputError, match="one of 2 networks in the scene"):
+        avatar_assets.only_network_of(assets)
+    with pytest.raises(BadInputError, match="one of 2 networks in the scene"):
+        avatar_assets.with_network(assets, first.network)
+    (alone,) = avatar_assets.networks_of(avatar_assets.pack_assets([first], staged))
+    assert alone.model == first.network.model
     again = avatar_assets.staged_of(assets)
     assert np.array_equal(again.camera.sample(0.3), staged.camera.sample(0.3))
     assert len(again.movers) == 2
     config = configured(tiny_bundle, avatar_dirs=(Path("/b"), Path("/a"), Path("/b")))
     assert avatar_assets.distinct(config) == [Path("/b"), Path("/a")]
-    with pytest.raises(BadInputError, match=r"networks with different inputs"):
-        avatar_assets.require_one_tensor([first, second])
-    with pytest.raises(BadInputError, match=r"networks with different inputs"):
-        avatar_assets.require_one_tensor([first, replace(first, texture=first.texture[..., :4])])
     other = replace(first.network, where="x", model=type(first.network.model)())
-    with pytest.raises(BadInputError, match="another network"):
-        avatar_assets.require_one_tensor([first, first, replace(first, network=other)])
-    avatar_assets.require_one_tensor([first, replace(first, texture=first.texture * 2)])
+    brighter = replace(first, texture=first.texture * 2)
+    unlike = [first, second, replace(first, network=other), brighter, second]
+    assert avatar_assets.networks_of_avatars(unlike) == [0, 1, 2, 0, 1]
 
 
 # --- options ---------------------------------------------------------------------------------------------------------
@@ -179,16 +181,18 @@ def test_an_edge_is_one_of_the_rules() -> None:
 def test_cuts_are_a_tensor_and_a_unit(tiny_bundle: Path) -> None:
     network = load_bundle(tiny_bundle).read_network()
     first, second = [cut.at for cut in cuts(network)][:2]
-    assert configure.requested_cuts((f"{first}=gpu", f"{second}=cpu"), network) == (
+    assert configure.requested_cuts((f"{first}=gpu", f"{second}=cpu"), [network]) == (
         NetworkCut(at=first, unit="gpu"),
         NetworkCut(at=second, unit="cpu"),
     )
-    assert configure.requested_cuts((), network) == ()
+    assert configure.requested_cuts((), [network, network]) == ()
     for text in (f"{first}=npu", first, "=gpu="):
         with pytest.raises(BadInputError, match="TENSOR=UNIT, with UNIT one of cpu, gpu, dsp"):
-            configure.requested_cuts((text,), network)
+            configure.requested_cuts((text,), [network])
     with pytest.raises(BadInputError, match="quantised tensor"):
-        configure.requested_cuts(("nowhere=gpu",), network)
+        configure.requested_cuts(("nowhere=gpu",), [network])
+    with pytest.raises(BadInputError, match="2 networks in the scene"):
+        configure.requested_cuts((f"{first}=gpu",), [network, network])
 
 
 @pytest.mark.parametrize(

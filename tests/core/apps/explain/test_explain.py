@@ -169,7 +169,7 @@ def test_the_table_names_avatars_reasons_in_order_and_how_to_read_it(checked: Ch
 def test_costs_are_those_of_the_profile(tiny_bundle: Path) -> None:
     """As `trilane predict` computes them; a frame with nobody in view needs neither raster nor network."""
     network, chip = load_bundle(tiny_bundle).read_network(), load_profile(CHIP)
-    costs, corners = CostModel(network, CHIP, CAP), corners_of(chip, CAP)
+    costs, corners = CostModel([network], CHIP, CAP), corners_of(chip, CAP)
     work = count_work(reshaped(network, 96, 64).model)
     plan = Plan(Network({}, 96, 64, network.channels, "packed", work), "dsp", PIPELINED)
     times = {stage: ms for (stage, _), ms in stage_times_ms(chip, plan, corners).items()}
@@ -187,7 +187,7 @@ def test_costs_are_those_of_the_profile(tiny_bundle: Path) -> None:
 def test_each_avatar_in_view_has_its_joints_and_vertices(tiny_bundle: Path) -> None:
     """0.3 ms of pose and 10,475 vertices of 5 ns each, by clocks; the tensor, network and picture are shared."""
     network, chip = load_bundle(tiny_bundle).read_network(), load_profile(CHIP)
-    costs, corners = CostModel(network, CHIP, CAP), corners_of(chip, CAP)
+    costs, corners = CostModel([network], CHIP, CAP), corners_of(chip, CAP)
     app, described = chip.application, Network({}, 96, 64, 16, "packed", count_work(reshaped(network, 96, 64).model))
     one, five = (stage_times_ms(chip, Plan(described, "dsp", avatars=count), corners) for count in (1, 5))
     cpu, gpu = (chip.units[unit].clock(corner) for unit, corner in zip(("cpu", "gpu"), corners, strict=False))
@@ -209,7 +209,7 @@ def test_phases_and_the_fixed_square_count_the_avatars_in_view(tiny_bundle: Path
     text = SCENE + more.replace("{x}", "0.8").replace("{z}", "0.0") + more.replace("{x}", "0.0").replace("{z}", "90.0")
     (tmp_path / "small.toml").write_text(text.format(bundle=tiny_bundle))
     document = json.loads(explained(tmp_path, "--json", "--frames", "4").stdout)
-    costs = CostModel(load_bundle(tiny_bundle).read_network(), CHIP, CAP)
+    costs = CostModel([load_bundle(tiny_bundle).read_network()], CHIP, CAP)
     for row in document["phases"]:
         cost, fixed = costs.of(tuple(row["tensor"]), 2), costs.of((512, 512), 2)
         assert [one["avatar"] for one in row["avatars"]] == [0, 1]
@@ -293,19 +293,19 @@ def test_cores_that_are_asked_for_are_kept(tiny_bundle: Path, monkeypatch: pytes
     """Of two cores: the other units go where frames are shortest; a network on both cores may share them."""
     for module in ("hw_profiles.host", "hw_profiles.predict", "apps.explain.explanation"):
         monkeypatch.setattr(f"trilane.{module}.usable_cores", lambda: (0, 1))
-    costs = CostModel(load_bundle(tiny_bundle).read_network(), "host", CAP)
+    costs = CostModel([load_bundle(tiny_bundle).read_network()], "host", CAP)
     free = costs.placement((96, 64))
     every = {"cpu": (1,), "gpu": (0,), "dsp": (0, 1)}
-    placed = costs.placement((96, 64), 1, every)
+    placed = costs.placement((96, 64), asked=every)
     assert {unit: tuple(row["cores"]) for unit, row in placed["units"].items()} == every
     assert placed["units"]["dsp"]["threads"] == 2
     assert placed["why"] == "cpu 1, gpu 0, dsp 0,1 (2 threads): as asked"
-    one = costs.placement((96, 64), 1, {"gpu": (1,)})
+    one = costs.placement((96, 64), asked={"gpu": (1,)})
     assert one["units"]["gpu"] == {"cores": [1], "threads": 1} and "gpu 1, dsp" in one["why"]
     assert "as asked, the others for the least predicted frame time; by the rule" in one["why"]
     assert one["predicted_ms"] <= 1.03 * free["predicted_ms"]
     with pytest.raises(BadInputError, match="--cores: found cores of snapdragon-888, expected --profile host"):
-        CostModel(load_bundle(tiny_bundle).read_network(), CHIP, CAP).placement(None, 1, {"gpu": (0,)})
+        CostModel([load_bundle(tiny_bundle).read_network()], CHIP, CAP).placement(None, asked={"gpu": (0,)})
 
 
 def test_measured_errors_are_those_of_the_drawn_vertices(checked: Checked) -> None:
