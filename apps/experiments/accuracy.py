@@ -50,7 +50,7 @@ def runtime_differences(checked: Checked, runtimes: Sequence[str], frames: int) 
     steps_of: dict[tuple[str, str], list[tuple[float, int, int]]] = {pair: [] for pair in pairs}
     numbers: list[int] = []
     for frame, network, tensor in _tensors(checked, frames):
-        numbers += [frame] if frame not in numbers else []
+        numbers += [frame] if frame not in numbers[-1:] else []
         pictures = {name: sessions[network].picture(name, tensor).astype(np.int16) for name in runtimes}
         for pair in pairs:
             steps = np.abs(pictures[pair[0]] - pictures[pair[1]])

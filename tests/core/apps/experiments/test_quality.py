@@ -123,10 +123,10 @@ def frames(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int, int]]:
         for number, height, first in shown:
             tensor = np.zeros((height, 4, 3), np.uint8)
             tensor[0, 0, 0] = first
-            yield number, tensor
+            yield number, 0, tensor
 
     monkeypatch.setattr(accuracy, "_tensors", tensors)
-    monkeypatch.setattr(accuracy, "network_of", lambda _: None)
+    monkeypatch.setattr(accuracy, "networks_of", lambda _: [None, None])
     monkeypatch.setattr(accuracy, "reshaped", lambda *_: None)
     monkeypatch.setattr(accuracy, "load_runtime", runtimes.__getitem__)
     return shown
@@ -172,6 +172,17 @@ def test_what_cannot_be_compared(names: tuple[str, ...], count: int, said: str) 
     with pytest.raises(BadInputError) as refused:
         runtime_differences(CHECKED, names, count)
     assert str(refused.value) == said
+
+
+@pytest.mark.usefixtures("frames")
+def test_a_frame_with_two_networks_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both tensors are compared: the second differs by 16 in one pixel of 8, as its first byte is 2."""
+    tensors = np.zeros((2, 2, 4, 3), np.uint8)
+    tensors[:, 0, 0, 0] = 1, 2
+    monkeypatch.setattr(accuracy, "_tensors", lambda *_: iter([(4, 0, tensors[0]), (4, 1, tensors[1])]))
+    found = runtime_differences(CHECKED, ("ort", "qnn"), 1)
+    assert found["frames"] == [4]
+    assert [tuple(row.values()) for row in found["rows"]] == [("ort", "qnn", 1.5, 16, 4)]
 
 
 def test_frames_that_show_nobody_are_no_agreement(frames: list[tuple[int, int, int]]) -> None:
