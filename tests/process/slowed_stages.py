@@ -38,7 +38,7 @@ def slowed(self, *arguments, **named):
     begin_ns = time.process_time_ns()
     metrics = run(self, *arguments, **named)
     end_ns = time.process_time_ns()
-    while time.process_time_ns() < end_ns + {share} * (end_ns - begin_ns):
+    while time.process_time_ns() < end_ns + float(os.environ["SLOWED_SHARE"]) * (end_ns - begin_ns):
         pass
     return metrics
 
@@ -46,20 +46,26 @@ BoundStage.run = slowed
 """
 
 
-def run(folder: Path, command: list[str], stage: str) -> dict[str, Any]:
-    """The report of one run in which `stage` is slowed; "": none is."""
-    out = folder / "run"
-    path = os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH"))))
-    environment = {**os.environ, "PYTHONPATH": path, "SLOWED_STAGE": stage}
+def hook_in(folder: Path) -> None:
+    """Make a folder with the module that slows a stage."""
+    folder.mkdir(parents=True)
+    (folder / "sitecustomize.py").write_text(HOOK, encoding="utf-8")
+
+
+def run(hook: Path, command: list[str], stage: str, share: float = SHARE, keep: Path | None = None) -> dict[str, Any]:
+    """The report of one run in which `stage` takes `share` more; "": none does. `keep`: where the run stays."""
+    out = keep or hook / "run"
+    path = os.pathsep.join(filter(None, (str(hook), os.environ.get("PYTHONPATH"))))
+    environment = {**os.environ, "PYTHONPATH": path, "SLOWED_STAGE": stage, "SLOWED_SHARE": str(share)}
     subprocess.run([*command, "--out", str(out)], env=environment, check=True, capture_output=True)
     report: dict[str, Any] = json.loads((out / "report.json").read_text(encoding="utf-8"))
-    shutil.rmtree(out)
+    if keep is None:
+        shutil.rmtree(out)
     return report
 
 
 def main(folder: Path, rounds: int, command: list[str]) -> None:
-    folder.mkdir()
-    (folder / "sitecustomize.py").write_text(HOOK.format(share=SHARE), encoding="utf-8")
+    hook_in(folder)
     stages = [*run(folder, command, "")["stages"]]
     cost: dict[str, list[float]] = {stage: [] for stage in stages}
     grown: dict[str, list[float]] = {stage: [] for stage in stages}
