@@ -128,7 +128,7 @@ class RunOptions(Options):
         default=False,
         description="Run also where a recorded camera shows the whole person in less than half of the frames.",
     )
-    hud: bool | None = Field(default=None, description="Write frame, rate and age on the picture.")
+    hud: bool | None = Field(default=None, description="Write frame number, rate and latency on the picture.")
     policy: Annotated[str, Option(words=tuple(POLICIES), offered=tuple(POLICIES))] = Field(
         default="pipelined",
         description="pipelined: highest rate; sequential: one frame at a time; latest: newest pose wins; "
@@ -161,7 +161,7 @@ class RunOptions(Options):
     pace: Annotated[bool, Option("--pace")] = Field(
         default=False, description="Hold each job until its modelled time has passed."
     )
-    slow_motion: Finite = Field(default=1.0, description="With --pace: how many times slower than the chip.")
+    slow_motion: Finite = Field(default=1.0, description="With --pace: how many times slower than the chip the run is.")
     latch_ms: Annotated[Finite, Option("--latch", unit="milliseconds")] = Field(
         default=0.0,
         ge=0,
@@ -171,15 +171,15 @@ class RunOptions(Options):
     performance_profile: Annotated[
         str | None,
         Option(words=PERFORMANCE_PROFILES, offered=(NOTHING, *PERFORMANCE_PROFILES)),
-    ] = Field(default=None, description="Power and speed of the units, by SNPE's names.")
+    ] = Field(default=None, description="Power mode of the units, which sets their speed. The names are SNPE's.")
     baseline_frames: Annotated[int, Option("--baseline", unit="frames")] = Field(
-        default=60, ge=0, description="Frames of the `sequential` run that follows for comparison; 0: no such run."
+        default=60, ge=0, description="Frames of a second, `sequential` run for comparison; 0: no such run."
     )
     check: Annotated[int, Option(unit="frames")] = Field(
         default=0,
         ge=0,
         le=1000,
-        description="Frames to compare with the truth or the float path when the run is over; 0: none.",
+        description="Frames to compare with the truth or the float path after the run; 0: none.",
     )
     out: Annotated[Path | None, BeforeValidator(_folder)] = Field(
         default=None, description="Run folder to write; runs/TIME-SCENE if not given."

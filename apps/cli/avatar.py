@@ -55,7 +55,7 @@ SHEET = "check-data.png"
 
 @app.command(epilog=EPILOG_INSPECT)
 def inspect(name: AvatarArgument, json: JsonOption = False) -> None:
-    """Say what an avatar holds and how good it is, after every check that a run makes."""
+    """Say what an avatar contains and how good it is, after every check that a run makes."""
     from trilane.apps.avatar.assembled_avatar import bundle_facts
     from trilane.avatars.bundle import load_bundle
 
@@ -87,7 +87,7 @@ def create(
 
 @app.command(epilog=EPILOG_LEVELS)
 def levels(name: AvatarArgument, json: JsonOption = False) -> None:
-    """Make the levels of an avatar's mesh, and write them into its folder: far off it is drawn with fewer triangles.
+    """Make coarser levels of an avatar's mesh, and write them into its folder. A distant avatar has fewer triangles.
 
     It takes minutes. `trilane avatar inspect` shows the levels.
     """
@@ -111,14 +111,16 @@ def create_data(
     picture: Annotated[str, typer.Option(help="Size of a frame in pixels: WIDTHxHEIGHT.")] = "1280x720",
     seed: Annotated[int, typer.Option(min=0, help="Seed of poses, views and noise.")] = 1,
     fit_deg: Annotated[
-        float, typer.Option(min=0, max=45, help="Turn joints of the fits by up to so many degrees.")
+        float, typer.Option(min=0, max=45, help="Noise of the fits: rotate joints by up to this many degrees.")
     ] = 0.0,
-    fit_mm: Annotated[float, typer.Option(min=0, max=1000, help="Move the fits by up to so many millimetres.")] = 0.0,
+    fit_mm: Annotated[
+        float, typer.Option(min=0, max=1000, help="Noise of the fits: move bodies by up to this many millimetres.")
+    ] = 0.0,
     mask_px: Annotated[
-        float, typer.Option(min=0, max=50, help="Move the outline of masks by up to so many pixels.")
+        float, typer.Option(min=0, max=50, help="Noise of the masks: move outlines by up to this many pixels.")
     ] = 0.0,
     look: Annotated[
-        str, typer.Option(help="Person to draw: default, or hiker, who has another build and other clothes.")
+        str, typer.Option(help="Person to draw: default, or hiker, who has a different build and different clothes.")
     ] = "default",
     json: JsonOption = False,
 ) -> None:

@@ -69,7 +69,9 @@ def train(
     config: Annotated[
         Path | None, typer.Option(help="Settings (training.toml), such as an avatar's own; options override them.")
     ] = None,
-    minutes: Annotated[float, typer.Option(help="Time of training; the samples before it take some more.")] = 60.0,
+    minutes: Annotated[
+        float, typer.Option(help="Minutes of training; drawing the samples before takes some more.")
+    ] = 60.0,
     steps: Annotated[int | None, typer.Option(help="Number of training steps, in place of a time.")] = None,
     samples: Annotated[int, typer.Option(help="Views of the frames to train on.")] = 4000,
     seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 1,
@@ -218,7 +220,9 @@ def validate(
     seed: Annotated[
         list[int] | None, typer.Option(min=0, help="Seed of views and poses. Repeat it; 1 to 8 if none.")
     ] = None,
-    per_band: Annotated[int, typer.Option(min=1, max=1000, help="Views of each band for each seed.")] = 24,
+    per_band: Annotated[
+        int, typer.Option(min=1, max=1000, help="Views of each band of distances, for each seed.")
+    ] = 24,
     runtime: Annotated[
         list[str] | None,
         typer.Option(help="ort, openvino, qnn or cuda. Repeat it; ort, and openvino where installed, if none."),
@@ -231,7 +235,8 @@ def validate(
         Path | None, typer.Option(help="Write a picture: the worst view of each seed beside its ground truth.")
     ] = None,
     sizes: Annotated[
-        bool, typer.Option("--sizes", help="Only measure what smaller tensors cost; the other figures stay.")
+        bool,
+        typer.Option("--sizes", help="Measure only what smaller tensors cost; the other figures stay as they are."),
     ] = False,
     json: JsonOption = False,
 ) -> None:

@@ -40,7 +40,7 @@ EPILOG_ANNY = "\b\nExamples:\n  trilane body from-anny --out body.npz"
 
 @app.command(epilog=EPILOG_INSPECT)
 def inspect(path: BodyFileArgument, json: JsonOption = False) -> None:
-    """Say what a body file holds, after every check that a run makes."""
+    """Say what a body file contains, after every check that a run makes."""
     facts = body_facts(path)
     if json:
         print_json(facts)

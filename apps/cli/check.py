@@ -42,7 +42,7 @@ SvgOption = Annotated[Path | None, typer.Option("--svg", help="Draw the graph he
 
 @app.command(epilog=EPILOG)
 def check(file: FileArgument, svg: SvgOption = None, profile: ProfileOption = None, json: JsonOption = False) -> None:
-    """Check a pipeline file and print its graph, the least period with the cycle that makes it, and its memory.
+    """Check a pipeline file and print its graph, the shortest period with the cycle that sets it, and its memory.
 
     For a scene, the command prints the pipeline file of its run. Nothing runs, and no Python of the file is imported.
     """

@@ -35,7 +35,7 @@ NewestRunArgument = Annotated[
     typer.Argument(help="Run folder, its journal, or its name below runs/; the newest below runs/ if none is given."),
 ]
 PortOption = Annotated[
-    int | None, typer.Option(min=1024, max=65535, help="Port of this machine to listen on; a free one if none.")
+    int | None, typer.Option(min=1024, max=65535, help="Port to listen on, on this machine; any free one if not given.")
 ]
 
 

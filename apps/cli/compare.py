@@ -55,7 +55,7 @@ BaseArgument = Annotated[
 OthersArgument = Annotated[
     list[str], typer.Argument(metavar="OTHER", help="Runs to compare with the base. Runs of one kind: A1,A2,A3.")
 ]
-HtmlOption = Annotated[Path | None, typer.Option("--html", help="Write a page that needs nothing else here.")]
+HtmlOption = Annotated[Path | None, typer.Option("--html", help="File for a page of HTML that needs no other file.")]
 AllOption = Annotated[bool, typer.Option("--all", help="Show every figure, not only those that differ.")]
 FailIfOption = Annotated[
     list[str] | None,
@@ -65,7 +65,8 @@ FailIfOption = Annotated[
     ),
 ]
 SlowerOption = Annotated[
-    str | None, typer.Option("--fail-if-slower", help="The old name of --fail-if slower=LIMIT; it goes next version.")
+    str | None,
+    typer.Option("--fail-if-slower", help="The old name of --fail-if slower=LIMIT; the next version removes it."),
 ]
 GithubOption = Annotated[
     bool,

@@ -28,7 +28,7 @@ OutOption = Annotated[Path, typer.Option("--out", help="Pipeline file to write, 
 UnitOption = Annotated[str, typer.Option("--unit", help="Unit of the networks: cpu, gpu or dsp.")]
 ShapeOption = Annotated[
     list[str] | None,
-    typer.Option("--input-shape", help="Sizes that a network leaves open: NAME=1x3x224x224."),
+    typer.Option("--input-shape", help="Sizes that a network does not fix: NAME=1x3x224x224."),
 ]
 
 

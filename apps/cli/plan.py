@@ -33,10 +33,12 @@ READ_PLAN_SO = (
     "density: tensor pixels for one pixel of the picture, along a side; bound: the largest of these frames; measured: "
     "in the first of them"
 )
-RECTANGLES = "in blue how far each reaches with its clothes, in orange what the tensor shows"
+RECTANGLES = "blue: a body with its clothes, orange: what the tensor shows"
 OneSceneArgument = Annotated[str, typer.Argument(help="A scene, by file (TOML) or name.")]
 ChipOption = Annotated[str, typer.Option("--profile", help=f"{PROFILE_HELP} The saved time is computed for it.")]
-OutOption = Annotated[Path | None, typer.Option("--out", help=f"Draw bodies, {RECTANGLES}, here (.png).")]
+OutOption = Annotated[
+    Path | None, typer.Option("--out", help=f"File for a drawing of bodies (.png). {RECTANGLES.capitalize()}.")
+]
 CapOption = Annotated[PerformanceProfile, PerformanceProfileOption]
 #: Options of a run that its plan depends on.
 OF_A_PLAN = frozenset({"motion", "camera", "avatar", "frames", "fps", "picture", "size", "skinning", "cores"})

@@ -36,7 +36,7 @@ PlacesArgument = Annotated[
     typer.Argument(metavar="DIR...", help="Run folders, sweeps' folders, folders of these, saved predictions."),
 ]
 OutOption = Annotated[Path, typer.Option(help="The page to write.")]
-TitleOption = Annotated[str, typer.Option(help="Its heading.")]
+TitleOption = Annotated[str, typer.Option(help="Heading of the page.")]
 CsvOption = Annotated[Path | None, typer.Option("--csv", help="Write the table as CSV too.")]
 ParquetOption = Annotated[Path | None, typer.Option("--parquet", help="Write the table as Parquet too (extra table).")]
 

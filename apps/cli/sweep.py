@@ -66,15 +66,17 @@ WordsArgument = Annotated[
 
 EngineOption = Annotated[EngineName, typer.Option(help="local: this machine; ray: the machines of a Ray cluster.")]
 
-ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on with a sweep that was interrupted or killed.")]
+ResumeOption = Annotated[bool, typer.Option("--resume", help="Resume a sweep that was interrupted or killed.")]
 
-FolderOption = Annotated[Path | None, typer.Option("--out", help="Folder of the sweep; sweeps/NAME-HASH if none.")]
+FolderOption = Annotated[Path | None, typer.Option("--out", help="Folder of the sweep; sweeps/NAME-HASH if not given.")]
 
 ListOption = Annotated[
     bool, typer.Option("--list", help="Combine the first values of all axes, then the second ones, and so on.")
 ]
 
-RandomOption = Annotated[int | None, typer.Option("--random", min=1, help="Draw so many of the combinations.")]
+RandomOption = Annotated[
+    int | None, typer.Option("--random", min=1, help="Draw this many of the combinations at random.")
+]
 
 SeedOption = Annotated[int | None, typer.Option(help="Seed of --random; 0 if not given.")]
 

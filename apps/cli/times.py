@@ -46,7 +46,7 @@ NetworkOption = Annotated[str | None, typer.Option(help="Network that was measur
 HardwareOption = Annotated[str, typer.Option(help="Unit that ran it: cpu, gpu or dsp.")]
 PrecisionOption = Annotated[str, typer.Option(help="int8, fp16 or fp32.")]
 RuntimeOption = Annotated[str, typer.Option(help="Runtime of a tensor engine: tflite or qnn_dlc.")]
-CsvOption = Annotated[Path | None, typer.Option("--csv", help="Write every single time here (.csv).")]
+CsvOption = Annotated[Path | None, typer.Option("--csv", help="File for every single time (.csv).")]
 
 
 @app.command(epilog=EPILOG)
@@ -62,7 +62,7 @@ def times(
     samples: CsvOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Read what other tools measured, say what it is, and refuse what cannot be.
+    """Read measurements of other tools, say what each is, and refuse implausible ones. The formats:
 
     QNN profiles, QHAS, ONNX Runtime, benchmark_model, LoadGen and MLPerf's app, TensorRT, AI Hub, ExecuTorch, Perfetto.
     """

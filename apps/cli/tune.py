@@ -80,10 +80,16 @@ SeedOption = Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of the
 
 ShortOption = Annotated[
     int | None,
-    typer.Option("--short", min=1, help="Of run: first a run of so few frames, which ends a trial below the median."),
+    typer.Option(
+        "--short",
+        min=1,
+        help="With run: begin each trial with a run of this many frames, and end it early if it is below the median.",
+    ),
 ]
 
-FolderOption = Annotated[Path | None, typer.Option("--out", help="Folder of the sweep; sweeps/tune-NAME-HASH if none.")]
+FolderOption = Annotated[
+    Path | None, typer.Option("--out", help="Folder of the sweep; sweeps/tune-NAME-HASH if not given.")
+]
 
 
 @app.command(epilog=EPILOG, context_settings={"ignore_unknown_options": True})
@@ -100,11 +106,11 @@ def tune(
     out: FolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Find the fastest configuration that keeps what is asked, over the axes of a sweep.
+    """Search the axes of a sweep for the fastest configuration within given limits.
 
-    Prints the best one and its figures, the command that runs it, the frontier, and what was not tried. Its folder is
-    that of a sweep: trilane report shows it, and trilane sweep --resume does the rest. Exit code 1 if nothing keeps
-    the limits. docs/tune.md says more.
+    Prints the best one and its figures, the command that runs it, the frontier, and what was not tried. It writes the
+    folder of a sweep: trilane report shows it, and trilane sweep --resume runs the trials that are left. Exit code 1
+    if no configuration keeps the limits. docs/tune.md says more.
     """
     from trilane.apps.sweep.tuner import Aim, Search, keep_of
 

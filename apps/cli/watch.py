@@ -37,13 +37,13 @@ Examples:
 """
 OnceOption = Annotated[bool, typer.Option("--once", help="Print the figures once, even if the run goes on.")]
 LooksOption = Annotated[
-    bool, typer.Option("--json", help="Print a JSON document in a line for each look; with --once, one document.")
+    bool, typer.Option("--json", help="Print one line of JSON for each update; with --once, one document.")
 ]
 OpenMetricsOption = Annotated[
     bool, typer.Option("--openmetrics", help="Print the figures once, in the form of the dashboard's `/metrics`.")
 ]
 WaitOption = Annotated[bool, typer.Option("--wait", help="Wait for a run that has not begun.")]
-IntervalOption = Annotated[float, typer.Option(min=0.1, max=3600, help="Seconds between two looks.")]
+IntervalOption = Annotated[float, typer.Option(min=0.1, max=3600, help="Seconds between two updates.")]
 EPILOG_SHOW = """\b
 Examples:
   trilane show
@@ -134,8 +134,8 @@ def _show(first: RunLook, rest: Iterator[RunLook]) -> None:
 def show(run: NewestRunArgument = None, port: PortOption = None) -> None:
     """Show a finished run in a browser: its pictures, timeline and figures at any moment.
 
-    The page is at the printed address, for this machine alone, until the command is interrupted. For a live run, use
-    `trilane run --dashboard`.
+    The page is served at the printed address, to this machine only, until the command is interrupted. For a live run,
+    use `trilane run --dashboard`.
     """
     import asyncio
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 ENCODER_HELP: Final = "resnet18, mobilenetv2, mobilenetv3 or efficientnet-lite0."
 NORM_HELP: Final = "batch, instance or group."
 #: Begins the help of an option of `OF_A_FILE`.
-PUBLISHED: Final = "Of a published network: "
+PUBLISHED: Final = "For a published network: "
 FIXED_SIZE_HELP: Final = "Tensor size in pixels: one side, or HEIGHTxWIDTH."
 #: How people call precisions -> as a hardware profile does.
 PRECISIONS: Final = {"w8a8": "int8", "int8": "int8", "float": "fp16", "fp16": "fp16", "fp32": "fp32"}
@@ -140,15 +140,18 @@ class PredictOptions(Options):
     )
     changes: Annotated[Texts, Option("--set")] = Field(
         default=(),
-        description="Of a pipeline file: another value, such as stages.seg.unit=dsp, or several with commas. "
+        description="For a pipeline file: change a key, such as stages.seg.unit=dsp, or several with commas. "
         "May be given again.",
     )
-    frames: int | None = Field(default=None, ge=1, le=MOST_FRAMES, description="Of a pipeline file: simulated frames.")
+    frames: int | None = Field(
+        default=None, ge=1, le=MOST_FRAMES, description="For a pipeline file: number of frames to simulate."
+    )
     measured: Annotated[Path | None, BeforeValidator(_path)] = Field(
         default=None,
-        description="Of a pipeline file: folder of its run here, whose stage times count; on a chip times their scale.",
+        description="For a pipeline file: folder of its run on this machine, whose stage times are used. For a chip, "
+        "each is multiplied by the stage's `scale`.",
     )
-    seed: int = Field(default=0, ge=0, le=2**32 - 1, description="Of a pipeline file: seed of its random times.")
+    seed: int = Field(default=0, ge=0, le=2**32 - 1, description="For a pipeline file: seed of its random times.")
     beside: Texts = Field(
         default=(),
         description="Another pipeline on the chip: SCENE, SCENE@RATE, NETWORK.onnx@RATE, @RATE:gpu, or a pipeline file "
@@ -156,7 +159,7 @@ class PredictOptions(Options):
     )
     turns: Annotated[str, _either(_turns)] = Field(
         default="round-robin",
-        description="Order of pipelines that wait for the same unit: round-robin or deadline.",
+        description="Which pipeline gets a unit next when several wait for it: round-robin or deadline.",
     )
     profile: Text = Field(default="snapdragon-888", description=PROFILE_HELP)
     encoder: str = Field(default="resnet18", description=f"{PUBLISHED}{ENCODER_HELP}")
@@ -193,8 +196,8 @@ class PredictOptions(Options):
     )
     policy: Annotated[str | None, one_of("reference", *POLICIES), Option(synonyms=("--pipelining",))] = Field(
         default=None,
-        description="pipelined (if not given, as in a run), sequential, latest or deadline. Or reference: that of the "
-        "published application. --encoder, --norm, --size and --channels have reference if not given.",
+        description="pipelined (if not given, as in a run), sequential, latest or deadline; or reference: the "
+        "published application's, which is the default with --encoder, --norm, --size or --channels.",
     )
     edge: str | None = Field(
         default=None, description="Buffers between stages: single, double (if not given), triple, fifo:N, orphan."
@@ -202,14 +205,15 @@ class PredictOptions(Options):
     batch: int = Field(default=1, description="Frames per job of the network.")
     fps: Annotated[float | None, AfterValidator(_rate)] = Field(
         default=None,
-        description="Rate to judge: whether it holds, and at which power. latest and deadline use 30 if not given.",
+        description="Frame rate to judge: whether the chip holds it, and at which power. latest and deadline use 30 "
+        "if not given.",
     )
     power_limit_w: Annotated[float | None, AfterValidator(_watts)] = Field(
         default=None, description="Also predict the highest rate at which the device stays within this many watts."
     )
     gpu_share: Finite = Field(default=0.0, description="Share of the network that the GPU does for the DSP.")
     performance_profile: Annotated[str, Option(words=PERFORMANCE_PROFILES)] = Field(
-        default=SUSTAINED, description="Power and speed of the units, by SNPE's names."
+        default=SUSTAINED, description="Power mode of the units, which sets their speed. The names are SNPE's."
     )
     governor: Annotated[str | None, _either(_governors)] = Field(
         default=None, description="Rule against heat: step_wise or power_allocator; the profile's if not given."
