@@ -87,33 +87,36 @@ Count = Annotated[Quantity, AfterValidator(_Range(1, 1e6))]
 
 
 class Memory(ProfileTable):
-    """The memory that the units share.
+    """The memory that the units share."""
 
-    `bandwidth_gb_s`: bandwidth of the whole chip. `application_use_fraction`: share of it that camera, display and
-    composition take.
-    """
-
-    bandwidth_gb_s: Rate
-    application_use_fraction: Annotated[Quantity, AfterValidator(_Range(0, 0.95))]
+    bandwidth_gb_s: Rate = Field(description="Bandwidth of the memory of the whole chip.")
+    application_use_fraction: Annotated[Quantity, AfterValidator(_Range(0, 0.95))] = Field(
+        description="Share of the bandwidth that camera, display and composition take."
+    )
 
 
 class Efficiencies(ProfileTable):
-    """Reached share of a peak: a peak of arithmetic for the first three, of memory bandwidth for the others.
+    """Share of a peak that each kind of operator reaches.
 
-    `*_traffic` are the shares of bandwidth that the products reach when traffic bounds them. Winograd and similar
-    shortcuts may take an arithmetic share above 1.
+    Winograd and similar shortcuts may take a share of arithmetic above 1.
     """
 
-    convolution: Efficiency
-    depthwise: Efficiency
-    pointwise: Efficiency
-    convolution_traffic: Efficiency
-    depthwise_traffic: Efficiency
-    pointwise_traffic: Efficiency
-    normalisation: Efficiency
-    resize: Efficiency
-    elementwise: Efficiency
-    permute: Efficiency
+    convolution: Efficiency = Field(description="Of convolutions: share of the peak of arithmetic.")
+    depthwise: Efficiency = Field(description="Of depthwise convolutions: share of the peak of arithmetic.")
+    pointwise: Efficiency = Field(description="Of 1x1 convolutions: share of the peak of arithmetic.")
+    convolution_traffic: Efficiency = Field(
+        description="Of convolutions that memory traffic bounds: share of the bandwidth."
+    )
+    depthwise_traffic: Efficiency = Field(
+        description="Of depthwise convolutions that memory traffic bounds: share of the bandwidth."
+    )
+    pointwise_traffic: Efficiency = Field(
+        description="Of 1x1 convolutions that memory traffic bounds: share of the bandwidth."
+    )
+    normalisation: Efficiency = Field(description="Of normalisation: share of the bandwidth.")
+    resize: Efficiency = Field(description="Of resizing: share of the bandwidth.")
+    elementwise: Efficiency = Field(description="Of elementwise operators: share of the bandwidth.")
+    permute: Efficiency = Field(description="Of permutations: share of the bandwidth.")
 
 
 #: A precision under a runtime: each has numbers of its own.
@@ -124,18 +127,14 @@ ENGINES: tuple[EngineName, ...] = ("int8_tflite", "int8_qnn_dlc", "fp16_tflite",
 
 
 class EngineRates(ProfileTable):
-    """The six numbers of a chip.
+    """The six numbers of a chip."""
 
-    They are the rates of products, of activations on the chip, of activations that do not fit there and of weights, and
-    the fixed cost of an operator and of a job.
-    """
-
-    arithmetic_tmac_s: Rate
-    activation_gb_s: Rate
-    spill_gb_s: Rate
-    weight_gb_s: Rate
-    operator_us: Cost
-    job_us: Cost
+    arithmetic_tmac_s: Rate = Field(description="Rate of products.")
+    activation_gb_s: Rate = Field(description="Rate of activations that fit on the chip.")
+    spill_gb_s: Rate = Field(description="Rate of activations that do not fit on the chip.")
+    weight_gb_s: Rate = Field(description="Rate of weights.")
+    operator_us: Cost = Field(description="Fixed time of an operator.")
+    job_us: Cost = Field(description="Fixed time of a job.")
 
 
 #: Rate of a term -> key of `EngineRates`, and the factor from the key's unit of measure to base units.
@@ -150,20 +149,26 @@ KEY_OF_RATE = {
 
 
 class Engine(ProfileTable):
-    """A tensor engine at one precision under one runtime.
+    """A tensor engine at one precision under one runtime."""
 
-    `on_chip_mb`: megabytes of activations that it holds. `factors`: how many times dearer each term of
-    `engine_layers.py` is than a plain convolution's; 1 where none is given. `error_fraction`: relative error of the
-    model itself, apart from that of its numbers, for a network that shares no term with the networks of the fit.
-    `seen`: each network of the fit, with the terms' shares in its time.
-    """
-
-    element_bytes: Literal[1, 2]
-    on_chip_mb: Rate
-    rates: EngineRates
-    factors: dict[str, Rate] = {}
-    seen: dict[str, dict[str, Annotated[float, Field(ge=0, le=1)]]] = {}
-    error_fraction: Annotated[Quantity, AfterValidator(_Range(0, 5))]
+    element_bytes: Literal[1, 2] = Field(description="Bytes of one element.")
+    on_chip_mb: Rate = Field(description="Memory for activations on the chip, megabytes.")
+    rates: EngineRates = Field(description="The six numbers of the chip.")
+    factors: dict[str, Rate] = Field(
+        default={},
+        description=(
+            "How many times more each term of `engine_layers.py` costs than a plain convolution; 1 if not given."
+        ),
+    )
+    seen: dict[str, dict[str, Annotated[float, Field(ge=0, le=1)]]] = Field(
+        default={}, description="Each network of the fit, with the share of its time that each term takes."
+    )
+    error_fraction: Annotated[Quantity, AfterValidator(_Range(0, 5))] = Field(
+        description=(
+            "Relative error of the model itself, without that of its numbers, for a network that "
+            "shares no term with the networks of the fit."
+        )
+    )
 
     @model_validator(mode="after")
     def _known_factors(self) -> Self:
@@ -186,61 +191,77 @@ class Engine(ProfileTable):
 
 
 class Measured(ProfileTable):
-    """The measurement of a network on a unit of this machine.
+    """The measurement of a network on a unit of this machine."""
 
-    `slower`: by number of threads, the measured time over the time by the unit's numbers. `error`: relative error of a
-    time that follows from it. `said`: sentence that tells how it was measured.
-    """
-
-    slower: dict[int, float] = Field(min_length=1)
-    error: float = Field(ge=0)
-    said: str
+    slower: dict[int, float] = Field(
+        min_length=1, description="By number of threads: measured time over the time that the unit's numbers give."
+    )
+    error: float = Field(ge=0, description="Relative error of a time that is computed with `slower`.")
+    said: str = Field(description="A sentence about how it was measured.")
 
 
 class Unit(ProfileTable):
     """One unit.
 
-    `fallback`: ONNX operators that it cannot run and hands to the CPU. `channel_block`: block to which channel counts
-    are rounded up. `job_fixed_ms` is paid once a job, `operator_fixed_us` once an operator, `input_ns_per_element` for
-    each element of the network's input, `permute_fixed_ms` where the picture comes in several tensors. `corners`: clock
-    at each voltage corner as a fraction of the highest. While a job runs the unit takes `power_max_w` times the clock
-    fraction to the power of `power_exponent`, and `idle_w` otherwise. `model_error_fraction`: relative error of the
-    roofline itself, apart from that of its numbers. `error_scale`: how many times the error that all these numbers
-    state is to be expected, as own rows showed; None without any. `runtimes`: how many times faster than ONNX Runtime
-    in FP32 each runtime runs an INT8 network; only the host's DSP unit has them. `core`: units with the same text share
-    a core and work in turns, as on a host with too few cores; empty for a unit of its own. `engines`: numbers of a
-    tensor engine by precision and runtime, from which `engine_runtime` chooses; a unit without any is priced by
-    `efficiency`. Only this machine's units have `threads`, which share the peak rates, and `measured`.
+    While a job runs, the unit takes `power_max_w` times the clock's fraction to the power of `power_exponent`.
     """
 
-    title: str
-    core: str = ""
-    threads: int = Field(default=1, ge=1)
-    measured: Measured | None = None
-    precision: Literal["int8", "fp16", "fp32"]
-    peak_int8_tmac_s: Rate
-    peak_fp16_tmac_s: Rate
-    peak_fp32_tmac_s: Rate
-    channel_block: Count
-    job_fixed_ms: Cost
-    operator_fixed_us: Cost
-    input_ns_per_element: Cost
-    permute_fixed_ms: Cost
-    fallback: tuple[str, ...] = ()
-    fallback_fixed_ms: Cost
-    fallback_ns_per_element: Cost
-    model_error_fraction: Annotated[Quantity, AfterValidator(_Range(0, 5))]
-    error_scale: Annotated[Quantity, AfterValidator(_Range(0, MOST_ERROR_SCALE))] | None = None
-    efficiency: Efficiencies
-    runtimes: dict[str, Rate] = {}
-    engines: dict[EngineName, Engine] = {}
-    engine_runtime: EngineRuntime = "tflite"
-    corners: dict[Corner, Fraction]
-    power_max_w: Power
-    power_exponent: Annotated[Quantity, AfterValidator(_Range(0, 6))]
-    idle_w: Power
-    junction_k_per_w: Resistance
-    junction_time_s: Seconds
+    title: str = Field(description="Name of the unit for people.")
+    core: str = Field(
+        default="",
+        description=(
+            "Units with the same text share a core and take turns, as on a host with few cores; empty "
+            "for a unit of its own."
+        ),
+    )
+    threads: int = Field(
+        default=1, ge=1, description="Threads that share the peak rates; only for this machine's units."
+    )
+    measured: Measured | None = Field(
+        default=None, description="A measurement on this machine; only for this machine's units."
+    )
+    precision: Literal["int8", "fp16", "fp32"] = Field(description="Number format in which the unit computes.")
+    peak_int8_tmac_s: Rate = Field(description="Peak of arithmetic in INT8.")
+    peak_fp16_tmac_s: Rate = Field(description="Peak of arithmetic in FP16.")
+    peak_fp32_tmac_s: Rate = Field(description="Peak of arithmetic in FP32.")
+    channel_block: Count = Field(description="Numbers of channels are rounded up to multiples of this.")
+    job_fixed_ms: Cost = Field(description="Fixed time of a job.")
+    operator_fixed_us: Cost = Field(description="Fixed time of an operator.")
+    input_ns_per_element: Cost = Field(description="Time for each element of the network's input.")
+    permute_fixed_ms: Cost = Field(description="Fixed time if the picture comes in several tensors.")
+    fallback: tuple[str, ...] = Field(
+        default=(), description="ONNX operators that the unit cannot run and hands to the CPU."
+    )
+    fallback_fixed_ms: Cost = Field(description="Fixed time of each operator that the CPU runs.")
+    fallback_ns_per_element: Cost = Field(description="Time for each element that is handed to the CPU.")
+    model_error_fraction: Annotated[Quantity, AfterValidator(_Range(0, 5))] = Field(
+        description="Relative error of the roofline model itself, without that of its numbers."
+    )
+    error_scale: Annotated[Quantity, AfterValidator(_Range(0, MOST_ERROR_SCALE))] | None = Field(
+        default=None, description="Factor on the stated errors, from measured rows of your own; none if not given."
+    )
+    efficiency: Efficiencies = Field(description="Reached shares of the peaks, for a unit without `engines`.")
+    runtimes: dict[str, Rate] = Field(
+        default={},
+        description=(
+            "How many times faster than ONNX Runtime in FP32 each runtime runs an INT8 network; only "
+            "for the host's DSP unit."
+        ),
+    )
+    engines: dict[EngineName, Engine] = Field(
+        default={}, description="Numbers of a tensor engine, by precision and runtime."
+    )
+    engine_runtime: EngineRuntime = Field(default="tflite", description="Runtime whose engine is used.")
+    corners: dict[Corner, Fraction] = Field(
+        description="Clock at each voltage corner, as a fraction of the highest clock."
+    )
+    power_max_w: Power = Field(description="Power of a job at the highest clock.")
+    power_exponent: Annotated[Quantity, AfterValidator(_Range(0, 6))] = Field(
+        description="The power of a job grows with the clock to this exponent."
+    )
+    idle_w: Power = Field(description="Power without a job.")
+    junction_k_per_w: Resistance = Field(description="Thermal resistance from the junction to the device.")
+    junction_time_s: Seconds = Field(description="Thermal time constant of the junction.")
 
     @model_validator(mode="after")
     def _all_corners(self) -> Self:
@@ -286,34 +307,35 @@ class Unit(ProfileTable):
 
 
 class Application(ProfileTable):
-    """The stages beside the network. Times are those at the `max` corner.
+    """The stages other than the network. Times are those at the `max` corner."""
 
-    `raster_ns_per_pixel` and `raster_ns_per_vertex`: drawing on the GPU. `readback_ns_per_byte`: from GPU memory to the
-    network's input, with the GPU held. `handover_ms`: from the end of the read-back to the network's start, with the
-    network's unit held. `composite_ms`: on the GPU. `pose_ms`: on the CPU. `display_ms`: shortest interval between
-    shown frames. `vertices` and `pose_ms` are those of one avatar. `ema20_half_range_fraction`: how far the exponential
-    average over 20 frames strays from the mean, as a fraction of it.
-    """
-
-    vertices: Annotated[Quantity, AfterValidator(_Range(0, 1e7))]
-    pose_ms: Cost
-    raster_ns_per_vertex: Cost
-    raster_ns_per_pixel: Cost
-    readback_ns_per_byte: Cost
-    handover_ms: Cost
-    composite_ms: Cost
-    present_ms: Cost
-    display_ms: Cost
-    ema20_half_range_fraction: Annotated[Quantity, AfterValidator(_Range(0, 1))]
+    vertices: Annotated[Quantity, AfterValidator(_Range(0, 1e7))] = Field(description="Vertices of one avatar.")
+    pose_ms: Cost = Field(description="Time to pose one avatar on the CPU.")
+    raster_ns_per_vertex: Cost = Field(description="Time on the GPU to draw, for each vertex.")
+    raster_ns_per_pixel: Cost = Field(description="Time on the GPU to draw, for each pixel.")
+    readback_ns_per_byte: Cost = Field(
+        description="Time from GPU memory to the network's input, during which the GPU is held."
+    )
+    handover_ms: Cost = Field(
+        description=(
+            "Time from the end of the read-back to the network's start, during which the network's unit is held."
+        )
+    )
+    composite_ms: Cost = Field(description="Time to composite on the GPU.")
+    present_ms: Cost = Field(description="Time to present on the CPU.")
+    display_ms: Cost = Field(description="Shortest interval between shown frames.")
+    ema20_half_range_fraction: Annotated[Quantity, AfterValidator(_Range(0, 1))] = Field(
+        description=("How far the exponential average over 20 frames strays from the mean, as a fraction of the mean.")
+    )
 
 
 class PerformanceSettings(ProfileTable):
     """A performance profile: the corner of each unit, and how soon an idle unit may sleep."""
 
-    cpu: Corner
-    gpu: Corner
-    dsp: Corner
-    sleep_latency_us: Cost
+    cpu: Corner = Field(description="Corner of the CPU.")
+    gpu: Corner = Field(description="Corner of the GPU.")
+    dsp: Corner = Field(description="Corner of the DSP.")
+    sleep_latency_us: Cost = Field(description="Idle time after which a unit may sleep.")
 
     def corner(self, unit: UnitName) -> Corner:
         """Return the corner of `unit`."""
@@ -322,33 +344,34 @@ class PerformanceSettings(ProfileTable):
 
 
 class Thermal(ProfileTable):
-    """The device as a slow thermal mass under the junction of each unit, its limits, and the governor that keeps them.
+    """The device as a slow thermal mass under each unit's junction, its limits, and the governor that keeps them."""
 
-    `governor`: name of a governor of the Linux thermal framework. `poll_s`: seconds between two of its looks.
-    """
-
-    ambient_c: Celsius
-    base_power_w: Power
-    device_k_per_w: Resistance
-    device_time_s: Seconds
-    skin_limit_c: Celsius
-    junction_limit_c: Celsius
-    hysteresis_k: Cost
-    governor: Literal["step_wise", "power_allocator"]
-    poll_s: Seconds
+    ambient_c: Celsius = Field(description="Temperature of the surroundings.")
+    base_power_w: Power = Field(description="Power of the device without its units.")
+    device_k_per_w: Resistance = Field(description="Thermal resistance from the device to the surroundings.")
+    device_time_s: Seconds = Field(description="Thermal time constant of the device.")
+    skin_limit_c: Celsius = Field(description="Limit of the device's surface.")
+    junction_limit_c: Celsius = Field(description="Limit of each junction.")
+    hysteresis_k: Cost = Field(description="Cooling below a limit that is needed before clocks rise again.")
+    governor: Literal["step_wise", "power_allocator"] = Field(description="Governor of the Linux thermal framework.")
+    poll_s: Seconds = Field(description="Time between two polls of the governor.")
 
 
 class Profile(ProfileTable):
-    """A chip in a device. `template`: whether it describes no chip and is only there to be extended."""
+    """A chip in a device."""
 
-    name: str = Field(min_length=1)
-    title: str
-    template: bool = False
-    memory: Memory
-    units: dict[UnitName, Unit]
-    application: Application
-    performance_profiles: dict[PerformanceProfile, PerformanceSettings]
-    thermal: Thermal
+    name: str = Field(min_length=1, description="Name of the profile, as `--profile` takes it.")
+    title: str = Field(description="Name of the chip for people.")
+    template: bool = Field(
+        default=False, description="Whether the profile describes no chip and exists only to be extended."
+    )
+    memory: Memory = Field(description="The shared memory.")
+    units: dict[UnitName, Unit] = Field(description="The units, by name: `cpu`, `gpu`, `dsp`.")
+    application: Application = Field(description="The stages other than the network.")
+    performance_profiles: dict[PerformanceProfile, PerformanceSettings] = Field(
+        description="The performance profiles, by SNPE's names."
+    )
+    thermal: Thermal = Field(description="Heat, its limits and the governor.")
 
     @model_validator(mode="after")
     def _complete(self) -> Self:

@@ -62,36 +62,67 @@ class Table(StrictModel):
 
 
 class OutputSpec(Table):
-    """Size of the picture that is shown, in pixels."""
+    """The picture that is shown."""
 
-    width: int = Field(default=640, ge=64, le=MAX_SIDE, multiple_of=2)
-    height: int = Field(default=480, ge=64, le=MAX_SIDE, multiple_of=2)
+    width: int = Field(
+        default=640, ge=64, le=MAX_SIDE, multiple_of=2, description="Width of the shown picture, pixels."
+    )
+    height: int = Field(
+        default=480, ge=64, le=MAX_SIDE, multiple_of=2, description="Height of the shown picture, pixels."
+    )
 
 
 class AvatarSpec(Table):
-    """One avatar.
+    """One avatar."""
 
-    `name`: name that no other avatar of the scene has; by default `avatar1`, `avatar2`, ... by its place. `bundle`:
-    `default`, `hiker` or a folder. `motion`: `builtin:NAME` or a file. `position`: place, metres. `up_axis`, `units`:
-    axis that is up and unit of lengths in the motion file. `joint_map`: the file's name of each joint of the body, or
-    an empty text for none. `start_s`, `end_s`: part of the motion's own time that is played. `speed`: factor on the
-    speed. `loop`: what follows the end, by default what is usual for the motion. `ground`: how the motion is put on the
-    floor (`mover.py`).
-    """
-
-    name: str | None = Field(default=None, min_length=1, max_length=80, pattern=NAME)
-    bundle: str = "default"
-    motion: str = "builtin:walk-wave-turn"
-    position: Annotated[tuple[Metres, Metres, Metres], LISTED] = (0.0, 0.0, 0.0)
-    heading_deg: float = Field(default=0.0, ge=-3600, le=3600, allow_inf_nan=False)
-    up_axis: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
-    units: Literal["auto", "m", "cm", "in", "cmu"] = "auto"
-    joint_map: dict[str, str] = Field(default={})
-    start_s: float = Field(default=0.0, ge=0, le=LONGEST_S, allow_inf_nan=False)
-    end_s: float | None = Field(default=None, gt=0, le=LONGEST_S, allow_inf_nan=False)
-    speed: float = Field(default=1.0, ge=0.01, le=100, allow_inf_nan=False)
-    loop: Literal["auto", "repeat", "back-and-forth", "hold"] = "auto"
-    ground: Literal["auto", "sequence", "frame", "none"] = "auto"
+    name: str | None = Field(
+        default=None,
+        min_length=1,
+        max_length=80,
+        pattern=NAME,
+        description="Name of the avatar, different from all others; `avatar1`, `avatar2`, ... if not given.",
+    )
+    bundle: str = Field(default="default", description="`default`, `hiker`, or the folder of an avatar.")
+    motion: str = Field(default="builtin:walk-wave-turn", description="`builtin:NAME`, or a motion file.")
+    position: Annotated[tuple[Metres, Metres, Metres], LISTED] = Field(
+        default=(0.0, 0.0, 0.0), description="Place of the avatar in the world: x, y, z in metres."
+    )
+    heading_deg: float = Field(
+        default=0.0, ge=-3600, le=3600, allow_inf_nan=False, description="Rotation about the vertical axis, degrees."
+    )
+    up_axis: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = Field(
+        default="auto", description="Axis of the motion file that points up."
+    )
+    units: Literal["auto", "m", "cm", "in", "cmu"] = Field(
+        default="auto", description="Unit of lengths in the motion file."
+    )
+    joint_map: dict[str, str] = Field(
+        default={}, description="For joints of the body, their names in the motion file; an empty text for none."
+    )
+    start_s: float = Field(
+        default=0.0,
+        ge=0,
+        le=LONGEST_S,
+        allow_inf_nan=False,
+        description="Time in the motion at which it begins, seconds.",
+    )
+    end_s: float | None = Field(
+        default=None,
+        gt=0,
+        le=LONGEST_S,
+        allow_inf_nan=False,
+        description="Time in the motion at which it ends, seconds; the end of the file if not given.",
+    )
+    speed: float = Field(
+        default=1.0, ge=0.01, le=100, allow_inf_nan=False, description="Factor on the speed of the motion."
+    )
+    loop: Literal["auto", "repeat", "back-and-forth", "hold"] = Field(
+        default="auto", description="The end of the motion is followed by this; `auto`: as is usual for the motion."
+    )
+    ground: Literal["auto", "sequence", "frame", "none"] = Field(
+        default="auto",
+        description="How the motion is put on the floor: for the whole sequence, for each frame, or not at all.",
+    )
 
     @field_validator("joint_map")
     @classmethod
@@ -145,29 +176,64 @@ FILE_KEYS = ("format", "up_axis", "metres_per_unit", "rate_hz", "time_unit", "ax
 
 
 class CameraSpec(Table):
-    """The camera.
+    """The camera."""
 
-    `source`: `builtin:NAME`, a file or a folder. `fov_y_deg`: field of view over the picture's height; None for that of
-    the file, or the usual one of its format. `up_axis`: axis that is up in the file's world. `metres_per_unit`: unit of
-    its lengths in metres; None for what the file says or what is likely. `rate_hz`: frames a second of a file without
-    times. `time_unit`: unit of a table's times; `frames` for numbers of frames, `auto` for what the times tell. `axes`:
-    directions in which x, y and z of each pose point, such as `forward-left-up`; `auto`: as the format defines them.
-    `near_m`, `far_m`: distances of the clip planes; the far one is moved beyond a body that a placed camera films from
-    farther off. `place`: whether a camera is placed in the scene (`auto`: a recorded one where it films the avatars, a
-    built-in one goes along with them) or stays where it is (`none`).
-    """
-
-    source: str = "builtin:orbit"
-    format: Literal["auto", "arkit", "colmap", "euroc", "kitti", "nerf", "record3d", "stray", "tum"] = "auto"
-    fov_y_deg: float | None = Field(default=None, gt=1, lt=170)
-    up_axis: Literal["auto", "x", "-x", "y", "-y", "z", "-z"] = "auto"
-    metres_per_unit: float | None = Field(default=None, gt=0, le=1e6, allow_inf_nan=False)
-    rate_hz: float | None = Field(default=None, ge=1e-3, le=1000, allow_inf_nan=False)
-    time_unit: Literal["auto", "s", "ms", "us", "ns", "frames"] = "auto"
-    axes: Annotated[str, AfterValidator(_camera_axes)] = AUTO
-    near_m: float = Field(default=0.05, gt=0, allow_inf_nan=False)
-    far_m: float = Field(default=100.0, gt=0, allow_inf_nan=False)
-    place: Literal["auto", "none"] = "auto"
+    source: str = Field(default="builtin:orbit", description="`builtin:NAME`, a file or a folder.")
+    format: Literal["auto", "arkit", "colmap", "euroc", "kitti", "nerf", "record3d", "stray", "tum"] = Field(
+        default="auto", description="Format of the file."
+    )
+    fov_y_deg: float | None = Field(
+        default=None,
+        gt=1,
+        lt=170,
+        description=(
+            "Vertical field of view, degrees. If not given: that of the file, or the usual one of its format."
+        ),
+    )
+    up_axis: Literal["auto", "x", "-x", "y", "-y", "z", "-z"] = Field(
+        default="auto", description="Axis of the file's world that points up."
+    )
+    metres_per_unit: float | None = Field(
+        default=None,
+        gt=0,
+        le=1e6,
+        allow_inf_nan=False,
+        description="Length of the file's unit in metres. If not given: what the file says, or what is likely.",
+    )
+    rate_hz: float | None = Field(
+        default=None, ge=1e-3, le=1000, allow_inf_nan=False, description="Poses per second, for a file without times."
+    )
+    time_unit: Literal["auto", "s", "ms", "us", "ns", "frames"] = Field(
+        default="auto",
+        description=(
+            "Unit of a table's times. `frames`: the times are frame numbers; `auto`: by the times themselves."
+        ),
+    )
+    axes: Annotated[str, AfterValidator(_camera_axes)] = Field(
+        default=AUTO,
+        description=(
+            "Where x, y and z of each pose point, such as `forward-left-up`; `auto`: as the format defines them."
+        ),
+    )
+    near_m: float = Field(
+        default=0.05, gt=0, allow_inf_nan=False, description="Distance of the near clip plane, metres."
+    )
+    far_m: float = Field(
+        default=100.0,
+        gt=0,
+        allow_inf_nan=False,
+        description=(
+            "Distance of the far clip plane, metres. A camera that is placed farther from a body "
+            "moves it beyond the body."
+        ),
+    )
+    place: Literal["auto", "none"] = Field(
+        default="auto",
+        description=(
+            "`auto`: a recorded camera is placed so that it films the avatars, and a built-in one "
+            "follows them. `none`: it stays where it is."
+        ),
+    )
 
     @model_validator(mode="after")
     def _is_of_a_file(self) -> Self:
@@ -191,17 +257,27 @@ class CameraSpec(Table):
 
 
 class PlaneSpec(Table):
-    """A detected plane to show: a rectangle around `centre` (world, metres) with `normal` (of any length but 0).
+    """A detected plane to show: a rectangle."""
 
-    `turn_deg`: turn about the normal. At 0 the first side lies along the world's x if the plane is level, else it
-    points up.
-    """
-
-    centre: Annotated[tuple[Finite, Finite, Finite], LISTED] = (0.0, 0.0, 0.0)
-    normal: Annotated[tuple[Finite, Finite, Finite], LISTED] = (0.0, 1.0, 0.0)
-    width_m: float = Field(default=2.0, gt=0, le=1000, allow_inf_nan=False)
-    depth_m: float = Field(default=2.0, gt=0, le=1000, allow_inf_nan=False)
-    turn_deg: Finite = 0.0
+    centre: Annotated[tuple[Finite, Finite, Finite], LISTED] = Field(
+        default=(0.0, 0.0, 0.0), description="Centre of the rectangle in the world: x, y, z in metres."
+    )
+    normal: Annotated[tuple[Finite, Finite, Finite], LISTED] = Field(
+        default=(0.0, 1.0, 0.0), description="Direction that the rectangle faces; any length but 0."
+    )
+    width_m: float = Field(
+        default=2.0, gt=0, le=1000, allow_inf_nan=False, description="Length of the first side, metres."
+    )
+    depth_m: float = Field(
+        default=2.0, gt=0, le=1000, allow_inf_nan=False, description="Length of the second side, metres."
+    )
+    turn_deg: Finite = Field(
+        default=0.0,
+        description=(
+            "Rotation about the normal, degrees. At 0 the first side is parallel to the world's x if "
+            "the plane is level; otherwise it points up."
+        ),
+    )
 
     @field_validator("normal")
     @classmethod
@@ -221,38 +297,64 @@ def _scene_size(size: str) -> str:
 
 
 class Scene(Table):
-    """A scene.
+    """A scene."""
 
-    `background`: `room`, or a video, a folder of images or a picture. `hud`: whether frame, rate and age are written on
-    the picture. `planes`: detected planes, shown over the background. `texture_filter`: filter of the neural texture.
-
-    Keys about what may be left out:
-    `plan`: `planned` (what the picture does not show is not modelled), `fixed` (everything is modelled in every frame)
-    or `full` (a reference: float64 body, supersampled raster, FP32 network; nothing runs it in real time).
-    `size`: `auto` plans the tensor, up to `most_side`² pixels; any other size is fixed.
-    `error_budget_px`: largest error of a vertex on the picture, pixels.
-    `error_budget_db`: largest loss of an avatar's PSNR in dB against tensors of the size that its network was trained
-    for; None: no loss, unless frames would be late.
-    `memory_mb`: most memory of the networks that are made ready for the planned shapes.
-    """
-
-    name: str = Field(default="scene", min_length=1, max_length=80, pattern=NAME)
-    fps: float = Field(default=30.0, ge=LEAST_FPS, le=1000, allow_inf_nan=False)
-    frames: int = Field(default=300, ge=1, le=10_000_000)
-    size: Annotated[str, AfterValidator(_scene_size)] = "256"
-    background: str = "room"
-    hud: bool = False
-    planes: Annotated[tuple[PlaneSpec, ...], LISTED] = Field(default=(), max_length=32)
-    texture_filter: Literal["linear", "mipmap", "anisotropic"] = "linear"
-    plan: Literal["planned", "fixed", "full"] = "planned"
-    error_budget_px: float = Field(default=0.5, gt=0, le=100, allow_inf_nan=False)
-    error_budget_db: float | None = Field(default=None, gt=0, le=100, allow_inf_nan=False)
-    most_side: int = Field(default=512, ge=BUCKET_STEP, le=MAX_SIDE, multiple_of=BUCKET_STEP)
-    memory_mb: int = Field(default=512, ge=1, le=1_000_000)
-    output: OutputSpec = OutputSpec()
-    camera: CameraSpec = CameraSpec()
+    name: str = Field(default="scene", min_length=1, max_length=80, pattern=NAME, description="Name of the scene.")
+    fps: float = Field(
+        default=30.0, ge=LEAST_FPS, le=1000, allow_inf_nan=False, description="Frames per second of the scene's time."
+    )
+    frames: int = Field(default=300, ge=1, le=10_000_000, description="Number of frames of a run.")
+    size: Annotated[str, AfterValidator(_scene_size)] = Field(
+        default="256",
+        description=(
+            "Size of the tensor. `auto`: planned from the scene, up to `most_side`² pixels; any other size is fixed."
+        ),
+    )
+    background: str = Field(default="room", description="`room`, a video, a folder of images, or a picture.")
+    hud: bool = Field(default=False, description="Whether frame number, rate and latency are written on the picture.")
+    planes: Annotated[tuple[PlaneSpec, ...], LISTED] = Field(
+        default=(), max_length=32, description="Detected planes, drawn over the background."
+    )
+    texture_filter: Literal["linear", "mipmap", "anisotropic"] = Field(
+        default="linear", description="Filter of the neural texture."
+    )
+    plan: Literal["planned", "fixed", "full"] = Field(
+        default="planned",
+        description=(
+            "`planned`: what the picture does not show is not modelled. `fixed`: everything is "
+            "modelled in every frame. `full`: a reference, not in real time."
+        ),
+    )
+    error_budget_px: float = Field(
+        default=0.5, gt=0, le=100, allow_inf_nan=False, description="Largest error of a vertex on the picture, pixels."
+    )
+    error_budget_db: float | None = Field(
+        default=None,
+        gt=0,
+        le=100,
+        allow_inf_nan=False,
+        description=(
+            "Largest loss of an avatar's PSNR against tensors of the size of its training, dB. If not "
+            "given: no loss, unless frames would be late."
+        ),
+    )
+    most_side: int = Field(
+        default=512,
+        ge=BUCKET_STEP,
+        le=MAX_SIDE,
+        multiple_of=BUCKET_STEP,
+        description="Largest side of a planned tensor, pixels.",
+    )
+    memory_mb: int = Field(
+        default=512,
+        ge=1,
+        le=1_000_000,
+        description="Most memory for networks that are made ready for planned shapes, megabytes.",
+    )
+    output: OutputSpec = Field(default=OutputSpec(), description="The shown picture.")
+    camera: CameraSpec = Field(default=CameraSpec(), description="The camera.")
     avatars: Annotated[tuple[AvatarSpec, ...], LISTED] = Field(
-        default=(AvatarSpec(),), min_length=1, max_length=8, validate_default=True
+        default=(AvatarSpec(),), min_length=1, max_length=8, validate_default=True, description="The avatars."
     )
 
     @field_validator("avatars")

@@ -196,8 +196,8 @@ class PredictOptions(Options):
     )
     policy: Annotated[str | None, one_of("reference", *POLICIES), Option(synonyms=("--pipelining",))] = Field(
         default=None,
-        description="pipelined (if not given, as in a run), sequential, latest or deadline; or reference: the "
-        "published application's, which is the default with --encoder, --norm, --size or --channels.",
+        description="pipelined (if not given, as in a run), sequential, latest or deadline. Or reference: that of the "
+        "published application. It is the default with --encoder, --norm, --size or --channels.",
     )
     edge: str | None = Field(
         default=None, description="Buffers between stages: single, double (if not given), triple, fifo:N, orphan."

@@ -122,7 +122,7 @@ def key_tables(model: type[BaseModel], table: str, seen: set[type[BaseModel]]) -
     """A table of keys for each table of a file, what the code says about it first."""
     seen.add(model)
     yield f"\n### {table}\n\n{cell(inspect.getdoc(model) or '')}\n"
-    yield "| key | value | range | default |\n|---|---|---|---|"
+    yield "| key | meaning | value | range | default |\n|---|---|---|---|---|"
     below = []
     for key, field in model.model_fields.items():
         inner = [each for each in models_in(field.annotation) if each is not profiles.Quantity]
@@ -136,7 +136,8 @@ def key_tables(model: type[BaseModel], table: str, seen: set[type[BaseModel]]) -
             and not inner
         )
         default = "needed" if field.is_required() else in_a_file(field.default) if plain else ""
-        yield f"| `{key}` | {spelled(field.annotation)} | {limits(field)} | {default} |"
+        meaning = cell(field.description or "")
+        yield f"| `{key}` | {meaning} | {spelled(field.annotation)} | {limits(field)} | {default} |"
     for each, name in below:
         if each not in seen:
             yield from key_tables(each, name, seen)
