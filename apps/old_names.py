@@ -40,8 +40,12 @@ OPTIONS: Final = (
     Renamed("predict", "--runtime", "--unit", "cpu|gpu|dsp|all"),
     Renamed("avatar create-data", "--output", "--picture"),
 )
-#: Options of `trilane explain`, each with whether a value follows. It had those of `trilane plan` too.
-OF_EXPLAIN: Final = {"--slowest": True, "--jobs": True, "--json": False, "--help": False, "-h": False}
+#: Options with a value of `trilane explain` now, and those that it had when it explained a scene.
+OF_EXPLAIN: Final = frozenset({"--slowest", "--jobs"})
+OF_A_SCENE: Final = frozenset(
+    {"--motion", "--camera", "--avatar", "--frames", "--fps", "--picture", "--output", "--size", "--skinning"}
+    | {"--cores", "--profile", "--performance-profile"}
+)
 #: Commands that are given another command with its options.
 WITH_COMMAND: Final = ("sweep", "tune")
 
@@ -99,9 +103,9 @@ def _is_of_a_scene(words: Sequence[str]) -> bool:
         option, equals, _ = word.partition("=")
         if not option.startswith("-"):
             names.append(word)
-        elif option not in OF_EXPLAIN:
+        elif option in OF_A_SCENE:
             return True
-        elif OF_EXPLAIN[option] and not equals:
+        elif option in OF_EXPLAIN and not equals:
             next(left, None)
     return any(map(_is_scene, names))
 

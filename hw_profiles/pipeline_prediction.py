@@ -238,7 +238,9 @@ def predict_file(
     }
     if file.run.fps is not None:
         counts = report["frames"]
-        rate = holding(file.run.fps, needs, wanted_drops(counts["dropped"]), counts["requested"])
+        rate = holding(
+            file.run.fps, needs, wanted_drops(counts["dropped"]), report["deadline_misses"], counts["requested"]
+        )
         answer["rate"] = {**rate, "sentence": rate["sentence"] + _share(file)}
     return answer if all(each.low_ms is not None for each in prices.values()) else _without_intervals(answer)
 

@@ -114,12 +114,18 @@ def predict(
         "temperature_c": temperatures_of(moments),
         "caps": caps_of(moments),
         "timeline": timeline_of(moments),
-        **answers(profile, load_of(profile, plan), corners, wanted, times),
+        **answers(profile, load_of(profile, plan), corners, wanted, _shown_times(profile, wanted.fps, times)),
         **_expected_error(profile, plan, job),
         **({} if placed is None else {"placement": placed.facts}),
         "notes": _notes(profile, plan, placed),
     }
     return with_known_intervals(profile, plan.unit, answer) if profile.name == HOST else answer
+
+
+def _shown_times(profile: Profile, fps: float | None, times: FrameInterval) -> FrameInterval:
+    """Return the times of a frame, which are at least the display's where the rate `fps` is more than it can show."""
+    display = profile.application.display_ms.or_else(0)
+    return times if not fps or display * fps <= 1e3 else FrameInterval(*(max(ms, display) for ms in times))
 
 
 def predicted_run(

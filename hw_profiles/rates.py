@@ -35,11 +35,11 @@ class FrameInterval(NamedTuple):
     high_ms: float
 
 
-def holding(fps: float, times: FrameInterval, dropped: int = 0, frames: int = 0) -> dict[str, Any]:
+def holding(fps: float, times: FrameInterval, dropped: int = 0, late: int = 0, frames: int = 0) -> dict[str, Any]:
     """Say whether `fps` frames a second hold, in words too. The reserve is the part of a frame's time that is left.
 
-    `times`: time of a frame that never waits for its turn. `dropped`: number of frames, of `frames`, that a run at this
-    rate drops; jitter may drop some although a mean frame fits.
+    `times`: time of a frame that never waits for its turn. `dropped`, `late`: numbers of frames, of `frames`, that a
+    run at this rate drops, or shows too late; jitter may cause both although a mean frame fits.
     """
     reserve, high, low = (1 - ms * fps / 1e3 for ms in times)
     if low >= 0:
@@ -54,7 +54,7 @@ def holding(fps: float, times: FrameInterval, dropped: int = 0, frames: int = 0)
         "fps": fps,
         "holds": reserve >= 0,
         "words": words,
-        "sentence": _sentence(fps, times, dropped, frames),
+        "sentence": _sentence(fps, times, {"dropped": dropped, "late": late}, frames),
         "reserve": reserve,
         "reserve_low": low,
         "reserve_high": high,
@@ -77,13 +77,14 @@ def without_interval(rate: Mapping[str, Any]) -> dict[str, Any]:
     return {**rate, **said, "reserve_low": None, "reserve_high": None}
 
 
-def _sentence(fps: float, times: FrameInterval, dropped: int, frames: int) -> str:
+def _sentence(fps: float, times: FrameInterval, missed: Mapping[str, int], frames: int) -> str:
     """Say whether the rate holds: `holds 30 fps: yes; 12-19 ms of 33 ms (80 %)`."""
     frame_ms = 1e3 / fps
     holds = "yes" if times.high_ms <= frame_ms else "no" if times.low_ms > frame_ms else "perhaps"
-    left_out = ""
-    if dropped and holds == "yes":
-        holds, left_out = "not for every frame", f"; {dropped} of {frames} frames are dropped"
+    said = " and ".join(f"{count} {what}" for what, count in missed.items() if count)
+    left_out = f"; of {frames} frames {said}" if said and holds == "yes" else ""
+    if left_out:
+        holds = "not for every frame"
     low, high = _short(times.low_ms), _short(times.high_ms)
     span = f"{low} ms" if low == high else f"{low}-{high} ms"
     share = "" if times.low_ms == times.high_ms else " (80 %)"

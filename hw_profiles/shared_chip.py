@@ -238,7 +238,7 @@ def _rate(
     `frames`: its frames at its rate, as its report counts them.
     """
     needs = needed(profile, tenants, number, corners, turns)
-    rate = holding(tenants[number].fps, needs, wanted_drops(frames["dropped"]), frames["requested"])
+    rate = holding(tenants[number].fps, needs, wanted_drops(frames["dropped"]), frames=frames["requested"])
     is_measured = profile.name != HOST or profile.units[INFER[1]].measured is not None
     if not (is_measured and tenants[number].on(profile, corners, "expected", 0.0).is_known):
         return {"needs_ms": {"mean": needs.ms, "low": None, "high": None}, "rate": without_interval(rate)}

@@ -106,6 +106,9 @@ def _head(document: Mapping[str, Any]) -> Iterator[str]:
     mean = "fewer than two frames: no frame time" if frame_ms is None else f"{frame_ms:.2f} ms a frame"
     scene = f"scene {document['scene']}, " if document["scene"] else ""
     yield f"Run {document['run']}: {scene}policy {document['policy']}, {document['frames']} frames, {mean}"
+    for kind, counts in document["left"].items():
+        causes = ", ".join(f"{cause} {count}" for cause, count in counts.items())
+        yield f"{kind}: {sum(counts.values())} frames ({causes})"
     if frame_ms and document["nobodys_ms"] >= LEAST_SHARE * frame_ms:
         yield (
             f"other programs: {document['nobodys_ms']:.1f} of {frame_ms:.1f} ms a frame were nobody's of this run: a "
@@ -133,8 +136,8 @@ def _efficiency(document: Mapping[str, Any]) -> Iterator[str]:
         numbers, efficiency = ",".join(map(str, document["cores"]["numbers"])), document["machine_efficiency"]
         cpu_ms, had_ms = document["cores"]["cpu_ms"], document["cores"]["had_ms"]
         yield (
-            f"cores {numbers}: jobs had {cpu_ms:.2f} of {had_ms:.2f} ms of CPU time a frame, {efficiency:.0%}; the "
-            f"fullest {document['core_efficiency']:.0%}; the slowest unit {document['efficiency']:.0%}"
+            f"efficiency: {document['efficiency']:.0%} of the slowest unit, {document['core_efficiency']:.0%} of the "
+            f"fullest cores, {efficiency:.0%} of all (cores {numbers}: {cpu_ms:.2f} of {had_ms:.2f} ms a frame in jobs)"
         )
 
 

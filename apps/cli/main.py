@@ -221,7 +221,9 @@ def entry() -> NoReturn:
             main()
     except SystemExit as left:
         code = left.code
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
+        if not interrupt.args:  # otherwise somebody has said it
+            os.write(2, b"interrupted\n")
         code = INTERRUPTED
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):  # closed by whoever was to read it

@@ -57,7 +57,7 @@ def _show(console: Console, answer: Mapping[str, Any]) -> None:
     console.print(f"always fed      {_ms(needs['mean'])}{_span(needs['low'], needs['high'])} a frame")
     cycle = " -> ".join(answer["cycle"])
     limit = f", by {answer['limit'].replace('_', ' ')}: {cycle}" if cycle else ""
-    console.print(f"bound           {_ms(answer['period_ms'])} a frame{limit}", soft_wrap=True)
+    console.print(f"period          {_ms(answer['period_ms'])} a frame{limit}", soft_wrap=True)
     console.print(_stages(answer))
     console.print(_units(answer))
     for reason in dict.fromkeys(

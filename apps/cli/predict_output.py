@@ -243,7 +243,8 @@ def _print_network(console: Console, answer: dict[str, Any]) -> None:
 
 def _print_times(console: Console, answer: dict[str, Any]) -> None:
     frame = answer["frame_time_ms"]
-    capped = ", held by the display" if answer["display_capped"] else ""
+    held = "the display" if "rate" not in answer else "the rate that was asked for"
+    capped = f", held by {held}" if answer["display_capped"] else ""
     stray = f"averages over 20 frames {frame['ema20_min']:.1f} to {frame['ema20_max']:.1f} ms"
     span = _span(frame["low"], frame["high"], ".1f")
     means = f"{frame['mean']:.1f} ms{span}, {answer['fps']:.1f} fps{capped}"

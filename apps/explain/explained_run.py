@@ -8,7 +8,7 @@ stages report, which are the last columns.
 from __future__ import annotations
 
 import csv
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
@@ -25,7 +25,7 @@ from trilane.pipeline.critical_path import WHATS, Part, Taken
 from trilane.pipeline.journal import NAME, Begun, Ended, Record, Said, Worked, config_of, journal_in, read_journal
 from trilane.pipeline.reckoning import Reckoning, places_of
 from trilane.pipeline.result import MOST_MESSAGES
-from trilane.pipeline.timeline import ExplainedJob, Timeline
+from trilane.pipeline.timeline import ExplainedJob, Gone, Timeline
 from trilane.pipeline.unit_history import PREEMPTED
 from trilane.units import HOST_CLOCK, NS_PER_MS
 from trilane.writing import write_atomically
@@ -96,6 +96,7 @@ class RunExplanation:
         self._jobs = dict.fromkeys(self._waits, 0)
         self._joins = Joins(begun.graph)
         self._frames, self._first_ns, self._last_ns = 0, 0, 0
+        self._left: dict[str, Counter[str]] = {}
         self._said: deque[str] = deque(maxlen=MOST_MESSAGES)
 
     def add(self, record: Record) -> None:
@@ -105,6 +106,8 @@ class RunExplanation:
         for fact in self._timeline.add(record):
             if isinstance(fact, ExplainedJob):
                 self._count(fact)
+            elif isinstance(fact, Gone):
+                self._left.setdefault(fact.kind, Counter())[fact.cause] += 1
 
     def _count(self, explained: ExplainedJob) -> None:
         job = explained.job
@@ -135,6 +138,7 @@ class RunExplanation:
             **self._of_run(),
             "verdict": None if self._report is None else verdict_of(self._report, self._name).shown(),
             "frames": self._frames,
+            "left": {kind: dict(causes) for kind, causes in self._left.items()},
             "frame_ms": frame_ms,
             **figures,
             "cores": self._of_cores(frame_ms, figures["machine_efficiency"]),

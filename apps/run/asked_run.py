@@ -41,8 +41,17 @@ def run_asked(
 
         return run_file(options, hooks, command)
     options.check_together()
+    _require_free(options)
     with early_processes() as (starter, gl):
         return run_prepared(prepare(options, gl, command), hooks=hooks, starter=starter, gl=gl)
+
+
+def _require_free(options: RunOptions) -> None:
+    """Raise BadInputError if `--out` is taken, before anything is read: the run's folder makes sure of it again."""
+    from trilane.apps.run.run_folder import require_free
+
+    if options.out is not None:
+        require_free(options.out.absolute())
 
 
 def prepare(options: RunOptions, gl: GlFacts, command: tuple[str, ...] = ()) -> Prepared:
@@ -145,5 +154,6 @@ def run_prepared(
             machine = required_machine(gl)
             return run_to_folder(prepared, target, told, machine=machine, made=made, starter=starter, watched=watched)
         except KeyboardInterrupt:
-            told.message("interrupted: nothing was written")
-            raise
+            said = "interrupted: nothing was written"
+            told.message(said)
+            raise KeyboardInterrupt(said) from None

@@ -144,8 +144,9 @@ def _run(asked: _Asked, folder: RunFolder, told: Hooks, starter: UnitStarter) ->
             on_message=told.message,
         )
     except KeyboardInterrupt:
-        told.message("interrupted: nothing was written")
-        raise
+        said = "interrupted: nothing was written"
+        told.message(said)
+        raise KeyboardInterrupt(said) from None
     if not result.presented:
         if result.interrupted:
             raise KeyboardInterrupt

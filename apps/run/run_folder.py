@@ -23,6 +23,16 @@ from trilane.writing import WRITABLE
 RESERVED_BYTES = 4 << 20
 
 
+def require_free(target: Path) -> None:
+    """Raise BadInputError if `target` exists, or if a run that goes on is to have its name."""
+    found = "a file or folder" if target.exists() else ""
+    for other in _partial(target):
+        if _is_locked(other):
+            found = f"a run that goes on, in {other.name}"
+    if found:
+        raise BadInputError(target, found, "a name that is free", "choose another --out")
+
+
 def default_place(scene: str) -> Path:
     """Return `runs/<UTC time>-<scene>` in the working directory, a name that no run has or is to have."""
     stamp = machine.here.now().strftime("%Y%m%dT%H%M%SZ")
@@ -53,8 +63,7 @@ class RunFolder:
 
     def __enter__(self) -> Self:
         try:
-            if self.target.exists():
-                raise BadInputError(self.target, "a file or folder", "a name that is free", "choose another --out")
+            require_free(self.target)
             self._make_parents()
             self._claim()
             self._reserve_space()
@@ -76,10 +85,7 @@ class RunFolder:
         parent = os.open(self.target.parent, os.O_RDONLY | os.O_DIRECTORY)
         try:
             fcntl.flock(parent, fcntl.LOCK_EX)
-            for other in _partial(self.target):
-                if _is_locked(other):
-                    found = f"a run that goes on, in {other.name}"
-                    raise BadInputError(self.target, found, "a name that is free", "choose another --out")
+            require_free(self.target)
             self.work.mkdir()
             self._lock = os.open(self.work, os.O_RDONLY | os.O_DIRECTORY)
             fcntl.flock(self._lock, fcntl.LOCK_EX)

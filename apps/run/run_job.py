@@ -12,6 +12,7 @@ import shutil
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
@@ -24,7 +25,7 @@ from trilane.apps.run.report_facts import build_report, config_facts, resolution
 from trilane.apps.run.run_folder import RunFolder
 from trilane.arrays import F64, U8, Mask
 from trilane.bench.lib.picture_error import psnr_of_frames, require_metrics
-from trilane.errors import TrilaneError
+from trilane.errors import TrilaneError, require
 from trilane.hw_profiles.governor import Governor
 from trilane.hw_profiles.profile_files import load_runnable
 from trilane.pipeline import journal
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
 BASELINE_POLICY = "sequential"
 INTERRUPTED = 130
 ENDLESS = 1_000_000_000  # frames of a run that somebody watches: a year at 30 a second
+NO_SEGMENTS = "segments: the frames were removed while the run went on, so there is no video"
 NO_VIDEO = "no video, no contact sheet and no checksum: the frames were presented without, as was asked for"
 TRUTH = "the truth: the clothed body that the avatar was trained on"
 FLOAT_PATH = "the float path: float64 body and raster, FP32 network"
@@ -165,8 +167,10 @@ def run_to_folder(
 
             files, unwritten = write_files(folder.work, checked.config.scene.fps)
             facts |= files
-            if unwritten is not None:
-                result = replace(result, failure=result.failure or Failure(str(unwritten)))
+            lacks = checked.config.record and result.presented and files["video"] is None
+            failed = str(unwritten) if unwritten is not None else NO_SEGMENTS if lacks else ""
+            if failed:
+                result = replace(result, failure=result.failure or Failure(failed))
             folder.release()
             result = _renamed(result, folder.named)
             report = build_report(result, checked.config, machine=machine, baseline=baseline, facts=facts)
@@ -337,12 +341,10 @@ def asked_frames(total: int, count: int) -> tuple[int, ...]:
 
 
 def require_parts(bundles: Iterable[Bundle]) -> None:
-    """Raise MissingPartError for a missing library that the check of a run with avatars `bundles` needs."""
+    """Raise MissingPartError for all libraries that the check of a run with avatars `bundles` needs and lacks."""
     from trilane.bench.lib.full_network import require_float_network
 
-    require_metrics()
-    for bundle in bundles:
-        require_float_network(bundle)
+    require([require_metrics, *(partial(require_float_network, bundle) for bundle in bundles)])
 
 
 def check_run(checked: Checked, folder: Path, told: Callable[[int, int], None] = lambda *_: None) -> dict[str, Any]:

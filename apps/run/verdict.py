@@ -25,9 +25,12 @@ LABELS: Final = ("PASS", "FAIL")
 UNKNOWN: Final = "not known"
 #: What figures are of that are not a finished run's.
 SO_FAR, COMPUTED = "so far", "computed"
+#: Name of the bound of a prediction that the chip's display holds back.
+DISPLAY: Final = "display"
 #: Names of the path that are no unit's -> what they mean to a person.
 MEANINGS: Final = {
     "release": "no frame was released yet: frames come no more often than was asked for",
+    DISPLAY: "it shows no more frames a second",
     "other programs": "no job of this run had the core",
     "overhead": "messages and hand-overs",
     "held": "the policy or the order of frames",
@@ -176,7 +179,8 @@ def _ended(facts: Facts) -> str:
 def _too_slow(facts: Facts) -> str:
     if facts.is_held_to_rate or facts.rate is None or facts.rate.fps >= facts.target_fps:
         return ""
-    return f"{_number(facts.rate.fps)} of {_number(facts.target_fps)} fps"
+    found, target = _apart(facts.rate.fps, facts.target_fps)
+    return f"{found} of {target} fps"
 
 
 def _too_late(facts: Facts) -> str:
@@ -194,18 +198,18 @@ def _late(found: Lateness) -> str:
 
 def _held(facts: Facts) -> str:
     """Return the rate beside what is asked for, such as `96 fps (92 to 102), at 30 fps 0 of 299 frames late`."""
-    target = f"at {_number(facts.target_fps)} fps"
-    late = f"{target} {_late(facts.lateness)}" if facts.lateness else f"asked for {_number(facts.target_fps)} fps"
     if facts.failure:
         return f"the run ended early: {facts.failure}"
     if facts.rate is None:
         return "fewer than two frames were presented"
+    found, target = _apart(facts.rate.fps, facts.target_fps)
+    late = f"at {target} fps {_late(facts.lateness)}" if facts.lateness else f"asked for {target} fps"
     around = ""
     if facts.rate.low is not None and facts.rate.high is not None and facts.rate.low < facts.rate.high:
         share = "" if facts.rate.share == Rate._field_defaults["share"] else f", {facts.rate.share}"
         around = f" ({_number(facts.rate.low)} to {_number(facts.rate.high)}{share})"
     source = f" {facts.source}" if facts.source else ""
-    return f"{_number(facts.rate.fps)} fps{around}{source}, {late}"
+    return f"{found} fps{around}{source}, {late}"
 
 
 def _times(facts: Facts) -> str:
@@ -271,6 +275,16 @@ def slow_percentile(times: Mapping[str, Any]) -> tuple[str, float] | None:
         if times.get(name) is not None and (samples is None or samples >= samples_needed(int(name[1:]) / 100)):
             return name, times[name]
     return ("max", times["max"]) if times.get("max") is not None else None
+
+
+def _apart(one: float, other: float) -> tuple[str, str]:
+    """Return two numbers with three digits, or with as many as tell them apart."""
+    texts = _number(one), _number(other)
+    for digits in range(4, 17) if one != other else ():
+        if texts[0] != texts[1]:
+            break
+        texts = f"{one:.{digits}g}", f"{other:.{digits}g}"
+    return texts
 
 
 def _number(value: float | None) -> str:

@@ -13,6 +13,7 @@ from trilane.apps.explain.reasons import SHORTER
 from trilane.apps.run.trust import MOST_OTHERS, Trust, percent, trust_of
 from trilane.apps.run.verdict import (
     COMPUTED,
+    DISPLAY,
     LEAST_NAMED,
     SO_FAR,
     TARGET_FPS,
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 MUCH_LATER: Final = 2.0
 #: Part of a frame's time that has to be left before more work for a frame is proposed.
 MUCH_LEFT: Final = 0.5
+#: Part of a rate by which two computations of it may differ.
+ROUNDED: Final = 1e-6
 NOT_YET: Final = Trust(False, ("the run goes on: its machine is judged at its end",))
 NO_TRUTH: Final = "nothing to compare with: a pipeline of your own has no true picture"
 
@@ -194,8 +197,6 @@ def predicted_verdict(answer: Mapping[str, Any]) -> Verdict:
     """
     times = _needed(answer)
     config = answer.get("config") or {}
-    # The simulated run of a pipeline file is released at its rate; jitter makes frames late although a mean one fits.
-    has_run = "cycle" in answer and "rate" in answer
     target = float((answer.get("rate") or {}).get("fps") or config.get("fps") or TARGET_FPS)
     low, high = times.get("low"), times.get("high")
     least, most = (None, None) if low is None or high is None or not low else (1e3 / high, 1e3 / low)
@@ -204,8 +205,8 @@ def predicted_verdict(answer: Mapping[str, Any]) -> Verdict:
         Facts(
             Rate(1e3 / times["mean"], least, most, "80 %"),
             target,
-            _lateness(answer, is_paced=True) if has_run else None,
-            _trust_in(least, most, target),
+            _predicted_lateness(answer),
+            _trust_in(least, most, target, is_held=_is_held_by_display(answer)),
             frame_ms=times["mean"],
             latency_ms=latency["mean"] if latency and latency.get("samples", 1) else None,
             bound=_predicted_bound(answer, times["mean"]),
@@ -215,6 +216,14 @@ def predicted_verdict(answer: Mapping[str, Any]) -> Verdict:
             source=COMPUTED,
         )
     )
+
+
+def _predicted_lateness(answer: Mapping[str, Any]) -> Lateness | None:
+    """Return how many frames of the simulated run of a pipeline file were not in time; None without a rate.
+
+    They are released at that rate. Jitter makes frames late although a mean one fits.
+    """
+    return _lateness(answer, is_paced=True) if "cycle" in answer and "rate" in answer else None
 
 
 def _needed(answer: Mapping[str, Any]) -> dict[str, Any]:
@@ -228,12 +237,21 @@ def _needed(answer: Mapping[str, Any]) -> dict[str, Any]:
     return dict(answer.get("needs_ms") or answer["frame_time_ms"])
 
 
-def _trust_in(low: float | None, high: float | None, target: float) -> Trust:
+def _trust_in(low: float | None, high: float | None, target: float, *, is_held: bool) -> Trust:
     if low is None or high is None:
         return Trust(False, ("computed, with an unknown error",))
     if low < target <= high:
         return Trust(False, (f"computed, and the 80 % interval of {low:.0f} to {high:.0f} fps holds the target",))
-    return Trust(True, ("computed, and the whole 80 % interval is on one side of the target",))
+    if low < high:
+        return Trust(True, ("computed, and the whole 80 % interval is on one side of the target",))
+    why = "the display holds the rate over the whole 80 % interval" if is_held else "the times have no interval"
+    return Trust(True, (f"computed; {why}",))
+
+
+def _is_held_by_display(answer: Mapping[str, Any]) -> bool:
+    """Return whether only the chip's display keeps the predicted frames from being quicker."""
+    rate = answer.get("rate")
+    return bool(answer.get("display_capped")) and (rate is None or answer["fps"] < rate["fps"] * (1 - ROUNDED))
 
 
 def _predicted_bound(answer: Mapping[str, Any], frame_ms: float) -> Bound | None:
@@ -253,6 +271,8 @@ def _predicted_bound(answer: Mapping[str, Any], frame_ms: float) -> Bound | None
     for name in cycle:
         by_unit[stages[name]["unit"]] = by_unit.get(stages[name]["unit"], 0.0) + ms_of[name]
     unit = max(by_unit, key=by_unit.__getitem__)
+    if _is_held_by_display(answer):
+        return Bound(DISPLAY, {name: ms_of[name] for name in cycle if stages[name]["unit"] == unit}, 1.0)
     own = sorted((name for name in cycle if stages[name]["unit"] == unit), key=lambda name: -ms_of[name])
     return Bound(unit, {name: ms_of[name] for name in own}, min(by_unit[unit] / frame_ms, 1.0), of_unit=frozenset(own))
 
@@ -269,5 +289,7 @@ def _predicted_tries(answer: Mapping[str, Any], is_slow: bool) -> Iterator[str]:
         yield f"--precision w8a8 in place of {answer['precision']}"
     elif is_slow:
         yield "a smaller network, or another --profile"
+    elif (lateness := _predicted_lateness(answer)) and lateness.missed:
+        yield "--trace FILE: which frames are late, and what they wait for"
     elif "temperature_c" in answer and not answer["temperature_c"]:
         yield "--minutes 30: what heat leaves of it"

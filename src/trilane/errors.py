@@ -14,7 +14,7 @@ import re
 import resource
 import shlex
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -67,12 +67,15 @@ def package_line(name: str) -> str:
 
 
 def install_line(extra: str = "") -> str:
-    """Return the command that installs the packages of an `extra`; without one, those that every run needs."""
+    """Return the command that installs the packages of an `extra`; without one, those that every run needs.
+
+    `extra`: one of Trilane's extras, or several joined by commas.
+    """
     root = clone()
     if root is not None:
         source = ("." if _stands_in(root) else str(root)) + (f"[{extra}]" if extra else "")
         return f"{pip()} install -e {shlex.quote(source)}"
-    packages = [shlex.quote(requirement) for requirement in _requirements(extra)] or [UNKNOWN]
+    packages = [shlex.quote(each) for name in extra.split(",") for each in _requirements(name)] or [UNKNOWN]
     return f"{pip()} install {' '.join(packages)}"
 
 
@@ -193,14 +196,32 @@ class UnitLostError(TrilaneError):
 class MissingPartError(TrilaneError):
     """The environment lacks something. Exit code 3.
 
-    `what`: what is missing. `install`: line to type. `extra`: one of Trilane's extras, in place of `install`.
+    `what`: what is missing. `install`: line to type. `extra`: Trilane's extra, or several joined by commas, in place of
+    `install`.
     """
 
     exit_code = 3
 
     def __init__(self, what: str, install: str = "", *, extra: str = "") -> None:
-        self.what, self.install = what, install or install_line(extra)
+        self.what, self.extra, self.install = what, extra, install or install_line(extra)
         super().__init__(self.what, self.install)
 
     def __str__(self) -> str:
         return f"{self.what}; install it with: {self.install}"
+
+
+def require(checks: Iterable[Callable[[], object]]) -> None:
+    """Call all `checks`, and raise one MissingPartError with everything that they miss and one line that installs it.
+
+    Each check raises a MissingPartError with an `extra` for what it misses.
+    """
+    missing: list[MissingPartError] = []
+    for check in checks:
+        try:
+            check()
+        except MissingPartError as error:
+            missing.append(error)
+    if missing:
+        whats = dict.fromkeys(error.what for error in missing)
+        extras = dict.fromkeys(error.extra for error in missing)
+        raise MissingPartError(", and ".join(whats), extra=",".join(extras))

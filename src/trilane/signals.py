@@ -28,7 +28,7 @@ def _raise(number: int, _frame: FrameType | None) -> NoReturn:
     """Say which signal came, which nobody has typed, and end as Ctrl-C does."""
     with contextlib.suppress(OSError):  # of a terminal that was closed
         os.write(2, f"interrupted by {signal.Signals(number).name}\n".encode())
-    raise KeyboardInterrupt
+    raise KeyboardInterrupt(number)
 
 
 def that_end() -> list[signal.Signals]:

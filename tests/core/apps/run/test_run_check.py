@@ -193,6 +193,8 @@ def test_a_check_without_its_libraries_is_refused_before_the_run(monkeypatch: py
     there.remove("skimage")
     with pytest.raises(MissingPartError, match=r"skimage.*\[metrics\]"):
         require_parts([])
+    with pytest.raises(MissingPartError, match=r"skimage, and the FP32 network needs torch.*\[metrics,train\]"):
+        require_parts([bundle, bundle])
     checked: Any = SimpleNamespace(config=SimpleNamespace(avatar_dirs=(bundle.folder,)))
     with pytest.raises(MissingPartError, match="skimage"):
         asked_run._require_check(checked)
@@ -209,7 +211,7 @@ def test_a_sweep_whose_runs_cannot_be_checked_is_refused_before_its_first_trial(
         with pytest.raises(SystemExit) as left:
             cli.main()
         assert (left.value.code or 0) == code
-    assert "[metrics]" in capsys.readouterr().err
+    assert "[metrics,train]" in capsys.readouterr().err
     assert not (tmp_path / "sweep").exists()
 
 
