@@ -115,8 +115,8 @@ class RunKeys(Keys):
         default=0,
         ge=0,
         le=MOST_FRAMES,
-        description="Most frames that wait before the first stage, beside one that its unit holds ready; "
-        "more are turned away. 0: no limit.",
+        description="How many frames may wait before the first stage, besides the one that its unit holds ready; "
+        "further frames are turned away. 0: no limit.",
     )
     latency_to: str = Field(
         default="", description="Stage at whose end the latency ends; without it the last one that nobody reads."

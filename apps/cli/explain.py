@@ -108,7 +108,7 @@ def _head(document: Mapping[str, Any]) -> Iterator[str]:
     yield f"Run {document['run']}: {scene}policy {document['policy']}, {document['frames']} frames, {mean}"
     for kind, counts in document["left"].items():
         causes = ", ".join(f"{cause} {count}" for cause, count in counts.items())
-        yield f"{kind}: {sum(counts.values())} frames ({causes})"
+        yield f"frames {kind}: {sum(counts.values())} ({causes})"
     if frame_ms and document["nobodys_ms"] >= LEAST_SHARE * frame_ms:
         yield (
             f"other programs: {document['nobodys_ms']:.1f} of {frame_ms:.1f} ms a frame were nobody's of this run: a "

@@ -115,6 +115,9 @@ def test_dropped_frames_and_late_input_are_named(tmp_path: Path) -> None:
     settings = Settings(40, "latest", period_ns=10 * MS, deadline_ns=30 * MS)
     found = explain_run(write_run(tmp_path / "run", simulated({("infer", 5): 200}, settings)), 40)
     assert any("before it were dropped or lost" in note for row in found["slowest"] for note in row["notes"])
+    assert found["left"].keys() == {"dropped"}
+    assert sum(found["left"]["dropped"].values()) == 40 - found["frames"] > 10
+    assert {cause.rpartition(":")[2] for cause in found["left"]["dropped"]} == {"stale"}
     assert found["slowest"][0]["why"][0]["text"] == "infer was slow: 200.0 ms, median 4.0"
     assert any(row["what"] == "release" for row in found["budget"])
     usual = explain_run(write_run(tmp_path / "usual", simulated({}, replace(settings, period_ns=40 * MS))))

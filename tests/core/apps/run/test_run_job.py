@@ -144,10 +144,15 @@ def with_a_place(given: Checked, _policy: str, _starter: Any, _driver: str, _say
 
 
 def go(
-    runs: Runs, target: Path, made: Mapping[str, Any] | None = None, pace: Pace | None = None, **options: Any
+    runs: Runs,
+    target: Path,
+    made: Mapping[str, Any] | None = None,
+    pace: Pace | None = None,
+    record: bool = False,
+    **options: Any,
 ) -> RunOutcome:
     starter: Any = "the starter"
-    prepared = Prepared(RunOptions(**options), checked(), pace)
+    prepared = Prepared(RunOptions(**options), checked().changed(record=record), pace)
     return run_to_folder(prepared, target, runs.hooks, machine=MACHINE, made=made, starter=starter)
 
 
@@ -163,7 +168,7 @@ def test_a_run_and_its_baseline(runs: Callable[..., Runs], tmp_path: Path) -> No
     ]
     assert second["config"].out_dir == first["config"].out_dir / "sequential"
     assert first["config"].out_dir.name.endswith(".partial")
-    assert first["config"].model_copy(update={"out_dir": Path("/nowhere")}) == checked().config
+    assert first["config"].model_copy(update={"out_dir": Path("/nowhere")}) == checked().changed(record=False).config
     assert (first["starter"], first["governor"], first["assets"]) == ("the starter", None, {})
     assert double.said == [PLACED, ("deadline", 2, 5), "hello", ("sequential", 2, 5), "hello"]
     assert sorted(file.name for file in outcome.folder.iterdir()) == FILES
@@ -313,7 +318,7 @@ def test_the_video_is_joined_and_what_it_lacks_is_told(runs: Callable[..., Runs]
         return a_result(metrics={"pose": {"visible": 0.0}})
 
     double = runs(recorded)
-    outcome = go(double, tmp_path / "run", baseline_frames=0)
+    outcome = go(double, tmp_path / "run", record=True, baseline_frames=0)
     assert outcome.report.video is not None
     assert (outcome.report.video.frames, outcome.report.video.seconds) == (5, pytest.approx(0.2))
     assert len(outcome.report.checksum or "") == 64
@@ -324,6 +329,11 @@ def test_the_video_is_joined_and_what_it_lacks_is_told(runs: Callable[..., Runs]
     files = {file.name for file in outcome.folder.iterdir()}
     assert files == {"contact.png", "video.mp4", *FILES}
     assert SEGMENTS not in files
+
+
+def test_frames_that_vanish_before_the_video_is_joined_are_a_failure(runs: Callable[..., Runs], tmp_path: Path) -> None:
+    outcome = go(runs(a_result()), tmp_path / "run", record=True, baseline_frames=0)
+    assert (outcome.exit_code, outcome.report.video, outcome.report.failure) == (1, None, run_job.NO_SEGMENTS)
 
 
 def test_a_run_without_a_video_says_why(runs: Callable[..., Runs], tmp_path: Path) -> None:

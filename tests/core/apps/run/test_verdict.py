@@ -47,6 +47,8 @@ US = 1000
         ({"rate": None, "lateness": None}, False, "fewer than two frames were presented"),
         ({"target_fps": 60.0}, True, "60 fps are held"),
         ({"target_fps": 97.0}, False, "96 of 97 fps"),
+        ({"rate": Rate(29.97)}, False, "29.97 of 30 fps"),  # with three digits both are 30
+        ({"rate": Rate(119.999), "target_fps": 120.0}, False, "119.999 of 120 fps"),
     ],
 )
 def test_what_passes(change: dict[str, Any], passed: bool, why: str) -> None:
@@ -90,6 +92,25 @@ def test_a_prediction_is_sure_where_its_interval_is_on_one_side() -> None:
         found = predicted_verdict({**answer, "config": {"fps": fps}}).as_json()
         assert (found["pass"], found["trusted"]) == (passed, trusted)
         assert found["bound"] == {"unit": "v", "stages": ["b"], "share": 0.8}
+
+
+def test_what_the_display_holds_back_is_bound_by_it() -> None:
+    """The display shows a frame every 16.6 ms, 60.2 fps; the stages need 9 ms. A rate below that is no display's."""
+    stages = {"a": {"unit": "u", "service_ms": {"mean": 9.0}}}
+    held = {"stages": stages, "display_capped": True, "fps": 1e3 / 16.6}
+    shown = {"mean": 16.6, "low": 16.6, "high": 16.6}
+    found = predicted_verdict({**held, "frame_time_ms": shown})
+    lines = dict(found.lines())
+    assert lines["BOUND"] == (
+        "display: 16.6 of 16.6 ms a frame (100 %); it shows no more frames a second; of stages most a 9.0"
+    )
+    assert lines["TRUST"] == "computed; the display holds the rate over the whole 80 % interval"
+    reserve = {"fps": 100.0, "reserve": 1 - 1.66, "reserve_low": 1 - 1.66, "reserve_high": 1 - 1.66}
+    slow = predicted_verdict({**held, "frame_time_ms": shown, "rate": reserve})
+    assert (slow.passed, slow.as_json()["bound"]["unit"]) == (False, "display")
+    left = {"fps": 30.0, "reserve": 0.73, "reserve_low": 0.7, "reserve_high": 0.75}
+    quick = predicted_verdict({**held, "fps": 30.0, "frame_time_ms": {"mean": 33.3}, "rate": left})
+    assert (quick.passed, quick.as_json()["bound"]["unit"]) == (True, "u")
 
 
 def test_frames_that_gave_way_to_newer_ones_are_told_beside_the_rate() -> None:
