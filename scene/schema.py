@@ -307,7 +307,7 @@ class Scene(Table):
     size: Annotated[str, AfterValidator(_scene_size)] = Field(
         default="256",
         description=(
-            "Size of the tensor: HEIGHTxWIDTH, or a side S for areas up to SxS. `auto`: planned, up to `most_side`² pixels."
+            "Tensor size: HEIGHTxWIDTH, or a side S for areas up to SxS. `auto`: planned, up to `most_side`² pixels."
         ),
     )
     background: str = Field(default="room", description="`room`, a video, a folder of images, or a picture.")
