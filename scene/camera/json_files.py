@@ -97,7 +97,7 @@ def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
         _place_of,
         detected,
         _pictures(frames),
-        unit=LengthUnit.USUALLY_M,
+        unit=LengthUnit.OFTEN_M,
     )
 
 

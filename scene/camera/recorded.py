@@ -4,7 +4,8 @@ The movement from pose to pose never changes. Three constants are applied. One t
 of the picture by a multiple of 90 degrees acts as a phone does with its display. One scale leads to metres.
 
 **Unit.** The scene states it, or the format defines it as a metre. Otherwise, or where cameras would be faster than
-anything that carries one, the scale is guessed: a person fills the pictures where the cameras look.
+anything that carries one, the scale is guessed: a person fills the pictures where the cameras look. Files of NeRF have
+no unit, but many are in metres: the scale is guessed only where the views circle a point at which no person fits.
 
 **Up.** People hold a camera level. Each axis of the world is tried with each quarter turn of the picture. A guess costs
 more the farther the horizon is from level, and the more steeply the camera looks down or up and the more that changes.
@@ -42,10 +43,11 @@ PATH_M = 2.0
 
 
 class LengthUnit(Enum):
-    """The unit of a format's lengths: metres by its definition, usually metres, or none."""
+    """The unit of a format's lengths: metres by its definition, usually metres, metres where a person fits, or none."""
 
     METRES = "metres"
     USUALLY_M = "usually metres"
+    OFTEN_M = "often metres"
     NONE = "none"
 
 
@@ -71,13 +73,27 @@ def metres_per_unit(
     if spec.metres_per_unit is not None:
         return spec.metres_per_unit, (f"1 unit of the file is {spec.metres_per_unit:g} m, as given",)
     speed = _speed(places, times_s)
-    if unit is LengthUnit.METRES or (unit is LengthUnit.USUALLY_M and speed <= FASTEST_M_S):
+    is_possible = unit is not LengthUnit.NONE and speed <= FASTEST_M_S
+    if unit is LengthUnit.METRES or (unit is LengthUnit.USUALLY_M and is_possible):
         return 1.0, ()
-    reason = "the file has no unit" if unit is LengthUnit.NONE else f"at {speed:.0f} m/s its unit can be no metre"
+    reason = f"at {speed:.0f} m/s its unit can be no metre"
+    if unit is LengthUnit.NONE or is_possible:
+        reason = "the file has no unit"
+    if unit is LengthUnit.OFTEN_M and is_possible:
+        height = _looked_at_height(turns, places, fov_y_deg)
+        if height is None or height >= PERSON_M:
+            return 1.0, (f"{reason}: 1 unit is taken for 1 m; camera.metres_per_unit decides",)
+        reason += ", and in metres no person would fit where the cameras look"
     if spec.place == "none":
         return 1.0, (f"{reason}: 1 unit is taken for 1 m, as camera.place is none; camera.metres_per_unit decides",)
     scale, how = _fitting(turns, places, fov_y_deg)
     return scale, (f"{reason}: 1 unit is taken for {scale:.4g} m, so that {how}; camera.metres_per_unit decides",)
+
+
+def _looked_at_height(turns: F64, places: F64, fov_y_deg: float) -> float | None:
+    """Return the height, in units, of what the pictures show where the cameras look; None where they look nowhere."""
+    distance = looked_at_from(turns, places)
+    return None if distance is None else float(2 * np.tan(np.radians(fov_y_deg) / 2) * distance)
 
 
 def _speed(places: F64, times_s: F64) -> float:
@@ -89,10 +105,9 @@ def _speed(places: F64, times_s: F64) -> float:
 
 def _fitting(turns: F64, places: F64, fov_y_deg: float) -> tuple[float, str]:
     """Return a scale that follows only from the path's shape and where it looks, and its effect in words."""
-    distance = looked_at_from(turns, places)
-    if distance is not None:
-        wanted = PERSON_M / SHARE / (2 * np.tan(np.radians(fov_y_deg) / 2))
-        return float(wanted / distance), f"a person fills {SHARE:.0%} of the picture's height where the cameras look"
+    height = _looked_at_height(turns, places, fov_y_deg)
+    if height is not None:
+        return PERSON_M / SHARE / height, f"a person fills {SHARE:.0%} of the picture's height where the cameras look"
     length = float(np.linalg.norm(places.max(axis=0) - places.min(axis=0)))
     if length == 0.0:
         return 1.0, "nothing changes, as the camera stays where it is"

@@ -274,6 +274,23 @@ def test_a_map_without_unit_is_scaled_by_where_its_cameras_look() -> None:
     assert still[0] == 1.0
 
 
+@pytest.mark.parametrize(("radius", "scale"), [(0.6, 3.271), (1.4, 1.402), (1.5, 1.0), (30.0, 1.0)])
+def test_nerf_s_unit_is_a_metre_where_a_person_fits(tmp_path: Path, radius: float, scale: float) -> None:
+    """At 60 degrees, 1.7 m are the picture's height at 1.472 m, and 75 % of it at 1.963 m. A note says either."""
+    angles = np.linspace(0, 2, 9)
+    places = radius * np.column_stack([np.sin(angles), np.zeros(9), np.cos(angles)])
+    views = np.tile(np.eye(4), (9, 1, 1))
+    views[:, :3, :3], views[:, :3, 3] = axes_towards(places, np.zeros(3)), places
+    (tmp_path / "a.json").write_text(nerf_text(*views, w=800, h=600, fl_y=300 / math.tan(math.radians(30))))
+    camera = load(tmp_path / "a.json")
+    length, own = (np.linalg.norm(np.ptp(one, axis=0)) for one in (camera.places, places))
+    assert length / own == pytest.approx(scale, rel=1e-3)
+    (note,) = (note for note in camera.notes if "camera.metres_per_unit decides" in note)
+    assert note.startswith("the file has no unit")
+    assert ("1 unit is taken for 1 m;" in note) == (scale == 1.0)
+    assert camera.detected.unit == note
+
+
 ONE_CAMERA = struct.pack("<QiiQQ3d", 1, 1, 0, 640, 480, 500.0, 320.0, 240.0)
 ONE_IMAGE = struct.pack("<Qi7di", 1, 1, 1, 0, 0, 0, 0, 0, 0, 1)
 #: cameras.bin, images.bin, what is said of which of them.
@@ -510,7 +527,7 @@ def test_the_lens_of_height_and_of_width(
         (tmp_path / "a.json").write_text(nerf_text(matrix, **keys))
         camera = load(tmp_path / "a.json", up_axis="z")
         assert camera.lens(0.0, (480, 640)).fov_y_deg == pytest.approx(angle(tangent))
-        assert camera.notes[2] == f"field of view {angle(tangent):.4g} degrees high, {note}"
+        assert camera.notes[3] == f"field of view {angle(tangent):.4g} degrees high, {note}"
 
 
 def test_the_principal_point_counts_where_only_an_angle_is_known(tmp_path: Path) -> None:
