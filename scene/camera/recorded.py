@@ -149,17 +149,24 @@ PER_ROLL, PER_TILT, PER_PITCH = 2.0, 1.0, 0.5
 
 @dataclass(frozen=True)
 class _Prices:
-    """Costs of a guess: an unusual axis, a turned picture, a direction between the axes (None: it is never guessed)."""
+    """Costs of a guess: an unusual axis, a turned picture, a direction between the axes (None: it is never guessed).
+
+    `nadir`: cost of a camera that looks straight down along the usual axis. `nadir_deg`: how far off it may look.
+    """
 
     axis: float
     turn: float
     between: float | None
+    nadir: float
+    nadir_deg: float
 
 
 #: Costs in a format whose world is whatever the program chose, and in one whose world is aligned with gravity by
 #: definition. In the first, a turn of the device is believed only after every axis. It costs as much as another axis
-#: plus the most that the picture's own up can be off an axis (45 degrees).
-ANY_WORLD, LEVELLED = _Prices(0.2, 0.4, 0.25), _Prices(0.4, 0.1, None)
+#: plus the most that the picture's own up can be off an axis (45 degrees). A view straight down along the usual axis is
+#: believed there only where other axes have horizons that are 0.15 rad off; under gravity, before every other axis.
+ANY_WORLD = _Prices(axis=0.2, turn=0.4, between=0.25, nadir=0.5, nadir_deg=5.0)
+LEVELLED = _Prices(axis=0.4, turn=0.1, between=None, nadir=0.3, nadir_deg=18.0)
 #: A direction between the axes is believed when the cameras pan by at least this, in radians (root mean square), and
 #: its cosine with every axis is below this.
 LEAST_PAN, MOST_AXIS_COSINE = 0.15, 0.995
@@ -189,6 +196,7 @@ class _Guess:
     up: F64
     quarter: int
     price: float
+    is_nadir: bool = False
 
 
 def find_upright(turns: F64, usual: str, is_levelled: bool, stated: str = AUTO) -> Upright:
@@ -206,6 +214,15 @@ def find_upright(turns: F64, usual: str, is_levelled: bool, stated: str = AUTO) 
     return Upright(best.up, best.quarter, _note(best, usual, stated) + _rival(best, guesses, stated) + of_first)
 
 
+def _is_nadir(turns: F64, usual: str, most_deg: float) -> bool:
+    """Return whether a camera looks straight down along the axis `usual`, within `most_deg`.
+
+    A map whose axes are those of the first picture also has a view along an axis, but ahead.
+    """
+    is_of_first = np.abs(np.diag(turns[0])).min() > AS_FIRST
+    return bool(turns[:, :, 2].mean(axis=0) @ UP[usual] > np.cos(np.radians(most_deg)) and not is_of_first)
+
+
 def price_of(turns: F64, usual: str) -> float:
     """Return the cost of the cheapest guess for camera axes `turns` (N, 3, 3): 0 where they are level about `usual`."""
     return min((guess.price for guess in _guesses(turns, usual, ANY_WORLD, AUTO)), default=math.inf)
@@ -219,6 +236,8 @@ def _guesses(turns: F64, expected: str, prices: _Prices, stated: str) -> list[_G
         for quarter in range(4)
         if (price := _price(turns, np.array(up), quarter)) is not None
     ]
+    if stated == AUTO and _is_nadir(turns, expected, prices.nadir_deg):
+        guesses.append(_Guess(expected, np.array(UP[expected]), 0, prices.nadir, is_nadir=True))
     if stated != AUTO or prices.between is None:
         return guesses
     return guesses + _between(turns, prices.between)
@@ -276,6 +295,8 @@ def _note(best: _Guess, usual: str, stated: str) -> str:
         return f"up is {off:.0f} degrees off {nearest.upper()}, where the pictures' horizons are level"
     if stated != AUTO:
         return f"{best.name.upper()} up, as given{turned}"
+    if best.is_nadir:
+        return f"{best.name.upper()} up, usual for the format, as the camera looks straight down"
     if best.name != usual:
         return f"{best.name.upper()} up, as the camera is held (not {usual.upper()}, usual for the format){turned}"
     return f"{best.name.upper()} up{turned}"
@@ -283,6 +304,9 @@ def _note(best: _Guess, usual: str, stated: str) -> str:
 
 def _rival(best: _Guess, guesses: list[_Guess], stated: str) -> str:
     """Name the next guess, when it is nearly as cheap and the two are far apart."""
+    for guess in guesses:
+        if guess.is_nadir and guess.name != best.name:
+            return f"; {guess.name.upper()} up fits if it looks straight down: camera.up_axis decides"
     rivals = [g for g in guesses if g.name and g is not best and g.price < best.price + NEAR]
     rivals = [g for g in rivals if g.quarter != best.quarter or g.up @ best.up < np.sqrt(0.5)]
     if not rivals or stated != AUTO:

@@ -32,7 +32,7 @@ from trilane.scene.lens import Lens, of_fov_y
 from trilane.scene.motion.builtin import BUILTIN
 from trilane.scene.motion.motion import Wrap
 from trilane.scene.mover import make_mover
-from trilane.scene.rotations import about, matrix_from_quat, matrix_from_rotvec
+from trilane.scene.rotations import about, matrix_from_quat, matrix_from_rotvec, shortest_turn
 from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
 
 SPEC = CameraSpec()
@@ -162,11 +162,17 @@ def test_a_tum_pose_puts_points_at_their_pixels(tmp_path: Path) -> None:
 
 
 def test_a_camera_that_looks_straight_down_keeps_its_picture() -> None:
-    """No turn of the picture has its up near the usual one: up is the axis nearest to the picture's own up."""
+    """No turn of the picture has its up near the usual one: up is the axis nearest to the picture's own up.
+
+    A level camera of another world has the same pose, so a note names the usual axis.
+    """
     down = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # x right, up = -Z, looks along -Y
     raw = RawCamera(np.zeros(1), down[None], np.zeros((1, 3)), "y", LENSES, "usual", ())
     camera = path_from_recording(raw, "here", SPEC)
-    assert camera.notes[0] == "-Z up, as the camera is held (not Y, usual for the format)"
+    assert camera.notes[0] == (
+        "-Z up, as the camera is held (not Y, usual for the format); "
+        "Y up fits if it looks straight down: camera.up_axis decides"
+    )
     assert camera.pose(0.0)[0][:, 1] == pytest.approx([0, 1, 0], abs=1e-12)
     assert fov_y(camera) == pytest.approx(36.0)
 
@@ -174,10 +180,29 @@ def test_a_camera_that_looks_straight_down_keeps_its_picture() -> None:
 @pytest.mark.parametrize(("cosine", "turned"), [(0.31, True), (0.29, False)])
 def test_the_usual_up_holds_above_a_cosine_of_0_3(cosine: float, turned: bool) -> None:
     sine = math.sqrt(1 - cosine**2)
-    pitched = np.array([[1.0, 0, 0], [0, cosine, sine], [0, -sine, cosine]])  # up (0, cos, -sin): looks down steeply
+    pitched = np.array([[1.0, 0, 0], [0, cosine, -sine], [0, sine, cosine]])  # up (0, cos, sin): looks up steeply
     raw = RawCamera(np.zeros(1), pitched[None], np.zeros((1, 3)), "y", LENSES, "usual", (), is_levelled=True)
     note = path_from_recording(raw, "here", SPEC).notes[0]
-    assert note.split(";")[0] == ("Y up" if turned else "-Z up, as the camera is held (not Y, usual for the format)")
+    assert note.split(";")[0] == ("Y up" if turned else "Z up, as the camera is held (not Y, usual for the format)")
+
+
+@pytest.mark.parametrize("usual", ["y", "z", "-y"])
+@pytest.mark.parametrize("off_deg", [0.0, 3.0])
+def test_a_drone_that_looks_straight_down_keeps_the_usual_axis(usual: str, off_deg: float) -> None:
+    """Its heading wanders by 30 degrees about one that is 10 degrees off the map's axes, so no other axis is level."""
+    headings = math.radians(10.0) + np.radians(30.0) * np.sin(np.linspace(0, 7, 60))
+    down = about(1, headings) @ about(0, math.radians(-90.0 + off_deg))
+    world = shortest_turn(np.array(UP["y"]), np.array(UP[usual]))
+    found = find_upright(world @ down, usual, is_levelled=False)
+    assert (found.up.tolist(), found.quarter) == (list(UP[usual]), 0), found.note
+    assert found.note == f"{usual.upper()} up, usual for the format, as the camera looks straight down"
+
+
+@pytest.mark.parametrize("pitch", [-74.0, -80.0, -90.0])
+def test_gravity_tells_up_where_a_phone_looks_straight_down(pitch: float) -> None:
+    """A levelled world has Y up by definition, so a still view down is no level view of another world."""
+    found = find_upright(about(0, math.radians(pitch))[None], "y", is_levelled=True)
+    assert (found.up.tolist(), found.quarter) == (list(UP["y"]), 0), found.note
 
 
 @pytest.mark.parametrize(
