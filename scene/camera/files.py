@@ -39,6 +39,7 @@ from trilane.scene.camera.recorded import (
     UP,
     RawCamera,
     are_rotations,
+    is_of_body,
     path_from_recording,
     price_of,
 )
@@ -346,6 +347,23 @@ def _with_axes(raw: RawCamera, kind: str, stated: str) -> RawCamera:
     return replace(raw, turns=turns, notes=(*raw.notes, f"axes of a pose: {stated}, as given"))
 
 
+#: Axes of the poses of robots and drones.
+BODY_AXES = "forward-left-up"
+
+
+def _require_camera(path: Path, raw: RawCamera, kind: str, spec: CameraSpec) -> None:
+    """Raise BadInputError where the poses are rather those of a vehicle's body, unless the scene states its axes."""
+    if spec.axes != AUTO or spec.up_axis != AUTO or kind in OPENGL_KINDS:
+        return
+    sound = are_rotations(np.nan_to_num(raw.turns))
+    turns = raw.turns[sound]
+    if len(turns) and is_of_body(turns, turns @ _axes(kind, AUTO).T @ _axes(kind, BODY_AXES), raw.usual_up):
+        found = "poses which, as a camera's, are turned by 90 degrees and look up steeply"
+        remedy = f"set camera.axes to \"{BODY_AXES}\" if the poses are those of a drone's or robot's body (x forward), "
+        remedy += 'or to "right-down-forward" if they are the camera\'s'
+        raise BadInputError(path, found, "poses of a camera that is held level", remedy)
+
+
 def load_camera(spec: CameraSpec, base: Path) -> CameraPath:
     """Load the camera that `spec.source` names; a relative path starts at `base`.
 
@@ -364,6 +382,7 @@ def load_camera(spec: CameraSpec, base: Path) -> CameraPath:
         require_file(path, EXPECTED)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # non-finite values are left out later
         raw = _with_axes(_read(guess.kind, path, spec), guess.kind, spec.axes)
+        _require_camera(path, raw, guess.kind, spec)
         camera = path_from_recording(raw, str(path), spec)
     reason = guess.reason or "as given"
     taken = f"taken for {camera.detected.format}: {reason}"

@@ -178,6 +178,10 @@ OF_FIRST = "; the axes are those of the first picture: if that looked down or up
 NEAR = 0.1
 
 
+#: Sine of the elevation above which a view is steeply up: 20 degrees.
+LEAST_SKYWARDS = 0.34
+
+
 @dataclass(frozen=True)
 class Upright:
     """Up of a world.
@@ -226,6 +230,23 @@ def _is_nadir(turns: F64, usual: str, most_deg: float) -> bool:
 def price_of(turns: F64, usual: str) -> float:
     """Return the cost of the cheapest guess for camera axes `turns` (N, 3, 3): 0 where they are level about `usual`."""
     return min((guess.price for guess in _guesses(turns, usual, ANY_WORLD, AUTO)), default=math.inf)
+
+
+def is_of_body(turns: F64, of_body: F64, usual: str) -> bool:
+    """Return whether poses are rather those of a level vehicle than of a camera.
+
+    As a camera's `turns` (N, 3, 3) they need two corrections at once: a turned picture, and a view that is steeply up.
+    As `of_body` (N, 3, 3) they need none, look ahead or down, and are cheaper by NEAR. `usual`: axis usually up.
+    """
+    cheapest = [
+        min(_guesses(one, usual, ANY_WORLD, AUTO), key=lambda guess: guess.price, default=None)
+        for one in (turns, of_body)
+    ]
+    camera, body = cheapest
+    if camera is None or body is None or not camera.quarter or body.quarter or {camera.name, body.name} != {usual}:
+        return False
+    skywards, ahead = (-float(one[:, :, 2].mean(axis=0) @ UP[usual]) for one in (turns, of_body))
+    return skywards > LEAST_SKYWARDS and ahead < LEAST_SKYWARDS and body.price < camera.price - NEAR
 
 
 def _guesses(turns: F64, expected: str, prices: _Prices, stated: str) -> list[_Guess]:

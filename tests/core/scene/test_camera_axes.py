@@ -63,3 +63,24 @@ def test_axes_are_right_handed_triples_of_directions() -> None:
         assert axes_of(text) is None
         with pytest.raises(BadInputError, match=r"camera\.axes: found .*expected auto, or directions of x, y and z"):
             scene_from("a.toml", {"camera": {"axes": text}})
+
+
+@pytest.mark.parametrize("pitch_deg", [-40.0, -60.0])
+def test_poses_of_a_drone_s_body_ask_for_the_axes(tmp_path: Path, pitch_deg: float) -> None:
+    """As a camera's they need a turned picture and a view up at once; stated axes and a phone need no question."""
+    z_up = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    turns = about(1, np.linspace(0.0, 2.0, 30)) @ about(0, np.radians(pitch_deg))
+    body = z_up @ turns @ np.array(BY_HAND["forward-left-up"], dtype=float).T
+    path = WRITERS["tum"](tmp_path, body @ OPTICAL.T, np.zeros((30, 3)))
+    with pytest.raises(BadInputError, match=r'camera\.axes to "forward-left-up" if .* or to "right-down-forward"'):
+        load(path)
+    assert matrix_from_quat(load(path, axes="forward-left-up").quats) == pytest.approx(turns, abs=1e-6)
+    assert load(path, axes="right-down-forward").quarter == 1
+
+
+@pytest.mark.parametrize("quarter", range(4))
+@pytest.mark.parametrize("pitch_deg", [-60.0, -30.0, 0.0, 15.0])
+def test_a_hand_held_camera_is_not_asked_for_its_axes(tmp_path: Path, quarter: int, pitch_deg: float) -> None:
+    z_up = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    turns = about(1, np.linspace(0.0, 2.0, 30)) @ about(0, np.radians(pitch_deg)) @ about(2, quarter * np.pi / 2)
+    load(WRITERS["tum"](tmp_path, z_up @ turns, np.zeros((30, 3))))
