@@ -198,7 +198,7 @@ def _placed(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Seq
     far_m, far_notes = _far(levelled.places, points @ turn + best, scene.camera)
     away = float(np.hypot(film.eyes[:, 0] - best[0], film.eyes[:, 2] - best[2]).mean())
     notes = (
-        *((f"camera tilted by {tilt:+.0f} degrees on its mount",) if tilt else ()),
+        *((f"camera tilted by {tilt:+.0f} degrees on its mount",) if round(tilt) else ()),
         f"camera set down {away:.1f} m from the avatar, {film.eyes[:, 1].mean() - best[1]:.1f} m over the floor on "
         "average",
         *far_notes,
