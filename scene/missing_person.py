@@ -7,7 +7,7 @@ shows the person most is named; whether it is true only the user knows.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,12 +39,18 @@ RUNS_ANYHOW = "--allow-empty runs it as it is"
 
 
 def require_person(
-    scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], base: Path, footage: Footage | None = None
+    scene: Scene,
+    staged: Staged,
+    bodies: Sequence[ShapedBody],
+    base: Path,
+    footage: Footage | None = None,
+    say: Callable[[str], object] = lambda _: None,
 ) -> None:
     """Raise BadInputError where the recorded camera of `staged` does not show the person; it names a key that helps.
 
     A camera that was placed has to show whole bodies, any other a part of one, in half of the frames, of which
-    some are looked at. The parameters are those of `stage_scene`, and its result.
+    some are looked at. The parameters are those of `stage_scene`, and its result. `say`: function that is given the
+    notes and what is tried, before a refusal's trials, which take up to a minute.
     """
     if not staged.camera.path.recorded:
         return
@@ -56,6 +62,9 @@ def require_person(
     found = f"{what} in the picture in {share:.0%} of the run's frames"
     where = " at the best place" if is_placed else " where it was recorded"
     expected = f"at least {ENOUGH:.0%}"
+    for note in staged.notes:
+        say(note)
+    say(f"camera: {found}{where}; other axes, directions for up and units are tried")
     remedy = _remedy(scene, staged, bodies, base, footage)
     raise BadInputError(f"camera {scene.camera.source}", f"{found}{where}", expected, f"{remedy}; {RUNS_ANYHOW}")
 

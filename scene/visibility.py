@@ -22,6 +22,8 @@ from trilane.shapes import Shape
 
 #: Share of the picture's height below which a person is hard to find, in the median over the frames.
 SMALL = 0.08
+#: Walk over the floor, metres, from which on a small person is small because the camera sees all of it.
+FAR_WALK_M = 10.0
 #: Number of frames that are looked at; of a longer run as many, evenly spread.
 MOST_FRAMES = 300
 
@@ -115,16 +117,27 @@ def seen_notes(camera: Camera, scene: Scene, movers: Sequence[Mover], bodies: Se
     parts += [f"a part of it in {1 - whole - nobody:.0%}"] if round(1 - whole - nobody, 9) else []
     parts += [f"nobody in {nobody:.0%}"] if nobody else []
     parts += [f"{height:.0%} of its height on average"] if nobody < 1 else []
-    return (", ".join(parts), *_hint(scene, seen.height[seen.nobody == 0]))
+    return (", ".join(parts), *_hint(scene, seen.height[seen.nobody == 0], _walked(movers, frames / scene.fps)))
 
 
-def _hint(scene: Scene, heights: F64) -> tuple[str, ...]:
-    """Return a note where `heights` (F,), shares of the picture's height, are small for want of the right unit."""
+def _walked(movers: Sequence[Mover], times_s: F64) -> float:
+    """Return how far apart over the floor the places are where one of the `movers` is at `times_s` (F,), metres."""
+    ways = [[mover.sample(float(t_s))[1] @ mover.world[:3, :3].T for t_s in times_s] for mover in movers]
+    return max(float(np.hypot(*np.ptp(np.array(way)[:, [0, 2]], axis=0))) for way in ways)
+
+
+def _hint(scene: Scene, heights: F64, walked_m: float) -> tuple[str, ...]:
+    """Return a note where `heights` (F,), shares of the picture's height, are small: a long walk, or another unit."""
     is_placed = scene.camera.place == "auto" and not scene.camera.source.startswith(BUILT_IN_PREFIX)
     if not is_placed or not len(heights) or np.median(heights) >= SMALL:
         return ()
+    small = f"the person is only {np.median(heights):.1%} of the picture's height in the median, hard to find"
+    if walked_m >= FAR_WALK_M:
+        return (
+            f"{small}: the camera is set down where it sees a walk of {walked_m:.0f} m; start_s and end_s of the "
+            "avatar choose a part of the motion, and a built-in camera goes along with the person",
+        )
     return (
-        f"the person is only {np.median(heights):.1%} of the picture's height in the median, hard to find: if the "
-        "camera was nearer, its file's unit is smaller than it was taken for (camera.metres_per_unit states it), or "
-        "the columns of its places are in another order",
+        f"{small}: if the camera was nearer, its file's unit is smaller than it was taken for (camera.metres_per_unit "
+        "states it), or the columns of its places are in another order",
     )

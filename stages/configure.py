@@ -108,10 +108,18 @@ def _picture(text: str) -> dict[str, int]:
     return {"width": int(match[1]), "height": int(match[2])}
 
 
-def configure(options: RunOptions, out_dir: Path, gl: GlFacts = gl_facts, *, needs_person: bool = False) -> Checked:
+def configure(
+    options: RunOptions,
+    out_dir: Path,
+    gl: GlFacts = gl_facts,
+    *,
+    needs_person: bool = False,
+    say: Callable[[str], object] = lambda _: None,
+) -> Checked:
     """Check every part of what the options ask for. Raises BadInputError or MissingPartError.
 
     `needs_person`: whether to refuse a recorded camera that does not show the person in half of the frames.
+    `say`: function that is given sentences while such a refusal takes time.
     """
     scene = requested_scene(options)
     if scene.plan == "full":
@@ -132,7 +140,7 @@ def configure(options: RunOptions, out_dir: Path, gl: GlFacts = gl_facts, *, nee
     bodies = [avatars[folder].shaped for folder in folders]
     staged = stage_scene(scene, bodies, Path.cwd(), footage)
     if needs_person:
-        require_person(scene, staged, bodies, Path.cwd(), footage)
+        require_person(scene, staged, bodies, Path.cwd(), footage, say)
     _check_pictures(scene, staged)
     cuts = requested_cuts(options.split, list(networks.values()))
     unit, why = skinning_unit(options.skinning, gl)

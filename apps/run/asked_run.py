@@ -43,7 +43,7 @@ def run_asked(
     options.check_together()
     _require_free(options)
     with early_processes() as (starter, gl):
-        return run_prepared(prepare(options, gl, command), hooks=hooks, starter=starter, gl=gl)
+        return run_prepared(prepare(options, gl, command, hooks), hooks=hooks, starter=starter, gl=gl)
 
 
 def _require_free(options: RunOptions) -> None:
@@ -54,17 +54,29 @@ def _require_free(options: RunOptions) -> None:
         require_free(options.out.absolute())
 
 
-def prepare(options: RunOptions, gl: GlFacts, command: tuple[str, ...] = ()) -> Prepared:
+def prepare(
+    options: RunOptions,
+    gl: GlFacts,
+    command: tuple[str, ...] = (),
+    hooks: Callable[[], AbstractContextManager[Hooks]] | None = None,
+) -> Prepared:
     """Check the options. Raises BadInputError and MissingPartError for what cannot be run.
 
-    `command`: words by which the run was asked for.
+    `command`: words by which the run was asked for. `hooks`: as in `run_asked`; they open to say why a refusal takes
+    time.
     """
+
+    def say(text: str) -> None:
+        if hooks is not None:
+            with hooks() as told:
+                told.message(text)
+
     options.check_together()
     from trilane.apps.run.run_job import Prepared
     from trilane.stages.configure import configure
 
     requested, said = _with_remade_avatar(options) if options.remakes_avatar else (options, ())
-    checked = configure(requested, Path.cwd(), gl, needs_person=not requested.allow_empty)
+    checked = configure(requested, Path.cwd(), gl, needs_person=not requested.allow_empty, say=say)
     if said:
         checked = replace(checked, notes=(*said, *checked.notes))
     if options.check:

@@ -14,7 +14,7 @@ from trilane.scene import rotations as rot
 from trilane.scene.camera.path import CameraPath, one_lens
 from trilane.scene.camera_placement import place_camera
 from trilane.scene.motion.builtin import BUILTIN
-from trilane.scene.motion.motion import Wrap
+from trilane.scene.motion.motion import Motion, Wrap
 from trilane.scene.mover import Mover, make_mover, outline
 from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
 from trilane.scene.visibility import seen_at, seen_notes
@@ -22,6 +22,13 @@ from trilane.scene.visibility import seen_at, seen_notes
 
 def standing(body: ShapedBody, **spec: float) -> Mover:
     return make_mover(AvatarSpec(**spec), BUILTIN["t-pose"](), body)
+
+
+def walking(body: ShapedBody, speed: float) -> Mover:
+    """To the side, 20 seconds long; speed in m/s."""
+    places = np.array([[0.0, 0.0, 0.0], [20 * speed, 0.0, 0.0]])
+    motion = Motion(np.array([0.0, 20.0]), np.zeros((2, 55, 3)), places, None, (), Wrap.HOLD)
+    return make_mover(AvatarSpec(), motion, body)
 
 
 def film(turns: list[F64], places: list[list[float]]) -> CameraPath:
@@ -60,6 +67,18 @@ def test_a_person_of_a_twelfth_of_the_height_gets_a_hint(body: ShapedBody, dista
         assert any("camera.metres_per_unit" in note for note in notes) == said
     unplaced = Scene(camera=CameraSpec(source="a.txt", place="none"))
     assert len(seen_notes(camera, unplaced, [mover], [body])) == 1
+
+
+@pytest.mark.parametrize(("speed", "walk"), [(1.0, False), (1.2, True)])
+def test_a_person_who_is_small_because_they_walk_far_gets_another_hint(
+    body: ShapedBody, speed: float, walk: bool
+) -> None:
+    """In 300 frames at 30 a second 9.97 s pass: 9.97 m at 1 m/s, 11.96 m at 1.2 m/s."""
+    mover, path = walking(body, speed), film([np.eye(3)], [[0.0, 0.9, 40.0]])
+    camera = place_camera(path, Scene(camera=CameraSpec(place="none")), [mover], [body])
+    notes = seen_notes(camera, Scene(camera=CameraSpec(source="a.txt")), [mover], [body])
+    assert any("a walk of 12 m; start_s" in note for note in notes) == walk
+    assert any("camera.metres_per_unit" in note for note in notes) != walk
 
 
 def test_all_frames_of_the_run_count(body: ShapedBody) -> None:
