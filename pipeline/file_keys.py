@@ -97,9 +97,9 @@ class Arrivals(Keys):
 class RunKeys(Keys):
     """The table [run]."""
 
-    fps: Rate | None = Field(default=None, description="Frames a second that the source gives, under each policy.")
+    fps: Rate | None = Field(default=None, description="Frames a second that the source gives, under every policy.")
     arrivals: Arrivals | None = Field(
-        default=None, description="`{ poisson = RATE }` instead of fps: a source without a beat, for queues."
+        default=None, description="`{ poisson = RATE }` instead of fps: frames come at random moments, for queues."
     )
     policy: Annotated[str, one_of(*POLICIES)] = Field(
         default="pipelined",
@@ -108,9 +108,11 @@ class RunKeys(Keys):
     edge: EdgeRule | None = Field(
         default=None,
         description="Rule of each stream that [edges] does not name: single, double, triple, fifo:N or orphan:N. "
-        "Without it double, and more where branches meet.",
+        "If absent: double, and fifo:N where branches meet.",
     )
-    in_flight: int = Field(default=0, ge=0, le=1000, description="Most frames on their way at once; 0: no limit.")
+    in_flight: int = Field(
+        default=0, ge=0, le=1000, description="Largest number of frames in the pipeline at once; 0: no limit."
+    )
     in_queue: int = Field(
         default=0,
         ge=0,
@@ -119,7 +121,7 @@ class RunKeys(Keys):
         "further frames are turned away. 0: no limit.",
     )
     latency_to: str = Field(
-        default="", description="Stage at whose end the latency ends; without it the last one that nobody reads."
+        default="", description="Stage at whose end the latency ends; if absent, the last stage that no stage reads."
     )
     frames: int | None = Field(default=None, ge=1, le=MOST_FRAMES, description="Frames of a run.")
 
@@ -128,12 +130,12 @@ class UnitKeys(Keys):
     """A unit in the table [units]."""
 
     hardware: Annotated[str, one_of(*UNITS)] | None = Field(
-        default=None, description="Unit of a hardware profile that it is: cpu, gpu or dsp; without it that of its name."
+        default=None, description="Unit of the hardware profile: cpu, gpu or dsp; if absent, the one of the same name."
     )
     cores: Annotated[tuple[Annotated[int, Field(ge=0, le=4095)], ...], BeforeValidator(_as_tuple)] | None = Field(
-        default=None, min_length=1, description="Cores of this machine that it may use, such as [0, 1]."
+        default=None, min_length=1, description="Cores of this machine that the unit may use, such as [0, 1]."
     )
-    threads: int | None = Field(default=None, ge=1, le=4096, description="Threads that it may use.")
+    threads: int | None = Field(default=None, ge=1, le=4096, description="Number of threads that the unit may use.")
 
 
 @dataclass(frozen=True)
@@ -201,17 +203,17 @@ class StageInput:
 class InputKeys(Keys):
     """An input that is written as a table."""
 
-    source: str = Field(alias="from", description="Stage, or stage.port, that it reads.")
+    source: str = Field(alias="from", description="Stage, or stage.port, that the input reads.")
     sync: Literal["frame", "latest"] = Field(
         default="frame",
-        description="frame: the same frame as the other inputs; latest: the newest that there is.",
+        description="frame: the same frame as the other inputs; latest: the newest frame that there is.",
     )
     max_age_ms: float | None = Field(
         default=None,
         gt=0,
         le=LONGEST_MS,
         allow_inf_nan=False,
-        description="Age from which on the newest frame counts as absent; only beside sync = 'latest'.",
+        description="If the newest frame is older than this, there is no frame; only with sync = 'latest'.",
     )
 
     @model_validator(mode="after")
@@ -253,13 +255,13 @@ class StageTime(Keys):
     `sd` stands beside `mean`, `name` beside `source`, which `pipeline_file.py` replaces by the times of that file.
     """
 
-    mean: float | None = Field(default=None, ge=0, le=LONGEST_MS, allow_inf_nan=False, description="Mean, ms.")
+    mean: float | None = Field(default=None, ge=0, le=LONGEST_MS, allow_inf_nan=False, description="Mean time, ms.")
     sd: float = Field(
         default=0.0,
         ge=0,
         le=LONGEST_MS,
         allow_inf_nan=False,
-        description="Standard deviation beside mean, ms; times are lognormal.",
+        description="Standard deviation, ms, with the key mean; times are lognormal.",
     )
     exponential: float | None = Field(
         default=None, ge=0, le=LONGEST_MS, allow_inf_nan=False, description="Mean of exponential times, ms."
@@ -268,13 +270,13 @@ class StageTime(Keys):
         tuple[Annotated[float, Field(ge=0, le=LONGEST_MS, allow_inf_nan=False)], ...], BeforeValidator(_as_tuple)
     ] = Field(default=(), description="Measured times, ms; each frame draws one of them.")
     source: InsidePath | None = Field(
-        default=None, alias="from", description="File of another tool in this folder that has the times."
+        default=None, alias="from", description="File of another tool with the times, in this folder."
     )
     name: str | None = Field(
         default=None,
         min_length=1,
         max_length=300,
-        description="Measurement of that file, as `trilane times` names it; without it the only run.",
+        description="Name of the measurement in the file, as `trilane times` shows it; if absent, the only run.",
     )
 
     @model_validator(mode="before")
@@ -363,20 +365,22 @@ class StageKeys(Keys):
     kind: ClassVar[str]
     in_ports: ClassVar[Mapping[str, bool] | None] = None
 
-    unit: str = Field(pattern=NAME, description="Unit that does it; a name of your choice.")
+    unit: str = Field(pattern=NAME, description="Unit that runs the stage; a name of your choice.")
     inputs: tuple[StageInput, ...] = Field(
-        default=(), alias="in", description="Its inputs: a stage, stage.port, or a table of ports."
+        default=(), alias="in", description="Inputs of the stage: a stage, stage.port, or a table of ports."
     )
-    every: int = Field(default=1, ge=1, le=1000, description="3: it takes the first frame, the fourth and so on.")
+    every: int = Field(
+        default=1, ge=1, le=1000, description="3: the stage takes the first frame, the fourth, and so on."
+    )
     out: Annotated[dict[str, PortType] | None, BeforeValidator(_ports)] = Field(
         default=None,
-        description="What it writes: a type and sizes, such as 'u8 256x256x3', or a table of ports.",
+        description="Output of the stage: a type and sizes, such as 'u8 256x256x3', or a table of ports.",
     )
     stateful: bool = Field(
-        default=False, description="Whether it remembers frames, so that it is never called out of order."
+        default=False, description="Whether the stage remembers frames; if so, it gets the frames in order."
     )
     scale: dict[str, Annotated[float, Field(gt=0, le=1e4, allow_inf_nan=False)]] = Field(
-        default={}, description="How many times longer it takes on a chip than here, such as { snapdragon-888 = 2.1 }."
+        default={}, description="How many times longer a job takes on a chip than here: { snapdragon-888 = 2.1 }."
     )
     time_ms: StageTime | None = Field(
         default=None,
@@ -408,12 +412,12 @@ class OnnxStage(StageKeys):
     """A network."""
 
     kind = "onnx"
-    onnx: InsidePath = Field(description="Network, an ONNX file in this folder.")
+    onnx: InsidePath = Field(description="ONNX file of the network, in this folder.")
     precision: Annotated[str, one_of("int8", "fp16", "fp32")] | None = Field(
-        default=None, description="int8, fp16 or fp32 on a chip; as the network says and its unit has it."
+        default=None, description="int8, fp16 or fp32 on a chip; if absent, the network and its unit decide."
     )
     runtime: Annotated[str, one_of(*RUNTIMES)] = Field(
-        default="ort", description="What computes it on this machine: ort, openvino, qnn or cuda."
+        default="ort", description="Runtime of the network on this machine: ort, openvino, qnn or cuda."
     )
     shapes: dict[str, Annotated[tuple[int, ...], BeforeValidator(_sizes)]] = Field(
         default={}, description="Sizes of inputs that the file leaves open: `{ image = '1x3x224x224' }`."
@@ -425,7 +429,7 @@ class PythonStage(StageKeys):
 
     kind = "python"
     python: str = Field(pattern=FACTORY, description="`module:factory`, a module in this folder or an installed one.")
-    settings: dict[str, Any] = Field(default={}, description="What the factory is called with.")
+    settings: dict[str, Any] = Field(default={}, description="Argument with which the factory is called.")
 
 
 class BlockStage(StageKeys):
@@ -450,7 +454,7 @@ class VideoBlock(BlockStage):
     writes_one = True
     in_ports = {}
     path: InsidePath = Field(description="A video, a folder of pictures, or the number of a camera.")
-    size: Size = Field(description=f"{SIZE_HELP}; pictures are scaled to it.")
+    size: Size = Field(description=f"{SIZE_HELP}; pictures are scaled to this size.")
 
     @property
     def is_camera(self) -> bool:
@@ -458,23 +462,23 @@ class VideoBlock(BlockStage):
 
 
 class PrepareBlock(BlockStage):
-    """Makes of a picture what a network expects."""
+    """Turns a picture into the input that a network expects."""
 
     writes_one = True
     in_ports = {"": True}
-    like: str = Field(pattern=NAME, description="Network stage for whose input it prepares.")
+    like: str = Field(pattern=NAME, description="Stage of the network for whose input the picture is prepared.")
     port: str = Field(default="", description="Input of that network, if it has several.")
     fit: Literal["stretch", "letterbox", "crop"] = Field(
         default="stretch", description="How a picture gets another shape: stretch, letterbox or crop."
     )
     layout: Literal["nchw", "nhwc"] | None = Field(
-        default=None, description="nchw or nhwc; without it as the network's input looks."
+        default=None, description="nchw or nhwc; if absent, the layout of the network's input."
     )
     mean: Annotated[tuple[float, ...], BeforeValidator(_as_tuple)] | None = Field(
-        default=None, description="Mean of each channel that is subtracted, of values from 0 to 1."
+        default=None, description="Mean of each channel, which is subtracted; values are from 0 to 1."
     )
     sd: Annotated[tuple[float, ...], BeforeValidator(_as_tuple)] | None = Field(
-        default=None, description="Standard deviation of each channel by which it is divided."
+        default=None, description="Standard deviation of each channel, by which the channel is divided."
     )
     step: float | None = Field(
         default=None, gt=0, allow_inf_nan=False, description="Step of quantised numbers (their scale)."
@@ -483,11 +487,11 @@ class PrepareBlock(BlockStage):
 
 
 class OverlayBlock(BlockStage):
-    """Draws on a picture what networks found."""
+    """Draws the outputs of networks on a picture."""
 
     writes_one = True
     in_ports = {"frame": True, "mask": False, "depth": False, "boxes": False}
-    alpha: float = Field(default=0.5, ge=0, le=1, description="Weight of what is drawn, 0 to 1.")
+    alpha: float = Field(default=0.5, ge=0, le=1, description="Opacity of the drawing, 0 to 1.")
 
 
 class EncodeBlock(BlockStage):
@@ -502,9 +506,9 @@ class DiscardBlock(BlockStage):
 
 
 class BusyBlock(BlockStage):
-    """A load that is made up."""
+    """An artificial load."""
 
-    load_ms: float = Field(ge=0, le=LONGEST_MS, allow_inf_nan=False, description="How long it works, ms.")
+    load_ms: float = Field(ge=0, le=LONGEST_MS, allow_inf_nan=False, description="How long a job works, ms.")
 
     @property
     def own_time(self) -> StageTime | None:

@@ -97,12 +97,12 @@ class RunOptions(Options):
     )
     changes: Annotated[Texts, Option("--set")] = Field(
         default=(),
-        description="Change a key of a pipeline file, such as stages.seg.unit=dsp, or several with commas. "
+        description="Change a key of a pipeline file: stages.seg.unit=dsp. Separate several keys by commas. "
         "May be given again.",
     )
     motion: Text | None = Field(default=None, description="Motion: .bvh, .npz, .npy, .pkl, or builtin:NAME.")
-    camera: Text | None = Field(default=None, description="ARKit log, TUM, transforms.json, or builtin:NAME.")
-    background: Text | None = Field(default=None, description="room, or a video, image folder or picture.")
+    camera: Text | None = Field(default=None, description="Camera: ARKit log, TUM, transforms.json, or builtin:NAME.")
+    background: Text | None = Field(default=None, description="Background: room, or a video, image folder or picture.")
     avatar: Annotated[Text | None, Option(offered=())] = Field(default=None, description=AVATARS_HELP)
     width: int | None = Field(
         default=None, ge=1, le=256, description=f"{WIDTH_HELP} A width other than the avatar's is untrained."
@@ -117,16 +117,16 @@ class RunOptions(Options):
         "(5 views if not given).",
     )
     frames: Annotated[int | None, Option(unit="frames")] = Field(
-        default=None, description="Number of frames; the scene's if not given."
+        default=None, description="Number of frames; the scene's number if not given."
     )
     fps: Finite | None = Field(default=None, description="Frames a second of the scene's time, and of the video.")
     picture: str | None = Field(default=None, description="Size of the picture in pixels: WIDTHxHEIGHT.")
     size: Annotated[Text | None, Option(offered=("auto", "96", "128", "192", "256", "384", "512"))] = Field(
-        default=None, description=f"{SIZE_HELP} auto: the size at which the network paints best."
+        default=None, description=f"{SIZE_HELP} auto: the size at which the pictures are best."
     )
     allow_empty: Annotated[bool, Option("--allow-empty")] = Field(
         default=False,
-        description="Run also where a recorded camera shows the whole person in less than half of the frames.",
+        description="Run even if a recorded camera shows the whole person in less than half of the frames.",
     )
     hud: bool | None = Field(default=None, description="Write frame number, rate and latency on the picture.")
     policy: Annotated[str, Option(words=tuple(POLICIES), offered=tuple(POLICIES))] = Field(
@@ -154,37 +154,37 @@ class RunOptions(Options):
     )
     cores: Annotated[tuple[str, ...], BeforeValidator(_cores)] = Field(
         default=(),
-        description="UNIT=LIST: the unit's cores, such as dsp=0,1; once for each unit. If not given, measured "
-        "times decide.",
+        description="UNIT=LIST: the unit's cores, such as dsp=0,1; once for each unit. Without this option, "
+        "measured times decide which cores each unit gets.",
     )
-    profile: Text | None = Field(default=None, description=f"{PROFILE_HELP} For --pace.")
+    profile: Text | None = Field(default=None, description=f"{PROFILE_HELP} Only with --pace.")
     pace: Annotated[bool, Option("--pace")] = Field(
-        default=False, description="Hold each job until its modelled time has passed."
+        default=False, description="After its work, each job waits until its modelled time has passed."
     )
     slow_motion: Finite = Field(default=1.0, description="With --pace: how many times slower than the chip the run is.")
     latch_ms: Annotated[Finite, Option("--latch", unit="milliseconds")] = Field(
         default=0.0,
         ge=0,
         le=1000,
-        description="Sample poses late, so that they are ready this many ms before the raster; 0: at once.",
+        description="Sample poses late: a pose is ready this many ms before the raster; 0: sample at once.",
     )
     performance_profile: Annotated[
         str | None,
         Option(words=PERFORMANCE_PROFILES, offered=(NOTHING, *PERFORMANCE_PROFILES)),
     ] = Field(default=None, description="Power mode of the units, which sets their speed. The names are SNPE's.")
     baseline_frames: Annotated[int, Option("--baseline", unit="frames")] = Field(
-        default=60, ge=0, description="Frames of a second, `sequential` run for comparison; 0: no such run."
+        default=60, ge=0, description="Number of frames of a further run, `sequential`, for comparison; 0: no such run."
     )
     check: Annotated[int, Option(unit="frames")] = Field(
         default=0,
         ge=0,
         le=1000,
-        description="Frames to compare with the truth or the float path after the run; 0: none.",
+        description="Number of frames to compare with the truth or the float path after the run; 0: none.",
     )
     out: Annotated[Path | None, BeforeValidator(_folder)] = Field(
         default=None, description="Run folder to write; runs/TIME-SCENE if not given."
     )
-    video: bool = Field(default=True, description="Encode the frames to a video; switch this off for long runs.")
+    video: bool = Field(default=True, description="Encode the frames as a video; switch this off for long runs.")
 
     @property
     def remakes_avatar(self) -> bool:

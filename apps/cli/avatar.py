@@ -89,7 +89,7 @@ def create(
 def levels(name: AvatarArgument, json: JsonOption = False) -> None:
     """Make coarser levels of an avatar's mesh, and write them into its folder. A distant avatar has fewer triangles.
 
-    It takes minutes. `trilane avatar inspect` shows the levels.
+    The command takes minutes. `trilane avatar inspect` shows the levels.
     """
     from trilane.avatars.bundle import load_bundle
 
@@ -106,7 +106,7 @@ def levels(name: AvatarArgument, json: JsonOption = False) -> None:
 
 @app.command("create-data", epilog=EPILOG_CREATE_DATA)
 def create_data(
-    folder: Annotated[Path, typer.Argument(help="Folder to write; it must not be there yet, or be empty.")],
+    folder: Annotated[Path, typer.Argument(help="Folder to write; a folder that exists must be empty.")],
     frames: Annotated[int, typer.Option(min=4, max=MOST_FRAMES, help="Number of frames, from all sides.")] = 120,
     picture: Annotated[str, typer.Option(help="Size of a frame in pixels: WIDTHxHEIGHT.")] = "1280x720",
     seed: Annotated[int, typer.Option(min=0, help="Seed of poses, views and noise.")] = 1,

@@ -90,7 +90,7 @@ def network(
 def split(
     name: AvatarArgument,
     at: Annotated[
-        list[str] | None, typer.Option(help="Quantised tensor to cut at, once for each cut; all are listed if none.")
+        list[str] | None, typer.Option(help="Quantised tensor to cut at, once for each cut; if none, all are listed.")
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder to write part-1.onnx, part-2.onnx, ... to.")] = None,
     size: FixedSizeOption = "256",
@@ -123,7 +123,7 @@ def export(
     ] = False,
     soc: Annotated[str, typer.Option(help="Qualcomm's name of the chip.")] = "sm8350",
     size: Annotated[
-        str | None, typer.Option(help="HEIGHTxWIDTH of the tensor; the avatar's own when not given.")
+        str | None, typer.Option(help="HEIGHTxWIDTH of the tensor; if not given, the avatar's own size.")
     ] = None,
     json: JsonOption = False,
 ) -> None:
@@ -224,7 +224,7 @@ def quantise(
     report: Annotated[Path | None, typer.Option(help="Write the error of every layer, worst first, as JSON.")] = None,
     json: JsonOption = False,
 ) -> None:
-    """Quantise a float network to bytes in, bytes out, calibrated on real frames."""
+    """Quantise a float network, calibrated on real frames; input and output are bytes."""
     from trilane.apps.avatar.assembled_avatar import network_facts
     from trilane.avatars.network_file import parse_network
     from trilane.training.quantising.quantise import equalised

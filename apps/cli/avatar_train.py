@@ -70,13 +70,13 @@ def train(
         Path | None, typer.Option(help="Settings (training.toml), such as an avatar's own; options override them.")
     ] = None,
     minutes: Annotated[
-        float, typer.Option(help="Minutes of training; drawing the samples before takes some more.")
+        float, typer.Option(help="Minutes of training; to draw the samples first takes some more.")
     ] = 60.0,
     steps: Annotated[int | None, typer.Option(help="Number of training steps, in place of a time.")] = None,
     samples: Annotated[int, typer.Option(help="Views of the frames to train on.")] = 4000,
     seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 1,
     threads: Annotated[
-        int, typer.Option(help="Threads of PyTorch, and processes that draw; only 1 gives the same bits again.")
+        int, typer.Option(help="Threads of PyTorch, and drawing processes; only with 1 are the bits the same again.")
     ] = 1,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda; auto is an NVIDIA GPU if there is one.")] = "auto",
     start: Annotated[
@@ -84,7 +84,7 @@ def train(
     ] = "default",
     width: Annotated[int, typer.Option(help="Width of a new network; 64 is full.")] = 16,
     loss: Annotated[
-        str, typer.Option(help="default: the default avatar's; thesis: L1, Dice, perceptual, GAN.")
+        str, typer.Option(help="default: the default avatar's loss; thesis: L1, Dice, perceptual, GAN.")
     ] = "default",
     vgg: Annotated[
         Path | None, typer.Option(help="VGG-16 weights (.pth, .safetensors) for the perceptual loss; else MS-SSIM.")
@@ -215,17 +215,17 @@ def validate(
     name: AvatarArgument,
     held_out: Annotated[
         list[str] | None,
-        typer.Option(help="Motion that no training used: builtin:NAME or a file. Repeat it; walk-wave-turn if none."),
+        typer.Option(help="Motion that no training used: builtin:NAME or a file. Repeat it; if none, walk-wave-turn."),
     ] = None,
     seed: Annotated[
-        list[int] | None, typer.Option(min=0, help="Seed of views and poses. Repeat it; 1 to 8 if none.")
+        list[int] | None, typer.Option(min=0, help="Seed of views and poses. Repeat it; if none, 1 to 8.")
     ] = None,
     per_band: Annotated[
         int, typer.Option(min=1, max=1000, help="Views of each band of distances, for each seed.")
     ] = 24,
     runtime: Annotated[
         list[str] | None,
-        typer.Option(help="ort, openvino, qnn or cuda. Repeat it; ort, and openvino where installed, if none."),
+        typer.Option(help="ort, openvino, qnn or cuda. Repeat it; if none, ort, and openvino if installed."),
     ] = None,
     size: Annotated[str, typer.Option(help=SIZE_HELP)] = "256",
     float_network: Annotated[

@@ -25,7 +25,7 @@ from trilane.stages.run_options import RUNTIME_HELP, SIZE_HELP, WIDTH_HELP
 BENCHES = {
     "raster": ("trilane.bench.raster", "One packed pass against a pass for every four channels and a permute."),
     "readback": ("trilane.bench.readback", "Variants of moving pixels between GPU and slot."),
-    "several": ("trilane.bench.several", "What an avatar loses to others in the same tensor."),
+    "several": ("trilane.bench.several", "Image quality that an avatar loses because others share its tensor."),
     "filters": ("trilane.bench.filters", "MIP maps and anisotropy of the neural texture: cost and difference."),
     "infer": ("trilane.bench.infer", "A network, run continuously, on each runtime and in FP32."),
     "peers": ("trilane.bench.peers", "Trilane's runtimes beside the libraries' own examples and benchmark_app."),
@@ -33,7 +33,7 @@ BENCHES = {
     "pipeline": ("trilane.bench.pipeline", "Efficiency, idleness and gain of policies, edges and cores."),
     "placement": (
         "trilane.bench.placement",
-        "Every placement of the units on the cores, beside the one that is chosen.",
+        "Every placement of the units on the cores, compared with the chosen placement.",
     ),
     "scenario": ("trilane.bench.scenario", "MLPerf's load patterns, evaluated here and by MLCommons LoadGen."),
     "handoff": ("trilane.bench.handoff", "A slot from process to process, beside pickling, copying and iceoryx2."),
@@ -46,7 +46,7 @@ BENCHES = {
     "sizes": ("trilane.apps.experiments.error_by_size", "What a speed costs in image error, by size and runtime."),
     "flicker": (
         "trilane.apps.experiments.flicker",
-        "How restless the error is, by runtime, calibration and texture filter.",
+        "How much the error changes from frame to frame, by runtime, calibration and texture filter.",
     ),
 }
 METAVARS: dict[type, str] = {int: "N", float: "X", str: "TEXT"}
@@ -67,7 +67,7 @@ DRIVER_THREADS = "Threads of the software OpenGL driver."
 MEANINGS = {
     "avatar": "`default`, `hiker`, the folder of an avatar, or `resnet18`: the full-width network, untrained.",
     "avatars": "How many avatars share the tensor.",
-    "beside": "A second avatar, run at the same time and set beside the virtual clock.",
+    "beside": "A second avatar, which runs at the same time; both runs are compared with virtual time.",
     "beside_size": "Tensor size of the second avatar in pixels: HEIGHTxWIDTH, or a side.",
     "batch": "Frames inferred at once.",
     "calibration": "Network of the avatar: as-it-is, or quantised again by minmax, percentile or entropy.",
@@ -84,8 +84,8 @@ MEANINGS = {
     "handoff frames": "Hand-overs in each round, of each variant and size.",
     "judge": "Evaluator of the run: trilane or loadgen.",
     "kib": "Size of the slot in KiB: 256, 1024, 4096 or 16384.",
-    "limit_ms": "Longest latency of the server scenario that counts as in time.",
-    "finalists": "How many of the fastest placements are measured again; the chosen one and the rule's always are.",
+    "limit_ms": "Longest latency that counts as in time, in the server scenario.",
+    "finalists": "How many of the fastest placements are measured again, besides the chosen and the rule's placement.",
     "further": "Rounds in which only the finalists are measured, after the rounds of all placements.",
     "placement frames": "Frames of each whole run, at least 20.",
     "placement runs": "Whole runs of the chosen placement and of the rule's.",
@@ -93,7 +93,7 @@ MEANINGS = {
     "minutes": "Virtual minutes.",
     "network": "An .onnx file or an avatar, at its own size; if none, one of --encoder, --norm, --width and --size.",
     "norm": NORM_HELP,
-    "period": "Seconds that one runtime runs before the next one does.",
+    "period": "Seconds for which a runtime runs before the next runtime's turn.",
     "policy": POLICY_HELP,
     "rate": "Queries a second of the server scenario.",
     "repeats": "How often each variant runs.",

@@ -35,14 +35,14 @@ FileArgument = Annotated[
     str, typer.Argument(help="Pipeline file (.toml, docs/pipeline-file.md), or a scene: a name or a file.")
 ]
 ProfileOption = Annotated[
-    str | None, typer.Option("--profile", help="Of a scene: chip whose times the stages have, such as snapdragon-888.")
+    str | None, typer.Option("--profile", help="For a scene: chip whose times the stages have, such as snapdragon-888.")
 ]
 SvgOption = Annotated[Path | None, typer.Option("--svg", help="Draw the graph here (.svg).")]
 
 
 @app.command(epilog=EPILOG)
 def check(file: FileArgument, svg: SvgOption = None, profile: ProfileOption = None, json: JsonOption = False) -> None:
-    """Check a pipeline file and print its graph, the shortest period with the cycle that sets it, and its memory.
+    """Check a pipeline file and print its graph, its shortest period, what determines the period, and its memory.
 
     For a scene, the command prints the pipeline file of its run. Nothing runs, and no Python of the file is imported.
     """

@@ -61,7 +61,7 @@ FailIfOption = Annotated[
     list[str] | None,
     typer.Option(
         "--fail-if",
-        help="Exit with 1 if this limit is surely broken, with 4 if it cannot be told: slower=5%. May be given again.",
+        help="Limit, such as slower=5%. Exit code 1: surely broken; 4: undecided. May be given again.",
     ),
 ]
 SlowerOption = Annotated[
@@ -87,9 +87,10 @@ def compare(
 ) -> None:
     """Say what differs between runs, by how much, how sure that is, and the likely cause.
 
-    Each figure of OTHER stands beside the figure of BASE, with a 95 % interval. With --fail-if the command is a gate: 0
-    means no worse, 1 worse, and 4 that nobody can tell. It then says how many runs would tell. A disturbed run never
-    passes. Two sweeps are compared by trials of equal configuration. docs/compare.md explains the method.
+    Each figure of OTHER stands beside the figure of BASE, with a 95 % interval. With --fail-if the command is a gate.
+    Exit code 0 means no worse, 1 worse, and 4 undecided. With 4, the output says how many runs are needed.
+    A disturbed run never passes. In two sweeps, trials of equal configuration are compared.
+    docs/compare.md explains the method.
     """
     gates = _gates(fail_if or [], fail_if_slower)
     if github and not gates:

@@ -54,7 +54,7 @@ def explain(
 ) -> None:
     """Say where the time of a run went.
 
-    It shows the stage or wait that bounded the run, why jobs waited, and why the slowest frames were slow
+    The output is the stage or wait that bounded the run, why jobs waited, and why the slowest frames were slow
     (docs/explain.md). `trilane plan` explains a scene before it runs.
     """
     from trilane.apps.explain.explained_run import check_ending, explain_run, write_jobs

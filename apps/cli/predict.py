@@ -55,10 +55,10 @@ def predict(options: PredictOptions, *, json: JsonOption = False) -> None:
 
     Without options: the avatar, policy and edge of `trilane run`. With --encoder, --norm, --size or --channels: the
     published application with such a network. With --network: each network by itself, or with --application in the
-    avatar's place. With a pipeline file: that pipeline, by the times of its stages (docs/pipeline-file.md).
+    avatar's place. With a pipeline file: this pipeline, from the times of its stages (docs/pipeline-file.md).
 
-    Without --performance-profile, a network by itself has the profile burst, because published latencies have it. The
-    profile `host` (this machine) has it too, because a run here has no cap.
+    Without --performance-profile, a network by itself runs under burst, because published latencies do. On the profile
+    `host` (this machine), everything runs under burst, because a run here has no cap.
     """
     from trilane.hw_profiles.profile_files import load_runnable
 

@@ -124,18 +124,18 @@ def check(
 def fit(
     source: Annotated[Path, typer.Option("--from", help="CSV of measured rows (docs/predict.md).")],
     profile: Annotated[
-        str | None, typer.Option(help="Profile whose numbers are the priors; one of the 888 if not given.")
+        str | None, typer.Option(help="Profile whose numbers are the priors; if not given, one of the 888.")
     ] = None,
     name: Annotated[
-        str | None, typer.Option(help="Name of the fitted profile; calibrated or snapdragon-888 if not given.")
+        str | None, typer.Option(help="Name of the fitted profile; if not given, calibrated or snapdragon-888.")
     ] = None,
     write: Annotated[Path | None, typer.Option(help="Write the fitted profile here.")] = None,
-    networks: Annotated[Path | None, typer.Option(help="Folder of the networks; that of the CSV if not given.")] = None,
+    networks: Annotated[Path | None, typer.Option(help="Folder of the networks; if none, the CSV's folder.")] = None,
     json: JsonOption = False,
 ) -> None:
-    """Fit a profile to measured rows; print residuals and the error on rows left out.
+    """Fit a profile to measured rows; print residuals and the error for rows left out of the fit.
 
-    Rows `network, ms` move a chip's profile towards them; rows of the reference networks fit efficiencies.
+    Rows `network, ms` fit the numbers of a chip's profile; rows of the reference networks fit efficiencies.
     """
     from trilane.hw_profiles.calibrate import calibrate, is_own_table, read_own_rows
     from trilane.hw_profiles.fit import as_toml, fit_profile
@@ -184,9 +184,9 @@ def _counted(result: ProfileFit | Calibrated) -> str:
 )
 def fit_chips(
     folder: Annotated[Path, typer.Argument(help="Folder with chip_rows.csv, networks.csv and networks/.")],
-    write: Annotated[Path | None, typer.Option(help="Folder of profiles, into which the numbers go.")] = None,
+    write: Annotated[Path | None, typer.Option(help="Folder of profiles, which receive the numbers.")] = None,
     table: Annotated[Path | None, typer.Option(help="Markdown file in which the table of errors is renewed.")] = None,
-    plot: Annotated[Path | None, typer.Option(help="Picture of predicted against published times.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Picture to write: predicted times over published times.")] = None,
 ) -> None:
     """Fit tensor engines to published latencies: shared terms, six numbers a chip, and how far off both are."""
     from trilane.hw_profiles.engine_study import as_markdown, plot_errors, profile_texts, study_engines, with_table

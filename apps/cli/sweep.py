@@ -71,7 +71,7 @@ ResumeOption = Annotated[bool, typer.Option("--resume", help="Resume a sweep tha
 FolderOption = Annotated[Path | None, typer.Option("--out", help="Folder of the sweep; sweeps/NAME-HASH if not given.")]
 
 ListOption = Annotated[
-    bool, typer.Option("--list", help="Combine the first values of all axes, then the second ones, and so on.")
+    bool, typer.Option("--list", help="Combine the first values of all axes, then the second values, and so on.")
 ]
 
 RandomOption = Annotated[
@@ -97,9 +97,9 @@ def sweep(
 ) -> None:
     """Try many configurations of run, predict, quality or a bench, and keep every result.
 
-    Every combination of the axes is a trial, which is a process. Its line in trials.jsonl has the command's whole
-    --json document. Trials on the host clock run one at a time, predictions on all cores. Finished trials are not
-    repeated. docs/sweeps.md says more.
+    Every combination of the axes is a trial, which runs in its own process. The trial's line in trials.jsonl has the
+    command's whole --json document. Trials on the host clock run one at a time, predictions on all cores. Finished
+    trials are not repeated. docs/sweeps.md says more.
     """
     if words[0].endswith(ENDING):
         name, definition, command = of_file(words, as_list, random, seed)

@@ -37,14 +37,16 @@ BARS, WIDTH = " ▁▂▃▄▅▆▇█", 24
 MOST_ROWS = 40
 
 FilesArgument = Annotated[
-    list[Path], typer.Argument(help="Files of other tools; what each is follows from its content.")
+    list[Path], typer.Argument(help="Files of other tools. The kind of each file is recognised by its content.")
 ]
-NameOption = Annotated[str, typer.Option(help="Measurement that --stage or --rows takes; the only run if not given.")]
-StageOption = Annotated[str | None, typer.Option(help="Write it as the time of a stage, FILE.toml:STAGE.")]
-RowsOption = Annotated[Path | None, typer.Option(help="Add it to this table for `trilane profiles fit` (.csv).")]
-NetworkOption = Annotated[str | None, typer.Option(help="Network that was measured, a path beside the table.")]
-HardwareOption = Annotated[str, typer.Option(help="Unit that ran it: cpu, gpu or dsp.")]
-PrecisionOption = Annotated[str, typer.Option(help="int8, fp16 or fp32.")]
+NameOption = Annotated[str, typer.Option(help="Measurement for --stage or --rows; if not given, the only run.")]
+StageOption = Annotated[str | None, typer.Option(help="Write the measurement as the time of a stage, FILE.toml:STAGE.")]
+RowsOption = Annotated[
+    Path | None, typer.Option(help="Add the measurement to this table for `trilane profiles fit` (.csv).")
+]
+NetworkOption = Annotated[str | None, typer.Option(help="Measured network: its path from the folder of the table.")]
+HardwareOption = Annotated[str, typer.Option(help="Unit that ran the network: cpu, gpu or dsp.")]
+PrecisionOption = Annotated[str, typer.Option(help="Precision of the network: int8, fp16 or fp32.")]
 RuntimeOption = Annotated[str, typer.Option(help="Runtime of a tensor engine: tflite or qnn_dlc.")]
 CsvOption = Annotated[Path | None, typer.Option("--csv", help="File for every single time (.csv).")]
 
@@ -62,7 +64,7 @@ def times(
     samples: CsvOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Read measurements of other tools, say what each is, and refuse implausible ones. The formats:
+    """Read measurements of other tools, say what each time contains, and refuse rows that cannot be right. The formats:
 
     QNN profiles, QHAS, ONNX Runtime, benchmark_model, LoadGen and MLPerf's app, TensorRT, AI Hub, ExecuTorch, Perfetto.
     """

@@ -72,9 +72,11 @@ AxisOption = Annotated[
     list[str] | None, typer.Option("--axis", help="Values of an option, such as size=128,192,256. Repeat it.")
 ]
 
-ChipOption = Annotated[str | None, typer.Option("--on", help="Tune predictions for this hardware profile.")]
+ChipOption = Annotated[
+    str | None, typer.Option("--on", help="Search by predictions for this hardware profile, not by runs.")
+]
 
-TrialsOption = Annotated[int, typer.Option("--trials", min=1, help="Configurations to try.")]
+TrialsOption = Annotated[int, typer.Option("--trials", min=1, help="Number of configurations to try.")]
 
 SeedOption = Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of the search.")]
 
@@ -83,7 +85,7 @@ ShortOption = Annotated[
     typer.Option(
         "--short",
         min=1,
-        help="With run: begin each trial with a run of this many frames, and end it early if it is below the median.",
+        help="With run: begin each trial with a run of this many frames; end it if this run is below the median.",
     ),
 ]
 
@@ -108,9 +110,9 @@ def tune(
 ) -> None:
     """Search the axes of a sweep for the fastest configuration within given limits.
 
-    Prints the best one and its figures, the command that runs it, the frontier, and what was not tried. It writes the
-    folder of a sweep: trilane report shows it, and trilane sweep --resume runs the trials that are left. Exit code 1
-    if no configuration keeps the limits. docs/tune.md says more.
+    The output is the best configuration with its figures and its command, the frontier, and what was not tried. The
+    command writes the folder of a sweep: trilane report shows this folder, and trilane sweep --resume runs the trials
+    that are left. The exit code is 1 if no configuration keeps the limits. docs/tune.md says more.
     """
     from trilane.apps.sweep.tuner import Aim, Search, keep_of
 

@@ -71,8 +71,8 @@ def watch(
 ) -> None:
     """Show how busy the units of a run are, its frame time and latency, queues, drops, heat and error.
 
-    It ends with the run, or with Ctrl-C. A finished run is shown as it ended. If stdout is no terminal, each update is
-    a line.
+    The command ends with the run, or with Ctrl-C. For a finished run, the last figures are shown. If stdout is no
+    terminal, each update is a line.
     """
     from trilane.apps.watch.followed_run import follow
     from trilane.apps.watch.live_figures import looks

@@ -140,7 +140,7 @@ class PredictOptions(Options):
     )
     changes: Annotated[Texts, Option("--set")] = Field(
         default=(),
-        description="For a pipeline file: change a key, such as stages.seg.unit=dsp, or several with commas. "
+        description="For a pipeline file: change a key: stages.seg.unit=dsp. Separate several keys by commas. "
         "May be given again.",
     )
     frames: int | None = Field(
@@ -148,13 +148,13 @@ class PredictOptions(Options):
     )
     measured: Annotated[Path | None, BeforeValidator(_path)] = Field(
         default=None,
-        description="For a pipeline file: folder of its run on this machine, whose stage times are used. For a chip, "
-        "each is multiplied by the stage's `scale`.",
+        description="For a pipeline file: folder of a run of this file here, whose stage times are used. For a "
+        "chip, each time is multiplied by the stage's `scale`.",
     )
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="For a pipeline file: seed of its random times.")
     beside: Texts = Field(
         default=(),
-        description="Another pipeline on the chip: SCENE, SCENE@RATE, NETWORK.onnx@RATE, @RATE:gpu, or a pipeline file "
+        description="Further pipeline on the chip: SCENE, SCENE@RATE, NETWORK.onnx@RATE, @RATE:gpu, or a pipeline file "
         "(.toml, .toml@RATE). Repeat it.",
     )
     turns: Annotated[str, _either(_turns)] = Field(
@@ -175,13 +175,13 @@ class PredictOptions(Options):
         description="ONNX file of a network by itself, without raster and composite. Repeat it.",
     )
     application: Annotated[bool, Option("--application")] = Field(
-        default=False, description="Predict the application with the --network, not the network by itself."
+        default=False, description="Predict the avatar application with the --network, not the network by itself."
     )
     input_shape: Annotated[Texts, AfterValidator(_shapes)] = Field(
         default=(), description="Shape of an input of a --network: NAME=1x3x224x224. Repeat it."
     )
     precision: Annotated[str | None, _either(lambda: tuple(PRECISIONS), "w8a8 (int8), float (fp16) or fp32")] = Field(
-        default=None, description="w8a8 (int8), float (fp16) or fp32; by the network and its unit if not given."
+        default=None, description="w8a8 (int8), float (fp16) or fp32; if not given, the network and its unit decide."
     )
     runtime: Annotated[str | None, _either(_runtimes)] = Field(
         default=None,
@@ -189,34 +189,34 @@ class PredictOptions(Options):
     )
     unit: str = Field(
         default="dsp",
-        description="Unit of the network: gpu or dsp. For a --network by itself also cpu, or all to compare them.",
+        description="Unit of the network: gpu or dsp. For a --network by itself also cpu, or all to compare units.",
     )
     minutes: Annotated[Finite, Option(unit="minutes")] = Field(
         default=0.0, ge=0, le=MAX_MINUTES, description="Virtual minutes with heat; 0: the settled state without heat."
     )
     policy: Annotated[str | None, one_of("reference", *POLICIES), Option(synonyms=("--pipelining",))] = Field(
         default=None,
-        description="pipelined (if not given, as in a run), sequential, latest or deadline. Or reference: that of the "
-        "published application. It is the default with --encoder, --norm, --size or --channels.",
+        description="pipelined (if not given, as in a run), sequential, latest or deadline. Or reference: the policy "
+        "of the published application, and the default with --encoder, --norm, --size or --channels.",
     )
     edge: str | None = Field(
         default=None, description="Buffers between stages: single, double (if not given), triple, fifo:N, orphan."
     )
-    batch: int = Field(default=1, description="Frames per job of the network.")
+    batch: int = Field(default=1, description="Frames in one job of the network.")
     fps: Annotated[float | None, AfterValidator(_rate)] = Field(
         default=None,
-        description="Frame rate to judge: whether the chip holds it, and at which power. latest and deadline use 30 "
-        "if not given.",
+        description="Frame rate to judge: whether the chip holds this rate, and at which power. If not given, latest "
+        "and deadline use 30.",
     )
     power_limit_w: Annotated[float | None, AfterValidator(_watts)] = Field(
         default=None, description="Also predict the highest rate at which the device stays within this many watts."
     )
-    gpu_share: Finite = Field(default=0.0, description="Share of the network that the GPU does for the DSP.")
+    gpu_share: Finite = Field(default=0.0, description="Share of the network that the GPU computes for the DSP.")
     performance_profile: Annotated[str, Option(words=PERFORMANCE_PROFILES)] = Field(
         default=SUSTAINED, description="Power mode of the units, which sets their speed. The names are SNPE's."
     )
     governor: Annotated[str | None, _either(_governors)] = Field(
-        default=None, description="Rule against heat: step_wise or power_allocator; the profile's if not given."
+        default=None, description="Rule against heat: step_wise or power_allocator; if not given, the profile's rule."
     )
     what_if: Annotated[bool, Option("--what-if")] = Field(
         default=False,
@@ -229,7 +229,7 @@ class PredictOptions(Options):
         default=None, description="File for the simulated run as a trace, for ui.perfetto.dev (docs/explain.md)."
     )
     table: Annotated[Path | None, BeforeValidator(_path)] = Field(
-        default=None, description="CSV of configurations: one answer per row."
+        default=None, description="CSV file of configurations; each row is predicted."
     )
 
     @property
