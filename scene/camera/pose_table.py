@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.files import read_text
-from trilane.scene.camera.recorded import AUTO, FILM_RATE_HZ
+from trilane.scene.camera.recorded import AUTO, FILM_RATE_HZ, LENGTH_UNITS
 from trilane.scene.rotations import matrix_from_quat, normalised
 
 MAX_ROWS = 1_000_000
@@ -43,12 +43,28 @@ LOOKED_AT = 20
 MOST_FRAMES, LEAST_GROWING = 1e7, 0.75
 #: Unit of a first column that numbers frames.
 FRAMES = "frames"
-#: The unit of times in a line of column names, such as `timestamp [ns]`, `time (ms)` or `t_us`.
-TIME_UNIT = re.compile(
-    r"\b(?:timestamp|time|t)s?(?:\s*[\[(]\s*(ns|us|ms|s)\s*[\])]|[_ ]?(ns|us|ms)(?![a-z0-9_]))", re.IGNORECASE
-)
-#: Parts that are removed from a column's name: its unit, the frames of EuRoC's symbols, and all but letters and digits.
-UNIT, SYMBOLS, OTHER = re.compile(r"\[[^\[\]]*\]|\([^()]*\)"), re.compile(r"_rs(_r)?_"), re.compile(r"[^a-z0-9]")
+#: Units of times that column names may state, in seconds, and how these and those of lengths are written.
+TIME_UNITS = {**SECONDS, "min": 60.0}
+SPELLINGS = {
+    **{unit: unit for unit in (*TIME_UNITS, *LENGTH_UNITS)},
+    **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"),
+    **dict.fromkeys(("msec", "millisecond", "milliseconds"), "ms"),
+    **dict.fromkeys(("usec", "\u00b5s", "\u03bcs", "microsecond", "microseconds"), "us"),
+    **dict.fromkeys(("nsec", "nanosecond", "nanoseconds"), "ns"),
+    **dict.fromkeys(("mins", "minute", "minutes"), "min"),
+    **dict.fromkeys(("meter", "metre", "meters", "metres"), "m"),
+    **dict.fromkeys(("centimeter", "centimetre", "centimeters", "centimetres"), "cm"),
+    **dict.fromkeys(("millimeter", "millimetre", "millimeters", "millimetres"), "mm"),
+    **dict.fromkeys(("kilometer", "kilometre", "kilometers", "kilometres"), "km"),
+    **dict.fromkeys(("foot", "feet"), "ft"),
+    **dict.fromkeys(("inch", "inches"), "in"),
+}
+#: Parts of a column's name: a unit in brackets, one at its end, and one at the end of a name of times; words in
+#: brackets for no unit; the frames of EuRoC's symbols; all but letters and digits.
+UNIT, AT_END = re.compile(r"\[[^\[\]]*\]|\([^()]*\)"), re.compile(r"[_ ](s|ms|us|ns|min|m|cm|mm|km|ft|in)$")
+OF_TIMES = re.compile(r"^(?:timestamp|time|t|timestamps)(ns|us|ms)$")
+NO_UNIT = ("", "-", "1")
+SYMBOLS, OTHER = re.compile(r"_rs(_r)?_"), re.compile(r"[^a-z0-9]")
 #: What a column holds, by its name.
 KNOWN = {
     **{name + unit: "time" for name in ("timestamp", "time", "t", "timestamps") for unit in ("", "ns", "us", "ms")},
@@ -78,7 +94,7 @@ class TableLayout(NamedTuple):
 
     `columns`: number of columns. `names`: content of each, by KNOWN, "" for others; none without column names.
     `has_commas`: whether commas separate the numbers. `is_ns`: whether the first column has times in nanoseconds.
-    `unit`: unit of the times by the column names, `auto` without one.
+    `unit`: unit of the times by the column names, `auto` without one. `lengths`: that of the places, "" without one.
     """
 
     columns: int
@@ -86,6 +102,7 @@ class TableLayout(NamedTuple):
     has_commas: bool
     is_ns: bool
     unit: str = AUTO
+    lengths: str = ""
 
     @property
     def has_pose(self) -> bool:
@@ -118,23 +135,27 @@ def head_of(path: Path, columns: int, expected: str) -> NDArray[np.float64]:
 
 def layout_of(path: Path, expected: str) -> TableLayout:
     """Return the layout of the first line of numbers; without such a line it has no columns. Raises BadInputError."""
-    names: tuple[str, ...] = ()
-    unit = AUTO
+    named: tuple[ColumnName, ...] = ()
     first: list[str] = []
     times: list[float] = []
     has_commas = False
     for line in read_text(path, expected).splitlines():
         words = words_of(line)
-        if found := names_in(line):
-            names, unit = (names, unit) if times else (found, _unit_in(line))
+        if found := columns_in(line):
+            named = named if times else found
         elif words:
             first, has_commas = first or words, has_commas or "," in _parted(line)
             times += _number(words[0])
         if len(times) == LOOKED_AT:
             break
+    names = tuple(column.holds for column in named)
+    unit, lengths = AUTO, ""
+    if set(POSE) <= set(names) or len(names) == len(first):
+        unit = _unit_of(path, named, ("time",), TIME_UNITS, "camera.time_unit") or AUTO
+        lengths = _unit_of(path, named, ("x", "y", "z"), LENGTH_UNITS, "camera.metres_per_unit")
     with np.errstate(over="ignore"):
         is_ns = "ns" in (units_of(np.array(times)) if unit == AUTO else (unit,))
-    return TableLayout(len(first), names, has_commas, is_ns, unit)
+    return TableLayout(len(first), names, has_commas, is_ns, unit, lengths)
 
 
 def _number(word: str) -> list[float]:
@@ -145,13 +166,67 @@ def _number(word: str) -> list[float]:
         return []
 
 
-def names_in(line: str) -> tuple[str, ...]:
-    """Return the contents of the columns if `line`, maybe a comment, names four or more known ones; else nothing."""
-    text = UNIT.sub("", _parted(line.strip().lstrip("#")))
-    words = text.split(",") if "," in text else text.split()
-    plain = (OTHER.sub("", SYMBOLS.sub("", word.strip().lower())) for word in words)
-    names = tuple(KNOWN.get(word, "") for word in plain)
-    return names if len({*names} - {""}) >= 4 else ()
+class ColumnName(NamedTuple):
+    """The name of a column.
+
+    `text`: name as written. `holds`: content, by KNOWN, "" for others. `unit`: unit as written, "" without one.
+    """
+
+    text: str
+    holds: str
+    unit: str
+
+
+def columns_in(line: str) -> tuple[ColumnName, ...]:
+    """Return the names of the columns if `line`, maybe a comment, has four or more known ones; else nothing."""
+    text = UNIT.sub(lambda unit: re.sub(r"[\s,]+", "_", unit[0]), _parted(line.strip().lstrip("#")))
+    text = re.sub(r"(?<!\s)\s+(?=[\[(])", "", text)  # a unit belongs to the name before it
+    columns = tuple(map(_named, text.split(",") if "," in text else text.split()))
+    return columns if len({column.holds for column in columns} - {""}) >= 4 else ()
+
+
+def _named(word: str) -> ColumnName:
+    text = word.strip().strip("\"'")
+    bare = UNIT.sub("", text).strip().lower()
+    in_brackets = UNIT.search(text)
+    plain = _plain(bare)
+    at_end = None if plain in KNOWN else AT_END.search(bare)
+    if at_end:
+        plain = _plain(bare[: at_end.start()])
+    of_times = OF_TIMES.search(plain)
+    unit = in_brackets[0][1:-1].strip("_ ") if in_brackets else ""
+    unit = unit or (at_end[1] if at_end else "") or (of_times[1] if of_times else "")
+    text = re.sub(r"(?<=\w)(?=[\[(])", " ", text)
+    return ColumnName(text, KNOWN.get(plain, ""), "" if unit in NO_UNIT else unit)
+
+
+def _plain(name: str) -> str:
+    return OTHER.sub("", SYMBOLS.sub("", name))
+
+
+def _unit_of(
+    path: Path, columns: tuple[ColumnName, ...], holding: tuple[str, ...], units: Mapping[str, float], key: str
+) -> str:
+    """Return the unit that the names of the columns `holding` something state, one of `units`; "" without one.
+
+    `key`: key of the scene that states it instead. Raises BadInputError where it is unknown or differs.
+    """
+    of = [column for column in columns if column.holds in holding]
+    found = [SPELLINGS.get(column.unit.lower(), column.unit) for column in of]
+    for column, unit in zip(of, found, strict=True):
+        if unit and unit not in units:
+            known = f"a unit that is one of {', '.join(units)}"
+            raise BadInputError(
+                path, f"the column name `{column.text}`", known, f"remove the unit there, and set {key}"
+            )
+    if len(set(found)) > 1:
+        both = " and ".join(f"`{column.text}`" for column in (of[0], of[_first_other(found)]))
+        raise BadInputError(path, f"the column names {both}", "one unit for all three", f"remove them, and set {key}")
+    return found[0] if found else ""
+
+
+def _first_other(found: Sequence[str]) -> int:
+    return next(k for k, unit in enumerate(found) if unit != found[0])
 
 
 def elapsed(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
@@ -183,13 +258,7 @@ def units_of(column: NDArray[np.float64]) -> tuple[str, ...]:
 
 
 def _since_1970(time: float, unit: str) -> bool:
-    return EARLIEST_S < time * SECONDS[unit] < LATEST_S
-
-
-def _unit_in(line: str) -> str:
-    """Return the unit of times that a line of column names states; `auto` without one."""
-    found = TIME_UNIT.search(line)
-    return (found[1] or found[2]).lower() if found else AUTO
+    return EARLIEST_S < time * TIME_UNITS[unit] < LATEST_S
 
 
 class Clock(NamedTuple):
@@ -203,15 +272,21 @@ class Clock(NamedTuple):
     unit: str = AUTO
     usual_hz: float = FILM_RATE_HZ
 
-    def stated(self, unit: str) -> Clock:
-        """Return this clock with the `unit` of the file's column names, which the scene overrules."""
+    def stated(self, path: Path, unit: str) -> Clock:
+        """Return this clock with the `unit` of the file's column names; the scene may say that they count frames.
+
+        Raises BadInputError where the scene states another unit.
+        """
+        if unit != AUTO and self.unit not in (AUTO, FRAMES, unit):
+            found = f'column names with times in {unit} and camera.time_unit = "{self.unit}"'
+            raise BadInputError(path, found, "one unit", "remove the wrong one")
         return self if self.unit != AUTO else self._replace(unit=unit)
 
 
 class ColumnTimes(NamedTuple):
     """The times of a column.
 
-    `since_s` (N,): times since the first finite one. `unit`: unit of the column, one of SECONDS or `frames`. `rate`:
+    `since_s` (N,): times since the first finite one. `unit`: unit of the column, one of TIME_UNITS or `frames`. `rate`:
     rate for notes, such as `, 30/s`; empty where it is unknown.
     """
 
@@ -236,11 +311,11 @@ def times_of(where: str | Path, column: NDArray[np.float64], clock: Clock) -> Co
         rate = clock.rate_hz or clock.usual_hz
         how = "as given" if clock.rate_hz else "assumed"
         return ColumnTimes(since / rate, FRAMES, f", {rate:g} a second {how}")
-    step *= SECONDS[unit]
+    step *= TIME_UNITS[unit]
     if 0 < step < LEAST_STEP_S:
         found = f"poses that follow each other by {step:.3g} s, if their times are in {unit}"
         raise BadInputError(where, found, "1000 a second at most", "camera.time_unit states the unit")
-    return ColumnTimes(since * SECONDS[unit], unit, f", {1 / step:.4g}/s" if step > 0 else "")
+    return ColumnTimes(since * TIME_UNITS[unit], unit, f", {1 / step:.4g}/s" if step > 0 else "")
 
 
 def is_index(column: NDArray[np.float64]) -> bool:
@@ -273,7 +348,7 @@ def _rows(path: Path, expected: str) -> Iterator[tuple[int, list[str]]]:
     is_first = True
     for number, line in enumerate(read_text(path, expected).splitlines(), 1):
         words = words_of(line)
-        if words and not (is_first and names_in(" ".join(words))):
+        if words and not (is_first and columns_in(line.split("#", 1)[0])):
             yield number, words
         is_first = is_first and not words
 
@@ -295,7 +370,8 @@ class PoseTable:
 
     `times_s` (N,): times from 0. `turns` (N, 3, 3), `places` (N, 3): poses as the file has them. `time`: unit of the
     file's times. `rate`: rate for notes, such as `, 30/s`. `order`: source of the order of columns. `names`: contents
-    of the columns of `table`. `began_s`: seconds since 1970 at time 0; None where the file has other times.
+    of the columns of `table`. `began_s`: seconds since 1970 at time 0; None where the file has other times. `lengths`:
+    unit of the places by the column names, "" without one.
     """
 
     times_s: F64
@@ -307,6 +383,7 @@ class PoseTable:
     names: Sequence[str]
     table: NumberTable
     began_s: float | None
+    lengths: str = ""
 
     def column(self, name: str) -> F64:
         """Return the numbers (N,) of the column that holds `name`."""
@@ -329,7 +406,7 @@ def read_pose_table(
         names = fitting if set(POSE) <= set(fitting) else names
     table = read_table(path, len(names), expected)
     time, x, y, z, qw, qx, qy, qz = (table.numbers[:, names.index(name)] for name in POSE)
-    times = times_of(path, time, clock.stated(layout.unit))
+    times = times_of(path, time, clock.stated(path, layout.unit))
     quats = np.column_stack([qw, qx, qy, qz])
     _require_quats(path, quats, table)
     turns = matrix_from_quat(normalised(quats))
@@ -337,7 +414,16 @@ def read_pose_table(
     if not layout.has_pose:
         _require_times(path, time, places)
     return PoseTable(
-        times.since_s, turns, places, times.unit, times.rate, order, names, table, _began(time, times.unit)
+        times.since_s,
+        turns,
+        places,
+        times.unit,
+        times.rate,
+        order,
+        names,
+        table,
+        _began(time, times.unit),
+        layout.lengths,
     )
 
 
@@ -345,12 +431,14 @@ class MatrixTable(NamedTuple):
     """The poses of a table with matrices.
 
     `turns` (N, 3, 3), `places` (N, 3): poses as the file has them. `times`: times, None where it has none.
+    `lengths`: unit of the places by the column names, "" without one.
     """
 
     times: ColumnTimes | None
     turns: F64
     places: F64
     table: NumberTable
+    lengths: str = ""
 
 
 def read_matrix_table(path: Path, clock: Clock, expected: str) -> MatrixTable:
@@ -358,11 +446,12 @@ def read_matrix_table(path: Path, clock: Clock, expected: str) -> MatrixTable:
 
     Raises BadInputError with the line.
     """
-    columns = MATRIX if layout_of(path, expected).columns == MATRIX else MATRIX + 1
+    layout = layout_of(path, expected)
+    columns = MATRIX if layout.columns == MATRIX else MATRIX + 1
     table = read_table(path, columns, expected)
-    first = times_of(path, table.numbers[:, 0], clock) if columns > MATRIX else None
+    first = times_of(path, table.numbers[:, 0], clock.stated(path, layout.unit)) if columns > MATRIX else None
     matrices = table.numbers[:, -MATRIX:].reshape(-1, 3, 4)
-    return MatrixTable(first, matrices[:, :, :3], matrices[:, :, 3], table)
+    return MatrixTable(first, matrices[:, :, :3], matrices[:, :, 3], table, layout.lengths)
 
 
 def _require_times(path: Path, times: F64, places: F64) -> None:
@@ -388,9 +477,9 @@ def _unevenness(column: F64) -> float:
 def _began(times: F64, unit: str) -> float | None:
     """Return the first of `times`, seconds since 1970; None when it is no such time."""
     finite = times[np.isfinite(times)]
-    if unit not in SECONDS or not len(finite) or not _since_1970(float(finite[0]), unit):
+    if unit not in TIME_UNITS or not len(finite) or not _since_1970(float(finite[0]), unit):
         return None
-    return float(finite[0]) * SECONDS[unit]
+    return float(finite[0]) * TIME_UNITS[unit]
 
 
 def _require_quats(path: Path, quats: F64, table: NumberTable) -> None:

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F64
+from trilane.errors import BadInputError
 from trilane.scene.camera.path import CameraPath, Optics, one_lens
 from trilane.scene.lens import Lens
 from trilane.scene.recordings import NOTHING, Detected, PlaceOf, by_number, usable_samples
@@ -132,6 +133,9 @@ def looked_at_from(turns: F64, places: F64) -> float | None:
 
 
 AUTO = "auto"
+#: Units of lengths that column names may state, in metres, and the share by which the scene's may differ.
+LENGTH_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "ft": 0.3048, "in": 0.0254}
+SAME_UNIT = 1e-3
 UP: dict[str, tuple[float, float, float]] = {
     "y": (0.0, 1.0, 0.0),
     "z": (0.0, 0.0, 1.0),
@@ -379,8 +383,8 @@ class RawCamera:
     pose; one for all poses or one for each. `lens`: source of the lenses. `notes`: notes on the file, for people.
     `place_of`: place of a sample in the file. `detected`: facts about the file, without its axes and lens. `pictures`:
     name of the photo of each pose, or none. `is_levelled`: whether the world of the format is aligned with gravity, by
-    its definition. `unit`: unit of the lengths. `began_s`: seconds since 1970 at time 0; None where the file does not
-    say it.
+    its definition. `unit`: unit of the lengths by the format. `began_s`: seconds since 1970 at time 0; None where the
+    file does not say it. `lengths`: unit of the places by the file's column names, "" without one.
     """
 
     times_s: F64
@@ -396,6 +400,7 @@ class RawCamera:
     is_levelled: bool = False
     unit: LengthUnit = LengthUnit.METRES
     began_s: float | None = None
+    lengths: str = ""
 
 
 def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraPath:
@@ -404,7 +409,8 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
     `raw`: content of the file. `where`: path of the file, for messages. `spec`: camera of the scene, with its lens.
     Raises BadInputError when more than half of the poses are unusable.
     """
-    near, offset_notes = near_origin(raw.places)
+    places_m, spec, length_notes = _in_metres(raw, where, spec)
+    near, offset_notes = near_origin(places_m)
     faults = _faults(raw.times_s, raw.turns, near)
     readable = ~np.logical_or.reduce(list(faults.values()))
     broken = " or ".join(fault for fault, of in faults.items() if of.any())
@@ -415,9 +421,11 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
     quats = quat_from_matrix(world @ turns @ about(2, np.array(upright.quarter * np.pi / 2)))
     optics, seen = _optics(raw, usable, upright.quarter, spec)
     fov_y_deg = float(np.median([lens.fov_y_deg for lens in optics.lenses]))
-    scale, scale_notes = metres_per_unit(turns, places, times, fov_y_deg, raw.unit, spec)
-    notes = (*raw.notes, *offset_notes, upright.note, *scale_notes, seen, *repairs)
-    unit = " ".join(scale_notes) or raw.detected.unit
+    scale, scale_notes = metres_per_unit(
+        turns, places, times, fov_y_deg, raw.unit if not raw.lengths else LengthUnit.METRES, spec
+    )
+    notes = (*raw.notes, *length_notes, *offset_notes, upright.note, *scale_notes, seen, *repairs)
+    unit = " ".join((*length_notes, *scale_notes)) or raw.detected.unit
     detected = replace(raw.detected, axes=upright.note, unit=unit, lens=seen)
     pictures = tuple(raw.pictures[k] for k in usable) if raw.pictures else ()
     return CameraPath(
@@ -431,6 +439,22 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
         quarter=upright.quarter,
         began_s=None if raw.began_s is None else raw.began_s + float(times[0]),
     )
+
+
+def _in_metres(raw: RawCamera, where: str, spec: CameraSpec) -> tuple[F64, CameraSpec, tuple[str, ...]]:
+    """Return the places (N, 3) in the unit that column names state, the camera of the scene without it, and a note.
+
+    Names with metres leave the places as they are, and `metres_per_unit` of the scene counts: programs write `[m]` over
+    maps that nobody measured. Raises BadInputError where the scene states another unit than the names.
+    """
+    metres = LENGTH_UNITS.get(raw.lengths, 1.0)
+    if metres == 1.0:
+        return raw.places, spec, ()
+    if spec.metres_per_unit is not None and not math.isclose(spec.metres_per_unit, metres, rel_tol=SAME_UNIT):
+        found = f"column names with lengths in {raw.lengths} and camera.metres_per_unit = {spec.metres_per_unit:g}"
+        raise BadInputError(where, found, f"{metres:g} metres in a unit", "remove the wrong one")
+    note = f"lengths in {raw.lengths} by the column names: 1 unit of the file is {metres:g} m"
+    return raw.places * metres, spec.model_copy(update={"metres_per_unit": None}), (note,)
 
 
 def _optics(raw: RawCamera, usable: NDArray[np.intp], quarter: int, spec: CameraSpec) -> tuple[Optics, str]:

@@ -28,7 +28,7 @@ from trilane.scene.camera.pose_table import (
     read_table,
     times_of,
 )
-from trilane.scene.camera.recorded import AUTO, OPENGL_FROM_OPTICAL, LengthUnit, RawCamera
+from trilane.scene.camera.recorded import AUTO, LENGTH_UNITS, OPENGL_FROM_OPTICAL, LengthUnit, RawCamera
 from trilane.scene.lens import Bent, Known, Lens, centred, checked_lens, distortion_note, measured_lens, of_opencv
 from trilane.scene.recordings import Detected
 
@@ -64,6 +64,7 @@ def load_arkit(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
             rate=f"by the times of the file, in {times.unit}",
         ),
         is_levelled=True,
+        lengths=read.lengths,
     )
 
 
@@ -88,7 +89,7 @@ def load_kitti(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
     detected = Detected("KITTI poses", f"{MATRIX} columns of numbers", unit="m", rate=rate)
     lens = ((GREY,), "usual for KITTI's cameras")
     turns = read.turns @ OPENGL_FROM_OPTICAL
-    return RawCamera(times, turns, read.places, "-y", *lens, notes, read.table.place_of, detected)
+    return RawCamera(times, turns, read.places, "-y", *lens, notes, read.table.place_of, detected, lengths=read.lengths)
 
 
 def _kitti_times(path: Path, read: MatrixTable, clock: Clock) -> tuple[F64, str]:
@@ -146,6 +147,7 @@ def load_tum(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
         detected,
         unit=LengthUnit.USUALLY_M,
         began_s=poses.began_s,
+        lengths=poses.lengths,
     )
 
 
@@ -173,14 +175,24 @@ def load_euroc(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
     if sensor.is_file():
         numbers = _sensor(sensor)
         to_body = numbers["data"].reshape(4, 4)
-        turns, places = turns @ to_body[:3, :3], places + turns @ to_body[:3, 3]
+        turns, places = turns @ to_body[:3, :3], places + turns @ to_body[:3, 3] / LENGTH_UNITS[poses.lengths or "m"]
         lens, source = checked_lens(sensor, _sensor_lens(numbers)), f"by {EUROC_SENSOR}"
         how = (f"poses of the body, brought to the camera by {EUROC_SENSOR}", *_sensor_distortion(lens, numbers))
     notes = (f"EuRoC poses, {len(poses.times_s)}{poses.rate}, time in {poses.time}, columns {poses.order}", *how)
     detected = Detected("EuRoC poses", "times in ns and commas", unit="m", rate="by the times of the file")
     turns = turns @ OPENGL_FROM_OPTICAL
     return RawCamera(
-        poses.times_s, turns, places, "z", (lens,), source, notes, poses.table.place_of, detected, began_s=poses.began_s
+        poses.times_s,
+        turns,
+        places,
+        "z",
+        (lens,),
+        source,
+        notes,
+        poses.table.place_of,
+        detected,
+        began_s=poses.began_s,
+        lengths=poses.lengths,
     )
 
 
@@ -231,11 +243,22 @@ def load_stray(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
     file = path / STRAY_FILE if path.is_dir() else path
     poses = read_pose_table(file, clock, STRAY_NAMES, STRAY, may_have_more=True)
     lenses, source = _stray_lenses(file, poses)
-    notes = (f"Stray Scanner, {len(poses.times_s)} poses{poses.rate}, optical axes, camera to world",)
+    time = "" if poses.time == "s" else f", time in {poses.time}"
+    notes = (f"Stray Scanner, {len(poses.times_s)} poses{poses.rate}{time}, optical axes, camera to world",)
     detected = Detected("Stray Scanner odometry", "its column names", unit="m", rate="by the times of the file")
     turns, place_of = poses.turns @ OPENGL_FROM_OPTICAL, poses.table.place_of
     return RawCamera(
-        poses.times_s, turns, poses.places, "y", lenses, source, notes, place_of, detected, is_levelled=True
+        poses.times_s,
+        turns,
+        poses.places,
+        "y",
+        lenses,
+        source,
+        notes,
+        place_of,
+        detected,
+        is_levelled=True,
+        lengths=poses.lengths,
     )
 
 

@@ -334,3 +334,77 @@ def test_the_format_is_told_by_columns_or_given(tmp_path: Path) -> None:
 def test_a_relative_path_starts_at_the_base(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("0 0 0 0 0 0 0 1\n")
     assert load_camera(CameraSpec(source="a.txt"), tmp_path).recorded
+
+
+#: Three poses on the z axis at 1, 2 and 4 m after 0.25, 1.25 and 2.25 s, without a turn.
+def three_poses(head: str, *, per_m: float = 1.0, per_s: float = 1.0) -> str:
+    rows = (
+        f"{(second + 0.25) * per_s:.9g},0,0,{metres * per_m:.9g},0,0,0,1" for second, metres in enumerate((1, 2, 4))
+    )
+    return "\n".join([head, *rows]) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("head", "per_m", "per_s", "notes"),
+    [
+        ("timestamp [s],tx [cm],ty [cm],tz [cm],qx,qy,qz,qw", 100, 1, ("lengths in cm",)),
+        ("timestamp,p_RS_R_x [mm],p_RS_R_y [mm],p_RS_R_z [mm],qx,qy,qz,qw", 1000, 1, ("lengths in mm",)),
+        ("time (s),x (km),y (km),z (km),qx,qy,qz,qw", 0.001, 1, ("lengths in km",)),
+        ("time,x [ft],y [ft],z [ft],qx,qy,qz,qw", 1 / 0.3048, 1, ("lengths in ft",)),
+        ("time,x_in,y_in,z_in,qx,qy,qz,qw", 1 / 0.0254, 1, ("lengths in in",)),
+        ("time [min],x,y,z,qx,qy,qz,qw", 1, 1 / 60, ("time in min",)),
+        ("time [Seconds],x [Metres],y [Metres],z [Metres],qx [],qy [],qz [],qw []", 1, 1, ()),
+        ("timestamp [ns],x [ m ],y [ m ],z [ m ],qx [-],qy [-],qz [-],qw [-]", 1, 1e9, ("time in ns",)),
+        ("# time [ms] x [cm] y [cm] z [cm] qx qy qz qw", 100, 1000, ("lengths in cm", "time in ms")),
+    ],
+)
+def test_units_in_column_names_count(
+    tmp_path: Path, head: str, per_m: float, per_s: float, notes: tuple[str, ...]
+) -> None:
+    """The camera is 1 m farther after 1 s, and 3 m farther after 2 s, in any unit."""
+    (tmp_path / "a.csv").write_text(three_poses(head, per_m=per_m, per_s=per_s))
+    camera = load(tmp_path / "a.csv", up_axis="y", place="none")
+    assert camera.places[:, 2] == pytest.approx([1, 2, 4], rel=1e-6)
+    assert camera.times_s == pytest.approx([0, 1, 2], rel=1e-4)
+    for note in notes:
+        assert any(note in each for each in camera.notes)
+
+
+def test_a_unit_of_column_names_that_the_scene_contradicts_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(three_poses("time [s],x [cm],y [cm],z [cm],qx,qy,qz,qw", per_m=100))
+    for spec, sentence in (
+        ({"metres_per_unit": 0.001}, "lengths in cm and camera.metres_per_unit = 0.001, expected 0.01 metres"),
+        ({"time_unit": "ms"}, 'times in s and camera.time_unit = "ms", expected one unit; remove the wrong one'),
+    ):
+        with pytest.raises(BadInputError, match=sentence):
+            load(path, **spec)
+    same = load(path, metres_per_unit=0.01, time_unit="s", up_axis="y", place="none")
+    assert same.places[:, 2] == pytest.approx([1, 2, 4])
+    path.write_text(three_poses("time [s],x [m],y [m],z [m],qx,qy,qz,qw"))
+    assert load(path, metres_per_unit=0.5, up_axis="y", place="none").places[:, 2] == pytest.approx([0.5, 1, 2])
+
+
+@pytest.mark.parametrize(
+    ("head", "sentence"),
+    [
+        ("time,x [px],y [px],z [px],qx,qy,qz,qw", "`x [px]`, expected a unit that is one of m, cm, mm, km, ft, in"),
+        ("time [h],x,y,z,qx,qy,qz,qw", "`time [h]`, expected a unit that is one of s, ms, us, ns, min"),
+        ("time,x [m],y [m],z [mm],qx,qy,qz,qw", "names `x [m]` and `z [mm]`, expected one unit"),
+        ("time,x [m],y [m],z,qx,qy,qz,qw", "names `x [m]` and `z`, expected one unit"),
+    ],
+)
+def test_units_of_column_names_that_are_unknown_or_differ_are_refused(tmp_path: Path, head: str, sentence: str) -> None:
+    (tmp_path / "a.csv").write_text(three_poses(head))
+    with pytest.raises(BadInputError) as refused:
+        load(tmp_path / "a.csv")
+    assert sentence in str(refused.value)
+
+
+def test_units_of_a_table_of_matrices_count(tmp_path: Path) -> None:
+    """12 numbers after a time in ms; the camera is 2 m off after 1 s."""
+    head = "time [ms],r11,r12,r13,tx [cm],r21,r22,r23,ty [cm],r31,r32,r33,tz [cm]"
+    rows = (f"{1000 * k},1,0,0,{200 * k},0,1,0,0,0,0,1,0" for k in range(3))
+    (tmp_path / "a.csv").write_text("\n".join([head, *rows]))
+    camera = load(tmp_path / "a.csv", format="arkit", place="none")
+    assert camera.times_s == pytest.approx([0, 1, 2]) and camera.places[:, 0] == pytest.approx([0, 2, 4])
