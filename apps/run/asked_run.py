@@ -7,7 +7,7 @@ So functions here import the modules of this process when they need them.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -51,7 +51,8 @@ def _require_free(options: RunOptions) -> None:
     from trilane.apps.run.run_folder import require_free
 
     if options.out is not None:
-        require_free(options.out.absolute())
+        with suppress(OSError):  # the run's folder says what is wrong with the place
+            require_free(options.out.absolute())
 
 
 def prepare(

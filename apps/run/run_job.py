@@ -48,7 +48,6 @@ if TYPE_CHECKING:
 BASELINE_POLICY = "sequential"
 INTERRUPTED = 130
 ENDLESS = 1_000_000_000  # frames of a run that somebody watches: a year at 30 a second
-NO_SEGMENTS = "segments: the frames were removed while the run went on, so there is no video"
 NO_VIDEO = "no video, no contact sheet and no checksum: the frames were presented without, as was asked for"
 TRUTH = "the truth: the clothed body that the avatar was trained on"
 FLOAT_PATH = "the float path: float64 body and raster, FP32 network"
@@ -167,10 +166,8 @@ def run_to_folder(
 
             files, unwritten = write_files(folder.work, checked.config.scene.fps)
             facts |= files
-            lacks = checked.config.record and result.presented and files["video"] is None
-            failed = str(unwritten) if unwritten is not None else NO_SEGMENTS if lacks else ""
-            if failed:
-                result = replace(result, failure=result.failure or Failure(failed))
+            if unwritten is not None:
+                result = replace(result, failure=result.failure or Failure(str(unwritten)))
             folder.release()
             result = _renamed(result, folder.named)
             report = build_report(result, checked.config, machine=machine, baseline=baseline, facts=facts)

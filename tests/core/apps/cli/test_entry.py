@@ -85,7 +85,7 @@ cli.main = main
 cli.entry()
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert (done.returncode, done.stdout, done.stderr) == (code, "x", "")
+    assert (done.returncode, done.stdout, done.stderr) == (code, "x", "interrupted\n" * (code == 130))
 
 
 @pytest.mark.parametrize("writes", ["print('x', flush=True)", "print('x')"], ids=["at once", "at the end"])

@@ -331,11 +331,6 @@ def test_the_video_is_joined_and_what_it_lacks_is_told(runs: Callable[..., Runs]
     assert SEGMENTS not in files
 
 
-def test_frames_that_vanish_before_the_video_is_joined_are_a_failure(runs: Callable[..., Runs], tmp_path: Path) -> None:
-    outcome = go(runs(a_result()), tmp_path / "run", record=True, baseline_frames=0)
-    assert (outcome.exit_code, outcome.report.video, outcome.report.failure) == (1, None, run_job.NO_SEGMENTS)
-
-
 def test_a_run_without_a_video_says_why(runs: Callable[..., Runs], tmp_path: Path) -> None:
     double, unrecorded = runs(a_result()), checked().changed(record=False)
     report = run_to_folder(
