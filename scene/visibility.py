@@ -117,7 +117,7 @@ def seen_notes(camera: Camera, scene: Scene, movers: Sequence[Mover], bodies: Se
     parts += [f"a part of it in {1 - whole - nobody:.0%}"] if round(1 - whole - nobody, 9) else []
     parts += [f"nobody in {nobody:.0%}"] if nobody else []
     parts += [f"{height:.0%} of its height on average"] if nobody < 1 else []
-    return (", ".join(parts), *_hint(scene, seen.height[seen.nobody == 0], _walked(movers, frames / scene.fps)))
+    return (", ".join(parts), *_hint(scene, seen.height[seen.nobody == 0], movers, frames / scene.fps))
 
 
 def _walked(movers: Sequence[Mover], times_s: F64) -> float:
@@ -126,12 +126,13 @@ def _walked(movers: Sequence[Mover], times_s: F64) -> float:
     return max(float(np.hypot(*np.ptp(np.array(way)[:, [0, 2]], axis=0))) for way in ways)
 
 
-def _hint(scene: Scene, heights: F64, walked_m: float) -> tuple[str, ...]:
+def _hint(scene: Scene, heights: F64, movers: Sequence[Mover], times_s: F64) -> tuple[str, ...]:
     """Return a note where `heights` (F,), shares of the picture's height, are small: a long walk, or another unit."""
     is_placed = scene.camera.place == "auto" and not scene.camera.source.startswith(BUILT_IN_PREFIX)
     if not is_placed or not len(heights) or np.median(heights) >= SMALL:
         return ()
     small = f"the person is only {np.median(heights):.1%} of the picture's height in the median, hard to find"
+    walked_m = _walked(movers, times_s)
     if walked_m >= FAR_WALK_M:
         return (
             f"{small}: the camera is set down where it sees a walk of {walked_m:.0f} m; start_s and end_s of the "
