@@ -1,6 +1,6 @@
 """Which stage's slowing costs a run the most frame time: that must be the one that the run names as its bound.
 
-Each stage in turn takes SHARE more CPU time in every job: its unit's thread goes on computing when the job is done.
+Each stage in turn takes SHARE more CPU time in every job: its unit's thread goes on computing before the job ends.
 The runs take turns, in another order each round. By hand, on a quiet machine:
 
     python tests/process/slowed_stages.py OUT ROUNDS -- trilane run --frames 200 --baseline 0 --no-video
@@ -28,21 +28,29 @@ SHARE = 0.2
 #: Python imports a module of this name when it starts, in the units' processes too.
 HOOK = """
 import os, time
+from trilane.pipeline.job_times import JobClock
 from trilane.pipeline.unit_loop import BoundStage
 
-run = BoundStage.run
+run, begin, end = BoundStage.run, JobClock.begin, JobClock.end
+job = {}
 
-def slowed(self, *arguments, **named):
-    if self.name != os.environ["SLOWED_STAGE"]:
-        return run(self, *arguments, **named)
-    begin_ns = time.process_time_ns()
-    metrics = run(self, *arguments, **named)
-    end_ns = time.process_time_ns()
-    while time.process_time_ns() < end_ns + float(os.environ["SLOWED_SHARE"]) * (end_ns - begin_ns):
-        pass
-    return metrics
+def begun(self, *arguments):
+    begin(self, *arguments)
+    job["begin_ns"] = time.process_time_ns()
 
-BoundStage.run = slowed
+def named(self, *arguments, **options):
+    job["stage"] = self.name
+    return run(self, *arguments, **options)
+
+def slowed(self, *arguments):
+    if job.pop("stage", "") == os.environ["SLOWED_STAGE"]:
+        end_ns = time.process_time_ns()
+        end_ns += float(os.environ["SLOWED_SHARE"]) * (end_ns - job["begin_ns"])
+        while time.process_time_ns() < end_ns:
+            pass
+    end(self, *arguments)
+
+JobClock.begin, JobClock.end, BoundStage.run = begun, slowed, named
 """
 
 
