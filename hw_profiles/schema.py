@@ -153,7 +153,7 @@ class Engine(ProfileTable):
 
     element_bytes: Literal[1, 2] = Field(description="Bytes of one element.")
     on_chip_mb: Rate = Field(description="Memory for activations on the chip, megabytes.")
-    rates: EngineRates = Field(description="The six numbers of the chip.")
+    rates: EngineRates = Field(description="The numbers of the chip; the next table lists them.")
     factors: dict[str, Rate] = Field(
         default={},
         description=(

@@ -1,4 +1,4 @@
-"""Writes a pipeline file for networks over a video, ready to be run, with sizes and rate read from the files.
+"""Writes a pipeline file that runs networks on a video, ready to be run, with sizes and rate read from the files.
 
 Each network looks at every frame of the video, on a branch of its own: a stage `prepare` makes its input, and a stage
 `discard` takes what it finds. A person then joins the branches as the pipeline needs it.

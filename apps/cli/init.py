@@ -1,4 +1,4 @@
-"""`trilane init`: a first pipeline file for networks over a video."""
+"""`trilane init`: a first pipeline file that runs networks on a video."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def init(
     unit: UnitOption = "dsp",
     input_shape: ShapeOption = None,
 ) -> None:
-    """Write a pipeline file for networks over a video, ready for `trilane check`, `predict` and `run`.
+    """Write a pipeline file that runs networks on a video, ready for `trilane check`, `predict` and `run`.
 
     Each network looks at every frame on a branch of its own. Sizes and rate are read from the files.
     """

@@ -36,7 +36,7 @@ READ_PLAN_SO = (
 RECTANGLES = "blue: a body with its clothes, orange: what the tensor shows"
 OneSceneArgument = Annotated[str, typer.Argument(help="A scene, by file (TOML) or name.")]
 ChipOption = Annotated[
-    str, typer.Option("--profile", help=f"{PROFILE_HELP} The saved time is computed for this profile.")
+    str, typer.Option("--profile", help=f"{PROFILE_HELP} The time that the plan saves is computed for this profile.")
 ]
 OutOption = Annotated[
     Path | None, typer.Option("--out", help=f"File for a drawing of bodies (.png). {RECTANGLES.capitalize()}.")

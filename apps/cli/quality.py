@@ -78,7 +78,7 @@ def quality(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare the runtimes with each other on a scene's frames, or hard cases with their bounds.
+    """Compare the runtimes with each other on a scene's frames, or errors in hard cases with their bounds.
 
     The exit code is 1 when a figure exceeds its bound. It is also 1 when the bound of a hard network is too wide to
     detect a wrong picture. Wrong pictures have a single colour, a shift by 8 pixels, or red and blue exchanged.

@@ -69,7 +69,7 @@ def watch(
     wait: WaitOption = False,
     interval: IntervalOption = 1.0,
 ) -> None:
-    """Show how busy the units of a run are, its frame time and latency, queues, drops, heat and error.
+    """Show a run's figures: busy units, frame time, latency, queues, drops, heat and error.
 
     The command ends with the run, or with Ctrl-C. For a finished run, the last figures are shown. If stdout is no
     terminal, each update is a line.
