@@ -31,12 +31,16 @@ Examples:
   trilane explain
   trilane explain runs/20261122T070136Z-default --slowest 20
   trilane explain walk --json
+  trilane explain walk --frame 57
   trilane explain /tmp/run --jobs jobs.csv
 """
 SLOWEST: Final = 10
 MOST_SLOWEST: Final = 1000
 LEAST_SHARE: Final = 0.005  # of the frame time, for a row
 SlowestOption = Annotated[int, typer.Option(min=1, max=MOST_SLOWEST, help="Number of the slowest frames to explain.")]
+FrameOption = Annotated[
+    int | None, typer.Option(min=0, help="Say instead what became of this frame: its jobs, or why it was dropped.")
+]
 JobsOption = Annotated[Path | None, typer.Option(help="File for a table of all jobs (.csv, .parquet).")]
 READ_PATH_SO = (
     "a job begins when the last thing that it needs is there; the path goes on with the job that brought it, so that "
@@ -50,14 +54,18 @@ SLOWEST_SO = (
 
 @app.command(epilog=EPILOG)
 def explain(
-    run: NewestRunArgument = None, slowest: SlowestOption = SLOWEST, jobs: JobsOption = None, json: JsonOption = False
+    run: NewestRunArgument = None,
+    slowest: SlowestOption = SLOWEST,
+    frame: FrameOption = None,
+    jobs: JobsOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Say where the time of a run went.
 
     The output is the stage or wait that bounded the run, why jobs waited, and why the slowest frames were slow
     (docs/explain.md). `trilane plan` explains a scene before it runs.
     """
-    from trilane.apps.explain.explained_run import check_ending, explain_run, write_jobs
+    from trilane.apps.explain.explained_run import check_ending, explain_frame, explain_run, write_jobs
     from trilane.apps.watch.followed_run import follow
     from trilane.writing import require_writable
 
@@ -66,14 +74,38 @@ def explain(
         require_writable(jobs)
     folder = follow(run).folder
     with spinner("reading the journal"):
-        document = explain_run(folder, slowest)
+        document = explain_run(folder, slowest) if frame is None else explain_frame(folder, frame)
         count = write_jobs(folder, jobs) if jobs is not None else 0
     if jobs is not None:
         stderr_console().print(f"jobs: {jobs}, {count} rows", soft_wrap=True, markup=False)
     if json:
         print_json(document)
         return
-    _show_run(without_controls(document))
+    (_show_run if frame is None else _show_frame)(without_controls(document))
+
+
+def _show_frame(document: Mapping[str, Any]) -> None:
+    from rich.table import Table
+
+    after = "" if document["after_ms"] is None else f" {document['after_ms']:.1f} ms after its release"
+    cause = (
+        "" if document["cause"] is None else f", cause {document['cause']} (docs/policies-and-edges.md)"
+    )
+    latency = "" if document["latency_ms"] is None else f", latency {document['latency_ms']:.1f} ms"
+    console = stdout_console()
+    console.print(f"Frame {document['frame']}: {document['outcome']}{after}{cause}{latency}", soft_wrap=True)
+    if not document["jobs"]:
+        console.print("no job of it began")
+        return
+    table = Table("stage (unit)", "began, ms", "took, ms", "waited, ms", "why, ms")
+    for row in document["jobs"]:
+        times = [f"{row[key]:.2f}" for key in ("begin_ms", "took_ms", "wait_ms")]
+        table.add_row(f"{row['stage']} ({row['unit']})", *times, _causes(row["causes_ms"]))
+    console.print(table)
+
+
+def _causes(causes_ms: Mapping[str, float]) -> str:
+    return ", ".join(f"{cause} {ms:.2f}" for cause, ms in causes_ms.items() if ms >= 0.005) or "-"
 
 
 def _show_run(document: Mapping[str, Any]) -> None:
@@ -185,8 +217,8 @@ def _waits(rows: list[dict[str, Any]]) -> Table:
 
     table = Table("stage (unit)", "jobs", "wait, ms", "why, ms", title="Why jobs waited", title_justify="left")
     for row in rows:
-        causes = ", ".join(f"{cause} {ms:.2f}" for cause, ms in row["causes_ms"].items() if ms >= 0.005)
-        table.add_row(f"{row['stage']} ({row['unit']})", str(row["jobs"]), f"{row['wait_ms']:.2f}", causes or "-")
+        waited = f"{row['wait_ms']:.2f}"
+        table.add_row(f"{row['stage']} ({row['unit']})", str(row["jobs"]), waited, _causes(row["causes_ms"]))
     return table
 
 

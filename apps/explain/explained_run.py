@@ -25,7 +25,8 @@ from trilane.pipeline.critical_path import WHATS, Part, Taken
 from trilane.pipeline.journal import NAME, Begun, Ended, Record, Said, Worked, config_of, journal_in, read_journal
 from trilane.pipeline.reckoning import Reckoning, places_of
 from trilane.pipeline.result import MOST_MESSAGES
-from trilane.pipeline.timeline import ExplainedJob, Gone, Timeline
+from trilane.pipeline.timeline import ExplainedJob, Gone, Presented, Timeline
+from trilane.pipeline.tracks import UNKNOWN
 from trilane.pipeline.unit_history import PREEMPTED
 from trilane.units import HOST_CLOCK, NS_PER_MS
 from trilane.writing import write_atomically
@@ -220,6 +221,63 @@ def explain_run(folder: Path, slowest: int = 10) -> dict[str, Any]:
     return {"run": str(folder), "remark": remark, **explanation.document()}
 
 
+def explain_frame(folder: Path, number: int) -> dict[str, Any]:
+    """Return what became of frame `number` of the run in `folder`, with a row for each of its jobs, as plain data.
+
+    `outcome` is `presented`, `dropped`, `lost` or `under way`; `cause` is the key of the report that counts a dropped
+    or lost frame. `after_ms` and the begins of jobs count from the frame's release. Raises BadInputError as
+    `explain_run` does, and for a frame that the journal does not tell.
+    """
+    begun, records = open_journal(folder)
+    timeline = Timeline(begun.graph, begun.settings, waits=True)
+    jobs: list[ExplainedJob] = []
+    presented: Presented | None = None
+    gone: Gone | None = None
+    last, untold = -1, 0
+    for record in records:
+        for fact in timeline.add(record):
+            if isinstance(fact, ExplainedJob):
+                last = max(last, fact.job.frame)
+                if fact.job.frame == number:
+                    jobs.append(fact)
+                    presented = fact.presented or presented
+            elif isinstance(fact, Gone):
+                last, untold = max(last, fact.frame), untold + (fact.frame == UNKNOWN)
+                gone = fact if fact.frame == number else gone
+    if not jobs and gone is None:
+        fix = f"{untold} lost frames of this run are not known by number" if untold else ""
+        raise BadInputError("--frame", str(number), f"a frame that began, of 0 to {last}", fix)
+    left = presented or gone
+    release_ns = left.release_ns if left is not None else min(one.job.ready_ns for one in jobs)
+    end_ns = presented.end_ns if presented is not None else gone.at_ns if gone is not None else None
+    return {
+        "schema": SCHEMA,
+        "run": str(folder),
+        "frame": number,
+        "outcome": "presented" if presented is not None else gone.kind if gone is not None else "under way",
+        "cause": None if gone is None else gone.cause,
+        "after_ms": None if end_ns is None else (end_ns - release_ns) / NS_PER_MS,
+        "latency_ms": None if presented is None or presented.latency_ns is None else presented.latency_ns / NS_PER_MS,
+        "jobs": [_job_row(one, release_ns) for one in jobs],
+    }
+
+
+def _job_row(one: ExplainedJob, release_ns: int) -> dict[str, Any]:
+    job = one.job
+    return {
+        "stage": job.stage,
+        "unit": job.unit,
+        "begin_ms": (job.begin_ns - release_ns) / NS_PER_MS,
+        "took_ms": (job.end_ns - job.begin_ns) / NS_PER_MS,
+        "wait_ms": (job.begin_ns - job.ready_ns) / NS_PER_MS,
+        "causes_ms": _causes_ms(one.waits_ns, NS_PER_MS),
+    }
+
+
+def _causes_ms(waits_ns: Mapping[str, int], per: int) -> dict[str, float]:
+    return {cause: ns / per for cause, ns in sorted(waits_ns.items(), key=lambda row: -row[1])}
+
+
 def _budget_rows(budget: Mapping[Part, int], unit_of: Mapping[str, str], intervals: int) -> list[dict[str, Any]]:
     total_ns = max(sum(budget.values()), 1)
     return [
@@ -237,13 +295,12 @@ def _budget_rows(budget: Mapping[Part, int], unit_of: Mapping[str, str], interva
 
 def _wait_row(stage: str, unit: str, jobs: int, waits_ns: Mapping[str, int]) -> dict[str, Any]:
     per_job = max(jobs, 1) * NS_PER_MS
-    causes = sorted(waits_ns.items(), key=lambda row: -row[1])
     return {
         "stage": stage,
         "unit": unit,
         "jobs": jobs,
         "wait_ms": sum(waits_ns.values()) / per_job,
-        "causes_ms": {cause: ns / per_job for cause, ns in causes},
+        "causes_ms": _causes_ms(waits_ns, per_job),
     }
 
 
