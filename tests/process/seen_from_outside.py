@@ -23,7 +23,7 @@ from typing import Any
 import msgpack
 import numpy as np
 
-PERIOD_S = 0.02
+PERIOD_S = 0.1
 WORKED = 3  # place of a job among the journal's kinds of record
 Places = Mapping[str, tuple[tuple[int, ...], int]]
 
