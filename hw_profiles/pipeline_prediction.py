@@ -26,7 +26,15 @@ from trilane.hw_profiles.host_model import MODEL_ERROR, UNMEASURED
 from trilane.hw_profiles.network_time import interval, price, spread_of
 from trilane.hw_profiles.rates import FrameInterval, holding, wanted_drops, without_interval
 from trilane.hw_profiles.schema import NORMAL_80, Corners, Profile
-from trilane.pipeline.file_graph import edge_rules, graph_of, in_flight_of, settings_of, source_ns
+from trilane.pipeline.file_graph import (
+    edge_rules,
+    graph_of,
+    in_flight_of,
+    settings_of,
+    shares_of,
+    skips_of,
+    source_ns,
+)
 from trilane.pipeline.file_keys import OnnxStage, StageTime
 from trilane.pipeline.pipeline_file import PipelineFile
 from trilane.scheduler.events import Graph, Settings
@@ -174,7 +182,7 @@ def bound_of(file: PipelineFile, prices: Mapping[str, StagePrice]) -> tuple[Grap
     """Return the scheduler's graph of a file and the bound on its period, from the mean times of its stages."""
     times = {name: each.mean_ns for name, each in prices.items()}
     graph = graph_of(file, edge_rules(file))
-    return graph, period_bound(graph, times, in_flight_of(file), source_ns(file))
+    return graph, period_bound(graph, times, in_flight_of(file), source_ns(file), shares_of(file))
 
 
 class Drawn:
@@ -220,7 +228,7 @@ def predict_file(
     """
     graph, bound = bound_of(file, prices)
     settings = settings_of(file, frames, seed, hang_ns=NEVER_HANGS_NS)
-    report = simulate(graph, settings, Drawn(prices, seed)).report
+    report = simulate(graph, settings, Drawn(prices, seed), skips=skips_of(file, seed)).report
     needs = _needs(file, prices, graph, seed)
     frame_time, latency = _intervals(file, prices, graph, report, needs, seed)
     answer = {
@@ -278,13 +286,16 @@ def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], graph: Graph, s
     first half is left out, and it takes no less than the bound: slots fill for as long as hundreds of frames.
     """
     times = {name: each.mean_ns for name, each in prices.items()}
-    in_flight = in_flight_of(file)
+    in_flight, shares, skips = in_flight_of(file), shares_of(file), skips_of(file, seed)
     graph = replace(graph, edges=tuple(map(holding_back, graph.edges)), from_release=False)
-    bound_ns = period_bound(graph, times, in_flight).period_ns
-    beat = math.lcm(*file.periods.values())
+    bound_ns = period_bound(graph, times, in_flight, shares=shares).period_ns
+    pattern = file.bypass[1].pattern if file.bypass else None
+    beat = math.lcm(*file.periods.values(), len(pattern or "."))
     count = -(-FED_FRAMES // beat) * beat if beat <= FED_FRAMES else FED_FRAMES
     half, whole = (
-        simulate(graph, Settings(each, hang_ns=NEVER_HANGS_NS, in_flight=in_flight), Drawn(prices, seed)).report
+        simulate(
+            graph, Settings(each, hang_ns=NEVER_HANGS_NS, in_flight=in_flight), Drawn(prices, seed), skips=skips
+        ).report
         for each in (count, 2 * count)
     )
     ms = max((whole["duration_s"] - half["duration_s"]) * 1e3 / count, float(bound_ns) / NS_PER_MS)
@@ -295,7 +306,7 @@ def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], graph: Graph, s
     found = []
     for factors in _factors(prices, rng, DRAWS):
         drawn = {name: round(ns * factors.get(name, 1.0)) for name, ns in times.items()}
-        found.append(float(period_bound(graph, drawn, in_flight).period_ns / bound_ns))
+        found.append(float(period_bound(graph, drawn, in_flight, shares=shares).period_ns / bound_ns))
     low, high = np.percentile(found, QUANTILES, method=OF_MIDDLES)
     return FrameInterval(ms, float(ms * low), float(ms * high))
 
@@ -341,7 +352,7 @@ def _intervals(
     count = min(frames["requested"], SIMULATED_FRAMES * frames["requested"] // max(frames["presented"], 1))
     settings = settings_of(file, count, seed, hang_ns=NEVER_HANGS_NS)
     whole, *runs = [
-        simulate(graph, settings, Drawn(prices, seed, factors)).report
+        simulate(graph, settings, Drawn(prices, seed, factors), skips=skips_of(file, seed)).report
         for factors in ({}, *_factors(prices, rng, SIMULATIONS))
     ]
 

@@ -334,8 +334,8 @@ class FileTenant:
     def settings(self, display_ns: int) -> Settings:  # noqa: ARG002 the file states how its frames are shown
         return settings_of(self.file, ENDLESS, hang_ns=NEVER_HANGS_NS)
 
-    def skips(self, frame: int, is_fresh: bool) -> bool:  # noqa: ARG002 a pipeline file has no bypass
-        return False
+    def skips(self, frame: int, is_fresh: bool) -> bool:  # noqa: ARG002 as in every prediction of a file
+        return self.file.bypass is not None and self.file.bypass[1].takes(frame)
 
     def on(self, profile: Profile, corners: Corners, end: Ends, always: float) -> Jobs:
         return _FileJobs(self, profile, corners, end, always)

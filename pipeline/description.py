@@ -167,6 +167,7 @@ class Pipeline(Described):
     `bypass`: names of two stages. A frame for which the first returns a `Skip` goes on to the second, past those
     between. The edges behind the first and before the second have the same header.
     `from_release`: whether the latency begins with a frame's release, as for a camera with a rate.
+    `warms_up`: whether the stages of a chain do a frame before the run; not where they may count their calls.
     `module_folders`: folders where a unit's process first looks for the modules of factories.
     `preload`: modules that are imported once, before the units' processes are forked; none from `module_folders`.
     """
@@ -177,6 +178,7 @@ class Pipeline(Described):
     latency_to: str = ""
     bypass: tuple[str, str] | None = None
     from_release: bool = False
+    warms_up: bool = True
     module_folders: tuple[Path, ...] = ()
     preload: tuple[str, ...] = ()
 

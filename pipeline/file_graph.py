@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from fractions import Fraction
 from typing import Any, Final
 
 import numpy as np
@@ -15,6 +16,7 @@ from trilane.pipeline.pipeline_file import PipelineFile, stage_inputs
 from trilane.scheduler.events import Graph, Input, Settings, StageSpec
 from trilane.scheduler.period_bound import LEAST_SLOTS, fewest_slots
 from trilane.scheduler.policy import POLICIES, run_settings
+from trilane.scheduler.virtual import Skips, none_skips
 from trilane.units import NS_PER_MS, NS_PER_S
 
 DEFAULT_FRAMES: Final = 1000
@@ -34,19 +36,32 @@ def graph_of(file: PipelineFile, rules: Mapping[str, str]) -> Graph:
         )
         for name, stage in file.stages.items()
     )
-    if _is_chain(stages):
+    if file.is_chain:
         stages = tuple(StageSpec(stage.name, stage.unit) for stage in stages)
     edges = tuple(rules[name] for name in file.readers)
-    return Graph(stages, edges, file.latency_to, from_release=file.run.fps is not None or file.run.arrivals is not None)
+    from_release = file.run.fps is not None or file.run.arrivals is not None
+    return Graph(stages, edges, file.latency_to, bypass_of(file), from_release)
 
 
-def _is_chain(stages: tuple[StageSpec, ...]) -> bool:
-    before: tuple[Input, ...] = ()
-    for stage in stages:
-        if stage.inputs != before or stage.every != 1:
-            return False
-        before = (Input(stage.name),)
-    return True
+def bypass_of(file: PipelineFile) -> tuple[str, str] | None:
+    """Return the two stages between which a frame may skip stages; None without a bypass."""
+    return None if file.bypass is None else (file.bypass[0], file.bypass[1].to)
+
+
+def skips_of(file: PipelineFile, seed: int = 0) -> Skips:
+    """Return which frames take the bypass in virtual time: those that the file says, none where it says nothing."""
+    if file.bypass is None:
+        return none_skips
+    _, way = file.bypass
+    return lambda frame, _fresh: way.takes(frame, seed)
+
+
+def shares_of(file: PipelineFile) -> dict[str, Fraction]:
+    """Return the share of the frames that a stage does, of each stage that some frames skip."""
+    if file.bypass is None or not (taken := file.bypass[1].taken):
+        return {}
+    names, (begin, end) = list(file.stages), (file.bypass[0], file.bypass[1].to)
+    return dict.fromkeys(names[names.index(begin) + 1 : names.index(end)], 1 - taken)
 
 
 def source_ns(file: PipelineFile) -> int:

@@ -11,6 +11,8 @@ import posixpath
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from fractions import Fraction
+from hashlib import blake2b
 from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -326,6 +328,58 @@ class StageTime(Keys):
         return bool(self.sd or self.exponential or len(set(self.samples)) > 1)
 
 
+def _pattern(text: str | None) -> str | None:
+    if text is not None and not re.fullmatch(rf"[01]{{1,{MOST_SAMPLES}}}", text):
+        raise UnexpectedValue(shown(text), "a text of 0 and 1, such as '0011'")
+    return text
+
+
+class BypassKeys(Keys):
+    """The way of a frame for which the stages behind have nothing to do: past them, to stage `to`."""
+
+    to: str = Field(
+        pattern=NAME, description="Stage to which such a frame goes, two places or more behind in the row of stages."
+    )
+    share: float | None = Field(
+        default=None,
+        ge=0,
+        le=1,
+        description="Share of the frames that go this way, at random, in a prediction and after `busy`.",
+    )
+    pattern: Annotated[str | None, AfterValidator(_pattern)] = Field(
+        default=None,
+        description="In place of share: 1 for each frame that goes this way, 0 for each other, from the first frame "
+        "on; '0011' starts over after four.",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_table(cls, value: Any) -> Any:
+        if not isinstance(value, dict | str):
+            raise UnexpectedValue(shown(value), "a stage, or a table { to, share } or { to, pattern }")
+        return {"to": value} if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> Self:
+        if self.share is not None and self.pattern is not None:
+            raise UnexpectedValue("share and pattern", "one of them")
+        return self
+
+    @property
+    def taken(self) -> Fraction | None:
+        """The share of the frames that go this way; None where the file does not say it."""
+        if self.pattern is not None:
+            return Fraction(self.pattern.count("1"), len(self.pattern))
+        return None if self.share is None else Fraction(str(self.share))
+
+    def takes(self, frame: int, seed: int = 0) -> bool:
+        """Say whether a frame goes this way. `seed`: seed of the random ones, as many as `share` says."""
+        if self.pattern is not None:
+            return self.pattern[frame % len(self.pattern)] == "1"
+        drawn = blake2b(f"{seed} {frame}".encode(), digest_size=8).digest()
+        return int.from_bytes(drawn) < (self.share or 0.0) * (1 << 64)
+
+
 def _size(text: str) -> tuple[int, int]:
     """Read `640x480` as width and height in pixels."""
     found = re.fullmatch(r"(\d{1,9})x(\d{1,9})", text)
@@ -375,6 +429,11 @@ class StageKeys(Keys):
     out: Annotated[dict[str, PortType] | None, BeforeValidator(_ports)] = Field(
         default=None,
         description="Output of the stage: a type and sizes, such as 'u8 256x256x3', or a table of ports.",
+    )
+    bypass: BypassKeys | None = Field(
+        default=None,
+        description="Way of a frame for which the stages behind have nothing to do: a stage, or a table of to and "
+        "share or pattern.",
     )
     stateful: bool = Field(
         default=False, description="Whether the stage remembers frames; if so, it gets the frames in order."

@@ -1,6 +1,6 @@
 """Writes a pipeline's description as the text of a pipeline file, and says what such a file cannot hold.
 
-    tables = tables_of(pipeline, {"policy": "latest", "fps": 30.0}, {"pose": 0.4})
+    tables = tables_of(pipeline, {"policy": "latest", "fps": 30.0}, {"camera": 0.4})
     text = file_text(tables, unsaid(pipeline))
 
 Rule: any description is written, by its stages, edges and units; what the stages do is not known here. The tables are
@@ -19,13 +19,16 @@ from trilane.transport.packets import header_dtype
 NOT_RUN: Final = (
     "its stages are no blocks and no code of your own: `trilane check` and `predict` take it, `run` does not"
 )
+NOT_SAID: Final[Mapping[str, Any]] = {}
 
 
-def tables_of(pipeline: Pipeline, run: Mapping[str, Any], times_ms: Mapping[str, float]) -> dict[str, Any]:
+def tables_of(
+    pipeline: Pipeline, run: Mapping[str, Any], times_ms: Mapping[str, float], taken: Mapping[str, Any] = NOT_SAID
+) -> dict[str, Any]:
     """Return the tables of a pipeline file.
 
     `run`: the table [run] without edges and latency, which the description states. `times_ms`: mean time of a job by
-    stage, in ms; a stage that is missing states no time.
+    stage, in ms; a stage that is missing states no time. `taken`: which frames take the bypass, as keys of its table.
     """
     joints = list(pipeline.joints.values())
     rules = {before.name: edge.rule for (before, _), edge in zip(joints, pipeline.edges, strict=True)}
@@ -38,6 +41,9 @@ def tables_of(pipeline: Pipeline, run: Mapping[str, Any], times_ms: Mapping[str,
             for place, stage in enumerate(pipeline.stages)
         },
     }
+    if pipeline.bypass is not None:
+        begin, end = pipeline.bypass
+        tables["stages"][begin]["bypass"] = {"to": end, **taken} if taken else end
     if alike:
         tables["run"]["edge"] = next(iter(rules.values()))
     elif rules:
@@ -74,19 +80,9 @@ def _reads(pipeline: Pipeline, place: int) -> str | dict[str, Any] | None:
     return reads or None
 
 
-def routes_of(pipeline: Pipeline) -> list[dict[str, Any]]:
-    """Return the ways past some stages: `from`, `to` and the stages in `past` that a frame skips there."""
-    if pipeline.bypass is None:
-        return []
-    begin, end = pipeline.bypass
-    return [{"from": begin, "to": end, "past": list(pipeline.graph().bypassed)}]
-
-
 def unsaid(pipeline: Pipeline) -> Iterator[str]:
     """Yield what a pipeline file cannot say of the pipeline, each as a sentence."""
     yield NOT_RUN
-    for route in routes_of(pipeline):
-        yield f"a frame may go from {route['from']} to {route['to']}, past {', '.join(route['past'])}: not in this file"
     own = max((edge.header.itemsize for edge in pipeline.edges), default=0)
     if own > header_dtype().itemsize:
         yield f"every slot also has a header of {own} bytes: not in this file"

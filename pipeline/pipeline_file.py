@@ -31,14 +31,18 @@ from trilane.pipeline.file_keys import (
     MOST_SDS,
     MOST_STAGES,
     NAME,
+    BusyBlock,
+    BypassKeys,
     InputKeys,
     Keys,
     OnnxStage,
     PrepareBlock,
+    PythonStage,
     RunKeys,
     StageInput,
     StageKeys,
     StageTime,
+    TimedStage,
     UnitKeys,
     read_input,
     shown,
@@ -60,7 +64,7 @@ STAGES: Final = re.compile(rb"""^\s*(\[\s*["']?stages["']?\s*[\].]|["']?stages["
 BETWEEN: Final = re.compile(rf",(?=\s*(?:{'|'.join(TABLES)})\.)")
 FORM: Final = "a pipeline file, TOML in UTF-8"
 #: Tables that a stage's key may hold, by the key.
-INNER: Final[dict[str, type[Keys]]] = {"in": InputKeys, "time_ms": StageTime}
+INNER: Final[dict[str, type[Keys]]] = {"in": InputKeys, "time_ms": StageTime, "bypass": BypassKeys}
 
 AnyKeys = TypeVar("AnyKeys", bound=Keys)
 
@@ -107,6 +111,21 @@ class PipelineFile:
         for name, stage in self.stages.items():
             found[name] = lcm(stage.every, *(found[each.stage] for each in stage.inputs if not each.latest))
         return found
+
+    @property
+    def is_chain(self) -> bool:
+        """Whether each stage takes every frame, from the stage before it alone."""
+        before: tuple[StageInput, ...] = ()
+        for name, stage in self.stages.items():
+            if stage_inputs(stage) != before or stage.every != 1:
+                return False
+            before = (StageInput("", name),)
+        return True
+
+    @property
+    def bypass(self) -> tuple[str, BypassKeys] | None:
+        """The stage at which the bypass begins, and the way that it leads; None without one."""
+        return next(((name, stage.bypass) for name, stage in self.stages.items() if stage.bypass is not None), None)
 
     @property
     def latency_to(self) -> str:
@@ -406,6 +425,7 @@ def _check_together(file: PipelineFile) -> None:
             raise BadInputError(f"{file.path}: stages.{name}.every", found, f"one of at most {MOST_PERIOD}")
     for name, stage in file.stages.items():
         _check_stage_together(file, name, stage)
+    _check_bypass(file)
 
 
 def _check_run(file: PipelineFile) -> None:
@@ -454,6 +474,30 @@ def _check_stage_together(file: PipelineFile, name: str, stage: StageKeys) -> No
         if each.latest and edge_rule(rule).slots < 2:
             found = f"edge {rule!r} behind {each.stage}, whose newest frame {name} holds"
             raise BadInputError(f"{file.path}: edges.{each.stage}", found, "two slots or more, such as double")
+
+
+def _check_bypass(file: PipelineFile) -> None:
+    if file.bypass is None:
+        return
+    (begin, way), names = file.bypass, list(file.stages)
+    where, stage = f"{file.path}: stages.{begin}.bypass", file.stages[begin]
+    if others := [name for name in names if name != begin and file.stages[name].bypass is not None]:
+        remedy = f"leave it out here, or at {begin}"
+        raise BadInputError(f"{file.path}: stages.{others[0]}.bypass", "a second bypass", "one in a file", remedy)
+    if not isinstance(stage, PythonStage | BusyBlock | TimedStage):
+        remedy = "put a stage with python before it, which says what has nothing to do"
+        raise BadInputError(where, f"a bypass at {stage.named_kind}", "python, busy or only time_ms", remedy)
+    if not file.is_chain:
+        remedy = "let each stage read the one before it alone, without every"
+        raise BadInputError(where, "a bypass in a pipeline with branches", "a row of stages", remedy)
+    behind = names[names.index(begin) + 2 :]
+    if way.to not in behind:
+        found = f"{way.to!r}, {'a stage before or next to it' if way.to in names else 'an unknown stage'}"
+        expected = f"one of {', '.join(behind)}" if behind else "two stages or more behind it"
+        raise BadInputError(f"{where}.to", found, expected, did_you_mean(way.to, behind))
+    if file.latency_to in names[names.index(begin) + 1 : names.index(way.to)]:
+        where, found = f"{file.path}: run.latency_to", f"{file.latency_to!r}, past which frames of {begin} may go"
+        raise BadInputError(where, found, "a stage that every frame meets", f"such as {way.to}")
 
 
 def assignments(text: str) -> list[str]:

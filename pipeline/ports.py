@@ -50,6 +50,16 @@ class PortRead(Model):
     port: str
 
 
+class PassedPorts(Model):
+    """What comes by a bypass that ends at the stage: slots behind its own ones, from the stage where it begins.
+
+    `behind`: number of slots of the stage's own stream. `ports`: ports in the slots behind them.
+    """
+
+    behind: int
+    ports: Ports
+
+
 class PortedSettings(Model):
     """The settings of every stage with ports.
 
@@ -61,6 +71,7 @@ class PortedSettings(Model):
     `streams`: ports of each stream that it reads.
     `writes`: ports that it writes; empty where nobody reads it and the file says none.
     `keys`: keys of the stage of its own kind.
+    `bypass`: what comes by a bypass that ends here; None where none does.
     """
 
     where: str
@@ -71,6 +82,7 @@ class PortedSettings(Model):
     streams: tuple[Ports, ...]
     writes: Ports
     keys: dict[str, Any]
+    bypass: PassedPorts | None = None
 
 
 class Read(NamedTuple):
@@ -91,7 +103,7 @@ class PortedStage:
         self._streams = [_types(ports) for ports in self.settings.streams]
         self.reads = [Read(each.name, self._streams[each.stream][each.port]) for each in self.settings.reads]
         self.writes = _types(self.settings.writes)
-        self._inputs: list[list[dict[str, NDArray[Any]]]] = []
+        self._inputs: list[list[Mapping[str, NDArray[Any] | None]]] = []
         self._outputs: list[dict[str, NDArray[Any]]] = []
         self._headers: list[list[NDArray[np.void]]] = []
         self._slots: Sequence[int | None] = ()
@@ -106,12 +118,21 @@ class PortedStage:
         """Make the views of all slots, then call `ready`."""
         streams: Sequence[Sequence[Packet]] = inputs if self.settings.joins else [inputs] if inputs else []
         self._inputs = [
-            [_read_only(views(packet.payload, ports)) for packet in packets]
+            [self._views(place, packet, ports) for place, packet in enumerate(packets)]
             for packets, ports in zip(streams, self._streams, strict=True)
         ]
         self._outputs = [views(packet.payload, self.writes) for packet in outputs]
         self._headers = [[packet.header for packet in packets] for packets in streams]
         self.ready()
+
+    def _views(self, place: int, packet: Packet, ports: Mapping[str, PortType]) -> Mapping[str, NDArray[Any] | None]:
+        """Return the arrays of a slot; of one that comes by the bypass, those ports that its writer has too."""
+        passed = self.settings.bypass
+        if passed is None or place < passed.behind:
+            return _read_only(views(packet.payload, ports))
+        given = _types(passed.ports)
+        arrays = _read_only(views(packet.payload, given))
+        return {name: arrays[name] if given.get(name) == port else None for name, port in ports.items()}
 
     def run(self, frame: int, slot_in: Any, slot_out: int | None) -> Mapping[str, float]:
         slots: Sequence[int | None] = slot_in if self.settings.joins else () if slot_in is None else (slot_in,)
@@ -124,12 +145,16 @@ class PortedStage:
         """Prepare what the first frame needs; called once, when the slots are there."""
 
     def work(self, frame: int, arrays: Sequence[NDArray[Any] | None], outputs: Arrays) -> Mapping[str, float]:
-        """Do a frame, and return metrics.
+        """Do a frame, and return metrics; a `trilane.pipeline.stage.Skip` where a bypass begins, to send it there.
 
-        `arrays`: array of each of `reads`, read-only; None for a newest frame that is not there.
+        `arrays`: array of each of `reads`, read-only; None for a newest frame that is not there, and for a port that
+        does not come by a bypass.
         `outputs`: array of each of `writes`, to be filled; empty where nobody reads the stage.
         """
         raise NotImplementedError
+
+    def forget(self) -> None:
+        """Do not send the next frame to a bypass because of earlier frames."""
 
     def close(self) -> None:
         """Release what the stage holds."""

@@ -169,7 +169,7 @@ def run_pipeline(
             cores = sorted({core for unit in pipeline.units.values() for core in unit.cores})
             if controls is not None:
                 clock.heed(controls)
-            run = _Run(core, clock, processes, interrupts, log, record, cores)
+            run = _Run(core, clock, processes, interrupts, log, record, cores, pipeline.warms_up)
             run.execute()
         is_open = requests is not None or controls is not None
         report = core.report(clock="host", requested=core.source.released if is_open else None)
@@ -210,8 +210,10 @@ class _Run:
         log: RunLog,
         record: RunRecord,
         cores: Sequence[int],
+        warms_up: bool,
     ) -> None:
         self._core, self._clock, self._processes, self._cores = core, clock, processes, cores
+        self._warms_up = warms_up and core.graph.is_chain  # a graph's stages may count their calls
         self._interrupts, self._log, self._record = interrupts, log, record
         self.pids: dict[str, int] = {}
         self.other_programs: float | None = None
@@ -224,7 +226,7 @@ class _Run:
         self._startup_ms = start_units(self._processes, self._core.graph.units, self._interrupts)
         self.pids = self._processes.pids
         graph, settings = self._core.graph, self._core.settings
-        if graph.is_chain:  # the stages of a graph may count their calls, so they see the run's own frames alone
+        if self._warms_up:
             # The last stage writes files, so the frames before the run leave it out.
             chain = Chain(graph, dict.fromkeys(graph.units, self._processes), self._interrupts, whole=False)
             if settings.works:

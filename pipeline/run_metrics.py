@@ -394,7 +394,7 @@ class PolicyMetrics(Record):
 
     `frames`: counts of frames by what became of them.
     `frame_time_ms`: times between presented frames.
-    `latency_ms`: times from the sampled pose to the end of the stage that the pipeline names (the composited frame).
+    `latency_ms`: times from a frame's sampling, or release, to the end of the stage that the pipeline names.
     `fps`: presented frames a second; 0 for fewer than two.
     `fps_low`, `fps_high`: bounds of the 95 % interval of `fps`, from that of the mean frame time; null when there are
     too few frames.

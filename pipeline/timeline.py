@@ -1,7 +1,7 @@
 """Turns the journal of a run into frames, jobs, waits and idle time.
 
 Rule: no other module interprets a journal's events. The scheduler's own parts tell what it knew: its source says which
-frames are released and wait (frame_source.py). Its record of a frame says when the pose was sampled and how long the
+frames are released and wait (frame_source.py). Its record of a frame says when it was sampled and how long the
 frame took (state.py).
 
 A frame waits before the first stage from its release on. It waits before another stage from the step in which the
@@ -52,7 +52,7 @@ class Presented(NamedTuple):
     `end_ns`: end of its last job.
     `interval_ns`: time since the end of the frame presented before it; None for the first, and if a viewer held the
     run between the two: a pause is no slow frame.
-    `latency_ns`: time from its sampled pose to the end of the stage that the pipeline names; None for a frame that this
+    `latency_ns`: time from its sampling to the end of the stage that the pipeline names; None for a frame that this
     stage does not take.
     `skips`: whether it took the bypass.
     `rung`: rung of its work.

@@ -72,6 +72,7 @@ class ChainTrack:
         names = [stage.name for stage in graph.stages]
         self.frames: dict[int, FrameState] = {}
         self._source, self._bypass, self._latency_to = source, graph.bypass, graph.latency_to
+        self._from_release = graph.from_release
         self._first, self._last = names[0], names[-1]
         self._next = dict(pairwise(names))
         self._waiting: dict[str, list[int]] = {name: [] for name in names[1:]}
@@ -94,7 +95,9 @@ class ChainTrack:
         self._heard_ns[job.frame] = now_ns
         frame = self._frame(job.frame, now_ns)
         # The scheduler's own record computes the latency, so that it is defined once.
-        sampled_ns = event.t_sampled_ns if job.stage == self._first else None
+        sampled_ns = None
+        if job.stage == self._first:
+            sampled_ns = frame.release_ns if self._from_release else event.t_sampled_ns
         frame.end_stage(sampled_ns, event.t_end_ns, job.stage == self._latency_to)
         frame.skips |= event.skips
         if job.stage == self._last:

@@ -29,7 +29,7 @@ off too early.
 
 Dispatch ahead and leading. A unit holds its next job while one runs, so that no message delay lies between them. A
 policy that wants the newest frame hands the next job over only `lead_ns` before the running one should end. Latching is
-the same for the first stage: it begins so late that its pose is new when the second stage can take it.
+the same for the first stage: it begins so late that what it samples is new when the second stage can take it.
 """
 
 from __future__ import annotations
@@ -220,7 +220,7 @@ class Core:
     # events of jobs
 
     def _on_done(self, event: JobDone) -> None:
-        name, job_id, begin_ns, end_ns, pose_ns, preempted_ns, asleep_ns, preempted_before_ns, skips = event
+        name, job_id, begin_ns, end_ns, read_ns, preempted_ns, asleep_ns, preempted_before_ns, skips = event
         unit = self.units[name]
         if not unit.queue or unit.queue[0].id != job_id:
             return  # the job was lost with its process
@@ -242,7 +242,7 @@ class Core:
             unit.hold_until_ns = end_ns + service_ns * (FULL_DUTY - unit.duty) // unit.duty
             unit.update_queue_capacity()
             self._reset_alarm()
-        sampled_ns = None if stage.before else frame.release_ns if self.graph.from_release else pose_ns
+        sampled_ns = None if stage.before else frame.release_ns if self.graph.from_release else read_ns
         frame.end_stage(sampled_ns, end_ns, stage is self._latency_stage)
         self.flow.mark_dirty(unit)
         self.flow.pass_on(stage, job, end_ns)

@@ -137,7 +137,7 @@ class UnitReady(NamedTuple):
 class JobDone(NamedTuple):
     """A unit has finished a job.
 
-    `t_sampled_ns`: time at which the frame's pose was sampled, from the frame's header; 0 except from the first stage.
+    `t_sampled_ns`: time at which the frame was sampled, from its header; 0 except from the first stage.
     `preempted_ns`: part of the job in which the unit had no core.
     `asleep_ns`: part of the job in which nothing of the unit worked.
     `preempted_before_ns`: time in which the unit had no core between the job before and this one.
@@ -343,7 +343,7 @@ class Graph:
     `latency_to`: stage at whose end the latency ends.
     `bypass`: names of two stages of a chain; a frame for which the first says so skips the stages between them
     (flow.py).
-    `from_release`: whether the latency begins with the frame's release, not with the pose that its first stage samples.
+    `from_release`: whether the latency begins with the frame's release, not when its first stage samples it.
     """
 
     stages: tuple[StageSpec, ...]
@@ -453,11 +453,11 @@ class Settings:
     `arrivals_ns`: release times from the start, instead of a period.
     `asked`: whether `FrameRequest` alone releases frames.
     `latch_ns`: margin by which a frame's first stage is expected to end before the second can take it. The first stage
-    begins that late so that the pose is newer and waits less.
+    begins that late so that what it samples is newer and waits less.
     `deadline_ns`: longest time from a frame's release to its presentation.
     `works`: work of each rung of the ladder (work_ladder.py) in thousandths, 1000 first, falling; empty: no ladder.
     `follow`: names of the stages whose time follows the work.
-    `in_flight`: limit of frames between pose and presentation.
+    `in_flight`: limit of frames between admission and presentation.
     `in_queue`: limit of released frames that wait; more are turned away.
     `queue_timeout_ns`: longest wait of a released frame.
     `hang_ns`: longest time of a job, and longest time for which an idle unit may leave a ping unanswered.

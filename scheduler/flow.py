@@ -226,7 +226,7 @@ class Flow:
             slots.append(-1)
             if held >= 0:
                 newest = self._written[side.producer.position, held]
-                age_ns = now_ns - newest.pose_ns
+                age_ns = now_ns - newest.sampled_ns
                 if not 0 < side.max_age_ns < age_ns:
                     slots[-1] = side.edge.take_newest(side.reader)
                     self._ledger.newest(side.producer.name, age_ns, state.number - newest.number)

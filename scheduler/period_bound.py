@@ -5,6 +5,8 @@ slot. A cycle of such waits that takes w ns and leads s frames on allows no peri
 ratio of all cycles. Other cycles are the work of a unit for one frame and the period of the source. With constant times
 and one stage on each unit the bound is reached. Where stages share a unit, their order may cost more.
 
+Where frames skip stages by a bypass, the slots count for nothing, so that the bound may be less than what is reached.
+
 With `every` a stage takes one frame of several, so the jobs of a whole hyperperiod are told apart. Inputs of the newest
 frame hold back nobody. A rule that replaces waiting frames (triple, orphan) holds back nobody either.
 
@@ -26,6 +28,7 @@ from trilane.transport.slots import MAX_SLOTS, edge_rule
 #: Jobs of a hyperperiod from which on only units and the source count, because the search would take long.
 MOST_JOBS: Final = 4096
 LEAST_SLOTS: Final = 2
+NO_SHARES: Final[Mapping[str, Fraction]] = {}
 
 
 @dataclass(frozen=True)
@@ -141,14 +144,21 @@ def _periods(graph: Graph) -> dict[str, int]:
     return found
 
 
-def period_bound(graph: Graph, times_ns: Mapping[str, int], in_flight: int = 0, source_ns: int = 0) -> Bound:
+def period_bound(
+    graph: Graph,
+    times_ns: Mapping[str, int],
+    in_flight: int = 0,
+    source_ns: int = 0,
+    shares: Mapping[str, Fraction] = NO_SHARES,
+) -> Bound:
     """Return the least period of `graph`.
 
     `times_ns`: time of a job of each stage.
     `in_flight`: limit of frames in flight; 0: none.
     `source_ns`: period of the source; 0: it is always ready.
+    `shares`: share of the frames that each stage does which some of them skip.
     """
-    return _bound(_Waits(graph, times_ns, in_flight), _slots(graph), source_ns)
+    return _bound(_Waits(graph, times_ns, in_flight), _slots(graph), source_ns, shares)
 
 
 def _slots(graph: Graph) -> dict[str, int]:
@@ -157,9 +167,11 @@ def _slots(graph: Graph) -> dict[str, int]:
     return {name: rule.slots for name, rule in rules.items() if not rule.yields}
 
 
-def _bound(waits: _Waits, slots: Mapping[str, int], source_ns: int = 0) -> Bound:
-    best = max(_of_units(waits), key=lambda bound: bound.period_ns)
-    arcs = waits.arcs(slots) if waits.is_small else []
+def _bound(
+    waits: _Waits, slots: Mapping[str, int], source_ns: int = 0, shares: Mapping[str, Fraction] = NO_SHARES
+) -> Bound:
+    best = max(_of_units(waits, shares), key=lambda bound: bound.period_ns)
+    arcs = waits.arcs(slots) if waits.is_small and not shares else []
     ratio = best.period_ns * waits.hyperperiod
     while cycle := _positive_cycle(len(waits.stages), arcs, ratio):
         ratio = Fraction(sum(arc.ns for arc in cycle), sum(arc.tokens for arc in cycle))
@@ -170,12 +182,13 @@ def _bound(waits: _Waits, slots: Mapping[str, int], source_ns: int = 0) -> Bound
     return best
 
 
-def _of_units(waits: _Waits) -> Iterator[Bound]:
+def _of_units(waits: _Waits, shares: Mapping[str, Fraction]) -> Iterator[Bound]:
     """Yield the work of each unit for one frame."""
     for unit in waits.graph.units:
         names = tuple(stage.name for stage in waits.graph.stages if stage.unit == unit)
-        work = sum((Fraction(waits.times_ns[name], waits.periods[name]) for name in names), Fraction())
-        busy = tuple(name for name in names if waits.times_ns[name])
+        each = {name: shares.get(name, 1) * Fraction(waits.times_ns[name], waits.periods[name]) for name in names}
+        work = sum(each.values(), Fraction())
+        busy = tuple(name for name, part in each.items() if part)
         yield Bound(work, busy, f"unit {unit}" if work else "")
 
 

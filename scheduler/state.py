@@ -308,7 +308,7 @@ class FrameState:
     `position`: position of its next stage in a chain.
     `release_ns`: time of its release.
     `ready_ns`: time at which the inputs of each stage were there, by the stage's position.
-    `latency_ns`: time from the pose to the end of the stage at which the latency ends, once known; else -1.
+    `latency_ns`: time from its sampling to the end of the stage at which the latency ends, once known; else -1.
     `skips`: whether it takes the bypass.
     `rung`: rung of its work.
     `number`: how many frames were put in flight before it.
@@ -324,11 +324,11 @@ class FrameState:
         "jobs",
         "latency_ns",
         "number",
-        "pose_ns",
         "position",
         "ready_ns",
         "release_ns",
         "rung",
+        "sampled_ns",
         "skips",
         "todo",
     )
@@ -338,7 +338,7 @@ class FrameState:
     ) -> None:
         self.position, self.release_ns, self.ready_ns = 0, release_ns, [release_ns] * stages
         self.deadline_ns, self.rung = deadline_ns, rung
-        self.pose_ns = self.latency_ns = -1
+        self.sampled_ns = self.latency_ns = -1
         self.number, self.todo = number, todo
         self.begun = self.jobs = 0
         self.skips = self.is_presented = False
@@ -350,9 +350,9 @@ class FrameState:
         `ends_latency`: whether the latency ends with the stage.
         """
         if sampled_ns is not None:
-            self.pose_ns = sampled_ns if self.pose_ns < 0 else min(self.pose_ns, sampled_ns)
+            self.sampled_ns = sampled_ns if self.sampled_ns < 0 else min(self.sampled_ns, sampled_ns)
         if ends_latency:
-            self.latency_ns = end_ns - self.pose_ns
+            self.latency_ns = end_ns - self.sampled_ns
 
 
 def build(graph: Graph) -> tuple[list[StageState], dict[str, UnitState], list[EdgeSlots]]:

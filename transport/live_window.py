@@ -56,7 +56,7 @@ class ShownPicture(NamedTuple):
     """A picture of `frame`.
 
     `media_s`: time of the scene in seconds.
-    `sampled_ns`: time at which its pose was sampled.
+    `sampled_ns`: time at which it was sampled.
     `pixels`: RGB picture (height, width, 3).
     """
 

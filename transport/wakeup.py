@@ -5,7 +5,7 @@ if it asks for a shorter slice (EEVDF since Linux 6.12; older kernels ignore the
 the same core, the measured 99th percentile of the wake-up went from 3.4 ms to 0.2 ms.
 
 This matters most for ZeroMQ's I/O threads. A unit that has sent a message begins its next job at once. The thread that
-carries the message then waits on the same core for the end of that job's slice: 1.6 ms from raster to infer.
+carries the message then waits on the same core for the end of that job's slice: 1.6 ms between two units.
 """
 
 from __future__ import annotations

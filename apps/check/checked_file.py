@@ -12,7 +12,7 @@ from typing import Any, Final
 from trilane.apps.check.port_types import PortTypes, port_types, read_networks
 from trilane.errors import BadInputError
 from trilane.hw_profiles.pipeline_prediction import StagePrice, bound_of, given_price
-from trilane.pipeline.file_graph import edge_rules
+from trilane.pipeline.file_graph import edge_rules, graph_of
 from trilane.pipeline.file_keys import PythonStage, StageKeys
 from trilane.pipeline.pipeline_file import PipelineFile, read_pipeline
 from trilane.transport.slots import edge_rule
@@ -54,6 +54,7 @@ def document_of(file: PipelineFile) -> dict[str, Any]:
         "units": {name: {"hardware": file.hardware(name)} for name in file.units},
         "stages": [_stage(file, name, prices.get(name)) for name in file.stages],
         "streams": streams,
+        "routes": _routes(file, rules),
         **period,
         "memory_bytes": sum(each for each in memory if each is not None),
         "memory_unknown": [each["from"] for each in streams if each["memory_bytes"] is None],
@@ -73,6 +74,15 @@ def _stage(file: PipelineFile, name: str, price: StagePrice | None) -> dict[str,
         "time_ms": None if price is None else price.time.mean_ms,
         "time_from": "" if price is None else price.source,
     }
+
+
+def _routes(file: PipelineFile, rules: Mapping[str, str]) -> list[dict[str, Any]]:
+    """Return the way past some stages: its ends, the stages that a frame skips there, and the share of such frames."""
+    if file.bypass is None:
+        return []
+    begin, way = file.bypass
+    share = None if way.taken is None else float(way.taken)
+    return [{"from": begin, "to": way.to, "past": list(graph_of(file, rules).bypassed), "share": share}]
 
 
 def _what(stage: StageKeys) -> str:

@@ -18,7 +18,7 @@ from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import corners_of
 from trilane.hw_profiles.shared_chip import alone_ms
 from trilane.hw_profiles.tenants import SKIPS
-from trilane.pipeline.file_text import file_text, routes_of, tables_of, unsaid
+from trilane.pipeline.file_text import file_text, tables_of, unsaid
 from trilane.pipeline.pipeline_file import FORM, MOST_BYTES, TABLES, checked_tables
 from trilane.scene.schema import scene_names
 from trilane.scheduler.policy import POLICIES
@@ -31,7 +31,7 @@ DIGITS: Final = 6  # of a time in ms: the scheduler counts nanoseconds
 
 
 class CheckedScene(NamedTuple):
-    """`document`: as `check_file` returns it, with `routes` and `notes`. `text`: the scene as a pipeline file."""
+    """`document`: as `check_file` returns it, with `notes`. `text`: the scene as a pipeline file."""
 
     document: dict[str, Any]
     text: str
@@ -63,23 +63,25 @@ def check_scene(text: str, profile: str | None = None) -> CheckedScene:
     if POLICIES[options.policy].paced:
         run["fps"] = scene.fps
     times: Mapping[str, float] = {}
-    share: float | None = None
+    taken: Mapping[str, Any] = {}
     if profile is not None:
-        times, share = _priced(text, profile)
-    routes = [{**each, "share": share} for each in routes_of(pipeline)]
-    notes = [*unsaid(pipeline), *_said(profile, share)]
-    tables = tables_of(pipeline, run, times)
+        times, taken = _priced(text, profile)
+    tables = tables_of(pipeline, run, times, taken)
     document = document_of(checked_tables(tables, Path(f"{scene.name}.toml")))
+    notes = [*unsaid(pipeline), *_said(profile, document["routes"][0]["share"])]
     period = document["period_ms"]
     head = [f"the pipeline of the scene {scene.name}, as `trilane run {text}` runs it"]
     if period is not None:
         head.append(f"period {period:.6g} ms or more, by {document['limit']}: {' -> '.join(document['cycle'])}")
-    answer = {**document, "file": text, "imports": [], "routes": routes, "notes": notes}
+    answer = {**document, "file": text, "imports": [], "notes": notes}
     return CheckedScene(answer, file_text(tables, [*head, *notes]))
 
 
-def _priced(text: str, profile: str) -> tuple[Mapping[str, float], float]:
-    """Return the mean time of a job by stage in ms, of frames with a network, and the share of frames without one."""
+def _priced(text: str, profile: str) -> tuple[Mapping[str, float], Mapping[str, Any]]:
+    """Return the mean time of a job by stage in ms, of frames with a network, and which frames have none.
+
+    The second is written as the keys of a bypass.
+    """
     chip = load_runnable(profile)
     if chip.name == HOST:
         remedy = f"`trilane predict {text} --profile {HOST}` measures this machine"
@@ -87,7 +89,8 @@ def _priced(text: str, profile: str) -> tuple[Mapping[str, float], float]:
     tenant = avatar(asked(text), text)
     means = alone_ms(chip, tenant, corners_of(chip, SUSTAINED))
     rounded = {stage: round(round(ms * NS_PER_MS) / NS_PER_MS, DIGITS) for stage, ms in means.items()}
-    return rounded, tenant.frames.count(SKIPS) / len(tenant.frames)
+    pattern = "".join(str(int(place == SKIPS)) for place in tenant.frames)
+    return rounded, {"pattern": pattern} if "1" in pattern else {"share": 0}
 
 
 def _said(profile: str | None, share: float | None) -> list[str]:

@@ -1,6 +1,7 @@
 """Draws a checked pipeline file: a lane for each unit, a box for each stage, a line for each input.
 
-A line of dashes is an input of the newest frame. The stages of the cycle that makes the period have a thick border.
+A line of dashes is an input of the newest frame, a line of dots a bypass. The stages of the cycle that makes the period
+have a thick border.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from typing import Any, Final
 COLUMN, LANE, BOX, HEIGHT, LEFT, TOP = 170, 84, 130, 44, 90, 20
 OVER: Final = 10  # pixels above a row of boxes, where a line passes them
 LETTERS: Final = 17  # of a name that fit into a box
+DASHES: Final = {"frame": "", "latest": " stroke-dasharray='5 4'"}
+DOTS: Final = " stroke-dasharray='1 4'"
 STYLE: Final = "font-family='sans-serif' font-size='12'"
 
 
@@ -29,10 +32,11 @@ def draw_graph(document: Mapping[str, Any]) -> str:
         for unit, end in zip(names, ends, strict=True)
     ]
     body += [
-        _line(places[each["from"].partition(".")[0]], places[stage["name"]], each["sync"] == "latest")
+        _line(places[each["from"].partition(".")[0]], places[stage["name"]], DASHES[each["sync"]])
         for stage in document["stages"]
         for each in stage["in"]
     ]
+    body += [_line(places[each["from"]], places[each["to"]], DOTS) for each in document["routes"]]
     body += [_box(stage, *places[stage["name"]], stage["name"] in document["cycle"]) for stage in document["stages"]]
     head = f"<svg xmlns='http://www.w3.org/2000/svg' width='{width}' height='{height}' viewBox='0 0 {width} {height}'>"
     return "\n".join([head, "<rect width='100%' height='100%' fill='white'/>", *body, "</svg>", ""])
@@ -80,9 +84,8 @@ def _box(stage: Mapping[str, Any], x: int, y: int, is_bound: bool) -> str:
     )
 
 
-def _line(start: tuple[int, int], end: tuple[int, int], is_latest: bool) -> str:
+def _line(start: tuple[int, int], end: tuple[int, int], dashes: str) -> str:
     x, y, to_x, to_y = start[0] + BOX, start[1] + HEIGHT // 2, end[0], end[1] + HEIGHT // 2
-    dashes = " stroke-dasharray='5 4'" if is_latest else ""
     bend = (x + to_x) // 2
     path = f"M {x} {y} C {bend} {y} {bend} {to_y} {to_x} {to_y}"
     if y == to_y and to_x - x > COLUMN:  # over the boxes between the two

@@ -19,13 +19,17 @@ from trilane.errors import BadInputError, did_you_mean
 from trilane.hw_profiles.graph_file import GraphFile, fed_inputs, read_graph
 from trilane.pipeline.file_keys import (
     TYPES,
+    BusyBlock,
+    DiscardBlock,
     EncodeBlock,
     OnnxStage,
     OverlayBlock,
     PortType,
     PrepareBlock,
+    PythonStage,
     StageInput,
     StageKeys,
+    TimedStage,
     VideoBlock,
 )
 from trilane.pipeline.pipeline_file import PipelineFile
@@ -102,7 +106,27 @@ def port_types(file: PipelineFile, networks: Mapping[str, GraphFile]) -> PortTyp
         known = _written(stage, found, networks.get(name), networks)
         if known:
             found[name] = known
+    _check_bypass(file, found)
     return found
+
+
+def _check_bypass(file: PipelineFile, types: PortTypes) -> None:
+    """Check that the stage at the end of a bypass gets what it cannot do without from the stage at its begin."""
+    if file.bypass is None:
+        return
+    begin, way = file.bypass
+    stage, given = file.stages[way.to], types.get(begin)
+    if given is None or isinstance(stage, PythonStage | TimedStage | BusyBlock | DiscardBlock):
+        return
+    for each in stage.inputs:
+        known = source_type(each, types)
+        is_needed = not isinstance(stage, OverlayBlock) or each.port in ("", "frame")
+        port = each.from_port or next(iter(types.get(each.stage, {"": None})))
+        if is_needed and known is not None and given.get(port) != known:
+            where, named = f"{file.path}: stages.{begin}.bypass.to", f"the port {port}" if port else "a port"
+            found = f"{way.to!r}, which needs {named} with {known} also from {begin}"
+            remedy = f"or a stage with python there, which gets None where {begin} does not write the port"
+            raise BadInputError(where, found, f"{begin} with this port", remedy)
 
 
 def _written(

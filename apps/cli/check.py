@@ -154,6 +154,9 @@ def _tail(document: Mapping[str, Any]) -> list[str]:
         lines.append(f"period    {period:.6g} ms or more{rate}{limit if document['cycle'] else ''}")
     more = f", and what is unknown of {', '.join(document['memory_unknown'])}" if document["memory_unknown"] else ""
     lines.append(f"memory    {document['memory_bytes'] / 1e6:.3g} MB of slots{more}")
+    for route in document["routes"]:
+        share = "frames that need nothing there" if route["share"] is None else f"{route['share']:.1%} of the frames"
+        lines.append(f"bypass    {route['from']} -> {route['to']}, past {', '.join(route['past'])}: {share}")
     lines.append(f"latency   to the end of {document['latency_to']}")
     if document["imports"]:
         lines.append(f"imports   {', '.join(document['imports'])}, by `trilane run` alone")

@@ -153,7 +153,12 @@ class RunExplanation:
                 "service_ms": {name: ns / NS_PER_MS for name, ns in usual.service_ns.items()},
             },
             "slowest": [_slow_row(shown, usual) for shown in slowest],
-            "advice": advice(rows, self._begun.settings.policy, self._spare_cores(unit_of)),
+            "advice": advice(
+                rows,
+                self._begun.settings.policy,
+                self._spare_cores(unit_of),
+                is_of_file="pipeline" in config_of(self._begun),
+            ),
             "sources": {
                 "frames, waits_ms, service_ms, preempted_ms": MEASURED if clock == HOST_CLOCK else COMPUTED,
                 "efficiency, core_efficiency, machine_efficiency, cores": "CPU time of the run's own jobs",

@@ -13,7 +13,7 @@ from functools import cache
 from typing import Any
 
 from trilane.apps.explain.scene_plan import PlannedFrame, ScenePlan, phases
-from trilane.apps.run.report_facts import worst_loss
+from trilane.apps.run.avatar_facts import worst_loss
 from trilane.avatars.network_file import NetworkFile
 from trilane.body.skinning import DETAILS, left_out
 from trilane.errors import BadInputError

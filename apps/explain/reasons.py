@@ -265,6 +265,8 @@ SHORTER = {
     "present": "a smaller `--picture`: the picture is encoded there",
 }
 
+#: Cause -> what to try where a run of a pipeline file has no such option.
+OF_FILES = {HELD: "another `--policy` or `--edge` lets {stage} begin sooner (docs/policies-and-edges.md)"}
 OF_CAUSES = {
     THROTTLED: "a performance profile with more power, such as `--performance-profile burst`, caps {unit} less",
     DOWN: "{unit} was restarted: the run's messages say why",
@@ -278,11 +280,14 @@ OF_CAUSES = {
 }
 
 
-def advice(budget: Sequence[Mapping[str, Any]], policy: str, spare_cores: int) -> list[str]:
+def advice(
+    budget: Sequence[Mapping[str, Any]], policy: str, spare_cores: int, *, is_of_file: bool = False
+) -> list[str]:
     """Return what a person could try, as sentences that name their reason.
 
     First comes the policy, then what other programs took, then the largest rows. `budget`: rows of the document, the
     largest first. `policy`: policy of the run. `spare_cores`: cores of the machine beyond one for each unit.
+    `is_of_file`: whether the stages are those of a pipeline file, not the avatar's.
     """
     found = []
     works = [row for row in budget if row["what"] == WORK]
@@ -295,18 +300,24 @@ def advice(budget: Sequence[Mapping[str, Any]], policy: str, spare_cores: int) -
             f"({PREEMPTED}): no job of this run had the core: end other programs; threads that spin take it too"
         )
     found += [
-        f"{row['ms']:.1f} ms a frame, {row['stage']} ({row['what']}): {_try(row, spare_cores)}"
+        f"{row['ms']:.1f} ms a frame, {row['stage']} ({row['what']}): {_try(row, spare_cores, is_of_file)}"
         for row in budget
         if row["share"] >= LEAST_ADVISED_SHARE and row["what"] != PREEMPTED
     ]
     return found[:MOST_ADVICE]
 
 
-def _try(row: Mapping[str, Any], spare_cores: int) -> str:
+def _try(row: Mapping[str, Any], spare_cores: int, is_of_file: bool) -> str:
     stage, unit = row["stage"], row["unit"]
+    if is_of_file and row["what"] in (WORK, TAKEN):
+        own_core = row["what"] == TAKEN and spare_cores >= 0
+        return (
+            f"`cores` of {unit} in [units]: a core of its own" if own_core else f"less work in {stage}, or another unit"
+        )
     if row["what"] == TAKEN and spare_cores >= 0:
         return f"this machine has a core for every unit: `--cores` gives {unit} one of its own"
     if row["what"] in (WORK, TAKEN):
         more_cores = ", or more cores for it (`--cores dsp=...`)" if stage == "infer" and spare_cores > 0 else ""
         return SHORTER.get(stage, f"shorter work of {stage}, or a unit of its own for it") + more_cores
-    return OF_CAUSES.get(row["what"], "nothing: it is before what is known").format(stage=stage, unit=unit)
+    known = OF_CAUSES | OF_FILES if is_of_file else OF_CAUSES
+    return known.get(row["what"], "nothing: it is before what is known").format(stage=stage, unit=unit)

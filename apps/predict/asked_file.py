@@ -23,6 +23,7 @@ from trilane.pipeline.journal import Worked
 from trilane.pipeline.pipeline_file import PipelineFile, assignments, read_pipeline
 from trilane.units import HOST, INFER, NS_PER_MS, UnitName
 
+NONE_SKIPS: Final = "no frame takes the bypass of {}: its table says neither share nor pattern"
 APART: Final = "networks are priced alone: units that work at once share memory and heat, which is not in these times"
 
 
@@ -31,10 +32,10 @@ def predict_asked_file(options: PredictOptions, path: Path, say: Callable[[str],
 
     `say`: function that is told before something takes seconds.
     """
-    file = read_pipeline(path)
-    variants = [("", file)] + [(text, file.changed(assignments(text))) for text in options.changes]
     chips = _Chips(options, say)
     measured = _measured(options.measured, chips.name) if options.measured else Measured({}, "", chips.name)
+    file = _with_share(read_pipeline(path), measured)
+    variants = [("", file)] + [(text, file.changed(assignments(text))) for text in options.changes]
     answers = [_answer(each, text, options, chips, measured) for text, each in variants]
     chip = chips.used
     return {
@@ -43,8 +44,12 @@ def predict_asked_file(options: PredictOptions, path: Path, say: Callable[[str],
         "machine": {"profile": chip.name, "title": chip.title} if chip else None,
         "config": {"performance_profile": options.cap if chip else None, "seed": options.seed},
         "pipelines": answers,
-        "notes": [APART] if chip else [],
+        "notes": [*([APART] if chip else []), *_without_share(file)],
     }
+
+
+def _without_share(file: PipelineFile) -> list[str]:
+    return [NONE_SKIPS.format(file.bypass[0])] if file.bypass and file.bypass[1].taken is None else []
 
 
 class _Chips:
@@ -83,6 +88,18 @@ def _measured(folder: Path, chip: str) -> Measured:
             samples.setdefault(record.job.stage, []).append((record.job.end_ns - record.job.begin_ns) / NS_PER_MS)
     times = {name: StageTime(samples=tuple(each[:MOST_SAMPLES])) for name, each in samples.items()}
     return Measured(times, str(folder), chip)
+
+
+def _with_share(file: PipelineFile, measured: Measured) -> PipelineFile:
+    """Return the file with the share of frames that took the bypass in the run, if the file says nothing of them."""
+    if file.bypass is None or file.bypass[1].taken is not None:
+        return file
+    (begin, way), names = file.bypass, list(file.stages)
+    skipped = names[names.index(begin) + 1]
+    begun, done = (len(measured.times[name].samples) if name in measured.times else 0 for name in (begin, skipped))
+    if not begun:
+        return file
+    return file.changed([f"stages.{begin}.bypass={{ to = '{way.to}', share = {max(0.0, 1 - done / begun):.6f} }}"])
 
 
 def _answer(

@@ -15,7 +15,7 @@ from trilane.hw_profiles.graph_file import GraphFile, fed_inputs
 from trilane.hw_profiles.host import settings_of, usable_cores
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
 from trilane.pipeline.description import StageInput as StreamInput
-from trilane.pipeline.file_graph import DEFAULT_FRAMES, edge_rules
+from trilane.pipeline.file_graph import DEFAULT_FRAMES, bypass_of, edge_rules
 from trilane.pipeline.file_keys import (
     BlockStage,
     EncodeBlock,
@@ -33,6 +33,7 @@ from trilane.pipeline.ports import payload_bytes
 from trilane.scheduler.places import Place
 from trilane.stages.blocks.video import DEFAULT_FPS, Footage, footage
 from trilane.stages.dsp.runtime import resolve
+from trilane.transport.slots import edge_rule
 
 BLOCKS: Final = "trilane.stages.blocks"
 ENCODE: Final = f"{BLOCKS}.encode:build"
@@ -50,14 +51,18 @@ def pipeline_of(file: PipelineFile, run_folder: Path) -> Pipeline:
     """
     networks = read_networks(file)
     types = _all_types(file, networks)
-    stages = tuple(_stage(file, name, types, networks, run_folder) for name in file.stages)
     rules = edge_rules(file, None)
+    stages = tuple(_stage(file, name, types, networks, run_folder) for name in file.stages)
+    if file.bypass is not None:
+        stages = _bypassed(file, stages, types, rules)
     edges = tuple(PipelineEdge(payload_bytes=payload_bytes(types[name]), rule=rules[name]) for name in file.readers)
     return Pipeline(
         stages=stages,
         edges=edges,
         units=cores_of(file, usable_cores()),
         latency_to=file.latency_to,
+        bypass=bypass_of(file),
+        warms_up=False,
         from_release=file.run.fps is not None or file.run.arrivals is not None,
         module_folders=(file.folder.absolute(),),
     )
@@ -207,6 +212,24 @@ def _stage(
         "keys": _keys(file, name, stage, networks),
     }
     return made.model_copy(update={"settings": settings})
+
+
+def _bypassed(
+    file: PipelineFile, stages: Sequence[PipelineStage], types: PortTypes, rules: Mapping[str, str]
+) -> tuple[PipelineStage, ...]:
+    """Return the stages as a chain, whose stage at the bypass's end knows what the stage at its begin writes."""
+    assert file.bypass is not None
+    begin, way = file.bypass
+    found = []
+    for stage in stages:
+        settings = dict(stage.settings)
+        if stage.name == begin:
+            settings["keys"] = {**settings["keys"], "bypass": way.model_dump(mode="json")}
+        elif stage.name == way.to:
+            own = file.stages[way.to].inputs[0].stage
+            settings["bypass"] = {"behind": edge_rule(rules[own]).slots, "ports": _texts(types[begin])}
+        found.append(stage.model_copy(update={"inputs": None, "settings": settings}))
+    return tuple(found)
 
 
 def _module(stage: StageKeys) -> str:

@@ -5,6 +5,10 @@ with an array for each input: a named port as a keyword, a lone input without a 
 frame that is not there is None. It returns a dict of arrays by port, or the array of the only port. If it has a
 parameter `out`, it gets the arrays to fill, by port, and may return None.
 
+Where a bypass begins, it has an attribute `skips`, which is read after each frame: true sends the frame to the bypass.
+If it has a method `forget`, that is called before the first frame, and when what earlier frames brought to the bypass's
+end is gone.
+
 Rule: what it returns must have the type that the file says; nothing is cast or broadcast in silence. An error says
 which stage, file and line it comes from.
 """
@@ -25,9 +29,9 @@ from numpy.typing import NDArray
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.file_keys import TYPES
 from trilane.pipeline.ports import Arrays, PortedStage
-from trilane.pipeline.stage import UnitContext
+from trilane.pipeline.stage import Skip, UnitContext
 
-OUT = "out"
+OUT, SKIPS, FORGET = "out", "skips", "forget"
 
 
 class OwnCode(PortedStage):
@@ -46,21 +50,29 @@ class OwnCode(PortedStage):
         if not callable(self._call):
             found = f"{factory} returned {type(self._call).__name__}"
             raise BadInputError(where, found, "something callable", "the factory returns a function for the frames")
-        self._fills = _takes_out(self._call)
+        self._fills, self._may_skip = _takes_out(self._call), "bypass" in self.settings.keys
 
     def work(self, frame: int, arrays: Sequence[NDArray[Any] | None], outputs: Arrays) -> Mapping[str, float]:  # noqa: ARG002
         named = {each.name: array for each, array in zip(self.reads, arrays, strict=True) if each.name}
         plain = [array for each, array in zip(self.reads, arrays, strict=True) if not each.name]
         filled = {OUT: outputs} if self._fills else {}
         found = self._guarded(self._call, *plain, **named, **filled)
-        if not outputs or (found is None and self._fills):
-            return {}
+        if outputs and (found is not None or not self._fills):
+            self._write(found, outputs)
+        return Skip() if self._may_skip and getattr(self._call, SKIPS, False) else {}
+
+    def forget(self) -> None:
+        if callable(own := getattr(self._call, FORGET, None)):
+            self._guarded(own)
+
+    def _write(self, found: object, outputs: Arrays) -> None:
+        """Copy what the code returned to its slot. Raises TrilaneError."""
         if not isinstance(found, dict):
             found = dict.fromkeys(outputs, found) if len(outputs) == 1 else found
         self._check(found, outputs)
+        assert isinstance(found, dict)
         for name, target in outputs.items():
             target[...] = found[name]
-        return {}
 
     def _check(self, found: object, outputs: Arrays) -> None:
         """Check what the code returned. Raises TrilaneError."""

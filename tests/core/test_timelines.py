@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from string import ascii_letters, digits
@@ -32,17 +33,29 @@ LEFT = 15  # characters before the first millisecond
 
 
 @cache
-def example(policy: str, edge: str) -> Simulation:
-    """`FRAMES` frames of the example; all times of its jobs are whole milliseconds."""
+def example(policy: str, edge: str, skipping: str = "") -> Simulation:
+    """`FRAMES` frames of the example; all times of its jobs are whole milliseconds.
+
+    `skipping`: a 1 for each frame that skips raster and infer, from the first one on and again from the start.
+    """
     times = {stage: ms * NS_PER_MS for stage, _, ms in STAGES}
     graph = chain(((stage, unit) for stage, unit, _ in STAGES), edge, LATENCY_TO)
     settings = run_settings(policy, FRAMES, PERIOD_MS * NS_PER_MS)
-    return simulate(graph, settings, lambda stage, *_: times[stage], keep=True)
+    if not skipping:
+        return simulate(graph, settings, lambda stage, *_: times[stage], keep=True)
+    graph = replace(graph, bypass=("pose", "composite"))
+    return simulate(
+        graph,
+        settings,
+        lambda stage, *_: times[stage],
+        skips=lambda frame, _fresh: skipping[frame % len(skipping)] == "1",
+        keep=True,
+    )
 
 
-def timeline(policy: str, edge: str) -> str:
+def timeline(policy: str, edge: str, skipping: str = "") -> str:
     """The first `DRAWN_MS` milliseconds of the example: a line for each stage, a character for each millisecond."""
-    run = example(policy, edge)
+    run = example(policy, edge, skipping)
     lines = ["".ljust(LEFT) + "".join(f"{ms:<10}" for ms in range(0, DRAWN_MS, 10)).rstrip() + " ms"]
     if POLICIES[policy].paced:
         released = {frame * PERIOD_MS: LABELS[frame] for frame in range(DRAWN_MS // PERIOD_MS + 1)}
@@ -93,13 +106,13 @@ def figures() -> str:
 
 
 PAGE = Path(__file__).parents[2] / "docs" / "policies-and-edges.md"
-BLOCK = re.compile(r"(<!-- (timeline (\S+) (\S+)|figures) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+BLOCK = re.compile(r"(<!-- (timeline (\w+) (\S+)(?: ([01]+))?|figures) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 
 
 def drawn(found: re.Match[str]) -> str:
     """The block anew."""
-    text = figures() + "\n" if found[2] == "figures" else f"```\n{timeline(found[3], found[4])}\n```\n"
-    return found[1] + text + found[6]
+    text = figures() + "\n" if found[2] == "figures" else f"```\n{timeline(found[3], found[4], found[5] or '')}\n```\n"
+    return found[1] + text + found[7]
 
 
 def test_the_page_shows_what_the_scheduler_does() -> None:
@@ -125,6 +138,18 @@ def test_one_slot_between_stages_by_hand() -> None:
     """Raster cannot write while infer reads, nor infer while composite reads: 3 + 6 + 2 = 11 ms a frame."""
     assert example("pipelined", "single").report["fps"] == pytest.approx(1000 / 11, rel=1e-2)
     assert example("pipelined", "double").report["fps"] == pytest.approx(1000 / 6, rel=1e-2)
+
+
+def test_frames_that_skip_by_hand() -> None:
+    """Pose has two slots. Frames 2 and 3 wait in them for frame 1, whose infer ends at 16.
+
+    Composite has done frame 2 at 20, and the CPU has shown it at 21. Therefore pose 4 begins at 21.
+    """
+    run = example("pipelined", "double", "0011")
+    done = {(job.stage, job.frame): (job.begin_ns // NS_PER_MS, job.end_ns // NS_PER_MS) for job in run.jobs}
+    assert [done["composite", frame] for frame in range(4)] == [(10, 12), (16, 18), (18, 20), (20, 22)]
+    assert done["pose", 4][0] == 21 and not {("raster", 2), ("infer", 3)} & {*done}
+    assert run.report["frames"]["skipped"] == FRAMES // 2
 
 
 @pytest.mark.parametrize("edge", EDGES)

@@ -47,6 +47,34 @@ def spot(settings):
 """
 
 
+#: Every second picture goes round the stage that inverts the others.
+ROUND = """
+[run]
+fps = 60
+[stages]
+camera = { block = "video", unit = "cpu", path = "street.mp4", size = "64x48" }
+odd    = { python = "own:odd", unit = "gpu", in = "camera", out = "u8 48x64x3", bypass = "video" }
+invert = { python = "own:invert", unit = "dsp", in = "odd", out = "u8 48x64x3" }
+video  = { block = "encode", unit = "cpu", in = "invert", path = "out.mp4" }
+"""
+OWN_ROUND = """
+class Odd:
+    def __init__(self):
+        self.count, self.skips, self.was_told = 0, False, False
+    def forget(self):
+        self.was_told = True
+    def __call__(self, picture):
+        assert self.was_told, "before the first frame"
+        self.skips = self.count % 2 == 1
+        self.count += 1
+        return picture
+def odd(settings):
+    return Odd()
+def invert(settings):
+    return lambda picture: 255 - picture
+"""
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A pipeline file, its network, its code, and a video of 30 pictures."""
@@ -169,6 +197,38 @@ def test_options_stand_for_keys_of_the_file(cli: Cli) -> None:
     assert report["config"]["scene"]["fps"] == 20
     assert (report["stages"]["slow"]["jobs"], report["stages"]["overlay"]["unit"]) == (2, "screen")
     assert report["options"]["changes"] == ["stages.slow.every=2,stages.overlay.unit=screen"]
+
+
+def test_frames_go_round_a_stage_that_has_nothing_to_do(cli: Cli, folder: Path) -> None:
+    """Own code that counts its calls sends pictures 1, 3, 5 ... round: 30 of 60, and no call came before the run."""
+    (folder / "own.py").write_text(OWN_ROUND)
+    (folder / "street.toml").write_text(ROUND)
+    done = cli("run", "street.toml", "--out", "round", "--json")
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert {name: row["jobs"] for name, row in report["stages"].items()} == {
+        **dict.fromkeys(("camera", "odd", "video"), 60),
+        "invert": 30,
+    }
+    assert (report["frames"]["presented"], report["frames"]["skipped"]) == (60, 30)
+    with av.open(str(folder / "out.mp4")) as video:
+        means = [frame.to_ndarray(format="gray").mean() for frame in video.decode(video=0)]
+    assert [mean > 128 for mean in means] == [number % 2 == 0 for number in range(60)]
+    assert cli("explain", "round").returncode == 0
+
+
+def test_a_load_sends_the_frames_of_its_pattern_round_here_and_in_a_prediction(cli: Cli, folder: Path) -> None:
+    (folder / "street.toml").write_text(
+        "[run]\nframes = 50\n[stages]\n"
+        'a = { block = "busy", unit = "cpu", load_ms = 1, bypass = { to = "c", pattern = "01101" } }\n'
+        'b = { block = "busy", unit = "gpu", in = "a", load_ms = 2 }\n'
+        'c = { block = "busy", unit = "cpu", in = "b", load_ms = 1 }\n'
+    )
+    run = json.loads(cli("run", "street.toml", "--json").stdout)
+    predicted = json.loads(cli("predict", "street.toml", "--json").stdout)["pipelines"][0]
+    for report in (run, predicted):
+        assert {name: row["jobs"] for name, row in report["stages"].items()} == {"a": 50, "b": 20, "c": 50}
+        assert report["frames"]["skipped"] == 30
 
 
 def test_a_program_runs_a_file_as_the_command_does(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -40,6 +40,15 @@ left = { unit = "npu", in = "camera", time_ms = { exponential = 9 } }
 right = { unit = "cpu", in = "camera", time_ms = 3 }
 shown = { unit = "gpu", in = { a = "left", b = "right" }, every = 3, time_ms = 5 }
 """
+#: Every third frame skips a stage.
+SKIPPING = """
+[run]
+fps = 50
+[stages]
+a = { unit = "cpu", time_ms = 3, bypass = { to = "c", pattern = "001" } }
+b = { unit = "npu", in = "a", time_ms = 9 }
+c = { unit = "gpu", in = "b", time_ms = 2 }
+"""
 #: Two networks at once, each fed by a camera of no time.
 NETWORKS = """
 [run]
@@ -81,7 +90,9 @@ def reports(tenants: Sequence[Pipeline]) -> list[dict[str, Any]]:
 
 
 @pytest.mark.parametrize(
-    "text", ["[run]\nfps = 50" + DEPTH, SIX, FOUR, MIXED], ids=["join", "one", "own unit", "mixed"]
+    "text",
+    ["[run]\nfps = 50" + DEPTH, SIX, FOUR, MIXED, SKIPPING],
+    ids=["join", "one", "own unit", "mixed", "bypass"],
 )
 def test_a_file_alone_on_a_chip_is_the_file_by_itself(asked: Asked, text: str) -> None:
     """Its simulated run has the same frames and the same luck, so every figure of the run is the same."""

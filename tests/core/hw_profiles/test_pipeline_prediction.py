@@ -15,12 +15,17 @@ import pytest
 
 from support.pipeline_files import CUT, DEPTH, STREET, network, write_file
 from support.run_folders import write_run
-from trilane.hw_profiles.pipeline_prediction import given_price, predict_file
+from trilane.hw_profiles.application import Plan, Variant, simulated, stage_times_ms
+from trilane.hw_profiles.pipeline_prediction import given_price, predict_file, prices_of
+from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.rates import FrameInterval, holding
+from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
+from trilane.hw_profiles.schema import corners_of
 from trilane.pipeline.file_graph import edge_rules, graph_of
-from trilane.pipeline.pipeline_file import read_pipeline
+from trilane.pipeline.pipeline_file import checked_tables, read_pipeline
 from trilane.scheduler.events import Settings
 from trilane.scheduler.virtual import simulate
+from trilane.units import SUSTAINED
 
 Command = Callable[..., tuple[str, str]]
 Predict = Callable[..., dict[str, Any]]
@@ -451,3 +456,88 @@ def test_measured_times_are_those_of_a_run_and_on_a_chip_times_their_scale(
 def test_what_a_frame_needs_has_no_part_of_the_start(predict: Predict) -> None:
     stages = 't = { unit = "u", time_ms = 12 }\nd = { unit = "u", in = "t", time_ms = 45, every = 3 }'
     assert predict(f"[stages]\n{stages}")["needs_ms"]["mean"] == 27
+
+
+#: The pipeline of tests/core/scheduler/test_bypass_by_hand.py, of whose five frames 2 and 3 skip `net`.
+ROUND = """
+[stages]
+pose = {{ unit = "cpu", time_ms = 3, bypass = {{ to = "show", {} }} }}
+net = {{ unit = "dsp", in = "pose", time_ms = 7 }}
+show = {{ unit = "gpu", in = "net", time_ms = 1 }}
+"""
+
+
+def test_frames_that_skip_a_stage_are_where_they_were_worked_out(predict: Predict) -> None:
+    """Presented at 11, 18, 19, 21, 31; latencies 11, 15, 9, 4, 11. Of five frames the DSP works three times 7 ms."""
+    answer = predict("[run]\nframes = 5" + ROUND.format('pattern = "00110"'))
+    assert (answer["frame_time_ms"]["mean"], answer["frame_time_ms"]["max"]) == (5, 10)
+    assert (answer["latency_ms"]["mean"], answer["latency_ms"]["max"]) == (10, 15)
+    assert (answer["frames"]["presented"], answer["frames"]["skipped"]) == (5, 2)
+    assert {name: row["jobs"] for name, row in answer["stages"].items()} == {"pose": 5, "net": 3, "show": 5}
+    assert (answer["period_ms"], answer["limit"], answer["cycle"]) == (4.2, "unit dsp", ["net"])
+
+
+def test_what_a_frame_needs_is_a_mean_of_both_ways(predict: Predict) -> None:
+    """One frame at a time: 3 + 7 + 1 = 11 ms, or 3 + 1 = 4 ms; a unit alone works at most 3.5 ms a frame."""
+    head = '[run]\npolicy = "sequential"\n'
+    answer = predict(head + "fps = 100" + ROUND.format('pattern = "01"'))
+    assert (answer["needs_ms"]["mean"], answer["period_ms"]) == (7.5, 10)
+    assert answer["rate"]["sentence"].startswith("holds 100 fps: ")
+    assert predict(head + ROUND.format('pattern = "01"'))["period_ms"] == 3.5
+    some = predict(head + "frames = 4000" + ROUND.format("share = 0.25"))
+    assert some["frame_time_ms"]["mean"] == pytest.approx(11 - 7 * 0.25, abs=3 * 7 * sqrt(0.25 * 0.75 / 4000))
+    none, whole = (predict(head + ROUND.format(f"share = {share}")) for share in (0, 1))
+    assert (none["frame_time_ms"]["mean"], whole["frame_time_ms"]["mean"]) == (11, 4)
+    assert (none["frames"]["skipped"], whole["frames"]["skipped"]) == (0, 1000)
+
+
+def test_another_share_is_a_what_if_and_a_seed_other_frames(documents: Predict) -> None:
+    text = ROUND.format("share = 0.5")
+    rows = documents(text, "--set", "stages.pose.bypass.share=0.9")["pipelines"]
+    skipped = [row["frames"]["skipped"] for row in rows]
+    assert skipped == pytest.approx([500, 900], abs=50)
+    assert documents(text, "--seed", "1")["pipelines"][0]["frames"]["skipped"] != skipped[0]
+
+
+@pytest.mark.parametrize("edge", ["single", "double", "triple", "fifo:4", "orphan"])
+@pytest.mark.parametrize(("policy", "fps"), [("pipelined", None), ("sequential", None), ("latest", 20.0)])
+def test_the_application_runs_as_a_file_of_its_stages(policy: str, fps: float | None, edge: str) -> None:
+    """Two ways to the same run: every figure is the same, to the last digit. A latency at a rate has another begin."""
+    chip = load_runnable("snapdragon-888")
+    network = reference_network(NetworkSpec("resnet18", "batch", 512, 512, 16, "packed"))
+    plan, corners = Plan(network, "dsp", Variant(policy, edge, fps=fps or 30.0)), corners_of(chip, SUSTAINED)
+    report = simulated(chip, plan, corners).report
+    stages: dict[str, dict[str, Any]] = {}
+    for (name, unit), ms in stage_times_ms(chip, plan, corners).items():
+        stages[name] = {"unit": unit, "time_ms": ms, **({"in": list(stages)[-1]} if stages else {})}
+    run = {"policy": policy, "edge": edge, "latency_to": "composite", **({"fps": fps} if fps else {})}
+    file = checked_tables({"run": run, "stages": stages}, Path("application.toml"))
+    own = predict_file(file, prices_of(file, {}, lambda *_: chip, lambda _: corners), report["frames"]["requested"])
+    assert report["frame_time_ms"]["mean"] > 20, "else the display would hold the application"
+    assert own["frame_time_ms"] == report["frame_time_ms"] | {key: own["frame_time_ms"][key] for key in ("low", "high")}
+    for key in ("frames", "fps", "deadline_misses", "units", "efficiency"):
+        assert own[key] == report[key], key
+    for name, row in report["stages"].items():
+        assert {key: own["stages"][name][key] for key in row} == row
+    if fps is None:
+        assert own["latency_ms"]["mean"] == report["latency_ms"]["mean"]
+
+
+def test_a_run_gives_the_share_of_its_frames_that_skipped(documents: Predict, tmp_path: Path) -> None:
+    """30 of 40 frames went past `net`, of whose ten each took 7 ms; a share in the file would go before."""
+    text = ROUND.format("").replace('{ to = "show",  }', '"show"')
+    file = read_pipeline(write_file(tmp_path, text))
+    times = {"pose": 3_000_000, "net": 7_000_000, "show": 1_000_000}
+    done = simulate(
+        graph_of(file, edge_rules(file)),
+        Settings(40),
+        lambda stage, *_: times[stage],
+        skips=lambda frame, _fresh: frame % 4 > 0,
+        keep=True,
+    )
+    run = write_run(tmp_path / "run", done)
+    found = documents(text, "--measured", str(run))
+    assert found["pipelines"][0]["frames"]["skipped"] == pytest.approx(750, abs=3 * sqrt(1000 * 0.75 * 0.25))
+    assert found["notes"] == []
+    said = documents(ROUND.format("share = 0"), "--measured", str(run))["pipelines"][0]
+    assert said["frames"]["skipped"] == 0

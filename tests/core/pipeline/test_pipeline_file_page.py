@@ -14,6 +14,7 @@ from support.pipeline_files import write_file
 from trilane.pipeline.file_keys import (
     BLOCKS,
     BlockStage,
+    BypassKeys,
     InputKeys,
     Keys,
     OnnxStage,
@@ -31,6 +32,7 @@ MODELS: dict[str, type[Keys]] = {
     "units": UnitKeys,
     "stage": StageKeys,
     "input": InputKeys,
+    "bypass": BypassKeys,
     "time": StageTime,
     "onnx": OnnxStage,
     "python": PythonStage,
@@ -76,7 +78,7 @@ def test_every_key_says_what_it_means() -> None:
 
 def test_the_files_of_the_page_can_be_read(tmp_path: Path) -> None:
     examples = re.findall(r"```toml\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    assert len(examples) == 2
+    assert len(examples) == 3
     for example in examples:
         file = read_pipeline(write_file(tmp_path, example))
         assert set(file.stages) == set(tomllib.loads(example)["stages"])

@@ -204,3 +204,15 @@ def test_no_slot_of_the_fewest_can_be_left_out(case: tuple[Graph, dict[str, int]
 
 def test_a_given_rule_stays() -> None:
     assert fewest_slots(graph({"depth": "single"}, *DEPTH), DEPTH_NS, ["depth"]) == [2, 1, 2]
+
+
+def test_stages_that_frames_skip_count_by_the_share_of_those_that_do_not() -> None:
+    """By one slot b 10 and c 3 take turns, 13. With a fifth of the frames at b, its unit works 2 a frame, c 3."""
+    stages = tuple(StageSpec(name, name) for name in "abc")
+    known = Graph(stages, ("single", "single"), "c", ("a", "c"))
+    times = {"a": 2, "b": 10, "c": 3}
+    assert period_bound(known, times).period_ns == 13
+    some = period_bound(known, times, shares={"b": Fraction(1, 5)})
+    assert (some.period_ns, some.stages, some.limit) == (3, ("c",), "unit c")
+    assert period_bound(known, times, shares={"b": Fraction(1, 2)}).period_ns == 5
+    assert period_bound(known, times, 0, 7, {"b": Fraction(1, 2)}).limit == "rate"

@@ -15,10 +15,14 @@ import pytest
 
 from support.pipeline_files import BRANCHES, CUT, DEPTH, STREET, write_file
 from trilane.apps.check.checked_scene import check_scene
+from trilane.apps.predict.asked_pipelines import asked, avatar
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, StageInput, UnitSettings
-from trilane.pipeline.file_graph import edge_rules, graph_of
+from trilane.pipeline.file_graph import edge_rules, graph_of, skips_of
 from trilane.pipeline.file_text import file_text, tables_of, unsaid
 from trilane.pipeline.pipeline_file import checked_tables, read_pipeline
+from trilane.stages.avatar_pipeline import avatar_pipeline
+from trilane.stages.configure import configure
+from trilane.stages.run_options import RunOptions
 from trilane.transport.packets import header_dtype
 
 Command = Callable[..., tuple[str, str]]
@@ -107,6 +111,12 @@ A = 'a = { unit = "u", time_ms = 1 }\n'
 STAGES = f"[stages]\n{A}"
 VIDEO = 'v = { block = "video", unit = "cpu", path = "v.mp4", size = "640x480" }\n'
 NET = 'n = { onnx = "seg.onnx", unit = "dsp", in = "a" }\n'
+#: Frames may go from the first of three stages past the second.
+ROW = """[stages]
+a = {{ unit = "u", time_ms = 1, bypass = {} }}
+b = {{ unit = "v", in = "a", time_ms = 1 }}
+c = {{ unit = "u", in = "b", time_ms = 1 }}
+"""
 
 #: What is wrong: the file, then what the message must name, the key first.
 WRONG: dict[str, tuple[str, ...]] = {
@@ -286,6 +296,42 @@ WRONG: dict[str, tuple[str, ...]] = {
         'b = { unit = "u", in = "d", time_ms = 1 }',
         *("stages.b.in", "'d', a discard"),
     ),
+    "a bypass to an unknown stage": (ROW.format('"d"'), "stages.a.bypass.to", "'d', an unknown stage", "one of c"),
+    "a bypass to the next stage": (ROW.format('"b"'), "stages.a.bypass.to", "'b', a stage before or next to it"),
+    "a bypass at a network": (
+        STAGES + NET.replace(" }", ', bypass = "c" }') + 'b = { unit = "u", in = "n", time_ms = 1 }\n'
+        'c = { unit = "u", in = "b", time_ms = 1 }',
+        *("stages.n.bypass", "a bypass at onnx", "python, busy or only time_ms"),
+    ),
+    "a bypass among branches": (
+        ROW.format('"c"') + 'd = { unit = "u", in = "a", time_ms = 1 }',
+        *("stages.a.bypass", "a bypass in a pipeline with branches", "a row of stages"),
+    ),
+    "two bypasses": (
+        ROW.format('"c"').replace('"v"', '"v", bypass = "d"') + 'd = { unit = "u", in = "c", time_ms = 1 }',
+        *("stages.b.bypass", "a second bypass", "leave it out here, or at a"),
+    ),
+    "a bypass with share and pattern": (
+        ROW.format('{ to = "c", share = 0.5, pattern = "01" }'),
+        *("stages.a.bypass", "share and pattern", "one of them"),
+    ),
+    "a bypass for more than all": (ROW.format('{ to = "c", share = 1.5 }'), "stages.a.bypass.share", "1.5", "to 1"),
+    "a pattern of letters": (ROW.format('{ to = "c", pattern = "01x" }'), "stages.a.bypass.pattern", "'01x'", "'0011'"),
+    "unknown key of a bypass": (
+        ROW.format('{ to = "c", shar = 0.5 }'),
+        *("stages.a.bypass.shar", "did you mean 'share'?"),
+    ),
+    "number for a bypass": (ROW.format("3"), "stages.a.bypass", "3", "a stage, or a table"),
+    "latency to a stage that frames skip": (
+        '[run]\nlatency_to = "b"\n' + ROW.format('"c"'),
+        *("run.latency_to", "'b', past which frames of a may go", "such as c"),
+    ),
+    "a bypass to a stage that needs more": (
+        '[stages]\na = { python = "m:f", unit = "u", out = "f32 2", bypass = "e" }\n'
+        'b = { python = "m:g", unit = "u", in = "a", out = "u8 4x6x3" }\n'
+        'e = { block = "encode", unit = "u", in = "b", path = "o.mp4" }',
+        *("stages.a.bypass.to", "'e', which needs a port with u8 4x6x3 also from a", "python"),
+    ),
     "no TOML": (STAGES + "b = = 3", "line 3", "no TOML", "Invalid value"),
 }
 
@@ -362,7 +408,22 @@ def test_a_line_between_stages_of_one_row_passes_over_the_box_between(command: C
     assert [" H " in path for path in paths] == [False, True, False]
 
 
-@pytest.mark.parametrize("scene", ["default", "portrait"])
+def test_a_bypass_is_shown_with_what_it_saves(command: Command, tmp_path: Path) -> None:
+    """Frames 1 and 2 of 4 skip b, whose unit then works 1 of 4 ms for two frames of four: 2 of u, 0.5 of v."""
+    path = write_file(tmp_path, ROW.format('{ to = "c", pattern = "0110" }'))
+    document = json.loads(command("check", path, "--svg", tmp_path / "graph.svg", "--json")[0])
+    assert document["routes"] == [{"from": "a", "to": "c", "past": ["b"], "share": 0.5}]
+    assert (document["period_ms"], document["limit"], document["cycle"]) == (2, "unit u", ["a", "c"])
+    assert "bypass    a -> c, past b: 50.0% of the frames" in command("check", path)[0]
+    assert (tmp_path / "graph.svg").read_text(encoding="utf-8").count("stroke-dasharray='1 4'") == 1
+    path = write_file(tmp_path, ROW.format('"c"').replace('"v", in = "a", time_ms = 1', '"v", in = "a", time_ms = 9'))
+    document = json.loads(command("check", path, "--json")[0])
+    assert document["routes"][0]["share"] is None and document["period_ms"] == 9
+    notes = json.loads(command("predict", path, "--json")[0])["notes"]
+    assert notes == ["no frame takes the bypass of a: its table says neither share nor pattern"]
+
+
+@pytest.mark.parametrize("scene", ["default", "portrait", "walk-past"])
 def test_a_scene_is_printed_as_a_file_with_the_same_streams_and_the_same_least_period(
     command: Command, tmp_path: Path, scene: str
 ) -> None:
@@ -371,14 +432,22 @@ def test_a_scene_is_printed_as_a_file_with_the_same_streams_and_the_same_least_p
     path = tmp_path / "printed.toml"
     path.write_text(text, encoding="utf-8")
     again = json.loads(command("check", path, "--json")[0])
-    for key in ("run", "latency_to", "units", "stages", "streams", "period_ms", "cycle", "limit", "memory_bytes"):
+    for key in ("run", "latency_to", "units", "stages", "streams", "routes", "period_ms", "cycle", "limit"):
         assert again[key] == document[key], key
+    assert again["memory_bytes"] == document["memory_bytes"]
+    checked = configure(RunOptions(scene=scene, skinning="gpu"), tmp_path)
+    described, file = avatar_pipeline(checked.config, checked.assets, "double"), read_pipeline(path)
+    assert graph_of(file, edge_rules(file)) == described.graph(), "nothing of the description is lost"
     (route,) = document["routes"]
     assert (route["from"], route["to"], route["past"]) == ("pose", "composite", ["raster", "infer"])
-    assert 0 <= route["share"] < 1 and any("past raster, infer" in each for each in document["notes"])
+    planned, skips = avatar(asked(scene), scene), skips_of(file)
+    frames = range(len(planned.frames) + 2)
+    assert [skips(frame, False) for frame in frames] == [planned.skips(frame, False) for frame in frames]
+    assert (route["share"] > 0) == (scene == "walk-past")
     busy: dict[str, float] = {}
     for stage in document["stages"]:
-        busy[stage["unit"]] = busy.get(stage["unit"], 0.0) + stage["time_ms"]
+        part = 1 - route["share"] if stage["name"] in route["past"] else 1
+        busy[stage["unit"]] = busy.get(stage["unit"], 0.0) + part * stage["time_ms"]
     assert document["period_ms"] == pytest.approx(max(busy.values()), abs=1e-9)
     predicted = json.loads(command("predict", path, "--json")[0])["pipelines"][0]
     alone = json.loads(command("predict", scene, "--profile", "snapdragon-888", "--json")[0])["pipelines"][0]

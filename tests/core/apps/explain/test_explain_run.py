@@ -360,6 +360,21 @@ def test_advice_is_what_this_machine_can_follow(what: str, spare: int, found: st
     assert advice([row], "pipelined", spare) == [f"5.0 ms a frame, infer ({what}): {found}"]
 
 
+@pytest.mark.parametrize(
+    ("what", "spare", "found"),
+    [
+        ("work", 1, "less work in composite, or another unit"),
+        ("taken", -1, "less work in composite, or another unit"),
+        ("taken", 0, "`cores` of gpu in [units]: a core of its own"),
+        ("held", 0, "another `--policy` or `--edge` lets composite begin sooner (docs/policies-and-edges.md)"),
+    ],
+)
+def test_advice_for_a_stage_of_a_pipeline_file_is_not_the_avatars(what: str, spare: int, found: str) -> None:
+    """A run of a file refuses --picture, --cores and --latch, and its stages may have any name."""
+    row = {"stage": "composite", "unit": "gpu", "what": what, "share": 0.5, "ms": 5.0}
+    assert advice([row], "pipelined", spare, is_of_file=True) == [f"5.0 ms a frame, composite ({what}): {found}"]
+
+
 def test_what_other_programs_took_is_said_first() -> None:
     rows = [
         {"stage": "infer", "unit": "dsp", "what": "work", "share": 0.6, "ms": 6.0},
