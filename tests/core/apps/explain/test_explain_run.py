@@ -78,7 +78,7 @@ def test_one_frame_by_its_jobs_or_by_why_it_left(folder: Path) -> None:
     assert all(row["wait_ms"] == pytest.approx(sum(row["causes_ms"].values())) for row in found["jobs"])
     outcomes = [explain_frame(folder, number)["outcome"] for number in range(40)]
     assert (outcomes.count("presented"), outcomes.count("lost")) == (39, 1)
-    assert explain_frame(folder, outcomes.index("lost"))["cause"] == "unit_died"
+    assert explain_frame(folder, outcomes.index("lost"))["cause"] == "died:gpu"
     with pytest.raises(BadInputError, match="40, expected a frame that began, of 0 to 39"):
         explain_frame(folder, 40)
 
