@@ -88,9 +88,7 @@ def _show_frame(document: Mapping[str, Any]) -> None:
     from rich.table import Table
 
     after = "" if document["after_ms"] is None else f" {document['after_ms']:.1f} ms after its release"
-    cause = (
-        "" if document["cause"] is None else f", cause {document['cause']} (docs/policies-and-edges.md)"
-    )
+    cause = "" if document["cause"] is None else f", cause {document['cause']} (docs/policies-and-edges.md)"
     latency = "" if document["latency_ms"] is None else f", latency {document['latency_ms']:.1f} ms"
     console = stdout_console()
     console.print(f"Frame {document['frame']}: {document['outcome']}{after}{cause}{latency}", soft_wrap=True)

@@ -192,7 +192,10 @@ class PredictOptions(Options):
         description="Unit of the network: gpu or dsp. For a --network by itself also cpu, or all to compare units.",
     )
     minutes: Annotated[Finite, Option(unit="minutes")] = Field(
-        default=0.0, ge=0, le=MAX_MINUTES, description="Virtual minutes to predict with heat. With 0, heat is ignored and the settled state is predicted."
+        default=0.0,
+        ge=0,
+        le=MAX_MINUTES,
+        description="Virtual minutes to predict with heat. With 0, the settled state is predicted, without heat.",
     )
     policy: Annotated[str | None, one_of("reference", *POLICIES), Option(synonyms=("--pipelining",))] = Field(
         default=None,
