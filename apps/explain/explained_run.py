@@ -279,7 +279,7 @@ def _job_row(one: ExplainedJob, release_ns: int) -> dict[str, Any]:
     }
 
 
-def _causes_ms(waits_ns: Mapping[str, int], per: int) -> dict[str, float]:
+def _causes_ms(waits_ns: Mapping[str, int], per: float) -> dict[str, float]:
     return {cause: ns / per for cause, ns in sorted(waits_ns.items(), key=lambda row: -row[1])}
 
 
