@@ -197,15 +197,17 @@ def _run(checked: Checked, plan: Setting, slowest_ms: float = 0.0) -> dict[str, 
 def _figures(result: RunResult) -> dict[str, Any]:
     """Return the row of one run, before it is compared with others."""
     metrics = result.report
-    stages_ms = sum(stage.service_ms.mean for stage in metrics.stages.values())
+    frame_ms = metrics.frame_time_ms.mean
+    assert frame_ms is not None  # two frames were presented
+    stages_ms = sum(stage.service_ms.mean or 0.0 for stage in metrics.stages.values())
     busiest = max(metrics.units, key=lambda unit: metrics.units[unit].busy)
     return {
         "fps": metrics.fps,
-        "frame_ms": metrics.frame_time_ms.mean,
+        "frame_ms": frame_ms,
         LATENCIES: latencies_ns(result.recording, result.jobs),
         "efficiency": metrics.efficiency,
         UNITS_MS: _units_ms(result),
-        "hops_ms": metrics.frame_time_ms.mean - stages_ms if metrics.policy == SEQUENTIAL else None,
+        "hops_ms": frame_ms - stages_ms if metrics.policy == SEQUENTIAL else None,
         "busiest": busiest,
         **idle_between_jobs([job for job in result.jobs if job.unit == busiest]),
         "dropped": sum(result.dropped.values()),
@@ -218,7 +220,7 @@ def _units_ms(result: RunResult) -> dict[str, float]:
     times = dict.fromkeys(result.report.units, 0.0)
     for name, stage in result.report.stages.items():
         preempted = [job.preempted_ns for job in result.jobs if job.stage == name]
-        times[stage.unit] += stage.service_ms.mean - (fmean(preempted) / NS_PER_MS if preempted else 0.0)
+        times[stage.unit] += (stage.service_ms.mean or 0.0) - (fmean(preempted) / NS_PER_MS if preempted else 0.0)
     return times
 
 

@@ -250,7 +250,9 @@ def _frame_ms(checked: Checked, what: str, starter: UnitStarter) -> float:
         raise KeyboardInterrupt
     if result.failure is not None or result.presented < 2:
         raise TrilaneError(f"{what}: {result.failure.message if result.failure else 'no frames were presented'}")
-    return result.report.frame_time_ms.mean
+    frame_ms = result.report.frame_time_ms.mean
+    assert frame_ms is not None  # two frames were presented
+    return frame_ms
 
 
 def sheet(moment: _Moment) -> U8:

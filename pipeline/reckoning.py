@@ -141,7 +141,7 @@ class Reckoning:
 
 
 def _bound(budget: Budget, unit_of: Mapping[str, str], slowed: Slowed | None) -> dict[str, Any]:
-    """Return `bottleneck` and `bound` of a report; empty where there is no path.
+    """Return `bottleneck` and `bound` of a report; both None where there is no path.
 
     The bound is what costs most when it is slowed; without a replay that can be trusted, what has most of the path.
     Where most of the path is no unit's, that is the bottleneck, whatever slowing a unit costs.
@@ -149,7 +149,7 @@ def _bound(budget: Budget, unit_of: Mapping[str, str], slowed: Slowed | None) ->
     names = budget.names(unit_of)
     path = {kind: budget.largest(name_of) for kind, name_of in names.items()}
     if path["unit"] is None:
-        return {}
+        return {"bottleneck": None, "bound": None}
     bound: dict[str, Any] = dict(path)
     if slowed is not None and slowed.is_trusted:
         costs = {"unit": slowed.by(unit_of), "stage": slowed.costs}

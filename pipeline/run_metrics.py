@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from trilane.pipeline.description import Model
 
@@ -69,33 +69,41 @@ class FrameCounts(Record):
 
 
 class TimeSummary(Record):
-    """Statistics of times in ms: `mean`, percentiles `p50` to `p99`, and `max`; all 0 when there were none.
+    """Statistics of times in ms: `mean`, percentiles `p50` to `p99`, and `max`; all null when there were none.
 
     `samples`: number of times; null in reports older than this count. p90 needs 29 of them, p95 59, p99 299
     (`trilane.scheduler.stats.samples_needed`).
     """
 
-    mean: float
-    p50: float
-    p90: float
-    p95: float
-    p99: float
-    max: float
+    mean: float | None
+    p50: float | None
+    p90: float | None
+    p95: float | None
+    p99: float | None
+    max: float | None
     samples: int | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _know_nothing_of_no_times(cls, document: Any) -> Any:
+        """Replace what counts as 0 without a time, also in the files of an older Trilane."""
+        if not isinstance(document, dict) or document.get("samples") != 0:
+            return document
+        return {key: value if key == "samples" else None for key, value in document.items()}
 
 
 class FrameTimes(TimeSummary):
     """Times between presented frames, in ms.
 
-    `ema20_min`, `ema20_max`: smallest and largest exponential average over 20 frames.
-    `jitter`: mean absolute difference of successive frame times.
+    `ema20_min`, `ema20_max`: smallest and largest exponential average over 20 frames; null without a frame time.
+    `jitter`: mean absolute difference of successive frame times; null for fewer than two.
     `mean_low`, `mean_high`: bounds of the 95 % interval of the mean, from the scatter of this run's frames (batch
     means); null when there are too few frames.
     """
 
-    ema20_min: float
-    ema20_max: float
-    jitter: float
+    ema20_min: float | None
+    ema20_max: float | None
+    jitter: float | None
     mean_low: float | None = None
     mean_high: float | None = None
 
@@ -395,7 +403,7 @@ class PolicyMetrics(Record):
     `frames`: counts of frames by what became of them.
     `frame_time_ms`: times between presented frames.
     `latency_ms`: times from a frame's sampling, or release, to the end of the stage that the pipeline names.
-    `fps`: presented frames a second; 0 for fewer than two.
+    `fps`: presented frames a second; null for fewer than two.
     `fps_low`, `fps_high`: bounds of the 95 % interval of `fps`, from that of the mean frame time; null when there are
     too few frames.
     `deadline_misses`: number of frames presented after their deadline, or of frame times above the target.
@@ -416,7 +424,7 @@ class PolicyMetrics(Record):
     frames: FrameCounts
     frame_time_ms: FrameTimes
     latency_ms: TimeSummary
-    fps: float
+    fps: float | None
     fps_low: float | None = None
     fps_high: float | None = None
     deadline_misses: int
@@ -430,6 +438,13 @@ class PolicyMetrics(Record):
     bound: Bound | None = None
     core_shares: tuple[CoreShare, ...] = ()
     policy: str = ""
+
+    @field_validator("fps")
+    @classmethod
+    def _know_no_rate_of_one_frame(cls, fps: float | None, known: ValidationInfo) -> float | None:
+        """Replace the 0 of a run that presented fewer than two frames, also in the files of an older Trilane."""
+        frames = known.data.get("frames")
+        return fps if frames is None or frames.presented > 1 else None
 
 
 class RunMetrics(PolicyMetrics):

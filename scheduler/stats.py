@@ -255,13 +255,14 @@ class FrameTimeSamples:
         """Return `frame_time_ms` of a report: summary, exponential average, jitter, interval of the mean.
 
         The average over SPAN frames (weight 2 / (SPAN + 1)) counts from frame SPAN on, if there are that many. Jitter
-        is the mean absolute difference of successive times.
+        is the mean absolute difference of successive times, None for fewer than two.
         """
+        count = self.samples.count
         return {
             **self.samples.summary_ms(),
             f"ema{SPAN}_min": round(self._least / NS_PER_MS, 6),
             f"ema{SPAN}_max": round(self._most / NS_PER_MS, 6),
-            "jitter": round(self._steps_ns / max(self.samples.count - 1, 1) / NS_PER_MS, 6),
+            "jitter": round(self._steps_ns / (count - 1) / NS_PER_MS, 6) if count > 1 else None,
             **frame_interval_ms(self._interval()),
         }
 

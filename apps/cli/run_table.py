@@ -248,7 +248,7 @@ def _skipped(report: Report) -> str:
     return f"skipped raster and infer: {frames.skipped} of {frames.presented} frames ({parts})"
 
 
-def _of_several(run: PolicyMetrics, value: float) -> float | None:
+def _of_several(run: PolicyMetrics, value: float | None) -> float | None:
     """Return a frame time or a latency; None for a single frame, which gives no statistic."""
     return value if run.frames.presented > 1 else None
 

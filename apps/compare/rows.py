@@ -243,7 +243,7 @@ def _summaries(document: Mapping[str, Any]) -> dict[Figure, float]:
 
 
 def _statistics(measure: str, of: str, times: Mapping[str, Any], names: Sequence[str]) -> dict[Figure, float]:
-    return {Figure(measure, of, "", name, MS): float(times[name]) for name in names if name in times}
+    return {Figure(measure, of, "", name, MS): float(times[name]) for name in names if times.get(name) is not None}
 
 
 def _of_counts(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figure, Difference]]:

@@ -86,7 +86,7 @@ def _run(avatar: str, frames: int, out: Path) -> tuple[float, float | None]:
     """Return the milliseconds between the frames of a run, and the share of the cores that other programs had."""
     options = RunOptions(avatar=avatar, frames=frames, baseline_frames=0, out=out)
     report = run_asked(options, quiet, ("trilane", "bench")).report
-    return report.frame_time_ms.mean, report.other_programs
+    return report.frame_time_ms.mean or 0.0, report.other_programs
 
 
 def _of_network(file: Path) -> Predicted:

@@ -179,9 +179,10 @@ def inspect_report(path: Path) -> Inspection:
     presented = report.frames.presented
     seconds = report.duration_s
     facts = {"clock": report.clock, "fps": report.fps, "presented": presented, "failure": report.failure}
-    what = f"the report of {presented} frames at {report.fps:.4g}/s on the {report.clock} clock"
+    rate = "one frame" if report.fps is None else f"{presented} frames at {report.fps:.4g}/s"
+    what = f"the report of {rate} on the {report.clock} clock"
     advice = f"trilane explain {path if path.is_dir() else path.parent}"
-    length = Length(presented, float(seconds), float(report.fps))
+    length = Length(presented, float(seconds), report.fps)
     return Inspection("report", what, "", advice, Detected("report of a run", "its key `clock`"), length, facts)
 
 

@@ -23,6 +23,7 @@ MOST_CAUSES: Final = 2
 MOST_TRIES: Final = 3
 LABELS: Final = ("PASS", "FAIL")
 UNKNOWN: Final = "not known"
+NO_RATE: Final = f"the rate is {UNKNOWN}: fewer than two frames were presented"
 #: What figures are of that are not a finished run's.
 SO_FAR, COMPUTED = "so far", "computed"
 #: Name of the bound of a prediction that the chip's display holds back.
@@ -173,7 +174,7 @@ def judged(facts: Facts) -> Verdict:
 def _ended(facts: Facts) -> str:
     if facts.failure:
         return f"the run failed: {facts.failure}"
-    return "" if facts.rate else "fewer than two frames were presented"
+    return "" if facts.rate else NO_RATE
 
 
 def _too_slow(facts: Facts) -> str:
@@ -201,7 +202,7 @@ def _held(facts: Facts) -> str:
     if facts.failure:
         return f"the run ended early: {facts.failure}"
     if facts.rate is None:
-        return "fewer than two frames were presented"
+        return NO_RATE
     found, target = _apart(facts.rate.fps, facts.target_fps)
     late = f"at {target} fps {_late(facts.lateness)}" if facts.lateness else f"asked for {target} fps"
     around = ""
@@ -213,10 +214,10 @@ def _held(facts: Facts) -> str:
 
 
 def _times(facts: Facts) -> str:
-    if facts.rate is None or facts.frame_ms is None:
-        return ""
-    slow = f" ({facts.slow[0]} {_ms(facts.slow[1])})" if facts.slow else ""
     latency = f", latency {_number(facts.latency_ms)} ms" if facts.latency_ms is not None else ""
+    if facts.rate is None or facts.frame_ms is None:
+        return f"{UNKNOWN}{latency}"
+    slow = f" ({facts.slow[0]} {_ms(facts.slow[1])})" if facts.slow else ""
     alone = f"; one at a time: {_number(facts.alone[0])} fps, {_number(facts.alone[1])} ms" if facts.alone else ""
     return f"{_ms(facts.frame_ms)} ms a frame{slow}{latency}{alone}"
 

@@ -7,6 +7,7 @@ what is not known is left out of the verdict. The bound is the report's own, nev
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from math import inf
 from typing import TYPE_CHECKING, Any, Final
 
 from trilane.apps.explain.reasons import SHORTER
@@ -57,7 +58,8 @@ def facts_of(document: Mapping[str, Any], folder: str = "", *, goes_on: bool = F
     frames, times, latency = (document.get(key) or {} for key in ("frames", "frame_time_ms", "latency_ms"))
     has_times = frames.get("presented", 0) > 1
     target, is_paced = target_fps(document), _is_paced(document)
-    rate = Rate(document["fps"], document.get("fps_low"), document.get("fps_high")) if has_times else None
+    fps = document.get("fps") if has_times else None
+    rate = Rate(fps, document.get("fps_low"), document.get("fps_high")) if fps else None
     bound = bound_of(document)
     baseline = document.get("baseline")
     trust = NOT_YET if goes_on else trust_of(document)
@@ -71,7 +73,7 @@ def facts_of(document: Mapping[str, Any], folder: str = "", *, goes_on: bool = F
         frame_ms=times.get("mean") if has_times else None,
         slow=slow_percentile(times),
         latency_ms=latency.get("mean"),
-        alone=(baseline["fps"], baseline["latency_ms"]["mean"]) if baseline else None,
+        alone=(baseline["fps"], baseline["latency_ms"]["mean"]) if baseline and baseline["fps"] else None,
         bound=bound,
         idle={unit: (1 - row["busy"], _causes(row["idle"])) for unit, row in document.get("units", {}).items()},
         image=_image(document),
@@ -99,7 +101,8 @@ def _lateness(document: Mapping[str, Any], *, is_paced: bool) -> Lateness | None
     frames, late = document["frames"], document["deadline_misses"]
     dropped = wanted_drops(frames["dropped"])
     if is_paced:
-        return Lateness(frames["presented"] + dropped + frames["lost"], late, dropped, frames["lost"])
+        lost = frames.get("lost", 0)  # a prediction loses none
+        return Lateness(frames["presented"] + dropped + lost, late, dropped, lost)
     if (document.get("pace") or {}).get("slow_motion", 1.0) != 1.0:
         return None
     return Lateness(frames["presented"] - 1, late, 0, frames["lost"], dropped)
@@ -166,8 +169,8 @@ def _tries(document: Mapping[str, Any], bound: Bound | None, target: float, fold
     left = 1 - target / document["fps"] if document.get("fps") else 0.0
     if left < 0 or _is_paced(document):
         yield from _shorter(document, bound)
-    latency, baseline = document.get("latency_ms") or {}, document.get("baseline")
-    if left >= 0 and baseline and latency.get("mean", 0.0) > MUCH_LATER * baseline["latency_ms"]["mean"] > 0:
+    latency_ms, baseline = (document.get("latency_ms") or {}).get("mean") or 0.0, document.get("baseline")
+    if left >= 0 and baseline and latency_ms > MUCH_LATER * (baseline["latency_ms"]["mean"] or 0.0) > 0:
         yield "--latch 3 for newer poses: a frame alone takes less than half of the latency"
     if left >= MUCH_LEFT and "pipeline" not in (document.get("config") or {}):
         yield f"a larger --picture: {100 * left:.0f} % of each frame's time is left"
@@ -203,7 +206,7 @@ def predicted_verdict(answer: Mapping[str, Any]) -> Verdict:
     units, latency = answer.get("units") or {}, answer.get("latency_ms")
     return judged(
         Facts(
-            Rate(1e3 / times["mean"], least, most, "80 %"),
+            Rate(1e3 / times["mean"] if times["mean"] else inf, least, most, "80 %"),
             target,
             _predicted_lateness(answer),
             _trust_in(least, most, target, is_held=_is_held_by_display(answer)),
@@ -219,11 +222,11 @@ def predicted_verdict(answer: Mapping[str, Any]) -> Verdict:
 
 
 def _predicted_lateness(answer: Mapping[str, Any]) -> Lateness | None:
-    """Return how many frames of the simulated run of a pipeline file were not in time; None without a rate.
+    """Return how many frames of the simulated run were not in time; None where none was released at a rate.
 
-    They are released at that rate. Jitter makes frames late although a mean one fits.
+    Jitter, and pipelines beside this one, make frames late although a mean one fits.
     """
-    return _lateness(answer, is_paced=True) if "cycle" in answer and "rate" in answer else None
+    return _lateness(answer, is_paced=True) if "frames" in answer and "rate" in answer else None
 
 
 def _needed(answer: Mapping[str, Any]) -> dict[str, Any]:
@@ -271,6 +274,8 @@ def _predicted_bound(answer: Mapping[str, Any], frame_ms: float) -> Bound | None
     for name in cycle:
         by_unit[stages[name]["unit"]] = by_unit.get(stages[name]["unit"], 0.0) + ms_of[name]
     unit = max(by_unit, key=by_unit.__getitem__)
+    if not by_unit[unit] or not frame_ms:
+        return None  # what takes no time is bound by nothing
     if _is_held_by_display(answer):
         return Bound(DISPLAY, {name: ms_of[name] for name in cycle if stages[name]["unit"] == unit}, 1.0)
     own = sorted((name for name in cycle if stages[name]["unit"] == unit), key=lambda name: -ms_of[name])

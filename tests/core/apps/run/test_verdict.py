@@ -44,7 +44,7 @@ US = 1000
         ({"lateness": Lateness(300, 1, 2, 1)}, False, "1 of 300 frames late, 2 dropped, 1 lost at 30 fps"),
         ({"lateness": Lateness(34, 0, replaced=85)}, True, "30 fps are held"),  # the rate is of those that were shown
         ({"failure": "gpu is gone"}, False, "the run failed: gpu is gone"),
-        ({"rate": None, "lateness": None}, False, "fewer than two frames were presented"),
+        ({"rate": None, "lateness": None}, False, "the rate is not known: fewer than two frames were presented"),
         ({"target_fps": 60.0}, True, "60 fps are held"),
         ({"target_fps": 97.0}, False, "96 of 97 fps"),
         ({"rate": Rate(29.97)}, False, "29.97 of 30 fps"),  # with three digits both are 30
@@ -121,13 +121,38 @@ def test_frames_that_gave_way_to_newer_ones_are_told_beside_the_rate() -> None:
 def test_frames_that_every_leaves_out_are_not_dropped_ones() -> None:
     """Of 300 frames a stage takes each second one: 147 came, 3 went because they were stale, 1 was late."""
     dropped = {"a->b:every": 150, "a->b:stale": 3}
-    frames = {"presented": 147, "lost": 0, "dropped": dropped}
+    frames = {"presented": 147, "dropped": dropped}
     answer = {
         "frame_time_ms": {"mean": 15.0},
         "rate": {"fps": 30, "reserve": 0.5, "reserve_low": 0.4, "reserve_high": 0.6},
     }
-    found = predicted_verdict({**answer, "cycle": {}, "frames": frames, "deadline_misses": 1})
+    found = predicted_verdict({**answer, "frames": frames, "deadline_misses": 1})
     assert "1 of 150 frames late, 3 dropped at 30 fps" in str(found.as_json())
+
+
+@pytest.mark.parametrize("times", [{"samples": 0}, {"samples": 0, "mean": None}], ids=["older", "new"])
+def test_a_run_of_one_frame_says_what_is_not_known(times: dict[str, Any]) -> None:
+    """Its report has null where an older one had 0, and reads the same; the latency of the one frame is known."""
+    none = {**dict.fromkeys([*TIMES, "ema20_min", "ema20_max", "jitter"], 0.0), **times}
+    frames = {"requested": 1, "presented": 1, "lost": 0, "lost_by_cause": {}, "dropped": {}, "not_begun": 0}
+    alone = {"frames": frames, "frame_time_ms": none, "fps": 0.0, "bottleneck": None, "bound": None}
+    baseline = {**make_report()["baseline"], **alone}
+    report = report_of(**alone, latency_ms={**TIMES, "mean": 36.0, "samples": 1}, baseline=baseline)
+    document = report.as_json()
+    assert (document["fps"], document["bound"], document["bottleneck"]) == (None, None, None)
+    assert {key: value for key, value in document["frame_time_ms"].items() if value is not None} == {"samples": 0}
+    assert Report.model_validate(document) == report
+    verdict = verdict_of(report)
+    lines = dict(verdict.lines())
+    assert lines["FAIL"] == "the rate is not known: fewer than two frames were presented"
+    assert (lines["TIME"], lines["BOUND"]) == ("not known, latency 36 ms", "not known")
+    assert (verdict.passed, verdict.as_json()["bound"]) == (False, None)
+
+
+def test_stages_that_take_no_time_bound_nothing() -> None:
+    stages = {"a": {"unit": "u", "alone_ms": 0.0, "service_ms": {"mean": 0.0}}}
+    found = predicted_verdict({"needs_ms": {"mean": 0.0, "low": None, "high": None}, "stages": stages})
+    assert (found.passed, found.as_json()["bound"]) == (True, None)
 
 
 def test_a_prediction_without_a_presented_frame_has_no_latency() -> None:
