@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from trilane.apps.cli.console import print_json, say, spinner, stdout_console
+from trilane.apps.cli.console import print_json, print_verdict, say, spinner, stdout_console
 from trilane.apps.cli.predict_output import IDLE
 from trilane.errors import BadInputError
 
@@ -30,9 +30,8 @@ def predict_pipelines(options: PredictOptions, as_json: bool) -> None:
 
     Raises BadInputError for a fault in one of them.
     """
-    from trilane.apps.predict.asked_pipelines import tenants
+    from trilane.apps.predict.asked_pipelines import answer_of, tenants
     from trilane.hw_profiles.profile_files import load_runnable
-    from trilane.hw_profiles.shared_chip import predict_beside
     from trilane.units import HOST
 
     scene = str(options.scene)
@@ -43,7 +42,7 @@ def predict_pipelines(options: PredictOptions, as_json: bool) -> None:
         chip = with_first(chip, scene, say)
     with spinner("predicting"):
         found = tenants([scene, *options.beside], variant, options.numbers)
-        answer = predict_beside(chip, found, options.cap, options.minutes, options.governor, options.turns)
+        answer = answer_of(chip, found, options)
         if options.trace is not None:
             _write_trace(chip, found, options, answer, options.trace)
     if as_json:
@@ -84,11 +83,12 @@ def _variant(policy: str, edge: str | None) -> Variant:
 def _show(answer: dict[str, Any]) -> None:
     console, config = stdout_console(), answer["config"]
     console.print(f"{answer['machine']['title']} (virtual clock), {config['performance_profile']}")
-    console.print(_pipelines(answer))
     for row in answer["pipelines"]:
         alone = f"; alone {row['alone']['rate']['sentence']}" if len(answer["pipelines"]) > 1 else ""
         where = "" if row["precision"] is None else f", {row['unit']} in {row['precision']}"
         console.print(f"{row['name']}{where}: {row['rate']['sentence']}{alone}", soft_wrap=True)
+        print_verdict(row["verdict"]["lines"])
+    console.print(_pipelines(answer))
     console.print(_idle(answer))
     _show_chip(console, answer)
     for note in answer["notes"]:

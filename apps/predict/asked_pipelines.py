@@ -9,16 +9,19 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from trilane.apps.check.port_types import port_types, read_networks
 from trilane.apps.explain.scene_plan import ScenePlan
+from trilane.apps.predict.predict_options import PredictOptions
+from trilane.apps.run.verdict_facts import predicted_verdict
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import LEAST_FPS, MOST_FPS, NETWORK_UNITS, Variant
 from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.network_time import Computes
 from trilane.hw_profiles.network_work import Network
-from trilane.hw_profiles.shared_chip import MOST_TENANTS
+from trilane.hw_profiles.schema import Profile
+from trilane.hw_profiles.shared_chip import MOST_TENANTS, predict_beside
 from trilane.hw_profiles.tenants import NEWEST, SKIPS, FileTenant, Pipeline, Tenant
 from trilane.pipeline.pipeline_file import checked_tables, is_pipeline_file, read_pipeline
 from trilane.scene.planner import FrameWork
@@ -102,6 +105,13 @@ def tenants(texts: Sequence[str], variant: Variant = NEWEST, precision: str | No
     read = [asked(text) for text in texts]
     names = _names([Path(each.what).stem for each in read])
     return [_tenant(each, name, variant, precision) for each, name in zip(read, names, strict=True)]
+
+
+def answer_of(chip: Profile, pipelines: Sequence[Pipeline], options: PredictOptions) -> dict[str, Any]:
+    """Return what `pipelines` do on one chip, each with its verdict. Raises BadInputError."""
+    answer = predict_beside(chip, pipelines, options.cap, options.minutes, options.governor, options.turns)
+    rows = [row | {"verdict": predicted_verdict(answer | row).shown()} for row in answer["pipelines"]]
+    return answer | {"pipelines": rows}
 
 
 def _tenant(each: AskedPipeline, name: str, variant: Variant, precision: str | None) -> Pipeline:

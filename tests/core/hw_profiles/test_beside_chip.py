@@ -338,7 +338,7 @@ def test_a_network_of_one_frame_has_no_frame_time(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     onnx.save(additions(32), "add.onnx")
-    row = next(line for line in command("predict", "add.onnx@0.001")[0].splitlines() if "add" in line)
+    row = next(line for line in command("predict", "add.onnx@0.001")[0].splitlines() if "│ add" in line)
     assert row.split("│")[3].strip() == "-"
 
 
