@@ -64,7 +64,7 @@ def line(look: RunLook) -> str:
     parts = (
         f"{figures.t_ms / 1000:.1f} s",
         _passed(figures),
-        _rate(look),
+        _rate(figures),
         f"frame {_three(figures.frame_time_ms)}",
         f"latency {_three(figures.latency_ms)}",
         f"busy {busy}",
@@ -106,18 +106,19 @@ def dropped(figures: MomentFigures) -> int:
 def _title(look: RunLook) -> str:
     figures = look.figures
     over = "over" if figures.is_over else f"for {figures.run_s:.1f} s"
-    rate = f"{_rate(look)} between the first frame and the last"
+    rate = f"{_rate(figures)} between the first frame and the last"
     if look.state is not RunState.FINISHED:
-        rate = (
-            f"{_rate(look)} in the last {figures.window_s:.1f} s, {figures.run_fps:.1f} between the first and the last"
-        )
+        of_run = _number(figures.run_fps)
+        rate = f"{_rate(figures)} in the last {figures.window_s:.1f} s, {of_run} between the first and the last"
     return f"run {look.name}: {look.state}, {over}; {rate}"
 
 
-def _rate(look: RunLook) -> str:
-    """Return the rate of a finished run as its report has it, of any other in the window."""
-    figures = look.figures
-    return f"{figures.run_fps if look.state is RunState.FINISHED else figures.fps:.1f} fps"
+def _rate(figures: MomentFigures) -> str:
+    return f"{_number(figures.fps)} fps"
+
+
+def _number(value: float | None) -> str:
+    return DASH if value is None else f"{value:.1f}"
 
 
 def _units(figures: MomentFigures) -> Table:

@@ -129,7 +129,8 @@ class MomentFigures:
     `t_ms`: time since the first step. `window_s`, `run_s`: lengths of the window and of the run.
     `clock`: "host" or "virtual". `is_over`: whether the journal has the run's end.
     `state`: "goes on", "finished", "killed" or "removed".
-    `fps`: frames presented a second, in the window. `run_fps`: the same between the first and the last presented frame.
+    `run_fps`: frames presented a second between the first and the last presented one, as in report.json; null for fewer
+    than two. `fps`: the same of a finished run; of any other, frames presented a second in the window.
     `frame_time_ms`, `latency_ms`: exact mean, p50, p90, p95, p99, max and samples, of the window.
     `units`, `stages`: figures by name, in the order of the pipeline.
     `temperature_c`, `duty`: last values by place and by unit. `memory_bytes`: memory of the processes, by unit.
@@ -148,8 +149,8 @@ class MomentFigures:
     clock: str
     is_over: bool
     state: str
-    fps: float
-    run_fps: float
+    fps: float | None
+    run_fps: float | None
     frame_time_ms: Mapping[str, float]
     latency_ms: Mapping[str, float]
     frames: FrameFigures

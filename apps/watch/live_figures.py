@@ -149,6 +149,7 @@ class LiveFigures:
         clock = str(self._facts.get("clock", ""))
         state = state or (RunState.FINISHED if self._is_over else RunState.GOES_ON)
         goes_on = state is RunState.GOES_ON and not self._is_over
+        run_fps = self._run_fps()
         figures = MomentFigures(
             t_ms=self._since_first_ms(now_ns),
             window_s=window_s,
@@ -156,8 +157,8 @@ class LiveFigures:
             clock=clock,
             is_over=self._is_over,
             state=state.value,
-            fps=len(recent) / window_s if window_s else 0.0,
-            run_fps=self._run_fps(),
+            fps=run_fps if state is RunState.FINISHED else len(recent) / window_s if window_s else 0.0,
+            run_fps=run_fps,
             frame_time_ms=summary_ms(each.interval_ns for each in recent if each.interval_ns is not None),
             latency_ms=summary_ms(each.latency_ns for each in recent if each.latency_ns is not None),
             frames=self._frame_figures(),
@@ -261,8 +262,8 @@ class LiveFigures:
     def _since_first_ms(self, now_ns: int) -> float:
         return 0.0 if self._first_ns is None else (now_ns - self._first_ns) / NS_PER_MS
 
-    def _run_fps(self) -> float:
-        return self._intervals * NS_PER_S / self._between_ns if self._between_ns else 0.0
+    def _run_fps(self) -> float | None:
+        return self._intervals * NS_PER_S / self._between_ns if self._between_ns else None
 
     def _frame_figures(self) -> FrameFigures:
         line = self._timeline

@@ -30,7 +30,8 @@ function oneError(facts) {
 export function showSpeed(figures, accuracy) {
   const how = figures.clock === "virtual" ? "computed, virtual clock" : "measured, host clock";
   setText(byId("fps"), number(figures.fps));
-  setText(byId("speed-note"), `frames a second, last ${number(figures.window_s, 0)} s (${how})`);
+  const when = figures.state === "finished" ? "whole run" : `last ${number(figures.window_s, 0)} s`;
+  setText(byId("speed-note"), `frames a second, ${when} (${how})`);
   setText(byId("error"), errorText(accuracy));
   for (const [key, id] of [
     ["frame_time_ms", "frame-time"],

@@ -97,7 +97,7 @@ def test_a_journal_by_hand() -> None:
     assert frames.not_begun == 7
     assert figures.latency_ms["p50"] == 40 - 2
     assert (figures.latency_ms["samples"], figures.frame_time_ms["samples"]) == (1, 0)
-    assert (figures.fps, figures.run_fps) == (pytest.approx(1 / 0.07), 0)
+    assert (figures.fps, figures.run_fps) == (pytest.approx(1 / 0.07), None)
     a, b = figures.stages["a"], figures.stages["b"]
     assert (a.unit, a.waiting, a.service_ms, a.bytes) == ("u", 0, 22.5, {"written": Moved(400, 200)})
     assert (b.waiting, b.service_ms, b.bytes) == (0, 20, {"read": Moved(100, 100), "written": Moved(7, 7)})
@@ -239,7 +239,7 @@ def test_at_every_step_frames_are_where_the_scheduler_has_them(case: str) -> Non
     assert {f"{drop.edge}:{drop.cause}": drop.frames for drop in now.frames.dropped} == frames["dropped"]
     assert (now.frames.skipped, now.frames.in_flight) == (frames.get("skipped", 0), 0)
     assert {stage.waiting for stage in now.stages.values()} == {0}
-    assert now.run_fps == pytest.approx(report["fps"])
+    assert now.fps == now.run_fps == (pytest.approx(report["fps"]) if frames["presented"] > 1 else None)
     assert now.frame_time_ms == {key: report["frame_time_ms"][key] for key in now.frame_time_ms}
     assert now.latency_ms == report["latency_ms"]
     assert now.frame_times.count == report["frame_time_ms"]["samples"]
