@@ -27,9 +27,9 @@ from trilane.apps.run.asked_run import run_asked
 from trilane.apps.run.report import Report, read_report
 from trilane.apps.run.verdict import Verdict
 from trilane.apps.run.verdict_facts import predicted_verdict, verdict_of
-from trilane.errors import BadInputError, MissingPartError, TrilaneError
+from trilane.errors import BadInputError, MissingPartError, TrilaneError, did_you_mean
 from trilane.figure_sources import COMPUTED, MEASURED, NO_FIGURES
-from trilane.options import Options
+from trilane.options import EMPTY_PATH, Options
 from trilane.pipeline.journal import Record, Stepped
 from trilane.pipeline.timeline import Presented, Timeline
 from trilane.pipeline.unit_history import IdleSlice
@@ -176,7 +176,7 @@ def run(
     from trilane.pipeline.pipeline_file import is_pipeline_file
 
     parameters = inspect.signature(run).parameters
-    given = inspect.signature(run).bind(scene, **_in_new_names("run", options)).arguments
+    given = _bound(run, scene, options)
     asked = RunOptions.checked(given if is_pipeline_file(Path(scene)) else DEFAULTS | given)
     told = (f"{name}={value!r}" for name, value in given.items() if value != parameters[name].default)
     hooks = Hooks(on_progress or (lambda *_: None), on_message or (lambda _: None))
@@ -284,7 +284,7 @@ def predict(
     from trilane.avatars.bundle import DEFAULT
     from trilane.hw_profiles.profile_files import load_runnable
 
-    given = inspect.signature(predict).bind(profile, **_in_new_names("predict", options)).arguments
+    given = _bound(predict, profile, options)
     wanted = PredictOptions.checked({name: value for name, value in given.items() if value is not None})
     wanted.check_together()
     chip, say = load_runnable(wanted.profile), on_message or (lambda _: None)
@@ -306,16 +306,25 @@ def predict(
 predict.__signature__ = _signature(predict, PredictOptions, PREDICTED)  # type: ignore[attr-defined]
 
 
-def _in_new_names(command: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of a program with new names for old ones, each of which is a DeprecationWarning."""
+def _bound(function: Callable[..., Any], first: str | Path, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of `run` or `predict` by name, with new names for old ones.
+
+    Each old name is a DeprecationWarning. Raises TypeError for an unknown one, with the most similar option.
+    """
+    command, signature = function.__name__, inspect.signature(function)
     warned = partial(warnings.warn, category=DeprecationWarning, stacklevel=5)  # at the caller of `run` or `predict`
-    return {in_new_name(command, name, value, warned): value for name, value in options.items()}
+    named = {in_new_name(command, name, value, warned): value for name, value in options.items()}
+    for name in named:
+        if name not in signature.parameters:
+            meant = "".join(f"; {text}" for text in [did_you_mean(name, signature.parameters)] if text)
+            raise TypeError(f"{command}() got an unexpected keyword argument {name!r}{meant}")
+    return signature.bind(first, **named).arguments
 
 
 def _place(where: str, given: str | Path) -> Path:
-    """Return `given` as a path; an empty name is refused, because Path would turn it into the working directory."""
+    """Return `given` as a path. Raises BadInputError for an empty one."""
     if isinstance(given, str) and not given.strip():
-        raise BadInputError(where, repr(given), "the name of a folder")
+        raise BadInputError(where, *EMPTY_PATH)
     return Path(given)
 
 
@@ -346,7 +355,8 @@ def _run_rows(report: Report) -> Iterable[Row]:
         yield "rate", f"{report.fps:.1f} frames a second ({_between(report.fps_low, report.fps_high)})", measured
     for name, facts in report.accuracy.items():
         yield (f"error of {name}", *_error(facts))
-    yield "latency", f"p50 {latency.p50:.1f} ms, p95 {latency.p95:.1f} ms", measured
+    if latency.p50 is not None:
+        yield "latency", f"p50 {latency.p50:.1f} ms, p95 {latency.p95:.1f} ms", measured
     counts = f"{frames.presented} presented, {frames.lost} lost, {sum(frames.dropped.values())} dropped"
     yield "frames", counts + (f", {frames.not_begun} not begun" if frames.not_begun else ""), measured
     for unit, shares in report.units.items():

@@ -7,13 +7,12 @@ Rule: no other list of the options exists. A field is plain data; `configure` fi
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Final
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from trilane.errors import BadInputError, did_you_mean
-from trilane.options import NOTHING, Finite, Option, Options, Text, Texts, texts_of
+from trilane.options import NOTHING, Finite, Name, OnePath, Option, Options, Text, Texts, texts_of
 from trilane.scheduler.policy import POLICIES
 from trilane.transport.slots import RULES, edge_rule
 from trilane.unexpected_value import UnexpectedValue
@@ -59,13 +58,6 @@ def _cores(value: object) -> object:
     return tuple(f"{unit}={','.join(map(str, own))}" for unit, own in value.items())
 
 
-def _folder(value: object) -> object:
-    """Refuse an empty name, which Path would turn into the working directory."""
-    if isinstance(value, str) and not value.strip():
-        raise UnexpectedValue(repr(value), "the name of a folder")
-    return Path(value) if isinstance(value, str) else value
-
-
 def _known_channels(channels: int | None) -> int | None:
     if channels is not None and channels not in CHANNELS:
         raise UnexpectedValue(repr(channels), "4, 8, 12 or 16")
@@ -91,7 +83,7 @@ def _known_edge(text: str) -> str:
 class RunOptions(Options):
     """The options of `trilane run`, in the order of its help; None leaves what the scene or the avatar says."""
 
-    scene: Annotated[Text, Option(is_argument=True)] = Field(
+    scene: Annotated[Name, Option(is_argument=True)] = Field(
         default="default",
         description="A scene file (TOML), the name of a bundled one, or a pipeline file.",
     )
@@ -100,10 +92,10 @@ class RunOptions(Options):
         description="Change a key of a pipeline file: stages.seg.unit=dsp. Separate several keys by commas. "
         "May be given again.",
     )
-    motion: Text | None = Field(default=None, description="Motion: .bvh, .npz, .npy, .pkl, or builtin:NAME.")
-    camera: Text | None = Field(default=None, description="Camera: ARKit log, TUM, transforms.json, or builtin:NAME.")
-    background: Text | None = Field(default=None, description="Background: room, or a video, image folder or picture.")
-    avatar: Annotated[Text | None, Option(offered=())] = Field(default=None, description=AVATARS_HELP)
+    motion: Name | None = Field(default=None, description="Motion: .bvh, .npz, .npy, .pkl, or builtin:NAME.")
+    camera: Name | None = Field(default=None, description="Camera: ARKit log, TUM, transforms.json, or builtin:NAME.")
+    background: Name | None = Field(default=None, description="Background: room, or a video, image folder or picture.")
+    avatar: Annotated[Name | None, Option(offered=())] = Field(default=None, description=AVATARS_HELP)
     width: int | None = Field(
         default=None, ge=1, le=256, description=f"{WIDTH_HELP} A width other than the avatar's is untrained."
     )
@@ -157,7 +149,7 @@ class RunOptions(Options):
         description="UNIT=LIST: the unit's cores, such as dsp=0,1; once for each unit. Without this option, "
         "measured times decide which cores each unit gets.",
     )
-    profile: Text | None = Field(default=None, description=f"{PROFILE_HELP} Only with --pace.")
+    profile: Name | None = Field(default=None, description=f"{PROFILE_HELP} Only with --pace.")
     pace: Annotated[bool, Option("--pace")] = Field(
         default=False, description="After its work, each job waits until its modelled time has passed."
     )
@@ -181,9 +173,7 @@ class RunOptions(Options):
         le=1000,
         description="Number of frames to compare with the truth or the float path after the run; 0: none.",
     )
-    out: Annotated[Path | None, BeforeValidator(_folder)] = Field(
-        default=None, description="Run folder to write; runs/TIME-SCENE if not given."
-    )
+    out: OnePath | None = Field(default=None, description="Run folder to write; runs/TIME-SCENE if not given.")
     video: bool = Field(default=True, description="Encode the frames as a video; switch this off for long runs.")
 
     @property

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator, Sequence
 from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
@@ -20,7 +20,7 @@ from typer.core import TyperCommand, TyperOption
 
 from trilane.apps.predict.predict_options import ENCODER_HELP, FIXED_SIZE_HELP, NORM_HELP
 from trilane.errors import BadInputError, did_you_mean
-from trilane.options import Options, element_of, expected, kind_of, limits_of, option_of
+from trilane.options import EMPTY_PATH, Options, element_of, expected, kind_of, limits_of, option_of
 from trilane.stages.run_options import AVATARS_HELP, PROFILE_HELP, WIDTH_HELP, RunOptions
 
 #: Name of the attribute of a command's function that holds its model of options.
@@ -45,9 +45,11 @@ class OnceCommand(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Raise BadInputError naming an option that is given twice or has a value of another kind or range.
 
-        Its other spelling (`--no-hud`) is the same option.
+        An empty path or argument is refused too. An option's other spelling (`--no-hud`) is the same option.
         """
-        _, _, given = self.make_parser(ctx).parse_args(args=list(args))
+        typed, _, given = self.make_parser(ctx).parse_args(args=list(args))
+        for parameter in self.params:
+            _refuse_empty(parameter, typed.get(parameter.name))
         for option, times in Counter(given).items():
             if times > 1 and isinstance(option, TyperOption) and not _may_be_repeated(option):
                 names = " or ".join([*option.opts, *option.secondary_opts])
@@ -58,6 +60,22 @@ class OnceCommand(TyperCommand):
             if isinstance(error.__cause__, ValidationError) and error.param is not None:
                 raise _wrong_value(error.param, error.__cause__, getattr(self.callback, OPTIONS, None)) from None
             raise
+
+
+def _refuse_empty(parameter: Any, typed: str | Sequence[str] | None) -> None:
+    """Raise BadInputError for an empty path or argument. `typed`: the words, of which Typer would make the path `.`."""
+    kinds = [*_kinds(parameter.type_descriptor.annotation)]
+    names_a_thing = parameter.param_type_name == "argument" and str in kinds
+    texts = [typed] if isinstance(typed, str) else typed or ()
+    if (Path in kinds or names_a_thing) and any(isinstance(text, str) and not text.strip() for text in texts):
+        raise BadInputError(parameter.opts[0], *EMPTY_PATH)
+
+
+def _kinds(kind: Any) -> Iterator[Any]:
+    """Yield the type and all types within it."""
+    yield kind
+    for each in get_args(kind):
+        yield from _kinds(each)
 
 
 def _wrong_value(parameter: Any, error: ValidationError, model: type[Options] | None) -> BadInputError:

@@ -7,14 +7,14 @@ when they are checked, because the import takes long.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
-from pathlib import Path, PurePath
+from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from trilane.errors import BadInputError
-from trilane.options import Finite, Option, Options, Text, Texts, one_of
+from trilane.options import Finite, Name, OnePath, Option, Options, Text, Texts, one_of, paths_of
 from trilane.scheduler.policy import MOST_FRAMES, POLICIES
 from trilane.stages.run_options import AVATARS_HELP, PROFILE_HELP
 from trilane.unexpected_value import UnexpectedValue
@@ -90,18 +90,6 @@ def _turns() -> tuple[str, ...]:
     return tuple(TURNS)
 
 
-def _paths(value: object) -> object:
-    """Turn one file, or several, into paths."""
-    several = [value] if isinstance(value, str | PurePath) else value
-    if not isinstance(several, Iterable):
-        return value
-    return tuple(Path(each) if isinstance(each, str) else each for each in several)
-
-
-def _path(value: object) -> object:
-    return Path(value) if isinstance(value, str) else value
-
-
 def _rate(fps: float | None) -> float | None:
     from trilane.hw_profiles.application import LEAST_FPS, MOST_FPS
 
@@ -133,7 +121,7 @@ def _shapes(texts: tuple[str, ...]) -> tuple[str, ...]:
 class PredictOptions(Options):
     """The options of `trilane predict`, in the order of its help."""
 
-    scene: Annotated[Text | None, Option(is_argument=True)] = Field(
+    scene: Annotated[Name | None, Option(is_argument=True)] = Field(
         default=None,
         description="A scene to predict frame by frame, in place of a network: a name, a file, or SCENE@RATE. "
         "Or a pipeline file (.toml).",
@@ -146,7 +134,7 @@ class PredictOptions(Options):
     frames: int | None = Field(
         default=None, ge=1, le=MOST_FRAMES, description="For a pipeline file: number of frames to simulate."
     )
-    measured: Annotated[Path | None, BeforeValidator(_path)] = Field(
+    measured: OnePath | None = Field(
         default=None,
         description="For a pipeline file: folder of a run of this file here, whose stage times are used. For a "
         "chip, each time is multiplied by the stage's `scale`.",
@@ -161,7 +149,7 @@ class PredictOptions(Options):
         default="round-robin",
         description="Which pipeline gets a unit next when several wait for it: round-robin or deadline.",
     )
-    profile: Text = Field(default="snapdragon-888", description=PROFILE_HELP)
+    profile: Name = Field(default="snapdragon-888", description=PROFILE_HELP)
     encoder: str = Field(default="resnet18", description=f"{PUBLISHED}{ENCODER_HELP}")
     norm: str = Field(default="batch", description=f"{PUBLISHED}{NORM_HELP}")
     size: Text = Field(default="512", description=f"{PUBLISHED}{FIXED_SIZE_HELP}")
@@ -169,8 +157,8 @@ class PredictOptions(Options):
     layout: Annotated[str, _either(lambda: ("packed", "split"))] = Field(
         default="packed", description="packed: one raster pass; split: one for every 4 channels."
     )
-    avatar: Text | None = Field(default=None, description=f"Predict the network of an avatar: {AVATARS_HELP}")
-    network: Annotated[tuple[Path, ...], BeforeValidator(_paths)] = Field(
+    avatar: Name | None = Field(default=None, description=f"Predict the network of an avatar: {AVATARS_HELP}")
+    network: Annotated[tuple[Path, ...], BeforeValidator(paths_of)] = Field(
         default=(),
         description="ONNX file of a network by itself, without raster and composite. Repeat it.",
     )
@@ -225,15 +213,13 @@ class PredictOptions(Options):
         default=False,
         description="Compare policies and edges for the same network; with --fps, every policy with every edge.",
     )
-    plot: Annotated[Path | None, BeforeValidator(_path)] = Field(
+    plot: OnePath | None = Field(
         default=None, description="File for a drawing of frame rate and temperature (.png, .svg, .pdf)."
     )
-    trace: Annotated[Path | None, BeforeValidator(_path)] = Field(
+    trace: OnePath | None = Field(
         default=None, description="File for the simulated run as a trace, for ui.perfetto.dev (docs/explain.md)."
     )
-    table: Annotated[Path | None, BeforeValidator(_path)] = Field(
-        default=None, description="CSV file of configurations; each row is predicted."
-    )
+    table: OnePath | None = Field(default=None, description="CSV file of configurations; each row is predicted.")
 
     @property
     def is_bare(self) -> bool:

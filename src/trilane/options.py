@@ -5,7 +5,7 @@ The command line and programs read their options from the fields. Rule: a model 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from types import NoneType, UnionType
@@ -94,6 +94,29 @@ def texts_of(value: object) -> object:
     return tuple(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
 
 
+#: What is found and expected where a path is empty: Path would turn it into the working directory.
+EMPTY_PATH: Final = ("an empty path", "a file or a folder")
+
+
+def path_of(value: object) -> object:
+    """Turn a text into a path. Raises UnexpectedValue for an empty one."""
+    if not isinstance(value, str):
+        return value
+    return Path(_not_empty(value))
+
+
+def paths_of(value: object) -> object:
+    """Turn one file, or several, into paths. Raises UnexpectedValue for an empty one."""
+    several = [value] if isinstance(value, str | PurePath) else value
+    return tuple(map(path_of, several)) if isinstance(several, Iterable) else value
+
+
+def _not_empty(text: str) -> str:
+    if not text.strip():
+        raise UnexpectedValue(*EMPTY_PATH)
+    return text
+
+
 def one_of(*words: str) -> AfterValidator:
     """Return a validator that refuses a text which is none of `words`; None passes."""
 
@@ -107,6 +130,9 @@ def one_of(*words: str) -> AfterValidator:
 
 Text = Annotated[str, BeforeValidator(text_of)]
 Texts = Annotated[tuple[str, ...], BeforeValidator(texts_of)]
+#: The name of something bundled, or a path.
+Name = Annotated[Text, AfterValidator(_not_empty)]
+OnePath = Annotated[Path, BeforeValidator(path_of)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 

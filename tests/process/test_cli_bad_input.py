@@ -150,7 +150,7 @@ OPTIONS = {
         "options",
         "--performance-profile with --pace",
     ),
-    "no motion": (["--motion", ""], "name of a file", "found nothing"),
+    "no motion": (["--motion", ""], "--motion", "found an empty path, expected a file or a folder"),
     "unknown motion": (["--motion", "builtin:fly"], "motion", "builtin:fly"),
     "unknown camera": (["--camera", "builtin:fly"], "camera", "builtin:fly"),
     "missing background": (["--background", "b.mp4"], "b.mp4", "no such file"),

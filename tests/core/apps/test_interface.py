@@ -144,12 +144,23 @@ def test_a_data_frame_without_pandas_names_the_extra(folder: Path, monkeypatch: 
         trilane.load_run(folder).to_pandas()
 
 
+@pytest.mark.parametrize(
+    ("function", "typed", "meant"), [("run", "frams", "frames"), ("predict", "gpu_shar", "gpu_share")]
+)
+def test_a_mistyped_option_is_answered_with_the_nearest(function: str, typed: str, meant: str) -> None:
+    said = rf"^{function}\(\) got an unexpected keyword argument '{typed}'; did you mean '{meant}'\?$"
+    with pytest.raises(TypeError, match=said):
+        getattr(trilane, function)(**{typed: 3})
+    with pytest.raises(TypeError, match=r"argument 'zzz'$"):
+        getattr(trilane, function)(zzz=3)
+
+
 def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="no folder"):
         trilane.load_run(tmp_path / "none")
     with pytest.raises(BadInputError, match=r"report\.json"):
         trilane.load_run(tmp_path)
-    with pytest.raises(BadInputError, match="load_run: found ' ', expected the name of a folder"):
+    with pytest.raises(BadInputError, match="load_run: found an empty path, expected a file or a folder"):
         trilane.load_run(" ")
 
 
@@ -244,7 +255,8 @@ def test_what_cannot_be_predicted_is_refused(arguments: dict[str, Any], found: s
         ("check", True, "check: found True, expected"),
         ("policy", "latst", "policy: found 'latst', .*did you mean 'latest'"),
         ("performance_profile", "turbo", "performance_profile: found 'turbo'"),
-        ("out", " ", "out: found ' ', expected the name of a folder"),
+        ("out", " ", "out: found an empty path, expected a file or a folder"),
+        ("motion", "", "motion: found an empty path, expected a file or a folder"),
     ],
 )
 def test_wrong_arguments_are_refused_before_a_process_starts(

@@ -49,6 +49,26 @@ def test_every_option_is_explained_and_refused_twice() -> None:
     assert tried > 100
 
 
+def empties(command: Any) -> Iterator[list[str]]:
+    """Words in which one argument, or one path of an option, is empty."""
+    arguments = [each for each in command.params if each.param_type_name == "argument"]
+    yield from (["x"] * place + [" "] for place in range(len(arguments)))
+    for option in command.params:
+        if option not in arguments and "Path" in str(option.type_descriptor.annotation):
+            yield [f"{option.opts[0]}="]
+
+
+def test_an_empty_path_is_refused_everywhere() -> None:
+    """Before anything is read: as a path it would be the working directory."""
+    tried = 0
+    for words, command in commands():
+        for empty in empties(command):
+            tried += 1
+            with pytest.raises(BadInputError, match="found an empty path, expected a file or a folder"):
+                command.make_context(words, empty)
+    assert tried > 60
+
+
 @pytest.fixture
 def seen() -> list[dict[str, Any]]:
     return []
