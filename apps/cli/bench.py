@@ -14,10 +14,10 @@ from types import ModuleType
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperCommand, TyperGroup
 
 from trilane.apps.cli.commands import POLICY_HELP, Commands, JsonOption
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console, stdout_kept
+from trilane.apps.cli.lazy_group import lazy_group
 from trilane.apps.predict.predict_options import ENCODER_HELP, NORM_HELP
 from trilane.stages.run_options import RUNTIME_HELP, SIZE_HELP, WIDTH_HELP
 
@@ -132,36 +132,6 @@ MEANINGS = {
 }
 
 
-class BenchGroup(TyperGroup):
-    """Lists the benches from the table and imports a bench's module when it is called."""
-
-    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002
-        return list(BENCHES)
-
-    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
-        """Return a stand-in with the help line: enough for `--help` and completion of the name."""
-        return TyperCommand(cmd_name, help=BENCHES[cmd_name][1]) if cmd_name in BENCHES else None
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        name, stand_in, rest = super().resolve_command(ctx, args)
-        if name is None or stand_in is None:
-            return name, stand_in, rest
-        return name, bench_command(name), rest
-
-
-app = Commands(
-    cls=BenchGroup,
-    no_args_is_help=True,
-    epilog=EPILOG,
-    help="Measure this machine; each result includes facts about it.",
-)
-
-
-@app.callback()
-def bench() -> None:
-    """Measure this machine; each result includes facts about it."""
-
-
 def bench_command(name: str) -> Any:
     """Return the command of bench `name`, with an option for every parameter of its `measure`."""
     module = importlib.import_module(BENCHES[name][0])
@@ -182,6 +152,19 @@ def bench_command(name: str) -> Any:
     single = Commands()
     single.command(name, help=_help(name, module))(described)
     return typer.main.get_command(single)
+
+
+app = Commands(
+    cls=lazy_group({name: line for name, (_, line) in BENCHES.items()}, bench_command),
+    no_args_is_help=True,
+    epilog=EPILOG,
+    help="Measure this machine; each result includes facts about it.",
+)
+
+
+@app.callback()
+def bench() -> None:
+    """Measure this machine; each result includes facts about it."""
 
 
 def _help(name: str, module: ModuleType) -> str:

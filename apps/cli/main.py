@@ -15,8 +15,8 @@ import sys
 from typing import Annotated, Any, NoReturn
 
 import typer
-from typer.core import TyperCommand, TyperGroup
 
+from trilane.apps.cli.lazy_group import lazy_group
 from trilane.apps.old_names import in_new_names
 from trilane.errors import TrilaneError, install_line, reason
 from trilane.memory import require_memory, shortage
@@ -73,33 +73,14 @@ def command_of(name: str) -> Any:
     """
     require_memory(part=2)  # with less, NumPy's import or the kernel would end the process
     command = typer.main.get_command(importlib.import_module(COMMANDS[name][0]).app)
-    return getattr(command, "commands", {}).get(name, command)  # small commands share a module
-
-
-class LazyGroup(TyperGroup):
-    """Lists the commands from the table and imports a command's module when it is called."""
-
-    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002
-        return list(COMMANDS)
-
-    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
-        """Return a stand-in with the help line: enough for `--help` and completion of the name."""
-        if cmd_name not in COMMANDS:
-            return None
-        return TyperCommand(cmd_name, help=COMMANDS[cmd_name][1])
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        name, stand_in, rest = super().resolve_command(ctx, args)
-        if name is None or stand_in is None:
-            return name, stand_in, rest
-        command = command_of(name)
-        command.name = name
-        return name, command, rest
+    command = getattr(command, "commands", {}).get(name, command)  # small commands share a module
+    command.name = name
+    return command
 
 
 app = typer.Typer(
     name="trilane",
-    cls=LazyGroup,
+    cls=lazy_group({name: line for name, (_, line) in COMMANDS.items()}, command_of),
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,

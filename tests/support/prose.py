@@ -105,7 +105,8 @@ def commands() -> Iterator[tuple[str, Any]]:
 def below(name: str, command: Any) -> Iterator[tuple[str, Any]]:
     yield name, command
     for part, inner in getattr(command, "commands", {}).items():
-        yield from below(f"{name} {part}", inner)
+        if inner.callback is not None:  # otherwise it stands in for a bench, and has one line
+            yield from below(f"{name} {part}", inner)
 
 
 def help_sentences() -> Iterator[str]:

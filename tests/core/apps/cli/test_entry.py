@@ -68,6 +68,19 @@ def test_a_command_that_is_none_and_an_option_that_is_none(command: Command) -> 
     assert (out, "Usage: trilane doctor" in err, "No such option: --fly" in err) == ("", True, True)
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("rnu",), "No such command 'rnu'. Did you mean 'run'?"),
+        (("bench", "schedular"), "No such command 'schedular'. Did you mean 'scheduler'?"),
+        (("avatar", "inspekt"), "No such command 'inspekt'. Did you mean 'inspect'?"),
+        (("doctor", "--jsn"), "No such option: --jsn (Possible options: --json)"),
+    ],
+)
+def test_a_mistyped_word_is_answered_with_the_nearest(words: tuple[str, ...], said: str, command: Command) -> None:
+    assert said in command(*words, code=2)[1]
+
+
 def test_the_version_is_all_that_is_printed(command: Command) -> None:
     assert command("--version", "doctor") == (f"trilane {trilane.__version__}\n", "")
 
