@@ -24,7 +24,7 @@ Examples:
   trilane quality closeup --by-cause --frames 2 --out errors
   trilane quality --hard-cases --json
 """
-OUT_OF_BOUNDS = 1
+OUT_OF_BOUNDS, AUTO = 1, "auto"
 SCENE, FRAMES, BY_CAUSE_FRAMES = "default", 8, 2
 NUMBER_COLUMNS = ("name", "error", "bound", "unit", "from", "verdict")
 HARD_COLUMNS = ("name", "error", "bound", "constant_error", "shifted_error", "swapped_error", "source", "verdict")
@@ -83,14 +83,17 @@ def quality(
     The exit code is 1 when a figure exceeds its bound. It is also 1 when the bound of a hard network is too wide to
     detect a wrong picture. Wrong pictures have a single colour, a shift by 8 pixels, or red and blue exchanged.
     """
-    from trilane.stages.dsp.runtime import installed
+    from trilane.stages.dsp.runtime import installed, resolve
 
     names = list(runtime or installed())
+    for name in names:
+        if not (by_cause and name == AUTO):  # which the run of --by-cause takes
+            resolve(name)
     if not by_cause:
         _refuse_without_by_cause({"--out": out, "--lpips-weights": lpips_weights})
     if by_cause:
         _refuse_other_comparisons(hard_cases, runtime or [])
-        asked = {"avatar": avatar, "size": size, "runtime": runtime[0] if runtime else "auto"}
+        asked = {"avatar": avatar, "size": size, "runtime": runtime[0] if runtime else AUTO}
         _show_by_cause(
             scene, asked, BY_CAUSE_FRAMES if frames is None else frames, _CauseFiles(out, lpips_weights), as_json
         )

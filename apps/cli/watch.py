@@ -140,16 +140,16 @@ def show(run: NewestRunArgument = None, port: PortOption = None) -> None:
     import asyncio
 
     from trilane.apps.dashboard.access import listen, require_server
-
-    require_server()
-    from trilane.apps.dashboard.app import DashboardApp, server
-    from trilane.apps.dashboard.finished_view import FinishedView
     from trilane.apps.watch.followed_run import RunState, follow
 
     followed = follow(run)
     if followed.state is RunState.GOES_ON:
         remedy = "`trilane watch` shows it; start it with `trilane run --dashboard` to see it in a browser"
         raise BadInputError(followed.folder, "a run that goes on", "one that is over", remedy)
+    require_server()
+    from trilane.apps.dashboard.app import DashboardApp, server
+    from trilane.apps.dashboard.finished_view import FinishedView
+
     with closing(FinishedView(followed.folder)) as view, closing(listen(port)) as place:
         answers = DashboardApp(view, place.port, place.token)
         stderr_console().print(f"dashboard: {place.url}", soft_wrap=True, markup=False)

@@ -15,7 +15,7 @@ from typing import Any, Protocol, cast
 from trilane import machine
 from trilane.arrays import U8
 from trilane.avatars.network_file import IntegerNetwork
-from trilane.errors import BadInputError, MissingPartError, install_line, package_line, pip
+from trilane.errors import BadInputError, MissingPartError, did_you_mean, install_line, package_line, pip
 
 X86 = ("x86_64", "AMD64")
 
@@ -109,7 +109,7 @@ def installed() -> Sequence[str]:
 def resolve(name: str) -> str:
     """Return `name` itself. Raises BadInputError when it is no runtime, MissingPartError when it is not installed."""
     if name not in RUNTIMES:
-        raise BadInputError("runtime", f"{name!r}", f"one of {', '.join(RUNTIMES)}")
+        raise BadInputError("runtime", f"{name!r}", f"one of {', '.join(RUNTIMES)}", did_you_mean(name, RUNTIMES))
     entry = RUNTIMES[name]
     if not entry.is_installed:
         what = f"a build of {entry.package} with {entry.file}" if entry.file else f"the package {entry.package}"

@@ -158,6 +158,8 @@ def test_a_finished_run_has_the_rate_of_its_report(command: Command) -> None:
     out = command("watch", "walk")[0]
     assert "finished; fps between the first frame and the last, p50" in out
     assert "; 50.0 fps; " in out
+    document = json.loads(command("watch", "walk", "--once", "--json")[0])
+    assert (document["fps"], document["run_fps"]) == (50, 50)
 
 
 def test_openmetrics(command: Command) -> None:
@@ -199,3 +201,8 @@ def test_an_interrupt_ends_it_without_a_word(command: Command, monkeypatch: pyte
 def test_what_cannot_be_shown_is_refused(command: Command, arguments: list[str], said: str) -> None:
     written("runs/empty")
     assert said in " ".join(command("watch", *arguments, code=2)[1].split())
+
+
+def test_a_run_that_is_none_is_told_before_a_missing_package(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trilane.apps.dashboard.access.require_server", pytest.fail)
+    assert "wolk: found no such run" in command("show", "wolk", code=2)[1]

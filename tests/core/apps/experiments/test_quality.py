@@ -80,6 +80,17 @@ def test_each_hard_number_says_where_its_bound_comes_from(rows: dict[str, list[A
     assert [line for line in lines if "bound: " in line][:2] == ["[1] bound: [proof]", "[2] bound: analysis"]
 
 
+@pytest.mark.parametrize("words", [(), ("--hard-cases",), ("--by-cause",)])
+def test_a_runtime_that_is_none_is_refused_before_the_work(
+    words: tuple[str, ...], command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(configure, "configure", pytest.fail)
+    monkeypatch.setattr(hard_numbers, "hard_numbers", pytest.fail)
+    said = command("quality", *words, "--runtime", "opevino", code=2)[1]
+    assert "runtime: found 'opevino', expected one of " in said
+    assert "did you mean 'openvino'?" in said
+
+
 @pytest.mark.parametrize(
     ("words", "found"),
     [
