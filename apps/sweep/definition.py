@@ -74,15 +74,17 @@ def _kind_named(where: str, word: str) -> SweepKind:
 
 
 def trials_of(definition: Definition, words: Callable[[Options], Sequence[str]]) -> list[Trial]:
-    """Return the trials. The last axis changes fastest, and repeats of a configuration follow each other.
+    """Return the trials. The last axis changes fastest. A repeat of all configurations follows the one before.
 
+    If the machine slows down, all configurations then slow down.
     `words`: gives the options of a configuration as a command line has them.
     Raises BadInputError for axes that do not fit each other, for more than `MOST_TRIALS`, and for a trial given twice.
     """
+    configurations = [*_configurations(definition)]
     made = [
         Trial(definition.command, options, tuple(words(options)), repeat)
-        for options in _configurations(definition)
         for repeat in range(1, definition.repeats + 1)
+        for options in configurations
     ]
     seen: set[str] = set()
     for trial in made:

@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
+from statistics import median
 from typing import Any, Final
 
 from trilane import machine
@@ -91,11 +92,34 @@ def prediction(run: Callable[..., str] = trilane) -> str:
 
 
 def sizes() -> str:
-    """Speed beside error by tensor size, of the project's own sweep on OpenVINO."""
+    """Speed beside error by tensor size, of the project's own sweep on OpenVINO: medians over the runs of a size."""
     with (ROOT / "docs" / "results" / "report.csv").open(encoding="utf-8", newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["runtime"] == "openvino" and not row["failure"]]
-    lines = [f"| {row['size']} | {float(row['frame_ms']):.1f} | {float(row['psnr_db']):.1f} |" for row in rows]
-    return "\n".join(["| tensor size | ms a frame | PSNR, dB |", "|--:|--:|--:|", *lines]) + "\n"
+    by_size: dict[str, list[dict[str, str]]] = {}
+    for row in rows:
+        by_size.setdefault(row["size"], []).append(row)
+    (runs,), (frames,) = {len(each) for each in by_size.values()}, {_checked(row) for row in rows}
+    lines = [f"| {size} | {_between(each)} | {_median(each, 'psnr_db'):.1f} |" for size, each in by_size.items()]
+    how = (
+        f"Runs of each size: {runs}. The time is their median, in brackets the outermost ends of their 95 % intervals. "
+        f"Frames of each run that the PSNR covers: {frames}.\n"
+    )
+    return "\n".join(["| tensor size | ms a frame | PSNR, dB |", "|--:|--:|--:|", *lines, "", how])
+
+
+def _median(runs: list[dict[str, str]], name: str) -> float:
+    return median(float(run[name]) for run in runs)
+
+
+def _between(runs: list[dict[str, str]]) -> str:
+    """The median frame time, and the outermost ends of the runs' intervals."""
+    low, high = min(float(run["low_ms"]) for run in runs), max(float(run["high_ms"]) for run in runs)
+    return f"{_median(runs, 'frame_ms'):.1f} ({low:.1f} to {high:.1f})"
+
+
+def _checked(run: dict[str, str]) -> int:
+    """How many frames of a run were compared."""
+    return int(re.findall(r"(\d+) frames", run["error_source"])[0])
 
 
 def measured(record: dict[str, Any]) -> dict[str, str]:

@@ -66,6 +66,8 @@ def test_a_grid_a_list_and_repeats_by_hand() -> None:
     assert rows(Definition(RUN, {"frames": 8}, side_by_side, SweepKind.LIST)) == [(8, "128", "ort"), (8, "256", "qnn")]
     twice = trials_of(Definition(RUN, {"frames": 8}, repeats=2), typed)
     assert [trial.repeat for trial in twice] == [1, 2]
+    in_turns = trials_of(Definition(RUN, {}, {"size": (64, 96)}, repeats=2), typed)
+    assert [(trial.repeat, trial.options["size"]) for trial in in_turns] == [(1, 64), (1, 96), (2, 64), (2, 96)]
     assert twice[0].id == trials_of(Definition(RUN, {"frames": 8}), typed)[0].id != twice[1].id
     assert twice[0].line == "trilane run --frames=8 --json"
 
