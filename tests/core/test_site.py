@@ -13,6 +13,8 @@ import pytest
 from trilane import machine
 
 ROOT = Path(__file__).resolve().parents[2]
+#: Pages outside the site.
+OUTSIDE = ("README.md", "CONTRIBUTING.md", "SECURITY.md", "tests/README.md")
 RECORDS = sorted(file for file in (ROOT / "docs" / "decisions").glob("*.md") if file.name != "index.md")
 INDEX = (ROOT / "docs" / "decisions" / "index.md").read_text(encoding="utf-8")
 HEAD = re.compile(r"# (.+)\n\n- \*\*What:\*\* (.+)\n- \*\*Why:\*\* .+\n- \*\*Figure:\*\* .+\n\n")
@@ -35,11 +37,22 @@ def test_the_site_is_built_with_strict_links_and_asks_no_other_host(tmp_path: Pa
     assert [found for page in pages for found in loaded.findall(page.read_text(encoding="utf-8"))] == []
 
 
-@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "SECURITY.md", "tests/README.md"])
+@pytest.mark.parametrize("name", OUTSIDE)
 def test_links_of_pages_outside_the_site_lead_to_files(name: str) -> None:
     page = ROOT / name
     links = LINK.findall(page.read_text(encoding="utf-8"))
     assert [link for link in links if not (page.parent / link).exists()] == []
+
+
+def test_pages_name_files_that_exist() -> None:
+    """Tests by their name, other files of this repository by their path."""
+    there = {file.name for file in (ROOT / "tests").rglob("test_*.py")}
+    outside = [ROOT / name for name in OUTSIDE]  # the changelog names what older versions had
+    for page in (*outside, *(ROOT / "docs").rglob("*.md")):
+        text = page.read_text(encoding="utf-8")
+        assert {name for name in re.findall(r"\btest_\w+\.py\b", text) if name not in there} == set(), page
+        paths = re.findall(r"`((?:apps|bench|docs|pipeline|scene|scheduler|src|stages|tests)/[\w./-]+\.\w+)`", text)
+        assert {path for path in paths if not (ROOT / path).exists()} == set(), page
 
 
 @pytest.mark.parametrize("record", RECORDS, ids=lambda file: file.stem)
