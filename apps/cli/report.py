@@ -84,7 +84,7 @@ def _print(entries: list[Entry], rows: list[dict[str, Any]]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from trilane.apps.compare.overview import told_knees
+    from trilane.apps.compare.overview import told_choices
 
     times, errors = ("frame, ms", "from, ms", "to, ms"), ("PSNR, dB", "worst", "1st pct.")
     table = Table(
@@ -95,7 +95,7 @@ def _print(entries: list[Entry], rows: list[dict[str, Any]]) -> None:
         shown = row | {"other_programs": None if share is None else f"{100 * share:.1f} %"}
         table.add_row(*(Text(_shown(shown[key])) for key in SHOWN))
     stdout_console().print(table)
-    for sentence in told_knees(entries):
+    for sentence in told_choices(entries):
         stdout_console().print(sentence, soft_wrap=True, markup=False)
     for entry in entries:
         if entry.failure:

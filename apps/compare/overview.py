@@ -13,7 +13,7 @@ import math
 import re
 import shlex
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -396,18 +396,30 @@ def varied(entries: list[Entry]) -> list[str]:
     return [key for key in keys if len({entry.settings[key] for entry in entries if key in entry.settings}) > 1]
 
 
-def told_knees(entries: Sequence[Entry]) -> Iterator[str]:
-    """Yield a sentence for the knee of each group that has one."""
-    for group, number in knees(entries).items():
-        rows = [(each, each.frame_ms, each.psnr_db) for each in entries if each.group == group]
-        known = [(each, ms, db) for each, ms, db in rows if ms is not None and db is not None]
-        ms, db = next((ms, db) for each, ms, db in known if each is entries[number])
-        quickest, best = min(known, key=lambda row: row[1]), max(known, key=lambda row: row[2])
-        yield (
-            f"Knee: {entries[number].name} has {ms:.1f} ms a frame and {db:.1f} dB. The best picture, {best[0].name}, "
-            f"takes {best[1] - ms:.1f} ms more for {best[2] - db:.2f} dB. The quickest, {quickest[0].name}, saves "
-            f"{ms - quickest[1]:.1f} ms and loses {db - quickest[2]:.1f} dB."
-        )
+def told_choices(entries: Sequence[Entry]) -> Iterator[str]:
+    """Yield a sentence for each group of two or more known entries: its knee, or its quickest and its best picture."""
+    at = knees(entries)
+    known: dict[Hashable, dict[int, tuple[float, float, str]]] = {}
+    for number, entry in enumerate(entries):
+        if entry.frame_ms is not None and entry.psnr_db is not None:
+            known.setdefault(entry.group, {})[number] = (entry.frame_ms, entry.psnr_db, entry.name)
+    for group, rows in known.items():
+        quick_ms, quick_db, quickest = min(rows.values(), key=lambda row: (row[0], -row[1]))
+        best_ms, best_db, best = max(rows.values(), key=lambda row: (row[1], -row[0]))
+        if group in at:
+            ms, db, knee = rows[at[group]]
+            yield (
+                f"Knee: {knee} has {ms:.1f} ms a frame and {db:.1f} dB. The best picture, {best}, takes "
+                f"{best_ms - ms:.1f} ms more for {best_db - db:.2f} dB. The quickest, {quickest}, saves "
+                f"{ms - quick_ms:.1f} ms and loses {db - quick_db:.1f} dB."
+            )
+        elif quickest == best and len(rows) > 1:
+            yield f"Best: {best} has {best_ms:.1f} ms a frame and {best_db:.1f} dB, the quickest and the best picture."
+        elif len(rows) > 1:
+            yield (
+                f"No knee: the quickest, {quickest}, has {quick_ms:.1f} ms a frame and {quick_db:.1f} dB. The best "
+                f"picture, {best}, takes {best_ms - quick_ms:.1f} ms more for {best_db - quick_db:.2f} dB."
+            )
 
 
 def columns(entries: Sequence[Entry]) -> list[str]:

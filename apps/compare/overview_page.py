@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import av
 
 from trilane.apps.compare.frontier import SAME_DB, frontier, knees
-from trilane.apps.compare.overview import Entry, columns, table_rows, told_knees
+from trilane.apps.compare.overview import Entry, columns, table_rows, told_choices
 
 UNITS = {"frame_ms": "frame, ms", "low_ms": "from, ms", "high_ms": "to, ms", "latency_ms": "latency, ms"}
 UNITS |= {"psnr_db": "PSNR, dB", "worst_psnr_db": "worst frame, dB", "p1_psnr_db": "1st percentile, dB"}
@@ -64,7 +64,7 @@ def page(title: str, entries: Sequence[Entry]) -> str:
 
 
 def _sections(title: str, entries: Sequence[Entry]) -> Iterator[str]:
-    yield from (f'<p class="verdict">{escape(sentence)}</p>' for sentence in told_knees(entries))
+    yield from (f'<p class="verdict">{escape(sentence)}</p>' for sentence in told_choices(entries))
     yield f"<h2>Frame time against error</h2>{_drawing(entries)}"
     yield f"<h2>All {len(entries)} entries</h2>{_table(title, entries)}"
     yield f'<p class="note">{escape(MEANING)}</p>'
