@@ -19,7 +19,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from trilane.apps.compare.frontier import frontier, knees
+from trilane.apps.compare.frontier import SAME_DB, frontier, knees
 from trilane.apps.run.report import MAX_REPORT_BYTES
 from trilane.apps.sweep.store import TRIALS, read_trials
 from trilane.errors import BadInputError, MissingPartError
@@ -402,10 +402,12 @@ def told_choices(entries: Sequence[Entry]) -> Iterator[str]:
     known: dict[Hashable, dict[int, tuple[float, float, str]]] = {}
     for number, entry in enumerate(entries):
         if entry.frame_ms is not None and entry.psnr_db is not None:
-            known.setdefault(entry.group, {})[number] = (entry.frame_ms, entry.psnr_db, entry.name)
+            held = f" ({entry.verdict}, {entry.trust})" if entry.verdict else ""
+            known.setdefault(entry.group, {})[number] = (entry.frame_ms, entry.psnr_db, f"{entry.name}{held}")
     for group, rows in known.items():
         quick_ms, quick_db, quickest = min(rows.values(), key=lambda row: (row[0], -row[1]))
-        best_ms, best_db, best = max(rows.values(), key=lambda row: (row[1], -row[0]))
+        top_db = max(db for _, db, _ in rows.values())
+        best_ms, best_db, best = min(row for row in rows.values() if row[1] >= top_db - SAME_DB)
         if group in at:
             ms, db, knee = rows[at[group]]
             yield (

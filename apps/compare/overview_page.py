@@ -31,8 +31,8 @@ SHARES = ("other_programs",)
 LETTER, BESIDE = 7, 12  # width of a letter of a name, and its distance from its dot
 MEANING = (
     "Frame time is the mean between presented frames, from and to its interval: of a run 95 %, by the scatter of its "
-    "own frames; of a prediction 80 %, by the model. PSNR is the error of the picture, larger is better, a mean "
-    "over frames, beside the worst one and the 1st percentile, which tell what the mean hides. The frontier "
+    "own frames; of a prediction 80 %, by the model. PSNR says how near the picture is to the truth; larger is better. "
+    "It is a mean over frames; the worst frame and the 1st percentile beside it tell what the mean hides. The frontier "
     "holds what nobody beats in both on the same clock and machine, with the same scene and the same kind of error. "
     f"Pictures within {SAME_DB} dB count as equal, and so do times whose intervals meet. An entry without a known "
     "error is in the table and on no frontier. After the knee more time buys little picture. The verdict says whether "
@@ -65,7 +65,7 @@ def page(title: str, entries: Sequence[Entry]) -> str:
 
 def _sections(title: str, entries: Sequence[Entry]) -> Iterator[str]:
     yield from (f'<p class="verdict">{escape(sentence)}</p>' for sentence in told_choices(entries))
-    yield f"<h2>Frame time against error</h2>{_drawing(entries)}"
+    yield f"<h2>Frame time against picture quality: up and left is better</h2>{_drawing(entries)}"
     yield f"<h2>All {len(entries)} entries</h2>{_table(title, entries)}"
     yield f'<p class="note">{escape(MEANING)}</p>'
     yield from _stills(entries)
@@ -86,7 +86,7 @@ def _drawing(entries: Sequence[Entry]) -> str:
     ]
     left_out = len(entries) - len(dots)
     note = f"{left_out} of {len(entries)} have no speed or no known error and are not drawn. " if left_out else ""
-    words = "Filled: on the frontier; in a ring: the knee. A marker's shape is what it is compared with: "
+    words = "Filled: no other entry beats it. Ring: the knee. Only entries with one marker are compared: "
     legend = "; ".join(f"{marker_name(number)}: {_told(group)}" for number, group in enumerate(groups))
     drawn = scatter(dots, "frame time, ms", "PSNR, dB")
     if not drawn:
