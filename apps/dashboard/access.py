@@ -35,6 +35,9 @@ NOT_FOUND: Final = 404
 #: Path that could name a page; the longest name of one has 30 characters.
 SOUND_PATH: Final = re.compile(r"(/(?!\.\.?(/|$))[\w.-]{0,60}){1,4}", re.ASCII)
 MOST_FIELDS: Final = 16
+#: Bytes of a request's target and headers; those of a browser have less than 1 kB.
+MOST_HEAD_BYTES: Final = 16384
+VERSIONS: Final = ("1.0", "1.1")
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
 Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
@@ -60,6 +63,7 @@ STATUS: Final = {
     Refusal.FOREIGN_ORIGIN: 403,
     Refusal.WRONG_TOKEN: 403,
     Refusal.MALFORMED: 400,
+    Refusal.OVERSIZED: 431,
 }
 
 
@@ -143,6 +147,16 @@ def headers(port: int) -> dict[str, str]:
     }
 
 
+def refusal_of_head(scope: Mapping[str, Any]) -> Refusal | None:
+    """Return why a request is refused whatever it asks for: its version, its length, or that it has a body."""
+    lines = [scope["raw_path"] + scope["query_string"], *(name + value for name, value in scope["headers"])]
+    if sum(map(len, lines)) > MOST_HEAD_BYTES:
+        return Refusal.OVERSIZED
+    bodies = [name for name, value in scope["headers"] if name == b"content-length" and value.strip(b"0")]
+    bodies += [name for name, _ in scope["headers"] if name == b"transfer-encoding"]
+    return Refusal.MALFORMED if bodies or scope["http_version"] not in VERSIONS else None
+
+
 class Guard:
     """ASGI middleware that refuses what `refusal_of` names, counts all refusals and gives every answer `headers`."""
 
@@ -172,6 +186,8 @@ class Guard:
             return Refusal.FOREIGN_ORIGIN
         if SOUND_PATH.fullmatch(scope["path"]) is None:
             return Refusal.MALFORMED
+        if why := refusal_of_head(scope):
+            return why
         if scope["path"] in SECRET_PATHS:
             return self._refusal_of_token(scope["query_string"])
         return None

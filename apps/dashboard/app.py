@@ -19,7 +19,7 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from trilane.apps.dashboard.access import Asgi, Guard, Refusal, Refusals
+from trilane.apps.dashboard.access import MOST_HEAD_BYTES, Asgi, Guard, Refusal, Refusals, refusal_of_head
 from trilane.apps.dashboard.pages import (
     MOST_BYTES,
     ChangesSaid,
@@ -193,6 +193,12 @@ def server(app: DashboardApp) -> Any:
             app.refusals.add(Refusal.MALFORMED)
             super().send_400_response(msg)
 
+        def handle_websocket_upgrade(self, event: Any) -> None:
+            if refusal_of_head(self.scope) is None:  # WebSockets are handed the request as one of HTTP/1.1
+                super().handle_websocket_upgrade(event)
+            else:
+                self.send_400_response("refused: malformed")
+
     class WebSockets(WebSocketsSansIOProtocol):  # type: ignore[misc]
         def handle_connect(self, event: Any) -> None:
             super().handle_connect(event)
@@ -214,7 +220,7 @@ def server(app: DashboardApp) -> Any:
         ws_per_message_deflate=False,
         timeout_keep_alive=5,
         timeout_graceful_shutdown=1,
-        h11_max_incomplete_event_size=16384,
+        h11_max_incomplete_event_size=MOST_HEAD_BYTES,
         server_header=False,
         date_header=False,
         http=Http,

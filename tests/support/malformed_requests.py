@@ -37,9 +37,9 @@ class Server:
     def query(self) -> str:
         return f"token={self.token}" if self.token else ""
 
-    def request(self, target: str, *lines: str, method: str = "GET") -> bytes:
+    def request(self, target: str, *lines: str, method: str = "GET", version: str = "1.1") -> bytes:
         """A request for `target`, with the header that the server expects and `lines`."""
-        head = [f"{method} {target} HTTP/1.1", f"Host: {self.host}:{self.port}", "Connection: close", *lines]
+        head = [f"{method} {target} HTTP/{version}", f"Host: {self.host}:{self.port}", "Connection: close", *lines]
         return ("\r\n".join(head) + "\r\n\r\n").encode("latin-1")
 
     def handshake(self, *lines: str) -> bytes:
@@ -99,6 +99,19 @@ def _range(server: Server, random: Random) -> bytes:
     return server.request(f"/?{server.query}", f"Range: {span}")
 
 
+def _version(server: Server, random: Random) -> bytes:
+    return server.request(f"/?{server.query}", version=random.choice(["0.9", "9.9", "2.0", "1.2"]))
+
+
+def _large(server: Server, random: Random) -> bytes:
+    return server.request(f"/?{server.query}", f"X-Large: {'a' * random.randint(17_000, 200_000)}")
+
+
+def _body(server: Server, random: Random) -> bytes:
+    line = random.choice(["Content-Length: 1", f"Content-Length: {10**15}", "Transfer-Encoding: chunked"])
+    return server.request(f"/?{server.query}", line)
+
+
 def _token(server: Server, random: Random) -> bytes:
     token = random.choice(["%ff", "%ed%a0%80", "\xe9", "%", "a" * 4000, f"{server.token}&token={server.token}"])
     return server.request(f"/metrics?token={token}x")
@@ -135,7 +148,7 @@ def _frames(_server: Server, random: Random) -> bytes:
 
 
 REQUESTS: Final[tuple[Callable[[Server, Random], bytes], ...]] = (
-    _fields, _nul, _long, _line, _headers, _method, _range, _token, _handshake,
+    _fields, _nul, _long, _line, _headers, _method, _range, _version, _large, _body, _token, _handshake,
 )  # fmt: skip
 
 
