@@ -24,10 +24,10 @@ from trilane.apps.run.file_pipeline import (
 )
 from trilane.apps.run.report import write_report
 from trilane.apps.run.report_facts import made_facts, report_of
-from trilane.apps.run.run_files import VIDEO, join_segments, write_files
+from trilane.apps.run.run_files import VIDEO, join_folder, write_files
 from trilane.apps.run.run_folder import RunFolder, default_place
 from trilane.apps.run.run_job import ENDLESS, Hooks, RunOutcome, error_of, exit_code_of, sensors
-from trilane.errors import BadInputError
+from trilane.errors import BadInputError, UnwrittenError
 from trilane.memory import require_memory
 from trilane.pipeline import journal
 from trilane.pipeline.controls import Interrupts, RunControls
@@ -166,13 +166,16 @@ def _written(file: PipelineFile, work: Path, fps: float, result: RunResult) -> t
     """Write the files of the folder and the file's own videos; return what the report says of them, and the result."""
     segments = segments_of(file)
     videos = {name: work / (VIDEO if place == 0 else f"{name}.mp4") for place, name in enumerate(segments)}
+    encoded = {name: min(result.report.stages[name].jobs, 1) for name in videos}
+    failed: UnwrittenError | None = None
     for name, video in videos.items():
         if video.name != VIDEO:
-            join_segments(sorted((work / segments[name]).glob("*.mp4")), video, fps)
+            _, removed = join_folder(work / segments[name], video, fps, encoded[name])
+            failed = failed or removed
             shutil.rmtree(work / segments[name], ignore_errors=True)
-    facts, unwritten = write_files(work, fps)
-    if unwritten is not None:
-        result = replace(result, failure=result.failure or Failure(str(unwritten)))
+    facts, unwritten = write_files(work, fps, next(iter(encoded.values()), 0))
+    if failed := failed or unwritten:
+        result = replace(result, failure=result.failure or Failure(str(failed)))
     for name, video in videos.items():
         stage = file.stages[name]
         assert isinstance(stage, EncodeBlock)

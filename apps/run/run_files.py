@@ -6,6 +6,7 @@ The journal is read once, record by record.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import shutil
 from collections.abc import Iterator
@@ -31,30 +32,31 @@ KEYFRAME_EVERY = 30  # frames, as the present stage encodes them
 FAST_PNG = 1  # a fifth larger than the best compression, in a quarter of the time
 
 
-def write_files(work: Path, fps: float) -> tuple[dict[str, Any], UnwrittenError | None]:
+def write_files(work: Path, fps: float, frames: int) -> tuple[dict[str, Any], UnwrittenError | None]:
     """Write every file of the run folder `work` except the report. Return the report's facts about these files.
 
-    On a full disk the error is returned too; files are then complete or absent, and the segments stay.
+    On a full disk the error is returned too; files are then complete or absent, and the segments stay. An error about
+    segments that were removed is returned after everything else is written.
 
-    `fps`: frames a second of the scene. Raises BadInputError for a broken journal.
+    `fps`: frames a second of the scene. `frames`: least number of frames in the segments. Raises BadInputError for a
+    broken journal.
     """
     segments = work / SEGMENTS
     facts: dict[str, Any] = {"video": None, "checksum": None}
     try:
-        if segments.is_dir():
-            facts["checksum"] = run_checksum(sorted(segments.glob("*.sha256")))
-            with _whole_or_absent(work / VIDEO):
-                joined = join_segments(sorted(segments.glob("*.mp4")), work / VIDEO, fps)
-            if joined is not None:
-                facts["video"] = {"frames": joined.frames, "seconds": joined.seconds}
-                with _whole_or_absent(work / SHEET):
-                    contact_sheet(work / VIDEO, work / SHEET, fps)
-            shutil.rmtree(segments)
+        checksum = run_checksum(sorted(segments.glob("*.sha256")))
+        joined, removed = join_folder(segments, work / VIDEO, fps, frames)
+        facts["checksum"] = None if removed else checksum
+        if joined is not None:
+            facts["video"] = {"frames": joined.frames, "seconds": joined.seconds}
+            with _whole_or_absent(work / SHEET):
+                contact_sheet(work / VIDEO, work / SHEET, fps)
+        shutil.rmtree(segments, ignore_errors=True)
         with _whole_or_absent(work / EVENTS, work / TRACE_NAME):
             _write_from_journal(work / NAME, work)
     except UnwrittenError as error:
         return facts, error
-    return facts, None
+    return facts, removed
 
 
 @contextmanager
@@ -91,6 +93,26 @@ class JoinedVideo:
 
     frames: int
     seconds: float
+
+
+def join_folder(
+    segments: Path, target: Path, fps: float, frames: int
+) -> tuple[JoinedVideo | None, UnwrittenError | None]:
+    """Join the folder `segments` to the video `target`, by `join_segments`; with an error where files were removed.
+
+    `frames`: least number of frames that were encoded. Each has a line in a digest file, and all but the last one of a
+    writer that was killed are in its segment. Raises UnwrittenError where the disk takes no more.
+    """
+    digests = sorted(segments.glob("*.sha256"))
+    whole = [path for path in sorted(segments.glob("*.mp4")) if path.with_suffix(".sha256") in digests]
+    with _whole_or_absent(target):
+        joined = join_segments(whole, target, fps)
+    lines, shown = sum(len(_digest_lines(path)) for path in digests), joined.frames if joined else 0
+    if frames <= lines <= shown + len(digests):
+        return joined, None
+    return joined, UnwrittenError(
+        segments, FileNotFoundError(errno.ENOENT, "files were removed from it during the run")
+    )
 
 
 def join_segments(segments: list[Path], target: Path, fps: float) -> JoinedVideo | None:

@@ -164,7 +164,9 @@ def run_to_folder(
                 facts |= _checked_frames(checked, folder.work, hooks, ended)
             from trilane.apps.run.run_files import write_files
 
-            files, unwritten = write_files(folder.work, checked.config.scene.fps)
+            is_encoded = "encode_ms" in result.metrics.get("present", {})
+            recorded = result.presented if is_encoded else 0
+            files, unwritten = write_files(folder.work, checked.config.scene.fps, recorded)
             facts |= files
             if unwritten is not None:
                 result = replace(result, failure=result.failure or Failure(str(unwritten)))

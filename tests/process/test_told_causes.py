@@ -6,8 +6,9 @@ import resource
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,17 +37,23 @@ pytestmark = pytest.mark.usefixtures("no_new_process")
 
 @pytest.fixture
 def run(starter: UnitStarter, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., RunOutcome]:
-    """Run mock units to tmp_path/a/run; `at(work)` is called once, when frames were presented."""
+    """Run mock units to tmp_path/a/run; `at(work)` is called once, when frames were presented.
+
+    Further keywords are what stages say of their jobs.
+    """
+    said: dict[str, Mapping[str, float]] = {}
 
     def run_doubles(config: RunConfig, assets: Assets, frames: int | None, edge: str, **options: Any) -> RunResult:
         pipeline = pipeline_of_doubles().with_rule(edge)
         count, fps = frames or config.scene.frames, config.scene.fps
-        return run_pipeline(pipeline, count, fps=fps, assets=assets, **{**options, "starter": starter})
+        result = run_pipeline(pipeline, count, fps=fps, assets=assets, **{**options, "starter": starter})
+        return replace(result, metrics={**result.metrics, **said})
 
     monkeypatch.setattr("trilane.apps.run.run_job.run_avatar", run_doubles)
 
-    def run(at: Callable[[Path], None], frames: int = FRAMES) -> RunOutcome:
+    def run(at: Callable[[Path], None], frames: int = FRAMES, **stages: Mapping[str, float]) -> RunOutcome:
         waiting = [at]
+        said.update(stages)
 
         def progress(_what: str, presented: int, _requested: int) -> None:
             if presented and waiting:
@@ -87,6 +94,18 @@ def test_a_run_whose_journal_is_removed_says_so(run: Callable[..., RunOutcome], 
         run(lambda work: (work / "journal.msgpack").unlink())
     assert raised.value.exit_code == 1
     assert list(tmp_path.rglob("*")) == []
+
+
+def test_a_run_whose_segments_are_removed_fails_and_keeps_its_report(
+    run: Callable[..., RunOutcome], tmp_path: Path
+) -> None:
+    """Doubles write none, so a run that says it has encoded its frames has lost them."""
+    outcome = run(lambda _work: None, frames=30, present={"encode_ms": 1.0})
+    said = f"{tmp_path}/a/run/segments: files were removed from it during the run"
+    assert (outcome.exit_code, outcome.report.failure) == (1, said)
+    names = {path.name for path in outcome.folder.iterdir()}
+    assert names == {"report.json", "journal.msgpack", "events.jsonl", "trace.pftrace"}
+    assert read_report(outcome.folder).frames.presented == 30
 
 
 def test_a_disk_that_fills_keeps_the_report(

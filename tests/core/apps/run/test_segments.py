@@ -15,7 +15,7 @@ from PIL import Image
 
 from support.small_pipeline import without_bytes
 from trilane.apps.run import run_files
-from trilane.apps.run.run_files import contact_sheet, join_segments, run_checksum
+from trilane.apps.run.run_files import contact_sheet, join_folder, join_segments, run_checksum
 from trilane.errors import UnwrittenError
 from trilane.pipeline.description import UnitSettings
 from trilane.scene.schema import OutputSpec, Scene
@@ -108,6 +108,46 @@ def test_a_segment_that_is_removed_is_told_at_the_next_frame(tmp_path: Path, rem
         stage.run(1, 0, None)
     assert str(raised.value) == f"{segment}: it was removed while it was written"
     stage.close()
+
+
+@pytest.mark.parametrize(
+    ("removed", "shown", "is_told"),
+    [
+        ("", 12, False),
+        ("*", 0, True),
+        ("1.*", 5, True),
+        ("1.mp4", 5, True),
+        ("1.sha256", 5, True),
+    ],
+)
+def test_segments_that_are_removed_after_the_last_frame_are_told(
+    tmp_path: Path, removed: str, shown: int, is_told: bool
+) -> None:
+    """Of two processes, the second with seven frames; the first has five."""
+    present(tmp_path, range(5))
+    present(tmp_path, range(5, 12))
+    for number, path in enumerate(segments(tmp_path)):
+        for file in (path, path.with_suffix(".sha256")):
+            file.rename(file.with_name(f"{number}{file.suffix}"))
+    for file in list((tmp_path / SEGMENTS).glob(removed)) if removed else ():
+        file.unlink()
+    joined, error = join_folder(tmp_path / SEGMENTS, tmp_path / "video.mp4", FPS, 12)
+    assert (joined.frames if joined else 0) == shown
+    assert (str(error) if error else "") == (
+        f"{tmp_path / SEGMENTS}: files were removed from it during the run" if is_told else ""
+    )
+
+
+def test_a_killed_writer_and_one_that_had_no_frame_removed_nothing(tmp_path: Path) -> None:
+    """The first has a digest of a frame that is not in its segment; the second died before its first picture."""
+    present(tmp_path, range(9))
+    whole = segments(tmp_path)[0]
+    with whole.with_suffix(".sha256").open("a") as digests:
+        digests.write("9 aa\n")
+    (whole.parent / "z.sha256").write_text("10 bb\n")
+    joined, error = join_folder(tmp_path / SEGMENTS, tmp_path / "video.mp4", FPS, 9)
+    assert joined is not None and (joined.frames, error) == (9, None)
+    assert join_folder(tmp_path / "none", tmp_path / "other.mp4", FPS, 0) == (None, None)
 
 
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "x"), av.error.err_check])
