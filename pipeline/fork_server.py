@@ -5,8 +5,8 @@ needs, then forks a unit for each request. So a unit starts in milliseconds inst
 
 A request is one packet on a SOCK_SEQPACKET socket: JSON with descriptors. The descriptors are the unit's spec (in a
 memory file), its stderr, its lifeline, and those that the spec names. The answer is the unit's process id with its
-pidfd. A request with `call` names a function instead; its result goes to the pipe that comes with the request, and it
-has no answer.
+pidfd and a pipe. When the unit has ended, its exit code comes through that pipe, negative for a signal. A request with
+`call` names a function instead; its result goes to the pipe that comes with the request, and it has no answer.
 
 A lifeline is a pipe whose other end only the parent has: the kernel kills the unit when that end is closed.
 """
@@ -48,35 +48,44 @@ def process_name(unit: str) -> str:
 def serve(requests: socket.socket) -> None:
     """Fork a unit for each request, until the other end is closed and every unit has ended."""
     server_pid = os.getpid()
-    signal.signal(signal.SIGCHLD, lambda _number, _frame: _reap(os.WNOHANG))
+    codes: dict[int, int] = {}  # pipe for the exit code of each living unit, by process id
+    signal.signal(signal.SIGCHLD, lambda _number, _frame: _reap(codes, os.WNOHANG))
     while True:
         packet, fds, _flags, _address = socket.recv_fds(requests, PACKET_BYTES, MAX_FDS)
         if not packet:
             break
         request = json.loads(packet)
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGCHLD})  # a unit that dies at once keeps its process id
+        reads, writes = os.pipe2(os.O_CLOEXEC)
         # This process has one thread. A lock that another thread held at a fork would stay locked in the child for
         # ever.
         pid = os.fork()
         if pid == 0:
             requests.close()
+            for fd in (reads, writes, *codes.values()):
+                os.close(fd)
             os._exit(_call(request, fds, server_pid) if "call" in request else _run_unit(request, fds))
+        codes[pid] = writes
         if "call" not in request:
             pidfd = os.pidfd_open(pid)
-            socket.send_fds(requests, [str(pid).encode()], [pidfd])
+            socket.send_fds(requests, [str(pid).encode()], [pidfd, reads])
             os.close(pidfd)
+        os.close(reads)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGCHLD})
         for fd in fds:
             os.close(fd)
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    _reap(0)
+    _reap(codes, 0)
 
 
-def _reap(options: int) -> None:
-    """Wait for the units that have ended; with options 0, for all units until they end."""
+def _reap(codes: dict[int, int], options: int) -> None:
+    """Wait for the units that have ended, and tell their exit codes; with options 0, for all units until they end."""
     with contextlib.suppress(ChildProcessError):
-        while os.waitpid(-1, options)[0]:
-            pass
+        while (ended := os.waitpid(-1, options))[0]:
+            writes = codes.pop(ended[0])
+            with contextlib.suppress(BrokenPipeError):  # nobody asks
+                os.write(writes, str(os.waitstatus_to_exitcode(ended[1])).encode())
+            os.close(writes)
 
 
 def _run_unit(request: dict[str, Any], fds: Sequence[int]) -> int:

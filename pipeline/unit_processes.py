@@ -43,6 +43,8 @@ from trilane.transport.messages import (
 
 TAIL_BYTES = 8192
 END_S = 2.0
+#: How long the fork server may take to say how a unit ended; it does so at once.
+CODE_MS = 200
 
 
 class UnitMessage(NamedTuple):
@@ -54,10 +56,11 @@ class UnitMessage(NamedTuple):
 
 class _Process:
     def __init__(self, unit: str, started: StartedUnit, stderr_fd: int, link: Link, folder: SocketFolder) -> None:
-        self.unit, self.pid, self.pidfd, self.lifeline = unit, *started
+        self.unit, self.pid, self.pidfd, self.lifeline, self.code_fd = unit, *started
         self.stderr_fd, self.link, self.folder = stderr_fd, link, folder
         self.tail = b""
         self.folder_open = True
+        self.is_killed_here = False
         os.set_blocking(stderr_fd, False)
 
     def read_stderr(self) -> bool:
@@ -69,6 +72,7 @@ class _Process:
         return True
 
     def kill(self) -> None:
+        self.is_killed_here = True
         with contextlib.suppress(ProcessLookupError):
             # Through a pidfd the signal can never reach another process that was given the same number.
             signal.pidfd_send_signal(self.pidfd, signal.SIGKILL)
@@ -81,6 +85,14 @@ class _Process:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.pid, signal.SIGKILL)
 
+    def killed_by(self) -> int:
+        """Return the signal from elsewhere that has ended the process; 0 for none, or if no fork server knows it."""
+        poller = select.poll()
+        poller.register(self.code_fd, select.POLLIN)
+        if self.is_killed_here or not poller.poll(CODE_MS):
+            return 0
+        return max(0, -int(os.read(self.code_fd, 16) or 0))
+
     def release_folder(self) -> None:
         if self.folder_open:
             self.folder_open = False
@@ -92,6 +104,7 @@ class UnitProcesses:
 
     `assets_fd`: descriptor of the arrays that every unit may read.
     `stderr_tails`: last text that each ended unit wrote, by unit.
+    `signals`: number of the signal that ended a unit, by unit; 0 for none.
     `places`: place of each stage among those of its unit, as messages use it.
     """
 
@@ -108,6 +121,7 @@ class UnitProcesses:
             stage.name: place for unit in pipeline.units for place, stage in enumerate(pipeline.stages_of(unit))
         }
         self.stderr_tails: dict[str, str] = {}
+        self.signals: dict[str, int] = {}
 
     @property
     def core_counts(self) -> dict[str, int]:
@@ -190,8 +204,10 @@ class UnitProcesses:
         return messages
 
     def why_ended(self, unit: str) -> str:
-        """Return the end of a sentence that says why a unit ended: what it wrote last, and whether memory ran out."""
-        ends = (after_stderr(self.stderr_tails.get(unit, "")), ended_by_system())
+        """Return the end of a sentence that says why a unit ended: its signal, what it wrote last, a lack of memory."""
+        number = self.signals.get(unit, 0)
+        killed = f"it was killed by signal {number}" if number else ""
+        ends = (killed, after_stderr(self.stderr_tails.get(unit, "")), ended_by_system())
         return "".join(f"; {end}" for end in ends if end)
 
     @property
@@ -268,6 +284,7 @@ class UnitProcesses:
 
     def _forget(self, process: _Process) -> None:
         process.wait()
+        self.signals[process.unit] = process.killed_by()
         process.read_stderr()
         self.stderr_tails[process.unit] = process.tail.decode(errors="replace").strip()
         for fd in (process.link.job_pipe.fileno(), process.link.heartbeat_fd, process.stderr_fd, process.pidfd):
@@ -276,6 +293,7 @@ class UnitProcesses:
         process.release_folder()
         os.close(process.pidfd)
         os.close(process.lifeline)
+        os.close(process.code_fd)
         os.close(process.stderr_fd)
         del self._live[process.unit]
 

@@ -29,20 +29,24 @@ LOOK_S = 0.1  # between two looks at a fork server that has not answered
 CLOSE_S = 5.0
 NOTICE_S = 0.2  # a fork server ends at most this many seconds after its call fails or its socket closes
 TAIL_BYTES = 8192
+DESCRIPTORS = 2  # that come with a unit's process id
 SERVER = "the fork server, which every unit comes from,"
 SERVERS = 3  # number of servers that are asked for one unit before it counts as not startable
 
 
 class StartedUnit(NamedTuple):
-    """A unit's process; its owner closes both descriptors.
+    """A unit's process; its owner closes the descriptors.
 
     `pidfd`: descriptor that is readable when the process has ended.
     `lifeline`: descriptor that keeps the process alive: it ends when this is closed, or when this process ends.
+    `code_fd`: descriptor through which the process's exit code comes, as text, soon after its end. It is negative for
+    a signal, and empty if the fork server has ended.
     """
 
     pid: int
     pidfd: int
     lifeline: int
+    code_fd: int
 
 
 class _ServerError(Exception):
@@ -192,10 +196,12 @@ class UnitStarter:
             answer, received = self._received()
             if not answer:
                 raise _ServerError(self._why())
-            if not received:
+            if len(received) < DESCRIPTORS:
+                for fd in received:
+                    os.close(fd)
                 raise TrilaneError(f"unit {spec.unit} could not be started: too many open files: ulimit -n 4096")
             undo.pop_all()
-        return StartedUnit(int(answer), received[0], lifeline)
+        return StartedUnit(int(answer), received[0], lifeline, received[1])
 
     def _received(self) -> tuple[bytes, list[int]]:
         """Return the answer and its descriptors.
@@ -205,7 +211,7 @@ class UnitStarter:
         end = time.monotonic() + ANSWER_S
         while time.monotonic() < end:
             with contextlib.suppress(TimeoutError, ConnectionResetError):
-                answer, fds, _flags, _address = socket.recv_fds(self._socket, 32, 1)
+                answer, fds, _flags, _address = socket.recv_fds(self._socket, 32, DESCRIPTORS)
                 return answer, fds
             if self.trouble():
                 break

@@ -209,23 +209,30 @@ def children():
 
 death, default, blocked, parent = json.loads(call("here:look"))
 files = os.listdir(f"/proc/{server}/fd")
-pid, (pidfd,) = unit(0.5)
+pid, (pidfd, said) = unit(0.5)
 named = until(lambda: open(f"/proc/{pid}/comm").read() == "trilane-u\\n")
 alive = not select.select([pidfd], [], [], 0)[0]
 ended = bool(select.select([pidfd], [], [], 60)[0])
 none = call("no:such")
 print(json.dumps([death, default, blocked, parent == server, named, alive, ended, none,
-                  until(lambda: not children()), until(lambda: os.listdir(f"/proc/{server}/fd") == files)]))
-_, (last,) = unit(0.3)
+                  until(lambda: not children()), until(lambda: os.listdir(f"/proc/{server}/fd") == files),
+                  os.read(said, 9).decode()]))
+killed, (_, said) = unit(60)
+os.kill(killed, signal.SIGKILL)
+how = os.read(said, 9).decode()
+_, (last, _) = unit(0.3)
 ours.close()
 code = os.waitstatus_to_exitcode(os.waitpid(server, 0)[1])
-print(json.dumps([code, bool(select.select([last], [], [], 0)[0])]))
+print(json.dumps([code, bool(select.select([last], [], [], 0)[0]), how]))
 """
 
 
 def test_a_fork_server_forks_answers_forgets_and_outlives_its_units() -> None:
-    """A call dies with the server too; units that ended leave no zombie, and no file; the server waits for the last."""
+    """A call dies with the server too; units that ended leave no zombie, and no file; the server waits for the last.
+
+    A unit's exit code comes through the pipe that came with its process.
+    """
     done = subprocess.run([sys.executable, "-c", SERVER_LIFE], capture_output=True, text=True, timeout=60, check=True)
     first, last = map(json.loads, done.stdout.splitlines())
-    assert first == [signal.SIGKILL, True, [], True, True, True, True, "", True, True]
-    assert last == [9, True]
+    assert first == [signal.SIGKILL, True, [], True, True, True, True, "", True, True, "5"]
+    assert last == [9, True, "-9"]

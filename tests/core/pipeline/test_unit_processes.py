@@ -56,13 +56,15 @@ class FakeStarter:
         self.pipes: dict[str, JobPipe] = {}
         self.stderr: dict[str, int] = {}
         self.sleepers: dict[str, subprocess.Popen[bytes]] = {}
+        self.codes: dict[str, int] = {}
 
     def start(self, spec: UnitSpec, stderr_fd: int) -> StartedUnit:
         self.specs[spec.unit] = spec
         self.pipes[spec.unit] = JobPipe(JobPipeEnd(*(os.dup(fd) for fd in spec.job_pipe)))
         self.stderr[spec.unit] = os.dup(stderr_fd)
         sleeper = self.sleepers[spec.unit] = subprocess.Popen(["sleep", "60"], process_group=0)
-        return StartedUnit(sleeper.pid, os.pidfd_open(sleeper.pid), os.open(os.devnull, os.O_RDONLY))
+        code_fd, self.codes[spec.unit] = os.pipe()
+        return StartedUnit(sleeper.pid, os.pidfd_open(sleeper.pid), os.open(os.devnull, os.O_RDONLY), code_fd)
 
     def renew(self) -> str:
         return "the server ended"
@@ -70,6 +72,7 @@ class FakeStarter:
     def leave(self, unit: str) -> None:
         self.pipes.pop(unit).close()
         os.close(self.stderr.pop(unit))
+        os.close(self.codes.pop(unit))
 
 
 @pytest.fixture
@@ -153,6 +156,29 @@ def test_what_a_unit_said_comes_before_its_end_and_its_last_line_is_kept(started
     assert processes.why_ended("right") == "; it wrote last: last words"
     assert (processes.why_ended("left"), processes.renew_starter()) == ("", "the server ended")
     assert list(processes.pids) == ["left"]
+
+
+@pytest.mark.parametrize(
+    ("code", "is_ours", "why"),
+    [
+        (b"-9", False, "; it was killed by signal 9; it wrote last: words"),
+        (b"-9", True, "; it wrote last: words"),
+        (b"3", False, "; it wrote last: words"),
+        (b"", False, "; it wrote last: words"),
+    ],
+)
+def test_a_signal_from_elsewhere_is_told(started: Started, code: bytes, is_ours: bool, why: str) -> None:
+    """But none that was sent here, nor one that the fork server does not tell."""
+    processes, starter = started
+    os.write(starter.stderr["left"], b"words\n")
+    os.write(starter.codes["left"], code)
+    if is_ours:
+        processes.kill("left")
+    else:
+        starter.sleepers["left"].kill()
+    starter.leave("left")
+    assert heard(processes, 1) == [UnitMessage("left", None)]
+    assert processes.why_ended("left") == why
 
 
 def test_bytes_that_are_no_message_end_the_run_and_name_the_unit(started: Started) -> None:
@@ -252,16 +278,19 @@ Starter = Callable[..., tuple[UnitStarter, list[socket.socket]]]
 
 
 @pytest.mark.parametrize(
-    ("answer", "passes_fd", "said"),
-    [(b"123", True, ""), (b"123", False, "^unit left could not be started: too many open files: ulimit -n 4096$")],
+    ("answer", "passed", "said"),
+    [
+        (b"123", 2, ""),
+        *((b"123", few, "^unit left could not be started: too many open files: ulimit -n 4096$") for few in (0, 1)),
+    ],
 )
 def test_a_unit_is_asked_for_with_its_spec_and_files(
-    starter_with: Starter, answer: bytes, passes_fd: bool, said: str
+    starter_with: Starter, answer: bytes, passed: int, said: str
 ) -> None:
     """The third of its files is the lifeline, whose other end is the caller's; without an answer it is nobody's."""
     server = FakeServer(None)
     starter, (theirs,) = starter_with(server)
-    socket.send_fds(theirs, [answer], [0] if passes_fd else [])
+    socket.send_fds(theirs, [answer], [0] * passed)
     unit = None
     if said:
         with pytest.raises(TrilaneError, match=said):
@@ -269,6 +298,7 @@ def test_a_unit_is_asked_for_with_its_spec_and_files(
     else:
         unit = starter.start(spec(), 2)
         os.close(unit.pidfd)
+        os.close(unit.code_fd)
         assert unit.pid == 123
     packet, fds, *_ = socket.recv_fds(theirs, 9999, 10)
     assert json.loads(packet) == {"unit": "left", "cores": [1, 0], "threads": 3, "fds": [0, 1, 2]}
