@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
 from trilane.stages.dsp.ort import LOAD_ERRORS, PROVIDER, settings_of
-from trilane.stages.dsp.runtime import RuntimeOptions, quiet_openvino, resolve
+from trilane.stages.dsp.runtime import RuntimeOptions, quiet_openvino, resolve, said_by_openvino
 
 Named = Mapping[str, NDArray[Any]]
 Shapes = Mapping[str, Sequence[int]]
@@ -134,7 +134,7 @@ def _openvino(path: Path, shapes: Shapes, options: RuntimeOptions) -> Engine:
             model.reshape({name: list(shape) for name, shape in shapes.items()})
         return OpenvinoEngine(openvino, core.compile_model(model, "CPU", settings))
     except RuntimeError as error:
-        raise BadInputError(path, str(error), "a network that OpenVINO loads") from error
+        raise BadInputError(path, said_by_openvino(error), "a network that OpenVINO loads") from error
 
 
 _ENGINES: Mapping[str, Callable[[Path, Shapes, RuntimeOptions], Engine]] = {

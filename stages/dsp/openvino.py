@@ -16,7 +16,7 @@ from trilane.arrays import U8
 from trilane.avatars.network_file import IntegerNetwork
 from trilane.cache import cache_entry
 from trilane.errors import BadInputError
-from trilane.stages.dsp.runtime import RuntimeOptions, quiet_openvino
+from trilane.stages.dsp.runtime import RuntimeOptions, quiet_openvino, said_by_openvino
 from trilane.writing import write_bytes
 
 openvino = quiet_openvino()
@@ -70,7 +70,7 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OpenvinoSession:
     try:
         compiled = _core().compile_model(_core().read_model(network.model.SerializeToString()), DEVICE, settings)
     except RuntimeError as error:
-        raise BadInputError(network.where, str(error), "a network that OpenVINO loads") from error
+        raise BadInputError(network.where, said_by_openvino(error), "a network that OpenVINO loads") from error
     _check_integer(compiled, network)
     if stored is not None:
         with contextlib.suppress(BadInputError):  # a full disk: it is compiled again next time

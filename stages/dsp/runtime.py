@@ -143,3 +143,8 @@ def quiet_openvino() -> Any:
     import openvino
 
     return openvino
+
+
+def said_by_openvino(error: RuntimeError) -> str:
+    """Return the text of an error of OpenVINO as part of a sentence: on one line, without the stop at its end."""
+    return " ".join(str(error).split()).rstrip(".")

@@ -294,6 +294,13 @@ def test_a_shape_that_is_no_bucket_is_named(tiny_bundle):
         stage.run(7, 0, 0)
 
 
+def test_an_error_of_openvino_is_a_part_of_a_sentence() -> None:
+    error = RuntimeError("Exception from core.cpp:105:\nUnable to read the model. Please check it.\n\n")
+    said = str(BadInputError("a.onnx", runtime.said_by_openvino(error), "a network that OpenVINO loads"))
+    text = "Exception from core.cpp:105: Unable to read the model. Please check it"
+    assert said == f"a.onnx: found {text}, expected a network that OpenVINO loads"
+
+
 def test_openvino_is_loaded_without_its_telemetry() -> None:
     """Imported by itself it tells its maker's server; this is its own stand-in, which does nothing."""
     if not machine.here.has_package("openvino"):
