@@ -25,23 +25,31 @@ from trilane.scene.camera.pose_table import (
     LEAST_GROWING,
     MATRIX,
     POSE,
+    ROW_ORDER,
     SAY_ORDER,
+    SECONDS,
     Clock,
     TableLayout,
     head_of,
     is_index,
     is_off,
     layout_of,
+    read_table,
+    units_of,
 )
 from trilane.scene.camera.recorded import (
     AUTO,
+    LEAST_SKYWARDS,
+    LEAST_UP_COSINE,
     OPENGL_FROM_OPTICAL,
     UP,
     RawCamera,
     are_rotations,
     is_of_body,
+    meeting_point,
     path_from_recording,
     price_of,
+    price_of_horizons,
 )
 from trilane.scene.camera.trajectories import (
     EUROC_NAMES,
@@ -77,6 +85,8 @@ class Guess(NamedTuple):
 
 #: Least number of rows that tell how a camera moves.
 LEAST_ROWS = 5
+#: Least number of rows that tell another order of columns by where the camera goes and looks.
+LEAST_LED = 20
 #: Median deviation of the steps of a column, in medians: below the first they are a clock's, above the second they are
 #: not.
 EVEN, UNEVEN = 0.1, 0.5
@@ -90,12 +100,20 @@ EXACT = 1e-6
 #: Mean cosine between the camera's way and its axis, and between its axes and the world's, above which both count as
 #: one.
 ALONG, UPRIGHT = 0.9, 0.7
+#: Nearest point that people walk round, and the largest share of its distance by which lines of sight miss it. Somebody
+#: who pans holds the camera at less than this from the axis of the turn, so their lines of sight meet behind it.
+LEAST_AWAY, MOST_MISSED = 1.0, 0.2
+#: Depths of a camera held at a person's height in a world with Y down and the floor at 0. With Y up none is there, nor
+#: in a phone's world, which begins where the phone is held.
+BELOW_M = 0.7, 2.5
+#: Times of a device's clock, in seconds since it was switched on: later than the start of a recording, before 1970's.
+OF_A_DEVICE_S = 60.0, 1e9
 #: Another order of a quaternion's parts is likely when it is cheaper by the first, and possible when it is not dearer
 #: by the second. The user is asked about both.
 MUCH_DEARER, AS_DEAR = 0.1, 0.02
 WHICH_MATRIX = (
     'set camera.format to "kitti" if the camera looks along +Z of its axes (x right, y down), to "arkit" if along -Z '
-    "(x right, y up)"
+    "(x right, y up); camera.axes states other axes"
 )
 
 #: How a table becomes usable, by the columns that other programs save.
@@ -104,7 +122,17 @@ OTHERS = {
     7: "if these are rotation vectors, as in ARKitScenes, or a place and a quaternion: write time, place and "
     "quaternion of each pose, camera to world, as TUM has them",
     16: "if these are 4x4 matrices, as of Replica: leave the last four columns out, which are 0 0 0 1, for KITTI's 12",
+    17: "if these are a time and a 4x4 matrix: leave the last four columns out, which are 0 0 0 1",
 }
+
+#: How an array of matrices, and a folder of files with a matrix each, become a table.
+OF_ARRAY = (
+    "if it has shape (N, 4, 4) or (N, 3, 4): python -c \"import numpy as np; np.savetxt('poses.txt', "
+    "np.load('{name}')[:, :3].reshape(-1, 12))\""
+)
+OF_FILES = (
+    "make one table of them: for f in $(ls -v {folder}/*.txt); do head -n 3 $f | tr '\\n' ' '; echo; done > poses.txt"
+)
 
 
 def detect(path: Path, up_axis: str = AUTO, axes: str = AUTO) -> Guess:
@@ -115,6 +143,8 @@ def detect(path: Path, up_axis: str = AUTO, axes: str = AUTO) -> Guess:
     if path.is_dir():
         return _of_folder(path)
     require_file(path, EXPECTED)
+    if path.suffix.lower() == ".npy":
+        raise BadInputError(path, "an array of NumPy", "a text or a folder", OF_ARRAY.format(name=path))
     if path.name in COLMAP_FILES and model_in(path.parent) is not None:
         return Guess("colmap", "a file of a COLMAP model")
     if path.suffix.lower() == ".json" or read_text(path, EXPECTED).lstrip()[:1] == "{":
@@ -136,10 +166,23 @@ def _of_folder(path: Path) -> Guess:
     for kind, name in (("nerf", NERF_FILE), ("stray", STRAY_FILE), ("record3d", RECORD3D_FILE)):
         if (path / name).is_file():
             return Guess(kind, f"{name} in the folder")
+    for folder in (path, path / "pose"):  # of 7-Scenes and ScanNet
+        if _has_matrices(folder):
+            text = "a folder of text files with a 4x4 matrix each"
+            raise BadInputError(folder, text, "one file with all poses", OF_FILES.format(folder=folder))
     remedy = "name the file of poses in it"
     raise BadInputError(
         path, f"a folder without {NERF_FILE}, {STRAY_FILE}, {RECORD3D_FILE} and COLMAP's files", EXPECTED, remedy
     )
+
+
+def _has_matrices(folder: Path) -> bool:
+    """Return whether `folder` has several text files, of which the first has 16 numbers."""
+    files = sorted(folder.glob("*.txt"))
+    try:
+        return len(files) > 1 and read_table(files[0], 4, EXPECTED).numbers.shape == (4, 4)
+    except BadInputError:
+        return False
 
 
 def _of_table(path: Path, layout: TableLayout, up_axis: str, axes: str) -> Guess:
@@ -213,52 +256,109 @@ def _of_matrices(path: Path, numbers: F64, up_axis: str, axes: str) -> Guess:
     if is_readable and (has_time or not path.with_name(KITTI_TIMES).is_file()):
         if has_time:
             _require_clock(path, rows, (4, 8, 12))
-        signs = _signs(matrices[sound], _ups(up_axis, has_time=has_time))
-        if axes == AUTO and (signs["kitti" if has_time else "arkit"] or not (has_time or signs["kitti"])):
+        if has_time and axes == AUTO:
+            _require_row_order(path, matrices[sound, :, :3], columns)
+        signs = _signs(matrices[sound], up_axis, rows[:, 0] if has_time else None)
+        if axes == AUTO and (signs["kitti" if has_time else "arkit"] or not signs[usual]):
             why = " and ".join((*signs["kitti"], *signs["arkit"])) or "which do not tell where the camera looks"
             raise BadInputError(path, f"{columns}3x4 matrices, {why}", "what fits one format", WHICH_MATRIX)
     return Guess(usual, f"{columns}a 3x4 matrix{'' if numbers.shape[1] > MATRIX else ' without a time'}")
 
 
-def _ups(up_axis: str, *, has_time: bool) -> tuple[str, ...]:
-    """Return the world axes that a picture's Y can point against only in KITTI's files; a phone may be upside down."""
-    if up_axis != AUTO:
-        return (up_axis,)
-    return ("z",) if has_time else ("z", "y")
+def _require_row_order(path: Path, turns: F64, columns: str) -> None:
+    """Raise BadInputError where the pictures of turns (N, 3, 3) are more level with their numbers in another order.
+
+    `columns`: the table's columns, in words. People hold a camera level while it pans. Transposed, or seen along
+    another axis, its picture swings.
+    """
+    others = {
+        "each is transposed, as of world to camera": turns.swapaxes(1, 2),
+        "their columns are y, z, x": turns[:, :, [1, 2, 0]],
+        "their columns are z, x, y": turns[:, :, [2, 0, 1]],
+    }
+    prices = {how: price_of_horizons(other) for how, other in others.items()}
+    best = min(prices, key=lambda how: prices[how])
+    if len(turns) >= LEAST_ROWS and prices[best] < price_of_horizons(turns) - MUCH_DEARER:
+        found = f"{columns}3x4 matrices whose pictures are more level if {best}"
+        remedy = f"write rotations from camera to world in this order; {WHICH_MATRIX}"
+        raise BadInputError(path, found, ROW_ORDER, remedy)
 
 
-def _signs(matrices: F64, ups: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
-    """Return what poses (N, 3, 4) say for KITTI's axes (x right, y down, looks along +Z), and what for ARKit's."""
+def _signs(matrices: F64, up_axis: str, times: F64 | None) -> dict[str, tuple[str, ...]]:
+    """Return what poses (N, 3, 4) say for KITTI's axes (x right, y down, looks along +Z), and what for ARKit's.
+
+    `up_axis`: axis that is up, by the scene. `times` (N,): times of the table. With times, the clock of a device counts
+    for ARKit, and so does Y that is up: others seldom write times before matrices of such a world. A device that is
+    held upright is as upright along the other axis, so it counts only where nobody else writes such a table.
+    """
     turns, places = matrices[:, :, :3], matrices[:, :, 3]
-    own_up = {axis: float(turns[:, :, 1].mean(axis=0) @ UP[axis]) for axis in ups}
-    steps = np.diff(places, axis=0)
-    length = float(np.linalg.norm(steps, axis=1).sum())
-    ahead = float((steps * turns[:-1, :, 2]).sum()) / length if length > 0 and len(turns) >= LEAST_ROWS else 0.0
-    is_upright = bool(abs(turns[:, 1, 0].mean()) > UPRIGHT)
+    ups = ("z", "y") if up_axis == AUTO else (up_axis,)
+    mean, gravity = turns.mean(axis=0), np.array(UP[ups[-1]])
+    own_up = {axis: float(mean[:, 1] @ UP[axis]) for axis in ups}
+    along = _along(turns, places)
+    is_upright = bool(abs(mean[:, 0] @ gravity) > max(UPRIGHT, *map(abs, own_up.values())))
     starts = np.abs(turns[0] - np.eye(3)).max() < EXACT and np.abs(places[0]).max() < EXACT
+    has_time = times is not None
+    is_up = has_time and own_up[ups[-1]] > LEAST_UP_COSINE
+    # of a phone with its lower end, where X points, down: how steeply the view along -Z goes down, and that along +Z up
+    downwards = float(mean[:, 2] @ gravity) if has_time and is_upright and mean[:, 0] @ gravity < 0 else 0.0
     said = {
         "kitti": {
             "which begin at the origin without a turn, as KITTI's": starts,
-            "which move along +Z, as KITTI's": ahead > ALONG,
+            "which move along +Z, as KITTI's": along > ALONG,
+            "which look at one point along +Z, as KITTI's": _meet(turns @ OPENGL_FROM_OPTICAL, places),
+            "which look down along +Z, as KITTI's": downwards < -LEAST_SKYWARDS,
             f"whose Y is down where {' or '.join(ups).upper()} is up, as KITTI's": (
                 min(own_up.values()) < -UPRIGHT and not is_upright
             ),
+            f"which lie below 0 if {ups[-1].upper()} is up, unlike a camera over the floor": (
+                is_up and BELOW_M[0] < -float(np.median(places @ gravity)) < BELOW_M[1]
+            ),
         },
         "arkit": {
-            "which move along -Z, as ARKit's": ahead < -ALONG,
-            "of a device held upright, as ARKit's": is_upright,
-            f"whose Y is up where {ups[0].upper()} is up, as ARKit's": own_up[ups[0]] > UPRIGHT,
+            "which move along -Z, as ARKit's": along < -ALONG,
+            "which look at one point along -Z, as ARKit's": _meet(turns, places),
+            "which look down along -Z, as ARKit's": downwards > LEAST_SKYWARDS,
+            "of a device held upright, as ARKit's": is_upright and not has_time,
+            "with times of a device's clock, as ARKit's": times is not None and _is_of_device(times),
+            f"whose Y is up where {ups[0].upper()} is up, as ARKit's": own_up[ups[0]] > UPRIGHT and not is_upright,
+            f"with times and {ups[-1].upper()} up, as ARKit's": is_up,
         },
     }
     return {kind: tuple(why for why, holds in of.items() if holds) for kind, of in said.items()}
+
+
+def _along(turns: F64, places: F64) -> float:
+    """Return the mean cosine, by length, between the way of cameras (N, 3, 3) at places (N, 3) and their Z."""
+    steps = np.diff(places, axis=0)
+    length = float(np.linalg.norm(steps, axis=1).sum())
+    return float((steps * turns[:-1, :, 2]).sum()) / length if length > 0 and len(turns) >= LEAST_ROWS else 0.0
+
+
+def _meet(turns: F64, places: F64) -> bool:
+    """Return whether cameras with OpenGL axes (N, 3, 3) at places (N, 3) look at one point that they go round."""
+    point = meeting_point(turns, places) if len(turns) >= LEAST_ROWS else None
+    if point is None:
+        return False
+    towards, ahead = point - places, -turns[:, :, 2]
+    along = (towards * ahead).sum(axis=1)
+    missed = np.linalg.norm(towards - along[:, None] * ahead, axis=1)
+    return bool(np.median(along) > LEAST_AWAY and np.median(missed) < MOST_MISSED * np.median(along))
+
+
+def _is_of_device(times: F64) -> bool:
+    """Return whether times (N,) may count from when a device was switched on; recordings begin at 0."""
+    least, most = OF_A_DEVICE_S
+    return any(least < times[0] * SECONDS[unit] < most for unit in units_of(times) if unit in SECONDS)
 
 
 def _require_one_order(path: Path, numbers: F64, names: tuple[str, ...], axes: F64) -> None:
     """Raise BadInputError where the quaternion's parts may be in another order than `names` of a table's columns.
 
     This holds where another order makes cameras more level, or where the other usual one (scalar first or last) makes
-    them as level. A map of SLAM that begins without a turn has the 1 where its scalar is. `axes` (3, 3): columns
-    are the directions of the camera's axes, in the coordinates of a pose.
+    them as level. It also holds where those of another order, as level, look where they go, and these do not. A map of
+    SLAM that begins without a turn has the 1 where its scalar is. `axes` (3, 3): columns are the directions of the
+    camera's axes, in the coordinates of a pose.
     """
     at = names.index("qw"), names.index("qx"), names.index("qy"), names.index("qz")
     first_of = min(at)
@@ -273,15 +373,24 @@ def _require_one_order(path: Path, numbers: F64, names: tuple[str, ...], axes: F
     _require_clock(path, numbers, (1, 2, 3))
     own = tuple(k - first_of for k in at)
     one = np.abs(np.abs(quats[0]) - 1) < EXACT
-    some = quats[:: len(quats) // 100 + 1]
-    prices = {order: _price(some, order, axes) for order in permutations(range(4)) if not one.any() or one[order[0]]}
+    every = len(quats) // 100 + 1
+    cameras = {
+        order: matrix_from_quat(normalised(quats[::every, order])) @ axes
+        for order in permutations(range(4))
+        if not one.any() or one[order[0]]
+    }
+    prices = {order: price_of(turns, "z") for order, turns in cameras.items()}
     other = (3, 0, 1, 2) if own[0] == 0 else (0, 1, 2, 3)
     mine = prices.get(own, np.inf)
-    if not (mine < min(prices.values()) + MUCH_DEARER and mine < prices.get(other, np.inf) - AS_DEAR):
+    places = numbers[::every, [names.index(axis) for axis in "xyz"]]
+    fitting = {order for order in prices if prices[order] < mine + MUCH_DEARER}
+    led = {order for order in fitting if len(places) >= LEAST_LED and _leads(cameras[order], places)}
+    is_best = mine < min(prices.values()) + MUCH_DEARER and mine < prices.get(other, np.inf) - AS_DEAR
+    if not is_best or (led and own not in led):
         raise BadInputError(
             path,
             f"{where} with quaternions whose order does not follow from how the camera is held",
-            "an order that makes a level camera, and no other",
+            "an order that makes a level camera that looks where it goes, and no other",
             'set camera.format to "tum" (qx qy qz qw) or "euroc" (qw qx qy qz), or ' + SAY_ORDER,
         )
 
@@ -291,9 +400,9 @@ def _has_digits(numbers: F64) -> bool:
     return bool((np.abs(numbers - np.round(numbers, 3)) > EXACT).any())
 
 
-def _price(quats: F64, order: tuple[int, ...], axes: F64) -> float:
-    """Return how far from level a camera is whose w, x, y, z are the columns `order` of `quats` (N, 4)."""
-    return price_of(matrix_from_quat(normalised(quats[:, order])) @ axes, "z")
+def _leads(turns: F64, places: F64) -> bool:
+    """Return whether cameras with OpenGL axes (N, 3, 3) look where they go, or at one point that they go round."""
+    return _along(turns, places) < -ALONG or _meet(turns, places)
 
 
 #: Reader of each table, called with a path and the scene's clock.

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.files import read_text
-from trilane.scene.camera.recorded import AUTO, FILM_RATE_HZ, LENGTH_UNITS
+from trilane.scene.camera.recorded import AUTO, FILM_RATE_HZ, LENGTH_UNITS, are_rotations
 from trilane.scene.rotations import matrix_from_quat, normalised
 
 MAX_ROWS = 1_000_000
@@ -151,11 +151,23 @@ def layout_of(path: Path, expected: str) -> TableLayout:
     names = tuple(column.holds for column in named)
     unit, lengths = AUTO, ""
     if set(POSE) <= set(names) or len(names) == len(first):
+        _require_one_of_each(path, named)
         unit = _unit_of(path, named, ("time",), TIME_UNITS, "camera.time_unit") or AUTO
         lengths = _unit_of(path, named, ("x", "y", "z"), LENGTH_UNITS, "camera.metres_per_unit")
     with np.errstate(over="ignore"):
         is_ns = "ns" in (units_of(np.array(times)) if unit == AUTO else (unit,))
     return TableLayout(len(first), names, has_commas, is_ns, unit, lengths)
+
+
+def _require_one_of_each(path: Path, columns: Sequence[ColumnName]) -> None:
+    """Raise BadInputError where two column names state the same content: either may be meant."""
+    named: dict[str, str] = {}
+    for column in columns:
+        if column.holds in named:
+            found = f"two columns of {column.holds}, `{named[column.holds]}` and `{column.text}`"
+            raise BadInputError(path, found, "one column of each", "rename or remove the one that is not meant")
+        if column.holds:
+            named[column.holds] = column.text
 
 
 def _number(word: str) -> list[float]:
@@ -355,8 +367,9 @@ def _rows(path: Path, expected: str) -> Iterator[tuple[int, list[str]]]:
 
 USUAL = "as usual"
 SAY_ORDER = "say the order in a first line, such as `timestamp qx qy qz qw tx ty tz`"
-#: Number of columns of a 3x4 matrix.
+#: Number of columns of a 3x4 matrix, and the order of its numbers in a line.
 MATRIX = 12
+ROW_ORDER = "the order r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
 #: Largest deviation of a quaternion's length from 1: two digits after the point change it by 0.01 at most.
 MOST_OFF = 0.02
 #: Steps of a clock differ by less than the first share of their median; steps that differ by more than the second are
@@ -450,8 +463,24 @@ def read_matrix_table(path: Path, clock: Clock, expected: str) -> MatrixTable:
     columns = MATRIX if layout.columns == MATRIX else MATRIX + 1
     table = read_table(path, columns, expected)
     first = times_of(path, table.numbers[:, 0], clock.stated(path, layout.unit)) if columns > MATRIX else None
+    _require_row_order(path, table)
     matrices = table.numbers[:, -MATRIX:].reshape(-1, 3, 4)
     return MatrixTable(first, matrices[:, :, :3], matrices[:, :, 3], table, layout.lengths)
+
+
+def _require_row_order(path: Path, table: NumberTable) -> None:
+    """Raise BadInputError where most matrices are rotations only by the first nine of their twelve numbers.
+
+    Such a table has each place after its rotation, or each matrix column by column.
+    """
+    numbers = np.nan_to_num(table.numbers[:, -MATRIX:])
+    by_row = are_rotations(numbers.reshape(-1, 3, 4)[:, :, :3])
+    by_nine = are_rotations(numbers[:, :9].reshape(-1, 3, 3)) & ~by_row
+    if 2 * np.count_nonzero(by_nine) > len(numbers):
+        where = f"{path}, {table.place_of(int(np.flatnonzero(by_nine)[0]))}"
+        found = "a matrix whose first nine numbers are a rotation"
+        remedy = "write each matrix row by row, with its place in the last column"
+        raise BadInputError(where, found, ROW_ORDER, remedy)
 
 
 def _require_times(path: Path, times: F64, places: F64) -> None:

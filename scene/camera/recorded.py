@@ -118,18 +118,27 @@ def _fitting(turns: F64, places: F64, fov_y_deg: float) -> tuple[float, str]:
 def looked_at_from(turns: F64, places: F64) -> float | None:
     """Return the median distance of the cameras from the point that is nearest to all their lines of sight.
 
-    None where the lines are nearly parallel, or meet behind the cameras. The point solves the normal equations of the
-    distances: sum (1 - d d') (x - p) = 0 for places p and unit directions d.
+    None where the lines are nearly parallel, or meet behind the cameras.
+    """
+    point = meeting_point(turns, places)
+    if point is None:
+        return None
+    towards = point - places
+    distance = float(np.median(np.linalg.norm(towards, axis=1)))
+    in_front = float(np.median(-(towards * turns[:, :, 2]).sum(axis=1)))
+    return distance if in_front > 0.5 * distance > 0 else None
+
+
+def meeting_point(turns: F64, places: F64) -> F64 | None:
+    """Return the point (3,) that is nearest to all lines of sight, before or behind the cameras; None if parallel.
+
+    It solves the normal equations of the distances: sum (1 - d d') (x - p) = 0 for places p and unit directions d.
     """
     ahead = -turns[:, :, 2]
     across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
     if np.linalg.eigvalsh(across.mean(axis=0))[0] < LEAST_SPREAD:
         return None
-    point = np.linalg.solve(across.sum(axis=0), (across @ places[:, :, None]).sum(axis=0)[:, 0])
-    towards = point - places
-    distance = float(np.median(np.linalg.norm(towards, axis=1)))
-    in_front = float(np.median((towards * ahead).sum(axis=1)))
-    return distance if in_front > 0.5 * distance > 0 else None
+    return np.asarray(np.linalg.solve(across.sum(axis=0), (across @ places[:, :, None]).sum(axis=0)[:, 0]))
 
 
 AUTO = "auto"
@@ -171,6 +180,8 @@ class _Prices:
 #: believed there only where other axes have horizons that are 0.15 rad off; under gravity, before every other axis.
 ANY_WORLD = _Prices(axis=0.2, turn=0.4, between=0.25, nadir=0.5, nadir_deg=5.0)
 LEVELLED = _Prices(axis=0.4, turn=0.1, between=None, nadir=0.3, nadir_deg=18.0)
+#: Without an opinion on world and device, to compare horizons alone.
+FREE = _Prices(axis=0.0, turn=0.0, between=None, nadir=0.0, nadir_deg=18.0)
 #: A direction between the axes is believed when the cameras pan by at least this, in radians (root mean square), and
 #: its cosine with every axis is below this.
 LEAST_PAN, MOST_AXIS_COSINE = 0.15, 0.995
@@ -234,6 +245,11 @@ def _is_nadir(turns: F64, usual: str, most_deg: float) -> bool:
 def price_of(turns: F64, usual: str) -> float:
     """Return the cost of the cheapest guess for camera axes `turns` (N, 3, 3): 0 where they are level about `usual`."""
     return min((guess.price for guess in _guesses(turns, usual, ANY_WORLD, AUTO)), default=math.inf)
+
+
+def price_of_horizons(turns: F64) -> float:
+    """Return the cost of camera axes `turns` (N, 3, 3) with the axis and the quarter turn that suit them best."""
+    return min((guess.price for guess in _guesses(turns, "y", FREE, AUTO)), default=math.inf)
 
 
 def is_of_body(turns: F64, of_body: F64, usual: str) -> bool:

@@ -93,14 +93,19 @@ def load_kitti(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
 
 
 def _kitti_times(path: Path, read: MatrixTable, clock: Clock) -> tuple[F64, str]:
-    """Return seconds (N,) of the poses and their source: the file, `times.txt`, the scene or the usual rate."""
+    """Return seconds (N,) of the poses and their source: the file, `times.txt`, the scene or the usual rate.
+
+    Raises BadInputError where `times.txt` has another number of times.
+    """
     if read.times is not None and read.times.unit != FRAMES:
         return read.times.since_s, f"by the times of the file, in {read.times.unit}"
     beside = path.with_name(KITTI_TIMES)
     if clock.rate_hz is None and beside.is_file() and beside != path:
         times = read_table(beside, 1, "the time of a pose a line").numbers[:, 0]
-        if len(times) == len(read.turns):
-            return times_of(beside, times, clock).since_s, f"times by {KITTI_TIMES}"
+        if len(times) != len(read.turns):
+            expected = f"{len(read.turns)}, one for each pose of {path.name}"
+            raise BadInputError(beside, f"{len(times)} times", expected, "correct it, or set camera.rate_hz")
+        return times_of(beside, times, clock).since_s, f"times by {KITTI_TIMES}"
     counted = read.times or times_of(path, np.arange(float(len(read.turns))), _counted(path, clock))
     return counted.since_s, f"{counted.rate.removeprefix(', ')}, as the file has no times"
 

@@ -186,12 +186,18 @@ def test_record3d_without_times_and_lenses_of_frames(tmp_path: Path) -> None:
 
 
 def test_kitti_times(tmp_path: Path) -> None:
-    """By times.txt, else by the scene, else 10 a second."""
+    """By times.txt, else by the scene, else 10 a second; other times than poses are refused."""
     path = write_kitti(tmp_path, TURNS, PLACES)
     assert load(path).times_s == pytest.approx(np.arange(5) / 30)
-    assert load(path, rate_hz=5).times_s == pytest.approx(np.arange(5) / 5)
-    (tmp_path / "times.txt").write_text("0\n1\n")  # of something else
-    camera = load(path)
+    for count in (2, 4, 6):
+        (tmp_path / "times.txt").write_text("".join(f"{k}\n" for k in range(count)))
+        assert load(path, rate_hz=5).times_s == pytest.approx(np.arange(5) / 5)
+        with pytest.raises(BadInputError) as refused:
+            load(path)
+        found = f"found {count} times, expected 5, one for each pose of 00.txt; correct it, or set camera.rate_hz"
+        assert str(refused.value) == f"{tmp_path}/times.txt: {found}"
+    (tmp_path / "times.txt").unlink()
+    camera = load(path, format="kitti")
     assert camera.times_s == pytest.approx(np.arange(5) / 10)
     assert "10 a second assumed, as the file has no times" in camera.notes[0]
 
@@ -478,7 +484,9 @@ def test_columns_that_hold_no_quaternion_are_refused_with_those_that_may(tmp_pat
     ] == pytest.approx([2, 0, 0])
 
 
-@pytest.mark.parametrize(("columns", "way"), [(1, "commas"), (7, "as TUM has them"), (16, "KITTI's 12")])
+@pytest.mark.parametrize(
+    ("columns", "way"), [(1, "commas"), (7, "as TUM has them"), (16, "KITTI's 12"), (17, "0 0 0 1")]
+)
 def test_tables_of_others_are_refused_with_a_way(tmp_path: Path, columns: int, way: str) -> None:
     (tmp_path / "a.txt").write_text("1 " * columns + "\n" + "2 " * columns + "\n")
     with pytest.raises(BadInputError) as refused:

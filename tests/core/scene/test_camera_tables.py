@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from collections.abc import Iterator
+from itertools import permutations
 from pathlib import Path
 from typing import NamedTuple
 
@@ -211,6 +214,32 @@ def test_the_order_of_a_quaternion_is_a_question_that_names_both(tmp_path: Path)
     )
 
 
+@pytest.mark.parametrize("heading", [-0.4, 1.8, 2.3, 2.9])
+def test_an_order_of_a_quaternion_by_which_a_camera_looks_elsewhere_than_it_goes_is_refused(
+    tmp_path: Path, heading: float
+) -> None:
+    """Somebody films ahead while they walk: what is read of the 24 orders looks ahead, and the right one is.
+
+    At these headings no wrong order goes round a point, which would be as good a reason for its axes.
+    """
+    turns, _ = by_hand(heading)
+    places = np.cumsum(-0.03 * turns[:, :, 2], axis=0)
+    poses = np.hstack([places @ Y_UP_FROM_Z_UP, quat_from_matrix(Y_UP_FROM_Z_UP.T @ turns @ OPTICAL)[:, [1, 2, 3, 0]]])
+    read = []
+    for order in permutations(range(4)):
+        table = np.column_stack([1305031098.5 + np.arange(COUNT) / 30, poses[:, :3], poses[:, 3:][:, order]])
+        (tmp_path / "a.txt").write_text(lines_of(table))
+        try:
+            camera = load(tmp_path / "a.txt", place="none")
+        except BadInputError:
+            continue
+        steps = np.diff(camera.places, axis=0)
+        ahead = -(steps * matrix_from_quat(camera.quats)[:-1, :, 2]).sum(axis=1) / np.linalg.norm(steps, axis=1)
+        assert ahead.mean() > 0.9, order
+        read.append(order)
+    assert (0, 1, 2, 3) in read
+
+
 @pytest.mark.parametrize(
     ("times", "unit", "names"),
     [
@@ -408,3 +437,139 @@ def test_units_of_a_table_of_matrices_count(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("\n".join([head, *rows]))
     camera = load(tmp_path / "a.csv", format="arkit", place="none")
     assert camera.times_s == pytest.approx([0, 1, 2]) and camera.places[:, 0] == pytest.approx([0, 2, 4])
+
+
+def panning(pitch: float, count: int = 40) -> F64:
+    """A level camera, Y up, that looks up by `pitch`, pans by 2.4 rad and stays 1.5 m over 0: 3x4 matrices."""
+    turns = about(1, np.linspace(0.2, 2.6, count)) @ about(0, pitch)
+    return np.dstack([turns, np.tile([0.5, 1.5, 0.25], (count, 1))])
+
+
+def orbit(count: int = 40) -> F64:
+    """A camera, Y up, that goes round a point at the height of its eyes, 2.5 m off: 3x4 matrices."""
+    angles = np.linspace(0.3, 1.7, count)
+    return np.dstack([about(1, angles), 2.5 * np.column_stack([np.sin(angles), np.zeros(count), np.cos(angles)])])
+
+
+def with_times(matrices: F64, first_ns: float = 0.0) -> str:
+    return lines_of(np.column_stack([first_ns + np.arange(len(matrices)) * 33e6, matrices.reshape(-1, 12)]))
+
+
+#: ns since a phone was switched on.
+UPTIME_NS = 105230574092166.0
+WAYS = {"pan": panning(-0.1), "pan, down": panning(-0.4), "orbit": orbit()}
+
+
+@pytest.mark.parametrize("world", ["y", "z", "-y"])
+@pytest.mark.parametrize("way", WAYS)
+def test_optical_matrices_with_times_are_a_question_that_format_settles(tmp_path: Path, way: str, world: str) -> None:
+    """They would look backwards as ARKit's."""
+    path, matrices = tmp_path / "a.txt", WAYS[way]
+    system = {"y": np.eye(3), "z": Y_UP_FROM_Z_UP.T, "-y": OPTICAL}[world]
+    optical = np.dstack([system @ matrices[:, :, :3] @ OPTICAL, matrices[:, :, 3] @ system.T])
+    path.write_text(with_times(optical))
+    with pytest.raises(BadInputError, match=r"KITTI's|unlike a camera over the floor") as asked:
+        load(path)
+    assert all(each in asked.value.remedy for each in ("camera.format", "camera.axes"))
+    assert asked.value.exit_code == 2
+    camera = load(path, format="kitti", place="none")
+    assert seen_from_the_first(matrix_from_quat(camera.quats), camera.places) == pytest.approx(
+        seen_from_the_first(matrices[:, :, :3], matrices[:, :, 3]), abs=1e-9
+    )
+
+
+@pytest.mark.parametrize("first_ns", [0.0, UPTIME_NS])
+@pytest.mark.parametrize("quarter", [0, 1, 3])
+@pytest.mark.parametrize("way", WAYS)
+def test_a_phone_s_matrices_are_read_where_something_tells_where_it_looks(
+    tmp_path: Path, way: str, quarter: int, first_ns: float
+) -> None:
+    """Held upright, the view is as level along either axis: a clock tells it, or a point that the camera goes round.
+
+    So does a view down, where the phone's lower end is down (quarter 3).
+    """
+    path, matrices = tmp_path / "a.txt", WAYS[way].copy()
+    matrices[:, :, :3] = matrices[:, :, :3] @ about(2, quarter * np.pi / 2)
+    path.write_text(with_times(matrices, first_ns))
+    told = load(path, format="arkit", place="none")
+    assert bool(told.quarter) == bool(quarter)
+    if not first_ns and (way, quarter) in (("pan", 1), ("pan", 3), ("pan, down", 1)):
+        with pytest.raises(BadInputError, match="which do not tell where the camera looks"):
+            load(path)
+    else:
+        camera = load(path, place="none")
+        assert (camera.quats.tolist(), camera.places.tolist()) == (told.quats.tolist(), told.places.tolist())
+
+
+@pytest.mark.parametrize("way", ["pan, down"])
+@pytest.mark.parametrize("first_ns", [0.0, UPTIME_NS])
+def test_matrices_in_another_order_are_refused(tmp_path: Path, way: str, first_ns: float) -> None:
+    """Transposed, world to camera, or with the axes of a robot, whose x is ahead: their pictures swing."""
+    turns, places = WAYS[way][:, :, :3], WAYS[way][:, :, 3]
+    back = turns.swapaxes(1, 2)
+    for matrices in (
+        np.dstack([back, places]),
+        np.dstack([back, -(back @ places[:, :, None])]),
+        np.dstack([turns[:, :, [2, 0, 1]], places]),
+        np.dstack([turns[:, :, [1, 2, 0]], places]),
+    ):
+        (tmp_path / "a.txt").write_text(with_times(matrices, first_ns))
+        with pytest.raises(BadInputError, match=r"more level if .* expected the order r11 r12 r13 tx"):
+            load(tmp_path / "a.txt")
+
+
+@pytest.mark.parametrize("has_time", [True, False])
+def test_matrices_that_are_rotations_by_their_first_nine_numbers_are_refused(tmp_path: Path, has_time: bool) -> None:
+    """Column by column, or with the place after the rotation: both are told as an order of numbers."""
+    matrices = panning(-0.4)
+    for numbers in (
+        matrices.swapaxes(1, 2).reshape(-1, 12),
+        np.hstack([matrices[:, :, :3].reshape(-1, 9), matrices[:, :, 3]]),
+    ):
+        rows = np.insert(numbers, 0, np.arange(40) / 30 + 0.25, axis=1) if has_time else numbers
+        (tmp_path / "a.txt").write_text(lines_of(rows))
+        with pytest.raises(BadInputError) as refused:
+            load(tmp_path / "a.txt", format="kitti")
+        assert refused.value.where == f"{tmp_path / 'a.txt'}, line 1"
+        assert refused.value.found == "a matrix whose first nine numbers are a rotation"
+        assert "r11 r12 r13 tx" in refused.value.expected
+
+
+@pytest.mark.parametrize(
+    ("head", "twice"),
+    [
+        ("time x y z x y z qx qy qz qw", "two columns of x, `x` and `x`"),
+        ("time,x,y,z,pos_x,qx,qy,qz,qw", "two columns of x, `x` and `pos_x`"),
+        ("# timestamp x y z qx qy qz qw qw", "two columns of qw, `qw` and `qw`"),
+        ("t tx ty tz qx qy qz qw timestamp", "two columns of time, `t` and `timestamp`"),
+    ],
+)
+def test_column_names_that_are_given_twice_are_refused(tmp_path: Path, head: str, twice: str) -> None:
+    count = len(head.replace(",", " ").replace("#", "").split())
+    rows = [", ".join(["0.5", *"0" * (count - 2), "1"]), ", ".join(["1", *"0" * (count - 2), "1"])]
+    (tmp_path / "a.txt").write_text("\n".join([head, *rows]))
+    with pytest.raises(BadInputError) as refused:
+        load(tmp_path / "a.txt")
+    assert refused.value.found == twice
+
+
+def test_arrays_and_folders_of_matrices_are_refused_with_what_makes_a_table(tmp_path: Path) -> None:
+    """The lines in the messages are run, and make a table that is read."""
+    matrices = np.tile(np.eye(4), (12, 1, 1))
+    matrices[:, :3] = orbit(12)
+    matrices[:, :3, :3] = matrices[:, :3, :3] @ OPTICAL
+    np.save(tmp_path / "poses.npy", matrices)
+    folder = tmp_path / "scan" / "pose"
+    folder.mkdir(parents=True)
+    for number, matrix in enumerate(matrices):
+        (folder / f"{number}.txt").write_text(lines_of(matrix))
+    tables = []
+    for source in (tmp_path / "poses.npy", tmp_path / "scan", folder):
+        with pytest.raises(BadInputError) as refused:
+            load(source)
+        line = refused.value.remedy.partition(": ")[2].replace("python -c", f"{sys.executable} -c")
+        subprocess.run(["bash", "-c", line], cwd=tmp_path, check=True)
+        tables.append(np.loadtxt(tmp_path / "poses.txt"))
+        assert tables[-1] == pytest.approx(matrices[:, :3].reshape(-1, 12), abs=1e-15)
+    camera = load(tmp_path / "poses.txt", format="kitti", place="none")
+    assert matrix_from_quat(camera.quats) == pytest.approx(orbit(12)[:, :, :3], abs=1e-9)
