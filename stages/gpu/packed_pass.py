@@ -29,6 +29,8 @@ FILTERS = {
     "anisotropic": (moderngl.LINEAR_MIPMAP_LINEAR, 16.0),
 }
 FP16_MAX = float(np.finfo(np.float16).max)
+HALF_EXPONENTS = 16  # FP16 numbers are below 2**16
+HALF_BIAS, FLOAT_BIAS = 15, 127  # what is added to the exponent of a number
 
 
 def texture_array(ctx: Any, texture: Floats, filtering: str = "linear", levels: Sequence[Floats] = ()) -> Any:
@@ -49,6 +51,25 @@ def texture_array(ctx: Any, texture: Floats, filtering: str = "linear", levels: 
     array.anisotropy = anisotropy
     array.repeat_x = array.repeat_y = False
     return array
+
+
+def texture_words(ctx: Any, texture: Floats) -> tuple[Any, float]:
+    """Return a texture of words with the FP16 numbers of `texture` (H,W,C), as `packed_tensor.frag` reads it deferred.
+
+    Also return its uniform `unit`. The numbers are first multiplied by a power of two, as large as FP16 allows, so that
+    none is subnormal beside usual ones. The bits of a half are then those of a float times another power of two.
+    """
+    height, width, channels = texture.shape
+    halves = texture.astype(np.float16)
+    raised = HALF_EXPONENTS - int(np.frexp(np.abs(halves).max(initial=0).astype(np.float64))[1])
+    eighths = -(-channels // 8)
+    padded = np.zeros((height, width, 8 * eighths), np.float16)
+    padded[:, :, :channels] = np.ldexp(halves.astype(np.float32), raised)
+    bits = padded.view(np.uint16).reshape(height, width, eighths, 2, 4).astype(np.uint32)
+    words = bits[:, :, :, 0] | bits[:, :, :, 1] << 16
+    made = ctx.texture((width * eighths, height), 4, np.ascontiguousarray(words).tobytes(), dtype="u4")
+    made.filter = (moderngl.NEAREST, moderngl.NEAREST)
+    return made, 2.0 ** (FLOAT_BIAS - HALF_BIAS - raised)
 
 
 def filter_of(asked: str, learnt: bool) -> str:
@@ -232,14 +253,16 @@ class PackedAvatar:
         if smaller and packed.deferred:
             raise BadInputError("neural texture", "learnt levels", "one level", "draw mesh and texture in one pass")
         self.meshes, self._ctx = (mesh, *coarser), packed.ctx
-        self._texture = texture_array(packed.ctx, texture, packed.filtering, smaller)
         defines: dict[str, int | str] = {"LAYERS": packed.layers, "WORDS": WORD_TYPES[packed.layers]}
         if packed.deferred:
+            self._texture, unit = texture_words(packed.ctx, texture)
             self._draws = [MeshDraw(packed.ctx, one, "uv_only.frag") for one in self.meshes]
-            pack = build_program(packed.ctx, "farthest.vert", "packed_tensor.frag", **defines, DEFERRED=1)
-            set_uniforms(pack, packed.uniforms)
+            defines |= {"DEFERRED": 1, "EIGHTHS": -(-packed.channels // 8)}
+            pack = build_program(packed.ctx, "farthest.vert", "packed_tensor.frag", **defines)
+            set_uniforms(pack, {**packed.uniforms, "unit": unit})
             self._screen = packed.ctx.vertex_array(pack, [])
         else:
+            self._texture = texture_array(packed.ctx, texture, packed.filtering, smaller)
             self._draws = [MeshDraw(packed.ctx, one, "packed_tensor.frag", **defines) for one in self.meshes]
             for draw in self._draws:
                 draw.set(packed.uniforms)
