@@ -21,10 +21,11 @@ WALL_PERIOD_M = 2.0
 WALL_TEXTURE_M = 4.0  # height that the wall texture spans; the paint goes on above it
 WALL_SHAPE = (1024, 256)
 SKIRTING_M = 0.11
+SHADE_M = 0.1  # height above the skirting board in which its shade fades
 MARGIN_M = 0.6
 GRID = np.array([0, 0.04, 0.12, 0.5, 0.88, 0.96, 1])
 SEED = 7
-VERSION = "room textures 1"  # raise it when the textures change
+VERSION = "room textures 2"  # raise it when the textures change
 
 
 @dataclass(frozen=True)
@@ -52,12 +53,14 @@ class Extent:
 class RoomMesh:
     """The mesh of the room.
 
-    `vertices` (N,8) float32: position, uv, light. `floor` and `rest` (M,3) uint32: triangles facing inwards.
+    `vertices` (N,8) float32: position, uv, light. `floor`, `boards` and `paint` (M,3) uint32: triangles facing inwards.
+    `boards` are the parts of the walls with the skirting board and its shade; `paint` is all that is only painted.
     """
 
     vertices: F32
     floor: NDArray[np.uint32]
-    rest: NDArray[np.uint32]
+    boards: NDArray[np.uint32]
+    paint: NDArray[np.uint32]
 
 
 def room_mesh(extent: Extent) -> RoomMesh:
@@ -65,18 +68,20 @@ def room_mesh(extent: Extent) -> RoomMesh:
     low, high = np.array(extent.low), np.array(extent.high)
     sides = [_side(low, high, axis, end) for axis in (1, 0, 2) for end in (0, 1)]
     count = GRID.size**2
-    triangles = [_triangles(turned) + n * count for n, (_, turned) in enumerate(sides)]
-    return RoomMesh(
-        np.concatenate([vertices for vertices, _ in sides]).astype(np.float32),
-        triangles[0].astype(np.uint32),
-        np.concatenate(triangles[1:]).astype(np.uint32),
-    )
+    floor, *others = ((_triangles(turned) + n * count).astype(np.uint32) for n, (_, turned) in enumerate(sides))
+    vertices, rest = np.concatenate([vertices for vertices, _ in sides]).astype(np.float32), np.concatenate(others)
+    has_board = vertices[rest, 1].min(axis=1) < SKIRTING_M + SHADE_M
+    return RoomMesh(vertices, floor, rest[has_board], rest[~has_board])
 
 
-def room_textures() -> tuple[U8, U8]:
-    """Return the floor's and the wall's texture; they are cached, because their noise takes a good part of a second."""
-    stored = cached_arrays(VERSION, (), lambda: {"floor": floor_texture(), "wall": wall_texture()})
-    return stored["floor"], stored["wall"]
+def room_textures() -> tuple[U8, U8, U8]:
+    """Return the textures of floor, boards and paint.
+
+    They are cached, because their noise takes a good part of a second.
+    """
+    made = {"floor": floor_texture, "boards": wall_texture, "paint": paint_texture}
+    stored = cached_arrays(VERSION, (), lambda: {name: make() for name, make in made.items()})
+    return stored["floor"], stored["boards"], stored["paint"]
 
 
 def floor_texture() -> U8:
@@ -100,14 +105,26 @@ def floor_texture() -> U8:
 
 def wall_texture() -> U8:
     """Return a painted wall with a skirting board, (1024, 256, 4) uint8 sRGB; row 0 is the floor, u repeats."""
-    rng = np.random.default_rng(SEED + 1)
     height = (np.arange(WALL_SHAPE[0]) + 0.5) / WALL_SHAPE[0] * WALL_TEXTURE_M
-    paint = np.array([218, 213, 201]) * (1 + 0.007 * _noise(rng, WALL_SHAPE, (12.0, 12.0)))[..., None]
     board = np.array([243, 241, 236]) * (1 - 0.25 * np.clip((height - SKIRTING_M + 0.012) / 0.012, 0, 1))[:, None]
     board[height < 0.012] *= 0.6
     is_board = (height < SKIRTING_M)[:, None, None]
     shade = 1 - 0.12 * np.exp(-np.clip(height - SKIRTING_M, 0, None) / 0.02)
-    return _bytes(np.where(is_board, board[:, None, :], paint * shade[:, None, None]))
+    return _bytes(np.where(is_board, board[:, None, :], _paint() * shade[:, None, None]))
+
+
+def paint_texture() -> U8:
+    """Return the wall's paint alone, (512, 128, 4) uint8 sRGB, repeating in both directions.
+
+    Half of the wall's resolution is enough for paint that is read texel by texel.
+    """
+    rows, columns = WALL_SHAPE
+    return _bytes(_paint().reshape(rows // 2, 2, columns // 2, 2, 3).mean(axis=(1, 3)))
+
+
+def _paint() -> F64:
+    noise = _noise(np.random.default_rng(SEED + 1), WALL_SHAPE, (12.0, 12.0))
+    return np.asarray(np.array([218, 213, 201]) * (1 + 0.007 * noise)[..., None])
 
 
 def _side(low: F64, high: F64, axis: int, end: int) -> tuple[F64, bool]:

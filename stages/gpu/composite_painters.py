@@ -99,10 +99,12 @@ class RoomPainter:
         """
         self._ctx = ctx
         self._program = build_program(ctx, "room.vert", "room.frag")
-        floor, wall = room_textures()
+        floor, boards, paint = room_textures()
         self._textures = [
-            _detail(ctx, floor, moderngl.LINEAR_MIPMAP_LINEAR),
-            _detail(ctx, wall, moderngl.LINEAR_MIPMAP_NEAREST),  # the wall is too smooth to show where levels change
+            _detail(ctx, floor, moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR),
+            # The boards are too smooth to show where levels change, and paint is too smooth to show texels.
+            _detail(ctx, boards, moderngl.LINEAR_MIPMAP_NEAREST, moderngl.LINEAR),
+            _detail(ctx, paint, moderngl.NEAREST, moderngl.NEAREST),
         ]
         self._extent = reduce(Extent.holding, (np.asarray(eye, np.float64) for eye in eyes), Extent())
         self._batches: list[Any] = []
@@ -128,7 +130,7 @@ class RoomPainter:
             batch.release()
         vertices = uploaded_buffer(self._ctx, mesh.vertices.tobytes())
         content = [(vertices, "3f 2f 3f", "position", "uv", "light")]
-        parts = (mesh.floor, mesh.rest)
+        parts = (mesh.floor, mesh.boards, mesh.paint)
         indices = [uploaded_buffer(self._ctx, part.tobytes()) for part in parts]
         self._batches = [self._ctx.vertex_array(self._program, content, index) for index in indices]
 
@@ -254,10 +256,10 @@ def _density(cell: tuple[int, int], pixels: tuple[float, float]) -> float:
     return max(side / max(length, 1e-6) for side, length in zip(cell, pixels, strict=True))
 
 
-def _detail(ctx: Any, image: U8, minify: int) -> Any:
+def _detail(ctx: Any, image: U8, minify: int, magnify: int) -> Any:
     texture = ctx.texture((image.shape[1], image.shape[0]), 4, image.tobytes())
     texture.build_mipmaps()
-    texture.filter = (minify, moderngl.LINEAR)
+    texture.filter = (minify, magnify)
     return texture
 
 

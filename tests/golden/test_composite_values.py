@@ -186,7 +186,7 @@ def test_a_tensor_of_the_pictures_density_is_copied_pixel_by_pixel(gl: Any) -> N
 @pytest.mark.parametrize("eye", [(0.5, 1.4, 2.5), (6.5, 3.4, -1.0)], ids=["inside", "where it must grow"])
 def test_the_room_is_texture_times_light(gl: Any, camera: Any, monkeypatch: pytest.MonkeyPatch, eye: Any) -> None:
     """With textures of one colour each, a pixel is that colour times the light of its vertices, as float64 draws it."""
-    colours = np.array([(100, 150, 200), (210, 120, 60)])
+    colours = np.array([(100, 150, 200), (210, 120, 60), (130, 220, 90)])
     textures = [np.tile(np.append(c, 255).astype(np.uint8), (4, 4, 1)) for c in colours]
     monkeypatch.setattr(composite_painters, "room_textures", lambda: tuple(textures))
     shape = (48, 64)
@@ -195,15 +195,16 @@ def test_the_room_is_texture_times_light(gl: Any, camera: Any, monkeypatch: pyte
     painter.draw(canvas.target, view, projection)
     mesh = room_mesh(Extent().holding(np.array(eye)))
     position, light = mesh.vertices[:, :3].astype(float), mesh.vertices[:, 5:].astype(float)
-    triangles = np.concatenate([mesh.floor, mesh.rest])
+    triangles = np.concatenate([mesh.floor, mesh.boards, mesh.paint])
     first, second = (
         float_raster.rasterise(position, triangles, pair, projection @ view, shape, cull=True)
         for pair in (light[:, :2], light[:, 1:])
     )
     lit = np.concatenate([first.uv[..., :1], second.uv], axis=-1)
-    expected = colours[(first.triangle >= len(mesh.floor)).astype(int)] * lit
+    part = np.repeat([0, 1, 2], [len(mesh.floor), len(mesh.boards), len(mesh.paint)])[first.triangle]
+    expected = colours[part] * lit
     off = np.abs(canvas.read() - np.clip(expected, 0, 255)).max(axis=-1)
-    assert {True, False} == set((first.triangle < len(mesh.floor)).ravel().tolist())
+    assert {0, 1, 2} == set(part.ravel().tolist())
     assert first.coverage.all()
     assert (off > 1).sum() <= 0.01 * off.size  # pixels on an edge of the room may fall to the other side
     assert lit.min() < 0.7 and (expected > 255).sum() == 0

@@ -12,7 +12,7 @@ from trilane.body.joints import JOINT_INDEX, JOINTS
 from trilane.errors import MissingPartError, TrilaneError, UnitLostError
 from trilane.scene.schema import PlaneSpec
 from trilane.stages.gpu import opengl
-from trilane.stages.gpu.builtin_room import Extent, floor_texture, room_mesh, wall_texture
+from trilane.stages.gpu.builtin_room import Extent, floor_texture, paint_texture, room_mesh, wall_texture
 from trilane.stages.gpu.composite_painters import floor_discs, half_sides
 from trilane.stages.gpu.opengl import target_clip
 
@@ -20,15 +20,32 @@ from trilane.stages.gpu.opengl import target_clip
 def test_room_faces_inward() -> None:
     """Every triangle winds counter-clockwise for an eye inside."""
     mesh = room_mesh(Extent())
-    for triangles in (mesh.floor, mesh.rest):
+    for triangles in (mesh.floor, mesh.boards, mesh.paint):
         corners = mesh.vertices[triangles, :3].astype(float)
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         assert (np.einsum("fi,fi->f", normal, np.array([0, 1.5, 0]) - corners[:, 0]) > 0).all()
 
 
+def test_only_smooth_paint_is_read_texel_by_texel() -> None:
+    """Neighbours of the paint differ by two codes at most, so that nobody sees texels; the board is not among them.
+
+    Paint begins where the shade of the board has faded, with the colours that the wall has there.
+    """
+    paint, wall = paint_texture().astype(int), wall_texture().astype(float)
+    assert max(np.abs(paint - np.roll(paint, 1, axis)).max() for axis in (0, 1)) <= 2
+    halved = wall.reshape(512, 2, 128, 2, 4).mean(axis=(1, 3))
+    shade_ends = round(0.21 / 4.0 * 512)
+    assert np.abs(halved - paint)[shade_ends:].max() <= 1
+    assert np.abs(halved - paint)[: shade_ends // 2].min(axis=1).max() > 10
+    for height in (3.0, 3.5, 9.0):
+        mesh = room_mesh(Extent(high=(4.0, height, 4.0)))
+        assert mesh.vertices[mesh.paint, 1].min() >= 0.21
+        assert mesh.vertices[mesh.boards, 1].min(axis=1).max() < 0.21 and len(mesh.boards) >= 4 * 12
+
+
 def test_textures_repeat_without_a_seam() -> None:
     """Across the border neighbours differ no more than inside, where they may repeat."""
-    for texture, axes in ((floor_texture(), (0, 1)), (wall_texture(), (1,))):
+    for texture, axes in ((floor_texture(), (0, 1)), (wall_texture(), (1,)), (paint_texture(), (0, 1))):
         for axis in axes:
             rows = np.moveaxis(texture.astype(int), axis, 0)
             inside = np.abs(np.diff(rows, axis=0)).mean(axis=(1, 2))
@@ -110,9 +127,10 @@ def test_the_rooms_vertices_have_place_uv_and_light_of_their_side() -> None:
             strength = dim * (0.86 + 0.2 * window) * (0.97 if axis == 1 else 1)
             colour = np.array([1 - 0.02 * window, 0.985, 0.955 + 0.035 * window])
             np.testing.assert_allclose(row[5:], strength * colour, rtol=1e-5)
-    assert mesh.floor.max() == 48 and mesh.floor.shape == (72, 3) and mesh.rest.shape == (360, 3)
-    assert sorted(np.unique(mesh.rest).tolist()) == list(range(49, 294))
-    for triangles in (mesh.floor, mesh.rest):
+    rest = np.concatenate([mesh.boards, mesh.paint])
+    assert mesh.floor.max() == 48 and mesh.floor.shape == (72, 3) and rest.shape == (360, 3)
+    assert sorted(np.unique(rest).tolist()) == list(range(49, 294))
+    for triangles in (mesh.floor, rest):
         corners = mesh.vertices[triangles, :3].astype(float)
         area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
         sides = (high - low) @ np.diag([1, 1, 1])
