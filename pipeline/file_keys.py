@@ -34,6 +34,8 @@ ONE_TIME: Final = "mean with or without sd, exponential, samples, or from with o
 MOST_SDS: Final = 1000  # standard deviation of a time, in means
 RUNTIMES: Final = ("ort", "openvino", "qnn", "cuda")
 NAME: Final = rf"^[\w-]{{1,{LONGEST_NAME}}}$"
+#: What a text must be that a pattern refuses.
+FORMS: Final = {NAME: f"at most {LONGEST_NAME} letters, digits, _ and -", FACTORY: "MODULE:FACTORY, such as crop:best"}
 #: Types of numbers in a port, by NumPy's name.
 TYPES: Final = {
     "u8": "uint8",
@@ -87,6 +89,7 @@ def _as_tuple(value: object) -> object:
 
 EdgeRule = Annotated[str, AfterValidator(_rule)]
 Rate = Annotated[float, Field(ge=0.001, le=1e6, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
 Side = Annotated[int, Field(ge=1, le=LONGEST_SIDE)]
 
 
@@ -169,7 +172,7 @@ def port_type(text: object) -> PortType:
         raise UnexpectedValue(f"type {found[1]!r}", f"one of {', '.join(TYPES)}", did_you_mean(found[1], TYPES))
     port = PortType(found[1], tuple(map(int, found[2].split("x"))))
     if not 0 < port.payload_bytes <= MOST_PORT_BYTES:
-        raise UnexpectedValue(f"{text!r}, {port.payload_bytes} bytes", expected)
+        raise UnexpectedValue(f"{text!r}, {port.payload_bytes} bytes", expected, "write smaller parts, or fewer")
     return port
 
 
@@ -245,6 +248,13 @@ def _inside(text: str) -> str:
     if not text or "\0" in text or "\\" in text or normal in (".", "..") or normal.startswith(("/", "../")):
         remedy = "copy the file there, or put a link to it there"
         raise UnexpectedValue(repr(text), "a path inside the folder of the pipeline file", remedy)
+    return text
+
+
+def _mp4(text: str) -> str:
+    """Refuse a path of another kind of file: code and networks of the folder must not become a video."""
+    if not text.endswith(".mp4"):
+        raise UnexpectedValue(repr(text), "a video to write, such as out.mp4", "let the name end with .mp4")
     return text
 
 
@@ -533,10 +543,10 @@ class PrepareBlock(BlockStage):
     layout: Literal["nchw", "nhwc"] | None = Field(
         default=None, description="nchw or nhwc; if absent, the layout of the network's input."
     )
-    mean: Annotated[tuple[float, ...], BeforeValidator(_as_tuple)] | None = Field(
+    mean: Annotated[tuple[Finite, ...], BeforeValidator(_as_tuple)] | None = Field(
         default=None, description="Mean of each channel, which is subtracted; values are from 0 to 1."
     )
-    sd: Annotated[tuple[float, ...], BeforeValidator(_as_tuple)] | None = Field(
+    sd: Annotated[tuple[Annotated[Finite, Field(gt=0)], ...], BeforeValidator(_as_tuple)] | None = Field(
         default=None, description="Standard deviation of each channel, by which the channel is divided."
     )
     step: float | None = Field(
@@ -557,7 +567,7 @@ class EncodeBlock(BlockStage):
     """Writes a video."""
 
     in_ports = {"": True}
-    path: InsidePath = Field(description="Video to write, such as out.mp4.")
+    path: Annotated[InsidePath, AfterValidator(_mp4)] = Field(description="Video to write, such as out.mp4.")
 
 
 class DiscardBlock(BlockStage):

@@ -17,6 +17,7 @@ from difflib import get_close_matches
 from heapq import heapify, heappop, heappush
 from math import lcm
 from pathlib import Path
+from posixpath import normpath
 from typing import Any, Final, TypeVar
 
 from pydantic import ValidationError
@@ -26,6 +27,7 @@ from trilane.files import instead_of_file, read_bytes
 from trilane.pipeline.file_keys import (
     BLOCKS,
     ENDS,
+    FORMS,
     KINDS,
     MOST_SAMPLES,
     MOST_SDS,
@@ -33,6 +35,7 @@ from trilane.pipeline.file_keys import (
     NAME,
     BusyBlock,
     BypassKeys,
+    EncodeBlock,
     InputKeys,
     Keys,
     OnnxStage,
@@ -44,6 +47,7 @@ from trilane.pipeline.file_keys import (
     StageTime,
     TimedStage,
     UnitKeys,
+    VideoBlock,
     read_input,
     shown,
 )
@@ -184,14 +188,15 @@ def checked_tables(tables: Mapping[str, Any], path: Path) -> PipelineFile:
     run = _checked(RunKeys, _table(tables, "run", path), f"{path}: run")
     written = _table(tables, "stages", path)
     if not 1 <= len(written) <= MOST_STAGES:
-        raise BadInputError(f"{path}: stages", f"{len(written)} stages", f"1 to {MOST_STAGES}")
+        remedy = "" if written else "`trilane init` writes a first file from networks and a video"
+        raise BadInputError(f"{path}: stages", f"{len(written)} stages", f"1 to {MOST_STAGES}", remedy)
     units = {
         name: _checked(UnitKeys, keys, f"{path}: units.{name}") for name, keys in _table(tables, "units", path).items()
     }
     for table in ("units", "stages"):
         for name in _table(tables, table, path):
             if not re.fullmatch(NAME, name):
-                raise BadInputError(f"{path}: {table}", f"the name {name!r}", "at most 40 letters, digits, _ and -")
+                raise BadInputError(f"{path}: {table}", f"the name {shown(name)}", FORMS[NAME])
     stages = {name: _stage(name, keys, path) for name, keys in written.items()}
     stages = _in_order(stages, path)
     named = list(dict.fromkeys(stage.unit for stage in stages.values()))
@@ -251,7 +256,8 @@ def _bad_input(model: type[Keys], error: ValidationError, where: str) -> BadInpu
         return BadInputError.at(where, unexpected)
     if first["type"] == "missing":
         return BadInputError(where, "nothing", "this key", _meaning(model, place[0]))
-    expected = first["msg"].removeprefix("Input should be ").removeprefix("Value should have ")
+    said = first["msg"].removeprefix("Input should be ").removeprefix("Value should have ")
+    expected = FORMS.get(first.get("ctx", {}).get("pattern", "")) or said.partition(" after validation")[0]
     return BadInputError(where, shown(first["input"]), expected, _meaning(model, place[0]))
 
 
@@ -350,7 +356,8 @@ def _check_ports(stage: StageKeys, where: str) -> None:
     for port, needed in known.items():
         if needed and port not in read:
             name = f"the input {port!r}" if port else "an input"
-            raise BadInputError(f"{where}.in", f"nobody who feeds {name} of {stage.named_kind}", "a stage")
+            remedy = f'add in = {{ {port} = "STAGE" }}' if port else 'add in = "STAGE"'
+            raise BadInputError(f"{where}.in", f"nobody who feeds {name} of {stage.named_kind}", "a stage", remedy)
 
 
 def _in_order(stages: Mapping[str, StageKeys], path: Path) -> dict[str, StageKeys]:
@@ -373,7 +380,8 @@ def _in_order(stages: Mapping[str, StageKeys], path: Path) -> dict[str, StageKey
     if len(done) < len(names):
         circle = _circle({name: sources for name, sources in waits.items() if sources})
         found = f"the circle {' -> '.join(circle)}"
-        raise BadInputError(f"{path}: stages.{circle[-1]}.in", found, "stages that do not wait for themselves")
+        remedy = "take one of these inputs away"
+        raise BadInputError(f"{path}: stages.{circle[-1]}.in", found, "stages that do not wait for themselves", remedy)
     return {name: stages[name] for name in done}
 
 
@@ -383,8 +391,8 @@ def _check_sources(name: str, stage: StageKeys, stages: Mapping[str, StageKeys],
     for each in stage.inputs:
         where = f"{path}: stages.{name}.in" + (f".{each.port}" if each.port else "")
         if each.stage not in stages:
-            remedy = did_you_mean(each.stage, stages)
-            raise BadInputError(where, f"the unknown stage {each.stage!r}", "a stage of the file", remedy)
+            expected = f"a stage of the file: {', '.join(stages)}"
+            raise BadInputError(where, f"the unknown stage {each.stage!r}", expected, did_you_mean(each.stage, stages))
         source = stages[each.stage]
         if source.named_kind in ENDS:
             raise BadInputError(where, f"{each.stage!r}, a {source.named_kind}", "a stage that writes something")
@@ -419,6 +427,7 @@ def _check_together(file: PipelineFile) -> None:
     """Check what concerns several tables. Raises BadInputError."""
     _check_run(file)
     _check_edges(file)
+    _check_written(file)
     for name, period in file.periods.items():
         if period > MOST_PERIOD:
             found = f"a frame of {period}, by every {file.stages[name].every} and those before"
@@ -436,8 +445,8 @@ def _check_run(file: PipelineFile) -> None:
         remedy = "add fps = 30 to [run]"
         raise BadInputError(f"{path}: run.policy", f"{run.policy} without a rate", "fps or arrivals", remedy)
     if run.latency_to and run.latency_to not in file.stages:
-        remedy = did_you_mean(run.latency_to, file.stages)
-        raise BadInputError(f"{path}: run.latency_to", f"the unknown stage {run.latency_to!r}", "a stage", remedy)
+        found, expected = f"the unknown stage {run.latency_to!r}", f"a stage of the file: {', '.join(file.stages)}"
+        raise BadInputError(f"{path}: run.latency_to", found, expected, did_you_mean(run.latency_to, file.stages))
 
 
 def _check_edges(file: PipelineFile) -> None:
@@ -454,6 +463,15 @@ def _check_edges(file: PipelineFile) -> None:
             edge_rule(rule)
         except UnexpectedValue as error:
             raise BadInputError.at(where, error) from None
+
+
+def _check_written(file: PipelineFile) -> None:
+    """Check that no video is written over another one, or over one that the pipeline reads."""
+    taken = {normpath(stage.path): name for name, stage in file.stages.items() if isinstance(stage, VideoBlock)}
+    for name, stage in file.stages.items():
+        if isinstance(stage, EncodeBlock) and (other := taken.setdefault(normpath(stage.path), name)) != name:
+            found = f"{stage.path!r}, the path of {other}"
+            raise BadInputError(f"{file.path}: stages.{name}.path", found, "a file of its own", "choose another name")
 
 
 def _check_stage_together(file: PipelineFile, name: str, stage: StageKeys) -> None:

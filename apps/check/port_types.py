@@ -19,6 +19,7 @@ from trilane.errors import BadInputError, did_you_mean
 from trilane.hw_profiles.graph_file import GraphFile, fed_inputs, read_graph
 from trilane.pipeline.file_keys import (
     TYPES,
+    BlockStage,
     BusyBlock,
     DiscardBlock,
     EncodeBlock,
@@ -33,6 +34,7 @@ from trilane.pipeline.file_keys import (
     VideoBlock,
 )
 from trilane.pipeline.pipeline_file import PipelineFile
+from trilane.stages.blocks.prepare import Preparation
 
 #: Types of the ports that each stage writes, by name; without the stages of which nothing is known.
 PortTypes = dict[str, dict[str, PortType]]
@@ -189,7 +191,11 @@ def _check_inputs(
             isinstance(stage, OverlayBlock) and each.port in ("", "frame")
         )
         if takes_picture and not is_picture(found):
-            raise BadInputError(where, f"{found} from {each.stage}", "a picture, such as u8 480x640x3")
+            remedy = "read a stage that writes pictures; overlay draws masks, depth and boxes on one"
+            raise BadInputError(where, f"{found} from {each.stage}", "a picture, such as u8 480x640x3", remedy)
+        if isinstance(stage, PrepareBlock) and (wanted := _written(stage, known, None, networks)):
+            keys = stage.model_dump(include=set(PrepareBlock.model_fields) - set(BlockStage.model_fields))
+            Preparation(found, next(iter(wanted.values())), keys, f"{file.path}: stages.{name}")
         if name in networks:
             _check_network(where, found, each, networks[name])
 
@@ -202,6 +208,7 @@ def _check_network(where: str, found: PortType, each: StageInput, network: Graph
     if wanted is None or (found.dtype == wanted.dtype and math.prod(found.shape) == math.prod(wanted.shape)):
         return
     if is_picture(found) and len(wanted.shape) == 4 and {wanted.shape[1], wanted.shape[3]} & set(NETWORK_CHANNELS):
+        Preparation(found, wanted, {}, where)
         return
     prepared = 'a block = "prepare" before it' if is_picture(found) else f"a stage that writes {wanted}"
     remedy = f"add {prepared}"

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.errors import BadInputError, TrilaneError
+from trilane.errors import BadInputError, TrilaneError, did_you_mean
 from trilane.pipeline.file_keys import TYPES
 from trilane.pipeline.ports import Arrays, PortedStage
 from trilane.pipeline.stage import Skip, UnitContext
@@ -44,8 +44,9 @@ class OwnCode(PortedStage):
         self._module = self._imported(name, where)
         made = getattr(self._module, factory, None)
         if not callable(made):
-            known = [one for one in vars(self._module) if not one.startswith("_")]
-            raise BadInputError(where, f"no function {factory!r} in {name}", f"one of {', '.join(known) or 'none'}")
+            known = [one for one, value in vars(self._module).items() if callable(value) and not one.startswith("_")]
+            expected = f"one of {', '.join(known) or 'none'}"
+            raise BadInputError(where, f"no function {factory!r} in {name}", expected, did_you_mean(factory, known))
         self._call: Callable[..., Any] = self._guarded(made, dict(self.settings.keys.get("settings", {})))
         if not callable(self._call):
             found = f"{factory} returned {type(self._call).__name__}"

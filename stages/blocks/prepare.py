@@ -114,8 +114,6 @@ def _each(values: Sequence[float] | None, channels: int, other: float, where: st
     given = [other] if values is None else list(values)
     if len(given) not in (1, channels):
         raise BadInputError(where, f"{len(given)} values", f"1 or {channels}, one for each channel")
-    if where.endswith(".sd") and min(given) <= 0:
-        raise BadInputError(where, str(min(given)), "numbers above 0")
     return np.broadcast_to(np.array(given, np.float64), (channels,))
 
 

@@ -79,7 +79,6 @@ def test_a_grey_network_gets_luminance(tmp_path: Path) -> None:
         ("f32 2x3x4x4", {}, "found a network for 2 pictures at once"),
         ("f32 1x5x4x7", {}, "expected 1 or 3 channels, first or last"),
         ("f32 1x3x4x4", {"mean": [1.0, 2.0]}, r"tried.mean: found 2 values, expected 1 or 3"),
-        ("f32 1x3x4x4", {"sd": [0.0]}, r"tried.sd: found 0.0, expected numbers above 0"),
         ("i16 1x3x4x4", {}, r"tried.step: found nothing"),
         ("f32 12", {}, "expected one that reads pictures"),
     ],
@@ -271,7 +270,7 @@ def test_what_is_wrong_with_code_names_the_stage_and_the_line(line: str, match: 
 @pytest.mark.parametrize(
     ("code", "match"),
     [
-        ("def other(settings): ...", r"tried.python: found no function 'make' in own\d+, expected one of np, other"),
+        ("def other(settings): ...", r"tried.python: found no function 'make' in own\d+, expected one of other$"),
         ("def make(settings): return 3", "found make returned int, expected something callable"),
         ("import nowhere_at_all", "found no module 'nowhere_at_all'"),
         ("1 / 0", r"stages.tried: ZeroDivisionError: division by zero at .*, line 2"),

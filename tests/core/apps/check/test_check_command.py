@@ -117,13 +117,14 @@ a = {{ unit = "u", time_ms = 1, bypass = {} }}
 b = {{ unit = "v", in = "a", time_ms = 1 }}
 c = {{ unit = "u", in = "b", time_ms = 1 }}
 """
+PREPARED = f'[stages]\n{VIDEO}{NET}a = {{ block = "prepare", unit = "cpu", in = "v", like = "n" }}\n'
 
 #: What is wrong: the file, then what the message must name, the key first.
 WRONG: dict[str, tuple[str, ...]] = {
     "circle": (
         '[stages]\na = { unit = "u", in = "c", time_ms = 1 }\nb = { unit = "u", in = "a", time_ms = 1 }\n'
         'c = { unit = "u", in = "b", time_ms = 1 }',
-        *("stages.a.in", "the circle a -> b -> c -> a"),
+        *("stages.a.in", "the circle a -> b -> c -> a", "take one of these inputs away"),
     ),
     "itself": ('[stages]\na = { unit = "u", in = "a", time_ms = 1 }', "stages.a.in", "the circle a -> a"),
     "circle of newest": (
@@ -142,7 +143,11 @@ WRONG: dict[str, tuple[str, ...]] = {
     ),
     "port that nobody feeds": (
         f'[stages]\n{VIDEO}o = {{ block = "overlay", unit = "gpu", in = {{ mask = "v" }} }}',
-        *("stages.o.in", "nobody who feeds the input 'frame'"),
+        *("stages.o.in", "nobody who feeds the input 'frame'", 'add in = { frame = "STAGE" }'),
+    ),
+    "nobody to encode": (
+        f'[stages]\n{VIDEO}e = {{ block = "encode", unit = "cpu", path = "o.mp4" }}',
+        *("stages.e.in", "nobody who feeds an input of encode", 'add in = "STAGE"'),
     ),
     "unknown port of a block": (
         f'[stages]\n{VIDEO}o = {{ block = "overlay", unit = "gpu", in = {{ frame = "v", masc = "v" }} }}',
@@ -163,7 +168,7 @@ WRONG: dict[str, tuple[str, ...]] = {
     ),
     "unknown stage": (
         STAGES.replace("a =", "camera =") + 'b = { unit = "u", in = "camra", time_ms = 1 }',
-        *("stages.b.in", "the unknown stage 'camra'", "did you mean 'camera'?"),
+        *("stages.b.in", "the unknown stage 'camra'", "a stage of the file: camera, b;", "did you mean 'camera'?"),
     ),
     "unknown unit": (
         '[units]\nneural = { hardware = "dsp" }\n[stages]\na = { unit = "neurl", time_ms = 1 }',
@@ -188,13 +193,26 @@ WRONG: dict[str, tuple[str, ...]] = {
         f'[stages]\n{VIDEO}e = {{ block = "encode", unit = "cpu", in = "v", path = "../../out.mp4" }}',
         *("stages.e.path", "inside the folder"),
     ),
+    "code written over": (
+        f'[stages]\n{VIDEO}e = {{ block = "encode", unit = "cpu", in = "v", path = "own.py" }}',
+        *("stages.e.path", "'own.py'", "let the name end with .mp4"),
+    ),
+    "video written over what is read": (
+        f'[stages]\n{VIDEO}e = {{ block = "encode", unit = "cpu", in = "v", path = "x/../v.mp4" }}',
+        *("stages.e.path", "the path of v", "choose another name"),
+    ),
+    "video written twice": (
+        f'[stages]\n{VIDEO}e = {{ block = "encode", unit = "cpu", in = "v", path = "o.mp4" }}\n'
+        'f = { block = "encode", unit = "cpu", in = "v", path = "./o.mp4" }',
+        *("stages.f.path", "'./o.mp4', the path of e"),
+    ),
     "text for a number": ('[run]\nfps = "30"\n' + STAGES, "run.fps", "'30'", "number"),
     "true for a number": (STAGES.replace("= 1", "= true"), "stages.a.time_ms", "true", "a time in ms"),
     "number for a stage": ("[stages]\na = 3", "stages.a", "3", "a table"),
     "number for an input": (STAGES + 'b = { unit = "u", in = 3, time_ms = 1 }', "stages.b.in", "3", "stage.port"),
     "two gigabytes": (
         '[stages]\na = { unit = "u", time_ms = 1, out = "u8 50000x50000" }',
-        *("stages.a.out", "2500000000 bytes", "at most 256 MiB"),
+        *("stages.a.out", "2500000000 bytes", "at most 256 MiB", "smaller"),
     ),
     "slots of gigabytes": (
         '[edges]\na = "fifo:64"\n[stages]\na = { unit = "u", time_ms = 1, out = "u8 250000000" }\n'
@@ -220,7 +238,7 @@ WRONG: dict[str, tuple[str, ...]] = {
     "no picture to encode": (
         STAGES.replace("time_ms = 1", 'time_ms = 1, out = "f32 32x5"')
         + 'e = { block = "encode", unit = "cpu", in = "a", path = "o.mp4" }',
-        *("stages.e.in", "f32 32x5 from a", "a picture"),
+        *("stages.e.in", "f32 32x5 from a", "a picture", "overlay draws"),
     ),
     "too many inputs": (
         "[stages]\n"
@@ -234,7 +252,7 @@ WRONG: dict[str, tuple[str, ...]] = {
         "[stages]\n" + "".join(f'a{n} = {{ unit = "u", time_ms = 1 }}\n' for n in range(65)),
         *("stages", "65 stages", "1 to 64"),
     ),
-    "no stages": ('[stages]\n[run]\nedge = "double"', "stages", "0 stages"),
+    "no stages": ('[stages]\n[run]\nedge = "double"', "stages", "0 stages", "`trilane init`"),
     "negative time": (STAGES.replace("= 1", "= -1"), "stages.a.time_ms.mean", "-1", "greater than or equal to 0"),
     "no number": (STAGES.replace("= 1", "= nan"), "stages.a.time_ms.mean", "nan", "finite"),
     "endless time": (STAGES.replace("= 1", "= inf"), "stages.a.time_ms.mean", "inf", "finite"),
@@ -279,15 +297,32 @@ WRONG: dict[str, tuple[str, ...]] = {
     "unknown policy": ('[run]\npolicy = "lates"\n' + STAGES, "run.policy", "did you mean 'latest'?"),
     "policy without a rate": ('[run]\npolicy = "latest"\n' + STAGES, "run.policy", "add fps = 30"),
     "two rates": ("[run]\nfps = 3\narrivals = { poisson = 3 }\n" + STAGES, "run.arrivals", "one or the other"),
-    "latency to nowhere": ('[run]\nlatency_to = "b"\n' + STAGES, "run.latency_to", "the unknown stage 'b'"),
+    "latency to nowhere": (
+        '[run]\nlatency_to = "b"\n' + STAGES,
+        *("run.latency_to", "the unknown stage 'b'", "of the file: a"),
+    ),
     "prepared for nobody": (
         f'[stages]\n{VIDEO}p = {{ block = "prepare", unit = "cpu", in = "v", like = "det" }}',
         *("stages.p.like", "'det'", "a stage with onnx"),
     ),
     "own code without a factory": (
         STAGES + 'b = { python = "crop", unit = "cpu" }',
-        "stages.b.python",
-        "module:factory",
+        *("stages.b.python", "'crop', expected MODULE:FACTORY, such as crop:best"),
+    ),
+    "a unit with a space": (
+        STAGES.replace('"u"', '"a unit"'),
+        *("stages.a.unit", "'a unit', expected at most 40 letters, digits, _ and -"),
+    ),
+    "no cores": (STAGES + "[units]\nu = { cores = [] }", "units.u.cores", "at least 1 item;"),
+    "means of two channels": (
+        PREPARED.replace("like", "mean = [0.5, 0.5], like"),
+        *("stages.a.mean", "2 values", "1 or 3, one for each channel"),
+    ),
+    "a mean that is no number": (PREPARED.replace("like", "mean = [nan], like"), "stages.a.mean.0", "nan", "finite"),
+    "no deviation": (PREPARED.replace("like", "sd = [0], like"), "stages.a.sd.0", "0", "greater than 0"),
+    "a layout of five channels": (
+        PREPARED.replace("like", 'layout = "nhwc", like'),
+        *("stages.a", "f32 1x3x256x256", "1 or 3 channels"),
     ),
     "every nothing": (STAGES.replace("unit", "every = 0, unit"), "stages.a.every", "greater than or equal to 1"),
     "a name with a dot": ('[stages]\n"a.b" = { unit = "u", time_ms = 1 }', "stages", "'a.b'"),
