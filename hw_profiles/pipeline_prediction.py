@@ -84,9 +84,10 @@ class StagePrice:
 def given_price(file: PipelineFile, name: str) -> StagePrice | None:
     """Return the price that the file itself states for stage `name`; None where it states none."""
     stage = file.stages[name]
-    time, source = stage.own_time, "time_ms" if stage.time_ms else "load_ms"
+    time = stage.own_time
     if time is None:
         return None
+    source = "time_ms" if stage.time_ms else f"block {stage.named_kind}"
     return StagePrice(time, source, low_ms=time.mean_ms, high_ms=time.mean_ms)
 
 

@@ -571,7 +571,11 @@ class EncodeBlock(BlockStage):
 
 
 class DiscardBlock(BlockStage):
-    """Takes frames and does nothing with them."""
+    """Takes frames and does nothing with them, which takes no time."""
+
+    @property
+    def own_time(self) -> StageTime | None:
+        return self.time_ms or StageTime(mean=0.0)
 
 
 class BusyBlock(BlockStage):

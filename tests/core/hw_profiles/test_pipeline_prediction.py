@@ -431,11 +431,12 @@ def test_measured_times_are_those_of_a_run_and_on_a_chip_times_their_scale(
     [stages]
     frame = { block = "busy", unit = "a", load_ms = 2 }
     depth = { python = "m:f", unit = "b", in = "frame", scale = { snapdragon-888 = 2 } }
+    end   = { block = "discard", unit = "a", in = "depth" }
     """
     file = read_pipeline(write_file(tmp_path, text))
 
     def service(stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
-        return {"frame": 3, "depth": 20 - 10 * (frame % 2)}[stage] * 1_000_000
+        return {"frame": 3, "depth": 20 - 10 * (frame % 2), "end": 1}[stage] * 1_000_000
 
     done = simulate(graph_of(file, edge_rules(file)), Settings(40), service, keep=True)
     run = write_run(tmp_path / "run", done)
@@ -444,8 +445,11 @@ def test_measured_times_are_those_of_a_run_and_on_a_chip_times_their_scale(
     assert rows["frame"]["alone_ms"] == 3  # not 2, which the file only asks for
     assert (here["alone_ms"], here["service_ms"]["max"]) == (15, 20)
     assert here["low_ms"] < 15 < here["high_ms"]
-    chip = documents(text, "--measured", str(run), "--profile", "snapdragon-888")["pipelines"][0]["stages"]["depth"]
+    on_chip = documents(text, "--measured", str(run), "--profile", "snapdragon-888")["pipelines"][0]["stages"]
+    chip, busy, end = (on_chip[name] for name in ("depth", "frame", "end"))
     assert (chip["alone_ms"], chip["source"]) == (30, f"measured in {run}, times 2")
+    assert (busy["alone_ms"], busy["source"]) == (2, "block busy")
+    assert (end["alone_ms"], end["source"]) == (0, "block discard")
     options = ("--measured", run, "--profile", "snapdragon-8-gen-3")
     error = " ".join(command("predict", tmp_path / "pipeline.toml", *options, code=2)[1].split())
     assert "stages.depth: found python without a time" in error
