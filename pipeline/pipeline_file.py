@@ -67,6 +67,7 @@ STAGES: Final = re.compile(rb"""^\s*(\[\s*["']?stages["']?\s*[\].]|["']?stages["
 #: A comma between two assignments, not one in a list or a table.
 BETWEEN: Final = re.compile(rf",(?=\s*(?:{'|'.join(TABLES)})\.)")
 FORM: Final = "a pipeline file, TOML in UTF-8"
+IF_EMPTY: Final = "`trilane init` writes a first file from networks and a video"
 #: Tables that a stage's key may hold, by the key.
 INNER: Final[dict[str, type[Keys]]] = {"in": InputKeys, "time_ms": StageTime, "bypass": BypassKeys}
 
@@ -147,11 +148,11 @@ class PipelineFile:
 
 def read_pipeline(path: Path) -> PipelineFile:
     """Read and check a pipeline file. Raises BadInputError."""
-    data = read_bytes(path, MOST_BYTES, FORM)
+    data = read_bytes(path, MOST_BYTES, FORM, IF_EMPTY)
     try:
         tables = tomllib.loads(data.decode("utf-8-sig"))
     except UnicodeDecodeError:
-        raise BadInputError(path, "bytes that are no text in UTF-8", FORM) from None
+        raise BadInputError(path, "bytes that are no text in UTF-8", FORM, "save it as UTF-8") from None
     except (ValueError, RecursionError) as error:
         raise _of_toml(path, str(error)) from None
     return checked_tables(tables, path)
@@ -188,7 +189,7 @@ def checked_tables(tables: Mapping[str, Any], path: Path) -> PipelineFile:
     run = _checked(RunKeys, _table(tables, "run", path), f"{path}: run")
     written = _table(tables, "stages", path)
     if not 1 <= len(written) <= MOST_STAGES:
-        remedy = "" if written else "`trilane init` writes a first file from networks and a video"
+        remedy = "" if written else IF_EMPTY
         raise BadInputError(f"{path}: stages", f"{len(written)} stages", f"1 to {MOST_STAGES}", remedy)
     units = {
         name: _checked(UnitKeys, keys, f"{path}: units.{name}") for name, keys in _table(tables, "units", path).items()

@@ -19,7 +19,7 @@ from trilane.hw_profiles.schema import corners_of
 from trilane.hw_profiles.shared_chip import alone_ms
 from trilane.hw_profiles.tenants import SKIPS
 from trilane.pipeline.file_text import file_text, tables_of, unsaid
-from trilane.pipeline.pipeline_file import FORM, MOST_BYTES, TABLES, checked_tables
+from trilane.pipeline.pipeline_file import FORM, IF_EMPTY, MOST_BYTES, TABLES, checked_tables
 from trilane.scene.schema import scene_names
 from trilane.scheduler.policy import POLICIES
 from trilane.stages.avatar_pipeline import avatar_pipeline
@@ -45,7 +45,7 @@ def is_scene(text: str) -> bool:
     if path.suffix != ".toml" or not path.is_file():
         return False
     try:
-        tables = tomllib.loads(read_bytes(path, MOST_BYTES, FORM).decode())
+        tables = tomllib.loads(read_bytes(path, MOST_BYTES, FORM, IF_EMPTY).decode())
     except (ValueError, RecursionError):
         return False
     return bool(tables) and not {*tables} & {*TABLES}

@@ -290,9 +290,12 @@ def _holds_objects(file: IO[bytes]) -> bool:
     return version in _HEADERS and _header(file, version)[2].hasobject
 
 
-def read_bytes(path: Path, most: int, expected: str) -> bytes:
-    """Return the whole file. Raises BadInputError when it is missing, empty or has more than `most` bytes."""
-    size = require_file(path, expected)
+def read_bytes(path: Path, most: int, expected: str, if_empty: str = "") -> bytes:
+    """Return the whole file. Raises BadInputError when it is missing, empty or has more than `most` bytes.
+
+    `if_empty`: remedy for an empty file.
+    """
+    size = require_file(path, expected, if_empty)
     if size > most:
         raise BadInputError(path, f"{size} bytes", f"at most {most}")
     try:

@@ -393,7 +393,11 @@ def test_a_prediction_refuses_it_alike(command: Command, tmp_path: Path, name: s
 def test_bytes_that_are_no_text_and_a_missing_file(command: Command, tmp_path: Path) -> None:
     path = tmp_path / "bytes.toml"
     path.write_bytes(b"[stages]\n\xff\xfe\x00")
-    assert "no text in UTF-8" in command("check", path, code=2)[1]
+    assert "no text in UTF-8" in (said := command("check", path, code=2)[1])
+    assert "save it as UTF-8" in said
+    path.write_bytes(b"")
+    assert "an empty file" in (said := command("check", path, code=2)[1])
+    assert "`trilane init`" in said
     assert "no such file" in command("check", tmp_path / "none.toml", code=2)[1]
     assert "a folder" in command("check", tmp_path, code=2)[1]
 
