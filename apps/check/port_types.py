@@ -78,6 +78,8 @@ def _check_names(file: PipelineFile, name: str, stage: OnnxStage, graph: GraphFi
         if shape not in inputs:
             expected = f"one of {', '.join(inputs)}"
             raise BadInputError(f"{where}.shapes.{shape}", "an unknown input", expected, did_you_mean(shape, inputs))
+    if stage.shapes:
+        _check_fixed(where, stage, onnx.load(file.folder / stage.onnx, load_external_data=False).graph)
     ports = [each.port for each in stage.inputs]
     if ports == [""] and len(wanted) == 1:
         return
@@ -90,6 +92,17 @@ def _check_names(file: PipelineFile, name: str, stage: OnnxStage, graph: GraphFi
         if each not in ports:
             found = f"nobody who feeds the input {each!r} of {stage.onnx}"
             raise BadInputError(f"{where}.in", found, f"a stage for each of {', '.join(wanted)}")
+
+
+def _check_fixed(where: str, stage: OnnxStage, graph: onnx.GraphProto) -> None:
+    """Check that `shapes` gives no size another value than the network's own, which no runtime would take."""
+    for value in graph.input:
+        own = [size.dim_value for size in value.type.tensor_type.shape.dim]
+        given = stage.shapes.get(value.name, ())
+        if any(size not in (0, asked) for size, asked in zip(own, given, strict=False)):
+            found, expected = ("x".join(str(size or "N") for size in sizes) for sizes in (given, own))
+            remedy = "leave it out, or export the network with open sizes"
+            raise BadInputError(f"{where}.shapes.{value.name}", found, f"{expected}, as the network fixes it", remedy)
 
 
 def _check_output(file: PipelineFile, name: str, each: StageInput, outputs: list[str]) -> None:

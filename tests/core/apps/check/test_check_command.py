@@ -320,6 +320,10 @@ WRONG: dict[str, tuple[str, ...]] = {
     ),
     "a mean that is no number": (PREPARED.replace("like", "mean = [nan], like"), "stages.a.mean.0", "nan", "finite"),
     "no deviation": (PREPARED.replace("like", "sd = [0], like"), "stages.a.sd.0", "0", "greater than 0"),
+    "another size than the network's": (
+        f"[stages]\n{VIDEO}" + NET.replace('"a"', '"v", shapes = { image = "1x3x128x256" }'),
+        *("stages.n.shapes.image", "1x3x128x256, expected 1x3x256x256", "leave it out"),
+    ),
     "a layout of five channels": (
         PREPARED.replace("like", 'layout = "nhwc", like'),
         *("stages.a", "f32 1x3x256x256", "1 or 3 channels"),
