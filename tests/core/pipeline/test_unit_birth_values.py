@@ -208,6 +208,7 @@ def children():
     return open(f"/proc/{server}/task/{server}/children").read().split()
 
 death, default, blocked, parent = json.loads(call("here:look"))
+until(lambda: not children())
 files = os.listdir(f"/proc/{server}/fd")
 pid, (pidfd, said) = unit(0.5)
 named = until(lambda: open(f"/proc/{pid}/comm").read() == "trilane-u\\n")
