@@ -63,7 +63,7 @@ class OnceCommand(TyperCommand):
 
 
 def _refuse_empty(parameter: Any, typed: str | Sequence[str] | None) -> None:
-    """Raise BadInputError for an empty path or argument. `typed`: the words, of which Typer would make the path `.`."""
+    """Raise BadInputError for an empty path or argument. `typed`: words as typed; Typer reads an empty one as `.`."""
     kinds = [*_kinds(parameter.type_descriptor.annotation)]
     names_a_thing = parameter.param_type_name == "argument" and str in kinds
     texts = [typed] if isinstance(typed, str) else typed or ()

@@ -35,7 +35,7 @@ NOT_FOUND: Final = 404
 #: Path that could name a page; the longest name of one has 30 characters.
 SOUND_PATH: Final = re.compile(r"(/(?!\.\.?(/|$))[\w.-]{0,60}){1,4}", re.ASCII)
 MOST_FIELDS: Final = 16
-#: Bytes of a request's target and headers; those of a browser have less than 1 kB.
+#: Most bytes of a request's target and headers together. A browser sends less than 1 kB.
 MOST_HEAD_BYTES: Final = 16384
 VERSIONS: Final = ("1.0", "1.1")
 Scope = MutableMapping[str, Any]

@@ -287,7 +287,7 @@ def advice(
 
     First comes the policy, then what other programs took, then the largest rows. `budget`: rows of the document, the
     largest first. `policy`: policy of the run. `spare_cores`: cores of the machine beyond one for each unit.
-    `is_of_file`: whether the stages are those of a pipeline file, not the avatar's.
+    `is_of_file`: whether the run is of a pipeline file. Otherwise its stages are the avatar's.
     """
     found = []
     works = [row for row in budget if row["what"] == WORK]

@@ -177,7 +177,7 @@ def _of_folder(path: Path) -> Guess:
 
 
 def _has_matrices(folder: Path) -> bool:
-    """Return whether `folder` has several text files, of which the first has 16 numbers."""
+    """Return whether `folder` has several text files, and the first one has 16 numbers."""
     files = sorted(folder.glob("*.txt"))
     try:
         return len(files) > 1 and read_table(files[0], 4, EXPECTED).numbers.shape == (4, 4)
@@ -356,7 +356,7 @@ def _require_one_order(path: Path, numbers: F64, names: tuple[str, ...], axes: F
     """Raise BadInputError where the quaternion's parts may be in another order than `names` of a table's columns.
 
     This holds where another order makes cameras more level, or where the other usual one (scalar first or last) makes
-    them as level. It also holds where those of another order, as level, look where they go, and these do not. A map of
+    them as level. It also holds where another order makes cameras as level, and only these look where they go. A map of
     SLAM that begins without a turn has the 1 where its scalar is. `axes` (3, 3): columns are the directions of the
     camera's axes, in the coordinates of a pose.
     """

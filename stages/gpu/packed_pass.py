@@ -57,7 +57,7 @@ def texture_words(ctx: Any, texture: Floats) -> tuple[Any, float]:
     """Return a texture of words with the FP16 numbers of `texture` (H,W,C), as `packed_tensor.frag` reads it deferred.
 
     Also return its uniform `unit`. The numbers are first multiplied by a power of two, as large as FP16 allows, so that
-    none is subnormal beside usual ones. The bits of a half are then those of a float times another power of two.
+    small numbers are not subnormal. The shader turns the bits of such a number into a float, and multiplies by `unit`.
     """
     height, width, channels = texture.shape
     halves = texture.astype(np.float16)
