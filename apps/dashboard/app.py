@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
+import traceback
+from collections.abc import AsyncIterator, Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -51,10 +53,14 @@ SWITCHING: Final = 101  # status of a WebSocket that begins
 
 
 class DashboardApp:
-    """The ASGI application `asgi` for `view` on `port`, for those who know `token`. `refusals`: its server's counts."""
+    """The ASGI application `asgi` for `view` on `port`, for those who know `token`. `refusals`: its server's counts.
+
+    `stop`: function that ends the server, for an app that can no longer tell its clients the news.
+    """
 
     def __init__(self, view: RunView, port: int, token: str) -> None:
         self._view = view
+        self.stop: Callable[[], None] = lambda: None
         self.refusals = Refusals()
         self._clients = Clients()
         self._asked = asyncio.Event()
@@ -76,12 +82,20 @@ class DashboardApp:
     @contextlib.asynccontextmanager
     async def _lifespan(self, _app: Starlette) -> AsyncIterator[None]:
         tasks = [asyncio.create_task(self._tell_news()), asyncio.create_task(self._hand_out_pictures())]
+        for task in tasks:
+            task.add_done_callback(self._stop_if_failed)
         try:
             yield
         finally:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
+
+    def _stop_if_failed(self, task: asyncio.Task[None]) -> None:
+        """End the server with a traceback: a page that stands still without a word would be taken for the run."""
+        if not task.cancelled() and (error := task.exception()) is not None:
+            traceback.print_exception(error)
+            self.stop()
 
     async def _index(self, _request: Request) -> Response:
         return FileResponse(PAGE / "index.html")
@@ -225,4 +239,6 @@ def server(app: DashboardApp) -> Any:
         date_header=False,
         http=Http,
     )
-    return uvicorn.Server(config)
+    answers = uvicorn.Server(config)
+    app.stop = partial(setattr, answers, "should_exit", True)
+    return answers

@@ -14,6 +14,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
@@ -36,8 +37,9 @@ from trilane.apps.dashboard.view import (
     note,
     slices,
 )
-from trilane.apps.watch.followed_run import FollowedRun
-from trilane.pipeline.journal import NAME, Begun, Record
+from trilane.apps.watch.followed_run import FollowedRun, run_name
+from trilane.errors import BadInputError
+from trilane.pipeline.journal import Begun, Record
 from trilane.transport.live_window import LiveWindow, ShownPicture, Steering
 from trilane.unexpected_value import UnexpectedValue
 
@@ -63,7 +65,7 @@ async def serve(listener: socket.socket, channel: ChannelEnd, window_fd: int) ->
     opened = await _first(channel)
     window = LiveWindow(window_fd, opened.height, opened.width)
     os.close(window_fd)
-    view = _LiveView(window, channel.send)
+    view = LiveView(window, channel.send)
     app = DashboardApp(view, listener.getsockname()[1], opened.token)
     answers = server(app)
     run_is_over = asyncio.Event()
@@ -89,7 +91,7 @@ async def _leave(run_is_over: asyncio.Event, app: DashboardApp, answers: Any) ->
     answers.should_exit = True
 
 
-def _hear(channel: ChannelEnd, view: _LiveView, run_is_over: asyncio.Event) -> None:
+def _hear(channel: ChannelEnd, view: LiveView, run_is_over: asyncio.Event) -> None:
     try:
         message = channel.receive()
     except EOFError:
@@ -135,7 +137,7 @@ class _Course:
         return [*([slices(jobs, idle)] if jobs or idle else []), *notes]
 
 
-class _LiveView:
+class LiveView:
     """The `RunView` of successive runs, which `hear` announces.
 
     `window`: window into them. `ask`: function that hands a request to the run and returns whether it could.
@@ -260,9 +262,10 @@ class _LiveView:
 
     async def _read_on(self) -> None:
         """Read the new records of the run, as far as there is time for it."""
-        if self._followed is None and self._folder is not None and (self._folder / NAME).is_file():
-            self._followed = FollowedRun(self._folder)
-        if self._followed is None:
+        if self._followed is None and self._folder is not None:
+            with suppress(BadInputError):  # the run has not begun to write, or moves its folder this very moment
+                self._followed = FollowedRun(_place_of(self._folder))
+        if (followed := self._followed) is None:
             return
         until_s = time.monotonic() + READ_S
         while records := list(islice(self._unread, RECORDS_AT_ONCE)):
@@ -272,7 +275,9 @@ class _LiveView:
             if self._is_behind:
                 return
             await asyncio.sleep(0)
-        self._unread = self._followed.new()
+            if self._followed is not followed:  # `hear` was told of another run meanwhile
+                return
+        self._unread = followed.new()
 
     def _add(self, record: Record) -> None:
         if isinstance(record, Begun):
@@ -319,6 +324,12 @@ class _LiveView:
     def _now_ns(self) -> int | None:
         """Return the time of the figures: now, or None for the last record's if the run is over or not fully read."""
         return None if self._is_behind or self._state in ("ended", "failed") else time.monotonic_ns()
+
+
+def _place_of(folder: Path) -> Path:
+    """Return the folder of a run that writes into `folder`: the one with its own name once the run is complete."""
+    complete = folder.with_name(run_name(folder))
+    return folder if folder.is_dir() or not complete.is_dir() else complete
 
 
 def _jpeg(seen: ShownPicture) -> bytes:
