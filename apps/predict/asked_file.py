@@ -81,11 +81,19 @@ class _Chips:
 
 
 def _measured(folder: Path, chip: str) -> Measured:
-    """Return the times of the jobs of a run, for `chip`."""
+    """Return the times of the jobs of a run, for `chip`.
+
+    On this machine a job takes its unit from the moment at which it is handed over: a unit whose core is busy, with the
+    scheduler's own work or another's, begins later. On a chip it takes what it computes.
+    """
     samples: dict[str, list[float]] = {}
+    free_ns: dict[str, int] = {}
     for record in open_journal(folder)[1]:
         if isinstance(record, Worked):
-            samples.setdefault(record.job.stage, []).append((record.job.end_ns - record.job.begin_ns) / NS_PER_MS)
+            job = record.job
+            from_ns = max(job.dispatch_ns, free_ns.get(job.unit, 0)) if chip == HOST else job.begin_ns
+            free_ns[job.unit] = job.end_ns
+            samples.setdefault(job.stage, []).append((job.end_ns - from_ns) / NS_PER_MS)
     times = {name: StageTime(samples=tuple(each[:MOST_SAMPLES])) for name, each in samples.items()}
     return Measured(times, str(folder), chip)
 

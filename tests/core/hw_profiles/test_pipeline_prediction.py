@@ -457,6 +457,34 @@ def test_measured_times_are_those_of_a_run_and_on_a_chip_times_their_scale(
     command("predict", tmp_path / "pipeline.toml", "--measured", tmp_path / "none", code=2)
 
 
+def test_here_a_job_takes_its_unit_from_the_moment_it_is_handed_over(documents: Predict, tmp_path: Path) -> None:
+    """Of 8 ms that a job of `a` holds its unit, it waits 2 for a core; a chip's unit waits for none.
+
+    The unit is handed the next job 1 ms before it is done with the last: that millisecond is the last one's.
+    """
+    text = """
+    [stages]
+    a = { block = "busy", unit = "a", load_ms = 1, scale = { snapdragon-888 = 10 } }
+    b = { block = "busy", unit = "b", load_ms = 1, in = "a" }
+    """
+    file = read_pipeline(write_file(tmp_path, text))
+    done = simulate(graph_of(file, edge_rules(file)), Settings(40), lambda *_: 8_000_000, keep=True)
+    waited = [job._replace(begin_ns=job.begin_ns + 2_000_000) for job in done.jobs]
+    early = [job._replace(dispatch_ns=job.dispatch_ns - 1_000_000 * (job.frame > 1)) for job in waited]
+    run = str(write_run(tmp_path / "run", done, early))
+    here = documents(text, "--measured", run)["pipelines"][0]
+    assert (here["stages"]["a"]["alone_ms"], here["stages"]["b"]["alone_ms"]) == (8, pytest.approx(8, abs=0.1))
+    assert here["frame_time_ms"]["mean"] == pytest.approx(8, rel=0.01)
+    on_chip = documents(
+        text.replace("load_ms = 1, in", "load_ms = 1, scale = { snapdragon-888 = 1 }, in"),
+        "--measured",
+        run,
+        "--profile",
+        "snapdragon-888",
+    )
+    assert on_chip["pipelines"][0]["stages"]["a"]["alone_ms"] == 60
+
+
 def test_what_a_frame_needs_has_no_part_of_the_start(predict: Predict) -> None:
     stages = 't = { unit = "u", time_ms = 12 }\nd = { unit = "u", in = "t", time_ms = 45, every = 3 }'
     assert predict(f"[stages]\n{stages}")["needs_ms"]["mean"] == 27
