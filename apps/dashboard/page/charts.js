@@ -1,4 +1,5 @@
-// Figures over time. Rule: as many moments as two minutes of a live run have, no more; what nobody sees is not drawn.
+// Figures over time. Rule: as many moments as two minutes of a live run have, no more; what nobody sees is not drawn
+// again. It is drawn once, so that the page below it stands still when it comes into view.
 /* global uPlot */
 
 import { colour, onThemeChange } from "./theme.js";
@@ -70,7 +71,7 @@ export class Chart {
   }
 
   tick() {
-    if (!this.isDirty || !this.isSeen) return;
+    if (!this.isDirty || (this.plot && !this.isSeen)) return;
     this.isDirty = false;
     this.home.classList.toggle("empty", this.names.length === 0);
     if (this.names.length === 0) return;
