@@ -103,6 +103,7 @@ def compare(
         from trilane.apps.cli.github import write_to_github
 
         write_to_github(judged, document["verdict"])
+    _say(judged)
     if json:
         with suppress(BrokenPipeError):  # the gate has the exit code
             print_json(document)
@@ -158,13 +159,17 @@ def _gates(asked: Sequence[str], slower: str | None) -> list[Gate]:
     return found
 
 
-def _leave(judged: Sequence[Judged]) -> None:
-    """Say what each limit came to, and leave with the exit code of the gate."""
-    from trilane.apps.compare.gate import Outcome, whole
-
+def _say(judged: Sequence[Judged]) -> None:
+    """Say what each limit came to."""
     several = len({each.name for each in judged}) > 1
     for each in judged:
         stderr_console().print(f"{each.name}: {each.said}" if several else each.said, soft_wrap=True, markup=False)
+
+
+def _leave(judged: Sequence[Judged]) -> None:
+    """Leave with the exit code of the gate."""
+    from trilane.apps.compare.gate import Outcome, whole
+
     codes = {Outcome.KEPT: 0, Outcome.BROKEN: BROKEN, Outcome.UNKNOWN: CANNOT_TELL}
     if code := codes[whole(judged)]:
         raise typer.Exit(code)

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from trilane.apps.compare.gate import Judged, Outcome
+from trilane.apps.compare.gate import Judged, Outcome, whole
 from trilane.errors import BadInputError
 from trilane.writing import WRITABLE
 
@@ -53,12 +53,15 @@ def _escaped(text: str) -> str:
 
 
 def summary(judged: Sequence[Judged], verdict: str) -> str:
-    """Return the summary: the verdict, and a table with a row for each limit, as much as GitHub keeps."""
+    """Return the summary: the gate's outcome, the verdict on the runs, and a table with a row for each limit.
+
+    It has as many rows as GitHub keeps.
+    """
     rows = [
         f"| {_plain(each.name)} | {_plain(each.gate.text)} | {each.outcome} | {_plain(each.reason)} |\n"
         for each in judged
     ]
-    text = f"### Trilane: {_plain(verdict)}\n\n| run | limit | outcome | why |\n|---|---|---|---|\n"
+    text = f"### Trilane: {whole(judged)}\n\n{_plain(verdict)}\n\n| run | limit | outcome | why |\n|---|---|---|---|\n"
     for row in rows:
         if len((text + row).encode()) > MAX_SUMMARY_BYTES:
             break

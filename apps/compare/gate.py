@@ -32,7 +32,7 @@ from trilane.apps.compare.rows import (
     relief_of,
 )
 from trilane.apps.compare.run_frames import CPU, INSTRUCTIONS
-from trilane.apps.compare.sides import Change, Side
+from trilane.apps.compare.sides import Change, ComparedRun, Side
 from trilane.errors import BadInputError, did_you_mean
 from trilane.student import student_quantile, student_tails
 
@@ -288,10 +288,12 @@ def _judged(gate: Gate, pair: Pair, figures: tuple[Weighed, ...]) -> Judged:
     worse = [each for each in figures if each.outcome is Outcome.BROKEN]
     if worse:
         return Judged(gate, pair.name, Outcome.BROKEN, f"{gate.metric.says}: {_list(worse)}", figures)
+    if not figures and gate.metric is METRICS["lost"] and all("frames" in run.document for run in _runs(pair)):
+        return Judged(gate, pair.name, Outcome.KEPT, "no run lost or dropped a frame", figures)
     if not figures:
         reason = ABSENT.get(gate.metric.of[0][0], "the two sides share no such figure")
         return Judged(gate, pair.name, Outcome.UNKNOWN, reason, figures)
-    unsure = [*spoilt((*pair.base.runs, *pair.other.runs))]
+    unsure = [*spoilt(_runs(pair))]
     decisive = _decisive(gate, pair, figures)
     unknown = [each for each in decisive if each.outcome is Outcome.UNKNOWN]
     if not unknown:
@@ -302,6 +304,10 @@ def _judged(gate: Gate, pair: Pair, figures: tuple[Weighed, ...]) -> Judged:
     runs = None if None in counts else max(count for count in counts if count is not None)
     reason = f"{_list(unknown)}; {_remedy(unknown, runs, unsure)}"
     return Judged(gate, pair.name, Outcome.UNKNOWN, reason, figures, runs)
+
+
+def _runs(pair: Pair) -> tuple[ComparedRun, ...]:
+    return (*pair.base.runs, *pair.other.runs)
 
 
 def _decisive(gate: Gate, pair: Pair, figures: Sequence[Weighed]) -> list[Weighed]:

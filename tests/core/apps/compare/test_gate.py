@@ -274,8 +274,8 @@ def test_no_name_is_a_command_to_github_or_a_cell_of_its_own() -> None:
     bad = named._replace(name="a%0A::error::x\n::stop-commands::t|<b>")
     assert annotation(bad).count("\n") == 0 and "a%250A::error" in annotation(bad)
     lines = summary([bad], "x | <y>").splitlines()
-    assert lines[0] == "### Trilane: x \\| \\<y\\>"
-    assert lines[4].startswith("| a%0A::error::x ::stop-commands::t\\|\\<b\\> | slower=5% | broken | ")
+    assert lines[:3] == ["### Trilane: broken", "", "x \\| \\<y\\>"]
+    assert lines[6].startswith("| a%0A::error::x ::stop-commands::t\\|\\<b\\> | slower=5% | broken | ")
 
 
 def prediction(ms: float, infer_ms: float) -> dict[str, Any]:
@@ -386,3 +386,10 @@ def test_how_often_the_gate_is_right(load: float, counted: bool) -> None:
         assert found[1.05][Outcome.BROKEN] >= 16
     if load > 0.05:
         assert not found[1.0][Outcome.KEPT]
+
+
+def test_runs_that_lost_nothing_keep_a_limit_of_losses() -> None:
+    assert reason(run(1), run(2), "lost=1%") == "lost=1%: kept: no run lost or dropped a frame"
+    frames = run(2).document["frames"]
+    losing = {**frames, "presented": frames["presented"] - 30, "dropped": {"raster->infer": 30}}
+    assert outcome(run(1), run(2, frames=losing), "lost=1%") is Outcome.BROKEN
