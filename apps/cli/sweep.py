@@ -348,7 +348,7 @@ def print_summary(document: Mapping[str, Any], definition: Definition, records: 
     for row in document["trials"]:
         cells = [row["options"][name] for name in axes] + [row[name] for name in repeats]
         figures = [_figure(results[row["id"]], path) for path in shown.values()]
-        table.add_row(*(text(each) for each in [*cells, row["status"], row["seconds"], *figures]))
+        table.add_row(*(text(each) for each in [*cells, marked(row["status"], row), row["seconds"], *figures]))
     stdout_console().print(table)
     counts = document["counts"]
     counted = ", ".join(f"{counts[key]} {key}" for key in ("trials", "done", "failed", "lost", "skipped"))
@@ -373,6 +373,11 @@ def _figure(result: Mapping[str, Any], path: tuple[str, ...]) -> Any:
     for key in path:
         found = found.get(key) if isinstance(found, dict) else None
     return found
+
+
+def marked(word: str, row: Mapping[str, Any]) -> str:
+    """Return `word` with UNSURE beside it for a trial whose machine was not quiet."""
+    return f"{word}, UNSURE" if row.get("unsure") else word
 
 
 def text(value: Any) -> str:

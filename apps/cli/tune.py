@@ -29,6 +29,7 @@ from trilane.apps.cli.sweep import (
     default_folder,
     described,
     engine_for,
+    marked,
     of_file,
     of_words,
     progress,
@@ -302,7 +303,7 @@ def _print_frontier(document: Mapping[str, Any], axes: Sequence[str]) -> None:
     table = Table(*axes, *map(_headed, names), "keeps", title="frontier")
     for row in document["frontier"]:
         cells = [row["options"][name] for name in axes] + [row["metrics"][name] for name in names]
-        table.add_row(*map(text, cells), "yes" if row["keeps"] else "no")
+        table.add_row(*map(text, cells), marked("yes" if row["keeps"] else "no", row))
     stdout_console().print(table)
 
 

@@ -254,6 +254,18 @@ def test_a_summary_says_why_trials_failed(capsys: pytest.CaptureFixture[str]) ->
     assert printed.splitlines()[-2:] == ["2 failed: no [room]", "1 lost: killed"] and "worst" not in printed
 
 
+def test_the_row_of_a_trial_on_a_busy_machine_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [
+        {"id": size, "options": {"size": size}, "status": "done", "seconds": 1.0, "error": None, "unsure": unsure}
+        for size, unsure in (("96", []), ("128", ["other programs took 27 %"]))
+    ]
+    counts = dict.fromkeys(("trials", "done", "failed", "lost", "skipped"), 1)
+    print_summary({"trials": rows, "counts": counts, "clock": "host"}, Definition(RUN, {}, {"size": [0]}), {})
+    quiet, busy = (line for line in capsys.readouterr().out.splitlines() if "done" in line and "│" in line)
+    assert "96" in quiet and "UNSURE" not in quiet
+    assert "128" in busy and "done, UNSURE" in busy
+
+
 @pytest.mark.parametrize(
     ("text", "found"),
     [
