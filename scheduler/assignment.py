@@ -95,7 +95,7 @@ class Choice:
             return False
         if stage.others and not all(stage.others):
             return False
-        return sink is None or bool(sink.free) or self.can_claim(stage, sink)
+        return sink is None or bool(sink.free) or (sink.rule.yields and self.can_claim(stage, sink))
 
     def can_claim(self, stage: StageState, sink: EdgeSlots) -> bool:
         """Return whether the stage may write to one of its slots."""
