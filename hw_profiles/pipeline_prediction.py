@@ -13,8 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from statistics import NormalDist
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_file import GraphFile
 from trilane.hw_profiles.host_model import MODEL_ERROR, UNMEASURED
-from trilane.hw_profiles.network_time import interval, price, spread_of
+from trilane.hw_profiles.network_time import interval, price
 from trilane.hw_profiles.rates import FrameInterval, holding, wanted_drops, without_interval
 from trilane.hw_profiles.schema import NORMAL_80, Corners, Profile
 from trilane.pipeline.file_graph import (
@@ -37,23 +36,25 @@ from trilane.pipeline.file_graph import (
 )
 from trilane.pipeline.file_keys import OnnxStage, StageTime
 from trilane.pipeline.pipeline_file import PipelineFile
-from trilane.scheduler.events import Graph, Settings
+from trilane.scheduler.events import Graph, Settings, Stop
 from trilane.scheduler.period_bound import Bound, period_bound
-from trilane.scheduler.virtual import simulate
+from trilane.scheduler.virtual import Simulation, simulate
 from trilane.transport.slots import edge_rule
 from trilane.units import HOST, NS_PER_MS, UNITS, UnitName
 
-DRAWS: Final = 200
-SIMULATIONS: Final = 20
-SIMULATED_FRAMES: Final = 100  # that each of them shows, about
-#: Frames of the run with an always ready source.
-FED_FRAMES: Final = 1000
+#: Frames that the runs at the ends of the interval show, about.
+SIMULATED_FRAMES: Final = 1000
+#: Frames of a run with an always ready source, about; and at most, because nothing holds back a stage of no time before
+#: a `latest` input.
+FED_FRAMES: Final = 2000
+MOST_FED: Final = 2 * FED_FRAMES
+EVEN: Final = (840, 60)  # multiples of all numbers to 8, and to 6
 BLOCK: Final = 4096  # frames whose times are drawn at once
 #: No job hangs in virtual time, however long the file says that it takes.
 NEVER_HANGS_NS: Final = 1 << 60
-QUANTILES: Final = (10, 90)
-#: Of draws at the middles of equally likely ranges, draw i of n stands for the quantile (i + 0.5) / n.
-OF_MIDDLES: Final = "hazen"
+#: Which time of a network counts: the expected one, or an end of its 80 % interval.
+Ends = Literal["expected", "low", "high"]
+ENDS: Final[tuple[Ends, ...]] = ("expected", "low", "high")
 
 #: (name of a stage, its graph, its unit of hardware) -> the chip that computes as this network does.
 ChipFor = Callable[[str, GraphFile, UnitName], Profile]
@@ -63,14 +64,13 @@ ChipFor = Callable[[str, GraphFile, UnitName], Profile]
 class StagePrice:
     """The time of a job of a stage.
 
-    `source`: where it comes from. `spread`: standard deviation of the logarithm of its error; 0 for times that the file
-    gives. `low_ms`, `high_ms`: 80 % interval of the mean; None where nobody knows the error. `why`: reasons for its
-    width, or why there is none. `is_modelled`: whether it follows from the network and the chip alone.
+    `source`: where it comes from. `low_ms`, `high_ms`: 80 % interval of the mean, the mean itself for times that the
+    file gives; None where nobody knows the error. `why`: reasons for its width, or why there is none. `is_modelled`:
+    whether it follows from the network and the chip alone.
     """
 
     time: StageTime
     source: str
-    spread: float = 0.0
     low_ms: float | None = None
     high_ms: float | None = None
     why: tuple[str, ...] = ()
@@ -98,9 +98,8 @@ def network_price(chip: Profile, graph: GraphFile, unit: UnitName, corners: Corn
     source = f"{chip.name}, {unit} in {chip.units[unit].precision}"
     if chip.name == HOST and chip.units[unit].measured is None:
         return StagePrice(StageTime(mean=time.total_ms), source, why=(UNMEASURED,), is_modelled=True)
-    spread = spread_of(around) if around.low_ms > 0 else 0.0
     mean = StageTime(mean=time.total_ms)
-    return StagePrice(mean, source, spread, around.low_ms, around.high_ms, around.why, is_modelled=True)
+    return StagePrice(mean, source, around.low_ms, around.high_ms, around.why, is_modelled=True)
 
 
 class Measured(NamedTuple):
@@ -126,7 +125,7 @@ def measured_price(file: PipelineFile, name: str, measured: Measured) -> StagePr
     time = measured.times[name].times(factor)
     source = f"measured in {measured.run}" + (f", times {factor:g}" if measured.chip != HOST else "")
     around = math.exp(NORMAL_80 * MODEL_ERROR)
-    return StagePrice(time, source, MODEL_ERROR, time.mean_ms / around, time.mean_ms * around)
+    return StagePrice(time, source, time.mean_ms / around, time.mean_ms * around)
 
 
 def prices_of(
@@ -177,6 +176,15 @@ def _without_a_time(file: PipelineFile, names: Sequence[str], measured: Measured
         remedy += "; or take the times of a run on this machine: --measured RUN"
         remedy += "" if measured.chip == HOST else f" and scale = {{ {measured.chip} = ... }} in each"
     return BadInputError(f"{file.path}: stages.{first}", found, "a stage whose time is known", remedy)
+
+
+def factors_at(prices: Mapping[str, StagePrice], end: Ends) -> dict[str, float]:
+    """Return by how much each stage's time is longer at an end of its interval than expected."""
+    found = {}
+    for name, each in prices.items():
+        at = {"expected": None, "low": each.low_ms, "high": each.high_ms}[end]
+        found[name] = 1.0 if at is None or not each.time.mean_ms else at / each.time.mean_ms
+    return found
 
 
 def bound_of(file: PipelineFile, prices: Mapping[str, StagePrice]) -> tuple[Graph, Bound]:
@@ -230,7 +238,7 @@ def predict_file(
     graph, bound = bound_of(file, prices)
     settings = settings_of(file, frames, seed, hang_ns=NEVER_HANGS_NS)
     report = simulate(graph, settings, Drawn(prices, seed), skips=skips_of(file, seed)).report
-    needs = _needs(file, prices, graph, seed)
+    needs = _needs(file, prices, seed)
     frame_time, latency = _intervals(file, prices, graph, report, needs, seed)
     answer = {
         "name": file.path.stem,
@@ -279,58 +287,78 @@ def _row(stage: StagePrice) -> dict[str, Any]:
     }
 
 
-def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], graph: Graph, seed: int) -> FrameInterval:
-    """Return the time of a frame of the source when frames never wait for it, with the interval by ignorance.
+def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], seed: int) -> FrameInterval:
+    """Return the time of a frame of the source when frames never wait for it."""
+    (graph, settings), skips = always_fed(file), skips_of(file, seed)
 
-    The jitter's part is that of a run with an always ready source; 200 draws of the bound have the ignorance. Streams
-    that leave out frames hold back instead, because a rate holds when every frame is shown. What the run takes for its
-    first half is left out, and it takes no less than the bound: slots fill for as long as hundreds of frames.
+    def needs_ms(end: Ends) -> float:
+        factors = factors_at(prices, end)
+        bound_ms = fed_bound_ms(file, {name: each.time.mean_ms * factors[name] for name, each in prices.items()})
+        stop_ns = round(FED_FRAMES * bound_ms * NS_PER_MS)
+        stop = ((stop_ns, Stop()),)
+        run = simulate(graph, settings, Drawn(prices, seed, factors), skips=skips, inputs=stop)
+        return max(bound_ms, steady_ms(run, stop_ns, repeats_after(file)))
+
+    return over_ends(needs_ms, _is_unsure(prices))
+
+
+def _is_unsure(prices: Mapping[str, StagePrice]) -> bool:
+    return any(each.low_ms != each.high_ms for each in prices.values())
+
+
+def always_fed(file: PipelineFile) -> tuple[Graph, Settings]:
+    """Return graph and settings of a file whose source is always ready."""
+    graph = holding_back(replace(graph_of(file, edge_rules(file)), from_release=False))
+    return graph, Settings(MOST_FED, hang_ns=NEVER_HANGS_NS, in_flight=in_flight_of(file))
+
+
+def holding_back(graph: Graph) -> Graph:
+    """Return a graph whose streams hold back instead of leaving frames out.
+
+    A rate holds when every frame is shown.
     """
-    times = {name: each.mean_ns for name, each in prices.items()}
-    in_flight, shares, skips = in_flight_of(file), shares_of(file), skips_of(file, seed)
-    graph = replace(graph, edges=tuple(map(holding_back, graph.edges)), from_release=False)
-    bound_ns = period_bound(graph, times, in_flight, shares=shares).period_ns
-    pattern = file.bypass[1].pattern if file.bypass else None
-    beat = math.lcm(*file.periods.values(), len(pattern or "."))
-    count = -(-FED_FRAMES // beat) * beat if beat <= FED_FRAMES else FED_FRAMES
-    half, whole = (
-        simulate(
-            graph, Settings(each, hang_ns=NEVER_HANGS_NS, in_flight=in_flight), Drawn(prices, seed), skips=skips
-        ).report
-        for each in (count, 2 * count)
-    )
-    ms = max((whole["duration_s"] - half["duration_s"]) * 1e3 / count, float(bound_ns) / NS_PER_MS)
-    ms = round(ms, 6)
-    if not bound_ns or not any(each.spread for each in prices.values()):
-        return FrameInterval(ms, ms, ms)
-    rng = np.random.default_rng([seed, 1])
-    found = []
-    for factors in _factors(prices, rng, DRAWS):
-        drawn = {name: round(ns * factors.get(name, 1.0)) for name, ns in times.items()}
-        found.append(float(period_bound(graph, drawn, in_flight, shares=shares).period_ns / bound_ns))
-    low, high = np.percentile(found, QUANTILES, method=OF_MIDDLES)
-    return FrameInterval(ms, float(ms * low), float(ms * high))
+    rules = ((rule, edge_rule(rule)) for rule in graph.edges)
+    edges = (f"fifo:{known.slots}" if known.yields else rule for rule, known in rules)
+    return replace(graph, edges=tuple(edges))
 
 
-def holding_back(rule: str) -> str:
-    """Return a rule with as many slots whose writer waits for a free one."""
-    known = edge_rule(rule)
-    return f"fifo:{known.slots}" if known.yields else rule
+def fed_bound_ms(file: PipelineFile, times_ms: Mapping[str, float]) -> float:
+    """Return the bound on the time of a frame whose source is always ready."""
+    (graph, settings), times = always_fed(file), {name: round(ms * NS_PER_MS) for name, ms in times_ms.items()}
+    return float(period_bound(graph, times, settings.in_flight, shares=shares_of(file)).period_ns) / NS_PER_MS
 
 
-def _factors(prices: Mapping[str, StagePrice], rng: np.random.Generator, count: int) -> list[dict[str, float]]:
-    """Draw `count` times by how much the model of the chip may be wrong for each stage.
+def repeats_after(file: PipelineFile) -> int:
+    """Return the number of frames after which the stages that a frame takes are the same again."""
+    return math.lcm(*file.periods.values(), len(file.bypass[1].pattern or ".") if file.bypass else 1)
 
-    Each stage meets each of `count` equally likely ranges once, in a random order (a Latin hypercube), so that few
-    draws give good quantiles.
+
+def steady_ms(run: Simulation, stop_ns: int, repeats: int) -> float:
+    """Return the time of a frame in the second half of a run whose source is always ready and stops at `stop_ns`.
+
+    The first half is left out because slots fill for as long as hundreds of frames, and what comes after `stop_ns` is
+    left out because the last frames meet less and less others.
+
+    `repeats`: number of frames after which the jobs are the same again. Their order repeats after some frames more, as
+    slots fill in turn, so the frames that count are a whole number of EVEN times as many, where there are so many.
+    A pipeline that shows no two frames there, as others never let it, needs all that time.
     """
-    normal = NormalDist()
-    middles = [normal.inv_cdf((place + 0.5) / count) for place in range(count)]
-    orders = {name: rng.permutation(count).tolist() for name, each in prices.items() if each.spread}
-    return [
-        {name: math.exp(prices[name].spread * middles[order[draw]]) for name, order in orders.items()}
-        for draw in range(count)
-    ]
+    shown = {frame: ns for frame, ns in run.shown_ns.items() if ns <= stop_ns}
+    last = max(shown, default=0)
+    half = last // 2
+    count = next((half // whole * whole for each in (*EVEN, 1) if (whole := each * repeats) <= half), half)
+    first = next((frame for frame in range(last - count, last) if frame in shown), None)
+    return (stop_ns if first is None else (shown[last] - shown[first]) / (last - first)) / NS_PER_MS
+
+
+def over_ends(ms_at: Callable[[Ends], float], is_unsure: bool = True) -> FrameInterval:
+    """Return a time with its interval: the times where all networks take as little, or as long, as theirs say.
+
+    The errors of all stages count as one, as they come from one model of one chip, or from one run.
+    `ms_at`: the time at an end. `is_unsure`: whether the ends differ.
+    """
+    found = [*map(ms_at, ENDS if is_unsure else ENDS[:1])]
+    return FrameInterval(found[0], min(found), max(found))  # jobs meet otherwise at each end, so the ends may cross
 
 
 def _intervals(
@@ -346,27 +374,24 @@ def _intervals(
     Where no frame is dropped the frame time is that of the bound, or of the source.
     """
     frame_ms, latency_ms = report["frame_time_ms"]["mean"], report["latency_ms"]["mean"]
-    if not any(each.spread for each in prices.values()):
+    if not _is_unsure(prices):
         return {"low": frame_ms, "high": frame_ms}, {"low": latency_ms, "high": latency_ms}
-    rng = np.random.default_rng([seed, 2])
     frames = report["frames"]
     count = min(frames["requested"], SIMULATED_FRAMES * frames["requested"] // max(frames["presented"], 1))
     settings = settings_of(file, count, seed, hang_ns=NEVER_HANGS_NS)
-    whole, *runs = [
-        simulate(graph, settings, Drawn(prices, seed, factors), skips=skips_of(file, seed)).report
-        for factors in ({}, *_factors(prices, rng, SIMULATIONS))
-    ]
+    runs = {
+        end: simulate(graph, settings, Drawn(prices, seed, factors_at(prices, end)), skips=skips_of(file, seed)).report
+        for end in ENDS
+    }
 
-    def around(key: str, mean: float) -> dict[str, float]:
+    def around_mean(key: str, mean: float) -> dict[str, float]:
         """Return the interval by what errors change in short runs, whose own jitter is the same in each."""
-        usual = whole[key]["mean"]
-        low, high = np.percentile(
-            [run[key]["mean"] / usual if usual else 1.0 for run in runs], QUANTILES, method=OF_MIDDLES
-        )
-        return {"low": float(mean * low), "high": float(mean * high)}
+        usual = runs["expected"][key]["mean"]
+        _, low, high = over_ends(lambda end: mean * runs[end][key]["mean"] / usual if usual else mean)
+        return {"low": low, "high": high}
 
     if frames["dropped"]:
-        return around("frame_time_ms", frame_ms), around("latency_ms", latency_ms)
+        return around_mean("frame_time_ms", frame_ms), around_mean("latency_ms", latency_ms)
     least = source_ns(file) / NS_PER_MS
     by_bound = {"low": max(least, needs.low_ms), "high": max(least, needs.high_ms)}
-    return by_bound, around("latency_ms", latency_ms)
+    return by_bound, around_mean("latency_ms", latency_ms)

@@ -13,13 +13,14 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 from trilane.hw_profiles.host_model import UNMEASURED
 from trilane.hw_profiles.over_time import Moment, last_fifth, temperatures_of, unit_power_w, warm_up
+from trilane.hw_profiles.pipeline_prediction import FED_FRAMES, Ends, over_ends, steady_ms
 from trilane.hw_profiles.rates import FrameInterval, holding, wanted_drops, without_interval
 from trilane.hw_profiles.schema import Corners, Profile, corners_of
-from trilane.hw_profiles.tenants import ENDS, Ends, Pipeline
+from trilane.hw_profiles.tenants import Pipeline
 from trilane.scheduler.events import Stop
 from trilane.scheduler.shared_units import ONE, ROUND_ROBIN, Member, Runs, simulate_beside
 from trilane.scheduler.virtual import Simulation
@@ -30,8 +31,6 @@ MOST_TENANTS = 8
 MOST_USE = 0.95
 #: A run lasts at least LEAST_S virtual seconds and LEAST_FRAMES of the slowest tenant, but at most MOST_S.
 LEAST_S, LEAST_FRAMES, MOST_S = 10.0, 64, 600.0
-#: A run of a pipeline that always has a frame ends after MOST_FED frames, about.
-MOST_FED: Final = 1000
 
 
 @dataclass(frozen=True)
@@ -104,16 +103,19 @@ def _run(
 def needed(profile: Profile, tenants: Sequence[Pipeline], number: int, corners: Corners, turns: str) -> FrameInterval:
     """Return the time of a released frame of tenant `number` if it always had another one, beside the others' rates.
 
-    The ends are those where all networks take as little, or as long, as their 80 % intervals say: their errors are
-    taken as one, as they are on one chip.
+    Alone it needs what a prediction of it by itself says: its run lasts as long, and has the same interval.
     """
-    found = []
-    for end in ENDS:
+
+    def needs_ms(end: Ends) -> float:
         costs = _Costs(profile, tenants, corners, end)
-        seconds = min(_seconds(tenants, costs), MOST_FED * max(costs.mean_ms[number].values()) / 1e3)
+        bound_ms = costs.jobs[number].bound_ms
+        seconds = FED_FRAMES * (bound_ms or max(costs.mean_ms[number].values())) / 1e3
+        if len(tenants) > 1:
+            seconds = min(seconds, _seconds(tenants, costs))
         run = _run(profile, tenants, costs, seconds, turns, fed=number)[number]
-        found.append(float(run.report["frame_time_ms"]["mean"]) / tenants[number].beat)
-    return FrameInterval(found[0], min(found), max(found))  # jobs meet otherwise at each end, so the ends may cross
+        return max(bound_ms, steady_ms(run, round(NS_PER_S * seconds), tenants[number].repeats))
+
+    return over_ends(needs_ms)
 
 
 def _busy_s(run: Simulation, tenant: Pipeline, unit: str) -> float:

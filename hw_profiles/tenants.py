@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Final, Literal, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import (
@@ -29,16 +29,20 @@ from trilane.hw_profiles.graph_file import GraphFile
 from trilane.hw_profiles.network_time import AS_IT_SAYS, Computes, interval, price
 from trilane.hw_profiles.network_work import Network, Work
 from trilane.hw_profiles.pipeline_prediction import (
-    FED_FRAMES,
     NEVER_HANGS_NS,
     Drawn,
+    Ends,
     StagePrice,
+    always_fed,
+    factors_at,
+    fed_bound_ms,
     holding_back,
     prices_of,
+    repeats_after,
 )
 from trilane.hw_profiles.schema import Corners, Profile, Unit
 from trilane.hw_profiles.unit_times import time_on
-from trilane.pipeline.file_graph import edge_rules, graph_of, in_flight_of, settings_of
+from trilane.pipeline.file_graph import edge_rules, graph_of, settings_of
 from trilane.pipeline.file_keys import OnnxStage
 from trilane.pipeline.pipeline_file import PipelineFile
 from trilane.scheduler.events import Graph, Settings, chain
@@ -47,9 +51,6 @@ from trilane.units import BYPASS, INFER, NS_PER_MS, NS_PER_S, UNITS, UnitName
 
 #: How frames are taken by default: only the newest counts, as with a camera; an older one is dropped.
 NEWEST = Variant("latest", "double")
-#: Which time of a network counts: the expected one, or an end of its 80 % interval.
-Ends = Literal["expected", "low", "high"]
-ENDS: Final[tuple[Ends, ...]] = ("expected", "low", "high")
 ENDLESS = 1 << 40
 SKIPS = -1
 
@@ -57,12 +58,15 @@ SKIPS = -1
 class Jobs(Protocol):
     """What the jobs of a pipeline cost on a chip, with its units at given corners.
 
-    `mean_ms`: mean milliseconds of a job by stage if no other pipeline runs. `is_known`: whether the error of every
-    time is known.
+    `mean_ms`: mean milliseconds of a job by stage if no other pipeline runs. `bound_ms`: bound on the time of a frame
+    whose source is always ready; 0 where none is known. `is_known`: whether the error of every time is known.
     """
 
     @property
     def mean_ms(self) -> Mapping[str, float]: ...
+
+    @property
+    def bound_ms(self) -> float: ...
 
     @property
     def is_known(self) -> bool: ...
@@ -85,7 +89,8 @@ class Pipeline(Protocol):
 
     `name`: its name in reports. `source`: what was asked for. `kind`: avatar, network or pipeline. `fps`: frames
     released a second. `takes_memory`: whether a camera, a display and the composition beside it use the memory all the
-    time. `beat`: it shows one of so many released frames, by `every`. `graph`: its stages, as the scheduler knows them.
+    time. `repeats`: number of frames after which its jobs are the same again. `graph`: its stages, as the scheduler
+    knows them.
     `fed`: graph and settings where it always has another frame, and shows all of them. `hardware`: for each of its
     units the unit of the chip that it is, or its own name.
     """
@@ -106,7 +111,7 @@ class Pipeline(Protocol):
     def takes_memory(self) -> bool: ...
 
     @property
-    def beat(self) -> int: ...
+    def repeats(self) -> int: ...
 
     @property
     def graph(self) -> Graph: ...
@@ -175,8 +180,8 @@ class Tenant:
         return not self.is_bare
 
     @property
-    def beat(self) -> int:
-        return 1
+    def repeats(self) -> int:
+        return len(self.frames)
 
     @property
     def hardware(self) -> Mapping[str, str]:
@@ -193,7 +198,7 @@ class Tenant:
     def fed(self) -> tuple[Graph, Settings]:
         policy = self.variant.policy
         settings = Settings(ENDLESS, Variant().policy if POLICIES[policy].paced else policy, hang_ns=ENDLESS)
-        return _always_fed(self.graph), settings
+        return holding_back(self.graph), settings
 
     def settings(self, display_ns: int) -> Settings:
         policy = self.variant.policy
@@ -233,6 +238,7 @@ class _AvatarJobs:
     """`Jobs` of a `Tenant`. `chip`: as its networks compute. A network is named by its place among the tenant's."""
 
     is_known = True
+    bound_ms = 0.0
 
     def __init__(self, tenant: Tenant, chip: Profile, corners: Corners, end: Ends, always: float) -> None:
         self._tenant, self._chip, self._corners, self._end = tenant, chip, corners, end
@@ -317,8 +323,8 @@ class FileTenant:
         return {unit: self.file.hardware(unit) or unit for unit in self.file.units}
 
     @property
-    def beat(self) -> int:
-        return self.file.periods[self.file.latency_to]
+    def repeats(self) -> int:
+        return repeats_after(self.file)
 
     @cached_property
     def graph(self) -> Graph:
@@ -326,10 +332,7 @@ class FileTenant:
 
     @property
     def fed(self) -> tuple[Graph, Settings]:
-        graph = replace(_always_fed(self.graph), from_release=False)
-        # A bound on the frames, because nothing holds back a stage of no time before a `latest` input.
-        frames = 2 * max(FED_FRAMES, self.beat)
-        return graph, Settings(frames, hang_ns=NEVER_HANGS_NS, in_flight=in_flight_of(self.file))
+        return always_fed(self.file)
 
     def settings(self, display_ns: int) -> Settings:  # noqa: ARG002 the file states how its frames are shown
         return settings_of(self.file, ENDLESS, hang_ns=NEVER_HANGS_NS)
@@ -370,11 +373,12 @@ class _FileJobs:
             tenant.file, tenant.graphs, lambda name, _, unit: tenant.chip(name, profile, unit), lambda _: corners
         )
         self.is_known = all(each.low_ms is not None for each in prices.values())
-        factors = {name: _end_over_mean(each, end) for name, each in prices.items()}
+        factors = factors_at(prices, end)
         self._networks = dict(_priced(tenant, prices, profile, factors))
         used = {name: self.network_ms(name, always) / prices[name].time.mean_ms for name in self._networks}
         self._drawn = Drawn(prices, 0, {**factors, **used})
         self.mean_ms = {name: each.time.mean_ms * {**factors, **used}[name] for name, each in prices.items()}
+        self.bound_ms = fed_bound_ms(tenant.file, self.mean_ms)
 
     def service_ns(self, stage: str, unit: str, frame: int, begin_ns: int) -> int:
         return self._drawn(stage, unit, frame, begin_ns)
@@ -400,16 +404,6 @@ def _priced(
         unit = next((each for each in UNITS if each == tenant.hardware[tenant.file.stages[name].unit]), None)
         if prices[name].is_modelled and unit is not None:
             yield name, _Priced(graph.work, tenant.chip(name, profile, unit), unit, factors[name])
-
-
-def _end_over_mean(stage: StagePrice, end: Ends) -> float:
-    at = {"expected": None, "low": stage.low_ms, "high": stage.high_ms}[end]
-    return 1.0 if at is None or not stage.time.mean_ms else at / stage.time.mean_ms
-
-
-def _always_fed(graph: Graph) -> Graph:
-    """Return a graph whose streams hold back instead of leaving frames out."""
-    return replace(graph, edges=tuple(map(holding_back, graph.edges)))
 
 
 def _used(profile: Profile, use: float) -> Profile:

@@ -288,6 +288,11 @@ class Ledger:
             self.lateness_ns.append(end_ns - deadline_ns)
 
     @property
+    def shown_ns(self) -> dict[int, int]:
+        """The time of each presented frame by its number; only for a run that keeps all values."""
+        return dict(zip(self.presented_frames, self.presented_ns, strict=True))
+
+    @property
     def left_out(self) -> int:
         """The number of frames that were lost or dropped so far."""
         return sum(self.lost.values()) + sum(self.dropped.values())

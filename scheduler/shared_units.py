@@ -364,7 +364,7 @@ def simulate_beside(members: Sequence[Member], *, keep: bool = False, **driver: 
     beside = BesideDriver(members, keep=keep, **driver)
     outcomes = beside.run()
     return [
-        Simulation(_report(line), line.recording, tuple(line.jobs), outcome)
+        Simulation(_report(line), line.recording, tuple(line.jobs), outcome, line.core.ledger.shown_ns)
         for line, outcome in zip(beside.lines, outcomes, strict=True)
     ]
 

@@ -6,7 +6,7 @@ The units are queues of jobs whose service times come from a function; everythin
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from heapq import heappop, heappush
 from typing import Any, Final
@@ -47,12 +47,16 @@ def none_skips(_frame: int, _fresh: bool) -> bool:
 
 @dataclass(frozen=True)
 class Simulation:
-    """The result of a simulated run. `report` has the keys of report.json."""
+    """The result of a simulated run.
+
+    `report` has the keys of report.json. `shown_ns`: time at which each presented frame was, by its number.
+    """
 
     report: dict[str, Any]
     recording: Recording | None
     jobs: tuple[JobRecord, ...]
     outcome: Outcome
+    shown_ns: Mapping[int, int]
 
 
 @dataclass
@@ -210,4 +214,4 @@ def simulate(
     virtual = VirtualDriver(graph, settings, service, keep=keep, books=Books(target_period_ns), **driver)
     outcome = virtual.run()
     report = virtual.core.report(clock="virtual")
-    return Simulation(report, virtual.recording, tuple(virtual.jobs), outcome)
+    return Simulation(report, virtual.recording, tuple(virtual.jobs), outcome, virtual.core.ledger.shown_ns)
