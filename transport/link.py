@@ -36,9 +36,17 @@ class SocketFolder:
         base = tempfile.gettempdir()
         base = base if len(base) < MAX_PATH else "/tmp"  # noqa: S108 - mkdtemp below makes a private folder in it
         remove_abandoned(Path(base))
+        while not self._is_made(base):  # another process took it for abandoned before it was locked, and removes it
+            os.close(self._lock)
+
+    def _is_made(self, base: str) -> bool:
+        """Make a folder with a lock, and return whether both are still there once it is locked."""
         self.path = Path(tempfile.mkdtemp(prefix=PREFIX, dir=base))
         self._lock = os.open(self.path / LOCK, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
-        fcntl.flock(self._lock, fcntl.LOCK_EX)
+        with contextlib.suppress(BlockingIOError):
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return os.fstat(self._lock).st_nlink > 0
+        return False
 
     def endpoint(self, name: str) -> str:
         """Return the ZeroMQ address of the socket `name` in this folder."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import select
+import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -170,6 +172,33 @@ def test_only_a_folder_of_ones_own_whose_lock_is_free_is_removed(
     left = {"elsewhere", "trilane-link", "trilane-without", locked.path.name}
     assert {path.name for path in tmp_path.iterdir()} == left
     locked.remove()
+
+
+@pytest.mark.parametrize("is_gone", [True, False])
+def test_a_folder_that_another_process_takes_for_abandoned_before_its_lock_is_replaced(
+    short_path: Path, monkeypatch: pytest.MonkeyPatch, is_gone: bool
+) -> None:
+    """The other process comes between the lock's file and the lock. It is done at once, or holds the lock meanwhile."""
+    monkeypatch.setattr("tempfile.tempdir", str(short_path))
+    lock, held = fcntl.flock, list[int]()
+
+    def late(fd: int, how: int) -> None:
+        if not held:
+            (path,) = short_path.glob(f"*/{LOCK}")
+            held.append(os.open(path, os.O_RDWR))
+            lock(held[0], fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if is_gone:
+                shutil.rmtree(path.parent)
+                lock(held[0], fcntl.LOCK_UN)
+        lock(fd, how)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    fds = psutil.Process().num_fds()
+    with SocketFolder() as folder:
+        assert psutil.Process().num_fds() == fds + 2
+        os.close(held[0])
+        remove_abandoned(short_path)
+        assert (folder.path / LOCK).exists() and [*short_path.iterdir()] == [folder.path]
 
 
 @pytest.mark.parametrize(("length", "is_kept"), [(79, True), (80, False)])
