@@ -169,13 +169,14 @@ def _without_a_time(file: PipelineFile, names: Sequence[str], measured: Measured
     found = f"{file.stages[first].named_kind} without a time"
     if names[1:]:
         found += f", as {', '.join(names[1:])}"
-    remedy = "add time_ms = ... to each: what it takes there"
+    remedy = 'add time_ms to each: a number, or { from = "FILE" } for what `trilane times` reads'
     if first in measured.times:
-        remedy = f"add time_ms = ... to each, or scale = {{ {measured.chip} = ... }} for its measured time"
+        remedy += f"; or scale = {{ {measured.chip} = ... }} for its measured time"
     elif measured.chip and not measured.times:
         remedy += "; or take the times of a run on this machine: --measured RUN"
         remedy += "" if measured.chip == HOST else f" and scale = {{ {measured.chip} = ... }} in each"
-    return BadInputError(f"{file.path}: stages.{first}", found, "a stage whose time is known", remedy)
+    expected = "a stage whose time is known" + (f" on {measured.chip}" if measured.chip else "")
+    return BadInputError(f"{file.path}: stages.{first}", found, expected, remedy)
 
 
 def factors_at(prices: Mapping[str, StagePrice], end: Ends) -> dict[str, float]:

@@ -14,7 +14,7 @@ from typing import Any
 import onnx
 import pytest
 
-from support.pipeline_files import CUT, DEPTH, STREET, network, write_file
+from support.pipeline_files import BRANCHES, CUT, DEPTH, STREET, network, write_file
 from support.run_folders import write_run
 from trilane.hw_profiles.application import Plan, Variant, simulated, stage_times_ms
 from trilane.hw_profiles.pipeline_prediction import given_price, predict_file, prices_of, steady_ms
@@ -341,7 +341,10 @@ def test_a_rate_that_jitter_breaks_is_not_held(predict: Predict) -> None:
 def test_a_stage_without_a_time_is_refused_by_name(command: Command, tmp_path: Path) -> None:
     error = " ".join(command("predict", write_file(tmp_path, STREET), code=2)[1].split())
     assert "stages.camera: found video without a time, as small, crop, overlay, video, expected" in error
-    assert "add time_ms" in error and "--measured RUN and scale = { snapdragon-888 = ... }" in error
+    assert 'add time_ms to each: a number, or { from = "FILE" } for what `trilane times` reads' in error
+    assert "--measured RUN and scale = { snapdragon-888 = ... } in each" in error
+    error = " ".join(command("predict", write_file(tmp_path, BRANCHES), code=2)[1].split())
+    assert "stages.frame: found video without a time, as composite, expected" in error
     options = (tmp_path / "pipeline.toml", "--profile", "host")
     out, error = command("predict", *options, code=2)
     assert "measuring" not in out + error and "scale" not in error
