@@ -224,7 +224,7 @@ class InputKeys(Keys):
     @model_validator(mode="after")
     def _age_of_latest(self) -> Self:
         if self.max_age_ms is not None and self.sync != "latest":
-            raise UnexpectedValue("max_age_ms beside sync = 'frame'", "sync = 'latest'")
+            raise UnexpectedValue("max_age_ms beside sync = 'frame'", "sync = 'latest'", "add it, or leave the age out")
         return self
 
 
@@ -235,10 +235,11 @@ def read_input(port: str, value: object) -> StageInput:
     elif isinstance(value, str):
         keys = InputKeys.model_validate({"from": value})
     else:
-        raise UnexpectedValue(shown(value), "a stage, stage.port, or a table { from, sync, max_age_ms }")
+        expected = "a stage, stage.port, or a table { from, sync, max_age_ms }"
+        raise UnexpectedValue(shown(value), expected, 'such as in = "camera"')
     stage, dot, from_port = keys.source.partition(".")
     if not stage or (dot and not from_port):
-        raise UnexpectedValue(repr(keys.source), "a stage, or stage.port")
+        raise UnexpectedValue(repr(keys.source), "a stage, or stage.port", "write both names, or the stage alone")
     return StageInput(port, stage, from_port, keys.sync == "latest", keys.max_age_ms or 0.0)
 
 

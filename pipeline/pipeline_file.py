@@ -68,6 +68,8 @@ STAGES: Final = re.compile(rb"""^\s*(\[\s*["']?stages["']?\s*[\].]|["']?stages["
 BETWEEN: Final = re.compile(rf",(?=\s*(?:{'|'.join(TABLES)})\.)")
 FORM: Final = "a pipeline file, TOML in UTF-8"
 IF_EMPTY: Final = "`trilane init` writes a first file from networks and a video"
+LEAVE_OUT: Final = "leave it out"
+IN_BRACES: Final = "put its keys in braces: { KEY = VALUE, KEY = VALUE }"
 #: Tables that a stage's key may hold, by the key.
 INNER: Final[dict[str, type[Keys]]] = {"in": InputKeys, "time_ms": StageTime, "bypass": BypassKeys}
 
@@ -118,14 +120,19 @@ class PipelineFile:
         return found
 
     @property
-    def is_chain(self) -> bool:
-        """Whether each stage takes every frame, from the stage before it alone."""
+    def out_of_row(self) -> str:
+        """The first stage that does not take every frame, from the stage before it alone; "" in a chain."""
         before: tuple[StageInput, ...] = ()
         for name, stage in self.stages.items():
             if stage_inputs(stage) != before or stage.every != 1:
-                return False
+                return name
             before = (StageInput("", name),)
-        return True
+        return ""
+
+    @property
+    def is_chain(self) -> bool:
+        """Whether each stage takes every frame, from the stage before it alone."""
+        return not self.out_of_row
 
     @property
     def bypass(self) -> tuple[str, BypassKeys] | None:
@@ -185,11 +192,11 @@ def checked_tables(tables: Mapping[str, Any], path: Path) -> PipelineFile:
     for name in tables:
         if name not in TABLES:
             found = f"the unknown key {name!r}"
-            raise BadInputError(path, found, f"tables {', '.join(TABLES)}", did_you_mean(name, TABLES))
+            raise BadInputError(path, found, f"tables {', '.join(TABLES)}", did_you_mean(name, TABLES) or LEAVE_OUT)
     run = _checked(RunKeys, _table(tables, "run", path), f"{path}: run")
     written = _table(tables, "stages", path)
     if not 1 <= len(written) <= MOST_STAGES:
-        remedy = "" if written else IF_EMPTY
+        remedy = "do in one stage what several do" if written else IF_EMPTY
         raise BadInputError(f"{path}: stages", f"{len(written)} stages", f"1 to {MOST_STAGES}", remedy)
     units = {
         name: _checked(UnitKeys, keys, f"{path}: units.{name}") for name, keys in _table(tables, "units", path).items()
@@ -197,7 +204,7 @@ def checked_tables(tables: Mapping[str, Any], path: Path) -> PipelineFile:
     for table in ("units", "stages"):
         for name in _table(tables, table, path):
             if not re.fullmatch(NAME, name):
-                raise BadInputError(f"{path}: {table}", f"the name {shown(name)}", FORMS[NAME])
+                raise BadInputError(f"{path}: {table}", f"the name {shown(name)}", FORMS[NAME], "choose another name")
     stages = {name: _stage(name, keys, path) for name, keys in written.items()}
     stages = _in_order(stages, path)
     named = list(dict.fromkeys(stage.unit for stage in stages.values()))
@@ -228,14 +235,14 @@ def _slip(unit: str, known: Sequence[str]) -> str:
 def _table(tables: Mapping[str, Any], name: str, path: Path) -> Mapping[str, Any]:
     table = tables.get(name, {})
     if not isinstance(table, dict):
-        raise BadInputError(f"{path}: {name}", shown(table), "a table")
+        raise BadInputError(f"{path}: {name}", shown(table), "a table", f"begin it with the line [{name}]")
     return table
 
 
 def _checked(model: type[AnyKeys], values: object, where: str) -> AnyKeys:
     """Check a table by its model. Raises BadInputError that names the key behind `where`."""
     if not isinstance(values, dict):
-        raise BadInputError(where, shown(values), f"a table with {', '.join(model.known())}")
+        raise BadInputError(where, shown(values), f"a table with {', '.join(model.known())}", IN_BRACES)
     try:
         return model.model_validate(values)
     except ValidationError as error:
@@ -250,11 +257,12 @@ def _bad_input(model: type[Keys], error: ValidationError, where: str) -> BadInpu
     where = ".".join([where, *place])
     if first["type"] == "extra_forbidden":
         known = (INNER.get(place[0], model) if len(place) > 1 else model).known()
-        hint = did_you_mean(place[-1], known)
+        hint = did_you_mean(place[-1], known) or LEAVE_OUT
         return BadInputError(where, f"the unknown key {place[-1]!r}", f"one of {', '.join(known)}", hint)
     unexpected = unexpected_in(first)
     if unexpected is not None:
-        return BadInputError.at(where, unexpected)
+        remedy = unexpected.remedy or _meaning(model, place[0] if place else "")
+        return BadInputError(where, unexpected.found, unexpected.expected, remedy)
     if first["type"] == "missing":
         return BadInputError(where, "nothing", "this key", _meaning(model, place[0]))
     said = first["msg"].removeprefix("Input should be ").removeprefix("Value should have ")
@@ -273,7 +281,8 @@ def _stage(name: str, values: object, path: Path) -> StageKeys:
     """Check one stage by its kind."""
     where = f"{path}: stages.{name}"
     if not isinstance(values, dict):
-        raise BadInputError(where, shown(values), "a table with a unit and one of onnx, python, block, time_ms")
+        expected = "a table with a unit and one of onnx, python, block, time_ms"
+        raise BadInputError(where, shown(values), expected, IN_BRACES)
     kinds = [kind for kind in KINDS if kind in values]
     named = [kind for kind in kinds if kind != "time_ms"] or kinds
     if len(named) != 1:
@@ -286,6 +295,7 @@ def _stage(name: str, values: object, path: Path) -> StageKeys:
         block = values["block"]
         if not isinstance(block, str) or block not in BLOCKS:
             hint = did_you_mean(block, BLOCKS) if isinstance(block, str) else ""
+            hint = hint or "python in place of block takes code of your own"
             raise BadInputError(f"{where}.block", shown(block), f"one of {', '.join(BLOCKS)}", hint)
         model = BLOCKS[block]
     inputs = _inputs(values["in"], f"{where}.in") if "in" in values else ()
@@ -324,7 +334,7 @@ def _inputs(value: object, where: str) -> tuple[StageInput, ...]:
     for port, each in ports.items():
         place = f"{where}.{port}" if port else where
         if port and not re.fullmatch(NAME, port):
-            raise BadInputError(where, f"port {port!r}", "letters, digits, _ and -")
+            raise BadInputError(where, f"port {port!r}", FORMS[NAME], "choose another name")
         try:
             found.append(read_input(port, each))
         except UnexpectedValue as error:
@@ -346,13 +356,14 @@ def _check_ports(stage: StageKeys, where: str) -> None:
         return
     ports = [each.port for each in stage.inputs]
     if not known and ports:
-        raise BadInputError(f"{where}.in", "an input", f"none, as {stage.named_kind} is a source")
+        raise BadInputError(f"{where}.in", "an input", f"none, as {stage.named_kind} is a source", LEAVE_OUT)
     first = next(iter(known), "")
     for port in ports:
         if port and port not in known:
             names = [name for name in known if name]
             expected = f"one of {', '.join(names)}" if names else "a stage alone, as it has one input"
-            raise BadInputError(f"{where}.in.{port}", f"the unknown port {port!r}", expected, did_you_mean(port, names))
+            hint = did_you_mean(port, names) or LEAVE_OUT
+            raise BadInputError(f"{where}.in.{port}", f"the unknown port {port!r}", expected, hint)
     read = {port or first for port in ports}
     for port, needed in known.items():
         if needed and port not in read:
@@ -393,22 +404,26 @@ def _check_sources(name: str, stage: StageKeys, stages: Mapping[str, StageKeys],
         where = f"{path}: stages.{name}.in" + (f".{each.port}" if each.port else "")
         if each.stage not in stages:
             expected = f"a stage of the file: {', '.join(stages)}"
-            raise BadInputError(where, f"the unknown stage {each.stage!r}", expected, did_you_mean(each.stage, stages))
+            hint = did_you_mean(each.stage, stages) or f"add {each.stage} to [stages]"
+            raise BadInputError(where, f"the unknown stage {each.stage!r}", expected, hint)
         source = stages[each.stage]
         if source.named_kind in ENDS:
-            raise BadInputError(where, f"{each.stage!r}, a {source.named_kind}", "a stage that writes something")
+            found, remedy = f"{each.stage!r}, a {source.named_kind}", "read what it reads"
+            raise BadInputError(where, found, "a stage that writes something", remedy)
         ports = source.out_ports
         if each.from_port and ports is not None and each.from_port not in ports:
             names = [port for port in ports if port]
             expected = f"one of {', '.join(names)}" if names else f"{each.stage!r} alone, which has one port"
             found = f"the unknown port {each.from_port!r} of {each.stage}"
-            raise BadInputError(where, found, expected, did_you_mean(each.from_port, names))
+            hint = did_you_mean(each.from_port, names) or f"write '{each.stage}{'.' if names else ''}{ports[0]}'"
+            raise BadInputError(where, found, expected, hint)
         if not each.from_port and ports is not None and len(ports) > 1:
             found = f"{each.stage!r}, which has the ports {', '.join(ports)}"
-            raise BadInputError(where, found, f"one of them, such as '{each.stage}.{ports[0]}'")
+            raise BadInputError(where, found, "one of them", f"write '{each.stage}.{ports[0]}'")
         before = synced.setdefault(each.stage, each)
         if (before.latest, before.max_age_ms) != (each.latest, each.max_age_ms):
-            raise BadInputError(where, f"{each.stage!r} with another sync or age than before", "the same for its ports")
+            found = f"{each.stage!r} with another sync or age than before"
+            raise BadInputError(where, found, "the same for its ports", "write the same sync and max_age_ms for each")
     if len(synced) > MOST_INPUTS:
         found = f"{len(synced)} stages"
         raise BadInputError(f"{path}: stages.{name}.in", found, f"at most {MOST_INPUTS}", "join some of them before")
@@ -432,7 +447,8 @@ def _check_together(file: PipelineFile) -> None:
     for name, period in file.periods.items():
         if period > MOST_PERIOD:
             found = f"a frame of {period}, by every {file.stages[name].every} and those before"
-            raise BadInputError(f"{file.path}: stages.{name}.every", found, f"one of at most {MOST_PERIOD}")
+            remedy = "choose numbers that divide each other, such as 2 and 4"
+            raise BadInputError(f"{file.path}: stages.{name}.every", found, f"one of at most {MOST_PERIOD}", remedy)
     for name, stage in file.stages.items():
         _check_stage_together(file, name, stage)
     _check_bypass(file)
@@ -441,13 +457,14 @@ def _check_together(file: PipelineFile) -> None:
 def _check_run(file: PipelineFile) -> None:
     path, run = file.path, file.run
     if run.fps is not None and run.arrivals is not None:
-        raise BadInputError(f"{path}: run.arrivals", "arrivals beside fps", "one or the other")
+        raise BadInputError(f"{path}: run.arrivals", "arrivals beside fps", "one or the other", "leave one out")
     if POLICIES[run.policy].paced and run.fps is None and run.arrivals is None:
         remedy = "add fps = 30 to [run]"
         raise BadInputError(f"{path}: run.policy", f"{run.policy} without a rate", "fps or arrivals", remedy)
     if run.latency_to and run.latency_to not in file.stages:
         found, expected = f"the unknown stage {run.latency_to!r}", f"a stage of the file: {', '.join(file.stages)}"
-        raise BadInputError(f"{path}: run.latency_to", found, expected, did_you_mean(run.latency_to, file.stages))
+        hint = did_you_mean(run.latency_to, file.stages) or f"{LEAVE_OUT}: the last stage counts then"
+        raise BadInputError(f"{path}: run.latency_to", found, expected, hint)
 
 
 def _check_edges(file: PipelineFile) -> None:
@@ -456,10 +473,10 @@ def _check_edges(file: PipelineFile) -> None:
         where = f"{file.path}: edges.{name}"
         if name not in readers:
             kind = "a stage that nobody reads" if name in file.stages else "an unknown stage"
-            remedy = did_you_mean(name, readers)
+            remedy = did_you_mean(name, readers) or LEAVE_OUT
             raise BadInputError(where, kind, f"one of {', '.join(readers) or 'none, as nobody reads'}", remedy)
         if not isinstance(rule, str):
-            raise BadInputError(where, shown(rule), "single, double, triple, fifo:N or orphan:N")
+            raise BadInputError(where, shown(rule), "single, double, triple, fifo:N or orphan:N", 'such as "double"')
         try:
             edge_rule(rule)
         except UnexpectedValue as error:
@@ -487,12 +504,14 @@ def _check_stage_together(file: PipelineFile, name: str, stage: StageKeys) -> No
             networks = [each for each, one in file.stages.items() if isinstance(one, OnnxStage)]
             found = f"{stage.like!r}, {'no network' if other else 'an unknown stage'}"
             expected = f"one of {', '.join(networks)}" if networks else "a stage with onnx"
-            raise BadInputError(f"{where}.like", found, expected, did_you_mean(stage.like, networks))
+            hint = did_you_mean(stage.like, networks) or "name the network that reads this stage"
+            raise BadInputError(f"{where}.like", found, expected, hint)
     for each in stage.inputs:
         rule = file.edges.get(each.stage, file.run.edge or "double")
         if each.latest and edge_rule(rule).slots < 2:
             found = f"edge {rule!r} behind {each.stage}, whose newest frame {name} holds"
-            raise BadInputError(f"{file.path}: edges.{each.stage}", found, "two slots or more, such as double")
+            remedy = f'add {each.stage} = "double" to [edges]'
+            raise BadInputError(f"{file.path}: edges.{each.stage}", found, "two slots or more", remedy)
 
 
 def _check_bypass(file: PipelineFile) -> None:
@@ -506,14 +525,15 @@ def _check_bypass(file: PipelineFile) -> None:
     if not isinstance(stage, PythonStage | BusyBlock | TimedStage):
         remedy = "put a stage with python before it, which says what has nothing to do"
         raise BadInputError(where, f"a bypass at {stage.named_kind}", "python, busy or only time_ms", remedy)
-    if not file.is_chain:
+    if other := file.out_of_row:
         remedy = "let each stage read the one before it alone, without every"
-        raise BadInputError(where, "a bypass in a pipeline with branches", "a row of stages", remedy)
+        raise BadInputError(where, f"a bypass in a pipeline with branches, at {other}", "a row of stages", remedy)
     behind = names[names.index(begin) + 2 :]
     if way.to not in behind:
         found = f"{way.to!r}, {'a stage before or next to it' if way.to in names else 'an unknown stage'}"
         expected = f"one of {', '.join(behind)}" if behind else "two stages or more behind it"
-        raise BadInputError(f"{where}.to", found, expected, did_you_mean(way.to, behind))
+        hint = did_you_mean(way.to, behind) or "a bypass goes past one stage at least"
+        raise BadInputError(f"{where}.to", found, expected, hint)
     if file.latency_to in names[names.index(begin) + 1 : names.index(way.to)]:
         where, found = f"{file.path}: run.latency_to", f"{file.latency_to!r}, past which frames of {begin} may go"
         raise BadInputError(where, found, "a stage that every frame meets", f"such as {way.to}")
@@ -529,7 +549,8 @@ def _assigned(tables: Mapping[str, Any], text: str) -> dict[str, Any]:
     key, equals, value = text.partition("=")
     parts = [part.strip() for part in key.split(".")]
     if not equals or not all(parts) or parts[0] not in TABLES or len(parts) < 2:
-        raise BadInputError("--set", repr(text), "KEY=VALUE, such as stages.seg.unit=dsp")
+        remedy = f"begin with one of {', '.join(f'{name}.' for name in TABLES)}"
+        raise BadInputError("--set", repr(text), "KEY=VALUE, such as stages.seg.unit=dsp", remedy)
     try:
         read = tomllib.loads(f"value = {value}")
         new = read["value"] if len(read) == 1 else value
@@ -543,7 +564,8 @@ def _check_new_stages(tables: Mapping[str, Any], names: Sequence[str]) -> None:
     for name, keys in tables["stages"].items():
         if name not in names and isinstance(keys, dict) and not {*keys} & {*KINDS}:
             expected = f"a stage of the file: {', '.join(names)}"
-            raise BadInputError("--set", f"the unknown stage {name!r}", expected, did_you_mean(name, names))
+            hint = did_you_mean(name, names) or f"a new stage needs one of {', '.join(KINDS)}"
+            raise BadInputError("--set", f"the unknown stage {name!r}", expected, hint)
 
 
 def _with_value(tables: Mapping[str, Any], parts: Sequence[str], value: object) -> dict[str, Any]:
@@ -551,7 +573,9 @@ def _with_value(tables: Mapping[str, Any], parts: Sequence[str], value: object) 
         return {**tables, parts[0]: value}
     inner = tables.get(parts[0], {})
     if not isinstance(inner, dict):
-        raise BadInputError("--set", f"{parts[1]!r} of {parts[0]}, which is {shown(inner)}", "a key of a table")
+        found = f"{parts[1]!r} of {parts[0]}, which is {shown(inner)}"
+        remedy = f"set all of {parts[0]}: {{ {parts[1]} = VALUE }}"
+        raise BadInputError("--set", found, "a key of a table", remedy)
     return {**tables, parts[0]: _with_value(inner, parts[1:], value)}
 
 

@@ -72,12 +72,13 @@ def edge_rule(text: str) -> EdgeRule:
     """
     name, colon, count = text.partition(":")
     if name not in RULES or (colon and name not in COUNTED):
-        raise UnexpectedValue(f"edge {text!r}", "single, double, triple, fifo:N or orphan:N")
+        raise UnexpectedValue(f"edge {text!r}", "single, double, triple, fifo:N or orphan:N", "such as fifo:3")
     rule = RULES[name]
     if not colon:
         return rule
     if not re.fullmatch(r"[0-9]{1,4}", count) or not COUNTED[name] <= int(count) <= MAX_SLOTS:
-        raise UnexpectedValue(f"edge {text!r}", f"{name}:N with N from {COUNTED[name]} to {MAX_SLOTS}")
+        expected = f"{name}:N with N from {COUNTED[name]} to {MAX_SLOTS}"
+        raise UnexpectedValue(f"edge {text!r}", expected, f"such as {name}:{COUNTED[name] + 1}")
     return EdgeRule(name, int(count), rule.mailbox, rule.yields)
 
 

@@ -77,7 +77,8 @@ def _check_names(file: PipelineFile, name: str, stage: OnnxStage, graph: GraphFi
     for shape in stage.shapes:
         if shape not in inputs:
             expected = f"one of {', '.join(inputs)}"
-            raise BadInputError(f"{where}.shapes.{shape}", "an unknown input", expected, did_you_mean(shape, inputs))
+            hint = did_you_mean(shape, inputs) or "leave it out"
+            raise BadInputError(f"{where}.shapes.{shape}", "an unknown input", expected, hint)
     if stage.shapes:
         _check_fixed(where, stage, onnx.load(file.folder / stage.onnx, load_external_data=False).graph)
     ports = [each.port for each in stage.inputs]
@@ -87,11 +88,13 @@ def _check_names(file: PipelineFile, name: str, stage: OnnxStage, graph: GraphFi
         if port not in inputs:
             found = f"the unknown port {port!r}" if port else "a stage without a port"
             expected = f"a table with {', '.join(wanted)}"
-            raise BadInputError(f"{where}.in", found, expected, did_you_mean(port, wanted))
+            remedy = did_you_mean(port, wanted) or "name each of its inputs there"
+            raise BadInputError(f"{where}.in", found, expected, remedy)
     for each in wanted:
         if each not in ports:
             found = f"nobody who feeds the input {each!r} of {stage.onnx}"
-            raise BadInputError(f"{where}.in", found, f"a stage for each of {', '.join(wanted)}")
+            remedy = f'add {each} = "STAGE" to the table in' if ports else 'add in = "STAGE"'
+            raise BadInputError(f"{where}.in", found, f"a stage for each of {', '.join(wanted)}", remedy)
 
 
 def _check_fixed(where: str, stage: OnnxStage, graph: onnx.GraphProto) -> None:
@@ -110,7 +113,8 @@ def _check_output(file: PipelineFile, name: str, each: StageInput, outputs: list
     where = f"{file.path}: stages.{name}.in" + (f".{each.port}" if each.port else "")
     if each.from_port and each.from_port not in outputs:
         found = f"the unknown port {each.from_port!r} of {each.stage}"
-        raise BadInputError(where, found, f"one of {', '.join(outputs)}", did_you_mean(each.from_port, outputs))
+        hint = did_you_mean(each.from_port, outputs) or f"write {each.stage}.OUTPUT"
+        raise BadInputError(where, found, f"one of {', '.join(outputs)}", hint)
 
 
 def port_types(file: PipelineFile, networks: Mapping[str, GraphFile]) -> PortTypes:

@@ -164,7 +164,7 @@ def cores_of(file: PipelineFile, cores: Sequence[int]) -> dict[str, UnitSettings
         if absent := set(own) - set(cores):
             found = f"core {', '.join(map(str, sorted(absent)))}"
             expected = f"cores that this process may use: {', '.join(map(str, cores))}"
-            raise BadInputError(f"{file.path}: units.{unit}.cores", found, expected)
+            raise BadInputError(f"{file.path}: units.{unit}.cores", found, expected, "or leave out `cores`")
         places[unit] = Place(own, keys.threads or len(own))
     return settings_of(places)
 
@@ -174,8 +174,8 @@ def _all_types(file: PipelineFile, networks: Mapping[str, GraphFile]) -> PortTyp
     types = port_types(file, networks)
     for name, stage in file.stages.items():
         if isinstance(stage, VideoBlock) and stage.is_camera:
-            expected = "a video or a folder of pictures"
-            raise BadInputError(f"{file.path}: stages.{name}.path", "a camera, which a run cannot read yet", expected)
+            found, expected = "a camera, which a run cannot read yet", "a video or a folder of pictures"
+            raise BadInputError(f"{file.path}: stages.{name}.path", found, expected, "record a video of it first")
         if isinstance(stage, TimedStage):
             found, expected = "a time alone, with nothing to run", "onnx, python or block"
             remedy = 'block = "busy" works for a time; `trilane predict` takes times alone'
@@ -257,7 +257,8 @@ def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str
         keys["inputs"] = {}
         for each, found in values:
             if found is None:
-                raise BadInputError(f"{file.path}: stages.{name}.onnx", f"an input {each!r} of no numbers", "numbers")
+                bare, remedy = f"an input {each!r} of no numbers", "export it with inputs of numbers alone"
+                raise BadInputError(f"{file.path}: stages.{name}.onnx", bare, "numbers", remedy)
             keys["inputs"][each] = str(found)
     elif isinstance(stage, VideoBlock):
         keys["fps"] = file.run.fps
@@ -275,7 +276,7 @@ def _port(file: PipelineFile, name: str, each: StageInput, types: PortTypes) -> 
             return chosen
     where = f"{file.path}: stages.{name}.in" + (f".{each.port}" if each.port else "")
     found = f"{each.stage!r}, which has the ports {', '.join(ports)}"
-    raise BadInputError(where, found, f"one of them, such as '{each.stage}.{next(iter(ports))}'")
+    raise BadInputError(where, found, "one of them", f"write '{each.stage}.{next(iter(ports))}'")
 
 
 def _texts(ports: Mapping[str, PortType]) -> dict[str, str]:

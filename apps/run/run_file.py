@@ -193,4 +193,4 @@ def _copied(video: Path, target: Path) -> None:
         partial.replace(target)
     except OSError as error:
         partial.unlink(missing_ok=True)
-        raise BadInputError.of_os_error(target, error, "a place for the video") from None
+        raise BadInputError.of_os_error(target, error, "a place for the video", "change `path` of the stage") from None

@@ -38,6 +38,7 @@ def class_colours() -> U8:
 
 
 STEPS: Final = 255
+OWN_CODE: Final = "a stage with python before it can bring them into this form"
 
 
 class Overlay(PortedStage):
@@ -52,9 +53,10 @@ class Overlay(PortedStage):
         for name in (MASK, DEPTH):
             if name in types and len([size for size in types[name].shape if size > 1]) not in (2, 3):
                 where, found = f"{self.settings.where}.in.{name}", f"{types[name]}"
-                raise BadInputError(where, found, "a height and a width, and maybe channels")
+                raise BadInputError(where, found, "a height and a width, and maybe channels", OWN_CODE)
         if BOXES in types and types[BOXES].shape[-1] < 4:
-            raise BadInputError(f"{self.settings.where}.in.boxes", f"{types[BOXES]}", "rows of 4 numbers or more")
+            where, found = f"{self.settings.where}.in.boxes", f"{types[BOXES]}"
+            raise BadInputError(where, found, "rows of 4 numbers or more", OWN_CODE)
 
     def work(self, frame: int, arrays: Sequence[NDArray[Any] | None], outputs: Arrays) -> Mapping[str, float]:  # noqa: ARG002
         found = {each.name or FRAME: array for each, array in zip(self.reads, arrays, strict=True)}

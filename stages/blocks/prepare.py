@@ -24,6 +24,7 @@ STEPS: Final = 255
 PAD: Final = 114  # the grey around a letterboxed picture, as detectors are trained with
 CHANNELS: Final = (1, 3)
 NCHW, NHWC = "nchw", "nhwc"
+OWN_CODE: Final = "a stage with python can prepare it"
 
 
 class Preparation:
@@ -39,7 +40,8 @@ class Preparation:
         self._dtype = np.dtype(TYPES[wanted.dtype])
         self._shape = wanted.shape
         if wanted.shape[0] != 1 and len(wanted.shape) == 4:
-            raise BadInputError(where, f"a network for {wanted.shape[0]} pictures at once", "one for 1 picture")
+            found, remedy = f"a network for {wanted.shape[0]} pictures at once", "export it with a batch of 1"
+            raise BadInputError(where, found, "one for 1 picture", remedy)
         mean, sd = (_each(keys.get(key), self._channels, other, f"{where}.{key}") for key, other in _DEFAULTS.items())
         step, zero = self._quantised(keys, where)
         numbers = (np.arange(STEPS + 1)[:, None] / STEPS - mean) / sd / step + zero
@@ -56,7 +58,11 @@ class Preparation:
         if self._dtype.kind == "f":
             return keys.get("step") or 1.0, float(keys.get("zero_point") or 0)
         if self._dtype.itemsize > 1 and keys.get("step") is None:
-            raise BadInputError(f"{where}.step", "nothing", f"the step of the network's numbers, {self._dtype.name}")
+            expected, remedy = (
+                f"the step of the network's numbers, {self._dtype.name}",
+                "as its quantisation says",
+            )
+            raise BadInputError(f"{where}.step", "nothing", expected, remedy)
         zero = keys.get("zero_point")
         usual = -128 if self._dtype == np.int8 and keys.get("step") is None else 0
         return keys.get("step") or 1 / STEPS, float(usual if zero is None else zero)
@@ -113,7 +119,8 @@ def _each(values: Sequence[float] | None, channels: int, other: float, where: st
     """Return a value for each channel."""
     given = [other] if values is None else list(values)
     if len(given) not in (1, channels):
-        raise BadInputError(where, f"{len(given)} values", f"1 or {channels}, one for each channel")
+        expected = f"1 or {channels}, one for each channel"
+        raise BadInputError(where, f"{len(given)} values", expected, "one value counts for all channels")
     return np.broadcast_to(np.array(given, np.float64), (channels,))
 
 
@@ -121,11 +128,13 @@ def _layout(wanted: PortType, asked: str | None, where: str) -> tuple[str, tuple
     """Return the layout of a network's input, and height, width and channels in it."""
     shape = wanted.shape[-3:]
     if len(wanted.shape) not in (3, 4):
-        raise BadInputError(where, f"a network that reads {wanted}", "one that reads pictures, 1xCxHxW or 1xHxWxC")
+        expected = "one that reads pictures, 1xCxHxW or 1xHxWxC"
+        raise BadInputError(where, f"a network that reads {wanted}", expected, OWN_CODE)
     fits = {NCHW: shape[0] in CHANNELS, NHWC: shape[2] in CHANNELS}
     layout = asked or next((name for name, is_so in fits.items() if is_so), "")
     if not layout or not fits[layout]:
-        raise BadInputError(where, f"a network that reads {wanted}", "1 or 3 channels, first or last")
+        expected, remedy = "1 or 3 channels, first or last", "change `layout`" if asked else OWN_CODE
+        raise BadInputError(where, f"a network that reads {wanted}", expected, remedy)
     channels, height, width = shape if layout == NCHW else (shape[2], shape[0], shape[1])
     return layout, (height, width, channels)
 

@@ -38,7 +38,7 @@ class Footage(NamedTuple):
 def footage(path: Path) -> Footage:
     """Return what a video file or a folder of pictures holds. Raises BadInputError."""
     if not path.exists():
-        raise BadInputError(path, "no such file", EXPECTED)
+        raise BadInputError(path, "no such file", EXPECTED, "put it there, or change `path`")
     if path.is_dir():
         return Footage(len(picture_files(path)), None)
     try:
@@ -48,14 +48,15 @@ def footage(path: Path) -> Footage:
             count = stream.frames or sum(packet.size > 0 for packet in container.demux(stream))
             return Footage(count, float(rate) if rate else None)
     except (av.FFmpegError, OSError) as error:
-        raise BadInputError(path, f"no readable video ({error})", EXPECTED) from None
+        raise BadInputError(path, f"no readable video ({error})", EXPECTED, "convert it to .mp4") from None
 
 
 def picture_files(folder: Path) -> list[Path]:
     """Return the pictures of a folder, by name. Raises BadInputError where there is none."""
     files = sorted(file for file in folder.iterdir() if file.suffix.lower() in PICTURES)
     if not files:
-        raise BadInputError(folder, "a folder without pictures", f"files that end in {', '.join(PICTURES)}")
+        expected = f"files that end in {', '.join(PICTURES)}"
+        raise BadInputError(folder, "a folder without pictures", expected, "put some there, or change `path`")
     return files
 
 
@@ -90,7 +91,9 @@ class Video(PortedStage):
             with Image.open(path) as image:
                 upright = ImageOps.exif_transpose(image).convert("RGB")
         except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-            raise BadInputError(path, f"no readable picture ({error})", "a picture") from None
+            raise BadInputError(
+                path, f"no readable picture ({error})", "a picture", "take it out of the folder"
+            ) from None
         return np.asarray(ImageOps.fit(upright, self._shape[::-1], Image.Resampling.BILINEAR), np.uint8)
 
 

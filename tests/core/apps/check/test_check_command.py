@@ -170,6 +170,20 @@ WRONG: dict[str, tuple[str, ...]] = {
         STAGES.replace("a =", "camera =") + 'b = { unit = "u", in = "camra", time_ms = 1 }',
         *("stages.b.in", "the unknown stage 'camra'", "a stage of the file: camera, b;", "did you mean 'camera'?"),
     ),
+    "a stage like no other": (
+        STAGES + 'b = { unit = "u", in = "xyz", time_ms = 1 }',
+        *("stages.b.in", "a stage of the file: a, b;", "add xyz to [stages]"),
+    ),
+    "a source that reads": (
+        f"[stages]\n{VIDEO}".replace(" }", ', in = "v" }'),
+        *("stages.v.in", "an input, expected none, as video is a source", "leave it out"),
+    ),
+    "one stage in two ways": (
+        STAGES + 'b = { unit = "u", in = { x = "a", y = { from = "a", sync = "latest" } }, time_ms = 1 }',
+        *("stages.b.in.y", "'a' with another sync or age", "the same sync and max_age_ms"),
+    ),
+    "number for a table": ("run = 3\n" + STAGES, "run", "3, expected a table", "begin it with the line [run]"),
+    "number for a unit": ("[units]\nu = 3\n" + STAGES, "units.u", "3, expected a table with hardware", "in braces"),
     "unknown unit": (
         '[units]\nneural = { hardware = "dsp" }\n[stages]\na = { unit = "neurl", time_ms = 1 }',
         *("stages.a.unit", "the unknown unit 'neurl'", "did you mean 'neural'?"),
@@ -344,7 +358,7 @@ WRONG: dict[str, tuple[str, ...]] = {
     ),
     "a bypass among branches": (
         ROW.format('"c"') + 'd = { unit = "u", in = "a", time_ms = 1 }',
-        *("stages.a.bypass", "a bypass in a pipeline with branches", "a row of stages"),
+        *("stages.a.bypass", "a bypass in a pipeline with branches, at d", "a row of stages", "without every"),
     ),
     "two bypasses": (
         ROW.format('"c"').replace('"v"', '"v", bypass = "d"') + 'd = { unit = "u", in = "c", time_ms = 1 }',
@@ -382,8 +396,9 @@ def test_a_wrong_file_is_refused_by_its_key(command: Command, tmp_path: Path, na
     _, err = command("check", path, code=2)
     said = " ".join(err.split())
     assert said.startswith(f"error: {path}"), said
-    assert "found" in said
-    assert "expected" in said
+    found, _, expected = said.partition(", expected ")
+    assert "found" in found
+    assert expected.partition("; ")[2], "no remedy"
     assert all(part in said for part in parts), said
     assert "Traceback" not in said
 
