@@ -58,11 +58,8 @@ class Preparation:
         if self._dtype.kind == "f":
             return keys.get("step") or 1.0, float(keys.get("zero_point") or 0)
         if self._dtype.itemsize > 1 and keys.get("step") is None:
-            expected, remedy = (
-                f"the step of the network's numbers, {self._dtype.name}",
-                "as its quantisation says",
-            )
-            raise BadInputError(f"{where}.step", "nothing", expected, remedy)
+            expected = f"the step of the network's numbers, {self._dtype.name}"
+            raise BadInputError(f"{where}.step", "nothing", expected, "add the scale of its quantisation")
         zero = keys.get("zero_point")
         usual = -128 if self._dtype == np.int8 and keys.get("step") is None else 0
         return keys.get("step") or 1 / STEPS, float(usual if zero is None else zero)

@@ -91,9 +91,7 @@ class Video(PortedStage):
             with Image.open(path) as image:
                 upright = ImageOps.exif_transpose(image).convert("RGB")
         except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-            raise BadInputError(
-                path, f"no readable picture ({error})", "a picture", "take it out of the folder"
-            ) from None
+            raise BadInputError(path, f"no readable picture ({error})", "a picture", "remove it") from None
         return np.asarray(ImageOps.fit(upright, self._shape[::-1], Image.Resampling.BILINEAR), np.uint8)
 
 
