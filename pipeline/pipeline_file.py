@@ -404,7 +404,7 @@ def _check_sources(name: str, stage: StageKeys, stages: Mapping[str, StageKeys],
         where = f"{path}: stages.{name}.in" + (f".{each.port}" if each.port else "")
         if each.stage not in stages:
             expected = f"a stage of the file: {', '.join(stages)}"
-            hint = did_you_mean(each.stage, stages) or f"add {each.stage} to [stages]"
+            hint = did_you_mean(each.stage, stages) or "add it to [stages]"
             raise BadInputError(where, f"the unknown stage {each.stage!r}", expected, hint)
         source = stages[each.stage]
         if source.named_kind in ENDS:

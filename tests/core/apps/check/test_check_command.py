@@ -172,7 +172,7 @@ WRONG: dict[str, tuple[str, ...]] = {
     ),
     "a stage like no other": (
         STAGES + 'b = { unit = "u", in = "xyz", time_ms = 1 }',
-        *("stages.b.in", "a stage of the file: a, b;", "add xyz to [stages]"),
+        *("stages.b.in", "a stage of the file: a, b;", "add it to [stages]"),
     ),
     "a source that reads": (
         f"[stages]\n{VIDEO}".replace(" }", ', in = "v" }'),
