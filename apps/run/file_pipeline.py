@@ -257,8 +257,8 @@ def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str
         keys["inputs"] = {}
         for each, found in values:
             if found is None:
-                bare, remedy = f"an input {each!r} of no numbers", "export it with inputs of numbers alone"
-                raise BadInputError(f"{file.path}: stages.{name}.onnx", bare, "numbers", remedy)
+                odd, remedy = f"an input {each!r} of no numbers", "export it with inputs of numbers alone"
+                raise BadInputError(f"{file.path}: stages.{name}.onnx", odd, "numbers", remedy)
             keys["inputs"][each] = str(found)
     elif isinstance(stage, VideoBlock):
         keys["fps"] = file.run.fps
