@@ -498,6 +498,7 @@ def test_what_a_frame_needs_has_no_part_of_the_start(predict: Predict) -> None:
     [
         ({0: 5, 1: 6, 2: 8, 3: 10, 4: 12, 5: 100}, 12, 1, 2),  # neither the start nor what comes after the stop
         ({0: 0, 3: 9, 6: 18, 9: 30}, 30, 3, 4),  # one frame of three is shown; the half has 3 of 9 frames
+        ({n: 4 * (n // 2) + n % 2 for n in range(123)}, 999, 1, 2),  # 1 and 3 in turn: 60 frames count, not 61
         ({0: 5}, 40, 1, 40),
         ({}, 40, 1, 40),
     ],
