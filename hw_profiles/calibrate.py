@@ -398,11 +398,14 @@ class NamedRow(NamedTuple):
     runtime: str
 
 
-def fit_row(table: Path, network: str | None, unit: str, precision: str, runtime: str) -> NamedRow:
-    """Check what a new row of `table` would say, the network's graph too. Raises BadInputError."""
+def fit_row(table: Path, network: str | None, unit: str | None, precision: str | None, runtime: str | None) -> NamedRow:
+    """Check what a new row of `table` would say, the network's graph too; None is what a row without the column means.
+
+    Raises BadInputError.
+    """
     if not network:
         raise BadInputError("--network", "nothing", "the network that was measured", "a path beside the table")
-    cells = {"unit": unit, "precision": precision, "runtime": runtime}
+    cells = {"unit": unit or "", "precision": precision or "", "runtime": runtime or ""}
     words = [_word("--rows", cells, *each) for each in WORDS]
     read_graph(network_file("--network", network, table.absolute().parent))
     return NamedRow(network, *words)

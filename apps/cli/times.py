@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from trilane.apps.cli.commands import Commands, JsonOption
-from trilane.apps.cli.console import print_json, stdout_console, without_controls
+from trilane.apps.cli.console import note, print_json, stdout_console, without_controls
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -45,9 +45,15 @@ RowsOption = Annotated[
     Path | None, typer.Option(help="Add the measurement to this table for `trilane profiles fit` (.csv).")
 ]
 NetworkOption = Annotated[str | None, typer.Option(help="Measured network: its path from the folder of the table.")]
-HardwareOption = Annotated[str, typer.Option(help="Unit that ran the network: cpu, gpu or dsp.")]
-PrecisionOption = Annotated[str, typer.Option(help="Precision of the network: int8, fp16 or fp32.")]
-RuntimeOption = Annotated[str, typer.Option(help="Runtime of a tensor engine: tflite or qnn_dlc.")]
+HardwareOption = Annotated[
+    str | None, typer.Option(help="Unit that ran the network: cpu, gpu or dsp; if not given, as the file says, or dsp.")
+]
+PrecisionOption = Annotated[
+    str | None, typer.Option(help="Precision of the network: int8 (if not given), fp16 or fp32.")
+]
+RuntimeOption = Annotated[
+    str | None, typer.Option(help="Runtime of a tensor engine: tflite (if not given) or qnn_dlc.")
+]
 CsvOption = Annotated[Path | None, typer.Option("--csv", help="File for every single time (.csv).")]
 
 
@@ -58,9 +64,9 @@ def times(
     stage: StageOption = None,
     rows: RowsOption = None,
     network: NetworkOption = None,
-    hardware: HardwareOption = "dsp",
-    precision: PrecisionOption = "int8",
-    runtime: RuntimeOption = "tflite",
+    hardware: HardwareOption = None,
+    precision: PrecisionOption = None,
+    runtime: RuntimeOption = None,
     samples: CsvOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -68,29 +74,34 @@ def times(
 
     QNN profiles, QHAS, ONNX Runtime, benchmark_model, LoadGen and MLPerf's app, TensorRT, AI Hub, ExecuTorch, Perfetto.
     """
-    from trilane.apps.times.imported_times import document, one_of, rows_text, samples_csv, stage_text
-    from trilane.hw_profiles.calibrate import fit_row
+    from trilane.apps.times.imported_times import document, one_of, samples_csv, stage_text, with_row
     from trilane.pipeline.measurements.read_file import read_measurements
     from trilane.writing import write_bytes
 
     reads = [read_measurements(path) for path in files]
     written: dict[Path, str] = {}
+    row_says: list[str] = []
     if stage is not None:
         path, name_of_stage = _stage_of(stage)
         written[path] = stage_text(path, name_of_stage, *one_of(reads, name))
     if rows is not None:
-        written[rows] = rows_text(rows, *one_of(reads, name), fit_row(rows, network, hardware, precision, runtime))
+        asked = {"unit": hardware, "precision": precision, "runtime": runtime}
+        written[rows], row_says = with_row(rows, *one_of(reads, name), network, asked)
     if samples is not None:
         written[samples] = samples_csv(reads)
     for path, text in written.items():
         write_bytes(path, text.encode())
     if json:
         print_json(document(reads))
+        for line in row_says:
+            note(line)
         return
     for read in reads:
         _show(read)
     for path in written:
         stdout_console().print(f"written: {without_controls(str(path))}", markup=False, soft_wrap=True)
+    for line in row_says:
+        stdout_console().print(without_controls(line), markup=False, soft_wrap=True)
 
 
 def _stage_of(text: str) -> tuple[Path, str]:

@@ -19,7 +19,7 @@ from typing import Any, Final
 
 from trilane.errors import BadInputError, MissingPartError, did_you_mean
 from trilane.files import read_text
-from trilane.hw_profiles.calibrate import NamedRow
+from trilane.hw_profiles.calibrate import fit_row
 from trilane.pipeline.measurements.measurement import Measurement
 from trilane.pipeline.measurements.read_file import OWN_COLUMNS, Measurements, chosen
 from trilane.pipeline.pipeline_file import checked_tables, read_pipeline, time_of
@@ -27,6 +27,12 @@ from trilane.pipeline.pipeline_file import checked_tables, read_pipeline, time_o
 MOST_WRITTEN: Final = 10_000  # samples that are written into a pipeline file
 #: Columns of the rows for `trilane profiles fit`.
 FIT_COLUMNS: Final = ("network", "ms", "unit", "precision", "runtime", "source")
+#: Option of `trilane times` that sets a column.
+OPTION_OF: Final = {"unit": "--hardware", "precision": "--precision", "runtime": "--runtime"}
+#: Words in which tools name the hardware of a run -> a profile's unit.
+UNIT_OF_WORD: Final = {
+    "CPU": "cpu", "XNNPACK": "cpu", "GPU": "gpu", "NPU": "dsp", "HTP": "dsp", "DSP": "dsp", "HEXAGON": "dsp",
+}  # fmt: skip
 
 
 def document(reads: Sequence[Measurements]) -> dict[str, Any]:
@@ -114,17 +120,41 @@ def _as_toml(path: Path, read: Measurements, measurement: Measurement) -> Any:
     return table
 
 
-def rows_text(path: Path, read: Measurements, measurement: Measurement, row: NamedRow) -> str:
-    """Return the text of the table `path` with one row more, its median or else its mean; the table may be new.
+def with_row(
+    path: Path, read: Measurements, measurement: Measurement, network: str | None, asked: Mapping[str, str | None]
+) -> tuple[str, list[str]]:
+    """Return the text of the table `path` with one row more, and lines that say what the row has and where it is from.
 
-    Raises BadInputError for a table with other columns.
+    The row has the measurement's median, or else its mean. The table may be new. `asked`: the columns of OPTION_OF;
+    None means what the file says, or else what the fit assumes. Raises BadInputError for a time that is not of a whole
+    run, and for a table with other columns.
     """
+    if measurement.kind == "layer":
+        runs = [repr(each.name) for each in read.measurements if each.kind == "run"]
+        remedy = f"--name is one of {', '.join(runs)}" if runs else f"{read.path.name} has no run"
+        raise BadInputError("--name", f"{measurement.name!r}, {measurement.what}", "the time of a whole run", remedy)
+    told = {"unit": _unit_told(read, measurement)}
+    row = fit_row(path, network, **{column: word or told.get(column) for column, word in asked.items()})
     before = read_text(path, "a table of rows for the fit") if path.exists() else ",".join(FIT_COLUMNS) + "\n"
     header = next(csv.reader(before.splitlines()[:1]))
     if tuple(header) != FIT_COLUMNS:
         raise BadInputError(path, f"the columns {', '.join(header)}", ", ".join(FIT_COLUMNS))
     text = io.StringIO()
-    ms = measurement.mean_ms if measurement.p50_ms is None else measurement.p50_ms
+    ms = float(f"{measurement.mean_ms if measurement.p50_ms is None else measurement.p50_ms:.6g}")
     source = f"{read.path.name}: {measurement.name}"
     csv.writer(text, lineterminator="\n").writerow([row.network, ms, *row[1:], source])
-    return before.rstrip("\n") + "\n" + text.getvalue()
+    words = row._asdict()
+    lines = [f"row: {row.network}, {ms:g} ms, " + ", ".join(f"{column} {words[column]}" for column in OPTION_OF)]
+    silent = [column for column, word in asked.items() if not word]
+    lines += [f"{read.path.name} says: {column} {words[column]}" for column in silent if told.get(column)]
+    assumed = [f"{column} ({OPTION_OF[column]})" for column in silent if not told.get(column)]
+    lines += [f"assumed, as {read.path.name} does not say it: {', '.join(assumed)}"] if assumed else []
+    return before.rstrip("\n") + "\n" + text.getvalue(), lines
+
+
+def _unit_told(read: Measurements, measurement: Measurement) -> str | None:
+    """Return the unit that did a run, as its file says of it or of each layer; None where that is not one unit."""
+    layers = [each.hardware for each in read.measurements if each.kind == "layer"]
+    named = [measurement.hardware] if measurement.hardware else layers
+    units = [{unit for word, unit in UNIT_OF_WORD.items() if word in each.upper()} for each in named]
+    return units[0].pop() if units and len(units[0]) == 1 and all(each == units[0] for each in units) else None

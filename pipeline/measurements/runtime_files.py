@@ -65,6 +65,7 @@ GRAPH: Final = re.compile(r"(?:--graph=|Graph: \[)([^\s\]\\]+)")
 LITERT: Final = re.compile(
     r"Inference \((avg|min|max|std|median|p5|p95)\):\s+(\S+)\s*(us|ms|s)?(?:\s*\((\d+) runs?\))?"
 )
+APPLIED: Final = re.compile(r"applied (\w+) delegate.*completely executed")
 OF_START: Final = "Benchmark Initialization"
 OPERATORS: Final = "Run Order"
 
@@ -87,6 +88,7 @@ class _Benchmark:
         self.found = Found("TFLite benchmark_model log", says)
         self._graph, self._starting, self._in_order, self._columns = "benchmark", False, False, list[str]()
         self._announced = 0
+        self._lines: list[str] = []  # of this benchmark
         self._figures: tuple[str, dict[str, str]] | None = None
         self._litert: dict[str, tuple[str, str, str | None, str | None]] = {}
         for number, line in enumerate(text.splitlines(), 1):
@@ -99,8 +101,9 @@ class _Benchmark:
         if graph:
             self._flush_litert()
             self._flush("")
-            self._announced = 0
+            self._announced, self._lines = 0, []
             self._graph = PurePosixPath(graph[1].replace("\\", "/")).name or self._graph
+        self._lines.append(line)
         if "Running benchmark for at least" in line:
             self._announced += 1
         if "Profiling Info for" in line:
@@ -165,7 +168,8 @@ class _Benchmark:
         row = f"{place}: {self._graph}"
         time = self.found.ms(row, average, "us", "run", "Inference (avg)")
         if time is not None:
-            self.found.add(Measurement(self._graph, "run", "us", "runs, the mean alone", mean_ms=time))
+            what, hardware = "runs, the mean alone", _ran_by(self._lines)
+            self.found.add(Measurement(self._graph, "run", "us", what, mean_ms=time, hardware=hardware))
 
     def _flush_litert(self) -> None:
         """Take the block of figures that newer versions print, each with its unit."""
@@ -220,7 +224,7 @@ class _Benchmark:
         self.found.add(
             Measurement(
                 name, "run", unit, "runs after the warm-up, figures alone", (), runs, figures.mean, figures.sd,
-                figures.low, figures.p50, figures.p95, figures.high,
+                figures.low, figures.p50, figures.p95, figures.high, hardware=_ran_by(self._lines),
             )
         )  # fmt: skip
 
@@ -239,6 +243,18 @@ class _Benchmark:
                 self.found.add(
                     Measurement(name, "layer", "ms", "an operator, the mean of a call", mean_ms=time, more=more)
                 )
+
+
+def _ran_by(lines: Sequence[str]) -> str:
+    """Return the delegate that ran the whole graph, as the lines of a log say; "" where that is not clear.
+
+    XNNPACK takes what other delegates leave. Where it is the only one that the log names, all ran on the CPU.
+    """
+    named = [line for line in lines if "delegate" in line.lower() and "\t" not in line]  # tables have tabs
+    applied = [said[1] for line in named if (said := APPLIED.search(line))]
+    if applied:
+        return applied[-1]
+    return "XNNPACK" if named and all("xnnpack" in line.lower() for line in named) else ""
 
 
 def _number(text: str) -> object:

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import onnx
 import pytest
 
 from trilane.errors import BadInputError
@@ -151,3 +152,73 @@ def test_control_characters_of_a_name_are_written_out(folder: Path, command: Com
     (folder / "log.txt").write_text(LOG.replace("net.tflite", "n\x1b[31m.tflite"))
     out, _ = command("times", "log.txt")
     assert "\x1b" not in out
+
+
+LAYERED = {
+    "execution_summary": {"all_inference_times": [1535.49999, 1535.49999]},
+    "execution_detail": [{"name": name, "execution_time": 702, "compute_unit": "NPU"} for name in ("conv1", "conv2")],
+}
+CPU_LOG = "INFO: Created TensorFlow Lite XNNPACK delegate for CPU.\n"
+GPU_LOG = "INFO: Explicitly applied GPU delegate, and the model graph will be completely executed by the delegate.\n"
+QNN_LOG = "INFO: TfLiteQnnDelegate delegate: 30 nodes delegated out of 31 nodes\n"
+
+
+@pytest.fixture
+def table(folder: Path, tiny_float: onnx.ModelProto) -> Path:
+    onnx.save(tiny_float, folder / "net.onnx")
+    (folder / "hub.json").write_text(json.dumps(LAYERED))
+    return folder / "rows.csv"
+
+
+def test_a_layer_is_no_row_of_a_network(table: Path, command: Command) -> None:
+    _, err = command("times", "hub.json", "--name", "conv1", "--rows", "rows.csv", "--network", "net.onnx", code=2)
+    assert "--name: found 'conv1', a layer, the mean, expected the time of a whole run" in err
+    assert "--name is one of 'all_inference_times'" in err
+    assert not table.exists()
+
+
+def test_cycles_are_no_row_of_a_network(folder: Path, table: Path, command: Command) -> None:
+    columns = "Msg Timestamp,Message,Time,Unit of Measurement,Timing Source,Event Level,Event Identifier\n"
+    rows = "1,ROOT,7784,US,BACKEND,ROOT,RPC (execute) time\n1,NODE,500,CYCLES,BACKEND,SUB-EVENT,conv (cycles)\n"
+    (folder / "qnn.csv").write_text(columns + rows)
+    (layer,) = (
+        each["name"]
+        for each in json.loads(command("times", "qnn.csv", "--json")[0])["measurements"]
+        if each["unit"] == "cycles"
+    )
+    _, err = command("times", "qnn.csv", "--name", layer, "--rows", "rows.csv", "--network", "net.onnx", code=2)
+    assert "only cycles" in err
+    assert not table.exists()
+
+
+def test_the_row_that_is_written_is_printed(table: Path, command: Command) -> None:
+    """Its time with six digits; AI Hub says where each layer ran."""
+    out, _ = command("times", "hub.json", "--rows", "rows.csv", "--network", "net.onnx", "--precision", "fp16")
+    assert table.read_text().splitlines()[1] == "net.onnx,1.5355,dsp,fp16,tflite,hub.json: all_inference_times"
+    assert out.splitlines()[-4:] == [
+        "written: rows.csv",
+        "row: net.onnx, 1.5355 ms, unit dsp, precision fp16, runtime tflite",
+        "hub.json says: unit dsp",
+        "assumed, as hub.json does not say it: runtime (--runtime)",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("said", "options", "unit", "line"),
+    [
+        (CPU_LOG, (), "cpu", "log.txt says: unit cpu"),
+        (GPU_LOG + CPU_LOG, (), "gpu", "log.txt says: unit gpu"),
+        (QNN_LOG + CPU_LOG, (), "dsp", "unit (--hardware), precision (--precision), runtime (--runtime)"),
+        ("", (), "dsp", "unit (--hardware), precision (--precision), runtime (--runtime)"),
+        (CPU_LOG, ("--hardware", "gpu"), "gpu", "does not say it: precision (--precision), runtime (--runtime)"),
+    ],
+)
+def test_the_unit_is_what_the_log_says(
+    said: str, options: tuple[str, ...], unit: str, line: str, folder: Path, table: Path, command: Command
+) -> None:
+    (folder / "log.txt").write_text(f"--graph=net.tflite\n{said}{LOG.splitlines()[1]}\n")
+    out, _ = command("times", "log.txt", "--rows", "rows.csv", "--network", "net.onnx", *options)
+    assert table.read_text().splitlines()[1] == f"net.onnx,5.0,{unit},int8,tflite,log.txt: net.tflite"
+    assert line in out
+    _, err = command("times", "log.txt", "--rows", "rows.csv", "--network", "net.onnx", *options, "--json")
+    assert line in err
