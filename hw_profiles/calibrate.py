@@ -118,12 +118,12 @@ class Calibrated:
 
 
 def is_own_table(path: Path) -> bool:
-    """Say whether a table has rows of networks in files, not of the reference networks. A missing file has none."""
+    """Say whether a table is one of networks in files. One of reference networks has encoders; no file is of those."""
     if not path.is_file():
         return False
     lines = [line for line in read_text(path, "a table of measured rows").splitlines() if not line.startswith("#")]
     header = [cell.strip() for cell in next(csv.reader(lines[:1]), [])]
-    return {"network", "ms"} <= set(header) and "encoder" not in header
+    return "encoder" not in header
 
 
 def read_own_rows(path: Path, folder: Path) -> list[OwnRow]:
@@ -135,7 +135,12 @@ def read_own_rows(path: Path, folder: Path) -> list[OwnRow]:
     numbered = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
     if not LEAST_ROWS <= len(numbered) - 1 <= MOST_ROWS:
         raise BadInputError(path, f"{max(len(numbered) - 1, 0)} rows", f"{LEAST_ROWS} to {MOST_ROWS}")
-    header = [cell.strip() for cell in next(csv.reader([numbered[0][1]]))]
+    first, line = numbered[0]
+    header = [cell.strip() for cell in next(csv.reader([line]))]
+    if not {"network", "ms"} <= set(header):
+        expected = f"network and ms, and maybe {', '.join(column for column, *_ in WORDS)}"
+        remedy = "separate cells by commas" if ";" in line or "\t" in line else "name the columns so in the first line"
+        raise BadInputError(f"{path}: line {first}", f"the columns {line.strip()!r}", expected, remedy)
     rows = []
     for number, line in numbered[1:]:
         place, cells = f"{path}: line {number}", next(csv.reader([line]), [])

@@ -273,6 +273,11 @@ TABLE = "network,ms,precision,runtime\n"
         (TABLE + "../a,1,int8,tflite\n" * 2, "line 2: network: found '../a'"),
         (TABLE + "/a,1,int8,tflite\n" * 2, "line 2: network: found '/a'"),
         (TABLE + "a,1,int8,tflite\n" * 2, "a.onnx: found no such file"),
+        (
+            "# own\nmodel,time\n" + "a,1\n" * 2,
+            "line 2: found the columns 'model,time', expected network and ms, and maybe",
+        ),
+        ("network;ms\n" + "a;1\n" * 2, "separate cells by commas"),
     ],
 )
 def test_wrong_tables_are_refused(text: str, found: str, tmp_path: Path) -> None:
@@ -281,6 +286,13 @@ def test_wrong_tables_are_refused(text: str, found: str, tmp_path: Path) -> None
     with pytest.raises(BadInputError) as caught:
         read_own_rows(path, tmp_path)
     assert found in str(caught.value)
+
+
+@pytest.mark.parametrize("header", ["model,time", "network;ms", "ms"])
+def test_the_command_names_the_columns_of_this_format(header: str, tmp_path: Path, command: Command) -> None:
+    (tmp_path / "own.csv").write_text(header + "\n1\n2\n")
+    _, err = command("profiles", "fit", "--from", str(tmp_path / "own.csv"), code=2)
+    assert "network and ms, and maybe unit, precision, runtime" in err and "encoder" not in err
 
 
 def test_a_row_that_the_profile_cannot_predict_names_its_line() -> None:
