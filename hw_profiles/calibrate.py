@@ -34,6 +34,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from statistics import median
 from typing import Any, Final, NamedTuple, get_args
 
 import numpy as np
@@ -68,6 +69,8 @@ NOISE, NU = 0.12, 3.0
 #: How many rows what the profile states of its error counts as.
 STATED_ROWS = 1
 STEPS, ENOUGH = 50, 1e-6
+#: How many times as long as the others' scale says a time is worth a word, and may be one of another unit.
+FAR_OFF, A_UNIT = 10.0, 100.0
 LEAST_ROWS, MOST_ROWS = 2, 1000
 LONGEST_MS = 3.6e6
 RATE_OF_TERM = np.array([RATES.index(TERMS[name]) for name in NAMES])
@@ -79,7 +82,10 @@ MOST_EFFICIENCY: Final = 4.0
 
 
 class OwnRow(NamedTuple):
-    """One own measurement. `place`: file and line. `network`: path as the table has it. `ms`: time of a job."""
+    """One own measurement. `place`: file and line. `network`: path as the table has it. `ms`: time of a job.
+
+    `silent`: the table says no precision, and the network's file is of floats.
+    """
 
     place: str
     network: str
@@ -88,6 +94,7 @@ class OwnRow(NamedTuple):
     unit: UnitName
     precision: str
     runtime: EngineRuntime
+    silent: bool = False
 
 
 class Checked(NamedTuple):
@@ -115,6 +122,28 @@ class Calibrated:
     data: Mapping[str, Any]
     numbers: Mapping[str, tuple[float, float]]
     rows: tuple[Checked, ...]
+
+    @property
+    def notes(self) -> list[str]:
+        """What a person should know of the rows: which precision was taken, and which times are far from the others.
+
+        Far is by over FAR_OFF from the median, over all rows, of measured over predicted time before the fit.
+        """
+        silent = sum(each.row.silent for each in self.rows)
+        notes = []
+        if silent:
+            counted = "1 row without a precision is" if silent == 1 else f"{silent} rows without a precision are"
+            notes = [f"{counted} counted as int8, though the network's file is of floats"]
+        scales = [math.log(each.row.ms / each.before_ms) for each in self.rows]
+        usual = median(scales)
+        for each, scale in zip(self.rows, scales, strict=True):
+            times = math.exp(abs(scale - usual))
+            if times > FAR_OFF:
+                unit = "us" if scale > usual else "s"
+                guess = f"in {unit}" if times >= A_UNIT else "of this network and unit"
+                how = f"{times:.0f} times" if scale > usual else f"1/{times:.0f} of"
+                notes.append(f"{each.row.place}: {each.row.ms:g} ms is {how} what the rows suggest; is it {guess}?")
+        return notes
 
 
 def is_own_table(path: Path) -> bool:
@@ -159,7 +188,8 @@ def _own_row(place: str, cells: Mapping[str, str], folder: Path) -> OwnRow:
         raise BadInputError(f"{place}: ms", repr(cells["ms"]), "a time in ms above 0, at most an hour")
     unit, precision, runtime = (_word(place, cells, *each) for each in WORDS)
     graph = read_graph(network_file(place, cells["network"], folder))
-    return OwnRow(place, cells["network"], graph.work, ms, unit, PRECISIONS[precision], runtime)  # type: ignore[arg-type]
+    silent = graph.numbers == "float" and not cells.get("precision")
+    return OwnRow(place, cells["network"], graph.work, ms, unit, PRECISIONS[precision], runtime, silent)  # type: ignore[arg-type]
 
 
 #: Columns that may be left out: what they may say, and what is meant without them.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 from collections.abc import Iterable
 from pathlib import Path
 from statistics import median
@@ -111,7 +112,7 @@ def check(
     table = Table("profile", "network", "runtime", "published, ms", "predicted, ms", "error", "")
     for row in latencies:
         note = "" if row.independent else "among the rows of the fit"
-        figures = (f"{row.published_ms:g}", f"{row.predicted_ms:.2f}", f"{100 * row.error:+.0f} %")
+        figures = (f"{row.published_ms:g}", f"{row.predicted_ms:.2f}", f"{100 * row.error:+z.0f} %")
         table.add_row(row.profile, row.network, row.runtime, *figures, note)
     console.print(table)
 
@@ -127,7 +128,7 @@ def fit(
         str | None, typer.Option(help="Profile whose numbers are the priors; if not given, one of the 888.")
     ] = None,
     name: Annotated[
-        str | None, typer.Option(help="Name of the fitted profile; if not given, calibrated or snapdragon-888.")
+        str | None, typer.Option(help="Name of the fitted profile; if not given, that of the file, or snapdragon-888.")
     ] = None,
     write: Annotated[Path | None, typer.Option(help="Write the fitted profile here.")] = None,
     networks: Annotated[Path | None, typer.Option(help="Folder of the networks; if none, the CSV's folder.")] = None,
@@ -141,7 +142,8 @@ def fit(
     from trilane.hw_profiles.fit import as_toml, fit_profile
 
     own = is_own_table(source)
-    usual = ("snapdragon-888", "calibrated") if own else ("snapdragon-888-facts", "snapdragon-888")
+    stem = "calibrated" if write is None else re.sub(r"[^\w.-]", "-", write.stem)[:64]
+    usual = ("snapdragon-888", stem) if own else ("snapdragon-888-facts", "snapdragon-888")
     base, named = (other if asked is None else asked for asked, other in zip((profile, name), usual, strict=True))
     if not re.fullmatch(r"[\w.-]{1,64}", named):
         raise BadInputError("--name", repr(named), "letters, digits, dots, hyphens and underscores")
@@ -153,10 +155,29 @@ def fit(
         print_json(_document(result))
     else:
         _show(result)
-    if write is not None:
-        head = {"extends": _beside(base, write), "name": named, "title": _title(result, own)}
-        count = _counted(result)
-        write_bytes(write, as_toml(result.numbers, head, f"trilane profiles fit --from {source}", count).encode())
+    if write is None:
+        return
+    head = {"extends": _beside(base, write), "name": named, "title": _title(result, named)}
+    count = _counted(result)
+    write_bytes(write, as_toml(result.numbers, head, f"trilane profiles fit --from {source}", count).encode())
+    if not json:
+        for line in (f"written: {write}", *_next_command(result, write, networks or source.parent)):
+            stdout_console().print(without_controls(line), markup=False, soft_wrap=True)
+
+
+def _next_command(result: ProfileFit | Calibrated, profile: Path, networks: Path) -> list[str]:
+    """Return the command that predicts the first row's network as the row was counted; none for other tables."""
+    from trilane.hw_profiles.calibrate import network_file
+    from trilane.hw_profiles.fit import ProfileFit
+
+    if isinstance(result, ProfileFit):
+        return []
+    row = result.rows[0].row
+    words = ["--network", str(network_file(row.place, row.network, networks)), "--profile", str(profile)]
+    words += ["--precision", {"int8": "w8a8", "fp16": "float"}.get(row.precision, row.precision)]
+    words += [] if row.runtime == "tflite" else ["--runtime", row.runtime]
+    words += [] if row.unit == "dsp" else ["--unit", row.unit]
+    return [f"predict: trilane predict {shlex.join(words)}"]
 
 
 def _beside(base: str, write: Path) -> str:
@@ -164,9 +185,12 @@ def _beside(base: str, write: Path) -> str:
     return os.path.relpath(base, write.absolute().parent) if base.endswith(".toml") else base
 
 
-def _title(result: ProfileFit | Calibrated, own: bool) -> str:
+def _title(result: ProfileFit | Calibrated, named: str) -> str:
+    from trilane.hw_profiles.fit import ProfileFit
+
     title: str = result.data["title"]
-    return f"{title}, moved to own measurements" if own else title.removesuffix(", before the fit")
+    fitted = isinstance(result, ProfileFit)
+    return title.removesuffix(", before the fit") if fitted else f"{named}: own measurements, from {title}"
 
 
 def _counted(result: ProfileFit | Calibrated) -> str:
@@ -223,6 +247,7 @@ def _calibrated_document(result: Calibrated) -> dict[str, Any]:
         "measurements": len(result.rows),
         "median_error_before": _median_error(each.error_before for each in result.rows),
         "median_error_left_out": _median_error(each.error_after for each in result.rows),
+        "notes": result.notes,
         "numbers": {key: {"value": v, "spread": s} for key, (v, s) in result.numbers.items()},
         "rows": [
             {
@@ -257,6 +282,8 @@ def _show_calibrated(result: Calibrated) -> None:
     console.print(table)
     before, after = (_median_error(getattr(row, key) for row in result.rows) for key in ("error_before", "error_after"))
     console.print(f"median error: {100 * before:.0f} % before, {100 * after:.0f} % on rows left out")
+    for text in result.notes:
+        console.print(without_controls(f"note: {text}"), markup=False, soft_wrap=True)
     numbers = Table("number", "value", "± %")
     for key, (value, spread) in result.numbers.items():
         numbers.add_row(key, f"{value:.4g}", f"{100 * spread:.0f}")
@@ -272,7 +299,7 @@ def _cells(each: Checked) -> tuple[str, ...]:
             (each.before_ms, each.before, each.error_before),
             (each.after_ms, each.after, each.error_after),
         )
-        for cell in (f"{ms:.3g} ({around.low_ms:.3g}-{around.high_ms:.3g})", f"{100 * error:+.0f} %")
+        for cell in (f"{ms:.3g} ({around.low_ms:.3g}-{around.high_ms:.3g})", f"{100 * error:+z.0f} %")
     )
     return (escape(without_controls(each.row.network)), each.row.unit, f"{each.row.ms:.4g}", *predictions)
 
@@ -309,7 +336,7 @@ def _show_fit(result: ProfileFit) -> None:
     for r in result.residuals:
         s = r.row.spec
         network = f"{s.encoder} {s.norm} {s.height} {s.channels} {s.layout}"
-        errors = (f"{100 * r.error:+.1f} %", f"{100 * r.left_out_error:+.1f} %")
+        errors = (f"{100 * r.error:+z.1f} %", f"{100 * r.left_out_error:+z.1f} %")
         table.add_row(network, r.column, f"{r.measured_ms:.1f}", f"{r.fitted_ms:.1f}", *errors)
     console.print(table)
     medians = Table("median of absolute errors", "fitted", "left out")

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import copy
 import json
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 
+from trilane.apps.cli.profiles import _cells
 from trilane.errors import BadInputError
 from trilane.hw_profiles import calibrate as module
 from trilane.hw_profiles.calibrate import (
     CHIP,
     NOISE,
     NU,
+    Calibrated,
     Checked,
     OwnRow,
     _derivatives,
@@ -293,6 +297,69 @@ def test_the_command_names_the_columns_of_this_format(header: str, tmp_path: Pat
     (tmp_path / "own.csv").write_text(header + "\n1\n2\n")
     _, err = command("profiles", "fit", "--from", str(tmp_path / "own.csv"), code=2)
     assert "network and ms, and maybe unit, precision, runtime" in err and "encoder" not in err
+
+
+def checked(place: str, ms: float, before_ms: float, silent: bool = False) -> Checked:
+    asked = row("resnet18", ms)._replace(place=place, silent=silent)
+    return Checked(asked, before_ms, around(1, 1), 1.0, around(1, 1))
+
+
+@pytest.mark.parametrize(
+    ("ms", "said"),
+    [
+        (9.9, None),
+        (0.11, None),
+        (70.0, "line 5: 70 ms is 70 times what the rows suggest; is it of this network and unit?"),
+        (700.0, "line 5: 700 ms is 700 times what the rows suggest; is it in us?"),
+        (0.001, "line 5: 0.001 ms is 1/1000 of what the rows suggest; is it in s?"),
+    ],
+)
+def test_a_row_of_another_scale_is_named(ms: float, said: str | None) -> None:
+    """The others take as long as predicted, so the median of the four ratios is 1."""
+    rows = (checked("line 2", 2.0, 2.0), checked("line 3", 4.0, 4.0), checked("line 4", 1.0, 1.0))
+    assert Calibrated({}, {}, (*rows, checked("line 5", ms, 1.0))).notes == ([] if said is None else [said])
+
+
+def test_rows_without_a_precision_are_named_where_the_network_is_of_floats(
+    tiny_float: onnx.ModelProto, tmp_path: Path
+) -> None:
+    onnx.save(tiny_float, tmp_path / "a.onnx")
+    (tmp_path / "own.csv").write_text("network,ms,precision\na,1,\na,1,int8\na,1,\n")
+    rows = read_own_rows(tmp_path / "own.csv", tmp_path)
+    assert [(each.precision, each.silent) for each in rows] == [("int8", True), ("int8", False), ("int8", True)]
+    told = "counted as int8, though the network's file is of floats"
+    for silent, said in (
+        (rows, f"2 rows without a precision are {told}"),
+        (rows[:2], f"1 row without a precision is {told}"),
+    ):
+        notes = Calibrated({}, {}, tuple(Checked(each, 1, around(1, 1), 1, around(1, 1)) for each in silent)).notes
+        assert notes == [said]
+
+
+def test_the_printed_command_predicts_as_the_rows_were_counted(
+    tiny_float: onnx.ModelProto, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A rehearsal: the command that the fit prints gives the moved profile's time of the first row in int8."""
+    monkeypatch.chdir(tmp_path)
+    onnx.save(tiny_float, tmp_path / "a.onnx")
+    (tmp_path / "own.csv").write_text("network,ms\na,0.0754\na,0.0754\n")
+    out, _ = command("profiles", "fit", "--from", "own.csv", "--profile", CHIP_NAME, "--write", "my chip.toml")
+    assert "note: 2 rows without a precision are counted as int8" in out
+    assert "-0 %" not in out
+    *_, written, predict = out.splitlines()
+    assert written == "written: my chip.toml"
+    assert predict == "predict: trilane predict --network a.onnx --profile 'my chip.toml' --precision w8a8"
+    mine = load_profile("my chip.toml")
+    assert (mine.name, mine.title.split(",")[0]) == ("my-chip", "my-chip: own measurements")
+    (answer,) = json.loads(command(*shlex.split(predict)[2:], "--json")[0])["networks"]
+    asked = read_own_rows(tmp_path / "own.csv", tmp_path)[0]
+    assert answer["precision"] == "int8"
+    assert answer["network_ms"] == pytest.approx(priced(mine, asked))
+    assert answer["network_ms"] == pytest.approx(0.0754, rel=0.2)
+
+
+def test_no_error_is_minus_nothing() -> None:
+    assert _cells(checked("line 2", 1.0, 0.999))[4] == "+0 %"
 
 
 def test_a_row_that_the_profile_cannot_predict_names_its_line() -> None:
