@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from trilane.apps.cli.commands import Commands, JsonOption
-from trilane.apps.cli.console import print_json, print_kept, stderr_console
+from trilane.apps.cli.console import print_json, print_kept, stderr_console, without_controls
 from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -163,7 +163,8 @@ def _say(judged: Sequence[Judged]) -> None:
     """Say what each limit came to."""
     several = len({each.name for each in judged}) > 1
     for each in judged:
-        stderr_console().print(f"{each.name}: {each.said}" if several else each.said, soft_wrap=True, markup=False)
+        said = without_controls(f"{each.name}: {each.said}" if several else each.said)
+        stderr_console().print(said, soft_wrap=True, markup=False)
 
 
 def _leave(judged: Sequence[Judged]) -> None:

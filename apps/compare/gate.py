@@ -240,11 +240,16 @@ def _weighed(gate: Gate, pair: Pair) -> Iterator[Weighed]:
 
 
 def _is_said(figure: Figure, row: Difference, work: Difference | None, metric: Metric) -> bool:
-    """Return whether the stage's `work` says the same: service time always, CPU time where one thread did the job."""
+    """Return whether the stage's `work` says the same: service time that grew as much, CPU time that is as long.
+
+    The typical job says nothing of few that take much longer; then the mean is weighed too.
+    """
     if work is None or (WORK, "typical") not in metric.of:
         return False
+    if figure.measure == SERVICE:
+        return row.other * work.base <= (1 + SAME_TIME) * row.base * work.other
     alike = all(abs(mine - its) <= SAME_TIME * its for mine, its in ((row.base, work.base), (row.other, work.other)))
-    return figure.measure == SERVICE or (figure.measure == CPU and alike)
+    return figure.measure == CPU and alike
 
 
 def _chance_of(least: float, row: Difference) -> float:
@@ -293,6 +298,8 @@ def _judged(gate: Gate, pair: Pair, figures: tuple[Weighed, ...]) -> Judged:
     if not figures:
         reason = ABSENT.get(gate.metric.of[0][0], "the two sides share no such figure")
         return Judged(gate, pair.name, Outcome.UNKNOWN, reason, figures)
+    if gate.metric.of[0][0] != CHECKED and (missing := _missing(pair)):
+        return Judged(gate, pair.name, Outcome.UNKNOWN, f"not on both sides: {', '.join(missing)}", figures)
     unsure = [*spoilt(_runs(pair))]
     decisive = _decisive(gate, pair, figures)
     unknown = [each for each in decisive if each.outcome is Outcome.UNKNOWN]
@@ -304,6 +311,12 @@ def _judged(gate: Gate, pair: Pair, figures: tuple[Weighed, ...]) -> Judged:
     runs = None if None in counts else max(count for count in counts if count is not None)
     reason = f"{_list(unknown)}; {_remedy(unknown, runs, unsure)}"
     return Judged(gate, pair.name, Outcome.UNKNOWN, reason, figures, runs)
+
+
+def _missing(pair: Pair) -> list[str]:
+    """Return the stages that some run lacks: nobody knows what became of them."""
+    stages = [{*run.document.get("stages", {})} for run in _runs(pair)]
+    return sorted(set().union(*stages) - set[str]().union(*stages[:1]).intersection(*stages))
 
 
 def _runs(pair: Pair) -> tuple[ComparedRun, ...]:

@@ -42,7 +42,7 @@ MEASURES: Final = {
     LATENCY: ("mean", "p50", "p90", "p99"),
     INSTRUCTIONS: ("mean",),
     INSTRUCTION_TIME: ("typical",),
-    CPU: ("typical",),
+    CPU: ("mean", "typical"),
     WORK: ("typical", "p90", "p99"),
     SERVICE: ("mean", "typical"),
     WAIT: ("mean", "p90"),

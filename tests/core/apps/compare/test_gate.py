@@ -12,9 +12,11 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from itertools import count
 from math import inf, log, sqrt
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import pytest
@@ -29,7 +31,9 @@ from trilane.apps.compare.rows import FRAME_TIME, MS, Figure
 from trilane.apps.compare.run_frames import frames_of
 from trilane.apps.compare.sides import ComparedRun, RunKind, Side
 from trilane.errors import BadInputError
-from trilane.pipeline.journal import Worked
+from trilane.pipeline.journal import Worked, journal_of
+from trilane.scheduler.events import Settings, chain
+from trilane.scheduler.virtual import simulate
 from trilane.student import student_quantile
 
 Command = Callable[..., tuple[str, str]]
@@ -393,3 +397,41 @@ def test_runs_that_lost_nothing_keep_a_limit_of_losses() -> None:
     frames = run(2).document["frames"]
     losing = {**frames, "presented": frames["presented"] - 30, "dropped": {"raster->infer": 30}}
     assert outcome(run(1), run(2, frames=losing), "lost=1%") is Outcome.BROKEN
+
+
+def at_times(seed: int, slow: str = "") -> ComparedRun:
+    """A run of 400 frames whose jobs scatter by 5 %. A fifth of the jobs of `slow` takes six times as long."""
+    draw = Random(seed)
+
+    def service(stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
+        longer = 6.0 if stage == slow and frame % 5 == 0 else 1.0
+        return round(longer * STAGES[stage][1] * 1e6 * draw.lognormvariate(0, 0.05))
+
+    graph = chain([(stage, unit) for stage, (unit, _) in STAGES.items()], "double", "composite")
+    done = simulate(graph, Settings(400), service, keep=True)
+    assert done.recording is not None
+    records = [*journal_of(done.recording, done.jobs, {"clock": "host"}, done.report)]
+    facts = {"clock": "host", "other_programs": QUIET, "baseline": None}
+    return ComparedRun(f"run {seed}", RunKind.RUN, make_report(**{**done.report, **facts}), frames_of(records))
+
+
+def of_four(name: str, first_seed: int, slow: str = "") -> Side:
+    return Side(name, tuple(at_times(seed, slow) for seed in range(first_seed, first_seed + 4)))
+
+
+@pytest.mark.parametrize("stage", ["pose", "present"])
+def test_few_jobs_that_take_much_longer_are_not_passed_though_the_typical_job_is_as_before(stage: str) -> None:
+    """The mean doubles while the middle half does not change, and neither stage bounds the frame time."""
+    for other, expected in ((of_four("slow", 9, stage), Outcome.BROKEN), (of_four("same", 20), Outcome.KEPT)):
+        found = compare(of_four("base", 0), [other])[0]
+        pairs = [Pair(other.name, found.base, found.other, found.rows, found.changes)]
+        judged = judge([read_gate("slower=12%")], pairs)[0]
+        assert judged.outcome is expected
+        assert (f"service of {stage}" in judged.said) == (expected is Outcome.BROKEN)
+
+
+def test_a_stage_that_one_side_lacks_is_not_passed() -> None:
+    other = run(2)
+    stages = {name: row for name, row in other.document["stages"].items() if name != "infer"}
+    less = replace(other, document={**other.document, "stages": stages})
+    assert reason(run(1), less, "slower=100%") == "slower=100%: cannot tell: not on both sides: infer"
