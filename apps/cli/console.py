@@ -28,38 +28,43 @@ _WRITTEN_OUT = {code: repr(chr(code))[1:-1] for code in (*range(0x20), *range(0x
 
 
 class _Kept:
-    """A stream whose terminal may close; later writes are then lost without an error."""
+    """A stream whose terminal may close; later writes are then lost without an error.
 
-    def __init__(self, stream: IO[str]) -> None:
-        self._stream = stream
+    `lost`: numbers of the errors after which that is so.
+    """
+
+    def __init__(self, stream: IO[str], *lost: int) -> None:
+        self._stream, self._lost = stream, (errno.EIO, *lost)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        with _hung_up():
+        with self._hung_up():
             self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
-        with _hung_up():
+        with self._hung_up():
             self._stream.flush()
 
-
-@contextmanager
-def _hung_up() -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        if error.errno != errno.EIO:
-            raise
+    @contextmanager
+    def _hung_up(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            if error.errno not in self._lost:
+                raise
 
 
 def stderr_console() -> Console:
-    """Return the console for messages and progress. Rich obeys NO_COLOR and plain pipes by itself."""
+    """Return the console for messages and progress. A reader of them that leaves early changes no exit code.
+
+    Rich obeys NO_COLOR and plain pipes by itself.
+    """
     from rich.console import Console
 
-    return Console(stderr=True, file=cast("IO[str]", _Kept(sys.stderr)), highlight=False)
+    return Console(stderr=True, file=cast("IO[str]", _Kept(sys.stderr, errno.EPIPE)), highlight=False)
 
 
 def stdout_console() -> Console:
@@ -129,7 +134,8 @@ def print_kept(parts: Iterable[Any]) -> None:
     console = stdout_console()
     with console.capture() as written:
         for part in parts:
-            console.print(part, soft_wrap=isinstance(part, str), markup=False)
+            is_text = isinstance(part, str)
+            console.print(without_controls(part) if is_text else part, soft_wrap=is_text, markup=False)
     with suppress(BrokenPipeError):
         sys.stdout.write(written.get())
         sys.stdout.flush()

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import os
 import re
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from trilane.apps.cli.console import stderr_console
 from trilane.apps.compare.gate import Judged, Outcome, whole
 from trilane.errors import BadInputError
 from trilane.writing import WRITABLE
@@ -31,7 +31,7 @@ def write_to_github(judged: Sequence[Judged], verdict: str) -> None:
     Raises BadInputError for a file that cannot be written.
     """
     for each in judged:
-        sys.stderr.write(annotation(each) + "\n")
+        stderr_console().file.write(annotation(each) + "\n")
     if not (name := os.environ.get(SUMMARY)):
         return
     try:
