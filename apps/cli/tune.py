@@ -157,6 +157,7 @@ def _goals(words: Sequence[str]) -> tuple[tuple[str, ...], list[str]]:
 def _space(words: Sequence[str], axes: Sequence[str], chip: str | None) -> tuple[str, Definition, Space]:
     """Return the name, the definition and the configurations of what is tuned. Raises BadInputError."""
     from trilane.apps.sweep.tuner import Space
+    from trilane.hw_profiles.profile_files import load_runnable
 
     words = words or ["run" if chip is None else "predict"]
     is_file = words[0].endswith(ENDING)
@@ -165,6 +166,7 @@ def _space(words: Sequence[str], axes: Sequence[str], chip: str | None) -> tuple
         if definition.command != ("predict",) or "profile" in definition.axes:
             found = "an axis profile" if "profile" in definition.axes else f"the command {' '.join(definition.command)}"
             raise BadInputError("--on", found, "predict without it", "a chip is predicted, not run")
+        load_runnable(chip)  # refuses an unknown chip before a trial does
         definition = replace(definition, options={**definition.options, "profile": command.converted("profile", chip)})
     added: dict[str, list[str]] = {}
     for each in axes:
@@ -261,6 +263,8 @@ def _called(words: list[str]) -> tuple[int, str, str]:
         except Exception as error:
             said, code = describe(error)
             messages.write(f"error: {said}\n")
+    if code == INTERRUPTED:  # the command made an exit code of it, but the search shall end too
+        raise KeyboardInterrupt
     return code or 0, out.getvalue(), messages.getvalue()
 
 

@@ -7,11 +7,12 @@ is done again. Only a lost trial is tried again, `TRIES` times in all.
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import json
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from types import TracebackType
@@ -141,14 +142,14 @@ class Store:
                 time.sleep(0.05)
 
     def _take_up(self) -> None:
-        path, ids = self.folder / SWEEP, [trial.id for trial in self._trials]
+        path, ids, inputs = self.folder / SWEEP, [trial.id for trial in self._trials], input_digests(self._trials)
         if path.exists():
-            self._check_same(path, ids)
+            self._check_same(path, ids, inputs)
         else:
             listed = [
                 {"id": trial.id, "options": dict(trial.options), "repeat": trial.repeat} for trial in self._trials
             ]
-            document = {"schema": 1, **self._about, "trials": listed}
+            document = {"schema": 1, **self._about, "inputs": inputs, "trials": listed}
             write_bytes(path, json.dumps(document, indent=1).encode() + b"\n")
         records, size = whole_lines(os.pread(self._file, os.fstat(self._file).st_size, 0), self.folder / TRIALS)
         os.ftruncate(self._file, size)
@@ -159,20 +160,36 @@ class Store:
             found = f"a sweep with {ended} of {len(ids)} trials done"
             raise BadInputError(self.folder, found, "a new folder, or one that is complete", "--resume goes on with it")
 
-    def _check_same(self, path: Path, ids: list[str]) -> None:
+    def _check_same(self, path: Path, ids: list[str], inputs: Mapping[str, str]) -> None:
         try:
-            there = {trial["id"] for trial in json.loads(path.read_bytes())["trials"]}
+            document = json.loads(path.read_bytes())
+            there, read = {trial["id"] for trial in document["trials"]}, dict(document.get("inputs", inputs))
         except (OSError, ValueError, TypeError, KeyError) as error:
             raise BadInputError(path, f"no description of a sweep ({reason(error)})", "one") from error
         if there != set(ids):
             found = f"a sweep of {len(there)} trials; {len(there & set(ids))} of them are among these {len(ids)}"
             raise BadInputError(self.folder, found, "the same trials", "choose another --out")
+        changed = [name for name, digest in inputs.items() if read.get(name) != digest]
+        if changed:
+            found = f"a sweep that read {', '.join(changed)} with other contents"
+            raise BadInputError(self.folder, found, "the same files", "choose another --out")
 
     def _close(self) -> None:
         for descriptor in (self._file, self._lock):
             if descriptor >= 0:
                 os.close(descriptor)
         self._file = self._lock = -1
+
+
+def input_digests(trials: Sequence[Trial]) -> dict[str, str]:
+    """Return the SHA-256 of each file that an option of the trials names, by the name that it has there."""
+    values = (each for trial in trials for value in trial.options.values() for each in _flat(value))
+    files = sorted({each for each in values if isinstance(each, str) and Path(each).is_file()})
+    return {name: hashlib.sha256(Path(name).read_bytes()).hexdigest() for name in files}
+
+
+def _flat(value: Any) -> Iterable[Any]:
+    return value if isinstance(value, list | tuple) else [value]
 
 
 def is_ended(record: Mapping[str, Any] | None) -> bool:
