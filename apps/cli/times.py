@@ -79,6 +79,7 @@ def times(
     from trilane.writing import write_bytes
 
     reads = [read_measurements(path) for path in files]
+    _check_results([*files, *([_stage_of(stage)[0]] if stage else []), rows, samples])
     written: dict[Path, str] = {}
     row_says: list[str] = []
     if stage is not None:
@@ -102,6 +103,17 @@ def times(
         stdout_console().print(f"written: {without_controls(str(path))}", markup=False, soft_wrap=True)
     for line in row_says:
         stdout_console().print(without_controls(line), markup=False, soft_wrap=True)
+
+
+def _check_results(paths: Sequence[Path | None]) -> None:
+    """Refuse a result that would replace a file that is read, or another result. Raises BadInputError."""
+    from trilane.errors import BadInputError
+
+    known: set[Path] = set()
+    for path in filter(None, paths):
+        if path.resolve() in known:
+            raise BadInputError(path, "the same file twice", "a file for each result", "choose another name")
+        known.add(path.resolve())
 
 
 def _stage_of(text: str) -> tuple[Path, str]:
