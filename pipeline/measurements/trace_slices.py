@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import zlib
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from trilane.errors import BadInputError
@@ -20,6 +20,21 @@ if TYPE_CHECKING:
     from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import TracePacket
 
 WHAT: Final = "a slice of the trace, with whatever its thread waited for"
+WHAT_ASYNC: Final = "an asynchronous slice of the trace, from its begin to its end, with all waiting between"
+BEGINS, ENDS, ASYNC = "BbS", "EeF", "beSF"  # phases of Chrome's events; b, e, S and F are of asynchronous slices
+#: What the events of the other phases are.
+NO_SLICES: Final = {
+    "M": "a name or another fact of a process or thread, no slice",
+    "C": "a counter, no slice",
+    **dict.fromkeys("iIRn", "a moment, no slice"),
+    **dict.fromkeys("Tp", "a step within an asynchronous slice"),
+    **dict.fromkeys("stf", "an arrow between slices, no slice"),
+    **dict.fromkeys("NOD", "the life of an object, no slice"),
+    **dict.fromkeys("vV", "a dump of the memory, no slice"),
+    "P": "a sample of a profiler, no slice",
+    "c": "a mark of a clock, no slice",
+}
+UNENDED: Final = "a slice that does not end in the trace"
 MOST_UNPACKED_BYTES: Final = 512 << 20
 FIRST_OWN_CLOCK, LAST_OWN_CLOCK = 64, 127  # clocks of a sequence
 STATE_CLEARED: Final = 1
@@ -76,7 +91,7 @@ class _Slices:
             self._found.refuse(f"packet {packets}", "the file is cut off or damaged from here on")
         unended = sum(len(stack) for stack in self._open.values())
         if unended:
-            self._found.skipped["a slice that does not end in the trace"] += unended
+            self._found.skipped[UNENDED] += unended
 
     def _packets(self, data: bytes, *, packed: bool = False) -> Iterator[TracePacket]:
         """Yield the packets one by one, so that a long trace is never held as objects. Raises DecodeError."""
@@ -181,34 +196,83 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
 
 
 def read_chrome(events: Sequence[Any]) -> Found:
-    """Read the slices of a trace in Chrome's format: complete events, and pairs of begin and end. Times are us."""
+    """Read the slices of a trace in Chrome's format: complete events, and pairs of begin and end. Times are us.
+
+    An asynchronous slice whose name an ordinary slice has too is called `name (async)`: their times do not mix.
+    """
     found = Found("Chrome trace (JSON)", "wall times of named slices")
-    open_: dict[tuple[object, object], list[tuple[str, float]]] = defaultdict(list)
+    slices = _ChromeSlices(found)
     for index, event in enumerate(events):
-        row = f"event {index}"
-        if not isinstance(event, dict):
-            found.refuse(row, "no table")
-            continue
-        name, phase, track = str(event.get("name", "")), event.get("ph"), (str(event.get("pid")), str(event.get("tid")))
-        row = f"{row}: {name}"
-        if phase == "X":
-            if event.get("dur") == 0:
-                found.skip("a slice without length")
-            else:
-                found.sample(row, name, "wall", event.get("dur"), "us", WHAT)
-        elif phase in ("B", "E"):
-            at = event.get("ts")
-            if not is_finite(at):
-                found.refuse(row, "ts is no number")
-            elif phase == "B":
-                open_[track].append((name, float(at)))
-            elif open_[track] and name not in ("", open_[track][-1][0]):
-                found.skip("the end of another slice than the one that is open")
-            elif open_[track]:
-                name, begin = open_[track].pop()
-                found.sample(row, name, "wall", float(at) - begin, "us", WHAT)
-            else:
-                found.skip("the end of a slice that began before the trace")
+        if isinstance(event, dict):
+            slices.event(f"event {index}: {event.get('name', '')}", event)
         else:
-            found.skip("no slice, such as a counter or a name")
+            found.refuse(f"event {index}", "no table")
+    slices.end()
     return found
+
+
+class _ChromeSlices:
+    def __init__(self, found: Found) -> None:
+        self._found = found
+        self._open: dict[tuple[str, ...], list[tuple[str, float]]] = defaultdict(list)
+        self._names: set[str] = set()  # of slices of threads
+        self._asynchronous: list[tuple[str, str, float]] = []
+
+    def event(self, row: str, event: Mapping[str, Any]) -> None:
+        name, phase, at = str(event.get("name", "")), str(event.get("ph", "")), event.get("ts")
+        if phase == "X":
+            self._take(row, name, event.get("dur"))
+        elif len(phase) != 1 or phase not in BEGINS + ENDS:
+            self._found.skip(NO_SLICES.get(phase, "an event of an unknown kind"))
+        elif not is_finite(at):
+            self._found.refuse(row, "ts is no number")
+        elif not (track := _asynchronous_track(event) if phase in ASYNC else _thread(event)):
+            self._found.refuse(row, "an asynchronous slice without a name or an id, which tell its end")
+        elif phase in BEGINS:
+            self._open[track].append((name, float(at)))
+        elif not self._open[track]:
+            self._found.skip("the end of a slice that began before the trace")
+        elif name not in ("", self._open[track][-1][0]):
+            self._found.skip("the end of another slice than the one that is open")
+        else:
+            name, begin = self._open[track].pop()
+            if phase in ASYNC:
+                self._asynchronous.append((row, name, float(at) - begin))
+            else:
+                self._take(row, name, float(at) - begin)
+
+    def end(self) -> None:
+        for row, name, time in self._asynchronous:
+            self._sample(row, f"{name} (async)" if name in self._names else name, time, WHAT_ASYNC)
+        unended = sum(map(len, self._open.values()))
+        if unended:
+            self._found.skipped[UNENDED] += unended
+
+    def _take(self, row: str, name: str, time: object) -> None:
+        self._names.add(name)
+        self._sample(row, name, time, WHAT)
+
+    def _sample(self, row: str, name: str, time: object, what: str) -> None:
+        if time == 0:
+            self._found.skip("a slice without length")
+        else:
+            self._found.sample(row, name, "wall", time, "us", what)
+
+
+def _thread(event: Mapping[str, Any]) -> tuple[str, ...]:
+    return str(event.get("pid")), str(event.get("tid"))
+
+
+def _asynchronous_track(event: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return what begin and end of an asynchronous slice share; () if a part of it is missing.
+
+    It may end in another process than it began in, unless its id is local.
+    """
+    name, id_, scoped = event.get("name"), event.get("id"), event.get("id2")
+    process = ""
+    if isinstance(scoped, dict):
+        id_ = scoped.get("global", scoped.get("local"))
+        process = str(event.get("pid")) if "local" in scoped else ""
+    if id_ is None or not name:
+        return ()
+    return "async", str(event.get("cat", "")), str(event.get("scope", "")), str(id_), str(name), process

@@ -150,3 +150,64 @@ def test_broken_events(
     assert [each.row for each in found.refused] == [row]
     assert reason in found.refused[0].reason
     assert "seg" in samples(found)
+
+
+def asynchronous(phase: str, ts: float, name: str = "job", **keys: Any) -> dict[str, Any]:
+    return {"name": name, "cat": "npu", "ph": phase, "ts": ts, "pid": 1, "tid": 1, "id": "0x1", **keys}
+
+
+#: Pairs by category, id and name: they overlap, end in another process, and lie within each other.
+ASYNCHRONOUS: list[dict[str, Any]] = [
+    asynchronous("b", 0),
+    asynchronous("b", 1000, id="0x2"),
+    asynchronous("b", 1500, "part"),
+    asynchronous("n", 1600, "part"),
+    asynchronous("e", 2000, "part"),
+    asynchronous("e", 4000, pid=2),
+    asynchronous("e", 7000, id="0x2"),
+    asynchronous("S", 0, "old", id=7),
+    asynchronous("T", 500, "old", id=7),
+    asynchronous("F", 1000, "old", id=7),
+]
+
+
+def test_asynchronous_slices(read: Callable[[bytes], Measurements]) -> None:
+    found = read(json.dumps(ASYNCHRONOUS).encode())
+    assert samples(found) == {"part": (0.5,), "job": (4.0, 6.0), "old": (1.0,)}
+    assert all("with all waiting" in each.what for each in found.measurements)
+    assert found.skipped == {"a moment, no slice": 1, "a step within an asynchronous slice": 1}
+
+
+def test_asynchronous_slices_do_not_mix_with_those_of_threads(read: Callable[[bytes], Measurements]) -> None:
+    events = [*ASYNCHRONOUS, {"name": "job", "ph": "X", "ts": 1, "dur": 3000, "pid": 1, "tid": 1}]
+    assert samples(read(json.dumps(events).encode())) == {
+        "job": (3.0,), "part": (0.5,), "job (async)": (4.0, 6.0), "old": (1.0,),
+    }  # fmt: skip
+
+
+def test_local_ids_are_of_their_process(read: Callable[[bytes], Measurements]) -> None:
+    local = {"id": None, "id2": {"local": "0x5"}}
+    events = [
+        asynchronous("b", 0, **local),
+        asynchronous("b", 1000, **local, pid=2),
+        asynchronous("e", 3000, **local),
+        asynchronous("e", 9000, **local, pid=2),
+    ]
+    assert samples(read(json.dumps(events).encode())) == {"job": (3.0, 8.0)}
+
+
+def test_other_events_are_counted_by_their_kind(read: Callable[[bytes], Measurements]) -> None:
+    others = [{"name": "x", "ph": phase, "ts": 1} for phase in ("M", "C", "C", "i", "s", "f", "?", "", None)]
+    events = [*others, asynchronous("b", 0), asynchronous("e", 1, id="0x3"), asynchronous("b", 5, id=None), EVENTS[0]]
+    found = read(json.dumps(events).encode())
+    assert found.skipped == {
+        "a name or another fact of a process or thread, no slice": 1,
+        "a counter, no slice": 2,
+        "a moment, no slice": 1,
+        "an arrow between slices, no slice": 2,
+        "an event of an unknown kind": 3,
+        "the end of a slice that began before the trace": 1,
+        "a slice that does not end in the trace": 1,
+    }
+    assert [each.row for each in found.refused] == ["event 11: job"]
+    assert "without a name or an id" in found.refused[0].reason
