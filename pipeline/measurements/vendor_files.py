@@ -176,8 +176,8 @@ def _add_cycles(found: Found, cycles: Mapping[str, Sequence[float]]) -> None:
     """Add the nodes with their shares in all cycles of the nodes."""
     nodes = {name: sum(values) / len(values) for name, values in cycles.items() if name}
     _add_shares(found, nodes, {name: len(cycles[name]) for name in nodes})
-    if cycles.get(""):
-        found.skip("cycles of a run, whose clock is not known")
+    if of_runs := cycles.get(""):
+        found.skipped["cycles of a run, whose clock is not known"] += len(of_runs)
 
 
 def _add_shares(found: Found, nodes: Mapping[str, float], counts: Mapping[str, int | None], hardware: str = "") -> None:

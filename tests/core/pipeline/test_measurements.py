@@ -233,6 +233,8 @@ def test_what_is_no_run_is_counted(read: Callable[[str], Measurements]) -> None:
         "a count, not a time": 2,
         "cycles of a run, whose clock is not known": 1,
     }
+    cycles = "0,BACKEND,51117377,CYCLES,BACKEND,ROOT,Accelerator (execute) time (cycles)\n"
+    assert read(QNN + cycles).skipped["cycles of a run, whose clock is not known"] == 2
     assert read(TFLITE.replace("--graph=/data/local/tmp/yolov5s_tflite_fp32.tflite\n", "")).skipped == {"warm-up": 1}
 
 
