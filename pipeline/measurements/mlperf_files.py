@@ -16,7 +16,6 @@ from itertools import pairwise
 from typing import Any, Final
 
 from trilane.pipeline.measurements.measurement import (
-    QUEUEING,
     Figures,
     Found,
     Kind,
@@ -26,7 +25,8 @@ from trilane.pipeline.measurements.measurement import (
 )
 
 SINGLE: Final = "SingleStream"
-SCENARIOS: Final = (SINGLE, "MultiStream", "Server", "Offline")
+OFFLINE: Final = "Offline"
+SCENARIOS: Final = (SINGLE, "MultiStream", "Server", OFFLINE)
 TITLE: Final = "MLPerf Results Summary"
 LATENCY: Final = re.compile(r"(Min|Max|Mean|[\d.]+ percentile) latency \(ns\)")
 PROCESSED: Final = re.compile(r"Processed at least \d+ queries \((\d+)\)")
@@ -64,6 +64,8 @@ def read_loadgen(text: str) -> Found:
 def _says(scenario: str) -> str:
     if scenario == SINGLE:
         return "latencies of one query at a time (SingleStream): service times"
+    if scenario == OFFLINE:
+        return "one query with all samples (Offline): a throughput, and no latency of a run"
     return f"latencies of queries that wait for each other ({scenario}): wall times with queueing"
 
 
@@ -95,20 +97,26 @@ def _add_latencies(found: Found, scenario: str, facts: Mapping[str, tuple[str, s
     if wrong:
         found.refuse(row, wrong)
         return
-    single = scenario == SINGLE
-    if not single:
-        found.refuse(row, f"as a time of a stage: {QUEUEING}, and the scenario is {scenario}")
     name = facts.get("SUT name", ("", "query"))[1] or "query"
-    what = "a query, one at a time" if single else f"a query under {scenario}, with queueing"
     more = {f"p{key:g}_ms": value for key, value in percentiles}
     result = facts.get("Result is", ("", ""))[1]
-    hint = f"LoadGen calls the result {result}" if result and result != "VALID" else ""
+    hints = [f"LoadGen calls the result {result}"] if result and result != "VALID" else []
+    rate = _number(facts.get("Samples per second", ("", ""))[1])
+    if scenario == OFFLINE and is_finite(rate):
+        hints.append(f"{rate:g} samples a second")
+        more["samples_per_second"] = rate
     found.add(
         Measurement(
-            name, kind, "ns", what, (), count, figures.mean, None, figures.low, figures.p50, figures.p95, figures.high,
-            service=single, hint=hint, more=more,
+            name, kind, "ns", _what(scenario), (), count, figures.mean, None, figures.low, figures.p50, figures.p95, figures.high,
+            service=scenario == SINGLE, hint="; ".join(hints), more=more,
         )
     )  # fmt: skip
+
+
+def _what(scenario: str) -> str:
+    if scenario == SINGLE:
+        return "query, one at a time"
+    return "all samples at once (Offline)" if scenario == OFFLINE else f"query, with queueing ({scenario})"
 
 
 def _of_rate(scenario: str, facts: Mapping[str, tuple[str, str]], mean_ms: float) -> str:
@@ -196,18 +204,23 @@ def _add_result(
     if scenario == SINGLE and is_finite(rate) and rate > 0 and not _fits(rate, mean, p90):
         found.refuse(row, f"a mean of {mean:g} ms beside {rate:g} queries a second: a unit is wrong")
         return
-    single = scenario == SINGLE
-    if not single:
-        found.refuse(row, f"as a time of a stage: {QUEUEING}, and the scenario is {scenario}")
     settings = result.get("backend_settings")
     hardware = str(settings.get("accelerator_desc", "")) if isinstance(settings, dict) else ""
     more = {} if p90 is None else {"p90_ms": p90}
     hint = "" if loadgen.get("is_result_valid", True) else "LoadGen calls the result invalid"
-    what = "a query, one at a time" if single else f"a query under {scenario}, with queueing"
-    what += f": {loadgen['what']}" if "what" in loadgen else ""
+    what = f"{_what(scenario)}: {loadgen.get('what', 'the mean')}"
     found.add(
         Measurement(
-            name, kind, "s", what, count=count, mean_ms=mean, hardware=hardware, service=single, hint=hint, more=more
+            name,
+            kind,
+            "s",
+            what,
+            count=count,
+            mean_ms=mean,
+            hardware=hardware,
+            service=scenario == SINGLE,
+            hint=hint,
+            more=more,
         )
     )
 

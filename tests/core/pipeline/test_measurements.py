@@ -243,10 +243,19 @@ def test_only_single_stream_is_a_service_time(read: Callable[[str], Measurements
         found = read(text)
         (wall,) = [each for each in found.measurements if each.kind == "wall"]
         assert not wall.service
-        assert ["contains queueing" in each.reason for each in found.refused] == [True]
+        assert not found.refused
         with pytest.raises(BadInputError, match="queueing is no service time"):
             chosen(found, wall.name, "x")
     assert chosen(read(LOADGEN), "", "x").mean_ms == 5.734487
+
+
+def test_offline_is_a_throughput(read: Callable[[str], Measurements]) -> None:
+    offline = LOADGEN.replace("SingleStream", "Offline").replace("QPS w/o", "Samples per second: 1992.95\nQPS w/o")
+    found = read(offline)
+    (one,) = found.measurements
+    assert found.says == "one query with all samples (Offline): a throughput, and no latency of a run"
+    assert (one.what, one.hint) == ("all samples at once (Offline)", "1992.95 samples a second")
+    assert one.more["samples_per_second"] == 1992.95
 
 
 def test_rest_times_that_rise_again(read: Callable[[str], Measurements]) -> None:

@@ -255,7 +255,6 @@ Max latency (ns)                : 12331497965
 Mean latency (ns)               : 12331497965
 """,
         {("snpe", "wall"): (None, 12331.497965)},
-        ("line 8: Mean latency (ns)",),
     ),
     # mlcommons/mobile_results_v4.0, closed/Samsung/results/exynos2400/result.json
     "mlperf app 4.0": Public(
