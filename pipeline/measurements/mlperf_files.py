@@ -4,8 +4,9 @@ In SingleStream the next query begins when the last one has ended, so a latency 
 scenarios queries wait for each other, or are many at once: their latencies are wall times with queueing.
 
 Versions: LoadGen before 1.0 writes `Single Stream` and `Performance`. The app before 4.0 states no latencies, but how
-long all queries took, and before 3.0 its file is a list of results. In SingleStream the app's throughput is one over
-the 90th percentile. Source: the results that mlcommons publishes (mobile_results_v2.1 to v5.0).
+long all queries took (`loadgen_info.duration`, or `duration_ms`), and before 3.0 its file is a list of results. In
+SingleStream the app's throughput is one over the 90th percentile.
+Source: the results that mlcommons publishes (mobile_results_v2.1 to v5.0).
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ PROCESSED: Final = re.compile(r"Processed at least \d+ queries \((\d+)\)")
 RATE_SLACK: Final = 0.25  # relative, between a rate and the time that it is one over
 RATE_ROUNDING: Final = 0.005  # of the rates that LoadGen prints
 UNIT_SLACK: Final = 10.0  # between a rate of the 90th percentile and the mean: a wrong unit is further off
+WHOLE_MS: Final = "measured_duration_ms"  # of all queries, where the app states nothing of LoadGen
 ACCURACY: Final = ("AccuracyOnly", "Accuracy")
 
 
@@ -107,8 +109,8 @@ def _add_latencies(found: Found, scenario: str, facts: Mapping[str, tuple[str, s
         more["samples_per_second"] = rate
     found.add(
         Measurement(
-            name, kind, "ns", _what(scenario), (), count, figures.mean, None, figures.low, figures.p50, figures.p95, figures.high,
-            service=scenario == SINGLE, hint="; ".join(hints), more=more,
+            name, kind, "ns", _what(scenario), (), count, figures.mean, None, figures.low, figures.p50, figures.p95,
+            figures.high, service=scenario == SINGLE, hint="; ".join(hints), more=more,
         )
     )  # fmt: skip
 
@@ -152,7 +154,8 @@ def _results(documents: Sequence[Any]) -> Iterator[tuple[str, Any]]:
 
 def read_mlperf_app(document: Mapping[str, Any] | Sequence[Any]) -> Found:
     """Read the result file of MLPerf's mobile app. Its latencies are seconds."""
-    found = Found("MLPerf app results", "mean latency of each benchmark; service times from SingleStream alone")
+    found = Found("MLPerf app results", "")
+    divided = stated = False
     for row, result in _results(document if isinstance(document, list) else [document]):
         if not isinstance(result, dict):
             found.refuse(row, "no table")
@@ -163,24 +166,40 @@ def read_mlperf_app(document: Mapping[str, Any] | Sequence[Any]) -> Found:
             found.skip("a benchmark without a run for performance")
         elif scenario not in SCENARIOS:
             found.refuse(f"{row}: {name}", f"the scenario is {str(scenario)[:40]!r}, none of {SCENARIOS}")
-        elif isinstance(run.get("loadgen"), dict):
-            _add_result(found, f"{row}: {name}", name, str(scenario), result, run["loadgen"])
+        elif loadgen := _loadgen(run):
+            stated = True
+            _add_result(found, f"{row}: {name}", name, str(scenario), result, loadgen)
         elif scenario == SINGLE and "measured_samples" in run:
+            divided = True
             _add_result(found, f"{row}: {name}", name, SINGLE, result, _of_older_app(found, f"{row}: {name}", run))
         else:
             found.skip("a benchmark without latencies")
+    figures = ["mean latency as LoadGen states it"] if stated else []
+    figures += ["duration of the run by its number of samples"] if divided else []
+    found.says = f"of each benchmark the {' or the '.join(figures)}; service times from SingleStream alone"
     return found
+
+
+def _loadgen(run: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the table with LoadGen's latencies: versions from 4.0 on call it `loadgen`; {} if there is none."""
+    older = run.get("loadgen_info")
+    table = older if isinstance(older, dict) and "latency_mean" in older else run.get("loadgen")
+    return table if isinstance(table, dict) else {}
 
 
 def _of_older_app(found: Found, row: str, run: Mapping[str, Any]) -> dict[str, Any]:
     """Return what newer versions state of a run: the mean is the time of all queries by their number."""
     info = run.get("loadgen_info")
     info = info if isinstance(info, dict) else {}
-    key = "duration" if info else "measured_duration_ms"
-    whole = found.number(row, (info or run).get(key), key)
+    key = next((key for key in ("duration", "duration_ms") if key in info), "duration" if info else WHOLE_MS)
+    path = f"performance_run.{'loadgen_info.' * bool(info)}{key}"
+    value = (info or run).get(key)
+    if value is None:
+        found.refuse(row, f"no latency and no {path}: give mlperf_log_summary.txt of this run instead")
+    whole = None if value is None else found.number(row, value, path)
     count = run["measured_samples"]
     is_count = isinstance(count, int) and not isinstance(count, bool) and count > 0
-    mean = None if whole is None else whole / (1.0 if info else 1e3) / (count if is_count else 1)
+    mean = None if whole is None else whole / (1e3 if key.endswith("_ms") else 1.0) / (count if is_count else 1)
     valid = info.get("validity", run.get("loadgen_validity", True))
     return {"query_count": count, "latency_mean": mean, "is_result_valid": valid, "what": f"{key} by measured_samples"}
 
@@ -207,7 +226,7 @@ def _add_result(
     settings = result.get("backend_settings")
     hardware = str(settings.get("accelerator_desc", "")) if isinstance(settings, dict) else ""
     more = {} if p90 is None else {"p90_ms": p90}
-    hint = "" if loadgen.get("is_result_valid", True) else "LoadGen calls the result invalid"
+    hint = "" if loadgen.get("is_result_valid", loadgen.get("validity", True)) else "LoadGen calls the result invalid"
     what = f"{_what(scenario)}: {loadgen.get('what', 'the mean')}"
     found.add(
         Measurement(

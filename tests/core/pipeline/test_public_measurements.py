@@ -391,6 +391,20 @@ def test_an_older_app_s_mean_is_that_of_loadgen(read: Callable[[str], Measuremen
     assert "measured_duration_ms by measured_samples" in of_app.what
 
 
+def test_the_app_s_figures_are_said(read: Callable[[str], Measurements]) -> None:
+    assert read(PUBLIC["mlperf app 4.0"].text).says.startswith(
+        "of each benchmark the mean latency as LoadGen states it;"
+    )
+    older = PUBLIC["mlperf app 3.0"].text
+    divided = {("super_resolution", "run"): (6436, 59996.05089200001 / 6436)}
+    assert read(older).says.startswith("of each benchmark the duration of the run by its number of samples;")
+    in_ms = read(older.replace('"duration": 59.99605089200001', '"duration_ms": 59996.05089200001'))
+    assert timed(in_ms) == {key: (count, pytest.approx(mean)) for key, (count, mean) in divided.items()}
+    stated = read(older.replace('"duration": 59.99605089200001', '"latency_mean": 0.009, "latency90": 0.0095'))
+    assert timed(stated) == {("super_resolution", "run"): (None, 9.0)}
+    assert stated.says.startswith("of each benchmark the mean latency")
+
+
 def test_nodes_of_a_viewer_are_shares(read: Callable[[str], Measurements]) -> None:
     nodes = [each for each in read(PUBLIC["qnn-profile-viewer"].text).measurements if each.kind == "layer"]
     assert {each.name: each.share for each in nodes} == {
@@ -430,7 +444,7 @@ BROKEN: list[tuple[str, str, str, str, str]] = [
         '"duration": 59.99605089200001',
         '"duration": -1',
         "results[0]: super_resolution",
-        "duration is negative",
+        "performance_run.loadgen_info.duration is negative",
     ),
     (
         "mlperf app 3.0",
@@ -439,8 +453,21 @@ BROKEN: list[tuple[str, str, str, str, str]] = [
         "results[0]: super_resolution",
         "a unit is",
     ),
+    (
+        "mlperf app 3.0",
+        ', "duration": 59.99605089200001',
+        "",
+        "results[0]",
+        "no performance_run.loadgen_info.duration:",
+    ),
     ("mlperf app 3.0", '"measured_samples": 6436', '"measured_samples": 0', "super_resolution", "query_count is 0"),
-    ("mlperf app 2.0", "59998.24609375", "null", "results[0]: LU_float32", "measured_duration_ms is nothing"),
+    (
+        "mlperf app 2.0",
+        "59998.24609375",
+        "null",
+        "results[0]: LU_float32",
+        "no performance_run.measured_duration_ms: give mlperf_log_summary.txt",
+    ),
 ]
 
 
