@@ -33,7 +33,7 @@ Examples:
 Exit codes:
   0 done, 2 a file of no known tool or without a usable time
 """
-BARS, WIDTH = " ▁▂▃▄▅▆▇█", 24
+BARS, WIDTH = " ▁▂▃▄▅▆▇█", 16
 MOST_ROWS = 40
 
 FilesArgument = Annotated[
@@ -155,7 +155,7 @@ def _table(kind: str, measurements: Sequence[Measurement]) -> Table:
     columns = [name for name in cells[0] if any(row[name] for row in cells)]
     table = Table(kind)
     for name in columns:
-        table.add_column(name, no_wrap=True)
+        table.add_column(name, no_wrap=name != "what")
     for each, row in zip(measurements, cells, strict=True):
         label = without_controls(each.name if len(each.name) <= 60 else f"{each.name[:40]}…{each.name[-19:]}")
         table.add_row(escape(label), *(escape(row[name]) for name in columns))
@@ -172,6 +172,7 @@ def _cells(each: Measurement) -> dict[str, str]:
         "share": "" if each.share is None else f"{100 * each.share:.1f} %",
         "distribution, ms": _distribution(each),
         "on": without_controls(each.hardware),
+        "what": without_controls(each.what),
     }
 
 

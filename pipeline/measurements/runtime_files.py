@@ -417,9 +417,7 @@ def _add_stats(found: Found, row: str, name: str, kind: Kind, stats: object) -> 
     if count is not None and (not isinstance(count, int) or isinstance(count, bool) or count < 1):
         found.refuse(row, f"count is {count!r}, not a whole number of runs")
         return
-    what = (
-        "calls of the network in its runtime" if kind == "run" else "wall time of the app, with all around the network"
-    )
+    what = "calls of the network in its runtime" if kind == "run" else "wall time, with all around the network"
     more = {"p90_ms": ms["p90"]} if ms.get("p90") is not None else {}
     found.add(
         Measurement(

@@ -19,8 +19,8 @@ from trilane.pipeline.measurements.measurement import Found, is_finite
 if TYPE_CHECKING:
     from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import TracePacket
 
-WHAT: Final = "a slice of the trace, with whatever its thread waited for"
-WHAT_ASYNC: Final = "an asynchronous slice of the trace, from its begin to its end, with all waiting between"
+WHAT: Final = "slice, with what its thread waited for"
+WHAT_ASYNC: Final = "asynchronous slice, with all waiting"
 BEGINS, ENDS, ASYNC = "BbS", "EeF", "beSF"  # phases of Chrome's events; b, e, S and F are of asynchronous slices
 #: What the events of the other phases are.
 NO_SLICES: Final = {

@@ -25,12 +25,12 @@ NO_TIMES: Final = ("COUNT", "BYTES", "OBJECT", "NONE", "INF/SEC", "UNKNOWN", "")
 NET_RUN: Final = "NetRun (execute) time"
 WHOLE: Final = "QNN (execute) time"
 NESTED: Final = (
-    (NET_RUN, "the whole execution as qnn-net-run sees it, with its input and output"),
-    (WHOLE, "the whole call, with the way to the accelerator and waiting for it"),
-    ("RPC (execute) time", "the call to the accelerator and back"),
-    ("QNN accelerator (execute) time", "on the accelerator, with acquiring its memory and power"),
-    ("Accelerator (execute) time", "on the accelerator"),
-    ("Accelerator (execute excluding wait) time", "on the accelerator, without waiting"),
+    (NET_RUN, "whole call, with input and output"),
+    (WHOLE, "whole call, with all waiting"),
+    ("RPC (execute) time", "to the accelerator and back"),
+    ("QNN accelerator (execute) time", "accelerator, with memory and power"),
+    ("Accelerator (execute) time", "accelerator"),
+    ("Accelerator (execute excluding wait) time", "accelerator, without waiting"),
 )
 WHAT: Final = dict(NESTED)
 NESTED_SLACK: Final = 0.01  # share by which a time may be longer than one around it
@@ -139,7 +139,7 @@ class _Run:
 
     def take(self, row: str, name: str, value: object, unit: str) -> None:
         if name not in WHAT:
-            self._found.sample(row, name, "run", value, unit, "of a run, as its name says")
+            self._found.sample(row, name, "run", value, unit, "as its name says")
             return
         if name in self._rows:
             self.end()
@@ -184,7 +184,7 @@ def _add_shares(found: Found, nodes: Mapping[str, float], counts: Mapping[str, i
     whole = sum(nodes.values())
     for name, mean in nodes.items():
         share = mean / whole if whole else None
-        what = "cycles: a share of the run, no time"
+        what = "cycles: a share, no time"
         found.add(
             Measurement(
                 name, "layer", CYCLES, what, count=counts[name], share=share, service=False, more={"cycles": mean},
@@ -209,7 +209,7 @@ def read_qhas(document: Mapping[str, Any]) -> Found:
             found.refuse(f"{row}: time_us", f"{time:g} ms beside {rate:g} inferences a second: a unit is wrong")
             time = None
         elif time is not None:
-            what = "a run on the accelerator, with what happens around the graph"
+            what = "run, with what is around the graph"
             found.add(Measurement(f"time_us{name}", "run", "us", what, mean_ms=time, more=more))
         execute = found.ms(f"{row}: graph_execute_us", summary.get("graph_execute_us"), "us", "run")
         if execute is not None and time is not None and execute > 1.01 * time:
@@ -249,13 +249,13 @@ def read_ai_hub(document: Mapping[str, Any]) -> Found:
     times = summary.get("all_inference_times")
     for index, value in enumerate(times if isinstance(times, list) else []):
         row = f"execution_summary.all_inference_times[{index}]"
-        found.sample(row, "all_inference_times", "run", value, "us", "a run on the device, without loading")
+        found.sample(row, "all_inference_times", "run", value, "us", "run on the device, without loading")
     stated = summary.get("estimated_inference_time")
     if stated is not None:
         row = "execution_summary.estimated_inference_time"
         time = found.ms(row, stated, "us", "run")
         if time is not None:
-            what = "the time that AI Hub states for a run, from its own estimate"
+            what = "run, as AI Hub estimates it"
             found.add(Measurement("estimated_inference_time", "run", "us", what, mean_ms=time))
     elif not times:
         found.refuse("execution_summary", "neither all_inference_times nor estimated_inference_time")

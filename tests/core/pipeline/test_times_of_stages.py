@@ -148,6 +148,21 @@ def test_the_document(folder: Path, command: Command) -> None:
     ]
 
 
+def test_the_table_says_what_each_time_contains(folder: Path, command: Command) -> None:
+    (folder / "qnn.csv").write_text(
+        "Msg Timestamp,Message,Time,Unit of Measurement,Timing Source,Event Level,Event Identifier\n"
+        "0,BACKEND,1359,US,BACKEND,ROOT,Accelerator (execute) time\n"
+        "0,NODE,109588,CYCLES,BACKEND,SUB-EVENT,matmul (cycles)\n"
+        "0,EXECUTE,9308,US,BACKEND,ROOT,QNN (execute) time\n"
+    )
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in command("times", "qnn.csv")[0].splitlines()]
+    assert {cells[0]: cells[-1] for cells in rows if cells} == {
+        "QNN (execute) time": "whole call, with all waiting",
+        "Accelerator (execute) time": "accelerator",
+        "matmul (cycles)": "cycles: a share, no time",
+    }
+
+
 def test_control_characters_of_a_name_are_written_out(folder: Path, command: Command) -> None:
     (folder / "log.txt").write_text(LOG.replace("net.tflite", "n\x1b[31m.tflite"))
     out, _ = command("times", "log.txt")
