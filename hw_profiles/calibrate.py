@@ -187,7 +187,7 @@ def _own_row(place: str, cells: Mapping[str, str], folder: Path) -> OwnRow:
     if not 0 < ms <= LONGEST_MS:
         raise BadInputError(f"{place}: ms", repr(cells["ms"]), "a time in ms above 0, at most an hour")
     unit, precision, runtime = (_word(place, cells, *each) for each in WORDS)
-    graph = read_graph(network_file(place, cells["network"], folder))
+    graph = read_graph(network_file(f"{place}: network", cells["network"], folder))
     silent = graph.numbers == "float" and not cells.get("precision")
     return OwnRow(place, cells["network"], graph.work, ms, unit, PRECISIONS[precision], runtime, silent)  # type: ignore[arg-type]
 
@@ -207,12 +207,12 @@ def _word(place: str, cells: Mapping[str, str], column: str, known: Sequence[str
     return word
 
 
-def network_file(place: str, name: str, folder: Path) -> Path:
+def network_file(place: str, name: str, folder: Path, remedy: str = "--networks names another folder") -> Path:
     """Return the path of a network; `.onnx` may be left out. Raises BadInputError for one outside of `folder`."""
     inner = PurePosixPath(name)
     if not name or inner.is_absolute() or ".." in inner.parts or "\0" in name or "\\" in name:
         expected = f"a path inside {folder}"
-        raise BadInputError(f"{place}: network", repr(name), expected, "--networks names another folder")
+        raise BadInputError(place, repr(name), expected, remedy)
     return folder / (name if inner.suffix == ".onnx" else f"{name}.onnx")
 
 
@@ -442,5 +442,6 @@ def fit_row(table: Path, network: str | None, unit: str | None, precision: str |
         raise BadInputError("--network", "nothing", "the network that was measured", "a path beside the table")
     cells = {"unit": unit or "", "precision": precision or "", "runtime": runtime or ""}
     words = [_word("--rows", cells, *each) for each in WORDS]
-    read_graph(network_file("--network", network, table.absolute().parent))
+    remedy = f"put the network into the folder of {table.name}, and give --network its path from there"
+    read_graph(network_file("--network", network, table.absolute().parent, remedy))
     return NamedRow(network, *words)
