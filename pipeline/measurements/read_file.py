@@ -220,10 +220,7 @@ def chosen(read: Measurements, name: str, where: str) -> Measurement:
     else:
         found = [each for each in read.measurements if each.kind == "run" and each.service]
         if len(found) != 1:
-            known = [each.name for each in found]
-            shown = ", ".join(map(repr, known[:8])) + (" …" if len(known) > 8 else "")
-            remedy = 'add name = "..." of one of them'
-            raise BadInputError(where, f"{len(found)} runs in {read.path.name}: {shown}", "one", remedy)
+            raise _not_one(read, found, where)
     one = found[0]
     if one.unit == CYCLES or one.mean_ms is None:
         raise BadInputError(
@@ -232,3 +229,15 @@ def chosen(read: Measurements, name: str, where: str) -> Measurement:
     if not one.service:
         raise BadInputError(where, f"{one.name!r}, {one.what}", "a time of a job", QUEUEING)
     return one
+
+
+def _not_one(read: Measurements, runs: Sequence[Measurement], where: str) -> BadInputError:
+    """Return the error for a file without a run, or with several: those that a name can choose, or why none can."""
+    usable = runs or [each for each in read.measurements if each.service and each.unit != CYCLES]
+    listed = [f"{each.name!r}" if runs else f"{each.name!r} ({each.what})" for each in usable or read.measurements]
+    shown = ", ".join(listed[:8]) + (" …" if len(listed) > 8 else "")
+    remedy = "give one with --name" if where == "--name" else 'add name = "..." of one of them'
+    if not usable:
+        remedy = "measure one job at a time, such as LoadGen's SingleStream"
+    count = f"{len(runs)} runs" if runs else "no run"
+    return BadInputError(where, f"{count} in {read.path.name}{':' if runs else ', only'} {shown}", "one", remedy)

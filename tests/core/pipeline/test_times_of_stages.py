@@ -84,6 +84,36 @@ def test_the_only_run_or_a_name(folder: Path) -> None:
         read_pipeline(written(folder, '{ from = "hub.json" }'))
 
 
+OFFLINE = """MLPerf Results Summary
+SUT name : snpe
+Scenario : Offline
+Mean latency (ns) : 12331497965
+"""
+SLICE = '[{"name": "seg", "ph": "X", "ts": 1, "dur": 4000}]'
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (
+            OFFLINE,
+            "found no run in times, only 'snpe' (all samples at once (Offline)), expected one; "
+            "measure one job at a time, such as LoadGen's SingleStream",
+        ),
+        (SLICE, "only 'seg' (slice, with what its thread waited for), expected one; give one with --name"),
+        (
+            LOG + LOG.replace("net", "other"),
+            "2 runs in times: 'net.tflite', 'other.tflite', expected one; give one with",
+        ),
+    ],
+)
+def test_a_file_without_one_run_says_why(text: str, reason: str, folder: Path, command: Command) -> None:
+    (folder / "times").write_text(text)
+    written(folder, "3")
+    _, err = command("times", "times", "--stage", "in/file.toml:tail", code=2)
+    assert reason in " ".join(err.split())
+
+
 def test_a_stage_is_written_and_all_else_stays(folder: Path, command: Command) -> None:
     """Beside the file the profile is named; from elsewhere its times are written out."""
     pytest.importorskip("tomlkit")
@@ -104,7 +134,7 @@ def test_a_stage_is_written_and_all_else_stays(folder: Path, command: Command) -
         (("--stage", "in/file.toml:tail", "--name", "x"), "the unknown measurement 'x'"),
         (("log.txt", "--stage", "in/file.toml:tail"), "2 files with such a time"),
         (("--rows", "rows.csv"), "the network that was measured"),
-        (("--rows", "rows.csv", "--network", "../net.onnx"), "a path inside"),
+        (("--rows", "rows.csv", "--network", "../net.onnx"), "give --network its path from there"),
     ],
 )
 def test_a_wrong_wish_writes_nothing(options: tuple[str, ...], message: str, folder: Path, command: Command) -> None:
