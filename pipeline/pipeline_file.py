@@ -155,14 +155,18 @@ class PipelineFile:
 
 def read_pipeline(path: Path) -> PipelineFile:
     """Read and check a pipeline file. Raises BadInputError."""
+    return checked_tables(tables_of(path), path)
+
+
+def tables_of(path: Path) -> dict[str, Any]:
+    """Return the tables of a pipeline file, not checked yet. Raises BadInputError."""
     data = read_bytes(path, MOST_BYTES, FORM, IF_EMPTY)
     try:
-        tables = tomllib.loads(data.decode("utf-8-sig"))
+        return tomllib.loads(data.decode("utf-8-sig"))
     except UnicodeDecodeError:
         raise BadInputError(path, "bytes that are no text in UTF-8", FORM, "save it as UTF-8") from None
     except (ValueError, RecursionError) as error:
         raise _of_toml(path, str(error)) from None
-    return checked_tables(tables, path)
 
 
 def is_pipeline_file(path: Path) -> bool:

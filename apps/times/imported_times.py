@@ -22,7 +22,7 @@ from trilane.files import read_text
 from trilane.hw_profiles.calibrate import fit_row
 from trilane.pipeline.measurements.measurement import Measurement
 from trilane.pipeline.measurements.read_file import OWN_COLUMNS, Measurements, chosen
-from trilane.pipeline.pipeline_file import checked_tables, read_pipeline, time_of
+from trilane.pipeline.pipeline_file import checked_tables, tables_of, time_of
 
 MOST_WRITTEN: Final = 10_000  # samples that are written into a pipeline file
 #: Columns of the rows for `trilane profiles fit`.
@@ -83,16 +83,20 @@ def stage_text(path: Path, stage: str, read: Measurements, measurement: Measurem
     """Return the text of the pipeline file `path` with the measurement as the `time_ms` of `stage`.
 
     Everything else of the file stays, comments too. A profile in the file's folder is named, others are written out.
+    The stage may lack a time before: the file is checked with it.
     Raises BadInputError for a stage that is not there or too many samples, MissingPartError without tomlkit.
     """
     try:
         import tomlkit
     except ImportError:
         raise MissingPartError("writing into a pipeline file needs tomlkit", extra="edit") from None
-    file = read_pipeline(path)
-    if stage not in file.stages:
-        expected = f"one of {', '.join(file.stages)}"
-        raise BadInputError(f"{path}: stages", f"no stage {stage!r}", expected, did_you_mean(stage, file.stages))
+    before = tables_of(path)
+    stages = before.get("stages")
+    if not isinstance(stages, dict) or not all(isinstance(each, dict) for each in stages.values()):
+        checked_tables(before, path)  # which says what is wrong
+    elif stage not in stages:
+        expected = f"one of {', '.join(stages)}"
+        raise BadInputError(f"{path}: stages", f"no stage {stage!r}", expected, did_you_mean(stage, stages))
     tables = tomlkit.parse(read_text(path, "a pipeline file"))
     tables["stages"][stage]["time_ms"] = _as_toml(path, read, measurement)
     text: str = tomlkit.dumps(tables)
@@ -113,11 +117,16 @@ def _as_toml(path: Path, read: Measurements, measurement: Measurement) -> Any:
         remedy = f"put {read.path.name} beside {path.name}: the file then names it"
         raise BadInputError(read.path, f"{len(time.samples)} samples", f"at most {MOST_WRITTEN} to write out", remedy)
     elif time.samples:
-        values = {"samples": list(time.samples)}
+        values = {"samples": [_rounded(ms) for ms in time.samples]}
     else:
-        values = {"mean": time.mean_ms, "sd": time.sd} if time.sd else {"mean": time.mean_ms}
+        values = {"mean": _rounded(time.mean_ms)} | ({"sd": _rounded(time.sd)} if time.sd else {})
     table.update(values)
     return table
+
+
+def _rounded(ms: float) -> float:
+    """Return a time with as many digits as clocks have: sums of floats end in digits that nobody measured."""
+    return float(f"{ms:.6g}")
 
 
 def with_row(
@@ -140,7 +149,7 @@ def with_row(
     if tuple(header) != FIT_COLUMNS:
         raise BadInputError(path, f"the columns {', '.join(header)}", ", ".join(FIT_COLUMNS))
     text = io.StringIO()
-    ms = float(f"{measurement.mean_ms if measurement.p50_ms is None else measurement.p50_ms:.6g}")
+    ms = _rounded(time_of(measurement).mean_ms if measurement.p50_ms is None else measurement.p50_ms)
     source = f"{read.path.name}: {measurement.name}"
     csv.writer(text, lineterminator="\n").writerow([row.network, ms, *row[1:], source])
     words = row._asdict()

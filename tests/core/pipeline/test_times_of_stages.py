@@ -126,6 +126,44 @@ def test_a_stage_is_written_and_all_else_stays(folder: Path, command: Command) -
     assert path.read_text() == FILE % "{mean = 5.0, sd = 0.5}"
 
 
+def test_a_stage_may_lack_a_time_before(folder: Path, command: Command) -> None:
+    pytest.importorskip("tomlkit")
+    path = folder / "in" / "file.toml"
+    path.write_text('[stages]\nhead = { unit = "gpu", time_ms = 1 }\ntail = { unit = "dsp", in = "head" }\n')
+    command("times", "hub.json", "--stage", "in/file.toml:tail")
+    tail = read_pipeline(path).stages["tail"].time_ms
+    assert tail is not None
+    assert tail.samples == (4.0, 5.0, 6.0)
+
+
+@pytest.mark.parametrize(
+    ("stages", "message"),
+    [
+        ("stages = 3", "stages"),
+        ("[stages]\ntail = 3", "stages.tail"),
+        ('[stages]\nhead = { unit = "gpu" }\ntail = { unit = "dsp", in = "head" }', "stages.head"),
+        ('[stages]\ntail = { unit = "dsp", tme = 1 }', "stages.tail"),
+    ],
+)
+def test_other_faults_of_the_file_are_still_told(stages: str, message: str, folder: Path, command: Command) -> None:
+    pytest.importorskip("tomlkit")
+    (folder / "in" / "file.toml").write_text(stages)
+    _, err = command("times", "hub.json", "--stage", "in/file.toml:tail", code=2)
+    assert message in err
+    assert (folder / "in" / "file.toml").read_text() == stages
+
+
+def test_written_times_have_six_digits(folder: Path, command: Command) -> None:
+    pytest.importorskip("tomlkit")
+    (folder / "hub.json").write_text(json.dumps({"execution_summary": {"all_inference_times": [12511.299999999999]}}))
+    path = written(folder, "3")
+    command("times", "hub.json", "--stage", "in/file.toml:tail")
+    assert path.read_text() == FILE % "{samples = [12.5113]}"
+    (folder / "log.txt").write_text(LOG.replace("avg=5000", "avg=5000.00012").replace("std=500", "std=500.00009"))
+    command("times", "log.txt", "--stage", "in/file.toml:tail")
+    assert path.read_text() == FILE % "{mean = 5.0, sd = 0.5}"
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
