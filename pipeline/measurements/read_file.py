@@ -97,6 +97,12 @@ def _of_text(path: Path, text: str) -> Found:
         return runtime_files.read_benchmark(text)
     if lines and tuple(lines[0].split(",")) == OWN_COLUMNS:
         return _read_own(text)
+    if trace_slices.PERFETTO_TEXT.match(text):
+        remedy = f"convert it with Perfetto's tool: traceconv binary {path.name} trace.pftrace"
+        raise BadInputError(path, "a Perfetto trace as text", "the trace itself, or JSON", remedy)
+    if trace_slices.FTRACE_TEXT.search(text[:HEAD_BYTES]):
+        remedy = f"convert it with Perfetto's tool: traceconv json {path.name} trace.json"
+        raise BadInputError(path, "a trace as text (ftrace or systrace)", "JSON, or a trace of Perfetto", remedy)
     raise BadInputError(path, f"text that begins with {(lines or [''])[0][:60]!r}", KNOWN)
 
 

@@ -39,6 +39,9 @@ MOST_UNPACKED_BYTES: Final = 512 << 20
 FIRST_OWN_CLOCK, LAST_OWN_CLOCK = 64, 127  # clocks of a sequence
 STATE_CLEARED: Final = 1
 ATRACE: Final = re.compile(r"([BE])(?:\|(\d+)(?:\|(.*))?)?\s*", re.DOTALL)
+#: Traces as text, which are told apart but not read: ftrace's lines, and Perfetto's.
+FTRACE_TEXT: Final = re.compile(r"^# tracer: |\[\d{3}\] .{0,40}\d+\.\d+: \w+: ", re.MULTILINE)
+PERFETTO_TEXT: Final = re.compile(r"\s*packet\s*:?\s*\{")
 PACKET: Final = 0x0A  # field 1 of a Trace, with a length
 
 

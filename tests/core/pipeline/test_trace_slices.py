@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -120,6 +121,24 @@ EVENTS: list[dict[str, Any]] = [
     {"ph": "E", "ts": 11000, "pid": 1, "tid": 1},
     {"name": "process_name", "ph": "M", "pid": 1, "args": {"name": "x"}},
 ]
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (
+            "# tracer: nop\n#\n app-1 (1) [000] ...1 5.1: tracing_mark_write: B|1|seg\n",
+            "found a trace as text (ftrace or systrace), expected JSON, or a trace of Perfetto; "
+            "convert it with Perfetto's tool: traceconv json file trace.json",
+        ),
+        ("TRACE:\n  app-123 (  100) [000] ...1 12.345678: tracing_mark_write: B|100|seg\n", "traceconv json file"),
+        (ATRACE, "found a Perfetto trace as text, expected the trace itself, or JSON; convert it with"),
+        ("a note on [000] 5 tracers\n", "text that begins with"),
+    ],
+)  # fmt: skip
+def test_traces_as_text_name_the_conversion(text: str, reason: str, read: Callable[[bytes], Measurements]) -> None:
+    with pytest.raises(BadInputError, match=re.escape(reason)):
+        read(text.encode())
 
 
 @pytest.mark.parametrize("document", [EVENTS, {"traceEvents": EVENTS}], ids=["list", "table"])
