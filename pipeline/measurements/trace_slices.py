@@ -36,8 +36,10 @@ NO_SLICES: Final = {
 }
 UNENDED: Final = "a slice that does not end in the trace"
 MOST_UNPACKED_BYTES: Final = 512 << 20
-FIRST_OWN_CLOCK, LAST_OWN_CLOCK = 64, 127  # clocks of a sequence
-STATE_CLEARED: Final = 1
+FIRST_OWN_CLOCK, LAST_OWN_CLOCK = 64, 127  # clocks of a sequence; those above are of the whole trace
+STATE_CLEARED, NEEDS_STATE = 1, 2  # flags of a packet
+LOST_STATE: Final = "an event whose names or clock were in packets that are lost"
+NO_CLOCK: Final = "an event on a clock that the trace does not explain"
 ATRACE: Final = re.compile(r"([BE])(?:\|(\d+)(?:\|(.*))?)?\s*", re.DOTALL)
 #: Traces as text, which are told apart but not read: ftrace's lines, and Perfetto's.
 FTRACE_TEXT: Final = re.compile(r"^# tracer: |\[\d{3}\] .{0,40}\d+\.\d+: \w+: ", re.MULTILINE)
@@ -71,13 +73,17 @@ class _Sequence:
         self.clocks: dict[int, list[int]] = {}  # clock: its last time, ns of a tick, whether times are differences
         self.default_clock = 0
         self.default_track = 0
+        self.is_known = False  # whether all that it has said is here
 
 
 class _Slices:
+    """Begins and ends are collected by track first: packets of several writers come in any order."""
+
     def __init__(self, found: Found) -> None:
         self._found = found
         self._sequences: dict[int, _Sequence] = defaultdict(_Sequence)
-        self._open: dict[object, list[tuple[str, int]]] = defaultdict(list)
+        self._clocks: dict[int, list[int]] = {}  # of the whole trace, as in `_Sequence`
+        self._marks: dict[object, list[tuple[int, str | None]]] = defaultdict(list)  # time, name; None for an end
         self._left = MOST_UNPACKED_BYTES
 
     def read(self, data: bytes) -> None:
@@ -92,9 +98,21 @@ class _Slices:
             if not packets:
                 raise BadInputError("the file", "bytes that do not parse", "a trace of Perfetto") from error
             self._found.refuse(f"packet {packets}", "the file is cut off or damaged from here on")
-        unended = sum(len(stack) for stack in self._open.values())
-        if unended:
-            self._found.skipped[UNENDED] += unended
+        for marks in self._marks.values():
+            self._pair(sorted(marks, key=lambda mark: mark[0]))  # marks of one time stay in their order
+
+    def _pair(self, marks: Sequence[tuple[int, str | None]]) -> None:
+        """Take the slices of one track, whose ends each belong to the last begin that is open."""
+        begun: list[tuple[str, int]] = []
+        for at, name in marks:
+            if name is not None:
+                begun.append((name, at))
+            elif begun:
+                self._take(*begun.pop(), at)
+            else:
+                self._found.skip("the end of a slice that began before the trace")
+        if begun:
+            self._found.skipped[UNENDED] += len(begun)
 
     def _packets(self, data: bytes, *, packed: bool = False) -> Iterator[TracePacket]:
         """Yield the packets one by one, so that a long trace is never held as objects. Raises DecodeError."""
@@ -122,59 +140,65 @@ class _Slices:
                 yield packet
 
     def _packet(self, packet: TracePacket) -> None:
+        sequence = self._learned(packet)
+        if packet.HasField("track_event"):
+            if packet.sequence_flags & NEEDS_STATE and not sequence.is_known:
+                self._found.skip(LOST_STATE)
+            elif (at := self._time(packet, sequence)) is None:
+                self._found.skip(NO_CLOCK)
+            else:
+                self._event(packet, sequence, at)
+        for event in packet.ftrace_events.event:
+            if event.HasField("print"):
+                self._mark(event.pid, event.timestamp, event.print.buf)
+
+    def _learned(self, packet: TracePacket) -> _Sequence:
+        """Return the sequence of a packet, with what the packet says for later ones."""
         sequence = self._sequences[packet.trusted_packet_sequence_id]
+        if packet.previous_packet_dropped:
+            sequence.is_known = False
         if packet.sequence_flags & STATE_CLEARED or packet.incremental_state_cleared:
             sequence = self._sequences[packet.trusted_packet_sequence_id] = _Sequence()
+            sequence.is_known = True
         if packet.HasField("trace_packet_defaults"):
             sequence.default_clock = packet.trace_packet_defaults.timestamp_clock_id
             sequence.default_track = packet.trace_packet_defaults.track_event_defaults.track_uuid
         for each in packet.interned_data.event_names:
             sequence.names[each.iid] = each.name
         for clock in packet.clock_snapshot.clocks:
-            if FIRST_OWN_CLOCK <= clock.clock_id <= LAST_OWN_CLOCK:
+            if clock.clock_id >= FIRST_OWN_CLOCK:
+                clocks = sequence.clocks if clock.clock_id <= LAST_OWN_CLOCK else self._clocks
                 tick = int(clock.unit_multiplier_ns) or 1
-                sequence.clocks[clock.clock_id] = [clock.timestamp * tick, tick, int(clock.is_incremental)]
-        if packet.HasField("track_event"):
-            self._event(packet, sequence)
-        for event in packet.ftrace_events.event:
-            if event.HasField("print"):
-                self._mark(event.pid, event.timestamp, event.print.buf)
+                clocks[clock.clock_id] = [clock.timestamp * tick, tick, int(clock.is_incremental)]
+        return sequence
 
-    def _time(self, packet: TracePacket, sequence: _Sequence) -> int:
-        clock = sequence.clocks.get(packet.timestamp_clock_id or sequence.default_clock)
+    def _time(self, packet: TracePacket, sequence: _Sequence) -> int | None:
+        """Return the time of a packet in ns; None on a clock of a program's own that no snapshot explains."""
+        known = packet.timestamp_clock_id or sequence.default_clock
+        clock = sequence.clocks.get(known) or self._clocks.get(known)
         if clock is None:
-            return int(packet.timestamp)
+            return int(packet.timestamp) if known < FIRST_OWN_CLOCK else None
         last, tick, incremental = clock
         clock[0] = packet.timestamp * tick + (last if incremental else 0)
         return clock[0]
 
-    def _event(self, packet: TracePacket, sequence: _Sequence) -> None:
-        event, at = packet.track_event, self._time(packet, sequence)
+    def _event(self, packet: TracePacket, sequence: _Sequence, at: int) -> None:
+        event = packet.track_event
         track = ("track", event.track_uuid or sequence.default_track or packet.trusted_packet_sequence_id)
         phase = event.legacy_event.phase if event.type == event.TYPE_UNSPECIFIED else 0
         name = event.name or sequence.names.get(event.name_iid, "") or f"unnamed {event.name_iid}"
         if event.type == event.TYPE_SLICE_BEGIN or phase == ord("B"):
-            self._open[track].append((name, at))
+            self._marks[track].append((at, name))
         elif event.type == event.TYPE_SLICE_END or phase == ord("E"):
-            self._end(track, at)
+            self._marks[track].append((at, None))
         elif phase == ord("X"):
             self._take(name, at, at + 1000 * event.legacy_event.duration_us)
 
     def _mark(self, thread: int, at: int, text: str) -> None:
         """Take a mark of atrace: `B|process|name` begins a slice of the thread, `E` ends its last one."""
         mark = ATRACE.fullmatch(text)
-        if mark is None:
-            return
-        if mark[1] == "B":
-            self._open["thread", thread].append(((mark[3] or "").strip(), at))
-        else:
-            self._end(("thread", thread), at)
-
-    def _end(self, track: object, at: int) -> None:
-        if not self._open[track]:
-            self._found.skip("the end of a slice that began before the trace")
-            return
-        self._take(*self._open[track].pop(), at)
+        if mark is not None:
+            self._marks["thread", thread].append((at, (mark[3] or "").strip() if mark[1] == "B" else None))
 
     def _take(self, name: str, begin: int, end: int) -> None:
         if end < begin:

@@ -67,6 +67,46 @@ def test_names_by_number_and_clocks_that_count_on(read: Callable[[bytes], Measur
     assert samples(read(binary(INTERNED))) == {"run": (0.004, 0.006)}
 
 
+#: A thread that moves from CPU 0 to 1 and back: runs from 1 to 11 and from 50 to 60 us. CPU 0's bundle comes first.
+MOVED = """
+packet { ftrace_events { cpu: 0 event { timestamp: 1000 pid: 10 print { buf: "B|10|run" } }
+                                event { timestamp: 60000 pid: 10 print { buf: "E|10" } } } }
+packet { ftrace_events { cpu: 1 event { timestamp: 11000 pid: 10 print { buf: "E|10" } }
+                                event { timestamp: 50000 pid: 10 print { buf: "B|10|run" } } } }
+"""
+
+
+def test_marks_of_several_cpus_are_paired_in_the_order_of_time(read: Callable[[bytes], Measurements]) -> None:
+    assert samples(read(binary(MOVED))) == {"run": (0.01, 0.01)}
+
+
+#: The last two events need what the lost packets said.
+NEEDY = INTERNED.replace("timestamp: 1 track", "sequence_flags: 2 timestamp: 1 track").replace(
+    "timestamp: 6", "sequence_flags: 2 timestamp: 6"
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected", "count", "reason"),
+    [
+        (NEEDY, (0.004, 0.006), 0, ""),
+        (NEEDY.replace("sequence_flags: 1 ", ""), (), 3, "in packets that are lost"),
+        (INTERNED.replace("clock_id: 64", "clock_id: 65", 1), (), 4, "on a clock that the trace does not explain"),
+        (INTERNED.replace("clock_id: 64", "clock_id: 130"), (0.004, 0.006), 0, ""),
+    ],
+)
+def test_events_whose_names_or_clock_are_not_there_are_counted(
+    text: str, expected: tuple[float, ...], count: int, reason: str, read: Callable[[bytes], Measurements]
+) -> None:
+    if not expected:
+        with pytest.raises(BadInputError):
+            read(binary(text))
+        text += ATRACE
+    found = read(binary(text))
+    assert samples(found).get("run", ()) == expected
+    assert sum(many for why, many in found.skipped.items() if reason and reason in why) == count
+
+
 def test_packed_packets(read: Callable[[bytes], Measurements]) -> None:
     packed = Trace(packet=[TracePacket(compressed_packets=zlib.compress(binary(INTERNED)))]).SerializeToString()
     assert samples(read(packed)) == {"run": (0.004, 0.006)}
@@ -99,7 +139,7 @@ def test_damage_is_named_and_what_came_before_stays(name: str, read: Callable[[b
 @pytest.mark.parametrize(
     ("old", "new", "reason"),
     [
-        ("timestamp: 2000", "timestamp: 999", "it ends 1 ns before it begins"),
+        ("timestamp: 2000", "timestamp: 999", "the end of a slice"),
         ("timestamp: 2000", "timestamp: 1000", "a slice without length"),
         ("timestamp: 2000", "timestamp: 9000000000000000000", "over an hour"),
         ('timestamp: 2000 pid: 10 print { buf: "E', 'timestamp: 2000 pid: 11 print { buf: "E', "the end of a slice"),
