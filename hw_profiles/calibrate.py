@@ -34,7 +34,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from statistics import median
+from statistics import fmean, median
 from typing import Any, Final, NamedTuple, get_args
 
 import numpy as np
@@ -237,8 +237,8 @@ def calibrate_tables(data: Mapping[str, Any], path: Path, rows: Sequence[OwnRow]
         except BadInputError as error:
             raise BadInputError(row.place, error.found, error.expected) from None
     left_out = []
-    for index, row in enumerate(rows):
-        others = with_numbers(data, _moved(profile, [*rows[:index], *rows[index + 1 :]]))
+    for row in rows:
+        others = with_numbers(data, _moved(profile, [each for each in rows if each.network != row.network]))
         left_out.append(Checked(row, *_predicted(profile, row), *_predicted(parse_profile(others, path), row)))
     checked = tuple(each._replace(after=_scaled(each, error_scale(misses(left_out, each)))) for each in left_out)
     numbers = _moved(profile, rows) | _error_scales(profile, left_out)
@@ -246,16 +246,20 @@ def calibrate_tables(data: Mapping[str, Any], path: Path, rows: Sequence[OwnRow]
 
 
 def misses(left_out: Sequence[Checked], of: Checked | UnitName) -> list[float]:
-    """Return how far off predictions were, as logarithms in units of the stated error.
+    """Return how far off predictions were, as logarithms in units of the stated error: one for each network.
 
-    `left_out`: rows beside a prediction by a fit to all others, with the interval that the profile states.
-    `of`: a unit, for all its rows; or a row, for all other rows of its unit.
-    A row without others on its unit tells nothing of a fit.
+    Rows of one network say the same of the fit, and nothing of other networks, so their mean counts.
+    `left_out`: rows beside a prediction by a fit to all other networks, with the interval that the profile states.
+    `of`: a unit, for all its networks; or a row, for all other networks of its unit.
+    A network without others on its unit tells nothing of a fit.
     """
-    unit = of if isinstance(of, str) else of.row.unit
-    of_unit = [each for each in left_out if each.row.unit == unit]
-    told = of_unit if len(of_unit) > 1 else []
-    return [math.log(each.row.ms / each.after_ms) / spread_of(each.after) for each in told if each is not of]
+    unit, own = (of, "") if isinstance(of, str) else (of.row.unit, of.row.network)
+    told: dict[str, list[float]] = {}
+    for each in left_out:
+        if each.row.unit == unit:
+            miss = math.log(each.row.ms / each.after_ms) / spread_of(each.after)
+            told.setdefault(each.row.network, []).append(miss)
+    return [fmean(each) for network, each in told.items() if network != own] if len(told) > 1 else []
 
 
 def error_scale(told: Sequence[float]) -> float:

@@ -141,12 +141,17 @@ def test_one_row_that_is_far_off_moves_little(tables: tuple[dict[str, Any], Path
 
 
 def test_a_row_left_out_is_predicted_by_the_others_alone(tables: tuple[dict[str, Any], Path]) -> None:
-    """Two rows of one network contradict each other: each is predicted as the other was measured, not in between."""
+    """Two equal networks contradict each other: each is predicted as the other was measured, not in between.
+
+    Two rows of one network tell nothing of each other, as a fit must predict networks that it has not met.
+    """
     data, path = tables
     ms = priced(parse_profile(data, path), row("resnet18"))
-    first, second = calibrate_tables(data, path, [row("resnet18", ms), row("resnet18", 2 * ms)]).rows
+    rows = [row("resnet18", ms), row("resnet18", 2 * ms)]
+    first, second = calibrate_tables(data, path, [rows[0], rows[1]._replace(network="equal")]).rows
     assert first.after_ms == pytest.approx(2 * ms, rel=0.03)
     assert second.after_ms == pytest.approx(ms, rel=1e-6)
+    assert [each.after_ms for each in calibrate_tables(data, path, rows).rows] == pytest.approx([ms, ms], rel=1e-6)
 
 
 def test_a_unit_without_an_engine_has_one_factor() -> None:
@@ -195,13 +200,15 @@ def around(low: float, high: float) -> Interval:
 def test_misses_are_those_of_other_rows_of_the_unit() -> None:
     """Twice as long as predicted, and the interval ends at twice the prediction: NORMAL_80 stated errors."""
     two = Checked(row("resnet18", 4.0), 1.0, around(1, 1), 2.0, around(1, 4))
-    same = Checked(row("resnet18", 2.0), 1.0, around(1, 1), 2.0, around(1, 4))
+    same = Checked(row("resnet18-128", 2.0), 1.0, around(1, 1), 2.0, around(1, 4))
     lonely = Checked(row("resnet18", 9.0, unit="gpu"), 1.0, around(1, 1), 2.0, around(1, 4))
     left_out = [two, same, lonely]
     assert misses(left_out, "dsp") == pytest.approx([NORMAL_80, 0])
     assert misses(left_out, two) == [0]
     assert misses(left_out, same) == pytest.approx([NORMAL_80])
     assert misses(left_out, "gpu") == [] == misses(left_out, lonely)
+    assert misses([two, two, same], "dsp") == pytest.approx([NORMAL_80, 0])
+    assert misses([two, two], "dsp") == []
 
 
 def test_the_moved_profile_states_the_scaled_error(tables: tuple[dict[str, Any], Path]) -> None:
