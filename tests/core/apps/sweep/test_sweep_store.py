@@ -147,3 +147,15 @@ def test_how_a_process_ended(code: int, out: str, status: str, error: str | None
 
 def test_a_process_without_a_word() -> None:
     assert ended_as(-11, "", "")["error"] == "exit code -11, no message"
+
+
+def test_a_sweep_of_a_file_with_other_contents_is_another_sweep(tmp_path: Path) -> None:
+    chip = tmp_path / "chip.toml"
+    chip.write_text("a = 1", encoding="utf-8")
+    trials = [Trial(("predict",), {"profile": str(chip), "size": ["1", "2"]}, ())]
+    for _ in range(2):  # again as it is: it is complete
+        with opened(tmp_path / "s", trials) as store:
+            store.add(record(trials[0]))
+    chip.write_text("a = 2", encoding="utf-8")
+    with pytest.raises(BadInputError, match=r"read .*chip.toml with other contents.*choose another --out"):
+        opened(tmp_path / "s", trials).__enter__()

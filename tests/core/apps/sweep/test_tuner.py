@@ -347,3 +347,17 @@ def test_a_command_in_this_process_ends_as_in_its_own() -> None:
     code, out, messages = _called(["predict", "--size", "127", "--json"])
     assert (code, out) == (2, "")
     assert messages.splitlines()[-1].startswith("error: ") and "127" in messages
+
+
+def test_an_interrupted_prediction_ends_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("trilane.apps.cli.predict.application_of", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        _called(["predict", "--size", "128", "--json"])
+
+
+def test_an_unknown_chip_is_refused_before_a_trial() -> None:
+    with pytest.raises(BadInputError, match="nosuchchip"):
+        _space([], ["size=128,192"], "nosuchchip")
