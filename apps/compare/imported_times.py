@@ -24,7 +24,9 @@ EXPECTED: Final = "imported times: JSON with `measurements`, each with `name`, `
 WALL: Final = "wall"
 #: Unit that imported stages stand on; nothing is known of it.
 UNIT: Final = "imported"
-Ms = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+#: Longest and shortest time that can be one, in ms: an hour, and a millionth of a nanosecond.
+LONGEST_MS, SHORTEST_MS = 3.6e6, 1e-12
+Ms = Annotated[float, Field(ge=0, le=LONGEST_MS)]
 
 
 class Measurement(BaseModel):
@@ -38,7 +40,7 @@ class Measurement(BaseModel):
 
     name: str = Field(min_length=1)
     kind: str
-    count: int | None = Field(default=None, ge=0)
+    count: int | None = Field(default=None, ge=0, le=1 << 53)
     mean_ms: Ms | None = None
     sd_ms: Ms | None = None
     p50_ms: Ms | None = None
@@ -61,7 +63,7 @@ class Measurement(BaseModel):
 def imported(document: Mapping[str, Any], path: Path) -> dict[str, Any]:
     """Return the keys of a report that a comparison reads. Raises BadInputError naming the first wrong key."""
     rows = [_measurement(row, f"{path}: {MEASUREMENTS}.{place}") for place, row in enumerate(document[MEASUREMENTS])]
-    rows = [row for row in rows if row.ms]
+    rows = [row for row in rows if row.ms >= SHORTEST_MS]
     if not rows:
         raise BadInputError(f"{path}: {MEASUREMENTS}", "no time", "one or more", "docs/compare.md has the keys")
     if len(files := {row.file for row in rows}) > 1:

@@ -194,10 +194,17 @@ def _events_by_line(text: str) -> tuple[list[Any], list[str]]:
 def _read_own(text: str) -> Found:
     """Read the CSV that `trilane times --csv` writes."""
     found = Found("CSV of trilane times", "samples, as another tool measured them")
-    reader = csv.DictReader(text.splitlines())
+    lines = text.splitlines()
+    reader, last = csv.DictReader(lines), len(lines)
     try:
         for row in reader:
             place, unit, kind = f"line {reader.line_num}: {row['name']}", str(row["unit"]), row["kind"]
+            if None in row:
+                found.refuse(place, f"more cells than the {len(OWN_COLUMNS)} of the header: a comma in a number?")
+                continue
+            if reader.line_num == last and not text.endswith("\n"):
+                found.refuse(place, "the file ends within the row")
+                continue
             if unit not in PER_MS or kind not in ("run", "layer", "wall"):
                 found.refuse(place, f"the unit {unit!r} or the kind {kind!r} is unknown")
                 continue

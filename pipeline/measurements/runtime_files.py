@@ -90,6 +90,7 @@ class _Benchmark:
         self._announced = 0
         self._lines: list[str] = []  # of this benchmark
         self._figures: tuple[str, dict[str, str]] | None = None
+        self._is_warm = False  # whether a warm-up came before those figures
         self._litert: dict[str, tuple[str, str, str | None, str | None]] = {}
         for number, line in enumerate(text.splitlines(), 1):
             self._line(f"line {number}", line)
@@ -131,13 +132,16 @@ class _Benchmark:
             else:
                 self._take(place, pairs, f"{self._graph}, sum of operators")
             return
-        if self._figures is not None:  # two such lines in a row: the first one is the warm-up
+        if self._figures is not None and self._is_warm:
+            self._flush(place)  # of the log before, in a file of several
+        elif self._figures is not None:  # two such lines in a row: the first one is the warm-up
             self.found.skip("warm-up")
+            self._is_warm = True
         self._figures = (place, pairs)
 
     def _flush(self, place: str, summary: str = "") -> None:
         """Take the figures that came last, which the summary repeats in part."""
-        figures, self._figures = self._figures, None
+        figures, self._figures, self._is_warm = self._figures, None, False
         stated = re.search(r"Inference \(avg\): ([^\s,]+)", summary)
         average = _number(stated[1]) if stated else None
         if figures is None:
@@ -177,7 +181,10 @@ class _Benchmark:
             self._litert = {}
             return
         place, _, unit, count = self._litert["avg"]
-        times = {key: _number(value) for key, (_, value, _, _) in self._litert.items()}
+        times = {
+            key: _in_unit(_number(value), of or unit or "us", unit or "us")
+            for key, (_, value, of, _) in self._litert.items()
+        }
         self._litert = {}
         if self._figures is not None:
             self._of_block(place, times["avg"], unit or "us")
@@ -190,7 +197,7 @@ class _Benchmark:
         row, pairs = self._figures
         mean, factor = _number(pairs.get("avg", "")), PER_MS["us"] / PER_MS[unit]
         if isinstance(mean, float) and isinstance(average, float) and abs(average * factor - mean) > 0.006 * factor:
-            self._figures = None
+            self._figures, self._is_warm = None, False
             said = f"avg={mean:g} us, but {place} says Inference (avg): {average:g} {unit}"
             self.found.refuse(f"{row}: {self._graph}", said)
             return
@@ -262,6 +269,11 @@ def _number(text: str) -> object:
         return float(text)
     except ValueError:
         return text
+
+
+def _in_unit(value: object, of: str, unit: str) -> object:
+    """Return a number in the unit `of` in `unit`; anything else as it is."""
+    return value / PER_MS[of] * PER_MS[unit] if isinstance(value, float) and of != unit else value
 
 
 def is_tensorrt(document: Sequence[Any]) -> bool:

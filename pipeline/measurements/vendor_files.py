@@ -51,7 +51,7 @@ def read_qnn(text: str) -> Found:
     found = Found("QNN profile (CSV)", "times of each run; of its nodes only cycles, which are shares")
     cycles: dict[str, list[float]] = defaultdict(list)
     run = _Run(found)
-    for place, cells, identifier in _qnn_rows(text, found):
+    for place, cells, identifier, graph in _qnn_rows(text, found):
         row = f"{place}: {identifier}"
         unit = cells["Unit of Measurement"].strip().upper()
         if unit in NO_TIMES:
@@ -67,25 +67,25 @@ def read_qnn(text: str) -> Found:
             elif "execute" not in identifier.lower():
                 found.skip("no time of a run, such as preparing the graph or acquiring memory")
             else:
-                run.take(row, identifier, value, QNN_UNITS[unit])
-    run.end()
+                run.take(row, identifier, value, QNN_UNITS[unit], graph)
+    run.finish()
     _add_cycles(found, cycles)
     return found
 
 
-def _qnn_rows(text: str, found: Found) -> Iterator[tuple[str, dict[str, str], str]]:
-    """Yield place, cells by column and identifier of each row. A header may come again where files were joined."""
+def _qnn_rows(text: str, found: Found) -> Iterator[tuple[str, dict[str, str], str, str]]:
+    """Yield place, cells by column, identifier and named graph of each row. A header may come again in joined files.
+
+    A row is one line, so that a quote that is not closed takes no other row with it.
+    """
     header: list[str] = []
-    reader = csv.reader(text.splitlines())
-    while True:
+    for number, line in enumerate(text.splitlines(), 1):
+        place = f"line {number}"
         try:
-            cells = next(reader)
-        except StopIteration:
-            return
+            cells = next(csv.reader([line]), [])
         except csv.Error as error:
-            found.refuse(f"line {reader.line_num}", f"no CSV: {error}")
+            found.refuse(place, f"no CSV: {error}")
             continue
-        place = f"line {reader.line_num}"
         if cells and cells[0].strip() == QNN_COLUMNS[0]:
             header = _names(cells)
             missing = [name for name in (*QNN_COLUMNS[2:4], IDENTIFIER) if name not in header]
@@ -101,7 +101,8 @@ def _qnn_rows(text: str, found: Found) -> Iterator[tuple[str, dict[str, str], st
                 # the tool does not quote identifiers, which may have commas
                 named = dict(zip(header, cells, strict=False))
                 last = ",".join(cells[len(header) - 1 :]) if header[-1] == IDENTIFIER else named[IDENTIFIER]
-                yield place, named, _event(named, last.strip())
+                event = _event(named, last.strip())
+                yield place, named, event, last.strip() if event == NET_RUN else ""
 
 
 def _event(named: dict[str, str], identifier: str) -> str:
@@ -131,18 +132,24 @@ def _number_of(text: str) -> object:
 
 
 class _Run:
-    """The times of one execution, in any order. A name that comes again, or the whole behind parts, ends it."""
+    """The times of one execution, in any order. A name that comes again, or the whole behind parts, ends it.
+
+    Executions of several graphs are told apart by the graph that a row of `qnn-net-run` names.
+    """
 
     def __init__(self, found: Found) -> None:
         self._found = found
         self._rows: dict[str, tuple[str, float, str]] = {}
+        self._graph = ""
+        self._ended: list[tuple[str, str, str, float, str]] = []  # graph, row, name, value, unit
 
-    def take(self, row: str, name: str, value: object, unit: str) -> None:
+    def take(self, row: str, name: str, value: object, unit: str, graph: str) -> None:
         if name not in WHAT:
             self._found.sample(row, name, "run", value, unit, "as its name says")
             return
         if name in self._rows:
             self.end()
+        self._graph = graph or self._graph
         if self._found.ms(row, value, unit, "run") is not None:
             self._rows[name] = (row, float(value), unit)  # type: ignore[arg-type]
         if name == WHOLE and self._rows.keys() - {WHOLE, NET_RUN}:
@@ -156,14 +163,22 @@ class _Run:
         for index, name in enumerate(names):
             row, value, unit = self._rows[name]
             if index in kept:
-                self._found.sample(row, name, "run", value, unit, WHAT[name])
+                self._ended.append((self._graph, row, name, value, unit))
                 continue
             around = next((k for k in reversed(kept) if k < index and ms[index] > ms[k]), None)
             inside = next((k for k in kept if k > index and ms[index] < ms[k]), None)
             other, word = (names[around], "longer") if around is not None else (names[inside or 0], "shorter")
             place = "around" if around is not None else "within"
             self._found.refuse(row, f"{ms[index]:g} ms is {word} than {other!r} {place} it")
-        self._rows = {}
+        self._rows, self._graph = {}, ""
+
+    def finish(self) -> None:
+        """Take the times of all executions, with their graph in the name where the file has several."""
+        self.end()
+        several = len({graph for graph, *_ in self._ended if graph}) > 1
+        for graph, row, name, value, unit in self._ended:
+            said = f"{name} of {graph or 'an unnamed graph'}" if several else name
+            self._found.sample(row, said, "run", value, unit, WHAT[name])
 
 
 def _take_cycles(found: Found, row: str, level: str, name: str, value: object, cycles: dict[str, list[float]]) -> None:

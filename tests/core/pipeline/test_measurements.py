@@ -14,7 +14,7 @@ import pytest
 
 from support.mutations import mutated
 from trilane.errors import BadInputError
-from trilane.pipeline.measurements.read_file import Measurements, chosen, read_measurements
+from trilane.pipeline.measurements.read_file import OWN_COLUMNS, Measurements, chosen, read_measurements
 
 #: usefulsensors/qc_npu_benchmark, npu_quant_profile.csv; the second run is of tezheng/winml-cli, optrace_resnet50.csv.
 QNN = """Msg Timestamp,Message,Time,Unit of Measurement,Timing Source,Event Level,Event Identifier
@@ -501,3 +501,62 @@ def test_changed_files_are_read_or_refused(name: str, tmp_path: Path) -> None:
             continue
         json.dumps([each.document() for each in found.measurements], allow_nan=False)
         assert all(each.mean_ms is None or each.mean_ms >= 0 for each in found.measurements)
+
+
+def runs(found: Measurements) -> dict[str, tuple[float, ...]]:
+    return {each.name: each.samples_ms for each in found.measurements if each.kind == "run"}
+
+
+#: Two executions of two graphs, in the layout of qnn-profile-viewer.
+GRAPHS = f"""{QNN.splitlines()[0]}
+0,EXECUTE,5000,US,NETRUN,ROOT,Graph 0: small
+0,EXECUTE,4800,US,BACKEND,ROOT,NULL
+0,EXECUTE,50000,US,NETRUN,ROOT,Graph 1: big
+0,EXECUTE,48000,US,BACKEND,ROOT,NULL
+"""
+
+
+def test_executions_of_several_graphs_are_several_runs(read: Callable[[str], Measurements]) -> None:
+    found = runs(read(GRAPHS))
+    assert {name: ms for name, ms in found.items() if name.startswith("NetRun")} == {
+        "NetRun (execute) time of Graph 0: small": (5.0,),
+        "NetRun (execute) time of Graph 1: big": (50.0,),
+    }
+    assert runs(read(GRAPHS.replace("1: big", "0: small")))["NetRun (execute) time"] == (5.0, 50.0)
+
+
+def test_an_open_quote_takes_no_other_row_with_it(read: Callable[[str], Measurements]) -> None:
+    whole, quoted = runs(read(QNN)), runs(read(QNN.replace("RPC (finalize) time", '"RPC (finalize) time')))
+    assert quoted == whole and len(whole["QNN (execute) time"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [(lambda row: row + ",5\n", "a comma in a number"), (lambda row: row[:-1], "ends within the row")],
+)
+def test_a_row_of_the_own_csv_that_is_not_whole_is_refused(
+    change: Callable[[str], str], reason: str, read: Callable[[str], Measurements]
+) -> None:
+    cells = {"name": "a", "kind": "run", "unit": "us", "ms": "15"}
+    row = ",".join(cells.get(name, "0") for name in OWN_COLUMNS)
+    found = read(",".join(OWN_COLUMNS) + f"\n{row}\n" + change(row))
+    assert runs(found) == {"a": (15.0,)}
+    assert [reason in each.reason for each in found.refused] == [True]
+
+
+def test_two_logs_of_figures_alone_are_two_runs_with_a_warm_up_each(read: Callable[[str], Measurements]) -> None:
+    log = "count=2 first=9 curr=9 min=9 max=9 avg=9 std=0\ncount=50 first=5 curr=5 min=5 max=5 avg={0} std=0\n"
+    found = read(log.format(5) + log.format(5))
+    assert [each.mean_ms for each in found.measurements] == [0.005, 0.005]
+    assert found.skipped["warm-up"] == 2
+
+
+def test_each_figure_of_litert_has_its_own_unit_and_one_without_is_in_that_of_the_mean(
+    read: Callable[[str], Measurements],
+) -> None:
+    lines = {"avg": "465 us (2112 runs)", "min": "0.44 ms", "std": "18"}
+    text = "--graph=net.tflite\n" + "".join(
+        f"INFO: [x:1] Inference ({name}):  {each}\n" for name, each in lines.items()
+    )
+    (one,) = read(text).measurements
+    assert (one.mean_ms, one.min_ms, one.sd_ms) == pytest.approx((0.465, 0.44, 0.018))
