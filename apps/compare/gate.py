@@ -228,9 +228,12 @@ def judge(gates: Sequence[Gate], pairs: Sequence[Pair]) -> list[Judged]:
 def _weighed(gate: Gate, pair: Pair) -> Iterator[Weighed]:
     relief, metric = relief_of(pair.base, pair.other), gate.metric
     rows = exact_rows(pair.base, pair.other, CHECKED, "dB") if metric.of[0][0] == CHECKED else pair.rows
+    is_quiet = not [*spoilt(_runs(pair))]
     works = {figure.of: row for figure, row in rows.items() if (figure.measure, figure.statistic) == (WORK, "typical")}
     for figure, row in rows.items():
-        if (figure.measure, figure.statistic) not in metric.of or _is_said(figure, row, works.get(figure.of), metric):
+        if (figure.measure, figure.statistic) not in metric.of:
+            continue
+        if _is_said(figure, row, works.get(figure.of), metric, is_quiet):
             continue
         down, up = (min(relief, 0.0), max(relief, 0.0)) if figure.measure in WALL else (-row.explained, row.explained)
         worse = metric.sign * row.effect
@@ -239,15 +242,16 @@ def _weighed(gate: Gate, pair: Pair) -> Iterator[Weighed]:
         yield Weighed(figure, row, least, most, limit, _chance_of(least, row))
 
 
-def _is_said(figure: Figure, row: Difference, work: Difference | None, metric: Metric) -> bool:
+def _is_said(figure: Figure, row: Difference, work: Difference | None, metric: Metric, is_quiet: bool) -> bool:
     """Return whether the stage's `work` says the same: service time that grew as much, CPU time that is as long.
 
-    The typical job says nothing of few that take much longer; then the mean is weighed too.
+    The typical job says nothing of few that take much longer; then the mean is weighed too. Beside other programs few
+    jobs take much longer by themselves, and nothing is kept there anyway.
     """
     if work is None or (WORK, "typical") not in metric.of:
         return False
     if figure.measure == SERVICE:
-        return row.other * work.base <= (1 + SAME_TIME) * row.base * work.other
+        return not is_quiet or row.other * work.base <= (1 + SAME_TIME) * row.base * work.other
     alike = all(abs(mine - its) <= SAME_TIME * its for mine, its in ((row.base, work.base), (row.other, work.other)))
     return figure.measure == CPU and alike
 

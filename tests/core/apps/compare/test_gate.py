@@ -399,7 +399,7 @@ def test_runs_that_lost_nothing_keep_a_limit_of_losses() -> None:
     assert outcome(run(1), run(2, frames=losing), "lost=1%") is Outcome.BROKEN
 
 
-def at_times(seed: int, slow: str = "") -> ComparedRun:
+def at_times(seed: int, slow: str = "", others: float = QUIET) -> ComparedRun:
     """A run of 400 frames whose jobs scatter by 5 %. A fifth of the jobs of `slow` takes six times as long."""
     draw = Random(seed)
 
@@ -410,9 +410,14 @@ def at_times(seed: int, slow: str = "") -> ComparedRun:
     graph = chain([(stage, unit) for stage, (unit, _) in STAGES.items()], "double", "composite")
     done = simulate(graph, Settings(400), service, keep=True)
     assert done.recording is not None
-    records = [*journal_of(done.recording, done.jobs, {"clock": "host"}, done.report)]
-    facts = {"clock": "host", "other_programs": QUIET, "baseline": None}
+    waited = [job._replace(cpu_ns=0) for job in done.jobs]  # nothing says that the long jobs computed
+    records = [*journal_of(done.recording, waited, {"clock": "host"}, done.report)]
+    facts = {"clock": "host", "other_programs": others, "baseline": None}
     return ComparedRun(f"run {seed}", RunKind.RUN, make_report(**{**done.report, **facts}), frames_of(records))
+
+
+def test_beside_other_programs_few_long_jobs_are_neither_passed_nor_called_slower() -> None:
+    assert outcome(at_times(1, others=0.5), at_times(2, "present", others=0.5), "slower=12%") is Outcome.UNKNOWN
 
 
 def of_four(name: str, first_seed: int, slow: str = "") -> Side:
