@@ -128,7 +128,8 @@ def fit(
         str | None, typer.Option(help="Profile whose numbers are the priors; if not given, one of the 888.")
     ] = None,
     name: Annotated[
-        str | None, typer.Option(help="Name of the fitted profile; if not given, that of the file, or snapdragon-888.")
+        str | None,
+        typer.Option(help="Name of the fitted profile. If not given, the name of the written file, or snapdragon-888."),
     ] = None,
     write: Annotated[Path | None, typer.Option(help="Write the fitted profile here.")] = None,
     networks: Annotated[Path | None, typer.Option(help="Folder of the networks; if none, the CSV's folder.")] = None,

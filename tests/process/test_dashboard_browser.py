@@ -247,6 +247,7 @@ def test_controls_act_restart_or_say_why_not(opened: Callable[..., Watched]) -> 
         seen.wait_for("() => document.getElementById('state').textContent.includes('paused')")
         seen.page.keyboard.press("Space")
         seen.wait_for("() => document.getElementById('state').textContent.includes('running')")
+        seen.wait_until(lambda: in_flight(seen) > 1)
         policy = seen.page.locator("[data-control=policy]")
         apply = seen.page.get_by_role("button", name="Apply and restart")
         assert apply.is_disabled()
@@ -462,6 +463,11 @@ def cell(seen: Watched, unit: str, column: int) -> str:
     return str(seen.page.locator(f"#units tr[data-unit={unit}]").locator("th, td").nth(column).inner_text())
 
 
+def in_flight(seen: Watched) -> int:
+    """The frames in flight that the page shows: several if pipelined, at most one if sequential, on any machine."""
+    return int(seen.text("#presented-rest").split(" in flight")[0].split()[-1])
+
+
 @pytest.mark.timeout(300)
 def test_a_run_is_watched_and_steered(opened: Callable[..., Watched], tmp_path: Path) -> None:
     with Started(tmp_path / "run") as started:
@@ -484,6 +490,7 @@ def test_a_run_is_watched_and_steered(opened: Callable[..., Watched], tmp_path: 
         seen.wait_for("() => document.getElementById('state').textContent.includes('running')")
         assert any("restarting" in state for state in seen.page.evaluate("() => window.states"))
         assert policy.locator("select").input_value() == "sequential"
+        assert in_flight(seen) <= 1
 
         seen.page.get_by_role("button", name="Kill dsp").click()
         seen.wait_until(lambda: (cell(seen, "dsp", RESTARTS), cell(seen, "dsp", PROCESS)) == ("1", "up"))
