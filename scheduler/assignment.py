@@ -166,7 +166,8 @@ class Choice:
                     continue
             elif not stage.waiting and (stage.bypassed is None or next_slot(stage, self._frames) < 0):
                 continue
-            if stage.output and not self.can_claim(stage, stage.output):
+            sink = stage.output
+            if sink is not None and not sink.free and not (sink.rule.yields and self.can_claim(stage, sink)):
                 return BLOCKED
             account = THROTTLED
         return account
@@ -320,6 +321,8 @@ class Assignment:
             self._prepare(unit, now_ns)
         runnable: list[StageState] = []
         for stage in unit.stages:
+            if stage.feeder is not None and not stage.waiting:  # most looks: `can_begin` takes longer
+                continue
             if self._drops:
                 self._late.drop(stage, now_ns)
             if self._choice.can_begin(stage, now_ns):

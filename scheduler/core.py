@@ -244,7 +244,6 @@ class Core:
             self._reset_alarm()
         sampled_ns = None if stage.before else frame.release_ns if self.graph.from_release else read_ns
         frame.end_stage(sampled_ns, end_ns, stage is self._latency_stage)
-        self.flow.mark_dirty(unit)
         self.flow.pass_on(stage, job, end_ns)
 
     def ready_ns(self, job: Job) -> int | None:

@@ -148,8 +148,9 @@ class Flow:
         self._all = (1 << self._count) - 1
         self._ends = sum(stage.bit for stage in self.stages if stage.output is None)
         self._every = any(stage.period > 1 for stage in self.stages)
-        self._roots = [stage for stage in self.stages if not stage.before]
-        self.source_lines = [(each, each.input) for each in self._roots if isinstance(each.input, SourceLine)]
+        roots = [stage for stage in self.stages if not stage.before]
+        self._root_units = [stage.unit for stage in roots]
+        self.source_lines = [(each, each.input) for each in roots if isinstance(each.input, SourceLine)]
         self.main = sum(stage.bit for stage in self.stages if stage.is_main)
         self._written: dict[tuple[int, int], FrameState] = {}  # frame of each slot behind a stage with newest readers
         self.bypass: Bypass | None = None
@@ -251,6 +252,7 @@ class Flow:
 
     def pass_on(self, stage: StageState, job: Job, end_ns: int) -> None:
         """Note that the job is done: its frame waits for the next stages, or is presented."""
+        self.dirty.append(stage.unit)
         state = self.frames.get(job.frame)
         if state is None:
             self.free_slots(job)
@@ -286,7 +288,7 @@ class Flow:
         if replaced:
             self.drop(replaced, stage, DropCause.STALE)
         if len(sink.ready) == 1 or self._drops:
-            self.mark_dirty(self.stages[place].unit)
+            self.dirty.append(self.stages[place].unit)
 
     def _commit(self, stage: StageState, sink: EdgeSlots, slot: int, state: FrameState, end_ns: int) -> None:
         """Let the slot wait for the readers of its frame."""
@@ -307,8 +309,9 @@ class Flow:
         if state.todo & self._ends:
             return
         state.is_presented = True
-        known = (state.latency_ns, state.deadline_ns, state.skips, state.rung, state.release_ns)
-        self._ledger.presented(frame, end_ns, *known)
+        self._ledger.presented(
+            frame, end_ns, state.latency_ns, state.deadline_ns, state.skips, state.rung, state.release_ns
+        )
         if state.todo:
             self.aside += 1
         else:
@@ -327,8 +330,7 @@ class Flow:
 
     def mark_roots_dirty(self) -> None:
         """Note that another frame may be put in flight."""
-        for root in self._roots:
-            self.mark_dirty(root.unit)
+        self.dirty += self._root_units
 
     def _take_bypass(self, bypass: Bypass, job: Job) -> bool:
         """Return whether the frame takes the bypass; if so, it waits for the stage at the bypass's end."""

@@ -67,8 +67,11 @@ class Source:
     def advance(self, now_ns: int) -> bool:
         """Release the frames that are due, drop those that waited too long, and return whether something changed."""
         changed = False
-        while self._paced and not self._held and self._next < self._end and self._release_ns(self._next) <= now_ns:
-            self._admit(self._next, self._release_ns(self._next))
+        while self._paced and not self._held and self._next < self._end:
+            release_ns = self._release_ns(self._next)
+            if release_ns > now_ns:
+                break
+            self._admit(self._next, release_ns)
             self._next += 1
             changed = True
         timeout = self._settings.queue_timeout_ns

@@ -95,14 +95,16 @@ class _UnitBook:
     def add_job(self, begin_ns: int, end_ns: int, preempted_ns: int, asleep_ns: int, preempted_before_ns: int) -> None:
         """Book a job, and the time before it in which the unit had it, did no other job and had no core."""
         self.jobs += 1
-        held_from_ns = max(self.last_end_ns, self.since_ns)
-        if begin_ns > held_from_ns:
+        last_end_ns = self.last_end_ns
+        if preempted_before_ns and begin_ns > (held_from_ns := max(last_end_ns, self.since_ns)):
             self.preempted_ns += min(preempted_before_ns, begin_ns - held_from_ns)
-        if end_ns > self.last_end_ns:
-            ran_ns = end_ns - max(begin_ns, self.last_end_ns)
+        if end_ns > last_end_ns:
+            ran_ns = end_ns - (begin_ns if begin_ns > last_end_ns else last_end_ns)
             self.last_end_ns = end_ns
-            self.preempted_ns += min(preempted_ns, ran_ns)
-            self.busy_ns += ran_ns - min(preempted_ns + asleep_ns, ran_ns)
+            self.busy_ns += ran_ns
+            if preempted_ns or asleep_ns:
+                self.preempted_ns += min(preempted_ns, ran_ns)
+                self.busy_ns -= min(preempted_ns + asleep_ns, ran_ns)
 
     def shares(self, joins: bool) -> dict[str, Any]:
         """Return the unit's row of the report. `joins`: whether one of its stages has several inputs."""
