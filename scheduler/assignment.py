@@ -6,13 +6,13 @@ changes nothing.
 A frame is dropped when the stage that it waits for is considered, and not before. The policy says which frames are
 dropped: those that must be late, or those that a newer frame has made stale.
 
-A frame must be late if even the earliest end of its last stage is past its deadline. That bound is never later than
-the truth if service times stay what they were lately, so no frame is given up that could be in time. At every stage
-older frames go first. So a frame begins at a stage after the older frames' work there, or after its own work at the
-stages before, whichever ends later. With a bypass, a frame that has not come to its beginning is taken to do what the
+A frame must be late if even the earliest end of its last stage is past its deadline. While service times stay as they
+were lately, this bound is never later than the real end. Therefore no frame is given up that could be in time. At every
+stage older frames go first. A frame begins at a stage after the older frames' work there, or after its own work at the
+stages before, whichever ends later. A frame that has not reached the beginning of a bypass is assumed to do what the
 last frame there did.
 
-Where branches meet, a frame is stale only before any branch that it must go through has begun it (flow.py).
+In a graph whose branches meet, a frame can become stale only until one of its branches has begun it (flow.py).
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def earliest_completion_ns(
     `stages`: all stages, with the estimates of service times.
     `frames`: frames in flight, by number.
     `todo`: bits of the stages that the frame has yet to do.
-    `bypass`: bypass that a frame takes which has yet to come to its beginning; None: no frame does.
+    `bypass`: bypass that every frame takes that has not reached its beginning yet; None: no such frame takes one.
     """
     older = [state.todo for number, state in frames.items() if number < frame]
     skipped, skips = 0, 0
@@ -74,7 +74,7 @@ def _done_of_running(now_ns: int, stage: StageState) -> int:
 
 
 class Choice:
-    """A view of the core's own stages, source and frames."""
+    """Answers questions about stages, source and frames of a core, as they are now."""
 
     def __init__(self, settings: Settings, policy: Policy, source: Source, flow: Flow) -> None:
         """Keep what the choice depends on: the run's settings and policy, its source and its frames in flight."""
@@ -86,7 +86,7 @@ class Choice:
         self.latches = settings.latch_ns > 0 and len(stages) > 1
 
     def can_begin(self, stage: StageState, now_ns: int) -> bool:
-        """Return whether the stage has a frame to take and a slot to put it in."""
+        """Return whether the stage has a frame to take and an output slot to write to."""
         source, sink = stage.input, stage.output
         if source is None:
             if self._source.is_empty or self.is_full() or (self.latches and now_ns < self.latch_from_ns(now_ns)):
@@ -104,7 +104,7 @@ class Choice:
         return sink.can_claim(lambda frame: self._flow.must_stay(stage, frame))
 
     def slot_to_take(self, stage: StageState) -> int:
-        """Return the slot of the frame that the stage would do next, as `next_slot` does; -1 if it has none to do."""
+        """Return the slot of the stage's next frame, as `Job.slot_in` counts; -1: the stage has no frame to do."""
         if stage.bypassed is not None:
             return next_slot(stage, self._frames)
         return stage.waiting[0] if stage.waiting and all(stage.others) else -1
@@ -149,7 +149,7 @@ class Choice:
         return release_ns + self._deadline_ns if self._deadline_ns else NEVER
 
     def account_without_job(self, unit: UnitState, now_ns: int) -> int:
-        """Return the account of the time of a unit whose queue is empty: why it has no job."""
+        """Return the account that gets the time of a unit with an empty queue; it says why the unit has no job."""
         if unit.life != READY:
             return ASSIGNED
         account = STARVED
@@ -274,8 +274,8 @@ class Assignment:
     def assign(self, now_ns: int, released_ns: int, actions: list[Action]) -> None:
         """Hand jobs to the dirty units, as `Dispatch` in `actions`, until each is full or has nothing to run.
 
-        `released_ns`: time at which the first frame of this step's release was due, else now. A unit without input
-        until then has waited for the scheduler since.
+        `released_ns`: time at which the first frame that this step released was due; now if it released none. If a unit
+        had no input before, it has waited for the scheduler since that time.
         """
         dirty, is_fed = self._flow.dirty, self._is_fed
         for unit in dirty:  # a dispatch may append to it, even a unit looked at before

@@ -1,7 +1,7 @@
 """The scheduler (which job runs where, and when), and the loop that every driver runs.
 
-Rule: pure; it knows the time only from `step`, and does no I/O. One loop serves all clocks; drivers differ in their
-`Clock` alone.
+Rule: the core is pure. It knows the time only from `step`, and does no I/O. One loop serves all clocks; drivers differ
+in their `Clock` alone.
 
 Theory of operation. A driver calls `step` with the time and the events since the last step. The core answers with
 actions to do now and with the time at which it wants to be asked again. The same steps give the same answers, so a run
@@ -16,8 +16,8 @@ Slots. Between two stages lies an edge with a fixed number of slots (transport/s
 its output slot from dispatch until it is done. So a stage can begin only when a frame waits before it and a slot is
 free behind it. Nothing else holds back the stages before a slow one.
 
-Bypass. A frame may skip the stages between two others, when the first of these says so. It then waits for the second in
-the slot that it has, and overtakes no frame (flow.py).
+Bypass. A frame may skip the stages between two others, when the first of these says so. It keeps its slot, waits there
+for the second, and overtakes no frame (flow.py).
 
 Dirty units. A step looks only at units for which something has changed. The unit's own job ended, a frame came to one
 of its stages, a slot got free behind one, or its life or duty changed. Whoever changes such a thing calls `mark_dirty`.
@@ -28,8 +28,9 @@ units, and only when it has gone off or was reset. Events that put a deadline of
 off too early.
 
 Dispatch ahead and leading. A unit holds its next job while one runs, so that no message delay lies between them. A
-policy that wants the newest frame hands the next job over only `lead_ns` before the running one should end. Latching is
-the same for the first stage: it begins so late that what it samples is new when the second stage can take it.
+policy that wants the newest frame hands the next job over only `lead_ns` before the running one should end. Latching
+does the same for the first stage. This stage begins so late that its sample is still new when the second stage can take
+it.
 """
 
 from __future__ import annotations
@@ -171,7 +172,7 @@ class Core:
         return Decision(tuple(self.actions), next_ns)
 
     def report(self, *, clock: str, requested: int | None = None) -> dict[str, Any]:
-        """Return the ledger's report. `requested`: number of frames that were asked for; None: that of the settings."""
+        """Return the ledger's report. `requested`: number of frames that were asked for; None: as in the settings."""
         asked = self.settings.frames if requested is None else requested
         return self.ledger.report(clock=clock, requested=asked, not_begun=asked - self.source.left)
 
@@ -384,8 +385,8 @@ class Clock(Protocol):
 
         Times never go back. It may return without an event at any time.
 
-        `deadline_ns`: latest time of return; NEVER when only an event can bring the core on. The first call of a run
-        has NEVER. It must return the first events: a `UnitReady` for each unit that is up.
+        `deadline_ns`: latest time of return; NEVER: without an event the core has nothing to do. The first call of a
+        run has NEVER. It must return the first events: a `UnitReady` for each unit that is up.
         """
         ...
 

@@ -110,8 +110,8 @@ NEVER: Final = (1 << 62) - 1  # ns, later than any time
 class Job(NamedTuple):
     """One stage of one frame on one unit, from an input slot to an output slot.
 
-    `slot_in`: index of the input slot; of several inputs, `packed`. Where a bypass ends at the stage, the slots of the
-    bypassed edge follow those of the input edge.
+    `slot_in`: index of the input slot; for several inputs, the result of `packed`. If a bypass ends at the stage, the
+    slots of the bypassed edge are counted after those of the input edge.
     `fresh`: whether the stage must ignore what earlier frames left behind; set for the stage at which the bypass
     begins.
     `rung`: rung of the frame's work (work_ladder.py).
@@ -287,8 +287,8 @@ class Input:
     """What a stage reads: the stream that another stage writes.
 
     `stage`: name of the stage that writes it.
-    `latest`: whether the stage takes the newest frame that there is, of whatever number. Otherwise it takes the same
-    frame as from its other inputs.
+    `latest`: whether the stage takes the newest frame, whatever its number. Otherwise the stage takes the same frame
+    here as from its other inputs.
     `max_age_ns`: longest age at which the newest frame is taken; an older one counts as absent. 0: any age.
     """
 
@@ -316,9 +316,9 @@ NO_SLOT: Final = 255
 
 
 def packed(slots: Sequence[int]) -> int:
-    """Return the slots of a job's inputs as one number, a byte for each, the first input lowest; -1 without inputs.
+    """Return the slots of a job's inputs as one number, with the first input in the lowest byte; -1 without inputs.
 
-    `slots`: slot of each input; -1 for an input of the newest frame where there is none yet.
+    `slots`: slot of each input; -1 for an input that takes the newest frame, while there is none.
     """
     if len(slots) == 1:
         return slots[0] if slots[0] >= 0 else NO_SLOT
@@ -329,19 +329,19 @@ def packed(slots: Sequence[int]) -> int:
 
 
 def unpacked(code: int, count: int) -> list[int]:
-    """Return the slots of `count` inputs that `packed` made `code` of."""
+    """Return the slots of `count` inputs from `code`, a result of `packed`."""
     slots = [code >> 8 * place & NO_SLOT for place in range(count)]
     return [slot if slot != NO_SLOT else -1 for slot in slots]
 
 
 @dataclass(frozen=True)
 class Graph:
-    """The stages of a run and how frames go through them, in an order in which each stage follows those that it reads.
+    """The stages of a run, and how frames go through them. Each stage comes after the stages that it reads.
 
-    `edges`: rule of each edge. In a chain `edges[i]` lies between stages i and i + 1. Elsewhere it is the rule of the
-    stream of each stage that has a reader, in the order of the stages.
+    `edges`: rule of each edge. In a chain `edges[i]` lies between stages i and i + 1. Any other graph has one rule for
+    each stage that has a reader, in the order of the stages.
     `latency_to`: stage at whose end the latency ends.
-    `bypass`: names of two stages of a chain; a frame for which the first says so skips the stages between them
+    `bypass`: names of two stages of a chain. A frame skips the stages between them if the first stage says so
     (flow.py).
     `from_release`: whether the latency begins with the frame's release, not when its first stage samples it.
     """
@@ -414,7 +414,7 @@ class Graph:
 
     @property
     def streams(self) -> dict[str, tuple[str, ...]]:
-        """The readers of each stage that has any, by its name."""
+        """The readers of each stage, by the stage's name; stages without readers are left out."""
         readers: dict[str, list[str]] = {stage.name: [] for stage in self.stages}
         for index, stage in enumerate(self.stages):
             for each in self.inputs_of(index):
@@ -422,12 +422,12 @@ class Graph:
         return {name: tuple(found) for name, found in readers.items() if found}
 
     def edge_name(self, index: int) -> str:
-        """Return `FROM->TO` of the edge that `edges[index]` is the rule of; several readers are joined by commas."""
+        """Return the name `FROM->TO` of the edge with the rule `edges[index]`; commas separate several readers."""
         name, readers = list(self.streams.items())[index]
         return f"{name}->{','.join(readers)}"
 
     def written(self) -> dict[str, Any]:
-        """Return the graph as JSON values, which `recording.graph_of` reads; a chain has no inputs in it."""
+        """Return the graph as JSON values, which `recording.graph_of` reads; those of a chain leave out the inputs."""
         if self.is_chain and not self.from_release:
             stages = [{"name": stage.name, "unit": stage.unit} for stage in self.stages]
             return {"stages": stages, "edges": self.edges, "latency_to": self.latency_to, "bypass": self.bypass}
@@ -453,7 +453,7 @@ class Settings:
     `arrivals_ns`: release times from the start, instead of a period.
     `asked`: whether `FrameRequest` alone releases frames.
     `latch_ns`: margin by which a frame's first stage is expected to end before the second can take it. The first stage
-    begins that late so that what it samples is newer and waits less.
+    begins that late so that its sample is newer and waits less.
     `deadline_ns`: longest time from a frame's release to its presentation.
     `works`: work of each rung of the ladder (work_ladder.py) in thousandths, 1000 first, falling; empty: no ladder.
     `follow`: names of the stages whose time follows the work.

@@ -8,20 +8,22 @@ then the same frame.
 
 Dropped everywhere. A frame that is dropped or lost leaves all lines, because a stage that joins branches would wait for
 it in vain. A job that has begun it goes on, and what the job writes is thrown away. A frame that one branch has begun
-is not dropped as stale on another, or two branches would choose different frames, and hardly any pair would meet.
+is not dropped as stale on another. Otherwise two branches would choose different frames, and hardly any pair would
+meet.
 
 Side work. Only inputs of the newest frame take the work of some stages, so no picture waits for it. A frame that such a
-stage leaves out is dropped there alone, and is not counted. Nor is a frame that was presented before it is dropped.
+stage leaves out is dropped there alone, and is not counted. A frame that is dropped after it was presented is not
+counted either.
 
-A bypass is the way past some stages of a chain. A frame on it overtakes none, and its slot goes back to the edge that
-it came from. The stage at which the bypass begins says of each frame whether it skips (`JobDone.skips`). The slot of
-such a frame waits in the second line of the edge behind that stage, for the stage at which the bypass ends. That stage
-takes frames from two sides. It takes the oldest frame, and a frame that skips only when no older frame is still before
-it.
+A bypass is the way past some stages of a chain. A frame on it overtakes none. The frame's slot goes back to the edge on
+which the frame waited. The stage at which the bypass begins says of each frame whether it skips (`JobDone.skips`). The
+slot of such a frame waits in the second line of the edge behind that stage, for the stage at which the bypass ends.
+That stage takes frames from two sides. It takes the oldest frame. It takes a frame that skips only when no older frame
+is still on its way to the stage.
 
-A frame that skips relies on what a frame that did not skip left at the bypass's end. Such a frame may be lost or
-dropped before it gets there, or the unit at the end may be started again. Then the next job at the bypass's begin is
-`fresh`.
+A frame that skips relies on what an earlier frame, which did not skip, left at the bypass's end. The earlier frame may
+be lost or dropped before it gets there, or the unit at the end may be started again. In these cases the next job at the
+bypass's begin is `fresh`.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ class Bypass:
     """The way past the stages between `begin` and `end`; a frame that takes it has its slot on `edge`, behind `begin`.
 
     `must_be_fresh`: whether the next job of `begin` must be fresh.
-    `was_taken`: whether the last frame that `begin` did skipped.
+    `was_taken`: whether the last frame of `begin` took the bypass.
     """
 
     __slots__ = ("begin", "edge", "end", "must_be_fresh", "was_taken")
@@ -83,7 +85,7 @@ def _is_older_before(stage: StageState, frame: int, frames: Mapping[int, FrameSt
 
 
 def own_slots(stage: StageState) -> int:
-    """Return the number of slots of the stage's own edge, after which those of the bypassed edge are counted."""
+    """Return the number of slots of the stage's own edge; `Job.slot_in` counts the bypassed edge from there on."""
     assert isinstance(stage.input, EdgeSlots)
     return len(stage.input.state)
 
@@ -98,10 +100,10 @@ def side_of(stage: StageState, slot_in: int) -> tuple[EdgeSlots | SourceLine, in
 
 
 def stale_slot(stage: StageState, frames: Mapping[int, FrameState]) -> int:
-    """Return the slot of the oldest frame that waits to skip to the stage if that frame is stale; else -1.
+    """Return the slot of the oldest frame that waits for the stage on the bypass, if it is stale; else -1.
 
-    The frame is stale if a newer waiting frame could go as soon. A frame that did not skip is not stale for one that
-    does, which may need it. The slot counts as `Job.slot_in` does.
+    The frame is stale if a newer waiting frame could go as soon. A frame that skips never makes a frame stale that did
+    not skip, because it may need that frame. The slot counts as `Job.slot_in` does.
     """
     own, bypassed = stage.input, stage.bypassed
     if own is None or bypassed is None or not bypassed.lines[SKIPPING]:
@@ -125,7 +127,7 @@ class Flow:
     `dirty`: units that a step must look at, in the order in which they were marked; a unit may appear twice.
     `bypass`: bypass of the chain, or None.
     `rung`: rung of the work of frames that are admitted from now on.
-    `gone`: frames that were dropped or lost while jobs worked on them, until these end.
+    `gone`: frames that were dropped or lost while jobs worked on them, until these jobs end.
     `aside`: number of frames in flight that are presented, so that only side work is left.
     `source_lines`: where frames wait for each stage without inputs, if there are several such stages.
     """
@@ -183,7 +185,7 @@ class Flow:
     def begin(self, stage: StageState, frame: int, slot_in: int, now_ns: int) -> Job:
         """Return the stage's job for `frame`, which was just admitted or waits for the stage.
 
-        `slot_in`: slot in which it waits, as `Job.slot_in` counts, for a stage that joins nothing.
+        `slot_in`: slot in which the frame waits, as `Job.slot_in` counts; it matters only in a chain.
         """
         source, sink, state = stage.input, stage.output, self.frames[frame]
         slot_out = -1
@@ -236,7 +238,7 @@ class Flow:
     def must_stay(self, behind: StageState, frame: int) -> bool:
         """Whether a frame behind a stage is not dropped for a newer one, because another branch has begun it.
 
-        If only side work waits for it there, it is left out there and goes on elsewhere.
+        If only side work waits for the frame there, the side work leaves it out, and the frame goes on elsewhere.
         """
         state = self.frames[frame]
         return self._is_awaited(behind, state) and bool(state.begun & self.main & ~(behind.before | behind.bit))
@@ -417,8 +419,8 @@ class Flow:
     def reclaim(self, unit: UnitState, loss: Loss) -> None:
         """Give the slots of a unit whose process is gone back to their edges, under a new epoch.
 
-        The frame that the unit worked on is lost. Its other frames wait again, but those for the only first stage are
-        lost.
+        The frame that the unit worked on is lost. Its other frames wait again, except before the only stage without
+        inputs. There they are lost too.
         """
         jobs = list(unit.queue)
         unit.queue.clear()

@@ -52,7 +52,7 @@ class Source:
 
     @property
     def released(self) -> int:
-        """The number of frames that have left, wait, or were forgotten."""
+        """The number of frames released so far: those that have left, those that wait, and those that `stop` forgot."""
         return self._next
 
     @property

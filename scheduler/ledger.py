@@ -34,7 +34,7 @@ class FrameLeft(NamedTuple):
     """A frame that left the run.
 
     `cause`: key of the cause in the report; empty for a presented frame.
-    `end_ns`, `latency_ns`, `rung`: as in `Ledger.presented`; 0 for other frames.
+    `end_ns`, `latency_ns`, `rung`: as in `Ledger.presented`; 0 for a frame that was not presented.
     """
 
     frame: int
@@ -130,8 +130,8 @@ class _UnitBook:
 class Books:
     """How a run is accounted for.
 
-    `target_period_ns`: longest frame time that is not a missed deadline; the frames' own deadlines then do not count.
-    0: only the frames' own deadlines count.
+    `target_period_ns`: longest frame time that counts as in time; it replaces the frames' own deadlines. 0: the frames'
+    own deadlines count.
     `sketch`: function that makes a sketch, as for `trilane.scheduler.stats.Samples`.
     """
 
@@ -241,7 +241,10 @@ class Ledger:
         self._units[unit].restarts += 1
 
     def hold(self, is_held: bool) -> None:
-        """Say whether somebody holds the run from now on. A time between frames with a pause in it is no frame time."""
+        """Note whether somebody holds the run from now on.
+
+        A time between frames that contains a pause is no frame time.
+        """
         self._is_held, self._was_held = is_held, True
 
     def presented(
@@ -256,7 +259,7 @@ class Ledger:
     ) -> None:
         """Book a presented frame.
 
-        `latency_ns`: its latency; below 0 for a frame that the stage at which the latency ends does not take.
+        `latency_ns`: its latency; below 0 if the frame does not go through the stage at which the latency ends.
         `deadline_ns`: time of its deadline; NEVER without one.
         `skipped`: whether it took the bypass.
         `rung`: rung of its work.

@@ -1,17 +1,18 @@
 """The least period of a graph, from the times of its stages: the maximum ratio of a cycle (max-plus algebra).
 
 A job begins when other jobs have ended: those that it reads, the one before it on its stage, and those that free its
-slot. A cycle of such waits that takes w ns and leads s frames on allows no period below w / s. The bound is the largest
-ratio of all cycles. Other cycles are the work of a unit for one frame and the period of the source. With constant times
-and one stage on each unit the bound is reached. Where stages share a unit, their order may cost more.
+slot. If the jobs of a cycle of such waits take w ns, and the cycle ends s frames later, no period below w / s is
+possible. The bound is the largest ratio of all cycles. The work of a unit for one frame counts as a cycle, and the
+period of the source as another. With constant times and one stage on each unit the bound is reached. Where stages share
+a unit, their order may cost more.
 
-Where frames skip stages by a bypass, the slots count for nothing, so that the bound may be less than what is reached.
+If frames can take a bypass, the bound ignores the slots. The period of a run may then be longer than the bound.
 
-With `every` a stage takes one frame of several, so the jobs of a whole hyperperiod are told apart. Inputs of the newest
-frame hold back nobody. A rule that replaces waiting frames (triple, orphan) holds back nobody either.
+With `every` a stage takes one frame of several, so each job of a whole hyperperiod counts by itself. Inputs of the
+newest frame hold back nobody. A rule that replaces waiting frames (triple, orphan) holds back nobody either.
 
-Rule: all is exact, in whole ns and fractions. The ratio is found by Newton's method: a positive cycle for the ratio so
-far gives the next one (Bellman and Ford), until none is left.
+Rule: all is exact, in whole ns and fractions. Newton's method finds the ratio. Each step searches a positive cycle for
+the ratio so far (Bellman and Ford). The ratio of that cycle is the next one, until no such cycle is left.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ class Bound:
     """The least period of a graph.
 
     `period_ns`: least time between two frames of the source.
-    `stages`: stages of the cycle that makes it, in the order of a frame.
-    `limit`: what makes it: `unit NAME`, `slots`, `in_flight`, or `rate`; "" where no stage takes time.
+    `stages`: stages of the cycle that sets the period, in the order of a frame.
+    `limit`: what sets the period: `unit NAME`, `slots`, `in_flight`, or `rate`; "" where no stage takes time.
     `streams`: stages whose slots are in the cycle.
     """
 
@@ -156,7 +157,7 @@ def period_bound(
     `times_ns`: time of a job of each stage.
     `in_flight`: limit of frames in flight; 0: none.
     `source_ns`: period of the source; 0: it is always ready.
-    `shares`: share of the frames that each stage does which some of them skip.
+    `shares`: for each stage that some frames skip, the share of the frames that it does.
     """
     return _bound(_Waits(graph, times_ns, in_flight), _slots(graph), source_ns, shares)
 
@@ -241,7 +242,7 @@ def fewest_slots(
 ) -> list[int]:
     """Return slots of each stream, in the order of `graph.edges`: two, or the fewest that do not lengthen the period.
 
-    With one slot fewer of any stream that has more than two the period would be longer.
+    If any stream with more than two slots had one slot fewer, the period would be longer.
 
     `times_ns`, `in_flight`: as in `period_bound`.
     `given`: streams whose rule stays as it is in `graph`.

@@ -7,20 +7,21 @@ A placement gives each unit cores and threads. Its frame time is predicted from 
 for a frame, and the time for which it takes each of its cores. Let T be the frame time. In a pipelined run these hold:
 
 - *A unit does one job at a time.* Its jobs of a frame take at most T.
-- *A core does one thing at a time.* What the units need of it is at most T. A unit with one thread and several cores
-  *floats*: the kernel runs it where there is room. So for every set of cores, work that cannot go elsewhere is at most
-  what they can do in T, less what the kernel misses. By Hall's condition the work can then be divided, and only then.
+- *A core does one thing at a time.* The time that all units need on it is at most T. A unit with one thread and several
+  cores *floats*: the kernel runs it where there is room. For every set of cores, the work that cannot go elsewhere is
+  at most what these cores can do in T, less what the kernel misses. By Hall's condition the work can be divided exactly
+  if this holds for all sets.
 - *Each of a job's parallel regions waits for its slowest thread.* Let others have core c for the share o(c) of the
-  time. A job of several threads goes on only while all its cores are free. If the others come independently, that is
-  the product of 1 - o(c) over its cores, as a share of the time. The job takes that much longer, and at most T too.
+  time. A job of several threads goes on only while all its cores are free. If the others come independently, this share
+  of the time is the product of 1 - o(c) over its cores. The job takes that much longer, and at most T too.
 - *Siblings* of one physical core together do `SIBLINGS` times the work that one does alone.
 
 The least such T is the answer. A sequential run has one stage at work at any time: T is the sum, and nothing waits.
 
 A floating unit that has one core to itself *stays* there, because the kernel moves a thread only when it has to wait.
 
-Every job of a unit on a shared core costs a change of threads more. A floating unit that does not stay is moved once a
-frame. The time that the scheduler takes on its cores counts like work that nothing waits for.
+Every job of a unit on a shared core costs one more change of threads. A floating unit that does not stay is moved once
+a frame. The time that the scheduler takes on its cores counts like work that nothing waits for.
 """
 
 from __future__ import annotations
@@ -253,8 +254,9 @@ def ranked(cores: Sequence[CpuCore], times: Times, rules: Rules, fixed: Placemen
 def chosen(found: Sequence[Ranked], rule: Ranked) -> Ranked:
     """Return the placement of `found` to take; `found` is in the order of `ranked`.
 
-    It is never predicted longer than `rule`, the placement for any run. The rule stays unless another placement is
-    shorter by more than WORTH. Otherwise the choice is the placement within WORTH of the shortest that shares least.
+    The choice is never predicted longer than `rule`, the placement that suits any run. The rule stays unless another
+    placement is shorter by more than WORTH. In that case the choice is the one that shares the fewest cores among the
+    placements within WORTH of the shortest.
     """
     near = [each for each in found if each.frame_ns * (1 - WORTH) <= found[0].frame_ns]
     if rule.frame_ns * (1 - WORTH) <= found[0].frame_ns:
@@ -285,7 +287,7 @@ def typical(rounds: Sequence[Sequence[float]]) -> list[float]:
 
 
 def fastest(frame_ns: Sequence[float]) -> int:
-    """Return the index of the placement with the shortest measured frames; the first of those that are the `SAME`."""
+    """Return the index of the placement with the shortest measured frames; of those within `SAME` of it, the first."""
     return next(place for place, value in enumerate(frame_ns) if value <= min(frame_ns) * (1 + SAME))
 
 

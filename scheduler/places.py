@@ -30,7 +30,7 @@ class UnitWork(NamedTuple):
     """The work of a unit for a frame, on cores of full speed that the unit has to itself.
 
     `serial_ns`: time of the unit's jobs.
-    `core_ns`: time that they take of each of its cores; less where a device works.
+    `core_ns`: time that the jobs take on each of the unit's cores; less than `serial_ns` if a device works for them.
     `jobs`: number of jobs.
     """
 

@@ -49,7 +49,8 @@ class Policy:
     `in_flight`: limit of frames between admission and presentation; 0: no limit of its own.
     `newest`: whether a stage takes the newest waiting frame, and the others are stale.
     `drop_late`: whether a frame that cannot make its deadline is dropped before its next stage.
-    `lead_ns`: time before the expected end of its job at which a unit is handed the next; 0: as soon as there is one.
+    `lead_ns`: time before the expected end of a unit's job at which the unit gets its next job; 0: as soon as there is
+    one.
     `paced`: whether frames need a rate.
     """
 

@@ -3,14 +3,14 @@
 Rule: the scheduler is the real `Core`; only the units and the cores are simulated. Every job's needs are given.
 
 A job needs CPU time of its unit's threads, and time in which they need no core (a device works, or the unit sleeps). A
-unit with one thread is on one core at a time. When it wakes, it goes where it was; if others are there, it goes to a
-core of its own that is idle. A core that becomes idle pulls a unit that shares another core. Where a unit begins to
-share a core while another one is idle already, the idle one pulls at the next tick (BALANCE_NS). The units on a core
-have equal shares of it. A unit of several threads is on all of its cores at once and goes as fast as the slowest of
-them, because each parallel region waits for its slowest thread.
+unit with one thread is on one core at a time. When it wakes, it goes where it was; if others are there, it goes to an
+idle one of its cores. A core that becomes idle pulls a unit that shares another core. If a unit begins to share a core
+while another core is already idle, the idle core pulls it at the next tick (BALANCE_NS). The units on a core have equal
+shares of it. A unit of several threads is on all of its cores at once and goes as fast as the slowest of them, because
+each parallel region waits for its slowest thread.
 
-Equal shares stand for the kernel's slices in turn. Moves and changes of threads cost nothing here: the CPU times of
-jobs that are given have them already.
+Equal shares stand for the kernel's slices in turn. Moves and changes of threads cost nothing here, because the given
+CPU times of jobs include them.
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@ takes when several pipelines have handed it one. It also decides how fast jobs g
 Theory of operation. Each pipeline has its own `Core` with its own policy, ledger and recording, like two applications
 on one phone, and none knows of the others. Each unit of a pipeline has a *seat*: the hardware that does its jobs. On a
 seat with turns one job runs at a time; the others wait, and their units are preempted. On a *divided* seat all jobs run
-at once, each with an equal share. An example is a processor core of this machine, between whose processes the kernel
-switches. A unit does its own jobs in the order in which they were handed to it.
+at once, each with an equal share. An example is a core of this machine: the kernel switches between the processes on
+it. A unit does its own jobs in the order in which they were handed to it.
 
 Turns. The first waiting job of each pipeline is a candidate, and a row of `TURNS` chooses one. A running job is never
 taken off its unit. Source of `deadline`: Liu and Layland, Journal of the ACM 20 (1973).
@@ -16,8 +16,9 @@ At one instant, all events and all deadlines of the schedulers come first; each 
 jobs begin, so that no ready job is passed over because it was named later. Running jobs change their speed when others
 begin or end. The rest of a job is kept as a whole number of ns / `ONE`.
 
-Accounts. A job that waits while another pipeline has its seat was preempted before (`JobDone.preempted_before_ns`). On
-a divided seat it is preempted within (`preempted_ns`). A job that the memory slows down is busy all the while.
+Accounts. If a job waits while another pipeline has its seat, this time counts as preempted before the job
+(`JobDone.preempted_before_ns`). On a divided seat, the share of the others counts as preempted within the job
+(`preempted_ns`). A job that the memory slows down is busy all the while.
 """
 
 from __future__ import annotations

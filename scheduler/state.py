@@ -156,9 +156,10 @@ class UnitState:
 
 
 class SourceLine:
-    """The frames that wait for a stage without inputs, in place of slots; for several such stages, or one with `every`.
+    """The frames that wait for a stage without inputs, in place of slots.
 
-    A slot's number is the number of its frame.
+    A run has such lines if several stages have no inputs, or one of them has `every`. A slot's number is the number of
+    its frame.
     """
 
     def __init__(self) -> None:
@@ -175,7 +176,7 @@ class SourceLine:
         """Do nothing: no memory was held."""
 
     def pass_by(self, frame: int, _line: int) -> None:
-        """Let the stage not wait for `frame` any more."""
+        """Note that the stage no longer waits for `frame`."""
         if frame in self.ready:
             self.ready.remove(frame)
 
@@ -188,11 +189,11 @@ class SourceLine:
 
 @dataclass(frozen=True)
 class Inlet:
-    """One input of a stage that takes frame by frame.
+    """An input through which a stage takes one frame after the other.
 
     `edge`: slots that it reads.
-    `line`: index of its line of waiting slots.
-    `producer`: stage that fills them; None for frames from the source.
+    `line`: index, in `edge.lines`, of the slots that wait for the stage.
+    `producer`: stage that fills the slots; None for frames from the source.
     """
 
     edge: EdgeSlots | SourceLine
@@ -206,10 +207,10 @@ class Inlet:
 
 @dataclass(frozen=True)
 class NewestInlet:
-    """One input of a stage that takes the newest frame.
+    """An input through which a stage takes the newest frame.
 
     `edge`: slots that it reads.
-    `reader`: index of what it holds in `edge.newest`.
+    `reader`: index, in `edge.newest`, of the slot that it holds.
     `max_age_ns`: longest age at which the frame is taken; 0: any age.
     """
 
@@ -224,18 +225,18 @@ class StageState:
 
     `estimate_ns`: running mean of its service time in ns (weight 1/8); 0 before the first job.
     `inlets`: inputs that take frame by frame; `input` is the first one's edge, and `waiting` its line.
-    `others`: lines of the further ones.
+    `others`: waiting lines of the other inputs.
     `slots_of`: inputs whose slots a job names, in the order of `Job.slot_in`.
-    `feeder`: unit that fills the input, of a stage whose jobs read one slot, always of the same edge.
-    `joins`: whether a job names other slots than that of one frame.
+    `feeder`: unit that fills the input, if all jobs of the stage read one slot of the same edge; else None.
+    `joins`: whether `Job.slot_in` is more than the slot of one input, and must be unpacked.
     `bypassed`: for the stage at which a bypass ends, the edge whose frames may skip to it.
     `readers`: stages that read its output frame by frame, in the order of the output's lines.
     `period`: distance between the frames that it does.
     `bit`: 1 shifted by its position.
     `after`: positions of the stages that it reads frame by frame.
     `before`: bits of the stages that a frame must have done before it.
-    `is_main`: whether a stage without readers waits for its work, or it is one itself. The others do side work, which
-    only inputs of the newest frame take.
+    `is_main`: whether the stage has no readers, or a stage without readers needs its work. Other stages do side work,
+    which only inputs of the newest frame take.
     """
 
     __slots__ = (
@@ -283,7 +284,7 @@ class StageState:
     def lower_estimate(self) -> None:
         """Lower the estimate by a sixteenth.
 
-        It may rest on one slow job, and no job corrects it while every frame is given up.
+        The estimate may come from one slow job. While every frame is given up, no other job corrects it.
         """
         self.estimate_ns -= self.estimate_ns >> 4
 
@@ -312,7 +313,7 @@ class FrameState:
     `skips`: whether it takes the bypass.
     `rung`: rung of its work.
     `number`: how many frames were put in flight before it.
-    `todo`, `begun`: bits of the stages that it has yet to end, and of those that have begun it.
+    `todo`, `begun`: bits of the stages that have not ended the frame yet, and of those that have begun it.
     `jobs`: number of its jobs that units hold.
     `is_presented`: whether all stages without readers have done it; what is left is side work.
     """

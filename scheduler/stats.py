@@ -1,8 +1,9 @@
 """Summaries of the times of a run: percentiles, means with their uncertainty, and scores.
 
-Rule: percentiles are exact (linear between ranks, without bins) while the values are few, then those of a sketch.
-`is_exact` says so. A sketch is a structure of bounded size that gives percentiles within a stated error. This folder
-knows none: the maker of `Samples` provides one for a run that may last for days. Without one, all values are kept.
+Rule: while the values are few, percentiles are exact (linear between ranks, without bins). After that they come from a
+sketch; `is_exact` says which. A sketch is a structure of bounded size that gives percentiles within a stated error.
+This folder contains no sketch: the maker of `Samples` provides one for a run that may last for days. Without one, all
+values are kept.
 
 The interval of a mean frame time follows from the run's own frames. Successive frames are not independent, so the
 method is nonoverlapping batch means. The times are cut into batches of equal length, longer than what one frame carries
@@ -69,8 +70,9 @@ def samples_needed(share: float) -> int:
 def median_interval(values: Sequence[float], confidence: float = 0.95) -> tuple[float, float]:
     """Return the two values between which the median of their distribution lies with at least `confidence`.
 
-    By the sign test: the k-th least and the k-th largest, k the largest with P(B(n, 1/2) < k) <= (1 - confidence) / 2.
-    With too few values for that (below six for 0.95), the least and the largest. Raises ValueError for no values.
+    By the sign test they are the k-th least and the k-th largest value. k is the largest number with P(B(n, 1/2) < k)
+    <= (1 - confidence) / 2. If there are too few values for that (below six for 0.95), they are the least and the
+    largest value. Raises ValueError for no values.
     """
     if not values:
         raise ValueError("no values")

@@ -49,7 +49,8 @@ def none_skips(_frame: int, _fresh: bool) -> bool:
 class Simulation:
     """The result of a simulated run.
 
-    `report` has the keys of report.json. `shown_ns`: time at which each presented frame was, by its number.
+    `report` has the keys of report.json. `shown_ns`: time in ns at which each frame was presented, by the frame's
+    number.
     """
 
     report: dict[str, Any]
@@ -151,7 +152,7 @@ class VirtualDriver:
         return deadline_ns, ()
 
     def perform(self, now_ns: int, actions: tuple[Action, ...]) -> None:
-        """Put what follows from the actions on the heap."""
+        """Put the events that follow from the actions on the heap."""
         for action in actions:
             if type(action) is Dispatch:
                 self._dispatch(now_ns, action.job)

@@ -12,11 +12,11 @@ The use of a rung is the larger of two shares:
 - the busiest unit's time for a frame, as a share of the period;
 - the time of all stages, as a share of the deadline.
 
-The wanted rung is the first whose use is at most `FULL`. Without such a rung it is the first that no other betters by
-more than a twentieth, because less work would then save nothing.
+The wanted rung is the first whose use is at most `FULL`. Without such a rung, it is the first rung whose use exceeds
+the least use by at most a twentieth, because less work would save nothing.
 
 The ladder steps down at once. It takes one step up after `patience` frames in which the use of the rung above was at
-most `ROOM`. A step up that did not last as long doubles the patience, up to `MOST_PATIENCE`.
+most `ROOM`. If the ladder steps down again sooner than that, the patience doubles, up to `MOST_PATIENCE`.
 """
 
 from __future__ import annotations
