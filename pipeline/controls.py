@@ -25,7 +25,7 @@ ALL = -1
 
 
 class RunControls:
-    """The way into one run; once the run is over, requests do nothing."""
+    """Passes requests to one run; once the run is over, they do nothing."""
 
     def __init__(self) -> None:
         self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
@@ -71,12 +71,12 @@ class RunControls:
 
 
 class FrameRequestQueue:
-    """The way into one run; frames are numbered from 0 in the order in which they are asked for.
+    """Passes requests for frames to one run; frames are numbered from 0 in the order of the requests.
 
     `answered(frame)`: function that is called when the frame was presented.
     `ended()`: function that is called when the run is over, after which nothing is answered.
-    `unanswered(causes)`: function that is called once, with the first frames that were dropped or lost: their number by
-    each cause's key in the report.
+    `unanswered(causes)`: function that is called once, when the first frames were dropped or lost. `causes`: number of
+    these frames by the cause's key in the report.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class FrameRequestQueue:
 
 
 class Interrupts:
-    """Counts the signals and makes `fd` readable while entered from the main thread; in other threads it does nothing.
+    """Context manager that counts signals and makes `fd` readable at each; it does nothing outside the main thread.
 
     SIGPIPE is ignored meanwhile, as Python does it: a message to a unit that is gone must not end the program.
 

@@ -2,16 +2,16 @@
 
 Rule: a job begins when the last thing that it needs is there. It needs its input, its unit, a slot, room in flight, and
 its frame's release. Of several inputs, the one that came last counts. The path goes on with the job that brought the
-last thing. Time between the two belongs to no job: overhead, a cap, a restart. So the pieces of a path follow each
-other without gaps and sum to the time that it spans.
+last thing. Time between the two belongs to no job: overhead, a cap, a restart. Therefore the pieces of a path follow
+each other without gaps and sum to the time that it spans.
 
-The last thing is known, not guessed. A job that was handed over while its unit did another waited for that one. Any
-other job waited for one of the ends that the scheduler heard of in the step in which it handed the job over.
+The last thing is known, not guessed. If a job was handed over while its unit did another job, it waited for that job.
+Any other job waited for a job whose end the scheduler heard of in the step that handed it over.
 
-Units that share cores slow each other down without bringing each other anything. So time in which a job on the path had
-no core belongs to the stage whose job had the core (`Sharing`). The kernel counted how long a job had no core. Which
-stage had it is computed from the jobs that ran then on cores that both units may use. The rest of that time was no
-job's of this run: another program had the core, or a thread between jobs.
+Units that share cores slow each other down, although neither brings the other anything. Therefore time in which a job
+on the path had no core belongs to the stage whose job had the core (`Sharing`). The kernel counted how long a job had
+no core. Meanwhile other jobs ran on cores that both units may use; `Sharing` computes from them which stage had the
+core. For the rest of the time no job of this run had it, but another program, or a thread between jobs.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ DELAY: Final = 256  # in jobs; all that ran beside a job have ended after as man
 class Taken(NamedTuple):
     """Times of all jobs of a stage together, in ns.
 
-    `of`: time that jobs of other stages took from them, by stage.
+    `of`: time in which a job of another stage had the core that they lacked, by that stage.
     `other_ns`: time without a core that no job of the run explains.
     """
 
@@ -49,7 +49,10 @@ class Taken(NamedTuple):
 
 
 class Sharing:
-    """Takes jobs in the order of their ends. `cores`: numbers of the cores of each unit; empty where not known."""
+    """Computes which stages had the core while a stage's jobs lacked one.
+
+    `cores`: numbers of the cores of each unit; empty where not known.
+    """
 
     def __init__(self, cores: Mapping[str, Sequence[int]], delay: int = DELAY) -> None:
         self._beside = {
@@ -73,15 +76,16 @@ class Sharing:
             self._count(self._waiting.popleft())
 
     def close(self) -> dict[str, Taken]:
-        """Return who took how much from each stage, by stage; called after the last job."""
+        """Return for each stage which stages had the core while it lacked one; called after the last job."""
         while self._waiting:
             self._count(self._waiting.popleft())
         return self._sums
 
     def taken(self, unit: str, begin_ns: int, end_ns: int, lacked_ns: int) -> dict[str, int]:
-        """Return, by stage, how long its jobs had the core that `unit` lacked for `lacked_ns` of a piece of time.
+        """Return by stage how long its jobs had the core that `unit` lacked between two times.
 
-        The time is divided in proportion to how long the jobs ran then; no stage gets more than its jobs ran.
+        The time without a core, `lacked_ns`, is divided in proportion to how long the jobs ran between the two times.
+        No stage gets more than its jobs ran.
         """
         if not lacked_ns:
             return {}
@@ -151,7 +155,7 @@ class Piece(NamedTuple):
 
     `job`: job to which it belongs, or before which it lies.
     `stage`: stage of that job, or a stage of the unit that was down.
-    `asleep`: what time is in which the job slept.
+    `asleep`: kind of the time in which the job slept.
     """
 
     what: str
@@ -332,8 +336,9 @@ Part = tuple[str, str]
 def parts(piece: Piece, begin_ns: int, end_ns: int, sharing: Sharing | None = None) -> dict[Part, int]:
     """Return the ns of a piece between two times, by kind and stage.
 
-    Where in a job it was preempted or asleep is not known, so each part of the job gets the same share of it.
-    `sharing`: knows who had a core that the job lacked; without it, no job of the run had it.
+    It is not known where in a job the unit was preempted or asleep. Therefore each part of the job gets the same share
+    of that time.
+    `sharing`: tells which stages had a core that the job lacked; None: no job of the run had it.
     """
     ns = min(piece.end_ns, end_ns) - max(piece.begin_ns, begin_ns)
     if ns <= 0:
@@ -368,11 +373,11 @@ def _divided_preempted(stage: str, ns: int, taken: Mapping[str, int], lacked_ns:
 class Budget:
     """What bounded a whole run: the path that ends with its last frame.
 
-    A path is walked back from every STEP-th presented frame. What lies in the last MARGIN frames before it is left to
-    the next walk; paths that end with different frames meet within that margin. So the cost per frame does not grow
-    with the run. `ns_of` counts from the first presented frame.
+    A path is walked back from every STEP-th presented frame. Each walk leaves the last MARGIN frames before its start
+    to the next walk, because paths that end with different frames meet within that margin. Therefore the cost per frame
+    does not grow with the run. `ns_of` counts from the first presented frame.
 
-    `sharing`: knows who had a core that a job lacked.
+    `sharing`: tells which stages had a core that a job lacked.
     """
 
     def __init__(self, paths: Paths, sharing: Sharing | None = None) -> None:
@@ -405,9 +410,9 @@ class Budget:
         return self.ns_of
 
     def names(self, unit_of: Mapping[str, str]) -> dict[str, dict[Part, str]]:
-        """Return whose each part of the path is: by `unit`, and by `stage` where it is a stage's.
+        """Return the owner of each part of the path: by `unit`, and by `stage` for parts that a stage owns.
 
-        `unit_of`: unit of each stage. Time that is no unit's is named after its kind: other programs, release,
+        `unit_of`: unit of each stage. Time that no unit owns is named after its kind: other programs, release,
         overhead, held.
         """
         stages = {part: part[1] for part in self.ns_of if part[0] in OF_STAGES}

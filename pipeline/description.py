@@ -1,7 +1,7 @@
 """Describes a pipeline as data: stages, the edges between them, and the units that they run on.
 
-Rule: it knows nothing of a stage's work, which is behind the name of the stage's factory. A `Pipeline` is plain data,
-so that JSON can carry it to a unit's process.
+Rule: it does not know what a stage does; it knows only the name of the stage's factory. A `Pipeline` is plain data, so
+that JSON can carry it to a unit's process.
 """
 
 from __future__ import annotations
@@ -109,8 +109,8 @@ class StageInput(Described):
     """What a stage of a graph reads: the stream that another stage writes.
 
     `stage`: name of the stage that writes it.
-    `latest`: whether the stage takes the newest frame that there is, of whatever number.
-    `max_age_ms`: age from which on the newest frame counts as absent; 0: no such age.
+    `latest`: whether the stage takes the newest frame, whatever its number.
+    `max_age_ms`: age in ms from which on the newest frame counts as absent; 0: no such age.
     """
 
     stage: str
@@ -138,13 +138,13 @@ class PipelineStage(Described):
 
     @property
     def joins(self) -> bool:
-        """Whether it is a `trilane.pipeline.stage.JoiningStage`: it has several inputs, or one of the newest frame."""
+        """Whether it is a `trilane.pipeline.stage.JoiningStage`: it has several inputs, or one with `latest`."""
         inputs = self.inputs or ()
         return len(inputs) > 1 or any(each.latest for each in inputs)
 
 
 class PipelineEdge(Described):
-    """The slots behind a stage, which the next stage reads; in a graph, all stages that read its stream.
+    """The slots behind a stage. The next stage reads them; in a graph, all readers of the stage do.
 
     `payload_bytes`: bytes of every packet's payload.
     `header`: dtype of every packet's header, made by `trilane.transport.packets.header_dtype`.
@@ -164,10 +164,10 @@ class Pipeline(Described):
     `units`: cores and threads of each unit that a stage names; the scheduler runs on the cores of the first stage's
     unit.
     `latency_to`: stage at whose end a frame's latency ends; without it, the last stage.
-    `bypass`: names of two stages. A frame for which the first returns a `Skip` goes on to the second, past those
-    between. The edges behind the first and before the second have the same header.
+    `bypass`: names of two stages. If the first returns a `Skip` for a frame, the frame goes on to the second, past the
+    stages between. The edges behind the first and before the second have the same header.
     `from_release`: whether the latency begins with a frame's release, as for a camera with a rate.
-    `warms_up`: whether the stages of a chain do a frame before the run; not where they may count their calls.
+    `warms_up`: whether the stages of a chain do a frame before the run; False if they may count their calls.
     `module_folders`: folders where a unit's process first looks for the modules of factories.
     `preload`: modules that are imported once, before the units' processes are forked; none from `module_folders`.
     """
@@ -231,7 +231,7 @@ class Pipeline(Described):
     def edges_into(self, stage: str) -> tuple[str, ...]:
         """Return the names of the edges from which the stage takes frames, in the order of its inputs.
 
-        Where a bypass ends at the stage of a chain, the edge on which the bypass begins follows.
+        If a bypass ends at the stage of a chain, the edge on which the bypass begins comes last.
         """
         begin, end = self.bypass or ("", "")
         joints, graph = self.joints, self.graph()
@@ -272,7 +272,7 @@ class Pipeline(Described):
         return tuple(stage for stage in self.stages if stage.unit == unit)
 
     def with_rule(self, rule: str) -> Pipeline:
-        """Return the same pipeline with `rule` for every edge; raises BadInputError for one that cannot be."""
+        """Return the same pipeline with `rule` for every edge; raises BadInputError for a rule that does not fit."""
         changed = self.model_copy(update={"edges": tuple(e.model_copy(update={"rule": rule}) for e in self.edges)})
         try:
             edge_rule(rule)

@@ -1,6 +1,6 @@
 """What the scheduler knows of a pipeline file: its graph, the rules of its streams, and the settings of a run.
 
-Rule: a run on this machine and a prediction take theirs from here, so that a file means the same on both clocks.
+Rule: a run on this machine and a prediction both take them from here, so that a file means the same on both clocks.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ DEFAULT_FRAMES: Final = 1000
 
 
 def graph_of(file: PipelineFile, rules: Mapping[str, str]) -> Graph:
-    """Return the scheduler's graph of a file; a chain where each stage reads the stage before it.
+    """Return the scheduler's graph of a file; it is a chain if each stage reads the stage before it.
 
     `rules`: rule of the stream of each stage that has a reader.
     """
@@ -57,7 +57,7 @@ def skips_of(file: PipelineFile, seed: int = 0) -> Skips:
 
 
 def shares_of(file: PipelineFile) -> dict[str, Fraction]:
-    """Return the share of the frames that a stage does, of each stage that some frames skip."""
+    """Return, for each stage that some frames skip, the share of the frames that it does."""
     if file.bypass is None or not (taken := file.bypass[1].taken):
         return {}
     names, (begin, end) = list(file.stages), (file.bypass[0], file.bypass[1].to)
@@ -88,9 +88,10 @@ def settings_of(file: PipelineFile, frames: int = 0, seed: int = 0, **others: An
 def edge_rules(file: PipelineFile, times_ns: Mapping[str, int] | None = None) -> dict[str, str]:
     """Return the rule of each stream: that of the file, else two slots, or more where branches meet.
 
-    Then it has the fewest slots that do not lengthen the period by the times of the file. Where the file does not state
-    them all, each stage counts as equally long and as if it had a unit of its own. That is enough for any times: a
-    cycle then has no more stages than slots. So a run and all predictions of a file have the same slots.
+    Where branches meet, a stream has the fewest slots that do not lengthen the period by the times of the file. If the
+    file does not state all times, all stages count as equally long, each on a unit of its own. These slots are enough
+    for any times, because no cycle then has more stages than slots. A run and all predictions of a file have the same
+    slots.
 
     `times_ns`: time of a job of each stage, in place of those of the file.
     """

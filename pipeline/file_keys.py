@@ -1,7 +1,8 @@
 """The keys of a pipeline file, each as one field: its type, its range and what it means.
 
-Rule: this module knows one value at a time. What must fit together is in `pipeline_file.py`. docs/pipeline-file.md has
-its tables from the descriptions here. Nothing is opened and nothing is imported for a file: it may be a stranger's.
+Rule: this module checks one value at a time; `pipeline_file.py` checks what must fit together. The tables of
+docs/pipeline-file.md come from the descriptions here. A pipeline file may be a stranger's, so nothing that it names is
+opened or imported.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def shown(value: object) -> str:
 
 
 def is_number(value: object) -> bool:
-    """Say whether a value of the file is a number; true and false are none."""
+    """Say whether a value of the file is a number; true and false are no numbers."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
@@ -193,8 +194,8 @@ class StageInput:
     """What a port of a stage reads.
 
     `port`: name of the port; empty where the file names a stage alone.
-    `stage`, `from_port`: stage that writes it, and its port; empty for the only one.
-    `latest`: whether it takes the newest frame that there is, not the frame of the other inputs.
+    `stage`, `from_port`: stage that is read, and its port; the port is empty for a stage with one port.
+    `latest`: whether it takes the newest frame instead of the frame of the other inputs.
     `max_age_ms`: age from which on the newest frame counts as absent; 0: no such age.
     """
 
@@ -384,7 +385,7 @@ class BypassKeys(Keys):
         return None if self.share is None else Fraction(str(self.share))
 
     def takes(self, frame: int, seed: int = 0) -> bool:
-        """Say whether a frame goes this way. `seed`: seed of the random ones, as many as `share` says."""
+        """Say whether a frame goes this way. `seed`: seed of the random choice by `share`."""
         if self.pattern is not None:
             return self.pattern[frame % len(self.pattern)] == "1"
         drawn = blake2b(f"{seed} {frame}".encode(), digest_size=8).digest()

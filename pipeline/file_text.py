@@ -3,8 +3,8 @@
     tables = tables_of(pipeline, {"policy": "latest", "fps": 30.0}, {"camera": 0.4})
     text = file_text(tables, unsaid(pipeline))
 
-Rule: any description is written, by its stages, edges and units; what the stages do is not known here. The tables are
-those that `pipeline_file.checked_tables` reads, so what is written can be checked and predicted.
+Rule: this module writes any description, by its stages, edges and units; it does not know what the stages do.
+`pipeline_file.checked_tables` reads the same tables, so every written file can be checked and predicted.
 """
 
 from __future__ import annotations

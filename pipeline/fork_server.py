@@ -1,12 +1,13 @@
 """The process that units are forked from. Rule: it has one thread; it ends with its parent, and its units outlive it.
 
 `python -P -m trilane.pipeline.fork_server --socket FD --parent PID --preload MODULE,...` imports once what every unit
-needs, then forks a unit for each request. So a unit starts in milliseconds instead of importing everything again.
+needs, then forks a unit for each request. Therefore a unit starts in milliseconds instead of importing everything
+again.
 
 A request is one packet on a SOCK_SEQPACKET socket: JSON with descriptors. The descriptors are the unit's spec (in a
 memory file), its stderr, its lifeline, and those that the spec names. The answer is the unit's process id with its
 pidfd and a pipe. When the unit has ended, its exit code comes through that pipe, negative for a signal. A request with
-`call` names a function instead; its result goes to the pipe that comes with the request, and it has no answer.
+`call` names a function instead; its result goes to the pipe that comes with the request, and there is no other answer.
 
 A lifeline is a pipe whose other end only the parent has: the kernel kills the unit when that end is closed.
 """

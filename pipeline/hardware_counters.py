@@ -1,11 +1,11 @@
 """Counts instructions and cache misses of a unit's jobs through perf_event_open.
 
-Rule: a figure is the processor's count, or is reported as absent. Counts are of user mode. They cover the thread that
-opens them and all threads that it and its threads begin later, which the kernel adds up (`inherit`). A processor with
-fewer counters than events counts each for a part of the time; such counts are scaled to the whole time.
+Rule: a figure is the processor's count, or is reported as absent. Counts are those of user mode. They cover the thread
+that opens them and all threads that it and its threads begin later, which the kernel adds up (`inherit`). A processor
+with fewer counters than events counts each for a part of the time; such counts are scaled to the whole time.
 
 Each event is opened and read by itself, because `inherit` and a group do not go together (`man 2 perf_event_open`).
-Some kernels refuse to read such a group (ECHILD). A figure that cannot be read is missing from its job, which goes on.
+Some kernels refuse to read such a group (ECHILD). If a figure cannot be read, the job goes on without it.
 """
 
 from __future__ import annotations

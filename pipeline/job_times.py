@@ -138,9 +138,9 @@ class Lost(NamedTuple):
 
 
 def most_preempted_ns(wall_ns: int, cpu_ns: int, cores: int) -> int:
-    """Return the most of `wall_ns` that a unit with `cores` cores can have waited for them.
+    """Return the longest part of `wall_ns` that a unit with `cores` cores can have waited for them.
 
-    This is what its CPU time leaves of the time.
+    It is what remains of `wall_ns` if the unit's CPU time is divided evenly among the cores.
     """
     return max(wall_ns - -(-cpu_ns // cores), 0)
 
@@ -148,9 +148,9 @@ def most_preempted_ns(wall_ns: int, cpu_ns: int, cores: int) -> int:
 def preempted_ns(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int) -> int:
     """Return how much of `wall_ns` a unit with `cores` cores waited for them.
 
-    Its threads were ready for cpu + delay. So m = (cpu + delay) / wall of them were ready at a time, but at least one.
-    Their waiting took delay / m, and never more than what the CPU time leaves of the cores. With one core this is
-    min(delay, wall - cpu).
+    Its threads were ready for cpu + delay. Therefore m = (cpu + delay) / wall of them were ready at a time, but at
+    least one. Their waiting took delay / m, and never more than what the CPU time leaves of the cores. With one core
+    this is min(delay, wall - cpu).
     """
     if not delay_ns:
         return 0
@@ -253,7 +253,8 @@ class JobClock:
     def answered(self) -> None:
         """Read what took place in the job and since; called after the answer was sent.
 
-        This thread did not sleep since the job's end, so a delay that may be the job's counts at most the time since.
+        If the run delay was not read at the job's end, part of it may belong to the job. Therefore it counts at most
+        the time since that end, in which this thread did not sleep.
         """
         delay_ns = self._meter.delay_ns()
         self._cpu_before_ns = self._meter.cpu_ns()

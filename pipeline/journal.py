@@ -1,4 +1,4 @@
-"""The journal of a run: one file that records what happened, in order, while it happens; others may follow it.
+"""The journal of a run: one file that records what happened, in order, while it happens. Readers may follow it.
 
 Rule: nothing of a run is kept in memory only because somebody may want it later. Whoever wants it reads the journal,
 after the run or during it, from the same bytes.

@@ -109,7 +109,7 @@ def graph(value: Any) -> Graph:
 
 
 def settings(value: Any, of_graph: Graph) -> Settings:
-    """Return the settings of a run with `of_graph`, with which its scheduler can be made."""
+    """Return the settings of a run with the graph `of_graph`; a scheduler can be made from the two."""
     try:
         found = settings_of(value)
         for name, kind in SETTINGS_TYPES.items():

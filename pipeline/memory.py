@@ -7,10 +7,10 @@ One region of anonymous memory holds all assets. It begins with 8 bytes for the 
 JSON, then the arrays, each on its own page. A unit maps it read-only. The kernel frees it when the last process that
 has it ends.
 
-A stage counts the bytes that it copies for a frame, beside the least that would do. A byte counts at each memory that
-it is read from or written to. A copy from a slot to the GPU counts as read and as uploaded; a copy back counts as read
-back and as written. So the four figures add up to what passed through the memories. A stage that copies nothing between
-its input and its output moves its least.
+A stage counts the bytes that it copies for a frame, and the least number of bytes that would do. A byte counts at each
+memory that it is read from or written to. A copy from a slot to the GPU counts as read and as uploaded; a copy back
+counts as read back and as written. Therefore the four figures add up to what passed through the memories. A stage that
+copies nothing between its input and its output moves its least.
 """
 
 from __future__ import annotations

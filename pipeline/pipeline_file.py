@@ -83,7 +83,7 @@ class PipelineFile:
     `path`: path of the file; paths in it are relative to its folder.
     `stages`: stages by name, each after those that it reads; otherwise in the order of the file.
     `units`: every unit that a stage names, in the order of the stages.
-    `edges`: rule of the streams of which the file says one, by the stage that writes it.
+    `edges`: rule of each stream for which the file states one, by the stage that writes the stream.
     `tables`: the tables as the file has them.
     """
 
@@ -99,12 +99,12 @@ class PipelineFile:
         return self.path.parent
 
     def hardware(self, unit: str) -> str | None:
-        """Return the unit of a hardware profile that `unit` is: cpu, gpu, dsp, or None where that is not known."""
+        """Return the unit of a hardware profile that `unit` stands for: cpu, gpu or dsp; None where it is unknown."""
         return self.units[unit].hardware or (unit if unit in UNITS else None)
 
     @property
     def readers(self) -> dict[str, list[str]]:
-        """The readers of each stage that has any, by its name, in the order of the stages."""
+        """The readers of each stage that has readers, by its name, in the order of the stages."""
         found: dict[str, list[str]] = {name: [] for name in self.stages}
         for name, stage in self.stages.items():
             for source in dict.fromkeys(each.stage for each in stage.inputs):
@@ -113,7 +113,7 @@ class PipelineFile:
 
     @property
     def periods(self) -> dict[str, int]:
-        """The distance between the frames that each stage takes: of its own `every` and of what it reads."""
+        """The distance between the frames that each stage takes, from its own `every` and those of what it reads."""
         found: dict[str, int] = {}
         for name, stage in self.stages.items():
             found[name] = lcm(stage.every, *(found[each.stage] for each in stage.inputs if not each.latest))
@@ -121,7 +121,7 @@ class PipelineFile:
 
     @property
     def out_of_row(self) -> str:
-        """The first stage that does not take every frame, from the stage before it alone; "" in a chain."""
+        """The first stage that leaves out frames, or reads anything but the stage before it; "" in a chain."""
         before: tuple[StageInput, ...] = ()
         for name, stage in self.stages.items():
             if stage_inputs(stage) != before or stage.every != 1:
@@ -131,12 +131,12 @@ class PipelineFile:
 
     @property
     def is_chain(self) -> bool:
-        """Whether each stage takes every frame, from the stage before it alone."""
+        """Whether each stage takes every frame, and only from the stage before it."""
         return not self.out_of_row
 
     @property
     def bypass(self) -> tuple[str, BypassKeys] | None:
-        """The stage at which the bypass begins, and the way that it leads; None without one."""
+        """The stage at which the bypass begins, and the bypass's keys; None without a bypass."""
         return next(((name, stage.bypass) for name, stage in self.stages.items() if stage.bypass is not None), None)
 
     @property
@@ -170,7 +170,7 @@ def tables_of(path: Path) -> dict[str, Any]:
 
 
 def is_pipeline_file(path: Path) -> bool:
-    """Say whether a file looks like a pipeline file: a .toml with stages. A scene is a .toml too, and has none."""
+    """Say whether a file looks like a pipeline file: a .toml with stages. A scene is a .toml without stages."""
     if path.suffix != ".toml" or not path.is_file():  # a pipe with that name would be waited for
         return False
     try:
@@ -544,7 +544,7 @@ def _check_bypass(file: PipelineFile) -> None:
 
 
 def assignments(text: str) -> list[str]:
-    """Return what `--set` gives: one assignment, or several with commas between them."""
+    """Return the assignments in a value of `--set`: one, or several with commas between them."""
     return BETWEEN.split(text)
 
 

@@ -43,7 +43,7 @@ def views(payload: U8, ports: Mapping[str, PortType]) -> dict[str, NDArray[Any]]
 
 
 class PortRead(Model):
-    """What a port of a stage reads. `stream`: place of the stream among the stage's inputs; `port`: port of it."""
+    """What a port of a stage reads. `stream`: place of the stream among the stage's inputs; `port`: its port."""
 
     name: str
     stream: int
@@ -51,9 +51,9 @@ class PortRead(Model):
 
 
 class PassedPorts(Model):
-    """What comes by a bypass that ends at the stage: slots behind its own ones, from the stage where it begins.
+    """The slots from which the stage takes frames that come by a bypass; they are counted after its own slots.
 
-    `behind`: number of slots of the stage's own stream. `ports`: ports in the slots behind them.
+    `behind`: number of slots of the stage's own stream. `ports`: ports in the slots of the bypass.
     """
 
     behind: int
@@ -70,8 +70,8 @@ class PortedSettings(Model):
     `reads`: ports of the stage, in the order of the file.
     `streams`: ports of each stream that it reads.
     `writes`: ports that it writes; empty where nobody reads it and the file says none.
-    `keys`: keys of the stage of its own kind.
-    `bypass`: what comes by a bypass that ends here; None where none does.
+    `keys`: the stage's keys that only its kind of stage has.
+    `bypass`: ports of the bypass that ends at the stage; None without one.
     """
 
     where: str
@@ -145,10 +145,12 @@ class PortedStage:
         """Prepare what the first frame needs; called once, when the slots are there."""
 
     def work(self, frame: int, arrays: Sequence[NDArray[Any] | None], outputs: Arrays) -> Mapping[str, float]:
-        """Do a frame, and return metrics; a `trilane.pipeline.stage.Skip` where a bypass begins, to send it there.
+        """Do a frame, and return metrics.
 
-        `arrays`: array of each of `reads`, read-only; None for a newest frame that is not there, and for a port that
-        does not come by a bypass.
+        A `trilane.pipeline.stage.Skip` sends the frame to the bypass that begins at the stage.
+
+        `arrays`: array of each of `reads`, read-only; None for a newest frame that does not exist yet, and for a port
+        that the frame's bypass does not carry.
         `outputs`: array of each of `writes`, to be filled; empty where nobody reads the stage.
         """
         raise NotImplementedError

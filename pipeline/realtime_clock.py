@@ -52,7 +52,7 @@ LONGEST_STEP_NS = PING_NS + 250_000_000  # between two steps, unless this proces
 
 
 class ClockGovernor(Protocol):
-    """Holds the units to shares of the time. `due_ns`: time at which `tick` is to be called next."""
+    """Limits each unit to a share of the time. `due_ns`: time at which `tick` is to be called next."""
 
     due_ns: int
 
@@ -142,7 +142,7 @@ class RealtimeClock:
         return len(self._unbooked)
 
     def ended(self) -> list[Worked | None]:
-        """Book the jobs that have ended since the last call; None stands for a job whose frame was lost by then."""
+        """Book and return the jobs that have ended since the last call; None stands for a job whose frame was lost."""
         found: list[Worked | None] = []
         for job, dispatch_ns, ready_ns, done in self._unbooked:
             if ready_ns is None:
@@ -312,7 +312,7 @@ class RealtimeClock:
 
 
 class HeldTime:
-    """Takes the requests to the run. A hold that lets some frames through lasts until the run goes on."""
+    """Measures how long the run was held. A hold that lets some frames through lasts until the run goes on."""
 
     def __init__(self) -> None:
         self._total_ns = 0

@@ -19,11 +19,11 @@ from trilane.scheduler.places import Place, Placement, busiest_core_ns
 
 
 class RunEfficiencies:
-    """How much of the time between the first and the last presented frame was work of jobs; no share can pass 1.
+    """The shares of work in the time between the first and the last presented frame; no share exceeds 1.
 
-    Jobs are added in the order of their ends. A job may begin before that time or end after it. Then it counts only the
-    CPU time that must lie within: its CPU time less the time that its cores had outside. So what a unit or a set of
-    cores is credited with fits into the time.
+    Jobs are added in the order of their ends. A job may begin before that time or end after it. Such a job counts only
+    the CPU time that must lie within: its CPU time less the time that its cores had outside. Therefore the counted work
+    of a unit or of a set of cores fits into the time.
 
     A unit's work counts the CPU time of a job divided by the unit's threads. It also counts the busy time beyond the
     CPU time, because a device of its own worked then while the threads slept.
@@ -60,7 +60,7 @@ class RunEfficiencies:
 
         The first is the work of the slowest unit. The second is the CPU time on the fullest set of cores, of the units
         that have no other cores. No division of the work avoids it. The third is the CPU time of all units on all
-        cores. Each is a share of the time that these had.
+        cores. Each is a share of the time that the unit or the cores had.
         """
         had_ns = self._last_ns - (self._first_ns or 0)
         if self._first_ns is None or had_ns <= 0:
@@ -90,7 +90,7 @@ class Reckoned(NamedTuple):
     """What bounded a whole run.
 
     `budget`: ns of the critical path by kind and stage.
-    `taken`: who had the core of each stage's unit, by stage.
+    `taken`: for each stage, which stages had the core while its jobs lacked one.
     `figures`: `bottleneck`, `bound`, `efficiency`, `core_efficiency` and `machine_efficiency` of a report.
     """
 
@@ -104,7 +104,7 @@ class Reckoning:
 
     `graph`, `settings`: graph and settings of the run.
     `places`: places of its units, as far as they are known.
-    `timeline`: what takes the run's records; its jobs are added here.
+    `timeline`: timeline of the run, whose explained jobs are added here.
     `paths`, `sharing`: paths and core sharing of the jobs so far.
     """
 
@@ -191,7 +191,7 @@ def _cost(cost: Cost) -> dict[str, float | None]:
 def places_of(begun: Begun) -> dict[str, Place]:
     """Return the cores and threads of each unit, as far as the journal's first record has them.
 
-    They are those of `Pipeline.places`. Raises BadInputError for a configuration that is none of a run.
+    They are those of `Pipeline.places`. Raises BadInputError for a configuration of another form.
     """
     config = config_of(begun)
     units, pace_ns = config.get("units", {}), config.get("pace_ns", {})

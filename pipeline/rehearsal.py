@@ -32,7 +32,7 @@ LIMIT_S = 0.5  # seconds after the warm-up from which no further frame is begun
 
 
 class Chain:
-    """The stages of `graph`, which must be a chain, without the last unless `whole`.
+    """The stages of `graph`, which must be a chain; the last stage is left out unless `whole`.
 
     `processes`: process of each unit, ready and without a job.
     """
@@ -78,9 +78,9 @@ def on_rungs(chain: Chain, frames: Sequence[int], rungs: int, follow: Sequence[s
     """Return the time that each stage of `follow` takes alone on each of `rungs` rungs of a ladder.
 
     Each time is the median over `frames`. All frames go through one rung before the next, so that no frame follows
-    itself. With several frames, the first of each rung warms up. A stage is left out unless it takes less on every
-    further rung. That happens, for example, where nobody is on the screen in any of the frames. Raises as `Chain.frame`
-    does.
+    itself. With several frames, the first of each rung warms up. A stage is left out unless it takes less time on every
+    further rung. Stages are left out, for example, if nobody is on the screen in any of the frames. Raises as
+    `Chain.frame` does.
     """
     medians: dict[str, list[float]] = {name: [] for name in follow}
     for rung in range(rungs):
@@ -111,7 +111,7 @@ def rehearse(
 ) -> Rehearsed:
     """Measure what each unit needs for a frame; the caller removes the files that the last stage writes.
 
-    `pipeline`: pipeline of which all units are measured, on `frames`.
+    `pipeline`: pipeline whose units are all measured, on `frames`.
     `variants`: the same pipeline with other settings of some units; only these are measured again, between the other
     stages.
     `assets`, `starter`: arrays and fork server, as for a run.

@@ -124,7 +124,7 @@ def run_pipeline(
     frame that would be late is given less work (`trilane.scheduler.work_ladder`), and the first stage is told
     (`SteppedStage`).
     `follow`: names of the stages whose time follows the work.
-    `settings`: all that the scheduler is asked, in place of `frames` and of the options above but `fps`.
+    `settings`: settings of the scheduler, which replace `frames` and the options above except `fps`.
     `requests`: queue through which others ask for frames, at most `frames`; it is closed when this returns.
     `controls`: queue of what others ask of the run, closed when this returns. At the run's end, the frames that it has
     released count as requested.

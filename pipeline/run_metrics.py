@@ -313,9 +313,10 @@ class SlowedCost(Record):
 
 
 class PathShare(SlowedCost):
-    """A unit or a stage that bounded the run, or what the critical path was instead (`trilane.pipeline.critical_path`).
+    """A unit or stage that bounded the run, or a part of the critical path that belongs to none.
 
-    The inherited costs are those of slowing its jobs; absent where the path alone says what bounded the run.
+    `trilane.pipeline.critical_path` finds the path. The inherited costs are those of slowing its jobs; they are absent
+    where the path alone says what bounded the run.
 
     `name`: name of the unit or stage, or of time that is neither's, such as `overhead`.
     `share`: its share of the path.
@@ -337,10 +338,10 @@ class PathShare(SlowedCost):
 
 
 class PathShares(Record):
-    """What has most of the critical path.
+    """The largest parts of the critical path.
 
-    `unit`: the unit, or what the path was instead.
-    `stage`: the stage; null where none is on the path.
+    `unit`: unit with the largest share, or time that belongs to no unit.
+    `stage`: stage with the largest share; null where no stage is on the path.
     """
 
     unit: PathShare
@@ -348,17 +349,17 @@ class PathShares(Record):
 
 
 class FramesBehind(Record):
-    """By how many frames inputs of the newest frame were behind: `mean` and `max` over the jobs that took one."""
+    """How many frames a newest frame was behind the job that took it: `mean` and `max` over such jobs."""
 
     mean: float
     max: int
 
 
 class NewestTaken(Record):
-    """What inputs of the newest frame took from one stream.
+    """The newest frames that jobs took from one stream.
 
-    `age_ms`: times from the sampling of the frame to the moment at which a job that took it was handed out.
-    `frames_behind`: distances to the frame of that job.
+    `age_ms`: times from the sampling of such a frame to the hand-over of the job that took it.
+    `frames_behind`: distances from such a frame to the frame of the job.
     """
 
     age_ms: TimeSummary
@@ -370,7 +371,7 @@ class Slowed(Record):
 
     `by`: share by which all jobs of a stage take longer.
     `frames`: number of the run's frames that were replayed.
-    `over_measured`: frame time of the replay of the run as it was, over the frame time that the run had.
+    `over_measured`: frame time of a replay without a slower stage, divided by the frame time of the run.
     `is_trusted`: whether the costs say what bounded the run: the replay is near the run, and a stage costs something.
     `costs`: cost of each stage.
     """
@@ -383,11 +384,11 @@ class Slowed(Record):
 
 
 class Bound(PathShares):
-    """What bounded the frame time: what costs most when it is slowed, or without that, what has most of the path.
+    """What bounded the frame time: what costs most when slowed or, without a replay, has the largest share of the path.
 
     `unit`: the unit; its name is the report's `bottleneck`.
     `stage`: the stage; null where no stage bounded the run.
-    `path`: what has most of the path; absent where it has the same names.
+    `path`: largest parts of the path; absent where they have the same names.
     `stages`: share of each stage in the path, the largest first; absent in reports of an older Trilane.
     `slowed`: what slowing each stage costs; absent where the run was not replayed.
     """
@@ -458,7 +459,7 @@ class RunMetrics(PolicyMetrics):
     `idle_cores`: whether cores without work stayed awake; on the host clock.
     `other_programs`: share of other programs in the time of the run's cores; null where a unit died.
     `processor`: clock and throttling of the run's cores; null in virtual time and in reports of an older Trilane.
-    `streams`: age of what was taken from each stream that has an input of the newest frame, by its stage.
+    `streams`: age of the newest frames that jobs took from a stream, by the stream's stage.
     `caps`, `temperature_c`: caps and temperatures of a capped run.
     """
 

@@ -46,7 +46,7 @@ class Stage(Protocol):
 
 
 class JoiningStage(Protocol):
-    """A stage of a graph with several inputs, or with one of the newest frame."""
+    """A stage of a graph that has several inputs, or takes the newest frame of one."""
 
     def bind(self, inputs: Sequence[Sequence[Packet]], outputs: Sequence[Packet]) -> None:
         """Take every slot of each input, in the order of the stage's inputs, and of the output, as `Stage.bind`."""
@@ -54,10 +54,10 @@ class JoiningStage(Protocol):
     def run(self, frame: int, slots_in: tuple[int | None, ...], slot_out: int | None) -> Mapping[str, float]:
         """Do `frame`, as `Stage.run`.
 
-        `slots_in`: slot of each input; None for one of the newest frame where there is none.
+        `slots_in`: slot of each input; None for an input that takes the newest frame, while there is none.
 
-        The header of the output slot already holds the frame's number and the sampling time of the oldest input that is
-        of this frame. It holds no other fields of the inputs.
+        The header of the output slot already holds the frame's number. It also holds the sampling time of the oldest
+        input; inputs that take the newest frame do not count. It holds no other fields of the inputs.
         """
 
     def close(self) -> None:
@@ -68,7 +68,7 @@ class SteppedStage(Stage, Protocol):
     """The first stage of a pipeline whose frames may be given less work (`run_pipeline`'s `works`)."""
 
     def step_to(self, rung: int) -> None:
-        """Give frames the work of `rung` from now on, at first 0; called before `run` whenever it changes."""
+        """Give frames the work of `rung` from now on; called before `run` whenever the rung, at first 0, changes."""
 
 
 class SkippingStage(Stage, Protocol):

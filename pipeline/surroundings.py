@@ -1,7 +1,8 @@
 """Prepares the surroundings of a run: checks before it, cores and processes to restore, and other programs' share.
 
 Rule: a check that raises has started nothing, so nothing has to be undone. Whatever happens, cores, memory and
-processes are as before. By the kernel's counts, all CPU time that is not the run's own is that of other programs.
+processes are afterwards as they were before. By the kernel's counts, all CPU time that is not the run's own is that of
+other programs.
 """
 
 from __future__ import annotations
@@ -64,10 +65,10 @@ def check_positive(**values: float | None) -> None:
 
 
 class OtherPrograms:
-    """Counts from its creation on.
+    """Counts the time that other programs have of some cores, from its creation on.
 
     `cores`: numbers of the cores that count.
-    `pids`: processes that are ours beside this one.
+    `pids`: processes that belong to the run, besides this one.
     """
 
     def __init__(self, cores: Sequence[int], pids: Sequence[int] = ()) -> None:
@@ -90,7 +91,7 @@ class OtherPrograms:
 
 
 def beside_units(cores: Sequence[int], pids: Mapping[str, int]) -> Callable[[Mapping[str, int]], float | None]:
-    """Count from now on what others have of `cores`, beside the processes `pids` of units.
+    """Count the time that other programs have of `cores` from now on; `pids` are the units' processes.
 
     Return a function that takes the units' present processes and returns the others' share. It returns None if a unit
     has died in between, because its CPU time is then unknown.

@@ -1,12 +1,12 @@
 """Turns the journal of a run into frames, jobs, waits and idle time.
 
 Rule: no other module interprets a journal's events. The scheduler's own parts tell what it knew: its source says which
-frames are released and wait (frame_source.py). Its record of a frame says when it was sampled and how long the
-frame took (state.py).
+frames are released and wait (frame_source.py). Its record of a frame says when the frame was sampled and how long it
+took (state.py).
 
 A frame waits before the first stage from its release on. It waits before another stage from the step in which the
 scheduler heard that the stage before had ended; where branches meet, the last of those stages. The wait ends when the
-frame is handed to a unit, dropped or lost. Where the frames are is known to a track (tracks.py).
+frame is handed to a unit, dropped or lost. A track knows where the frames are (tracks.py).
 """
 
 from __future__ import annotations

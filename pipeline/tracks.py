@@ -1,8 +1,8 @@
-"""Where the frames in flight of a run are, by what its journal says: along a chain, or through a graph.
+"""Follows the frames in flight of a run by its journal, along a chain or through a graph.
 
-A graph's events are taken by a scheduler once more, which says what becomes of each frame. A chain's journal may be
-older than this scheduler, so a chain goes by the jobs. Frames of a chain do not overtake each other: where several
-wait, the oldest are dropped.
+In a graph, a second scheduler takes the run's events and says what becomes of each frame. A chain's journal may be
+older than this scheduler, so its jobs alone decide. Frames of a chain do not overtake each other: where several wait,
+the oldest are dropped.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ class Track(Protocol):
         """Note that a job is handed out, and return when the scheduler heard that the job's input was there."""
 
     def end(self, job: Job, event: JobDone, now_ns: int) -> FrameState | None:
-        """Note that a job has ended; return its frame if that is presented by it."""
+        """Note that a job has ended; return its frame if the job presents it."""
 
     def give_back(self, job: Job, now_ns: int) -> Gone | None:
-        """Note that a job waits again, as its unit died; return its frame if that is lost by it."""
+        """Note that a job waits again because its unit died; return its frame if the frame is lost instead."""
 
     def lose(self, frame: int, now_ns: int) -> Gone | None:
-        """Note that a frame is lost; return it if the count of losses must be told which it was."""
+        """Note that a frame is lost; return it unless `left` will return it."""
 
     def left(self, cause: str, now_ns: int) -> Gone | None:
         """Return the next frame that was lost or dropped for `cause`, a key of the report; None: not known here."""
@@ -62,7 +62,11 @@ class Track(Protocol):
         """Return the frames that wait for a stage, the oldest first."""
 
     def late(self, unit: str) -> list[str]:
-        """Return the stages whose work is not there, for the oldest frame of which a stage of the unit has others."""
+        """Return the stages that the unit waits for.
+
+        A stage of the unit has some inputs of a frame, but not all. The oldest such frame lacks the work of these
+        stages.
+        """
 
 
 class ChainTrack:
@@ -157,7 +161,7 @@ class ChainTrack:
 
 
 class GraphTrack:
-    """The frames of a graph, as a scheduler knows them that takes the run's events once more."""
+    """The frames of a graph, from a second scheduler that takes the run's events."""
 
     def __init__(self, graph: Graph, settings: Settings) -> None:
         self._core = Core(graph, settings)

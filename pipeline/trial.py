@@ -1,4 +1,4 @@
-"""Measures frame times of placements by real frames. Rule: placements run in turns, a few frames each, the same frames.
+"""Times placements with real frames. Rule: placements run in turns, a few frames each, the same frames.
 
 Running units are moved from the cores of one placement to those of the next, while frames go through them. A slice of
 frames takes a fraction of a second, so what slows the machine for a second slows all placements that are compared. From
@@ -38,7 +38,7 @@ Cores = Mapping[str, tuple[int, ...]]
 
 
 class Group(NamedTuple):
-    """Placements that one set of processes can have: those of `pipeline`, whose own cores do not matter."""
+    """Placements that the processes of `pipeline` can have in turn; the cores in `pipeline` itself do not matter."""
 
     pipeline: Pipeline
     places: Sequence[Cores]
@@ -62,10 +62,10 @@ def try_in_turns(
     starter: UnitStarter,
     is_enough: Callable[[Sequence[Round]], bool] = lambda _: False,
 ) -> list[Round]:
-    """Return a round for each of `windows`, or fewer when they are enough by `is_enough`.
+    """Return a round for each of `windows`, or fewer once `is_enough` says that they are enough.
 
     `groups`: placements to try; each round begins with another one.
-    `windows`: first of the SLICE frames that every placement does, for each round.
+    `windows`: for each round, the first of the SLICE frames that every placement does.
     `assets`, `starter`: arrays and fork server, as for a run.
 
     Raises TrilaneError when a unit cannot start or a stage fails, and KeyboardInterrupt when interrupted.

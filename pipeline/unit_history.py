@@ -222,7 +222,7 @@ class UnitHistory:
 
     @property
     def cut_until_ns(self) -> int:
-        """Return a time; while the unit has a job, every slice still to come ends then or later."""
+        """The earliest time at which a slice still to come can end, while the unit has a job."""
         return self._cut_ns
 
     def note_idle(self, now_ns: int, cause: str) -> Iterator[IdleSlice]:

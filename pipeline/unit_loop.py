@@ -172,7 +172,7 @@ class BoundStage:
     def works_asleep(self) -> bool:
         """Whether the job goes on while its threads sleep.
 
-        It does on hardware other than the cores, and when it is held to the pace of a chip.
+        It goes on if hardware other than the cores does its work, or if it is held to the pace of a chip.
         """
         return self._pace_ns > 0 or self._unit.has_device
 
@@ -213,7 +213,7 @@ class Join:
 
 
 def hold_until(end_ns: int) -> None:
-    """Return at `end_ns` of CLOCK_MONOTONIC, or at once if that has passed: sleep first, then watch the clock."""
+    """Wait until `end_ns` of CLOCK_MONOTONIC, not at all if that has passed: sleep first, then watch the clock."""
     while (left_ns := end_ns - time.monotonic_ns()) > 0:
         if left_ns > WAKE_UP_NS:
             time.sleep((left_ns - WAKE_UP_NS) / NS_PER_S)

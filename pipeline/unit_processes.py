@@ -1,6 +1,6 @@
 """Starts, hears and ends the units' processes, one by one or all before and after a run.
 
-Rule: what was started here is ended here, and its end is always noticed. The limits of these times are here.
+Rule: what was started here is ended here, and its end is always noticed. The time limits for starts and ends are here.
 
 A unit's messages come over its link, its stderr over a pipe, and its end over a pidfd; one poller waits for all.
 """

@@ -1,14 +1,15 @@
-"""Replays a run in virtual time with one stage slower, and says what that costs: the stage that costs most bounds it.
+"""Replays a run in virtual time with one stage slower, and says what that costs. The stage that costs most bounds it.
 
 Rule: nothing is measured here; equal journals give equal answers.
 
-A share of the critical path says how the time went. It does not say how a run answers: a longer job is moved to another
-core more often, and takes it from a unit that was on no path. So some of the run's frames are done again, with the CPU
-times of their own jobs, on the run's placement, by the run's scheduler (`trilane.scheduler.shared_cores`). Then once
-more for each stage, with all its jobs longer by SLOWER.
+A share of the critical path says how the time went. It does not say how a run reacts: a longer job is moved to another
+core more often, and takes that core from a unit that was on no path. Therefore the replay does some of the run's frames
+again, with the CPU times of their own jobs, on the run's placement, by the run's scheduler
+(`trilane.scheduler.shared_cores`). After that it does them once more for each stage, with all jobs of the stage longer
+by SLOWER.
 
-The replay knows no other programs, caps or restarts. So its frame time is compared with the run's, and it is trusted
-only where the two are near each other.
+The replay knows no other programs, caps or restarts. Therefore its frame time is compared with the run's, and it is
+trusted only where the two are near each other.
 """
 
 from __future__ import annotations
@@ -62,7 +63,8 @@ class Slowed(NamedTuple):
 
     `costs`: cost of slowing each stage by SLOWER.
     `frames`: number of frames that were replayed and counted.
-    `over_measured`: frame time of the replay of the run as it was, over the run's frame time in the same frames.
+    `over_measured`: frame time of the replay without a slower stage, divided by the run's frame time in the same
+    frames.
     """
 
     costs: Mapping[str, Cost]
@@ -76,7 +78,7 @@ class Slowed(NamedTuple):
         return abs(self.over_measured - 1) <= TRUSTED and worst >= LEAST_COST
 
     def by(self, name_of: Mapping[str, str]) -> dict[str, Cost]:
-        """Return the costs of groups of stages, such as units: the sum over the stages. `name_of`: group by stage."""
+        """Return the costs of groups of stages, such as units, as sums over stages. `name_of`: group of a stage."""
         found: dict[str, Cost] = {}
         for stage, cost in self.costs.items():
             was = found.get(name_of[stage], Cost(0.0, (0.0,) * len(cost.of_blocks)))

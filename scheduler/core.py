@@ -13,8 +13,8 @@ can be replayed from its events alone. One step does five things, in this order:
 - With no frame in flight and none to come, the run is finished.
 
 Slots. Between two stages lies an edge with a fixed number of slots (transport/slots.py). A job holds its input slot and
-its output slot from dispatch until it is done. So a stage can begin only when a frame waits before it and a slot is
-free behind it. Nothing else holds back the stages before a slow one.
+its output slot from dispatch until it is done. Therefore a stage can begin only when a frame waits before it and a slot
+is free behind it. Nothing else holds back the stages before a slow one.
 
 Bypass. A frame may skip the stages between two others, when the first of these says so. It keeps its slot, waits there
 for the second, and overtakes no frame (flow.py).

@@ -165,7 +165,7 @@ class Found:
         return time
 
     def add(self, measurement: Measurement) -> None:
-        """Take a measurement of which the tool states the figures alone."""
+        """Take a measurement for which the tool states figures, but no single times."""
         if len(self._made) >= MOST_NAMES:
             raise BadInputError("the file", f"over {MOST_NAMES} names", "fewer")
         self._made.append(replace(measurement, name=measurement.name[:LONGEST_NAME] or UNNAMED))
@@ -257,8 +257,8 @@ def contradiction(figures: Figures) -> str:
 def falling(values: Sequence[float], slack: float = 0.0) -> list[int]:
     """Return the places of the longest series in `values` that never rises by more than the share `slack`.
 
-    What is left out of it does not fit to the most others. Of series as long as each other, the one with the larger
-    values stays: a tool leaves a part out of a time more easily than it adds one.
+    The values outside it do not fit to most of the others. Of several longest series, the one with the larger values
+    counts, because a tool leaves a part out of a time more easily than it adds one.
     """
 
     def weight(series: list[int]) -> tuple[int, float]:

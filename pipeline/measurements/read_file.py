@@ -35,8 +35,8 @@ OWN_COLUMNS: Final = ("name", "kind", "unit", "sample", "ms")
 class Measurements:
     """What a file says.
 
-    `tool`: its format. `says`: what its times are. `refused`: implausible rows, of which `refused_count` are there in
-    all. `skipped`: how many rows are no times of runs, by reason.
+    `tool`: its format. `says`: what its times are. `refused`: the first implausible rows. `refused_count`: number of
+    all of them. `skipped`: how many rows are no times of runs, by reason.
     """
 
     path: Path
@@ -219,7 +219,7 @@ def _read_own(text: str) -> Found:
 
 
 def chosen(read: Measurements, name: str, where: str) -> Measurement:
-    """Return the measurement `name` as the time of a stage; with an empty name the only run.
+    """Return the measurement `name` as the time of a stage; an empty `name` stands for the only run.
 
     `where`: place to name in errors. Raises BadInputError for an unknown name, several runs, or no service time.
     """

@@ -373,7 +373,7 @@ def read_cut_means(document: Mapping[str, Any]) -> Found:
 
 
 def rising_rests(points: Sequence[tuple[int, float]]) -> Iterator[tuple[int, str]]:
-    """Yield the cuts, each with the reason, that must go for the rest times to fall from cut to cut.
+    """Yield the cuts to remove, each with a reason, so that the rest times fall from cut to cut.
 
     `points`: place of the cut, and time of the rest in ms. The longest series that never rises stays.
     """

@@ -48,7 +48,7 @@ PACKET: Final = 0x0A  # field 1 of a Trace, with a length
 
 
 def is_perfetto(head: bytes) -> bool:
-    """Say whether a file begins as a trace of Perfetto does: a packet with its length, which is no text."""
+    """Say whether a file begins with a packet and its length, as a trace of Perfetto does, and not with text."""
     if head[:1] != bytes([PACKET]):
         return False
     try:
@@ -59,7 +59,7 @@ def is_perfetto(head: bytes) -> bool:
 
 
 def read_perfetto(data: bytes) -> Found:
-    """Read the slices of a Perfetto trace. Raises BadInputError for bytes that are none."""
+    """Read the slices of a Perfetto trace. Raises BadInputError for other bytes."""
     found = Found("Perfetto trace", "wall times of named slices")
     _Slices(found).read(data)
     return found
@@ -225,7 +225,8 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
 def read_chrome(events: Sequence[Any]) -> Found:
     """Read the slices of a trace in Chrome's format: complete events, and pairs of begin and end. Times are us.
 
-    An asynchronous slice whose name an ordinary slice has too is called `name (async)`: their times do not mix.
+    If an asynchronous slice has the name of an ordinary slice, it is called `name (async)`, so that their times do not
+    mix.
     """
     found = Found("Chrome trace (JSON)", "wall times of named slices")
     slices = _ChromeSlices(found)
