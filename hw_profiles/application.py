@@ -1,8 +1,8 @@
 """The whole application on a chip: a service time per stage, run through the real scheduler in virtual time.
 
 This file computes what a frame costs each stage; the scheduler alone decides which stage waits for which. `REFERENCE`
-is how the reference application works: with one buffer between stages, so that a frame is not drawn before the network
-has released the buffer that it reads. The GPU is busy during read-back, the network's unit during the hand-over.
+describes the reference application. It has one buffer between stages, so a frame is drawn only after the network has
+released that buffer. The GPU is busy during read-back, the network's unit during the hand-over.
 """
 
 from __future__ import annotations
@@ -116,8 +116,8 @@ def _job(
 def stage_times_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple[str, UnitName], float]:
     """Return the milliseconds of one job of each (stage, unit), in data-flow order.
 
-    A job has `plan.variant.batch` frames. Joints and vertices are those of each avatar in view, pixels those of the
-    tensor that all of them share.
+    A job has `plan.variant.batch` frames. Joints and vertices count for each avatar in view, pixels for the one tensor
+    that all avatars share.
     """
     app, network, batch = profile.application, plan.network, plan.variant.batch
     cpu, gpu = (profile.units[u].clock(corners[UNITS.index(u)]) for u in ("cpu", "gpu"))
@@ -169,10 +169,11 @@ def split_work(work: Work, share: float) -> tuple[Work, Work]:
 class Steady:
     """The application once it has settled.
 
-    `latency_ms`: None where no frame is in time. `capped`: whether the display, or a rate, holds it back.
-    `dropped`: share of the frames that are not shown. `unit_of`: unit of each stage. `stages_ms`: milliseconds of a
-    job of each stage. `busy`: share of the time in which each unit works; `idle`: shares of the rest by cause. Both
-    sum to 1 per unit. Where units share a core, `preempted` is the share in which another one of them works on it.
+    `latency_ms`: None where no frame is in time. `capped`: whether the display, or a rate, holds the application back.
+    `dropped`: share of the frames that are not shown. `unit_of`: unit of each stage. `stages_ms`: milliseconds of a job
+    of each stage. `busy`: share of the time in which each unit works; `idle`: shares of the rest by cause. `busy` and
+    `idle` sum to 1 for each unit. Where units share a core, `preempted` is the share in which another one of them works
+    on it.
     """
 
     frame_ms: float
@@ -217,8 +218,8 @@ def _frames_of(variant: Variant, quick: bool) -> int:
 def settings_of(variant: Variant, frames: int, display_ns: int, *, held: bool = False) -> Settings:
     """Return the scheduler's settings of a simulated run.
 
-    `variant`: its policy and the scene's rate. `frames`: how many jobs of each stage. `display_ns`: the shortest time
-    between two of them. `held`: whether the display holds every policy to its rate.
+    `variant`: its policy and the scene's rate. `frames`: number of jobs of each stage. `display_ns`: shortest time
+    between two shown frames. `held`: whether the display holds every policy to its rate.
     """
     scene_period_ns = max(display_ns, round(variant.batch * 1e9 / variant.fps))
     return run_settings(variant.policy, frames, scene_period_ns, display_ns if held else 0)
@@ -269,8 +270,8 @@ def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = Fals
     `profile`: hardware profile of the chip.
     `plan`: application that runs on it.
     `corners`: corner of each unit, the same all the time.
-    `quick`: whether a short run will do where it can. Its frame time is right to a hundredth; its shares of time
-    include filling and draining.
+    `quick`: whether to simulate a short run where that is possible. The frame time of a short run is right to a
+    hundredth; its shares of time include filling and draining.
     """
     times, worker = stage_times_ms(profile, plan, corners), workers_of(profile)
     batch, display = plan.variant.batch, _display_ms(profile, plan)

@@ -1,11 +1,11 @@
-"""Moves a chip's profile towards a handful of own measurements, and says how well rows that were left out are met.
+"""Moves a chip's profile towards a handful of own measurements, and says how well it predicts rows that it did not see.
 
     rows = read_own_rows(Path("chip.csv"), Path("networks"))
     moved = calibrate("snapdragon-8-gen-2", rows)
     moved.numbers, moved.rows[0].after
 
-The profile's numbers are the prior. What is not known of another chip is mostly how fast it is in everything, so the
-prior lets all rates move together by CHIP, and each apart by less:
+The profile's numbers are the prior. What is mostly unknown of another chip is how fast it is as a whole. Therefore the
+prior lets all rates move together by CHIP, and each by itself by less:
 
     covariance of two log rates = CHIP^2 + RATE^2 [same rate] + ENGINE^2 [same engine] + OWN^2 [same rate and engine]
 
@@ -16,14 +16,15 @@ The fit minimises, over the deviations d of all log rates from the profile's,
 by Gauss and Newton's method, as `fit_engines.py` does with many rows. A unit without a tensor engine has one factor on
 all its times. Every row is predicted by a fit to the others.
 
-How far off those predictions are says how much of the error that the profile states is to be expected of this chip.
-Misses z, in units of the stated error, are normal with a variance k^2 that nothing is known of but that the statement,
-k = 1, counts as one row more. So k^2 has a scaled inverse chi-square distribution, and a new row's miss over
+The errors of those predictions show whether the profile states too large or too small an error for this chip. The
+misses z, in units of the stated error, are normal with an unknown variance k^2. The stated error itself, k = 1, counts
+as one more row. Therefore k^2 has a scaled inverse chi-square distribution, and the miss of a new row divided by
 
     s = ((1 + sum of z^2) / (1 + n))^(1/2)
 
 is Student's t with 1 + n degrees of freedom (Gelman et al., Bayesian Data Analysis, section 2.6). A unit's
-`error_scale` is s times the quantile of t over that of a normal distribution, so 80 % intervals stay such.
+`error_scale` is s times the 80 % quantile of t divided by that of a normal distribution. With it, an 80 % interval
+holds 80 % again.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ MOST_EFFICIENCY: Final = 4.0
 class OwnRow(NamedTuple):
     """One own measurement. `place`: file and line. `network`: path as the table has it. `ms`: time of a job.
 
-    `silent`: the table says no precision, and the network's file is of floats.
+    `silent`: whether the table states no precision although the network's file has floats.
     """
 
     place: str
@@ -98,7 +99,7 @@ class OwnRow(NamedTuple):
 
 
 class Checked(NamedTuple):
-    """A row beside the profile's prediction of it, and that of the profile moved by all other rows."""
+    """A row with two predictions of it: by the profile, and by the profile moved towards all other rows."""
 
     row: OwnRow
     before_ms: float
@@ -125,9 +126,10 @@ class Calibrated:
 
     @property
     def notes(self) -> list[str]:
-        """What a person should know of the rows: which precision was taken, and which times are far from the others.
+        """What a person should know about the rows: which precision was taken, and which times are far from the others.
 
-        Far is by over FAR_OFF from the median, over all rows, of measured over predicted time before the fit.
+        For each row, the measured time is divided by the time predicted before the fit. A row is far from the others if
+        this ratio differs from the median ratio of all rows by more than a factor of FAR_OFF.
         """
         silent = sum(each.row.silent for each in self.rows)
         notes = []
@@ -147,7 +149,7 @@ class Calibrated:
 
 
 def is_own_table(path: Path) -> bool:
-    """Say whether a table is one of networks in files. One of reference networks has encoders; no file is of those."""
+    """Say whether a table lists networks in files. A table of reference networks has a column of encoders instead."""
     if not path.is_file():
         return False
     lines = [line for line in read_text(path, "a table of measured rows").splitlines() if not line.startswith("#")]
@@ -158,7 +160,7 @@ def is_own_table(path: Path) -> bool:
 def read_own_rows(path: Path, folder: Path) -> list[OwnRow]:
     """Read own measurements: columns network, ms, and maybe unit, precision and runtime; others are ignored.
 
-    `folder`: folder that the networks' paths are relative to; none leads out of it. Raises BadInputError.
+    `folder`: folder that the networks' paths are relative to; no path may lead out of it. Raises BadInputError.
     """
     text = read_text(path, "a table of measured rows")
     numbered = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
@@ -248,10 +250,10 @@ def calibrate_tables(data: Mapping[str, Any], path: Path, rows: Sequence[OwnRow]
 def misses(left_out: Sequence[Checked], of: Checked | UnitName) -> list[float]:
     """Return how far off predictions were, as logarithms in units of the stated error: one for each network.
 
-    Rows of one network say the same of the fit, and nothing of other networks, so their mean counts.
+    Rows of one network say the same about the fit, and nothing about other networks, so their mean counts.
     `left_out`: rows beside a prediction by a fit to all other networks, with the interval that the profile states.
-    `of`: a unit, for all its networks; or a row, for all other networks of its unit.
-    A network without others on its unit tells nothing of a fit.
+    `of`: a unit, for all its networks; or a row, for all other networks of its unit. Rows of only one network on a unit
+    tell nothing about a fit; the result is empty.
     """
     unit, own = (of, "") if isinstance(of, str) else (of.row.unit, of.row.network)
     told: dict[str, list[float]] = {}
@@ -263,7 +265,7 @@ def misses(left_out: Sequence[Checked], of: Checked | UnitName) -> list[float]:
 
 
 def error_scale(told: Sequence[float]) -> float:
-    """Return how many times the stated error is to be expected after the misses `told`, in units of it."""
+    """Return the factor to expect on the stated error. `told`: misses in units of the stated error."""
     freedom = STATED_ROWS + len(told)
     scale = math.sqrt((STATED_ROWS + sum(miss**2 for miss in told)) / freedom)
     return min(scale * student_quantile(freedom, 0.8) / NORMAL_80, MOST_ERROR_SCALE)
@@ -429,7 +431,7 @@ def _unit_numbers(profile: Profile, unit: UnitName, rows: Sequence[OwnRow]) -> d
 
 
 class NamedRow(NamedTuple):
-    """What a row of a table says beside the time, as texts."""
+    """The cells of a table's row as texts, without the time."""
 
     network: str
     unit: str
@@ -438,7 +440,7 @@ class NamedRow(NamedTuple):
 
 
 def fit_row(table: Path, network: str | None, unit: str | None, precision: str | None, runtime: str | None) -> NamedRow:
-    """Check what a new row of `table` would say, the network's graph too; None is what a row without the column means.
+    """Check the cells of a new row of `table`, and the network's graph. None stands for a column that is missing.
 
     Raises BadInputError.
     """

@@ -115,7 +115,7 @@ PICTURE_CHANNELS = 4
 class EngineLayer(NamedTuple):
     """One layer. `amounts`: amount of each term. `reads`, `writes`: names of tensors that are not weights.
 
-    `more`: further results that somebody needs, such as those of a split.
+    `more`: further results that other layers need, such as those of a split.
     """
 
     name: str
@@ -133,7 +133,7 @@ class EngineLayer(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """The layers of a network in order, equal to nothing but themselves.
+    """The layers of a network in order. An object equals only itself.
 
     `sizes`: elements of each tensor. `input`, `output`: elements of the network's input and output.
     """
@@ -216,7 +216,7 @@ class _Graph:
 def first_result(node: Any) -> str:
     """Return the first result that `node` makes.
 
-    A recurrent layer may leave out the one that comes first in the list.
+    A recurrent layer may leave out the first of its results.
     """
     name: str = next(name for name in node.output if name)
     return name

@@ -1,8 +1,8 @@
 """The whole fit of tensor engines: the numbers of every chip, their cross-validation, and how both are shown.
 
-Every stated error is that of a row whose network was left out of the fit. A chip without a row of an engine gets the
-numbers of a related chip, times the ratio of the two chips where both are known; they are `assumed`. The head of a
-chip's profile is written by hand and stays; everything from MARK on is written here.
+Every stated error comes from rows whose network was left out of the fit. A chip without a row of an engine gets the
+numbers of a related chip, times the ratio of the two chips where both are known. Such numbers are `assumed`. The head
+of a chip's profile is written by hand and stays; everything from MARK on is written here.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ def own_error(rows: Sequence[LeftOut]) -> float:
 
 
 def study_engines(folder: Path) -> Study:
-    """Fit and cross-validate every engine of which `folder` has rows. Raises BadInputError."""
+    """Fit and cross-validate every engine for which `folder` has rows. Raises BadInputError."""
     rows = [row for row in read_latencies(folder) if row.chip not in LEFT_ASIDE]
     layers = layers_of_rows(folder, rows)
     engines = {}

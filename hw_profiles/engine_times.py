@@ -3,9 +3,9 @@
     cost of a term    amount * factor / rate             factor: shared by all chips; rate: the chip's, one of six
     time of a layer   (a^4 + m^4 + s^4)^(1/4) + w + o    arithmetic, activations moved, spill; weights, fixed
 
-Products, movement and spill go on at once, so the slowest decides, smoothly where two are alike (as in the roofline of
-Williams, Waterman and Patterson, 2009). Spill is what does not fit on the chip: what is read last goes out first
-(Belady, 1966: no rule moves less). No measured time is looked up anywhere.
+Products, movement and spill go on at once, so the slowest decides, with a smooth transition where two are alike (as in
+the roofline of Williams, Waterman and Patterson, 2009). Spill is what does not fit on the chip. The tensor that is read
+last goes out first (Belady, 1966: no rule moves less). No measured time is looked up anywhere.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def numbers_of(engine: Engine, clock_fraction: float = 1.0, memory_fraction: flo
 
 
 def amounts(network: Layers, room: int) -> F64:
-    """Return amounts of each term (layers + 1, terms): a row for each layer with its spill, and one for the job."""
+    """Return the amount of each term (layers + 1, terms): a row for each layer, with its spill, and one for the job."""
     table = np.vstack([network.table, np.zeros(len(NAMES))])
     table[:-1, INDEX["spill"]] = spilled(network, room)
     for name, amount in (("input", network.input), ("output", network.output), ("job", 1)):

@@ -84,14 +84,14 @@ class ProfileFit:
     def median_error(self, column: str, *, left_out: bool = False) -> float:
         """Return the median absolute relative error of `column`.
 
-        `left_out`: whether to take the fits that had not seen the measurement.
+        `left_out`: whether to take the errors of fits that had not seen the measurement.
         """
         errors = [abs(r.left_out_error if left_out else r.error) for r in self.residuals if r.column == column]
         return median(errors) if errors else 0.0
 
 
 def measurements(rows: Sequence[ConfigurationRow], step: Step) -> list[Measurement]:
-    """Return the measurements of `step` in `rows`. The middle of its range stands for an application's frame time."""
+    """Return the measurements of `step` in `rows`. An application's frame time is a range; its middle counts."""
     result = []
     for row in rows:
         for column in step.columns:

@@ -50,7 +50,7 @@ def _from_flat(flat: F64) -> Numbers:
 
 @dataclass(frozen=True)
 class Fitted:
-    """An engine's numbers for `chips`, and the spread that the fit leaves of each.
+    """An engine's numbers for `chips`, and the spread that the fit leaves for each.
 
     `seen`: each network of the fit with the terms' shares in its time (terms,), as the mean over all chips.
     """
@@ -255,7 +255,7 @@ def predict_rows(fitted: Fitted, rows: Sequence[Latency], layers: Mapping[str, L
 
 
 def fit_anchors(fitted: Fitted, before: str, rows: Sequence[Latency], layers: Mapping[str, Layers]) -> Fitted:
-    """Fit a chip of which only `rows` are known: its prior rates are those of the chip `before` it, one STEP on.
+    """Fit a chip for which only `rows` are known. Its prior rates are one STEP beyond those of the chip `before` it.
 
     `fitted`: numbers of all other chips; its factors stay.
     `layers`: layers of each network, by name.

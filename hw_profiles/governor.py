@@ -3,8 +3,8 @@
 Each unit's junction (seconds) stands on the device's body (minutes). Each is an RC, T' = (T_below + R P - T) / tau,
 solved exactly over a step of constant power (lumped models of phones: Bhat, Gumussoy and Ogras, 2019). The rules are
 `step_wise` and `power_allocator` of the Linux thermal framework (Documentation/driver-api/thermal): pure functions of
-temperatures and power that move one unit by one corner per call. In a run on this machine a corner is a duty cycle,
-its clock over the highest one.
+temperatures and power that move one unit by one corner per call. In a run on this machine a corner is a duty cycle: its
+clock divided by the highest clock.
 """
 
 from __future__ import annotations
@@ -121,8 +121,8 @@ def power_allocator(
 ) -> None:
     """Grant the units the power that the device can shed, plus a share of the headroom.
 
-    Lower the unit that takes most power while all take more than the grant. Raise the most lowered one again once its
-    additional power fits into the grant.
+    Lower the unit that takes most power while all units together take more than the grant. Raise the most lowered one
+    again once its additional power fits into the grant.
 
     `profile`: hardware profile of the chip.
     `thermal_state`: temperatures now.

@@ -2,8 +2,8 @@
 
 A shape is inferred, or the file states it where ONNX knows no rule. A shape that stays unknown is an error that names
 the first operator behind it. Exporters compute sizes and axes by chains of operators, for a flattening, a repeat or an
-attention, and ONNX's inference does not see through them. `fold` replaces such operators by their values; it bounds
-what they would make before it makes it.
+attention, and ONNX's inference does not see through them. `fold` replaces such operators by their values. It checks the
+size of a value before it computes the value.
 """
 
 from __future__ import annotations

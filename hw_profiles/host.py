@@ -2,8 +2,8 @@
 
 The cores are those that this process may use; a quota of the control group lowers their number. Units share cores only
 when there are too few. Nothing is measured here: every number of `host_tables` says in its `source` what it was
-computed from, or on which other machine it was measured. `host_model.py` lays over them what was measured of this one,
-and `trilane.scheduler.placement` places units by measured times.
+computed from, or on which other machine it was measured. `host_model.py` replaces some of them by measurements of this
+machine, and `trilane.scheduler.placement` places units by measured times.
 """
 
 from __future__ import annotations
@@ -252,7 +252,7 @@ def unit_rows(placement: Placement) -> dict[str, Any]:
 
 
 def placement_of(rows: Mapping[str, Any]) -> Placement:
-    """Return the placement that `unit_rows` made `rows` of."""
+    """Return the placement from `rows`, a result of `unit_rows`."""
     return {unit: Place(tuple(row["cores"]), row["threads"]) for unit, row in rows.items()}
 
 

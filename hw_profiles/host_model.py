@@ -1,9 +1,10 @@
 """The profile `host` in a prediction: its units placed on cores, and measured times in place of assumed ones.
 
-Units are placed as a run's are, by modelled times. Virtual time knows units with cores of their own and units that
-take turns on one core, so no unit floats and none with several cores shares one, except where cores are asked for.
-A network's measured time over its modelled one says how much slower its unit is than assumed, for each number of
-threads, so another shape of its tensor takes a time in proportion to its work. What is not measured has no interval.
+Units are placed as in a run, but by modelled times. Virtual time knows units with cores of their own, and units that
+take turns on one core. Therefore no unit floats, and no unit with several cores shares one, unless the user asks for
+such cores. A network's measured time, divided by its modelled time, says how much slower its unit is than assumed, for
+each number of threads. Another shape of its tensor takes a time in proportion to its work. What is not measured has no
+interval.
 """
 
 from __future__ import annotations
@@ -142,7 +143,7 @@ def with_threads(unit: Unit, threads: int) -> Unit:
 
 
 def error_of(took: Sequence[float]) -> float:
-    """Return the relative error of what follows from measured times: their scatter and `MODEL_ERROR`.
+    """Return the relative error of figures that follow from measured times, from their scatter and `MODEL_ERROR`.
 
     `took`: measured times, each above 0; a single one has no scatter.
     """

@@ -132,7 +132,7 @@ def _by_roofline(operator: Operator, machine: UnitNumbers) -> OperatorTime:
 
 
 def interval(profile: Profile, work: Work, time: NetworkTime) -> Interval:
-    """Return the 80 % interval around `time`: the model's own error, and what its numbers leave open for this network.
+    """Return the 80 % interval around `time`, from the error of the model itself and the error of its numbers.
 
     `profile`: hardware profile of the chip.
     `work`: work of the network.

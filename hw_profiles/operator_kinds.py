@@ -1,4 +1,4 @@
-"""Tables of ONNX operators: which kind of work each one is, and what those that multiply tensors multiply.
+"""Tables of ONNX operators: the kind of work of each operator, and the products of those that multiply tensors.
 
 An operator that no table names is priced by the elements that it moves, and reports name it. The count of a product
 follows from shapes and attributes alone; `network_work.py` counts convolutions.

@@ -1,11 +1,12 @@
 """What a pipeline file does on a chip: a time for each stage, then one run of the scheduler in virtual time.
 
-The time of a stage is that of the file, else as measured here, else of its network on the unit's hardware. Two kinds of
-uncertainty are kept apart. Jitter is what differs from frame to frame; the simulated run has it. Ignorance is the error
-of the chip's model, or of measured times; it is the same for all frames, and makes the intervals. They hold 80 %, as
-those of a network by itself.
+The time of a stage comes from the file, else from a measurement on this machine, else from its network and the hardware
+of its unit. Two kinds of uncertainty are kept apart. Jitter is what differs from frame to frame; the simulated run has
+it. Ignorance is the error of the chip's model, or of measured times; it is the same for all frames, and makes the
+intervals. Like the interval of a network by itself, each holds the true value with a probability of 80 %.
 
-Rule: all draws follow from the seed, the stage's name and the frame, so that two variants of a file meet the same luck.
+Rule: all draws follow from the seed, the stage's name and the frame, so that two variants of a file meet the same
+random numbers.
 """
 
 from __future__ import annotations
@@ -65,8 +66,8 @@ class StagePrice:
     """The time of a job of a stage.
 
     `source`: where it comes from. `low_ms`, `high_ms`: 80 % interval of the mean, the mean itself for times that the
-    file gives; None where nobody knows the error. `why`: reasons for its width, or why there is none. `is_modelled`:
-    whether it follows from the network and the chip alone.
+    file gives; None where nobody knows the error. `why`: reasons for the interval's width, or for its absence.
+    `is_modelled`: whether it follows from the network and the chip alone.
     """
 
     time: StageTime
@@ -118,7 +119,10 @@ NOTHING_MEASURED: Final = Measured({}, "", "")
 
 
 def measured_price(file: PipelineFile, name: str, measured: Measured) -> StagePrice | None:
-    """Return the price of a stage that was measured here, on a chip by its `scale`; None without one of them."""
+    """Return the price of a stage from its time in a run on this machine.
+
+    On a chip, the stage's `scale` multiplies the time. None stands for a stage without a time or without a scale.
+    """
     factor = 1.0 if measured.chip == HOST else file.stages[name].scale.get(measured.chip)
     if name not in measured.times or factor is None:
         return None
@@ -135,7 +139,7 @@ def prices_of(
     corners_of_chip: Callable[[Profile], Corners],
     measured: Measured = NOTHING_MEASURED,
 ) -> dict[str, StagePrice]:
-    """Return the price of every stage: of the file, as measured, or of its network.
+    """Return the price of every stage: as the file states it, as measured, or from its network.
 
     Raises BadInputError naming the stages without one.
 
@@ -180,7 +184,7 @@ def _without_a_time(file: PipelineFile, names: Sequence[str], measured: Measured
 
 
 def factors_at(prices: Mapping[str, StagePrice], end: Ends) -> dict[str, float]:
-    """Return by how much each stage's time is longer at an end of its interval than expected."""
+    """Return, for each stage, the time at an end of its interval divided by the expected time."""
     found = {}
     for name, each in prices.items():
         at = {"expected": None, "low": each.low_ms, "high": each.high_ms}[end]
@@ -196,7 +200,7 @@ def bound_of(file: PipelineFile, prices: Mapping[str, StagePrice]) -> tuple[Grap
 
 
 class Drawn:
-    """The time of each job in ns, as a function for the virtual clock. `factors`: what each stage's time is times."""
+    """The time of each job in ns, as a function for the virtual clock. `factors`: factor on each stage's time."""
 
     def __init__(self, prices: Mapping[str, StagePrice], seed: int, factors: Mapping[str, float] | None = None) -> None:
         self._prices, self._seed, self._factors = prices, seed, factors or {}
@@ -314,7 +318,7 @@ def always_fed(file: PipelineFile) -> tuple[Graph, Settings]:
 
 
 def holding_back(graph: Graph) -> Graph:
-    """Return a graph whose streams hold back instead of leaving frames out.
+    """Return a graph whose streams hold back their writers and never drop a frame.
 
     A rate holds when every frame is shown.
     """
@@ -330,19 +334,19 @@ def fed_bound_ms(file: PipelineFile, times_ms: Mapping[str, float]) -> float:
 
 
 def repeats_after(file: PipelineFile) -> int:
-    """Return the number of frames after which the stages that a frame takes are the same again."""
+    """Return the number of frames after which frames go through the same stages again."""
     return math.lcm(*file.periods.values(), len(file.bypass[1].pattern or ".") if file.bypass else 1)
 
 
 def steady_ms(run: Simulation, stop_ns: int, repeats: int) -> float:
-    """Return the time of a frame in the second half of a run whose source is always ready and stops at `stop_ns`.
+    """Return the mean time of a frame in the second half of a run. Its source is always ready, and stops at `stop_ns`.
 
-    The first half is left out because slots fill for as long as hundreds of frames, and what comes after `stop_ns` is
-    left out because the last frames meet less and less others.
+    The first half is left out because slots may fill for hundreds of frames. The time after `stop_ns` is left out
+    because the last frames meet fewer and fewer others.
 
-    `repeats`: number of frames after which the jobs are the same again. Their order repeats after some frames more, as
-    slots fill in turn, so the frames that count are a whole number of EVEN times as many, where there are so many.
-    A pipeline that shows no two frames there, as others never let it, needs all that time.
+    `repeats`: number of frames after which the jobs are the same again. The order of the jobs repeats later, as slots
+    fill in turn. Therefore a whole number of EVEN times as many frames counts, if the run has so many. If the pipeline
+    shows no two frames there, because others never let it, the result is the whole time.
     """
     shown = {frame: ns for frame, ns in run.shown_ns.items() if ns <= stop_ns}
     last = max(shown, default=0)
@@ -353,9 +357,9 @@ def steady_ms(run: Simulation, stop_ns: int, repeats: int) -> float:
 
 
 def over_ends(ms_at: Callable[[Ends], float], is_unsure: bool = True) -> FrameInterval:
-    """Return a time with its interval: the times where all networks take as little, or as long, as theirs say.
+    """Return a time with its interval. At either end, all stages take as little, or as long, as their intervals say.
 
-    The errors of all stages count as one, as they come from one model of one chip, or from one run.
+    The errors of all stages count as one, because they come from one model of one chip, or from one run.
     `ms_at`: the time at an end. `is_unsure`: whether the ends differ.
     """
     found = [*map(ms_at, ENDS if is_unsure else ENDS[:1])]

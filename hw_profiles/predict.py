@@ -306,7 +306,7 @@ def _cells(row: ConfigurationRow) -> dict[str, Any]:
 
 
 def held_to(plan: Plan, fps: float | None) -> Plan:
-    """Return the plan at a rate. A policy that releases frames releases at it; any other one is held to it."""
+    """Return the plan at a rate. A policy that releases frames uses the rate; any other policy is held to it."""
     if fps is None:
         return plan
     if POLICIES[plan.variant.policy].paced:
@@ -321,8 +321,8 @@ def _unheld(plan: Plan) -> Plan:
 def unheld_times(profile: Profile, plan: Plan, corners: Corners, around: Interval, network_ms: float) -> FrameInterval:
     """Return the times of a frame when neither the display nor a rate holds the application.
 
-    A frame's times follow from the network's. Where the other stages were measured with it, they have its relative
-    error.
+    A frame's times follow from the network's. If the other stages were measured together with the network, they have
+    the network's relative error.
     `profile`: hardware profile of the chip.
     `plan`: application that runs on it.
     `corners`: corner of each unit.

@@ -178,7 +178,7 @@ class Engine(ProfileTable):
         return self
 
     def factor(self, term: str) -> float:
-        """Return how many times dearer `term` is than a plain convolution's."""
+        """Return how many times as much `term` costs as in a plain convolution."""
         return self.factors[term].or_else(1.0) if term in self.factors else 1.0
 
     def seconds_per_unit(self, rate: str) -> float:

@@ -1,11 +1,11 @@
 """Several pipelines on one chip: avatars, networks and pipeline files, each at a rate, on its units, memory and heat.
 
-`tenants.py` says what their jobs cost, and the cores of `trilane.scheduler.shared_units` decide who waits. This file
-adds how much a network slows while others use the memory: it has the bandwidth that they leave (Gables, Hill and Reddi,
-2019). Each avatar's camera, display and composition take `application_use_fraction` all the time, and a network of
-another unit takes its bytes over its time. Jobs of one unit follow each other and never compete.
-A network that nothing slows has the time of `network_time.price`, on a chip that computes as the network does.
-The answer has the keys of report.json where they mean the same.
+`tenants.py` says what their jobs cost, and the schedulers in `trilane.scheduler.shared_units` decide whose job waits.
+This file adds how much a network slows while others use the memory: it has the bandwidth that they leave (Gables, Hill
+and Reddi, 2019). Each avatar's camera, display and composition take `application_use_fraction` all the time, and a
+network on another unit takes its bytes, spread over its time. Jobs of one unit follow each other and never compete. A
+network that nothing slows has the time of `network_time.price`, on a chip that computes as the network does. The answer
+has the keys of report.json where they mean the same.
 """
 
 from __future__ import annotations
@@ -101,9 +101,10 @@ def _run(
 
 
 def needed(profile: Profile, tenants: Sequence[Pipeline], number: int, corners: Corners, turns: str) -> FrameInterval:
-    """Return the time of a released frame of tenant `number` if it always had another one, beside the others' rates.
+    """Return the time of a frame of tenant `number`, with its source always ready and the others at their rates.
 
-    Alone it needs what a prediction of it by itself says: its run lasts as long, and has the same interval.
+    A tenant alone needs the time that a prediction of it by itself gives: the run is as long, and the interval the
+    same.
     """
 
     def needs_ms(end: Ends) -> float:

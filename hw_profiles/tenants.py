@@ -3,8 +3,8 @@
     jobs = tenant.on(profile, corners, "expected", 0.1)
     jobs.service_ns("infer", "dsp", 7, 0), jobs.mean_ms
 
-Rule: a tenant knows its own stages and times. How several slow each other is the matter of `shared_chip.py`, which asks
-for each job which network it computes, and for a network how long it takes at less bandwidth.
+Rule: a tenant knows its own stages and times. `shared_chip.py` computes how several slow each other. It asks which
+network each job computes, and how long a network takes at less bandwidth.
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ class Pipeline(Protocol):
     released a second. `takes_memory`: whether a camera, a display and the composition beside it use the memory all the
     time. `repeats`: number of frames after which its jobs are the same again. `graph`: its stages, as the scheduler
     knows them.
-    `fed`: graph and settings where it always has another frame, and shows all of them. `hardware`: for each of its
-    units the unit of the chip that it is, or its own name.
+    `fed`: graph and settings with a source that is always ready, and with every frame shown. `hardware`: for each of
+    its units, the unit of the chip that it stands for, or its own name.
     """
 
     @property

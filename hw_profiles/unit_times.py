@@ -141,7 +141,7 @@ def _apart(own: Mapping[str, float], others: Mapping[str, float]) -> float:
 
 
 def unsure(engine: Engine, shares: F64) -> float:
-    """Return the relative error that the engine's numbers leave of a job.
+    """Return the relative error that the engine's numbers leave in the time of a job.
 
     `shares`: share of each term in its time (terms,).
     """
@@ -178,7 +178,7 @@ class UnitNumbers:
 
 
 def machine_of(unit: Unit, memory: Memory, clock_fraction: float = 1.0, contended: bool = False) -> UnitNumbers:
-    """Return the numbers of a unit, all of them slower by the factor that was measured of it.
+    """Return the numbers of a unit, all of them slower by the factor that was measured for the unit.
 
     `unit`: unit of a profile.
     `memory`: memory of the same profile.
