@@ -265,7 +265,7 @@ def misses(left_out: Sequence[Checked], of: Checked | UnitName) -> list[float]:
 
 
 def error_scale(told: Sequence[float]) -> float:
-    """Return the factor to expect on the stated error. `told`: misses in units of the stated error."""
+    """Return by which factor the stated error must grow or shrink. `told`: misses in units of the stated error."""
     freedom = STATED_ROWS + len(told)
     scale = math.sqrt((STATED_ROWS + sum(miss**2 for miss in told)) / freedom)
     return min(scale * student_quantile(freedom, 0.8) / NORMAL_80, MOST_ERROR_SCALE)

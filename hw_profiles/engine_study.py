@@ -215,7 +215,7 @@ def errors_of(rows: Sequence[LeftOut]) -> dict[str, float]:
 
 
 def as_markdown(study: Study) -> str:
-    """Return two tables: errors by engine, and those of USUAL by family and chip."""
+    """Return two tables: the errors by engine, and the errors of USUAL by family and chip."""
     return "\n".join([*_by_engine(study), "", *_by_family(study.engines[USUAL].left_out)])
 
 

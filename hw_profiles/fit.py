@@ -1,9 +1,10 @@
 """Fits a profile's efficiencies to measured rows.
 
 There are fewer free numbers than measurements, and each has a physical meaning and a prior: the value and the `spread`
-that the profile states before the fit. The fit minimises the sum of squares of log(predicted / measured) / noise and
-of log(number / prior) / spread, which gives the most probable numbers if both are normally distributed. Each of
-`STEPS` starts from the numbers of the steps before it: those of the network, unit by unit, then the application's.
+that the profile states before the fit. The fit minimises the sum of squares of log(predicted / measured) / noise and of
+log(number / prior) / spread. This gives the most probable numbers if both are normally distributed. Each of `STEPS`
+starts from the numbers of the earlier steps. The steps of the network come first, unit by unit, then that of the
+application.
 """
 
 from __future__ import annotations
@@ -91,7 +92,7 @@ class ProfileFit:
 
 
 def measurements(rows: Sequence[ConfigurationRow], step: Step) -> list[Measurement]:
-    """Return the measurements of `step` in `rows`. An application's frame time is a range; its middle counts."""
+    """Return the measurements of `step` in `rows`. For an application's frame time the middle of its range counts."""
     result = []
     for row in rows:
         for column in step.columns:

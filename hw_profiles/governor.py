@@ -169,7 +169,7 @@ GOVERNORS: dict[str, Govern] = {"step_wise": step_wise, "power_allocator": power
 class Governor:
     """The governor of one run. It learns time and work only from `tick`, so the same ticks give the same events.
 
-    `name`: name in GOVERNORS. `due_ns`: when `tick` is to be called next.
+    `name`: name in GOVERNORS. `due_ns`: time at which `tick` is to be called next.
     """
 
     def __init__(self, profile: Profile, performance_profile: str, governor: str | None = None) -> None:

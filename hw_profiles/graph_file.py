@@ -1,8 +1,8 @@
 """Reads any ONNX graph for its operators and shapes: float, quantised, or without weights.
 
-The file may come from a stranger. Sizes are checked before anything is taken in, weights are forgotten as soon as their
-shape is known, and no other file is opened: a graph keeps only the values of weights in other files. `image_network`
-turns a graph with one input, a picture, into the network of the application.
+The file may come from a stranger. Sizes are checked before anything is taken in, and weights are forgotten as soon as
+their shape is known. No other file is opened, because a graph keeps only the values of weights in other files.
+`image_network` turns a graph with one input, a picture, into the network of the application.
 """
 
 from __future__ import annotations

@@ -172,7 +172,7 @@ def with_network(profile: Profile, work: Work, ms: Mapping[int, float], error: f
 def with_stages(
     profile: Profile, network: Network, took_ns: Mapping[str, Sequence[int]], said: str, avatars: int = 1
 ) -> Profile:
-    """Return `profile` with the measured times of the stages beside the network; the medians over the frames count.
+    """Return `profile` with the measured times of the other stages; the medians over the frames count.
 
     `network`: network whose tensor the frames had. `took_ns`: nanoseconds of each stage, frame by frame. `avatars`:
     number of avatars that were posed. The scheduler works on the cores of the first and the last stage, so half of its

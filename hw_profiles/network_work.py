@@ -182,7 +182,7 @@ def _picture_tensors(graph: Any, inputs: list[str]) -> int:
 def graph_facts(model: Any) -> dict[str, Any]:
     """Return the facts of a network for reports; raises as `count_work` does.
 
-    Keys: `parameters`, those of the layers, as in the file; `gmac`, products of one pass, 1e9.
+    Keys: `parameters`: number of parameters of the layers, as in the file; `gmac`: products of one pass, in 1e9.
     """
     work = count_work(model)
     return {"parameters": work.weights, "gmac": work.macs / 1e9}

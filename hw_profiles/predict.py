@@ -345,7 +345,7 @@ def least_ms(profile: Profile, plan: Plan) -> float:
 
 
 def around_frame(frame_ms: float, times: FrameInterval, least: float) -> dict[str, float]:
-    """Return the 80 % interval of a mean frame time, from that of the network.
+    """Return the 80 % interval of a mean frame time, from the interval of the network's time.
 
     `frame_ms`: mean frame time.
     `times`: times of a frame when nothing holds the application.

@@ -1,10 +1,10 @@
 """Published latencies of networks on chips: a folder of rows to fit to, and two networks to check profiles by.
 
-Which rows count is decided in `read_latencies`, by what the file says of them. `fit_engines.py` has seen both networks
-among some thirty others, so `check_published` says how well the fit holds; `trilane profiles fit-chips` says how well
-unseen networks are predicted. Source: Qualcomm AI Hub Models, `unet_segmentation` (milesial's U-Net of 31.0 M
-parameters on 640x1280x3) and `resnet18`, w8a8, TFLite and QNN runtimes, QAIRT 2.41 (BSD-3-Clause,
-github.com/quic/ai-hub-models, perf.yaml).
+`read_latencies` decides which rows count, by what the file says of them. `fit_engines.py` has seen both networks among
+some thirty others, so `check_published` says how well the fit holds; `trilane profiles fit-chips` says how well unseen
+networks are predicted. Source: Qualcomm AI Hub Models, `unet_segmentation` (milesial's U-Net of 31.0 M parameters on
+640x1280x3) and `resnet18`, w8a8, TFLite and QNN runtimes, QAIRT 2.41 (BSD-3-Clause, github.com/quic/ai-hub-models,
+perf.yaml).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Whether a rate holds, which rate a limit of power leaves, and the power of a device with its intervals.
 
-All are pure functions of times and of a profile's powers, for the whole device, its base included. A mean is that of
-`Unit.power_w`. An interval follows from the spreads of the profile's numbers and of the busy shares, which are taken
-as independent. Powers are positive, so their sums are taken as log-normal.
+All are pure functions of times and of a profile's powers, for the whole device, its base included. Means come from
+`Unit.power_w`. An interval follows from the spreads of the profile's numbers and of the busy shares, which are taken as
+independent. Powers are positive, so their sums are taken as log-normal.
 """
 
 from __future__ import annotations
@@ -36,10 +36,12 @@ class FrameInterval(NamedTuple):
 
 
 def holding(fps: float, times: FrameInterval, dropped: int = 0, late: int = 0, frames: int = 0) -> dict[str, Any]:
-    """Say whether `fps` frames a second hold, in words too. The reserve is the part of a frame's time that is left.
+    """Say whether a rate of `fps` frames a second holds, also in words.
 
-    `times`: time of a frame that never waits for its turn. `dropped`, `late`: numbers of frames, of `frames`, that a
-    run at this rate drops, or shows too late; jitter may cause both although a mean frame fits.
+    The reserve is the part of a frame's time that is left.
+
+    `times`: time of a frame that never waits for its turn. `dropped`, `late`: numbers of the run's `frames` that it
+    drops, or shows too late, at this rate. Jitter may cause both although a mean frame fits.
     """
     reserve, high, low = (1 - ms * fps / 1e3 for ms in times)
     if low >= 0:

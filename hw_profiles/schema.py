@@ -98,7 +98,7 @@ class Memory(ProfileTable):
 class Efficiencies(ProfileTable):
     """Share of a peak that each kind of operator reaches.
 
-    Winograd and similar shortcuts may take a share of arithmetic above 1.
+    With Winograd and similar shortcuts, a share of arithmetic may exceed 1.
     """
 
     convolution: Efficiency = Field(description="Of convolutions: share of the peak of arithmetic.")

@@ -74,7 +74,7 @@ def together(
 
 
 def alone_ms(profile: Profile, tenant: Pipeline, corners: Corners) -> Mapping[str, float]:
-    """Return the mean milliseconds of a job by stage, of a pipeline that is alone, over its frames with a network."""
+    """Return the mean milliseconds of a job by stage, for a pipeline alone, over the frames with a network."""
     return _Costs(profile, [tenant], corners).mean_ms[0]
 
 

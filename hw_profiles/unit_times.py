@@ -72,10 +72,10 @@ def time_on(
 
 
 def relative_error(job: JobTime, unit: Unit) -> float:
-    """Return the relative error to expect of the time of `job` on `unit`; the measured one where the unit was measured.
+    """Return the relative error to expect of the time of `job` on `unit`; for a measured unit, the measured error.
 
-    Otherwise it joins the errors of the numbers behind each part of the time with the error of the model itself, and
-    scales both as the unit's own rows showed.
+    For other units it joins two errors: that of the numbers behind each part of the time, and that of the model itself.
+    It multiplies both by the unit's `error_scale`, which rows of the user's own give.
     """
     if unit.measured is not None:
         return unit.measured.error

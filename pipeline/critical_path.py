@@ -49,7 +49,7 @@ class Taken(NamedTuple):
 
 
 class Sharing:
-    """Computes which stages had the core while a stage's jobs lacked one.
+    """Computes, for the jobs of each stage, which other stages had the core while they had none.
 
     `cores`: numbers of the cores of each unit; empty where not known.
     """
@@ -82,7 +82,7 @@ class Sharing:
         return self._sums
 
     def taken(self, unit: str, begin_ns: int, end_ns: int, lacked_ns: int) -> dict[str, int]:
-        """Return by stage how long its jobs had the core that `unit` lacked between two times.
+        """Return how long each stage's jobs had the core that `unit` lacked between two times.
 
         The time without a core, `lacked_ns`, is divided in proportion to how long the jobs ran between the two times.
         No stage gets more than its jobs ran.

@@ -149,8 +149,8 @@ class PortedStage:
 
         A `trilane.pipeline.stage.Skip` sends the frame to the bypass that begins at the stage.
 
-        `arrays`: array of each of `reads`, read-only; None for a newest frame that does not exist yet, and for a port
-        that the frame's bypass does not carry.
+        `arrays`: array of each of `reads`, read-only; None if there is no newest frame yet, or if the frame took a
+        bypass that lacks the port.
         `outputs`: array of each of `writes`, to be filled; empty where nobody reads the stage.
         """
         raise NotImplementedError

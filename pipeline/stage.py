@@ -27,7 +27,7 @@ class Stage(Protocol):
     """One stage inside a unit's process, made by a `StageFactory`.
 
     The stage at the end of `Pipeline.bypass` takes frames from two edges. Its `inputs` holds the slots of its own edge,
-    then those of the edge at which skipping frames leave.
+    then those of the edge on which the bypass begins.
     """
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
@@ -77,8 +77,8 @@ class SkippingStage(Stage, Protocol):
     def forget(self) -> None:
         """Do not skip the next frame because of what earlier frames brought to the bypass's end.
 
-        Called before `run` for the first frame. Called again whenever a frame that did not skip failed to reach the
-        bypass's end, or the unit there was restarted.
+        Called before `run` for the first frame. Called again whenever the unit at the bypass's end was restarted, or a
+        frame did not skip and was lost or dropped before the bypass's end.
         """
 
 

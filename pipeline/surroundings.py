@@ -1,7 +1,7 @@
 """Prepares the surroundings of a run: checks before it, cores and processes to restore, and other programs' share.
 
 Rule: a check that raises has started nothing, so nothing has to be undone. Whatever happens, cores, memory and
-processes are afterwards as they were before. By the kernel's counts, all CPU time that is not the run's own is that of
+processes are afterwards as they were before. The kernel counts CPU time. All of it that is not the run's own belongs to
 other programs.
 """
 

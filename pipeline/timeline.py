@@ -94,7 +94,7 @@ class ExplainedJob(NamedTuple):
     `figures`: numbers that its stage reported of it, by name.
     `waits_ns`: ns of each cause of its wait, without zeros; they sum to `job.begin_ns - job.ready_ns`.
     `behind`: job that its unit did the longest during the wait; None without one.
-    `after`: jobs whose end the scheduler heard of in the step in which it handed this job over.
+    `after`: jobs whose end the scheduler heard of in the step that handed this job over.
     `presented`: the presented frame, for the job that presents it.
     `rung`: rung of the frame's work.
     `skips`: whether the frame takes the bypass; set for the stage at which the bypass begins.

@@ -53,7 +53,7 @@ class Handed(NamedTuple):
 
     `at_ns`: time of the hand-over.
     `heard_ns`: time at which the scheduler heard of the job's input.
-    `after`: jobs whose end the scheduler heard of in the step in which it handed this job over.
+    `after`: jobs whose end the scheduler heard of in the step that handed this job over.
     """
 
     job: Job
@@ -83,7 +83,7 @@ class UnitHistory:
     `kept`: number of last jobs and of last changes that are remembered to explain waits.
     `held`: jobs that the unit has, the running one first.
     `account`: account of the ledger that gets the unit's time without a job.
-    `late`: stages that it waits for, joined by commas, while `account` is that of joins.
+    `late`: stages that it waits for, joined by commas, while `account` is JOIN.
     `is_up`: whether the unit's process is up and ready, and no kill is under way.
     `stopped_ns`: last time at which its process was seen stopped by a signal; 0: never.
     """

@@ -172,7 +172,7 @@ class UnitProcesses:
     def send(self, unit: str, message: Message) -> None:
         """Send `message` to the unit; does nothing for a unit that is gone or does not read.
 
-        The end of such a unit, or its deadline, reveals it.
+        The scheduler notices such a unit by the end of its process, or by its deadline.
         """
         process = self._live.get(unit)
         if process is not None:

@@ -4,9 +4,8 @@ Rule: nothing is measured here; equal journals give equal answers.
 
 A share of the critical path says how the time went. It does not say how a run reacts: a longer job is moved to another
 core more often, and takes that core from a unit that was on no path. Therefore the replay does some of the run's frames
-again, with the CPU times of their own jobs, on the run's placement, by the run's scheduler
-(`trilane.scheduler.shared_cores`). After that it does them once more for each stage, with all jobs of the stage longer
-by SLOWER.
+again (`trilane.scheduler.shared_cores`). It uses the CPU times of their own jobs, the run's placement and the run's
+scheduler. After that it does them once more for each stage, with all jobs of the stage longer by SLOWER.
 
 The replay knows no other programs, caps or restarts. Therefore its frame time is compared with the run's, and it is
 trusted only where the two are near each other.
@@ -78,7 +77,7 @@ class Slowed(NamedTuple):
         return abs(self.over_measured - 1) <= TRUSTED and worst >= LEAST_COST
 
     def by(self, name_of: Mapping[str, str]) -> dict[str, Cost]:
-        """Return the costs of groups of stages, such as units, as sums over stages. `name_of`: group of a stage."""
+        """Return the cost of each group of stages, such as a unit, summed over them. `name_of`: group of a stage."""
         found: dict[str, Cost] = {}
         for stage, cost in self.costs.items():
             was = found.get(name_of[stage], Cost(0.0, (0.0,) * len(cost.of_blocks)))
@@ -98,7 +97,7 @@ class _Block(NamedTuple):
 
 
 class WhatIf:
-    """Takes the jobs of a run in the order of their ends; keeps those of a bounded number of frames, spread over it.
+    """Takes the jobs of a run in the order of their ends; keeps the jobs of a bounded number of frames.
 
     `graph`, `settings`: graph and settings of the run. `places`: places of its units.
     """

@@ -3,8 +3,9 @@
 Rule: measured times alone decide, by one formula; nothing is tried here. The formula is not exact. Where real frames
 can be had, they decide between the few placements that it cannot tell apart.
 
-A placement gives each unit cores and threads. Its frame time is predicted from `UnitWork`: the time that the unit needs
-for a frame, and the time for which it takes each of its cores. Let T be the frame time. In a pipelined run these hold:
+A placement gives each unit cores and threads. Its frame time is predicted from each unit's `UnitWork`: the time that
+the unit needs for a frame, and the time that it takes on each core. Let T be the frame time. In a pipelined run these
+hold:
 
 - *A unit does one job at a time.* Its jobs of a frame take at most T.
 - *A core does one thing at a time.* The time that all units need on it is at most T. A unit with one thread and several

@@ -6,7 +6,7 @@ A job needs CPU time of its unit's threads, and time in which they need no core 
 unit with one thread is on one core at a time. When it wakes, it goes where it was; if others are there, it goes to an
 idle one of its cores. A core that becomes idle pulls a unit that shares another core. If a unit begins to share a core
 while another core is already idle, the idle core pulls it at the next tick (BALANCE_NS). The units on a core have equal
-shares of it. A unit of several threads is on all of its cores at once and goes as fast as the slowest of them, because
+shares of it. A unit of several threads is on all of its cores at once. It goes as fast as the slowest of them, because
 each parallel region waits for its slowest thread.
 
 Equal shares stand for the kernel's slices in turn. Moves and changes of threads cost nothing here, because the given

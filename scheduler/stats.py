@@ -100,7 +100,7 @@ T_975 = {4: 2.776445, 5: 2.570582, 6: 2.446912, 7: 2.364624, 8: 2.306004, 9: 2.2
 
 
 def mean_interval(values: Sequence[float], mean: float | None = None) -> tuple[float, float] | None:
-    """Return the 95 % interval of the mean that a run like this one would have if it went on, in units of `values`.
+    """Return the 95 % interval of the mean of an endless run like this one, in the unit of `values`.
 
     None stands for too few values: fewer than `LEAST_BATCHES` batches of `LEAST_FRAMES`, or an interval that reaches 0.
 

@@ -233,7 +233,7 @@ ROUNDING: Final = 2e-5
 
 
 def contradiction(figures: Figures) -> str:
-    """Say which figures contradict each other: the mean and percentiles lie between least and largest; "" if none."""
+    """Say which figures contradict each other; "" if none do. Mean and percentiles lie between least and largest."""
     named = [
         ("the least", figures.low),
         ("the median", figures.p50),
@@ -257,7 +257,7 @@ def contradiction(figures: Figures) -> str:
 def falling(values: Sequence[float], slack: float = 0.0) -> list[int]:
     """Return the places of the longest series in `values` that never rises by more than the share `slack`.
 
-    The values outside it do not fit to most of the others. Of several longest series, the one with the larger values
+    The values outside it do not fit most of the others. Of several longest series, the one with the larger values
     counts, because a tool leaves a part out of a time more easily than it adds one.
     """
 

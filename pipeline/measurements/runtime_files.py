@@ -1,8 +1,10 @@
 """Readers of what runtimes write: ONNX Runtime's profile, `benchmark_model`'s log, TensorRT's layers, ExecuTorch's.
 
-Layouts as the tools write them: ONNX Runtime (`profiler.cc`: a JSON array with an event a line, cut off where the
-session was not closed), TFLite and LiteRT `benchmark_model` (microseconds; operators in ms), `trtexec --exportProfile`
-(ms), and the app benchmarks of react-native-executorch (ms).
+The tools write these layouts:
+- ONNX Runtime (`profiler.cc`): a JSON array with an event a line; it is cut off if the session was not closed.
+- `benchmark_model` of TFLite and LiteRT: microseconds, but ms for operators.
+- `trtexec --exportProfile`: ms.
+- The app benchmarks of react-native-executorch: ms.
 """
 
 from __future__ import annotations
@@ -76,7 +78,7 @@ def is_benchmark(text: str) -> bool:
 
 
 def read_benchmark(text: str) -> Found:
-    """Read the log of `benchmark_model`, of one benchmark or of many after each other."""
+    """Read the log of `benchmark_model`, with one benchmark or several after each other."""
     return _Benchmark(text).found
 
 
@@ -343,7 +345,10 @@ CUT: Final = re.compile(r"^(.*)_at_(-?\d+)$")
 
 
 def read_cut_means(document: Mapping[str, Any]) -> Found:
-    """Read a table of mean times by place of a cut (`NAME_at_N`). The rest behind a later cut cannot take longer."""
+    """Read a table of mean times of cut networks, by the place N of the cut (`NAME_at_N`).
+
+    The rest of a network behind a later cut cannot take longer than behind an earlier one.
+    """
     found = Found("table of times by cut", "the mean for each place at which a network is cut")
     rests: dict[str, list[tuple[int, float]]] = defaultdict(list)
     for name, facts in document.items():

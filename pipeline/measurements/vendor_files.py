@@ -1,10 +1,14 @@
 """Readers of Qualcomm's profiles: the CSV of the QNN execution provider, QHAS summaries, and jobs of AI Hub.
 
-Layouts as the tools write them: the QNN execution provider of ONNX Runtime (`qnn_backend_manager.cc`: seven columns,
-rows appended run after run, identifiers unquoted); the same table of `qnn-profile-viewer` (lines before it, blanks in
-its header, `EXECUTE` in each row, a row of `qnn-net-run` itself); QHAS of QAIRT (`htp_overall_summary`);
-`download_profile()` of qai-hub (times in microseconds). Cycles become shares of a run, never times: the clock is not
-in the file.
+The tools write these layouts:
+- The QNN execution provider of ONNX Runtime (`qnn_backend_manager.cc`) writes seven columns. It appends the rows of
+  each run, and does not quote identifiers.
+- `qnn-profile-viewer` writes the same table after some lines of text. The header has blanks, each row has `EXECUTE`,
+  and `qnn-net-run` itself has a row.
+- QHAS of QAIRT writes `htp_overall_summary`.
+- `download_profile()` of qai-hub returns times in microseconds.
+
+Cycles become shares of a run, never times, because the clock is not in the file.
 """
 
 from __future__ import annotations
