@@ -97,7 +97,7 @@ class _Block(NamedTuple):
 
 
 class WhatIf:
-    """Takes the jobs of a run in the order of their ends; keeps the jobs of a bounded number of frames.
+    """Takes the jobs of a run in order; keeps those of a bounded number of frames, spread over the run.
 
     `graph`, `settings`: graph and settings of the run. `places`: places of its units.
     """

@@ -61,6 +61,7 @@ def earliest_completion_ns(
         count = sum(1 for left in older if left & stage.bit and not (stage.bit & skipped and left & skips))
         if count:
             end = max(end, count * stage.estimate_ns - _done_of_running(now_ns, stage))
+        # The bypass leads the frame past the stages of `skipped`, so they cost it no time.
         ends.append(end if stage.bit & skipped and todo & skips else end + stage.estimate_ns)
     return now_ns + max(ends)
 
@@ -70,7 +71,7 @@ def _done_of_running(now_ns: int, stage: StageState) -> int:
     queue = stage.unit.queue
     if not queue or queue[0].stage != stage.name:
         return 0
-    return min(now_ns - stage.unit.head_since_ns, stage.estimate_ns)
+    return min(now_ns - stage.unit.head_since_ns, stage.estimate_ns)  # a job that takes longer may end at any time
 
 
 class Choice:
@@ -140,6 +141,7 @@ class Choice:
             return False
         bypass = self._bypass if self._bypass is not None and self._bypass.was_taken else None
         state = self._frames.get(waiting.frame)
+        # Side work presents nothing, so it makes no frame late.
         todo = (self._flow.next_todo() if state is None else state.todo) & self._flow.main
         end_ns = earliest_completion_ns(now_ns, waiting.frame, self._stages, self._frames, todo, bypass)
         return end_ns > waiting.deadline_ns
@@ -169,7 +171,7 @@ class Choice:
             sink = stage.output
             if sink is not None and not sink.free and not (sink.rule.yields and self.can_claim(stage, sink)):
                 return BLOCKED
-            account = THROTTLED
+            account = THROTTLED  # it has input and a free slot, so only its duty can hold it
         return account
 
     def _candidate(self, stage: StageState, now_ns: int) -> Candidate:

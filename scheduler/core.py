@@ -160,7 +160,7 @@ class Core:
             self._check_units()
         if self.started and not self.finished:
             if self._latches:
-                self.flow.mark_dirty(self.stages[0].unit)
+                self.flow.mark_dirty(self.stages[0].unit)  # time alone may let it begin, without any event
             released_ns = self._release(now_ns) if now_ns >= self.source.due_ns else now_ns
             before = len(self.actions)
             self.assignment.assign(now_ns, released_ns, self.actions)
@@ -227,8 +227,9 @@ class Core:
             return  # the job was lost with its process
         job = unit.queue.popleft()
         self._begin_next(unit)
-        unit.failures = 0
+        unit.failures = 0  # only failures in a row count
         stage = self._stage_named[job.stage]
+        # A frame that was given up while this job worked on it stays in `gone` until its jobs end.
         frame = self.frames.get(job.frame) or self.flow.gone[job.frame]
         service_ns = end_ns - begin_ns
         if skips:
@@ -240,6 +241,7 @@ class Core:
         if self.ladder is not None and not frame.skips:
             self._step_work(self.ladder, stage, frame, service_ns)
         if unit.duty < FULL_DUTY:
+            # The job is then `duty` thousandths of the time of job and pause.
             unit.hold_until_ns = end_ns + service_ns * (FULL_DUTY - unit.duty) // unit.duty
             unit.update_queue_capacity()
             self._reset_alarm()
@@ -300,8 +302,9 @@ class Core:
     def _on_died(self, event: UnitDied) -> None:
         """Plan the restart and reclaim the slots, or end the run when the unit fails too often."""
         unit = self.units[event.unit]
+        # Only a unit that passed its deadline is stopping.
         loss = Loss(LossKind.HUNG if unit.life == STOPPING else LossKind.DIED, unit.name)
-        unit.move(UnitDied, self.now_ns + back_off_ns(unit.failures + 1))
+        unit.move(UnitDied, self.now_ns + back_off_ns(unit.failures + 1))  # its deadline is now that of its restart
         unit.failures += 1
         unit.update_queue_capacity()
         self._reset_alarm()
@@ -313,6 +316,7 @@ class Core:
     def _on_pinged(self, event: Pinged) -> None:
         unit = self.units[event.unit]
         answer_by_ns = self.now_ns + self._hang_ns
+        # A job that was handed out meanwhile has a deadline of its own.
         if unit.move(Pinged, unit.deadline_ns if unit.queue else answer_by_ns):
             self._set_alarm(answer_by_ns)
 

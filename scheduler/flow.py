@@ -50,8 +50,8 @@ class Bypass:
     def __init__(self, begin: StageState, end: StageState) -> None:
         assert begin.output is not None
         self.begin, self.end, self.edge = begin, end, begin.output
-        end.bypassed, end.feeder = begin.output, None
-        self.must_be_fresh = True
+        end.bypassed, end.feeder = begin.output, None  # jobs of `end` read slots of two edges
+        self.must_be_fresh = True  # no frame has come to `end` yet
         self.was_taken = False
 
 
@@ -230,7 +230,7 @@ class Flow:
             if held >= 0:
                 newest = self._written[side.producer.position, held]
                 age_ns = now_ns - newest.sampled_ns
-                if not 0 < side.max_age_ns < age_ns:
+                if not 0 < side.max_age_ns < age_ns:  # an older frame counts as absent
                     slots[-1] = side.edge.take_newest(side.reader)
                     self._ledger.newest(side.producer.name, age_ns, state.number - newest.number)
         return packed(slots)
@@ -289,6 +289,7 @@ class Flow:
         replaced = sink.commit(job.slot_out)
         if replaced:
             self.drop(replaced, stage, DropCause.STALE)
+        # Behind another waiting frame, this one matters only to a policy that drops frames.
         if len(sink.ready) == 1 or self._drops:
             self.dirty.append(self.stages[place].unit)
 

@@ -31,7 +31,7 @@ class Source:
         self._forgotten = 0
         self.queue: deque[tuple[int, int]] = deque()
         self.due_ns = NEVER
-        self.is_empty = self._paced or not self._end
+        self.is_empty = self._paced or not self._end  # with a rate, no frame is released before `start`
 
     @property
     def _waits(self) -> bool:
@@ -141,6 +141,7 @@ class Source:
             self.due_ns = min(self.due_ns, self.queue[0][1] + self._settings.queue_timeout_ns)
 
     def _release_ns(self, frame: int) -> int:
+        # Requests alone release frames.
         if self._settings.asked:
             return NEVER
         arrivals = self._settings.arrivals_ns

@@ -172,6 +172,7 @@ def _bound(
     waits: _Waits, slots: Mapping[str, int], source_ns: int = 0, shares: Mapping[str, Fraction] = NO_SHARES
 ) -> Bound:
     best = max(_of_units(waits, shares), key=lambda bound: bound.period_ns)
+    # Without arcs, the work of the units alone bounds the period.
     arcs = waits.arcs(slots) if waits.is_small and not shares else []
     ratio = best.period_ns * waits.hyperperiod
     while cycle := _positive_cycle(len(waits.stages), arcs, ratio):
@@ -259,6 +260,7 @@ def fewest_slots(
             break
         slots = min((_with_one(slots, name, 1) for name in growing), key=lambda each: _bound(waits, each).period_ns)
     least = _bound(waits, slots).period_ns
+    # A slot that was added early may not be needed beside those that were added later.
     for name in reversed(free):
         while slots[name] > LEAST_SLOTS and _bound(waits, fewer := _with_one(slots, name, -1)).period_ns <= least:
             slots = fewer

@@ -110,6 +110,7 @@ def _settled(placement: Placement) -> Placement:
         own = [core for core in place.cores if core not in shared]
         if len(own) == 1 and place.threads < len(place.cores):
             settled[unit] = Place((own[0],), 1)
+    # A unit that leaves a core may leave it to one other unit alone, which can then stay there.
     return settled if settled == placement else _settled(settled)
 
 
@@ -140,6 +141,7 @@ class _Model:
         floats = place.threads < len(place.cores)
         speed = min(self._speed[core] for core in place.cores)
         physical = [self._physical[core] for core in place.cores]
+        # A unit with more threads than there are physical cores could only be measured on siblings.
         was_measured_so = len(physical) > len(list(self._physical_cores))
         both = not floats and len(set(physical)) < len(physical) and not was_measured_so
         slower = 2 / SIBLINGS if both else 1.0
@@ -154,6 +156,7 @@ class _Model:
         """Return the least whole number of ns that is long enough, searched upwards from what every frame needs."""
         high = low = int(max([*self._crowded(), *(unit.serial_ns for unit in self._units)]))
         gangs = [self._gang(unit) for unit in self._units if len(unit.cores) > 1 and not unit.floats]
+        # A time that fits stays one that fits when it grows, so it can be found by halving.
         while not all(gang.fits(high) for gang in gangs):
             low, high = high, 2 * high + 1
         while high - low > 1:
@@ -213,6 +216,7 @@ class _Gang(NamedTuple):
 
     def fits(self, frame: int) -> bool:
         """Return whether its jobs, stretched by their waits, end within `frame` ns."""
+        # Beside a busy sibling, a core does SIBLINGS / 2 of its work.
         free = prod(
             max(1 - on / frame, 0.0) * (1 - (1 - SIBLINGS / 2) * min(beside / frame, 1.0))
             for on, beside in self.others_ns

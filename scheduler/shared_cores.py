@@ -155,12 +155,14 @@ class SharedCores:
         for core in unit.on:
             self._queues[core].append(unit)
             if len(self._queues[core]) > 1 and self._balance_ns == inf and not all(self._queues.values()):
+                # A tick matters only while one core is shared and another one is idle.
                 self._balance_ns = (self._now_ns // BALANCE_NS + 1) * BALANCE_NS
         self._active.append(unit)
 
     def _woken_on(self, unit: _Unit) -> int:
         """Return the core on which a unit of one thread wakes, and keep it as its last."""
         if self._queues[unit.last]:
+            # The core with the fewest units; of several, the one where the unit was.
             unit.last = min(unit.cores, key=lambda core: (len(self._queues[core]), core != unit.last))
         return unit.last
 
@@ -172,6 +174,7 @@ class SharedCores:
             if unit.need.other_ns:
                 unit.left = unit.need.other_ns
                 return
+        # The core's time is in whole ns, and no end is told early.
         ended, now_ns, skips = unit.queue.popleft(), ceil(self._now_ns), unit.need.skips
         self._active.remove(unit)
         unit.need = None
@@ -222,4 +225,5 @@ class SharedCores:
 
     def _set_rates(self) -> None:
         for unit in self._active:
+            # Each parallel region waits for the thread on the fullest core.
             unit.rate = 1 / max(len(self._queues[core]) for core in unit.on) if unit.on else 1.0

@@ -252,6 +252,7 @@ class BesideDriver:
             return True
         ended = [running for running in self._running if running.left <= 0]
         if ended:
+            # Jobs that end at one time end in the order of their hand-over, so that equal inputs give equal runs.
             self._end(min(ended, key=lambda running: running.waited.order))
             return True
         for line in self.lines:
@@ -332,6 +333,7 @@ class BesideDriver:
         self._last[unit.seat] = line.number
         service_ns = line.member.service(job.stage, unit.name, job.frame, now_ns)
         runs = Runs(line.number, job.stage, unit.name, unit.seat, job.frame)
+        # While its own earlier job ran, the unit did not wait for the seat.
         before_ns = now_ns - max(waited.dispatch_ns, unit.last_end_ns)
         self._running.append(_Running(waited, runs, now_ns, service_ns, before_ns))
 
@@ -348,6 +350,7 @@ class BesideDriver:
             running.speed = running.held
             if self._speed is not None:
                 others = [other.runs for other in self._running if other is not running]
+                # A job of speed 0 would never end.
                 running.speed = max(1, running.held * self._speed(running.runs, others) // ONE)
 
     def _push(self, at_ns: int, number: int, event: Event) -> None:

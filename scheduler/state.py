@@ -166,7 +166,7 @@ class SourceLine:
         self.ready: deque[int] = deque()
         self.lines = (self.ready,)
         self.frame = range(NEVER)  # each slot's frame
-        self.free = True
+        self.free = True  # nobody waits for one of its slots
         self.epoch = 0
 
     def take(self, slot: int, _line: int = 0) -> None:
@@ -376,6 +376,7 @@ def build(graph: Graph) -> tuple[list[StageState], dict[str, UnitState], list[Ed
     held = dict.fromkeys(named, 0)
     for stage, spec in zip(stages, graph.stages, strict=True):
         stage.unit.stages.append(stage)
+        # The only stage without inputs takes its frames from the source itself.
         is_fed = stage in roots and (len(roots) > 1 or spec.every > 1)
         inlets: list[Inlet] = [Inlet(SourceLine(), 0, None)] if is_fed else []
         slots_of: list[Inlet | NewestInlet] = []
@@ -392,6 +393,7 @@ def build(graph: Graph) -> tuple[list[StageState], dict[str, UnitState], list[Ed
             stage.before |= producer.before | producer.bit
             stage.period = lcm(stage.period, producer.period)
         stage.set_inlets(inlets, slots_of)
+    # From the end, because a stage is main if one of its readers is.
     for stage in reversed(stages):
         stage.is_main = stage.output is None or any(reader.is_main for reader in stage.readers)
     return stages, units, edges

@@ -192,7 +192,7 @@ class VirtualDriver:
 
     def _start(self, now_ns: int, action: Start) -> None:
         unit = self._units[action.unit]
-        unit.up, unit.free_ns = True, 0
+        unit.up, unit.free_ns = True, 0  # its jobs were lost with the old process
         self._push(now_ns + self._restart_ns, EVENT, UnitReady(action.unit), unit.epoch)
 
 
