@@ -158,7 +158,7 @@ def split_work(work: Work, share: float) -> tuple[Work, Work]:
         macs += operator.macs
         if macs >= share * work.macs:
             break
-    crossing = work.operators[cut - 1].live
+    crossing = work.operators[cut - 1].live  # what later operators still need goes to the second part
     head = Work(work.operators[:cut], work.input_elements, work.input_tensors, crossing)
     rest = work.operators[cut:]
     layers = work.layers.since(rest[0].name if rest else "", crossing)
@@ -203,6 +203,7 @@ def _settled(times: StageTimes, variant: Variant, display_ns: int, quick: bool) 
     """
     frames = _frames_of(variant, quick)
     report = _simulated(times, variant, settings_of(variant, frames, display_ns)).report
+    # The display holds nothing back that is slower than it, or that has a rate of its own.
     if POLICIES[variant.policy].paced or report["frame_time_ms"]["mean"] * NS_PER_MS >= display_ns:
         return report, False
     return _simulated(times, variant, settings_of(variant, frames, display_ns, held=True)).report, True

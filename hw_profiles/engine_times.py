@@ -67,6 +67,7 @@ def numbers_of(engine: Engine, clock_fraction: float = 1.0, memory_fraction: flo
     `clock_fraction`: fraction of its highest clock, above 0 to 1; it slows everything that happens on the engine.
     `memory_fraction`: share of the memory's bandwidth that is left for it.
     """
+    # Only spill and weights cross the main memory; all other work slows down with the engine's clock.
     slower = {"spill": memory_fraction, "weight": memory_fraction}
     per_unit = {rate: engine.seconds_per_unit(rate) / slower.get(rate, clock_fraction) for rate in RATES}
     seconds = [per_unit[TERMS[name]] * engine.factor(name) for name in NAMES]
@@ -88,7 +89,7 @@ def engine_time(network: Layers, engine: EngineNumbers, batch: int = 1) -> Engin
     `network`: layers of the network.
     `engine`: numbers of the engine.
     """
-    once = OF_RATE[3:].any(axis=0)
+    once = OF_RATE[3:].any(axis=0)  # weights, and the fixed costs of operators and job
     costs = amounts(network, engine.room) * engine.seconds * np.where(once, 1, batch)
     joined, slopes = join(costs[:-1])
     shares = np.vstack([costs[:-1] * slopes, costs[-1:]]).sum(axis=0)
@@ -104,6 +105,7 @@ def join(costs: F64) -> tuple[F64, F64]:
     """
     by_rate = costs @ OF_RATE.T
     at_once = by_rate[:, :3]
+    # Relative to the largest, so that the powers neither overflow nor vanish.
     largest = np.maximum(at_once.max(axis=1, keepdims=True), 1e-30)
     powers = (at_once / largest) ** JOINED
     whole = largest * powers.sum(axis=1, keepdims=True) ** (1 / JOINED)

@@ -130,6 +130,7 @@ _tables: dict[tuple[Layers, int], tuple[F64, F64]] = {}
 def _distinct(layers: Layers, room: int) -> tuple[F64, F64]:
     """Return the amounts of layers that differ, and how often each of them occurs."""
     if (layers, room) not in _tables:
+        # Many layers of a network are alike, and every step of the fit prices each kind once.
         table, count = np.unique(amounts(layers, room), axis=0, return_counts=True)
         _tables[layers, room] = table, count.astype(np.float64)
     return _tables[layers, room]
@@ -195,7 +196,7 @@ def _derivatives(at: F64, data: _Rows, mean: F64, spread: F64, chips: int) -> tu
     """Return half the gradient of `_cost`, and half its curvature as if `predict` were linear."""
     ms, shares = data.predict(_from_flat(at))
     misses = np.log(ms / data.ms) / NOISE
-    weights = (NU + 1) / (NU + misses**2)
+    weights = (NU + 1) / (NU + misses**2)  # rows far off weigh little
     slopes = data.slopes(shares, chips) / NOISE
     gradient = slopes.T @ (weights * misses) + (at - mean) / spread**2
     return gradient, slopes.T @ (weights[:, None] * slopes) + np.diag(1 / spread**2)

@@ -56,6 +56,7 @@ class ThermalState:
 
 
 def _approach(value: float, goal: float, seconds: float, time_constant: float) -> float:
+    # The exact solution while the power, and with it `goal`, stays the same.
     return goal + (value - goal) * exp(-seconds / time_constant)
 
 

@@ -62,12 +62,13 @@ def cgroup_quota() -> float | None:
         limit, period = (root / "cpu.max").read_text().split()
     except (OSError, ValueError):
         try:
+            # Version 1 of control groups; it states -1 where there is no limit.
             limit = (root / "cpu" / "cpu.cfs_quota_us").read_text().strip()
             period = (root / "cpu" / "cpu.cfs_period_us").read_text().strip()
         except OSError:
             return None
     try:
-        value = float(limit) / float(period)
+        value = float(limit) / float(period)  # version 2 states `max`, which is no number
     except (ValueError, ZeroDivisionError):
         return None
     return value if value > 0 else None

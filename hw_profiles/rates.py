@@ -126,6 +126,7 @@ def within_power(profile: Profile, requested: Corners, load: FrameLoad, limit_w:
     best, fps = _best(profile, requested, load, limit_w)
     work = load.work_ms(best.corners)
     power = device_power(profile, {u: work.get(u, 0.0) * fps / 1e3 for u in UNITS}, best.corners, {})
+    # A device that takes more power than expected reaches the limit as if the limit were lower.
     slow, fast = (limit_w * power["w"] / power[end] for end in ("high_w", "low_w"))
     working = load.work_ms(requested)
     return {
@@ -148,6 +149,7 @@ def _best(profile: Profile, requested: Corners, load: FrameLoad, limit_w: float)
     )
     best, fps = choices[0], 0.0
     for choice in choices:
+        # The choices are sorted, so no later one can be faster.
         if choice.most_fps <= fps:
             break
         reached = min(choice.most_fps, 1e3 / load.frame_ms(choice.corners))

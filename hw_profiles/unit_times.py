@@ -137,6 +137,7 @@ def _apart(own: Mapping[str, float], others: Mapping[str, float]) -> float:
 
     A term that `others` do not name counts as 0.
     """
+    # The shares of `own` sum to 1, so the 1 contains the terms that `others` does not name.
     return (1 + sum([abs(own[name] - share) - own[name] for name, share in others.items()])) / 2
 
 
