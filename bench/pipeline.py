@@ -8,34 +8,39 @@ because a shared machine grows slower and faster within seconds; a row is the me
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from itertools import pairwise, product
+from multiprocessing.connection import Connection
 from pathlib import Path
 from statistics import fmean, median
-from typing import Any
+from typing import Any, NamedTuple
 
-from trilane.bench.beside import measure_beside
 from trilane.bench.lib import networks
-from trilane.bench.lib.avatar_process import Asked
+from trilane.bench.lib.interleaved_processes import answer_of, asked_processes
 from trilane.errors import BadInputError, TrilaneError
 from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
+from trilane.hw_profiles.application import application_graph
 from trilane.hw_profiles.host import host_units, usable_cores
 from trilane.pipeline.journal import records_of
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.timeline import Presented, Timeline
+from trilane.scheduler.events import Settings, Stop
 from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.placement import SCHEDULER_NS
 from trilane.scheduler.policy import policy_named
 from trilane.scheduler.recording import Recording
+from trilane.scheduler.shared_units import Member, simulate_beside
 from trilane.scheduler.stats import median_interval, percentile, samples_needed
 from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.configure import Checked, configure
 from trilane.stages.run_options import RunOptions
 from trilane.transport.slots import edge_rule
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import NS_PER_MS
+from trilane.units import AFTER_INFER, BEFORE_INFER, NS_PER_MS
 
-SEQUENTIAL = "sequential"
+SEQUENTIAL, PIPELINED = "sequential", "pipelined"
 MIN_FRAMES = 20
 LATENCIES = "latencies_ns"  # key of a run's latencies; a row has their percentiles over all rounds
 UNITS_MS = "units_ms"  # key of what each unit takes for a frame in a run
@@ -184,14 +189,23 @@ def _compare(runs: list[dict[str, Any]], after: dict[str, Any]) -> None:
 
 def _run(checked: Checked, plan: Setting, slowest_ms: float = 0.0) -> dict[str, Any]:
     pace = PACE * 1e3 / slowest_ms if policy_named(plan.policy).paced else None
+    return _figures(finished_run(checked, str(plan), policy=plan.policy, edge=plan.edge, pace_fps=pace))
+
+
+def finished_run(checked: Checked, what: str, least: int = 2, **options: Any) -> RunResult:
+    """Run `checked` with `options` of `run_avatar`, in a folder that is removed.
+
+    Raises TrilaneError, which begins with `what`, when the run fails or presents fewer than `least` frames.
+    """
     with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
         placed = checked.changed(out_dir=Path(folder))
-        result = run_avatar(placed.config, placed.assets, policy=plan.policy, edge=plan.edge, pace_fps=pace)
+        result = run_avatar(placed.config, placed.assets, **options)
     if result.interrupted:
         raise KeyboardInterrupt
-    if result.failure is not None or result.presented < 2:
-        raise TrilaneError(f"{plan}: {result.failure.message if result.failure else 'no frames were presented'}")
-    return _figures(result)
+    if result.failure is not None or result.presented < least:
+        reason = result.failure.message if result.failure else f"{result.presented} of at least {least} frames were presented"
+        raise TrilaneError(f"{what}: {reason}")
+    return result
 
 
 def _figures(result: RunResult) -> dict[str, Any]:
@@ -268,3 +282,219 @@ def _summary(setting: Setting, runs: list[dict[str, Any]]) -> dict[str, Any]:
     row |= _latency_ms(runs)
     row["of_bound_low"], row["of_bound_high"] = median_interval([run["gain_of_bound"] for run in runs])
     return row
+
+
+# Runs of an avatar, each in a process of its own, so that two can go on at once on the same cores.
+#
+# Rule: the process does what `trilane run` does, with its own scheduler and its own units; two of them share nothing
+# but the machine.
+
+START_S, RUN_S = 120.0, 600.0
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A run of the default scene.
+
+    `avatar`, `size`, `frames`, `runtime`: as in `trilane.stages.run_options.RunOptions`. `cores`: cores that its units
+    share by the rule for any run. `video`: whether a video is encoded. `edge`: rule of all edges.
+    """
+
+    avatar: str
+    size: str
+    frames: int
+    runtime: str
+    cores: tuple[int, ...]
+    video: bool
+    edge: str = "double"
+
+
+class Ran(NamedTuple):
+    """The result of a run.
+
+    `jobs`: all jobs that ended. `seats`: each unit's cores, as text.
+    """
+
+    jobs: tuple[JobRecord, ...]
+    seats: dict[str, str]
+
+
+class AvatarProcess:
+    """The parent's end of a process."""
+
+    def __init__(self, pipe: Connection, name: str) -> None:
+        self._pipe, self._name = pipe, name
+
+    def begin(self, policy: str) -> None:
+        """Begin a run under `policy`."""
+        self._pipe.send(policy)
+
+    def result(self) -> Ran:
+        """Return the result of the run that was begun. Raises TrilaneError when it failed."""
+        jobs, seats = self.receive(RUN_S)
+        return Ran(tuple(JobRecord(*job) for job in jobs), seats)
+
+    def receive(self, wait_s: float) -> Any:
+        """Return the process's next answer. Raises TrilaneError."""
+        return answer_of(self._pipe, self._name, wait_s)
+
+
+@contextmanager
+def avatar_processes(asked: Sequence[Asked]) -> Iterator[list[AvatarProcess]]:
+    """Start a process for each, ready to run; they end with the block. Raises TrilaneError when one does not start."""
+    with asked_processes() as start:
+        found = [AvatarProcess(start(serve, each), f"{each.avatar} at {each.size}") for each in asked]
+        for one in found:
+            one.receive(START_S)
+        yield found
+
+
+def serve(pipe: Connection, asked: Asked) -> None:
+    """Run the process: say that it is ready, then run under each policy that comes, until `pipe` closes."""
+    try:
+        request = RunOptions(avatar=asked.avatar, size=asked.size, frames=asked.frames, runtime=asked.runtime)
+        checked = configure(request, Path.cwd()).changed(units=host_units(asked.cores), record=asked.video)
+        seats = {unit: ",".join(map(str, settings.cores)) for unit, settings in checked.config.units.items()}
+        pipe.send(True)
+        while True:
+            policy = pipe.recv()
+            with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
+                placed = checked.changed(out_dir=Path(folder))
+                result = run_avatar(placed.config, placed.assets, policy=policy, edge=asked.edge)
+            if result.failure is not None:
+                pipe.send(result.failure.message)
+                return
+            pipe.send(([tuple(job) for job in result.jobs], seats))
+    except (EOFError, BrokenPipeError, KeyboardInterrupt):
+        return
+    except Exception as error:
+        pipe.send(f"{type(error).__name__}: {error}")
+
+
+# Two avatars at once on this machine, beside what the virtual clock predicts for them: are the frame times the same?
+#
+# Rule: the runs are measured, and before and after them the time of each stage while no other unit works. From these
+# times alone, the frame times of two such pipelines are computed, on cores that they divide in equal shares.
+#
+# The scheduler's own time on its core, `SCHEDULER_NS` a job as in the model of placement, counts with the first stage,
+# which runs there. `strangers` says how quiet the machine was: the time that sequential stages wait for their cores,
+# over the time that they work. The virtual clock does not know other programs: the ratio says nothing when `strangers`
+# is more than a few hundredths.
+
+FIRST, LAST = BEFORE_INFER[0][0], AFTER_INFER[-1][0]
+SECONDS = 20.0  # virtual seconds of the simulated runs
+ENDLESS = 1 << 40
+
+
+class Isolated(NamedTuple):
+    """The times of one pipeline alone.
+
+    `stage_ns`: mean time of each stage, ns. `worked_ns`, `waited_ns`: time that all stages worked, and waited for a
+    core, ns.
+    """
+
+    stage_ns: Mapping[str, float]
+    worked_ns: int
+    waited_ns: int
+
+
+def measure_beside(
+    asked: Sequence[Asked],
+    rounds: int,
+    processes: Callable[[Sequence[Asked]], AbstractContextManager[list[AvatarProcess]]] = avatar_processes,
+) -> list[dict[str, Any]]:
+    """Return a row for each of the two pipelines `asked`, medians over the `rounds`.
+
+    `frame_ms`: mean time between presented frames while both ran. `virtual_ms`: the same, computed. `ratio`: measured
+    over computed. `ratio_low`, `ratio_high`: 95 % interval of its median. `isolated_ms`: time of a frame's stages.
+    `strangers`: mean number of other programs' threads that were ready where its stages worked. `processes`: makes the
+    processes that run. Raises TrilaneError when a run fails.
+    """
+    found: list[list[dict[str, float]]] = []
+    with processes(asked) as pair:
+        before = [_ran(each, SEQUENTIAL) for each in pair]
+        for _ in range(rounds):
+            for each in pair:
+                each.begin(PIPELINED)
+            both = [each.result() for each in pair]
+            after = [_ran(each, SEQUENTIAL) for each in pair]
+            isolated = [isolated_of((*one.jobs, *other.jobs)) for one, other in zip(before, after, strict=True)]
+            found.append(_round(both, isolated, asked))
+            before = after
+    return [_row(number, each, [rows[number] for rows in found]) for number, each in enumerate(asked)]
+
+
+def _ran(process: AvatarProcess, policy: str) -> Ran:
+    process.begin(policy)
+    return process.result()
+
+
+def isolated_of(jobs: Sequence[JobRecord]) -> Isolated:
+    """Return the times of the stages in `jobs` of sequential runs, without their waits for cores."""
+    times: dict[str, list[int]] = {}
+    for job in jobs:
+        times.setdefault(job.stage, []).append(job.end_ns - job.begin_ns - job.preempted_ns)
+    worked_ns = sum(map(sum, times.values()))
+    means = {stage: fmean(each) for stage, each in times.items()}
+    return Isolated(means, worked_ns, sum(job.preempted_ns for job in jobs))
+
+
+def _round(both: Sequence[Ran], isolated: Sequence[Isolated], asked: Sequence[Asked]) -> list[dict[str, float]]:
+    measured = overlapping_ms([each.jobs for each in both])
+    computed = computed_ms(isolated, [each.seats for each in both], asked)
+    return [
+        {
+            "frame_ms": frame,
+            "virtual_ms": virtual,
+            "ratio": frame / virtual,
+            "isolated_ms": sum(each.stage_ns.values()) / NS_PER_MS,
+            "strangers": each.waited_ns / max(each.worked_ns, 1),
+        }
+        for frame, virtual, each in zip(measured, computed, isolated, strict=True)
+    ]
+
+
+def overlapping_ms(runs: Sequence[Sequence[JobRecord]]) -> list[float]:
+    """Return the mean time between presented frames of each run, while all ran, in ms.
+
+    Raises TrilaneError when they hardly overlapped.
+    """
+    ends = [sorted(job.end_ns for job in jobs if job.stage == LAST) for jobs in runs]
+    first, last = max(each[0] for each in ends), min(each[-1] for each in ends)
+    kept = [[end for end in each if first <= end <= last] for each in ends]
+    if min(map(len, kept)) < 3:
+        raise TrilaneError(f"the two runs met for {min(map(len, kept))} frames: more --frames are needed")
+    return [fmean(after - before for before, after in pairwise(each)) / NS_PER_MS for each in kept]
+
+
+def computed_ms(
+    isolated: Sequence[Isolated], seats: Sequence[Mapping[str, str]], asked: Sequence[Asked]
+) -> list[float]:
+    """Return the mean virtual frame time of each pipeline in ms, when all run at once and divide the cores."""
+    stop = (round(SECONDS * 1e9), Stop())
+    members = [
+        Member(
+            application_graph(each.edge),
+            Settings(ENDLESS, PIPELINED, hang_ns=ENDLESS),
+            _service(times),
+            own,
+            inputs=(stop,),
+        )
+        for times, own, each in zip(isolated, seats, asked, strict=True)
+    ]
+    cores = {core for own in seats for core in own.values()}
+    runs = simulate_beside(members, divided=cores)
+    return [run.report["frame_time_ms"]["mean"] for run in runs]
+
+
+def _service(isolated: Isolated) -> Any:
+    times = {stage: round(ns) for stage, ns in isolated.stage_ns.items()}
+    times[FIRST] += len(times) * SCHEDULER_NS
+    return lambda stage, *_: times[stage]
+
+
+def _row(number: int, asked: Asked, rounds: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+    low, high = median_interval([each["ratio"] for each in rounds])
+    row: dict[str, Any] = {"pipeline": number + 1, "avatar": asked.avatar, "size": asked.size, "edge": asked.edge}
+    row |= {key: median(each[key] for each in rounds) for key in rounds[0]}
+    return {**row, "ratio_low": low, "ratio_high": high}

@@ -7,7 +7,6 @@ rule's stand beside them. Other numbers of cores are computed in virtual time, a
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from math import sqrt
@@ -16,7 +15,8 @@ from statistics import median
 from typing import Any
 
 from trilane.bench.lib import networks
-from trilane.errors import BadInputError, TrilaneError
+from trilane.bench.pipeline import finished_run
+from trilane.errors import BadInputError
 from trilane.hw_profiles.application import Plan, Variant, steady
 from trilane.hw_profiles.host import described, host_cores, rule_placement, settings_of, usable_cores
 from trilane.hw_profiles.host_model import on_cores, place_units
@@ -30,7 +30,7 @@ from trilane.scheduler.places import CpuCore, Placement
 from trilane.scheduler.stats import median_interval
 from trilane.stages import PRELOAD
 from trilane.stages.avatar_assets import networks_of, painting
-from trilane.stages.avatar_pipeline import measured_times, run_avatar, tried
+from trilane.stages.avatar_pipeline import measured_times, tried
 from trilane.stages.configure import Checked, configure
 from trilane.stages.placing import FIRST, choice, considered, times_rows
 from trilane.stages.run_options import RunOptions
@@ -204,15 +204,9 @@ class _Trial:
         return tried(self._checked, [self._found[place].placement for place in places], rounds, self._starter)
 
     def _run(self, placement: Placement) -> RunMetrics:
-        with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
-            placed = self._checked.changed(out_dir=Path(folder), units=settings_of(placement))
-            result = run_avatar(placed.config, placed.assets, policy=POLICY, edge=EDGE, starter=self._starter)
-        if result.interrupted:
-            raise KeyboardInterrupt
-        if result.failure is not None or result.presented < MIN_FRAMES:
-            reason = result.failure.message if result.failure else f"{result.presented} frames were presented"
-            raise TrilaneError(f"{described(placement)}: {reason}")
-        return result.report
+        placed, what = self._checked.changed(units=settings_of(placement)), described(placement)
+        options = {"policy": POLICY, "edge": EDGE, "starter": self._starter}
+        return finished_run(placed, what, MIN_FRAMES, **options).report
 
 
 def _interval(prefix: str, values: Sequence[float]) -> dict[str, float]:

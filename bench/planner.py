@@ -8,7 +8,6 @@ seen but hidden by means, so every frame of both runs is also compared with the 
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,12 +21,12 @@ from trilane.bench.lib.cast import Cast
 from trilane.bench.lib.full_picture import FullPictures, true_pictures
 from trilane.bench.lib.picture_error import PictureErrors, box_psnr_db, psnr_of_frames, require_metrics
 from trilane.bench.lib.stage_chain import AvatarFrames
-from trilane.errors import BadInputError, TrilaneError
+from trilane.bench.pipeline import finished_run
+from trilane.errors import BadInputError
 from trilane.figure_sources import MEASURED
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.stats import median_interval
 from trilane.stages import PRELOAD
-from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.configure import Checked, configure
 from trilane.stages.gpu.opengl import describe
 from trilane.stages.placing import placed
@@ -243,14 +242,7 @@ def _figures(errors: Mapping[str, PictureErrors]) -> dict[str, float | None]:
 
 
 def _frame_ms(checked: Checked, what: str, starter: UnitStarter) -> float:
-    with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
-        here = checked.changed(out_dir=Path(folder))
-        result = run_avatar(here.config, here.assets, policy=POLICY, starter=starter)
-    if result.interrupted:
-        raise KeyboardInterrupt
-    if result.failure is not None or result.presented < 2:
-        raise TrilaneError(f"{what}: {result.failure.message if result.failure else 'no frames were presented'}")
-    frame_ms = result.report.frame_time_ms.mean
+    frame_ms = finished_run(checked, what, policy=POLICY, starter=starter).report.frame_time_ms.mean
     assert frame_ms is not None  # two frames were presented
     return frame_ms
 
