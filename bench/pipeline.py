@@ -203,7 +203,11 @@ def finished_run(checked: Checked, what: str, least: int = 2, **options: Any) ->
     if result.interrupted:
         raise KeyboardInterrupt
     if result.failure is not None or result.presented < least:
-        reason = result.failure.message if result.failure else f"{result.presented} of at least {least} frames were presented"
+        reason = (
+            result.failure.message
+            if result.failure
+            else f"{result.presented} of at least {least} frames were presented"
+        )
         raise TrilaneError(f"{what}: {reason}")
     return result
 

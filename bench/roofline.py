@@ -7,10 +7,18 @@ multiply-accumulates of a cycle, times the clock measured under that load, times
 
 from __future__ import annotations
 
+import ctypes
+import mmap
+import os
 import tempfile
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
+from statistics import fmean, median
 from typing import Any
 
 import numpy as np
@@ -18,9 +26,9 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from trilane import machine
-from trilane.bench.lib.instruction_sets import instruction_set_of, measure_issued, peak_gmac_s
 from trilane.bench.lib.interleaved_processes import ProcessVariant, runners
 from trilane.errors import reason
+from trilane.scheduler.stats import median_interval
 from trilane.stages.dsp.runtime import installed
 from trilane.stages.machine_facts import cpu_facts
 
@@ -60,10 +68,10 @@ def measure(threads: int = 0) -> dict[str, Any]:
 def instruction_peak(flags: Sequence[str], threads: int) -> dict[str, Any]:
     """Return the INT8 peak of the widest instruction set that `flags` name, on as many cores as `threads` can use.
 
-    `set`, `sequence`, `source`: entries of the table in lib/instruction_sets.py. `macs_a_cycle`: documented value for
-    one core. `issued_macs_a_cycle`: value that a loop of registers alone reached. `clock_ghz`: clock under that load,
-    with its 95 % interval. `cores`: number of cores. `gmac_s`: macs_a_cycle x clock x cores. `absent`: why there is
-    none; it stands alone.
+    `set`, `sequence`, `source`: entries of `INSTRUCTION_SETS`. `macs_a_cycle`: documented value for one core.
+    `issued_macs_a_cycle`: value that a loop of registers alone reached. `clock_ghz`: clock under that load, with its
+    95 % interval. `cores`: number of cores. `gmac_s`: macs_a_cycle x clock x cores. `absent`: why there is none; it
+    stands alone.
     """
     widest = instruction_set_of(flags)
     if widest is None:
@@ -84,7 +92,7 @@ def instruction_peak(flags: Sequence[str], threads: int) -> dict[str, Any]:
         "clock_low_ghz": issued.clock_low_ghz,
         "clock_high_ghz": issued.clock_high_ghz,
         "cores": len(cores),
-        "gmac_s": peak_gmac_s(macs, issued.clock_ghz, len(cores)),
+        "gmac_s": macs * issued.clock_ghz * len(cores),
     }
 
 
@@ -167,3 +175,266 @@ def _layers(side: int, channels: int, kernel: int) -> onnx.ModelProto:
 def _model(nodes: list[Any], ends: list[Any], tensors: list[Any]) -> onnx.ModelProto:
     graph = helper.make_graph(nodes, "roofline", ends[:1], ends[1:], tensors)
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+
+
+# The INT8 peak of a core by its instruction set: multiply-accumulates of an instruction, times instructions a cycle.
+#
+# Rule: the number of multiply-accumulates in an instruction is its definition; the number of instructions a cycle is
+# documented. Where cores with the same set differ, the measurement says which of the documented rates this core has.
+#
+# The cores are measured by two loops that run by turns in short bursts on every core at once; the median of the bursts
+# counts. One loop issues nothing but the set's instructions. In the other, each of them is followed by dependent
+# `imul`. An `imul` takes three cycles on every x86-64 core since Intel's Nehalem and AMD's Zen (uops.info
+# IMUL_R64_R64). These form the longer path, so the loop takes three cycles for each, at the clock that the core holds
+# under this very load. No processor counter is needed, because virtual machines have none. The loops are machine code,
+# because a compiler may be missing; the bytes are GNU as's for the lines beside them.
+
+
+@dataclass(frozen=True)
+class InstructionSet:
+    """One row of the table.
+
+    `flags`: flags of /proc/cpuinfo that every core with the set has.
+    `macs`: INT8 multiply-accumulates of one `sequence`, an instruction or the few that stand for one.
+    `rates`: sequences a cycle that cores with the set are documented to reach.
+    `source`: source of `macs` and `rates`.
+    """
+
+    name: str
+    flags: tuple[str, ...]
+    sequence: str
+    macs: int
+    rates: tuple[Fraction, ...]
+    source: str
+
+    def rate_nearest(self, measured: float) -> Fraction:
+        """Return the documented rate of a core on which `measured` sequences a cycle were issued."""
+        return min(self.rates, key=lambda rate: abs(float(rate) - measured))
+
+    def macs_a_cycle(self, measured: float) -> float:
+        """Return the multiply-accumulates a cycle of a core on which `measured` sequences a cycle were issued."""
+        return float(self.macs * self.rate_nearest(measured))
+
+
+ONE, TWO, FOUR = Fraction(1), Fraction(2), Fraction(4)
+#: From the widest to the narrowest: a core's own set is the first whose flags it has.
+INSTRUCTION_SETS = (
+    InstructionSet(
+        "AMX-INT8",
+        ("amx_tile", "amx_int8"),
+        "tdpbusd: a 16 x 64 by 64 x 16 tile product",
+        16 * 16 * 64,
+        (Fraction(1, 16),),
+        "Intel 64 Optimization Reference Manual, chapter on AMX: TDP* issues every 16 cycles, 2048 operations a cycle",
+    ),
+    InstructionSet(
+        "AVX512-VNNI",
+        ("avx512f", "avx512_vnni"),
+        "vpdpbusd zmm: 16 sums of 4 products",
+        16 * 4,
+        (ONE, TWO),
+        "uops.info VPDPBUSD_ZMM: two a cycle on Xeons with two 512-bit units and Zen 5, one on others and Zen 4",
+    ),
+    InstructionSet(
+        "AVX-VNNI",
+        ("avx2", "avx_vnni"),
+        "vpdpbusd ymm: 8 sums of 4 products",
+        8 * 4,
+        (ONE, TWO),
+        "uops.info VPDPBUSD_YMM (VEX): two a cycle on Alder Lake's P-cores and Zen 5, one on E-cores",
+    ),
+    InstructionSet(
+        "AVX512-BW",
+        ("avx512f", "avx512bw"),
+        "vpmaddubsw, vpmaddwd, vpaddd zmm: 16 sums of 4 products",
+        16 * 4,
+        (Fraction(1, 2), Fraction(2, 3)),
+        "uops.info: three on ports 0 and 5 of Xeons with two 512-bit units; on others both products on 0, the sum on 5",
+    ),
+    InstructionSet(
+        "AVX2",
+        ("avx2",),
+        "vpmaddubsw, vpmaddwd, vpaddd ymm: 8 sums of 4 products",
+        8 * 4,
+        (Fraction(1, 2), ONE),
+        "uops.info VPMADDUBSW_YMM, VPMADDWD_YMM: on ports 0 and 1 from Skylake and Zen on, on port 0 alone on Haswell",
+    ),
+    InstructionSet(
+        "NEON dot",
+        ("asimddp",),
+        "sdot: 4 sums of 4 products",
+        4 * 4,
+        (ONE, TWO, FOUR),
+        "Arm's Software Optimization Guides: two a cycle on Cortex-A76 and Neoverse N1, four on Neoverse V1",
+    ),
+)
+
+
+def instruction_set_of(flags: Iterable[str]) -> InstructionSet | None:
+    """Return the widest set that a core with these `flags` has, or None for one that is not in the table."""
+    found = {*flags}
+    return next((each for each in INSTRUCTION_SETS if found.issuperset(each.flags)), None)
+
+
+IMUL, IMUL_CYCLES = bytes.fromhex("480fafc0"), 3  # imul %rax,%rax
+DEC, JNZ, RET = bytes.fromhex("48ffcf"), bytes.fromhex("0f85"), b"\xc3"  # dec %rdi; jnz; ret
+VZEROUPPER = "c5f877"
+BURST_CYCLES, BURSTS = 1_000_000, 60
+SYS_ARCH_PRCTL, ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA = 158, 0x1023, 18
+#: Palette 1; eight tiles of 16 rows of 64 bytes.
+TILE_CONFIG = bytes([1, *[0] * 15, *[64, 0] * 8, *[0] * 16, *[16] * 8, *[0] * 8])
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """The machine code of a set's loop.
+
+    `body`: instructions in hexadecimal, `sequences` of them without an input from one another.
+    `imuls`: number of `imul` after each instruction in the loop that measures the clock: enough that they take longer
+    than it.
+    `cycles`: least number of cycles of the body, for the length of a burst.
+    """
+
+    body: str
+    sequences: int
+    imuls: int
+    cycles: int
+    before: str = ""
+    after: str = VZEROUPPER
+
+
+KERNELS = {
+    "AMX-INT8": Kernel(
+        "c4e2415ec6 c4e2415ece c4e2415ed6 c4e2415ede",  # tdpbusd %tmm7,%tmm6,%tmm0 to %tmm3
+        sequences=4,
+        imuls=8,
+        cycles=64,
+        # ldtilecfg (%rsi); tilezero %tmm0 to %tmm7
+        before="c4e2784906 c4e27b49c0 c4e27b49c8 c4e27b49d0 c4e27b49d8 c4e27b49e0 c4e27b49e8 c4e27b49f0 c4e27b49f8",
+        after="c4e27849c0",  # tilerelease
+    ),
+    "AVX512-VNNI": Kernel(  # vpdpbusd %zmm30,%zmm31,%zmm0 to %zmm11
+        "6292054050c6 6292054050ce 6292054050d6 6292054050de 6292054050e6 6292054050ee "
+        "6292054050f6 6292054050fe 6212054050c6 6212054050ce 6212054050d6 6212054050de",
+        sequences=12,
+        imuls=1,
+        cycles=6,
+    ),
+    "AVX-VNNI": Kernel(  # {vex} vpdpbusd %ymm14,%ymm15,%ymm0 to %ymm11
+        "c4c20550c6 c4c20550ce c4c20550d6 c4c20550de c4c20550e6 c4c20550ee "
+        "c4c20550f6 c4c20550fe c4420550c6 c4420550ce c4420550d6 c4420550de",
+        sequences=12,
+        imuls=1,
+        cycles=6,
+    ),
+    "AVX512-BW": Kernel(  # vpmaddubsw %zmm30,%zmm31,%zmmB; vpmaddwd %zmm29,%zmmB,%zmmB; vpaddd %zmmB,%zmmA,%zmmA
+        "6212054004e6 62111d48f5e5 62d17d48fec4 6212054004ee 62111548f5ed 62d17548fecd "
+        "6212054004f6 62110d48f5f5 62d16d48fed6 6212054004fe 62110548f5fd 62d16548fedf",
+        sequences=4,
+        imuls=1,
+        cycles=6,
+    ),
+    "AVX2": Kernel(  # vpmaddubsw %ymm14,%ymm15,%ymmB; vpmaddwd %ymm13,%ymmB,%ymmB; vpaddd %ymmB,%ymmA,%ymmA
+        "c4c20504f6 c4c14df5f5 c5fdfec6 c4c20504fe c4c145f5fd c5f5fecf c4420504c6 c4413df5c5 c4c16dfed0 "
+        "c4420504ce c44135f5cd c4c165fed9 c4420504d6 c4412df5d5 c4c15dfee2 c4420504de c44125f5dd c4c155feeb",
+        sequences=6,
+        imuls=1,
+        cycles=6,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Issued:
+    """The measured rates of the cores.
+
+    `rate`: sequences a cycle of the mean core. `clock_ghz`: clock of the mean core, with the interval of its median.
+    """
+
+    rate: float
+    clock_ghz: float
+    clock_low_ghz: float
+    clock_high_ghz: float
+
+
+def rate_loop(kernel: Kernel) -> bytes:
+    """Return a function that issues the body; it takes the number of turns (%rdi) and the tile configuration (%rsi)."""
+    return _loop(kernel, bytes.fromhex(kernel.body))
+
+
+def clock_loop(kernel: Kernel) -> bytes:
+    """Return the same function with `imul` after each instruction."""
+    return _loop(kernel, b"".join(bytes.fromhex(each) + IMUL * kernel.imuls for each in kernel.body.split()))
+
+
+def _loop(kernel: Kernel, body: bytes) -> bytes:
+    back = -(len(body) + len(DEC) + len(JNZ) + 4)
+    turn = body + DEC + JNZ + back.to_bytes(4, "little", signed=True)
+    return bytes.fromhex(kernel.before) + turn + bytes.fromhex(kernel.after) + RET
+
+
+def measure_issued(name: str, cores: Sequence[int]) -> Issued:
+    """Measure what every one of `cores` does while all of them work.
+
+    `name`: key of `KERNELS` for a set that this CPU has. Raises OSError when the kernel refuses machine code in memory
+    or the tiles of AMX.
+    """
+    if machine.here.architecture() != "x86_64":
+        raise OSError("there are no loops for this architecture")
+    kernel = KERNELS[name]
+    if kernel.before:
+        _ask_for_tiles()
+    together = threading.Barrier(len(cores))
+    with ThreadPoolExecutor(len(cores)) as pool:
+        measured = list(pool.map(lambda core: _on_core(core, kernel, together), cores))
+    rates = [rate for rate, _ in measured]
+    clocks = [median(clock) for _, clock in measured]
+    ends = [median_interval(clock) for _, clock in measured]
+    return Issued(fmean(rates), fmean(clocks), fmean(low for low, _ in ends), fmean(high for _, high in ends))
+
+
+def _ask_for_tiles() -> None:
+    """Ask Linux for the registers of AMX, which a process has only on request."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.syscall(SYS_ARCH_PRCTL, ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA):
+        raise OSError(ctypes.get_errno(), "the tiles of AMX are refused")
+
+
+def _on_core(core: int, kernel: Kernel, together: threading.Barrier) -> tuple[float, list[float]]:
+    """Return sequences a cycle, and the clock in GHz in each burst, on one core.
+
+    The thread ends afterwards, and with it its binding to the core.
+    """
+    os.sched_setaffinity(0, {core})
+    turns = BURST_CYCLES // kernel.cycles
+    chain = turns * len(kernel.body.split()) * kernel.imuls * IMUL_CYCLES
+    with _Code(rate_loop(kernel)) as issue, _Code(clock_loop(kernel)) as tell_clock:
+        together.wait()
+        rates, clocks = [], []
+        for _ in range(BURSTS):
+            rates.append(turns * kernel.sequences / issue.ns(turns))
+            clocks.append(chain / tell_clock.ns(turns))
+    return median(rates) / median(clocks), clocks
+
+
+class _Code:
+    """Machine code in memory. Raises OSError when the kernel refuses it."""
+
+    def __init__(self, code: bytes) -> None:
+        self._memory = mmap.mmap(-1, len(code), prot=mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC)
+        self._memory.write(code)
+        self._first = ctypes.c_char.from_buffer(self._memory)
+        self._call = ctypes.CFUNCTYPE(None, ctypes.c_uint64, ctypes.c_char_p)(ctypes.addressof(self._first))
+
+    def __enter__(self) -> _Code:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        del self._call, self._first
+        self._memory.close()
+
+    def ns(self, turns: int) -> int:
+        """Return the CPU time of so many turns; other threads of this process run meanwhile."""
+        begin = time.thread_time_ns()
+        self._call(turns, TILE_CONFIG)
+        return time.thread_time_ns() - begin

@@ -6,16 +6,20 @@ can ask for the same load and evaluate it.
 
 from __future__ import annotations
 
+import importlib
+import math
+import random
+import re
+import tempfile
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from trilane.bench.lib.load import PATTERNS, Load, Queries, bound_ms, play, verdict
-from trilane.bench.lib.loadgen import LoadGenPlayer, load_generator
-from trilane.errors import BadInputError, TrilaneError
+from trilane.errors import BadInputError, MissingPartError, TrilaneError
 from trilane.pipeline.controls import FrameRequestQueue
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.memory import Assets
@@ -102,7 +106,7 @@ def run_scenario(
         raise KeyboardInterrupt
     if player.errors:
         raise player.errors[0]
-    return _row(load, queries, loadgen), loadgen.verdict.summary if loadgen is not None else ""
+    return _row(load, queries, loadgen), loadgen.summary if loadgen is not None else ""
 
 
 @dataclass
@@ -141,7 +145,7 @@ def _row(load: Load, queries: Queries, loadgen: LoadGenPlayer | None) -> dict[st
     return {
         "scenario": load.scenario,
         "judge": "trilane" if loadgen is None else "loadgen",
-        "verdict": "VALID" if (loadgen.verdict.valid if loadgen is not None else not reasons) else "INVALID",
+        "verdict": "VALID" if (loadgen.valid if loadgen is not None else not reasons) else "INVALID",
         "queries": len(latencies),
         "seconds": lasted_s,
         "rate": len(latencies) / lasted_s,
@@ -162,3 +166,347 @@ def _check(scenarios: tuple[str, ...], judges: tuple[str, ...], numbers: dict[st
         low, high = LIMITS[option]
         if not low <= number <= high:
             raise BadInputError(option, f"{number:g}", f"{low:g} to {high:g}")
+
+
+# The four load patterns of MLPerf inference, and the conditions of a valid result.
+#
+# Rule: names, patterns and the number of queries that a percentile needs are LoadGen's, so that results can be compared
+# with LoadGen's; the warm-up is not counted.
+#
+# Reddi et al., MLPerf Inference Benchmark, ISCA 2020, sections III and V.
+
+CONFIDENCE = 0.99
+WARM_UP = 8
+#: Percentile of the queries' latency that decides in each scenario. Offline is decided by its rate.
+PERCENTILES = {"single-stream": 0.90, "multi-stream": 0.99, "server": 0.99, "offline": 0.90}
+STALLED_S = 60.0
+KEEPS_ALL = "single, double and fifo edges drop none, under the policies sequential and pipelined"
+
+
+@dataclass(frozen=True)
+class Load:
+    """The load on the pipeline.
+
+    `scenario`: key of `PATTERNS`.
+    `seconds`: least duration.
+    `rate`: queries a second of the server scenario.
+    `limit_ms`: limit of the server scenario on the percentile of its latency.
+    `samples`: number of frames in a query of multi-stream.
+    `seed`: seed of the moments at which a server's queries arrive.
+    """
+
+    scenario: str
+    seconds: float
+    rate: float = 15.0
+    limit_ms: float = 250.0
+    samples: int = 4
+    seed: int = 1
+
+    @property
+    def percentile(self) -> float:
+        return PERCENTILES[self.scenario]
+
+
+@dataclass
+class Queries:
+    """Times at which each query was asked of a `FrameRequestQueue` and answered; two threads share it.
+
+    The threads are the one that asks and the run's.
+    `size`: number of frames in a query, which is answered with the last of them.
+    `asked_s`, `answered_s`: monotonic seconds of the queries that count.
+    `over`: whether nothing more counts: the run has ended, or a frame was dropped or lost.
+    `why`: sentence about the dropped or lost frame.
+    `changed`: condition that is notified with every answer and when it is over.
+    """
+
+    size: int = 1
+    asked_s: list[float] = field(default_factory=list)
+    answered_s: list[float] = field(default_factory=list)
+    over: bool = False
+    why: str = ""
+    changed: threading.Condition = field(default_factory=threading.Condition)
+    _frames: int = 0
+
+    def ask(self, requests: FrameRequestQueue, count: int = 1) -> None:
+        """Ask `count` queries now."""
+        self.asked_s += [time.monotonic()] * count
+        requests.request(count * self.size)
+
+    def answered(self, _frame: int) -> None:
+        """Note a presented frame; the `FrameRequestQueue` calls this."""
+        with self.changed:
+            self._frames += 1
+            if self._frames % self.size == 0:
+                self.answered_s.append(time.monotonic())
+                self.changed.notify_all()
+
+    def unanswered(self, causes: Mapping[str, int]) -> None:
+        """Note that a frame was dropped or lost, so its query has no answer; the `FrameRequestQueue` calls this."""
+        frames = ", ".join(f"{cause} {count}" for cause, count in causes.items())
+        self.why = f"frames of queries were dropped or lost ({frames}), and every query must be answered: {KEEPS_ALL}"
+        self.ended()
+
+    def ended(self) -> None:
+        """Note that the run is over; the `FrameRequestQueue` calls this."""
+        with self.changed:
+            self.over = True
+            self.changed.notify_all()
+
+    def wait(self) -> None:
+        """Wait until every query is answered.
+
+        Raises TrilaneError when a frame was dropped or lost, when the run ends first, or when nothing is answered for
+        `STALLED_S`.
+        """
+        with self.changed:
+            while len(self.answered_s) < len(self.asked_s) and not self.over:
+                if not self.changed.wait(STALLED_S):
+                    raise TrilaneError(f"no query was answered for {STALLED_S:.0f} s")
+            if self.why or len(self.answered_s) < len(self.asked_s):
+                raise TrilaneError(self.why or "the run ended before every query was answered")
+
+    def warm_up(self, requests: FrameRequestQueue) -> None:
+        """Ask a few queries that are not counted."""
+        self.ask(requests, WARM_UP)
+        self.wait()
+        self.restart()
+
+    def restart(self) -> None:
+        """Count only the queries from now on."""
+        self.asked_s.clear()
+        self.answered_s.clear()
+
+    @property
+    def latencies_ms(self) -> list[float]:
+        """Latencies of the answered queries, in the order in which they were asked."""
+        return [(end - begin) * 1e3 for begin, end in zip(self.asked_s, self.answered_s, strict=False)]
+
+
+def play(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
+    """Ask as `load` says until the time has passed and there are enough queries, then wait for the answers.
+
+    `load`: pattern and its limits.
+    `requests`: queue of the run.
+    `queries`: times, which are filled in.
+    """
+    queries.warm_up(requests)
+    PATTERNS[load.scenario](load, requests, queries)
+    queries.wait()
+
+
+def _one_at_a_time(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
+    end = time.monotonic() + load.seconds
+    needed = queries_needed(load.percentile)
+    while time.monotonic() < end or len(queries.asked_s) < needed:
+        queries.ask(requests)
+        queries.wait()
+
+
+def _poisson(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
+    gaps = random.Random(load.seed)
+    at = time.monotonic()
+    end, needed = at + load.seconds, queries_needed(load.percentile)
+    while (at := at + gaps.expovariate(load.rate)) < end or len(queries.asked_s) < needed:
+        if queries.over:
+            return
+        time.sleep(max(0.0, at - time.monotonic()))
+        queries.ask(requests)
+
+
+def _all_at_once(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
+    """Ask as many queries at once as will take the time, by the rate that a first few show."""
+    few = queries_needed(load.percentile)
+    queries.ask(requests, few)
+    queries.wait()
+    rate = few / (queries.answered_s[-1] - queries.asked_s[0])
+    queries.restart()
+    queries.ask(requests, max(few, math.ceil(1.1 * rate * load.seconds)))
+
+
+PATTERNS: dict[str, Callable[[Load, FrameRequestQueue, Queries], None]] = {
+    "single-stream": _one_at_a_time,
+    "multi-stream": _one_at_a_time,
+    "server": _poisson,
+    "offline": _all_at_once,
+}
+
+
+def tail(queries: int, late: int, share: float) -> float:
+    """Return the tail of the binomial distribution: the chance of at most `late` late ones among `queries`.
+
+    `share`: chance of each query to be late.
+    """
+    logs = [
+        math.lgamma(queries + 1)
+        - math.lgamma(k + 1)
+        - math.lgamma(queries - k + 1)
+        + k * math.log(share)
+        + (queries - k) * math.log1p(-share)
+        for k in range(min(late, queries) + 1)
+    ]
+    return min(1.0, math.fsum(math.exp(value) for value in logs))
+
+
+def queries_needed(percentile: float, late: int = 1) -> int:
+    """Return the least number of queries that show, at `CONFIDENCE`, that `percentile` of all are within a limit.
+
+    `late` of them may be beyond it: 64 are needed for 0.90, 662 for 0.99, with one late query.
+    """
+    low, high = late, late + 1
+    while tail(high, late, 1 - percentile) > 1 - CONFIDENCE:
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if tail(middle, late, 1 - percentile) > 1 - CONFIDENCE else (low, middle)
+    return high
+
+
+def bound_ms(latencies_ms: list[float], percentile: float) -> float | None:
+    """Return the latency that `percentile` of all queries are within, at `CONFIDENCE`; None with too few queries.
+
+    It is the k-th largest, with k the number of queries that may be late, as in LoadGen.
+    """
+    if len(latencies_ms) < queries_needed(percentile):
+        return None
+    late = 1
+    while queries_needed(percentile, late + 1) <= len(latencies_ms):
+        late += 1
+    return sorted(latencies_ms)[-late]
+
+
+def verdict(load: Load, latencies_ms: list[float], lasted_s: float) -> list[str]:
+    """Say in sentences why the result is invalid; empty when it is valid.
+
+    `load`: load of the run.
+    `latencies_ms`: latencies of all queries.
+    `lasted_s`: seconds from the first query to the last answer.
+    """
+    needed = queries_needed(load.percentile)
+    reasons = []
+    if lasted_s < load.seconds:
+        reasons.append(f"it lasted {lasted_s:.1f} s, expected {load.seconds:g} s")
+    if len(latencies_ms) < needed:
+        reasons.append(f"{len(latencies_ms)} queries, expected {needed} for the {100 * load.percentile:g}th percentile")
+    elif load.scenario == "server":
+        late = sum(latency > load.limit_ms for latency in latencies_ms)
+        if tail(len(latencies_ms), late, 1 - load.percentile) > 1 - CONFIDENCE:
+            reasons.append(
+                f"{late} of {len(latencies_ms)} queries took longer than {load.limit_ms:g} ms, too many for "
+                f"{100 * load.percentile:g} % within it"
+            )
+    return reasons
+
+
+# A run evaluated by MLCommons LoadGen: it asks, it measures, and its own summary says whether the run is valid.
+#
+# Rule: LoadGen decides when a query comes and what counts; here its queries become frames, and the answers go back.
+
+NAMES = {"single-stream": "SingleStream", "multi-stream": "MultiStream", "server": "Server", "offline": "Offline"}
+VERDICT = re.compile(r"^Result is : (\w+)", re.MULTILINE)
+SAMPLES = 64  # size of the library that LoadGen draws from; whichever it draws, the motion's next frame is presented
+SUMMARY = "mlperf_log_summary.txt"
+
+
+def load_generator() -> Any:
+    """Return the module `mlperf_loadgen`. Raises MissingPartError."""
+    try:
+        return importlib.import_module("mlperf_loadgen")
+    except ImportError:
+        raise MissingPartError("LoadGen is not installed", extra="loadgen") from None
+
+
+@dataclass
+class LoadGenPlayer:
+    """Lets LoadGen ask a run for frames.
+
+    `load`: pattern and its limits, which LoadGen gets.
+    `queries`: times of the same frames, which also show an early end of the run.
+    `valid`, `summary`: whether LoadGen calls the run valid, and its text as LoadGen wrote it; `play` fills them in.
+    """
+
+    load: Load
+    queries: Queries
+    valid: bool = False
+    summary: str = ""
+    _ids: list[int] = field(default_factory=list)
+    _begun: bool = False
+    _completed: int = 0
+
+    def answered(self, frame: int) -> None:
+        """Pass a presented frame on to LoadGen, as a sample after the warm-up; the `FrameRequestQueue` calls this."""
+        self.queries.answered(frame)
+        if self._begun and not self.queries.over:
+            self._completed = frame - WARM_UP + 1
+            self._complete(frame - WARM_UP)
+
+    def unanswered(self, causes: Mapping[str, int]) -> None:
+        """Note a dropped or lost frame, which voids the rest of the run; the `FrameRequestQueue` calls this."""
+        self.queries.unanswered(causes)
+        self.ended()
+
+    def ended(self) -> None:
+        """Note that the run is over; the `FrameRequestQueue` calls this."""
+        self.queries.ended()
+        if self._begun:
+            with self.queries.changed:  # no sample is completed twice, whichever thread comes first
+                numbers = range(self._completed, len(self._ids))
+                self._completed = len(self._ids)
+            for number in numbers:
+                self._complete(number)
+
+    def play(self, requests: FrameRequestQueue) -> None:
+        """Warm up, then let LoadGen ask until it has enough answers. Raises TrilaneError when the run ends first."""
+        lg = load_generator()
+        self.queries.warm_up(requests)
+        self._begun = True
+
+        def issue(samples: list[Any]) -> None:
+            self._ids += [sample.id for sample in samples]
+            self.queries.ask(requests, len(samples))
+            if self.queries.over:
+                self.ended()
+
+        system = lg.ConstructSUT(issue, lambda: None)
+        library = lg.ConstructQSL(SAMPLES, SAMPLES, lambda _: None, lambda _: None)
+        try:
+            with tempfile.TemporaryDirectory(prefix="trilane-loadgen-") as folder:
+                lg.StartTestWithLogSettings(system, library, self._settings(lg), _logs(lg, folder))
+                self.summary = (Path(folder) / SUMMARY).read_text(encoding="utf-8")
+        finally:
+            lg.DestroyQSL(library)
+            lg.DestroySUT(system)
+        if self.queries.over:
+            raise TrilaneError(self.queries.why or "the run ended before LoadGen had its answers")
+        line = VERDICT.search(self.summary)
+        self.valid = line is not None and line[1] == "VALID"
+
+    def _complete(self, number: int) -> None:
+        lg = load_generator()
+        lg.QuerySamplesComplete([lg.QuerySampleResponse(self._ids[number], 0, 0)])
+
+    def _settings(self, lg: Any) -> Any:
+        load = self.load
+        settings = lg.TestSettings()
+        settings.scenario = getattr(lg.TestScenario, NAMES[load.scenario])
+        settings.mode = lg.TestMode.PerformanceOnly
+        settings.min_duration_ms = math.ceil(load.seconds * 1e3)
+        settings.min_query_count = queries_needed(load.percentile)
+        settings.server_target_qps = load.rate
+        settings.server_target_latency_ns = round(load.limit_ms * 1e6)
+        settings.server_target_latency_percentile = load.percentile
+        settings.single_stream_target_latency_percentile = load.percentile
+        settings.multi_stream_target_latency_percentile = load.percentile
+        settings.multi_stream_samples_per_query = load.samples
+        settings.offline_expected_qps = load.rate
+        settings.schedule_rng_seed = load.seed
+        return settings
+
+
+def _logs(lg: Any, folder: str) -> Any:
+    output = lg.LogOutputSettings()
+    output.outdir = folder
+    output.copy_summary_to_stdout = False
+    settings = lg.LogSettings()
+    settings.log_output = output
+    settings.enable_trace = False
+    return settings

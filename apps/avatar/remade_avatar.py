@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from trilane.arrays import F32
 from trilane.avatars.bundle import MANIFEST, TEXTURE_KEYS, Bundle, load_bundle, write_bundle
 from trilane.avatars.manifest import UNTRAINED, Manifest, digests_of, network_entry, sha256_of
-from trilane.bench.lib.full_network import float_weights, weights_name
+from trilane.bench.lib.full_picture import float_weights, weights_name
 from trilane.cache import cache_dir
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
 from trilane.files import read_npz

@@ -357,7 +357,7 @@ def _float_network(bundle: Bundle, weights: Path) -> FloatNetwork:
         from trilane.training.trainable_avatar import float_painter_of
     except ImportError as error:
         raise MissingPartError(f"the float network needs {error.name}", extra="train") from None
-    from trilane.bench.lib.full_network import weights_name
+    from trilane.bench.lib.full_picture import weights_name
     from trilane.training.validate import FloatNetwork
 
     return FloatNetwork(weights_name(weights), float_painter_of(bundle, weights))

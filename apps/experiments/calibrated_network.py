@@ -13,7 +13,7 @@ import onnx
 from trilane.arrays import F32
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import NetworkFile, reshaped
-from trilane.bench.lib.full_network import float_weights
+from trilane.bench.lib.full_picture import float_weights
 from trilane.errors import BadInputError, MissingPartError
 from trilane.stages.avatar_assets import distinct, with_network
 from trilane.stages.configure import Checked

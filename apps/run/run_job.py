@@ -341,7 +341,7 @@ def asked_frames(total: int, count: int) -> tuple[int, ...]:
 
 def require_parts(bundles: Iterable[Bundle]) -> None:
     """Raise MissingPartError for all libraries that the check of a run with avatars `bundles` needs and lacks."""
-    from trilane.bench.lib.full_network import require_float_network
+    from trilane.bench.lib.full_picture import require_float_network
 
     require([require_metrics, *(partial(require_float_network, bundle) for bundle in bundles)])
 

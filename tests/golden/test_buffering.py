@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from trilane.bench import raster, readback
-from trilane.bench.lib.gpu_buffering import READBACKS, UPLOADS
+from trilane.bench.readback import READBACKS, UPLOADS
 from trilane.errors import TrilaneError
 from trilane.stages.gpu import opengl as raw
 

@@ -9,8 +9,7 @@ import pytest
 
 from support.doubles import pipeline_of_doubles as doubles
 from trilane.bench import scenario
-from trilane.bench.lib import load
-from trilane.bench.lib.load import Load
+from trilane.bench.scenario import Load
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.controls import FrameRequestQueue
 
@@ -27,7 +26,7 @@ def test_every_query_is_answered_and_judged(name: str, queries: int) -> None:
 
 
 def test_a_query_of_several_frames_takes_longer_than_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(load.PERCENTILES, "multi-stream", 0.9)
+    monkeypatch.setitem(scenario.PERCENTILES, "multi-stream", 0.9)
     pipeline = doubles(infer=5)
     one, _ = scenario.run_scenario(pipeline, {}, Load("single-stream", seconds=0.1), "trilane", "pipelined")
     four, _ = scenario.run_scenario(pipeline, {}, Load("multi-stream", seconds=0.1, samples=4), "trilane", "pipelined")
@@ -69,18 +68,18 @@ def test_a_frame_that_an_edge_drops_ends_the_scenario_at_once_with_its_cause(
     eight answers. Before, the bench waited until nothing had been answered for `STALLED_S`."""
     if judge == "loadgen":
         pytest.importorskip("mlperf_loadgen")
-    monkeypatch.setattr(load, "STALLED_S", 30.0)
+    monkeypatch.setattr(scenario, "STALLED_S", 30.0)
     pipeline = doubles(raster=20).with_rule(edge)
     with pytest.raises(TrilaneError, match=r"dropped or lost \(.*pose->raster:\w+ \d.*every query must be answered"):
         scenario.run_scenario(pipeline, {}, Load("server", seconds=60, rate=300), judge, "pipelined")
 
 
 def test_an_interrupt_ends_a_scenario(monkeypatch: pytest.MonkeyPatch) -> None:
-    def ask_and_interrupt(_load: Load, requests: FrameRequestQueue, queries: load.Queries) -> None:
+    def ask_and_interrupt(_load: Load, requests: FrameRequestQueue, queries: scenario.Queries) -> None:
         queries.ask(requests, 5)
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setitem(load.PATTERNS, "offline", ask_and_interrupt)
+    monkeypatch.setitem(scenario.PATTERNS, "offline", ask_and_interrupt)
     with pytest.raises(KeyboardInterrupt):
         scenario.run_scenario(doubles(), {}, Load("offline", seconds=60), "trilane", "pipelined")
 

@@ -15,7 +15,7 @@ from support.small_inputs import net
 from trilane.arrays import F64
 from trilane.avatars.bundle import bundle_folder, load_bundle
 from trilane.avatars.network_file import check_network, reshaped
-from trilane.bench.lib import full_network
+from trilane.bench.lib import full_picture
 from trilane.bench.lib.full_picture import SAMPLES, FullBody, supersampled
 from trilane.body.body import load_body
 from trilane.body.kinematics import Skeleton
@@ -105,7 +105,7 @@ def test_the_integer_network_without_rounding_is_its_own_formula() -> None:
     middle = np.clip(real @ first.T, (0 - 100) * 0.125, (255 - 100) * 0.125)
     expected = np.clip(middle @ second.T, (0 - 11) * 0.25, (255 - 11) * 0.25)
     assert (np.abs(middle @ second.T - expected) > 0).any() and (np.abs(real @ first.T - middle) > 0).any()
-    own = full_network.dequantised(network)(real)
+    own = full_picture.dequantised(network)(real)
     assert np.abs(own - expected).max() < 1e-3
     session = onnxruntime.InferenceSession(network.model.SerializeToString(), providers=["CPUExecutionProvider"])
     integer = (session.run(None, {"bytes": bytes_in[None]})[0][0] - 11.0) * 0.25
@@ -116,16 +116,16 @@ def test_the_integer_network_without_rounding_is_its_own_formula() -> None:
 
 def test_the_float_network_is_known_by_the_digest_of_the_manifest(drawable_bundle: Path) -> None:
     bundle = load_bundle("default")
-    found = full_network.float_weights(bundle)
+    found = full_picture.float_weights(bundle)
     assert found is not None and found.name == "default-network.npz"
     validation = bundle.manifest.validation
     assert validation is not None and validation.model_extra is not None
     changed = validation.model_copy(update={"float": {"network": f"{found.name}, sha256 {'0' * 64}"}})
     other = replace(bundle, manifest=bundle.manifest.model_copy(update={"validation": changed}))
-    assert full_network.float_weights(other) is None
+    assert full_picture.float_weights(other) is None
     tiny = load_bundle(drawable_bundle)
-    assert full_network.float_weights(tiny) is None
-    paint, said = full_network.float_network(tiny)
+    assert full_picture.float_weights(tiny) is None
+    paint, said = full_picture.float_network(tiny)
     assert "nothing rounded" in said
     assert paint(np.zeros((32, 64, 4))).shape == (32, 64, 4)
 
@@ -134,7 +134,7 @@ def test_the_trained_network_paints_a_person_where_the_body_is() -> None:
     """In the T pose, straight on: the mask is the body with its clothes, the right way round."""
     pytest.importorskip("torch")
     bundle = load_bundle("default")
-    paint, said = full_network.float_network(bundle)
+    paint, said = full_picture.float_network(bundle)
     assert "default-network.npz" in said
     body = FullBody(load_body(bundle.body_path))
     clip = EYE.copy()

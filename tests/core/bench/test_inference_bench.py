@@ -21,9 +21,9 @@ from trilane import machine
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import read_network
 from trilane.bench import infer, peers, roofline
-from trilane.bench.lib.instruction_sets import Issued
 from trilane.bench.lib.interleaved_processes import ProcessVariant
 from trilane.bench.lib.networks import NetworkFixture, fixture_of_file
+from trilane.bench.roofline import Issued
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
 
 

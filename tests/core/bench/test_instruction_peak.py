@@ -10,8 +10,7 @@ import pytest
 
 from trilane import machine
 from trilane.bench import peers, roofline
-from trilane.bench.lib import instruction_sets
-from trilane.bench.lib.instruction_sets import (
+from trilane.bench.roofline import (
     INSTRUCTION_SETS,
     KERNELS,
     Issued,
@@ -19,7 +18,6 @@ from trilane.bench.lib.instruction_sets import (
     clock_loop,
     instruction_set_of,
     measure_issued,
-    peak_gmac_s,
     rate_loop,
 )
 
@@ -73,7 +71,6 @@ def test_the_peak_is_macs_a_cycle_by_clock_by_cores(monkeypatch: pytest.MonkeyPa
     peak = roofline.instruction_peak(["avx512f", "avx512_vnni"], threads=2)
     assert peak["gmac_s"] == 640 and peak["cores"] == 2 and peak["macs_a_cycle"] == 128
     assert peak["issued_macs_a_cycle"] == pytest.approx(121.6)
-    assert peak_gmac_s(1024, 2.0, 3) == 6144
 
 
 def test_one_512_bit_unit_is_told_from_two() -> None:
@@ -148,8 +145,8 @@ def test_what_cores_do_is_the_median_of_bursts_and_the_mean_of_cores(monkeypatch
             cycles, cycle_ns = (6, 0.5) if core.number == 2 else (12, 0.25)
             return turns * (36 if self._is_clock else cycles) * cycle_ns
 
-    monkeypatch.setattr(instruction_sets, "_Code", Code)
-    monkeypatch.setattr(instruction_sets.os, "sched_setaffinity", lambda _, cores: setattr(core, "number", *cores))
+    monkeypatch.setattr(roofline, "_Code", Code)
+    monkeypatch.setattr(roofline.os, "sched_setaffinity", lambda _, cores: setattr(core, "number", *cores))
     monkeypatch.setattr(machine.here, "architecture", lambda: "x86_64")
     assert measure_issued("AVX-VNNI", [2, 5]) == Issued(*(pytest.approx(value) for value in (1.5, 3.0, 3.0, 3.0)))
 
@@ -159,9 +156,9 @@ def test_tiles_are_asked_for_where_a_set_has_them(monkeypatch: pytest.MonkeyPatc
     calls: list[Any] = []
     libc = SimpleNamespace(syscall=lambda *what: calls.append(what) or refused)
     monkeypatch.setattr(
-        instruction_sets.ctypes, "CDLL", lambda name, use_errno: libc if (name, use_errno) == (None, True) else None
+        roofline.ctypes, "CDLL", lambda name, use_errno: libc if (name, use_errno) == (None, True) else None
     )
-    monkeypatch.setattr(instruction_sets, "_on_core", lambda *_: (1.0, [2.0, 4.0, 3.0]))
+    monkeypatch.setattr(roofline, "_on_core", lambda *_: (1.0, [2.0, 4.0, 3.0]))
     monkeypatch.setattr(machine.here, "architecture", lambda: "x86_64")
     if refused:
         with pytest.raises(OSError, match=words):
@@ -176,7 +173,7 @@ def test_tiles_are_asked_for_where_a_set_has_them(monkeypatch: pytest.MonkeyPatc
 @pytest.mark.skipif(machine.here.architecture() != "x86_64", reason="the loops are machine code of x86")
 def test_a_loop_runs_as_often_as_it_is_told() -> None:
     """Machine code by hand: `imul` alone is on every x86-64 core. Three cycles of at most 10 GHz each."""
-    kernel = instruction_sets.Kernel("480fafc0", sequences=1, imuls=1, cycles=3, after="")
-    with instruction_sets._Code(instruction_sets.clock_loop(kernel)) as code:
+    kernel = roofline.Kernel("480fafc0", sequences=1, imuls=1, cycles=3, after="")
+    with roofline._Code(roofline.clock_loop(kernel)) as code:
         assert code.ns(200_000) > 200_000 * 2 * 3 / 10
     assert code._memory.closed

@@ -14,9 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trilane.bench import scenario
-from trilane.bench.lib import load
-from trilane.bench.lib.load import Load, Queries, bound_ms, queries_needed, tail, verdict
-from trilane.bench.lib.loadgen import LoadGenPlayer, load_generator
+from trilane.bench.scenario import Load, LoadGenPlayer, Queries, bound_ms, load_generator, queries_needed, tail, verdict
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
 from trilane.stages.run_options import RunOptions
 
@@ -56,14 +54,14 @@ class Run:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     told = Clock()
-    monkeypatch.setattr(load, "time", told)
+    monkeypatch.setattr(scenario, "time", told)
     return told
 
 
 def played(clock: Clock, asked: Load) -> tuple[list[int], Queries]:
     queries = Queries(size=asked.samples if asked.scenario == "multi-stream" else 1)
     run = Run(clock, queries)
-    load.play(asked, run, queries)  # type: ignore[arg-type]
+    scenario.play(asked, run, queries)  # type: ignore[arg-type]
     return run.asked, queries
 
 
@@ -93,7 +91,7 @@ def test_a_server_is_asked_at_the_moments_of_its_seed(clock: Clock, held: Held) 
     """Until there are enough queries, or the run is over."""
     begin, queries = clock.now, Queries()
     run = Run(clock, queries, 0.0)
-    load.PATTERNS["server"](Load("server", 1.0, rate=0.05, seed=3), run, queries)  # type: ignore[arg-type]
+    scenario.PATTERNS["server"](Load("server", 1.0, rate=0.05, seed=3), run, queries)  # type: ignore[arg-type]
     assert len(run.moments) == 662
     held("moments", [moment - begin for moment in run.moments])
     asked: list[int] = []
@@ -102,12 +100,12 @@ def test_a_server_is_asked_at_the_moments_of_its_seed(clock: Clock, held: Held) 
         asked.append(count)
         queries.over = len(asked) == 2
 
-    load.PATTERNS["server"](Load("server", 1.0), SimpleNamespace(request=request), queries)  # type: ignore[arg-type]
+    scenario.PATTERNS["server"](Load("server", 1.0), SimpleNamespace(request=request), queries)  # type: ignore[arg-type]
     assert asked == [1, 1]
 
 
 def test_what_ends_a_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(load, "STALLED_S", 0.001)
+    monkeypatch.setattr(scenario, "STALLED_S", 0.001)
     queries = Queries(asked_s=[1.0, 2.0], answered_s=[1.5])
     with pytest.raises(TrilaneError, match=r"^no query was answered for 0 s$"):
         queries.wait()
@@ -170,7 +168,7 @@ def test_latencies_make_a_scenarios_row() -> None:
     short = scenario._row(Load("single-stream", seconds=70.0), queries, None)
     assert (short["verdict"], short["because"]) == ("INVALID", "it lasted 69.1 s, expected 70 s")
     for valid, said in ((True, "VALID"), (False, "INVALID")):
-        loadgen: Any = SimpleNamespace(verdict=SimpleNamespace(valid=valid))
+        loadgen: Any = SimpleNamespace(valid=valid)
         row = scenario._row(Load("single-stream", seconds=70.0), queries, loadgen)
         assert (row["judge"], row["verdict"], row["because"]) == ("loadgen", said, "")
 
@@ -287,7 +285,7 @@ def test_loadgen_asks_and_judges(loadgen: LoadGen, summary: str, valid: bool) ->
     frames = Frames(player)
     player.play(frames)  # type: ignore[arg-type]
     assert frames.next == 11 and loadgen.completed == [70, 71, 90] and not loadgen.left
-    assert (player.verdict.valid, player.verdict.summary) == (valid, summary)
+    assert (player.valid, player.summary) == (valid, summary)
     assert len(player.queries.latencies_ms) == 3
     told = vars(loadgen.settings)
     assert (told["scenario"], told["min_duration_ms"], told["min_query_count"]) == ("server", 1501, 662)

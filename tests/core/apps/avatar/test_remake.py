@@ -15,7 +15,7 @@ from trilane.apps.run.asked_run import prepare
 from trilane.avatars.bundle import MANIFEST, load_bundle
 from trilane.avatars.manifest import sha256_of
 from trilane.avatars.validation import DrawnAs, accuracy_of
-from trilane.bench.lib import full_network
+from trilane.bench.lib import full_picture
 from trilane.errors import BadInputError
 from trilane.stages.run_options import METHODS, RunOptions, calibration_of
 from trilane.training.quantising import calibration
@@ -117,7 +117,7 @@ def test_a_calibration_quantises_the_float_network_that_the_manifest_names(
 
     weights = tmp_path / "own.npz"
     weights.write_bytes(b"weights")
-    monkeypatch.setattr(full_network, "WEIGHTS", tmp_path)
+    monkeypatch.setattr(full_picture, "WEIGHTS", tmp_path)
     monkeypatch.setattr(
         make_bundle,
         "float_model",
@@ -135,7 +135,7 @@ def test_a_calibration_quantises_the_float_network_that_the_manifest_names(
     folder, said = remade_avatar.remade_avatar(str(named), RunOptions(calibration="minmax:1", width=8))
     made = load_bundle(folder)
     assert said == "made again: minmax on 1 view" and not remade_avatar.is_untrained(made)
-    assert full_network.float_weights(made) == weights
+    assert full_picture.float_weights(made) == weights
     assert views == [1] and made.manifest.quantisation["method"] == "minmax" and made.manifest.validation is None
     assert (made.read_texture() == load_bundle(named).read_texture()).all()
 

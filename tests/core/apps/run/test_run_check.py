@@ -178,10 +178,10 @@ def test_the_check_moves_as_the_picture_is_changed(
 def test_a_check_without_its_libraries_is_refused_before_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where an avatar's float network is here PyTorch must be too; of an avatar without one it need not."""
     from trilane.avatars.bundle import load_bundle
-    from trilane.bench.lib import full_network
+    from trilane.bench.lib import full_picture
 
     bundle = load_bundle("default")
-    monkeypatch.setattr(full_network, "float_weights", lambda each: Path("weights") if each == bundle else None)
+    monkeypatch.setattr(full_picture, "float_weights", lambda each: Path("weights") if each == bundle else None)
     there = {"skimage", "flip_evaluator", "torch"}
     monkeypatch.setattr(machine.here, "has_package", there.__contains__)
     require_parts([bundle])
