@@ -33,7 +33,7 @@ from trilane.apps.experiments.reference_path import (
 )
 from trilane.apps.experiments.scene_pictures import region, spread
 from trilane.arrays import F64, U8
-from trilane.bench.lib.layers import Box, RasterLayer, laid_over
+from trilane.bench.lib.cast import Box, RasterLayer, laid_over
 from trilane.bench.lib.picture_error import psnr_db
 from trilane.errors import BadInputError
 from trilane.figure_sources import MEASURED

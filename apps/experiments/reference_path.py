@@ -20,10 +20,20 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F32, F64, U8, Mask
 from trilane.avatars.network_file import Affine, NetworkFile, reshaped
-from trilane.bench.lib.cast import Cast, CastView
+from trilane.bench.lib.cast import (
+    Box,
+    Cast,
+    CastView,
+    RasterLayer,
+    enlarged,
+    grown,
+    laid_over,
+    placed,
+    premultiplied,
+    shrunk,
+)
 from trilane.bench.lib.float_raster import quantise
 from trilane.bench.lib.full_picture import SAMPLES, FullBody, Paint, as_written, fineness, float_network, supersampled
-from trilane.bench.lib.layers import Box, RasterLayer, enlarged, grown, laid_over, placed, premultiplied, shrunk
 from trilane.bench.lib.stage_chain import AvatarFrames
 from trilane.body.body import Body
 from trilane.body.joints import JOINTS, POSE_FEATURES

@@ -15,9 +15,8 @@ from typing import Any
 from trilane import machine
 from trilane.apps.experiments.picture_errors import LEAST_MS_SSIM_PX
 from trilane.arrays import U8
-from trilane.bench.lib.cast import Cast
+from trilane.bench.lib.cast import Box, Cast
 from trilane.bench.lib.full_picture import FullPictures
-from trilane.bench.lib.layers import Box
 from trilane.bench.lib.stage_chain import StageChain, units_of
 from trilane.errors import BadInputError
 from trilane.pipeline.job_times import CoreMeter, preempted_ns

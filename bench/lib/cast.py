@@ -1,25 +1,27 @@
-"""The avatars in a frame and their places, for pictures of a scene that are made without the stages.
+"""The avatars in a frame: their places, and the layers of the picture that show them, made without the stages.
 
 Rule: motion, camera and media time are the pose stage's, so a picture shows the same moment as the run's frame.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from trilane.arrays import F32, F64
+from trilane.arrays import F32, F64, U8, Floats
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M, load_bundle
-from trilane.bench.lib.layers import Box, box_around
 from trilane.body.kinematics import Skeleton
-from trilane.scene.crop import crop_projection
+from trilane.scene.crop import Rect, crop_projection
 from trilane.scene.mover import Mover
-from trilane.shapes import Shape
+from trilane.shapes import BUCKET_STEP, Shape
 from trilane.stages.avatar_assets import AvatarData, load_avatar, staged_of
 from trilane.stages.configure import Checked
 from trilane.stages.cpu.mesh_bounds import MeshBounds
+from trilane.stages.gpu.composite_painters import taps_of
 
 
 @dataclass(frozen=True)
@@ -108,3 +110,162 @@ class Cast:
 
 def _skeleton(data: AvatarData) -> Skeleton:
     return Skeleton(data.shaped.joints, data.shaped.body.parents)
+
+
+# Layers of a picture, blended in linear light in float64: a second implementation of the composite.
+#
+# Rule: a layer lies on the pixel grid of the picture and may hang over it. A layer off the grid is read by `placed` at
+# the picture's pixels.
+
+
+class Box(NamedTuple):
+    """Rows `top` to `bottom` and columns `left` to `right` of a picture, in pixels; the last of each are outside."""
+
+    top: int
+    left: int
+    bottom: int
+    right: int
+
+    @property
+    def shape(self) -> Shape:
+        return self.bottom - self.top, self.right - self.left
+
+    def rect(self, output: Shape) -> Rect:
+        """Return the box in normalised device coordinates of a picture of `output` (height, width)."""
+        across, down = 2.0 / output[1], 2.0 / output[0]
+        return Rect(self.left * across - 1, 1 - self.bottom * down, self.right * across - 1, 1 - self.top * down)
+
+    def within(self, other: Box) -> Rect:
+        """Return the box in normalised device coordinates of a picture that fills `other`."""
+        moved = Box(self.top - other.top, self.left - other.left, self.bottom - other.top, self.right - other.left)
+        return moved.rect(other.shape)
+
+    def on(self, output: Shape) -> Box:
+        """Return the part that lies on a picture of `output` (height, width)."""
+        return Box(max(self.top, 0), max(self.left, 0), min(self.bottom, output[0]), min(self.right, output[1]))
+
+
+@dataclass(frozen=True)
+class RasterLayer:
+    """A layer of a picture.
+
+    `light` (h,w,4): linear light times alpha, then alpha, 0..1. `depth`: camera z; the least is the farthest.
+    """
+
+    box: Box
+    depth: float
+    light: F64
+
+
+def box_around(rect: Rect, output: Shape) -> Box:
+    """Return whole pixels that hold `rect`, with enough around it that both sides are multiples of 32."""
+    top, bottom = np.floor((1 - rect.y1) / 2 * output[0]), np.ceil((1 - rect.y0) / 2 * output[0])
+    left, right = np.floor((1 + rect.x0) / 2 * output[1]), np.ceil((1 + rect.x1) / 2 * output[1])
+    return grown(Box(int(top), int(left), int(bottom), int(right)), BUCKET_STEP)
+
+
+def grown(box: Box, step: int) -> Box:
+    """Grow `box` until `step` divides both sides; an odd pixel goes to the bottom or the right."""
+    rows, columns = _grown(box.top, box.bottom, step), _grown(box.left, box.right, step)
+    return Box(rows[0], columns[0], rows[1], columns[1])
+
+
+def _grown(first: int, last: int, step: int) -> tuple[int, int]:
+    more = -(last - first) % step
+    return first - more // 2, last + more - more // 2
+
+
+def premultiplied(rgba: Floats) -> F64:
+    """Return linear light times alpha, and alpha, (h,w,4), of `rgba` (h,w,4): sRGB with straight alpha, 0..1."""
+    straight = np.asarray(rgba, np.float64)
+    alpha = straight[..., 3:]
+    return np.concatenate([to_light(straight[..., :3]) * alpha, alpha], axis=-1)
+
+
+def shrunk(light: F64, factor: int) -> F64:
+    """Return (h,w,C): the means of squares of `factor` x `factor` pixels of `light` (h * factor, w * factor, C)."""
+    height, width, channels = light.shape
+    squares = light.reshape(height // factor, factor, width // factor, factor, channels)
+    return np.asarray(squares.mean(axis=(1, 3)))
+
+
+def enlarged(light: F64, factor: int) -> F64:
+    """Return `light` (h,w,C) read bilinearly at the centres of smaller pixels: (h * factor, w * factor, C).
+
+    Each pixel becomes a square of `factor` x `factor`, with the same centre. Beyond the centres of the outermost pixels
+    their values continue.
+    """
+    return _enlarged_down(_enlarged_down(light, factor).swapaxes(0, 1), factor).swapaxes(0, 1)
+
+
+def _enlarged_down(light: F64, factor: int) -> F64:
+    places = np.clip((np.arange(len(light) * factor) + 0.5) / factor - 0.5, 0, len(light) - 1)
+    above = np.floor(places).astype(int)
+    below = np.minimum(above + 1, len(light) - 1)
+    share = (places - above)[:, None, None]
+    return np.asarray((1 - share) * light[above] + share * light[below])
+
+
+def placed(light: F64, rect: Rect, output: Shape, depth: float) -> RasterLayer:
+    """Read `light` (h,w,C), which fills `rect` of a picture of `output` (height, width), at the picture's pixels.
+
+    Each pixel whose centre lies in `rect` is the mean of as many bilinear reads as the composite takes, evenly over the
+    pixel. Beyond the centres of the outermost pixels of `light` their values continue.
+    """
+    top, bottom = (1 - rect.y1) / 2 * output[0], (1 - rect.y0) / 2 * output[0]
+    left, right = (1 + rect.x0) / 2 * output[1], (1 + rect.x1) / 2 * output[1]
+    height, width = light.shape[:2]
+    taps = taps_of((height, width), (bottom - top, right - left))
+    first_row, rows = _reads(top, bottom, height, output[0], taps)
+    first_column, columns = _reads(left, right, width, output[1], taps)
+    box = Box(first_row, first_column, first_row + len(rows), first_column + len(columns))
+    across = np.einsum("xw,hwc->hxc", columns, light, optimize=True)
+    return RasterLayer(box, depth, np.asarray(np.einsum("yh,hxc->yxc", rows, across, optimize=True)))
+
+
+def _reads(begin: float, end: float, count: int, side: int, taps: int) -> tuple[int, F64]:
+    """Return how the pixels between `begin` and `end` are read along one axis of a picture of `side` pixels.
+
+    They are the number of the first pixel of the picture whose centre lies in [begin, end), and weights (n, count). Row
+    k says how much each of the `count` pixels counts for the first pixel + k.
+    """
+    first, last = (min(max(int(np.ceil(place - 0.5)), 0), side) for place in (begin, end))
+    middles = np.arange(first, last)[:, None] + 0.5
+    offsets = (np.arange(taps) + 0.5) / taps - 0.5
+    places = np.clip((middles + offsets - begin) / (end - begin) * count - 0.5, 0, count - 1)
+    lower = np.floor(places).astype(int)
+    upper, share = np.minimum(lower + 1, count - 1), places - lower
+    weights = np.zeros((last - first, count))
+    pixel = np.broadcast_to(np.arange(last - first)[:, None], places.shape)
+    np.add.at(weights, (pixel, lower), (1 - share) / taps)
+    np.add.at(weights, (pixel, upper), share / taps)
+    return first, weights
+
+
+def blended(background: U8, layers: Iterable[RasterLayer]) -> U8:
+    """Blend `layers` over `background`, both sRGB, (h,w,3) uint8; the farthest layer first."""
+    return np.asarray(np.rint(laid_over(background, layers)[0] * 255), np.uint8)
+
+
+def laid_over(background: U8, layers: Iterable[RasterLayer]) -> tuple[F64, F64]:
+    """Blend as `blended`, without rounding: (h,w,3) in 0..1, and how much of each pixel (h,w) the layers cover."""
+    output = (background.shape[0], background.shape[1])
+    light, seen_through = to_light(background / 255.0), np.ones(output)
+    for layer in sorted(layers, key=lambda layer: layer.depth):
+        box = layer.box.on(output)
+        own = layer.light[box.top - layer.box.top :, box.left - layer.box.left :][: box.shape[0], : box.shape[1]]
+        part = np.s_[box.top : box.bottom, box.left : box.right]
+        light[part] = own[..., :3] + (1 - own[..., 3:]) * light[part]
+        seen_through[part] *= 1 - own[..., 3]
+    return to_code(light), 1 - seen_through
+
+
+def to_light(code: F64) -> F64:
+    """Turn sRGB in 0..1 into linear light, IEC 61966-2-1."""
+    return np.asarray(np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4))
+
+
+def to_code(light: F64) -> F64:
+    """Turn linear light into sRGB in 0..1, IEC 61966-2-1; light beyond 0..1 is clipped."""
+    light = np.clip(light, 0.0, 1.0)
+    return np.asarray(np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055))

@@ -31,8 +31,7 @@ from trilane.avatars.bundle import BUILT_IN, Bundle, bundle_folder
 from trilane.avatars.manifest import sha256_of
 from trilane.avatars.network_file import NetworkFile, constants_of, reshaped
 from trilane.bench.lib import float_raster
-from trilane.bench.lib.cast import Cast, CastView
-from trilane.bench.lib.layers import RasterLayer, blended, enlarged, grown, premultiplied, shrunk
+from trilane.bench.lib.cast import Cast, CastView, RasterLayer, blended, enlarged, grown, premultiplied, shrunk
 from trilane.body.body import Body
 from trilane.body.joints import JOINTS
 from trilane.body.kinematics import rodrigues

@@ -15,7 +15,7 @@ import numpy as np
 
 from trilane import machine
 from trilane.arrays import F64, U8, Mask
-from trilane.bench.lib.layers import Box
+from trilane.bench.lib.cast import Box
 from trilane.errors import MissingPartError
 
 MODULES = ("skimage", "flip_evaluator")

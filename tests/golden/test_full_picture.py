@@ -13,9 +13,8 @@ import pytest
 from trilane.arrays import F32, F64
 from trilane.avatars.bundle import BUILT_IN, CLOTHES_STANDOFF_M
 from trilane.bench.lib import full_picture
-from trilane.bench.lib.cast import Cast
+from trilane.bench.lib.cast import Box, Cast, RasterLayer, blended, premultiplied, to_light
 from trilane.bench.lib.full_picture import SAMPLES, FullPictures, true_pictures
-from trilane.bench.lib.layers import Box, RasterLayer, blended, premultiplied, to_light
 from trilane.bench.lib.stage_chain import AvatarFrames
 from trilane.body.body import load_body
 from trilane.stages.configure import Checked, configure

@@ -23,8 +23,8 @@ from trilane.apps.experiments import reference_path
 from trilane.apps.experiments.scene_pictures import around
 from trilane.apps.run.run_job import FLOAT_PATH, TRUTH, check_run
 from trilane.arrays import U8
+from trilane.bench.lib.cast import blended
 from trilane.bench.lib.full_picture import TruePictures, true_pictures
-from trilane.bench.lib.layers import blended
 from trilane.bench.lib.stage_chain import AvatarFrames
 from trilane.stages.configure import Checked, configure
 from trilane.stages.cpu.present import KeptFrames

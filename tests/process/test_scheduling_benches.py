@@ -93,7 +93,6 @@ def test_virtual_time_agrees_with_simpy_and_repeats_itself() -> None:
 
 def test_without_simpy_the_bench_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "simpy", None)
-    monkeypatch.delitem(sys.modules, "trilane.bench.lib.simpy_models", raising=False)
     result = scheduler.measure(minutes=0.05, rounds=1, seeds=1)
     assert {row["way"].partition(",")[0] for row in result["rows"]} == {"trilane"}
     assert result["over_simpy"] is result["over_simpy_lean"] is None

@@ -27,15 +27,12 @@ from trilane.errors import BadInputError
 
 FILE = Path(__file__).parents[1] / "printed/bench-protocol.txt"
 ROOT = Path(__file__).resolve().parents[3]
-#: It needs SimPy and holds no numbers.
-LEFT_OUT = {"trilane.bench.lib.simpy_models"}
 OF_THE_MACHINE = {"threads"}
 
 
 def modules() -> Iterator[ModuleType]:
     for found in sorted(pkgutil.walk_packages(trilane.bench.__path__, "trilane.bench."), key=lambda each: each.name):
-        if found.name not in LEFT_OUT:
-            yield importlib.import_module(found.name)
+        yield importlib.import_module(found.name)
 
 
 def constants(module: ModuleType) -> Iterator[tuple[str, Any]]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from trilane.bench.lib import picture_error
-from trilane.bench.lib.layers import Box
+from trilane.bench.lib.cast import Box
 from trilane.bench.lib.picture_error import (
     PictureErrors,
     box_psnr_db,

@@ -7,8 +7,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from trilane.bench.lib.full_picture import fineness
-from trilane.bench.lib.layers import (
+from trilane.bench.lib.cast import (
     Box,
     RasterLayer,
     blended,
@@ -21,6 +20,7 @@ from trilane.bench.lib.layers import (
     to_code,
     to_light,
 )
+from trilane.bench.lib.full_picture import fineness
 from trilane.scene.crop import Rect
 
 CODES = np.arange(256, dtype=np.uint8)

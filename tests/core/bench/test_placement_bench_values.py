@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from trilane.bench import placement, planner
-from trilane.bench.lib.layers import Box
+from trilane.bench.lib.cast import Box
 from trilane.errors import BadInputError
 from trilane.pipeline.rehearsal import Rehearsed
 from trilane.pipeline.trial import Round

@@ -28,8 +28,8 @@ from trilane.apps.experiments.scene_pictures import region
 from trilane.arrays import F64
 from trilane.avatars.bundle import bundle_folder, load_bundle
 from trilane.avatars.network_file import check_network, reshaped
+from trilane.bench.lib.cast import Box, RasterLayer
 from trilane.bench.lib.full_picture import as_written
-from trilane.bench.lib.layers import Box, RasterLayer
 from trilane.body.body import load_body
 from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import DETAILS

@@ -18,7 +18,7 @@ from trilane.apps.experiments.scene_pictures import region
 from trilane.apps.run import asked_run, run_job
 from trilane.apps.run.run_job import FLOAT_PATH, TRUTH, asked_frames, check_run, differs, require_parts, summed_up
 from trilane.arrays import U8
-from trilane.bench.lib.layers import Box
+from trilane.bench.lib.cast import Box
 from trilane.errors import MissingPartError, TrilaneError
 from trilane.stages.cpu.present import KeptFrames, kept_frames
 
