@@ -191,7 +191,7 @@ def show(name: str, measure: Callable[..., Mapping[str, Any]], asked: Mapping[st
     `asked`: value of each option.
     `as_json`: whether to print one JSON document, or a table for people.
     """
-    from trilane.bench.lib.limits import check_limits
+    from trilane.bench import check_limits
     from trilane.stages.machine_facts import machine_facts
 
     check_limits(asked)

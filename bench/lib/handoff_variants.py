@@ -123,6 +123,19 @@ class _SlotEnd:
         """Do nothing: the bench's acknowledgement gives the slot back."""
 
 
+class _OwnEnd:
+    """An end whose bytes belong to its process, so that none are given back."""
+
+    def __init__(self, size: int) -> None:
+        self._own = np.zeros(size, np.uint8)
+
+    def buffer(self) -> U8:
+        return self._own
+
+    def release(self) -> None:
+        """Do nothing: the bytes belong to this process."""
+
+
 class QueueChannel:
     """A `multiprocessing.Queue`: the array is pickled, copied through a pipe, and made again."""
 
@@ -139,12 +152,10 @@ class QueueChannel:
         self._queue.close()
 
 
-class _QueueEnd:
+class _QueueEnd(_OwnEnd):
     def __init__(self, channel: Queue[Any], size: int) -> None:
-        self._queue, self._own = channel, np.zeros(size, np.uint8)
-
-    def buffer(self) -> U8:
-        return self._own
+        super().__init__(size)
+        self._queue = channel
 
     def hand_over(self) -> None:
         self._queue.put(self._own)
@@ -152,9 +163,6 @@ class _QueueEnd:
     def receive(self) -> U8:
         array: U8 = self._queue.get(timeout=WAIT_MS / 1000)
         return array
-
-    def release(self) -> None:
-        """Do nothing: the array belongs to this process."""
 
 
 class PipeChannel:
@@ -176,12 +184,10 @@ class PipeChannel:
             end.close()
 
 
-class _PipeEnd:
+class _PipeEnd(_OwnEnd):
     def __init__(self, end: Connection, size: int) -> None:
-        self._end, self._own = end, np.zeros(size, np.uint8)
-
-    def buffer(self) -> U8:
-        return self._own
+        super().__init__(size)
+        self._end = end
 
     def hand_over(self) -> None:
         self._end.send_bytes(self._own.data)
@@ -189,9 +195,6 @@ class _PipeEnd:
     def receive(self) -> U8:
         self._end.recv_bytes_into(self._own.data)
         return self._own
-
-    def release(self) -> None:
-        """Do nothing: the array belongs to this process."""
 
 
 class ZmqChannel:
@@ -214,24 +217,18 @@ class ZmqChannel:
         self._folder.remove()
 
 
-class _ZmqEnd:
+class _ZmqEnd(_OwnEnd):
     def __init__(self, endpoint: str, size: int, bind: bool) -> None:
-        self._own = np.zeros(size, np.uint8)
+        super().__init__(size)
         self._socket = zmq.Context().socket(zmq.PAIR)
         self._socket.setsockopt(zmq.RCVTIMEO, WAIT_MS)
         (self._socket.bind if bind else self._socket.connect)(endpoint)
-
-    def buffer(self) -> U8:
-        return self._own
 
     def hand_over(self) -> None:
         self._socket.send(self._own.data, copy=False)
 
     def receive(self) -> U8:
         return np.frombuffer(self._socket.recv(copy=False).buffer, np.uint8)
-
-    def release(self) -> None:
-        """Do nothing: the bytes belong to this process."""
 
 
 class IceoryxChannel:

@@ -22,7 +22,7 @@ import pytest
 
 import trilane.bench
 from trilane import machine
-from trilane.bench.lib.limits import LIMITS, check_limits
+from trilane.bench import LIMITS, check_limits
 from trilane.errors import BadInputError
 
 FILE = Path(__file__).parents[1] / "printed/bench-protocol.txt"
@@ -31,6 +31,7 @@ OF_THE_MACHINE = {"threads"}
 
 
 def modules() -> Iterator[ModuleType]:
+    yield trilane.bench
     for found in sorted(pkgutil.walk_packages(trilane.bench.__path__, "trilane.bench."), key=lambda each: each.name):
         yield importlib.import_module(found.name)
 

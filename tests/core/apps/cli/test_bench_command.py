@@ -12,7 +12,7 @@ from rich.console import Console
 
 from trilane.apps.cli import bench
 from trilane.apps.cli.bench import MEANINGS, show
-from trilane.bench.lib.limits import LIMITS, check_limits
+from trilane.bench import LIMITS, check_limits
 from trilane.errors import BadInputError
 from trilane.stages import machine_facts
 
