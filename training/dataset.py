@@ -19,7 +19,7 @@ from trilane.arrays import F32, F64, U8
 from trilane.body.body import load_body
 from trilane.scene.motion.motion import Motion
 from trilane.shapes import Shape
-from trilane.training.clothing.looks import look_named
+from trilane.training.clothing import look_named
 from trilane.training.random_views import Crop
 from trilane.training.sample_files import U16, create_group, open_groups
 from trilane.training.sample_renderer import BAND_NAMES, PoseSource, Sample, SampleRenderer

@@ -20,7 +20,7 @@ from trilane.body.skinning import blend_matrices
 from trilane.scene.crop import choose_bucket, crop_projection
 from trilane.shapes import Shape
 from trilane.stages.cpu.mesh_bounds import MeshBounds
-from trilane.training.clothing.layers import Layer
+from trilane.training.clothing import Layer
 
 NEAR_M, FAR_M = 0.05, 100.0
 NEAREST_M = 0.45

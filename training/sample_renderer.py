@@ -8,22 +8,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import F32, F64, Floats
+from trilane.arrays import F32, F64, U8, Floats
 from trilane.body.body import ShapedBody
 from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import largest_weights
 from trilane.shapes import shape_buckets
-from trilane.stages.gpu.opengl import open_context
+from trilane.stages.gpu.opengl import build_program, eye_of, open_context, set_uniforms
 from trilane.stages.gpu.packed_pass import Placement
 from trilane.stages.gpu.skinned_mesh import BodyPose, MeshDraw, SkinnedMesh, enough_weights, mesh_arrays
-from trilane.training.clothing.clothed_body import ClothedBody
-from trilane.training.clothing.layers import clothing_layers
-from trilane.training.clothing.looks import DEFAULT, Look, find_landmarks
+from trilane.training import clothing as joint
+from trilane.training.clothing import DEFAULT, MATERIALS, Landmarks, Layer, Look, clothing_layers, find_landmarks
 from trilane.training.random_poses import random_pose
 from trilane.training.random_views import BANDS, ClothedSurface, Crop, Cropper, View, random_view
 from trilane.training.surface import body_arrays
@@ -173,22 +174,111 @@ class UvBytes:
     def __init__(self, ctx: Any, mesh: SkinnedMesh) -> None:
         self._target = _MeshTarget(ctx, mesh, "uv_only.frag", 2, "f1")
 
-    def render_into(
-        self,
-        tensor: NDArray[np.uint8],
-        joints: F32,
-        view: Floats,
-        projection: Floats,
-        shape: tuple[int, int],
-        feature: F32 | None = None,
-    ) -> None:
+    def render_into(self, tensor: U8, joints: F32, view: Floats, projection: Floats, shape: tuple[int, int]) -> None:
         """Write u and v of every pixel as round(255 x), row 0 on top; 0 off the mesh.
 
         `tensor`: (h * w * 2,) uint8, written as (h, w, 2).
         `joints`: skinning matrices (55,3,4).
         `view`, `projection`: matrices (4,4) of the camera; for a crop, the crop's projection.
         `shape`: (height, width) of the image.
-        `feature`: (486,) of a mesh with pose blend shapes.
         """
-        target = self._target.draw(BodyPose(joints, feature), view, projection, shape)
+        target = self._target.draw(BodyPose(joints), view, projection, shape)
         target.read_into(tensor, components=2, alignment=1)
+
+
+# The clothed body on the GPU: all its layers, each with its paint, drawn together.
+#
+# Rule: pictures come from the GPU stage's own raster, with the layers and the uniforms of `paint.frag`. The shader
+# writes linear light; samples are averaged in linear light, then written as sRGB.
+
+WEIGHTS_PER_VERTEX = 8
+PAINT = Path(__file__).with_name("paint.frag")
+
+
+class ClothedBody:
+    """Draws the layers of a clothed body."""
+
+    def __init__(self, ctx: Any, layers: list[Layer], landmarks: Landmarks, samples: int, look: Look = DEFAULT) -> None:
+        """Put the layers on the GPU.
+
+        `ctx`: OpenGL context.
+        `layers`: layers from `clothing_layers`.
+        `landmarks`: landmarks of the body at rest.
+        `samples`: number of samples along each side of a pixel (2 is 2x2), even.
+        `look`: look of the layers.
+        """
+        self._ctx, self._samples = ctx, samples
+        self._meshes = [MeshDraw(ctx, _mesh(ctx, layer), PAINT, **look.definitions(landmarks)) for layer in layers]
+        for layer, mesh in zip(layers, self._meshes, strict=True):
+            mesh.set(_places(landmarks) | {"material": MATERIALS.index(layer.material)})
+        self._resolve = build_program(ctx, "whole_screen.vert", "tent_filter.frag", SAMPLES=samples)
+        self._screen = ctx.vertex_array(self._resolve, [])
+        self._targets: dict[tuple[int, int], tuple[Any, Any, Any]] = {}
+
+    def render(self, joints: F32, view: Floats, projection: Floats, shape: tuple[int, int]) -> U8:
+        """Return the picture (h,w,4) uint8, sRGB, straight alpha, row 0 on top; 0, 0, 0, 0 where no layer is.
+
+        `joints`: skinning matrices (55,3,4).
+        `view`, `projection`: matrices (4,4) of the camera.
+        `shape`: (height, width) of the picture.
+        """
+        large, samples, small = self._target(shape)
+        large.use()
+        self._ctx.enable_only(moderngl.DEPTH_TEST)
+        self._ctx.depth_func = "<"
+        large.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
+        seen_from = {"view": tuple(np.asarray(view, np.float64).T.ravel()), "eye": tuple(eye_of(view))}
+        for mesh in self._meshes:
+            mesh.set(seen_from)
+            mesh.draw(BodyPose(joints), view, projection)
+        small.use()
+        self._ctx.enable_only(moderngl.NOTHING)
+        samples.use(0)
+        set_uniforms(self._resolve, {"samples": 0})
+        self._screen.render(vertices=3)
+        pixels = np.empty((*shape, 4), np.uint8)
+        small.read_into(pixels, components=4, alignment=1)
+        return pixels
+
+    def _target(self, shape: tuple[int, int]) -> tuple[Any, Any, Any]:
+        if shape not in self._targets:
+            size = (shape[1] * self._samples, shape[0] * self._samples)
+            samples = self._ctx.texture(size, 4, dtype="f2")
+            large = self._ctx.framebuffer([samples], self._ctx.depth_renderbuffer(size))
+            small = self._ctx.framebuffer([self._ctx.texture(shape[::-1], 4)])
+            self._targets[shape] = (large, samples, small)
+        return self._targets[shape]
+
+
+def _mesh(ctx: Any, layer: Layer) -> SkinnedMesh:
+    order = np.argsort(-layer.weights, axis=1)[:, :WEIGHTS_PER_VERTEX]
+    weight = np.take_along_axis(layer.weights, order, axis=1)
+    weight /= weight.sum(axis=1, keepdims=True)
+    colour = np.zeros((len(layer.vertices), 4))
+    colour[:, 0], colour[:, 1] = layer.light, layer.mark
+    no_uv = np.zeros((1, 2))
+    return SkinnedMesh(
+        ctx,
+        mesh_arrays(
+            layer.vertices, layer.faces, no_uv, np.zeros_like(layer.faces), order, weight, layer.normal, colour
+        ),
+    )
+
+
+def _places(landmarks: Landmarks) -> dict[str, Any]:
+    """Return the uniforms of `paint.frag` that say where things are on the body."""
+    joints = landmarks.joints
+    named = {
+        "pelvis": joints[joint.PELVIS],
+        "hip": joints[joint.HIP],
+        "neck": joints[joint.NECK],
+        "shoulder": joints[joint.SHOULDER],
+        "elbow": joints[joint.ELBOW],
+        "ankle": joints[joint.ANKLE],
+        "toes": joints[joint.FOOT],
+        "eyeball": landmarks.eye,
+        "ear": landmarks.ear,
+    }
+    return {name: tuple(float(x) for x in point) for name, point in named.items()} | {
+        "eyeball_radius": landmarks.eye_radius
+    }

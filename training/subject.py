@@ -27,7 +27,7 @@ from trilane.training.capture.check import (
     require_fits,
     texel_facts,
 )
-from trilane.training.clothing.looks import DEFAULT_NAME, KEY, look_named
+from trilane.training.clothing import DEFAULT_NAME, KEY, look_named
 from trilane.training.dataset import SampleSource, clothed_source
 from trilane.training.sample_renderer import SampleRenderer
 

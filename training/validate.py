@@ -37,7 +37,7 @@ from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement, 
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 from trilane.stages.machine_facts import package_version
 from trilane.training.backgrounds import SIDE, scenes
-from trilane.training.clothing.looks import look_of
+from trilane.training.clothing import look_of
 from trilane.training.dataset import VALIDATION_SIZE, plan_validation
 from trilane.training.image_error import ImageError, SampleError, image_error, over, summary
 from trilane.training.sample_renderer import BAND_NAMES, Sample, SampleRenderer

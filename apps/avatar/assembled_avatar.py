@@ -31,7 +31,7 @@ from trilane.body.mesh_levels import MeshLevel
 from trilane.errors import BadInputError
 from trilane.files import read_npz
 from trilane.hw_profiles.network_work import graph_facts
-from trilane.training.clothing.looks import KEY as LOOK
+from trilane.training.clothing import KEY as LOOK
 
 if TYPE_CHECKING:
     import onnx

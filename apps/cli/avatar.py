@@ -132,7 +132,7 @@ def create_data(
     from trilane.body.body import load_body
     from trilane.training.capture.capture import BODY
     from trilane.training.capture.synthetic import Recipe, SyntheticCapture, write_capture
-    from trilane.training.clothing.looks import look_named
+    from trilane.training.clothing import look_named
     from trilane.writing import write_folder
 
     recipe = Recipe(frames, _shape(picture), seed, fit_deg, fit_mm, mask_px, look)

@@ -128,7 +128,7 @@ def ground_truth(bundle: Bundle) -> tuple[Any, Any]:
     Raises MissingPartError.
     """
     try:
-        from trilane.training.clothing.looks import look_of
+        from trilane.training.clothing import look_of
         from trilane.training.image_error import image_error
         from trilane.training.sample_renderer import SampleRenderer
     except ImportError as error:

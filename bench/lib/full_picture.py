@@ -40,9 +40,8 @@ from trilane.scene.crop import crop_projection
 from trilane.shapes import BUCKET_STEP, Shape
 from trilane.stages.avatar_assets import AvatarData
 from trilane.stages.gpu.skinned_mesh import MeshArrays, avatar_mesh
-from trilane.training.clothing.clothed_body import ClothedBody
-from trilane.training.clothing.layers import clothing_layers
-from trilane.training.clothing.looks import find_landmarks, look_of
+from trilane.training.clothing import clothing_layers, find_landmarks, look_of
+from trilane.training.sample_renderer import ClothedBody
 from trilane.training.surface import body_arrays
 
 #: Number of points along each side of a tensor pixel at which the neural texture is read.

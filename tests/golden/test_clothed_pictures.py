@@ -9,8 +9,8 @@ pytest.importorskip("torch")
 
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import load_body
-from trilane.training.clothing import layers
-from trilane.training.clothing.looks import HIKER
+from trilane.training import clothing
+from trilane.training.clothing import HIKER
 from trilane.training.random_poses import random_pose
 from trilane.training.random_views import BANDS
 from trilane.training.sample_renderer import SampleRenderer
@@ -42,7 +42,7 @@ def opened_hiker(gl):  # noqa: ARG001 - where no context can be made, `gl` skips
     """Its obscurance is coarse, which takes a third of the time."""
     body = load_body(bundle_folder("default") / "body.npz").shape(HIKER.betas)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(layers, "EMITTERS", 600)
+        patch.setattr(clothing, "EMITTERS", 600)
         return SampleRenderer(body, threads=2, look=HIKER)
 
 

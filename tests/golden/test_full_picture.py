@@ -22,9 +22,8 @@ from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.gpu import opengl
 from trilane.stages.gpu.composite_painters import AvatarPainter, PicturePainter
 from trilane.stages.run_options import RunOptions
-from trilane.training.clothing.clothed_body import ClothedBody
-from trilane.training.clothing.layers import clothing_layers
-from trilane.training.clothing.looks import LOOKS, find_landmarks
+from trilane.training.clothing import LOOKS, clothing_layers, find_landmarks
+from trilane.training.sample_renderer import ClothedBody
 from trilane.training.surface import body_arrays
 
 SCENE = """

@@ -12,9 +12,8 @@ from PIL import Image
 
 from trilane.arrays import F64
 from trilane.stages.gpu.opengl import shader_source
-from trilane.training.clothing.clothed_body import PAINT, _places
-from trilane.training.clothing.layers import GARMENTS, MATERIALS
-from trilane.training.clothing.looks import DEFAULT, HIKER, Landmarks, Look, find_landmarks
+from trilane.training.clothing import DEFAULT, GARMENTS, HIKER, MATERIALS, Landmarks, Look, find_landmarks
+from trilane.training.sample_renderer import PAINT, _places
 from trilane.training.surface import BodyArrays, body_arrays, vertex_normals
 
 #: Points of each material, and the rows and columns of their picture.

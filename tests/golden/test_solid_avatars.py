@@ -19,8 +19,7 @@ pytest.importorskip("skimage")
 from trilane.arrays import U8
 from trilane.avatars.bundle import BUILT_IN, Bundle, load_bundle
 from trilane.avatars.manifest import Validation
-from trilane.training import validate
-from trilane.training.clothing import layers
+from trilane.training import clothing, validate
 from trilane.training.sample_renderer import SampleRenderer
 from trilane.training.validate import Evaluated, ValidationPlan, integer_painter, open_renderer
 
@@ -48,7 +47,7 @@ Change = Callable[[U8], U8]
 def opened(gl: Any) -> dict[str, tuple[Bundle, SampleRenderer]]:  # noqa: ARG001 - skips where no context can be made
     """Each avatar with its renderer, whose obscurance is coarse: a third of the time, and a few bytes of shade."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(layers, "EMITTERS", 600)
+        patch.setattr(clothing, "EMITTERS", 600)
         bundles = [load_bundle(name) for name in BUILT_IN]
         return {bundle.manifest.name: (bundle, open_renderer(bundle, 1)) for bundle in bundles}
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from trilane.training import dataset, sample_renderer
-from trilane.training.clothing.looks import HIKER
+from trilane.training.clothing import HIKER
 from trilane.training.random_views import Crop
 from trilane.training.sample_files import open_groups
 from trilane.training.sample_renderer import Sample, SampleRenderer

@@ -13,7 +13,7 @@ pytest.importorskip("skimage")
 
 from trilane.scene.motion.builtin import BUILTIN  # noqa: E402
 from trilane.training import objective, step_loop  # noqa: E402
-from trilane.training.clothing.layers import Layer  # noqa: E402
+from trilane.training.clothing import Layer  # noqa: E402
 from trilane.training.network import (  # noqa: E402
     ENCODERS,
     NORMS,

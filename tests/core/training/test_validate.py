@@ -22,7 +22,7 @@ from trilane.avatars.manifest import digests_of
 from trilane.body.body import load_body
 from trilane.training import validate
 from trilane.training.backgrounds import scenes
-from trilane.training.clothing.looks import LOOKS
+from trilane.training.clothing import LOOKS
 from trilane.training.image_error import (
     ImageError,
     image_error,

@@ -18,7 +18,7 @@ from trilane.apps.avatar.assembled_avatar import Parts, assemble
 from trilane.avatars.bundle import OFFSETS, bundle_folder, load_bundle, save_offsets
 from trilane.avatars.manifest import CAPTURED, UNTRAINED, Validation, digests_of, with_figures_digest
 from trilane.errors import BadInputError
-from trilane.training.clothing.looks import LOOKS, look_of
+from trilane.training.clothing import LOOKS, look_of
 from trilane.training.quantising.quantise import quantise
 
 Command = Callable[..., tuple[str, str]]

@@ -27,7 +27,7 @@ from trilane.training.capture.synthetic import (
     turned_at_random,
     write_capture,
 )
-from trilane.training.clothing.looks import LOOKS
+from trilane.training.clothing import LOOKS
 from trilane.training.random_views import look_at, perspective
 
 NOISY = Recipe(6, (64, 96), seed=3, fit_deg=1.0, fit_mm=5.0, mask_px=2.0)

@@ -18,8 +18,18 @@ from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError
 from trilane.shapes import shape_buckets
 from trilane.training import subject
-from trilane.training.clothing.layers import GARMENTS, clothing_layers, shoe
-from trilane.training.clothing.looks import ANKLES, DEFAULT, HIKER, LOOKS, find_landmarks, look_named, look_of
+from trilane.training.clothing import (
+    ANKLES,
+    DEFAULT,
+    GARMENTS,
+    HIKER,
+    LOOKS,
+    clothing_layers,
+    find_landmarks,
+    look_named,
+    look_of,
+    shoe,
+)
 from trilane.training.random_poses import ATTITUDES, random_pose
 from trilane.training.random_views import BANDS, Cropper, look_at, perspective, random_view
 from trilane.training.surface import (
