@@ -7,22 +7,28 @@ Rule: validation poses come from motions that no training sample uses; a sample 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from itertools import islice
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
+from numpy.lib.format import open_memmap
+from numpy.typing import NDArray
 
 from trilane.arrays import F32, F64, U8
 from trilane.body.body import load_body
+from trilane.errors import BadInputError
 from trilane.scene.motion.motion import Motion
-from trilane.shapes import Shape
+from trilane.shapes import Shape, parse_shape
 from trilane.training.clothing import look_named
 from trilane.training.random_views import Crop
-from trilane.training.sample_files import U16, create_group, open_groups
 from trilane.training.sample_renderer import BAND_NAMES, PoseSource, Sample, SampleRenderer
+from trilane.training.training_settings import TrainingSettings
 
 One = TypeVar("One")
 #: Share of each band among the training samples; `anywhere` is last.
@@ -162,3 +168,186 @@ def _render_part(folder: Path, part: list[tuple[Shape, int, Planned]]) -> None:
         group.uv[place] = np.round(np.clip(uv[..., :2], 0, 1) * U16)
         group.covered[place] = uv[..., 2] > 0
         group.rgba[place] = rgba
+
+
+# Rendered samples on disk, and which of them a training reads in each of its steps.
+#
+# Rule: arrays hold the rendered pixels without resampling; each shape has one folder of memory-mapped arrays.
+
+U16 = 65535
+#: Trailing shape and type of each array. `uv`: u and v in 1/65535. `covered`: 1 on the body. `rgba`: ground truth.
+FIELDS: dict[str, tuple[tuple[int, ...], type]] = {
+    "uv": ((2,), np.uint16),
+    "covered": ((), np.uint8),
+    "rgba": ((4,), np.uint8),
+}
+
+
+@dataclass(frozen=True)
+class ShapeGroup:
+    """Samples of one tensor shape, in arrays (N, H, W, ...) as in `FIELDS`.
+
+    `band` (N,): index of each sample's band.
+    """
+
+    shape: Shape
+    uv: NDArray[np.uint16]
+    covered: NDArray[np.uint8]
+    rgba: NDArray[np.uint8]
+    band: NDArray[np.int8]
+
+    def __len__(self) -> int:
+        return len(self.band)
+
+
+def create_group(folder: Path, shape: Shape, bands: NDArray[np.int8]) -> ShapeGroup:
+    """Create arrays on disk under `folder` for the caller to fill, one sample for each of `bands`."""
+    place = folder / f"{shape[0]}x{shape[1]}"
+    place.mkdir(parents=True, exist_ok=True)
+    np.save(place / "band.npy", bands)
+    arrays: dict[str, Any] = {
+        name: open_memmap(place / f"{name}.npy", "w+", dtype, (len(bands), *shape, *tail))
+        for name, (tail, dtype) in FIELDS.items()
+    }
+    return ShapeGroup(shape, band=bands, **arrays)
+
+
+def open_groups(folder: Path, writable: bool = False) -> list[ShapeGroup]:
+    """Open all groups of the data set in `folder`, in order of their shapes."""
+    mode: Any = "r+" if writable else "r"
+    groups = []
+    for place in sorted(folder.iterdir(), key=lambda path: parse_shape(path.name)):
+        arrays: dict[str, Any] = {name: np.load(place / f"{name}.npy", mmap_mode=mode) for name in FIELDS}
+        groups.append(ShapeGroup(parse_shape(place.name), band=np.load(place / "band.npy"), **arrays))
+    return groups
+
+
+def batches(
+    groups: list[ShapeGroup],
+    size: int,
+    rng: np.random.Generator,
+    repeats: Sequence[int] = (1,) * 5,
+    labels: Sequence[NDArray[np.int64]] | None = None,
+) -> Iterator[tuple[ShapeGroup, NDArray[np.int64]]]:
+    """Yield batches without end, each of one tensor shape: a group and the indices of its samples in the batch.
+
+    `groups`: samples.
+    `size`: approximate number of samples in a batch.
+    `rng`: shuffles the samples of each epoch.
+    `repeats`: number of times that an epoch has a sample, by the sample's band.
+    `labels`: label of each sample, (N,) for each group. A batch has one label; samples with a label below 0 are left
+    out.
+    """
+    kinds = labels if labels is not None else [np.zeros(len(group), np.int64) for group in groups]
+    while True:
+        epoch: list[tuple[ShapeGroup, NDArray[np.int64]]] = []
+        for group, kind in zip(groups, kinds, strict=True):
+            for label in np.unique(kind[kind >= 0]):
+                alike = np.flatnonzero(kind == label)
+                order = rng.permutation(np.repeat(alike, np.asarray(repeats)[group.band[alike]]))
+                parts = np.array_split(order, max(1, len(order) // size))
+                epoch += [(group, np.sort(part)) for part in parts if len(part)]
+        for index in rng.permutation(len(epoch)):
+            yield epoch[index]
+
+
+# Which samples a training reads in each of its steps.
+#
+# Rule: this follows from the settings, the samples and the number of the step alone, so a resumed training goes on with
+# the batches that it would have read.
+#
+# A training has up to three phases: half-size samples alone, all samples, and samples of whole bodies alone.
+
+#: Tensors with fewer pixels are half-size ones. Training begins with them alone because they are cheap.
+SMALL_PIXELS = 160 * 160
+#: Bands whose samples show the whole body. The tensor is cut to the body, so the body has the same size in both bands.
+WHOLE_BANDS = [BAND_NAMES.index(name) for name in ("far", "full_body")]
+#: Number of zooms in one octave that batches of one zoom tell apart; distance of the rows that a zoom is measured on.
+ZOOMS_PER_OCTAVE, ROW_STEP = 2, 8
+LEFT_OUT = -1
+
+Batch = tuple[ShapeGroup, NDArray[np.int64]]
+
+
+@dataclass(frozen=True)
+class Phase:
+    """The steps from `first` to before `end`.
+
+    `labels`: labels of all groups, as `batches` takes them.
+    """
+
+    first: int
+    end: int
+    labels: list[NDArray[np.int64]]
+
+
+def batch_stream(groups: list[ShapeGroup], settings: TrainingSettings, count: int, step: int = 0) -> Iterator[Batch]:
+    """Yield the batches of a training of `count` steps, from step `step` on; a step takes `batches_per_step` of them.
+
+    Raises BadInputError when no sample is left for some steps.
+    """
+    per_step = settings.optimiser.batches_per_step
+    for number, phase in enumerate(phases(groups, settings, count)):
+        rng = np.random.default_rng((settings.seed, 2, number))
+        stream = batches(groups, settings.batch, rng, settings.batches.repeats, phase.labels)
+        done = min(max(step - phase.first, 0), phase.end - phase.first)
+        yield from islice(stream, done * per_step, (phase.end - phase.first) * per_step)
+
+
+def phases(groups: list[ShapeGroup], settings: TrainingSettings, count: int) -> list[Phase]:
+    """Return the phases of a training of `count` steps; some may have no step. Raises BadInputError."""
+    labels = _labels(groups, settings)
+    small = [math.prod(group.shape) < SMALL_PIXELS for group in groups]
+    whole_from = math.ceil(settings.batches.full_body_from * count)
+    switch = min(math.ceil(settings.small_until * count), whole_from)
+    of_small = [label if each or not any(small) else _none(label) for label, each in zip(labels, small, strict=True)]
+    of_whole = [np.where(_whole(group), label, LEFT_OUT) for group, label in zip(groups, labels, strict=True)]
+    found = [Phase(0, switch, of_small), Phase(switch, whole_from, labels), Phase(whole_from, count, of_whole)]
+    for phase in found:
+        if phase.first < phase.end and not any((label >= 0).any() for label in phase.labels):
+            shown = "shows a whole body" if phase is found[2] else "is used"
+            raise BadInputError("samples", f"none that {shown}", "some for every step", "draw more samples")
+    return found
+
+
+def is_whole(batch: Batch) -> bool:
+    """Return whether all samples of `batch` show the whole body."""
+    group, index = batch
+    return bool(np.isin(group.band[index], WHOLE_BANDS).all())
+
+
+def zoom(group: ShapeGroup) -> NDArray[np.float64]:
+    """Return the zoom (N,) of each sample: tensor pixels that span one side of the UV image.
+
+    It is the median over pairs of neighbouring pixels.
+    """
+    rows = group.uv[:, ::ROW_STEP].astype(np.int64)
+    shown = group.covered[:, ::ROW_STEP] > 0
+    steps = np.sqrt(np.square(np.diff(rows, axis=2)).sum(axis=-1)) / U16
+    pairs = (shown[:, :, 1:] & shown[:, :, :-1]) & (steps > 0)
+    return np.array([1 / np.median(step[pair]) if pair.any() else 1.0 for step, pair in zip(steps, pairs, strict=True)])
+
+
+def _labels(groups: list[ShapeGroup], settings: TrainingSettings) -> list[NDArray[np.int64]]:
+    """Return the labels (N,) of each group: samples of a batch share one, and a label below 0 leaves a sample out."""
+    options = settings.batches
+    rng = np.random.default_rng((settings.seed, 3))
+    found = []
+    for group in groups:
+        label = np.zeros(len(group), np.int64)
+        if options.same_zoom:
+            label += 2 * np.maximum(0, np.round(ZOOMS_PER_OCTAVE * np.log2(zoom(group)))).astype(np.int64)
+        if options.full_body_statistics:
+            label += _whole(group)
+        left_out = rng.permutation(len(group))[math.ceil(options.sample_share * len(group)) :]
+        label[left_out] = LEFT_OUT
+        found.append(label)
+    return found
+
+
+def _whole(group: ShapeGroup) -> NDArray[np.bool_]:
+    return np.isin(group.band, WHOLE_BANDS)
+
+
+def _none(label: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.full_like(label, LEFT_OUT)

@@ -14,7 +14,7 @@ from scipy.sparse.linalg import eigsh, splu
 from scipy.spatial import cKDTree
 
 from trilane.arrays import F32, F64, Ints, Mask
-from trilane.training.sample_files import U16, ShapeGroup
+from trilane.training.dataset import U16, ShapeGroup
 from trilane.training.surface import BodyArrays
 
 COLOURS = 3

@@ -22,17 +22,15 @@ from trilane.avatars.bundle import Bundle, pack_levels, write_bundle
 from trilane.avatars.manifest import Manifest, network_entry
 from trilane.avatars.network_file import reshaped
 from trilane.body.body import ShapedBody
-from trilane.training.byte_grid import ByteGrid
-from trilane.training.dataset import SIZES, TRAINING_SHARE, VALIDATION_SIZE, motion_poses
+from trilane.training.dataset import SIZES, TRAINING_SHARE, U16, VALIDATION_SIZE, ShapeGroup, motion_poses
 from trilane.training.first_texture import fill_along_surface, grown, used_texels
 from trilane.training.network import UNet, export_onnx
 from trilane.training.quantising.quantise import ByteRanges, Quantised, byte_ranges, quantise
-from trilane.training.random_poses import random_pose
-from trilane.training.sample_files import U16, ShapeGroup
+from trilane.training.random_views import random_pose
 from trilane.training.sample_renderer import BAND_NAMES, Sample, SampleRenderer
 from trilane.training.subject import Person
 from trilane.training.surface import BodyArrays, body_arrays
-from trilane.training.trainable_avatar import TrainableAvatar, levels_of, load_network, read_levels
+from trilane.training.trainable_avatar import ByteGrid, TrainableAvatar, levels_of, load_network, read_levels
 from trilane.training.validate import BUILTIN_HELD_OUT, held_out_motions
 from trilane.writing import write_atomically, write_bytes
 

@@ -28,7 +28,7 @@ from trilane.body.mesh_levels import MeshLevel, grouped
 from trilane.body.skinning import CpuSkinner, blend_reach, branch_sums
 from trilane.errors import MissingPartError
 from trilane.stages.gpu.skinned_mesh import split_corners
-from trilane.training.random_poses import random_pose
+from trilane.training.random_views import random_pose
 
 #: Most that a level may move a point of the surface at rest and in `POSES` random poses, metres.
 TOLERANCES_M = (0.002, 0.005, 0.015, 0.04)

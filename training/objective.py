@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from trilane.errors import BadInputError, MissingPartError, package_line, reason
-from trilane.training.backgrounds import backgrounds
+from trilane.training.image_error import backgrounds
 
 PERCEPTUAL = "perceptual"
 #: Key of the discriminators' own error, in bits; it is reported with the terms but is not one of them.

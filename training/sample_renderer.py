@@ -25,8 +25,7 @@ from trilane.stages.gpu.packed_pass import Placement
 from trilane.stages.gpu.skinned_mesh import BodyPose, MeshDraw, SkinnedMesh, enough_weights, mesh_arrays
 from trilane.training import clothing as joint
 from trilane.training.clothing import DEFAULT, MATERIALS, Landmarks, Layer, Look, clothing_layers, find_landmarks
-from trilane.training.random_poses import random_pose
-from trilane.training.random_views import BANDS, ClothedSurface, Crop, Cropper, View, random_view
+from trilane.training.random_views import BANDS, ClothedSurface, Crop, Cropper, View, random_pose, random_view
 from trilane.training.surface import body_arrays
 
 BAND_NAMES = tuple(BANDS)

@@ -23,12 +23,11 @@ from torch import Tensor, nn
 
 from trilane.errors import BadInputError, MissingPartError, package_line, reason
 from trilane.files import DAMAGED
-from trilane.training.byte_grid import ByteGrid
+from trilane.training.dataset import Batch, ShapeGroup, batch_stream, is_whole
 from trilane.training.make_bundle import round_to_bytes
 from trilane.training.network import add_activation_noise, add_dropout
 from trilane.training.objective import Adversary, Objective, Vgg16
-from trilane.training.sample_files import Batch, ShapeGroup, batch_stream, is_whole
-from trilane.training.trainable_avatar import TrainableAvatar, load_batch
+from trilane.training.trainable_avatar import ByteGrid, TrainableAvatar, load_batch
 from trilane.training.training_settings import OptimiserOptions, TrainingSettings
 from trilane.writing import write_atomically
 

@@ -24,14 +24,20 @@ from trilane.avatars.manifest import sha256_of
 from trilane.errors import BadInputError
 from trilane.files import read_text
 from trilane.training.capture.capture_samples import CaptureRenderer
-from trilane.training.dataset import VALIDATION_SIZE, Planned, plan_training, write_dataset
+from trilane.training.dataset import (
+    FIELDS,
+    VALIDATION_SIZE,
+    Planned,
+    ShapeGroup,
+    open_groups,
+    plan_training,
+    write_dataset,
+)
 from trilane.training.first_texture import first_texture
 from trilane.training.image_error import MEANS, ImageError, image_error
 from trilane.training.make_bundle import keep_rounded_weights, quantise_avatar, write_avatar, write_float_network
 from trilane.training.network import UNet
 from trilane.training.objective import Vgg16, read_vgg16
-from trilane.training.sample_files import FIELDS, ShapeGroup, open_groups
-from trilane.training.stand_off import subject_with_offsets
 from trilane.training.step_loop import (
     TrainingState,
     chosen_device,
@@ -44,7 +50,7 @@ from trilane.training.step_loop import (
     step_seconds,
     steps,
 )
-from trilane.training.subject import Subject, captured_subject, clothed_subject
+from trilane.training.subject import Subject, captured_subject, clothed_subject, subject_with_offsets
 from trilane.training.surface import body_arrays
 from trilane.training.trainable_avatar import (
     SIDES,

@@ -36,10 +36,9 @@ from trilane.stages.dsp.runtime import RuntimeOptions, Session, load_runtime
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement, Quantisation
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 from trilane.stages.machine_facts import package_version
-from trilane.training.backgrounds import SIDE, scenes
 from trilane.training.clothing import look_of
 from trilane.training.dataset import VALIDATION_SIZE, plan_validation
-from trilane.training.image_error import ImageError, SampleError, image_error, over, summary
+from trilane.training.image_error import SIDE, ImageError, SampleError, image_error, over, scenes, summary
 from trilane.training.sample_renderer import BAND_NAMES, Sample, SampleRenderer
 
 # Evaluates an avatar on held-out samples: compares every painter's picture of a sample with the ground truth.

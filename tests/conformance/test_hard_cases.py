@@ -21,7 +21,7 @@ from trilane.apps.experiments.hard_cases import (  # noqa: E402  # noqa: E402
     make_case,
     make_pair,
 )
-from trilane.training.quantising import power_of_two_scales  # noqa: E402
+from trilane.training.quantising import calibration  # noqa: E402
 from trilane.training.quantising import quantise as quantise_module  # noqa: E402
 
 torch.set_num_threads(1)
@@ -77,7 +77,7 @@ def test_ranges_four_times_as_wide_fail(monkeypatch):
 
 
 def test_weights_of_a_quarter_of_the_steps_fail(monkeypatch):
-    monkeypatch.setattr(power_of_two_scales, "WEIGHT_TOP", {True: 16, False: 16})
+    monkeypatch.setattr(calibration, "WEIGHT_TOP", {True: 16, False: 16})
     assert_rows_fail_that_hold_when_sound("batch")
 
 

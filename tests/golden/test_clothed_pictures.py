@@ -11,8 +11,7 @@ from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import load_body
 from trilane.training import clothing
 from trilane.training.clothing import HIKER
-from trilane.training.random_poses import random_pose
-from trilane.training.random_views import BANDS
+from trilane.training.random_views import BANDS, random_pose
 from trilane.training.sample_renderer import SampleRenderer
 
 

@@ -13,7 +13,7 @@ from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Quantisatio
 
 torch = pytest.importorskip("torch")
 
-from trilane.training.random_poses import random_pose  # noqa: E402
+from trilane.training.random_views import random_pose  # noqa: E402
 from trilane.training.trainable_avatar import read_levels  # noqa: E402
 
 QUANTISATION = Quantisation(1 / 127, 128)

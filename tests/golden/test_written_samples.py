@@ -10,8 +10,7 @@ import pytest
 pytest.importorskip("torch")
 
 from trilane.avatars.bundle import bundle_folder
-from trilane.training.dataset import clothed_source, plan_training, write_dataset
-from trilane.training.sample_files import U16, open_groups
+from trilane.training.dataset import U16, clothed_source, open_groups, plan_training, write_dataset
 
 BODY = bundle_folder("default") / "body.npz"
 

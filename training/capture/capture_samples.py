@@ -26,8 +26,7 @@ from trilane.shapes import Shape, shape_buckets
 from trilane.stages.gpu.opengl import open_context
 from trilane.stages.gpu.packed_pass import Placement
 from trilane.stages.gpu.skinned_mesh import BodyPose, SkinnedMesh, avatar_mesh
-from trilane.training.capture.capture import Capture
-from trilane.training.capture.fits import Fit
+from trilane.training.capture.capture import Capture, Fit
 from trilane.training.random_views import ANYWHERE, BANDS, OUTPUT_ROWS, SCREENS, Crop, Cropper, View
 from trilane.training.sample_renderer import ANYWHERE_BAND, BAND_NAMES, LEAST_PIXELS, UvRaster
 from trilane.training.surface import vertex_areas

@@ -25,8 +25,7 @@ from trilane.scene.rotations import rotvec_from_matrix
 from trilane.shapes import Shape
 from trilane.training.capture.capture_file import FAR_M, NAME, NEAR_M, OPENGL_FROM_OPENCV
 from trilane.training.clothing import DEFAULT_NAME, look_named
-from trilane.training.random_poses import random_pose
-from trilane.training.random_views import look_at
+from trilane.training.random_views import look_at, random_pose
 from trilane.training.sample_renderer import SampleRenderer
 
 TRUTH = "truth"

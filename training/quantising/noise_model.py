@@ -25,8 +25,7 @@ from onnx import TensorProto, helper, numpy_helper
 from trilane.arrays import F32, U8
 from trilane.avatars.network_file import LAYERS, NetworkFile
 from trilane.errors import BadInputError
-from trilane.training.quantising.calibration import MOVES
-from trilane.training.quantising.power_of_two_scales import SHARING
+from trilane.training.quantising.calibration import MOVES, SHARING
 from trilane.training.quantising.quantise import Quantised
 
 DRAWS = 16

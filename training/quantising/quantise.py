@@ -30,12 +30,17 @@ from onnxruntime.quantization.shape_inference import quant_pre_process
 from trilane.arrays import F32
 from trilane.avatars.network_file import FLOAT_LAYERS_KEY, NetworkFile, check_network, constants_of
 from trilane.errors import BadInputError
-from trilane.training.quantising.calibration import limit_logits, measure, norm_inputs, saturated, share_ranges, widen
-from trilane.training.quantising.power_of_two_scales import (
+from trilane.training.quantising.calibration import (
     CannotRoundAlikeError,
+    limit_logits,
     may_round_alike,
+    measure,
+    norm_inputs,
     power_of_two_ranges,
     power_of_two_weights,
+    saturated,
+    share_ranges,
+    widen,
 )
 
 MIN_FRAMES, MAX_FRAMES = 1, 1000

@@ -14,11 +14,10 @@ pytest.importorskip("scipy")
 pytest.importorskip("skimage")
 
 from trilane.training import make_bundle  # noqa: E402
-from trilane.training.byte_grid import ByteGrid, rounded_weights  # noqa: E402
 from trilane.training.network import UNet, export_onnx  # noqa: E402
-from trilane.training.quantising.power_of_two_scales import _round_weights  # noqa: E402
+from trilane.training.quantising.calibration import _round_weights  # noqa: E402
 from trilane.training.quantising.quantise import ByteRanges, byte_ranges, quantise  # noqa: E402
-from trilane.training.trainable_avatar import NeuralTexture, TrainableAvatar  # noqa: E402
+from trilane.training.trainable_avatar import ByteGrid, NeuralTexture, TrainableAvatar, rounded_weights  # noqa: E402
 
 SHAPE, CHANNELS = (64, 32), 5
 

@@ -30,8 +30,7 @@ from trilane.training.clothing import (
     look_of,
     shoe,
 )
-from trilane.training.random_poses import ATTITUDES, random_pose
-from trilane.training.random_views import BANDS, Cropper, look_at, perspective, random_view
+from trilane.training.random_views import ATTITUDES, BANDS, Cropper, look_at, perspective, random_pose, random_view
 from trilane.training.surface import (
     BodyArrays,
     Smoother,

@@ -12,8 +12,8 @@ import pytest
 
 from trilane.training import dataset, sample_renderer
 from trilane.training.clothing import HIKER
+from trilane.training.dataset import open_groups
 from trilane.training.random_views import Crop
-from trilane.training.sample_files import open_groups
 from trilane.training.sample_renderer import Sample, SampleRenderer
 
 SHAPES = ((32, 64), (64, 32))

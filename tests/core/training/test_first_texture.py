@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("scipy")
 
 from trilane.training import first_texture as module
+from trilane.training.dataset import U16, ShapeGroup
 from trilane.training.first_texture import (
     eigenfunctions,
     fill_along_surface,
@@ -20,7 +21,6 @@ from trilane.training.first_texture import (
     lay_out,
     mean_colours,
 )
-from trilane.training.sample_files import U16, ShapeGroup
 from trilane.training.surface import BodyArrays
 
 ROUND, RINGS, SIDE = 24, 13, 96

@@ -11,8 +11,18 @@ import pytest
 pytest.importorskip("skimage")
 
 from trilane.arrays import U8
-from trilane.training.backgrounds import KINDS, SIDE, backgrounds, scenes
-from trilane.training.image_error import EDGE_PX, ImageError, SampleError, image_error, regions, summary
+from trilane.training.image_error import (
+    EDGE_PX,
+    KINDS,
+    SIDE,
+    ImageError,
+    SampleError,
+    backgrounds,
+    image_error,
+    regions,
+    scenes,
+    summary,
+)
 
 SIZE, START, SIDE_PX = 96, 16, 64
 #: The person's colour, in bytes and as a share.

@@ -15,9 +15,9 @@ pytest.importorskip("skimage")
 
 from trilane.avatars.bundle import load_bundle  # noqa: E402
 from trilane.training import make_bundle, trainable_avatar  # noqa: E402
+from trilane.training.dataset import U16, create_group  # noqa: E402
 from trilane.training.network import UNet  # noqa: E402
 from trilane.training.quantising.quantise import Quantised  # noqa: E402
-from trilane.training.sample_files import U16, create_group  # noqa: E402
 from trilane.training.subject import Person  # noqa: E402
 from trilane.training.surface import BodyArrays  # noqa: E402
 from trilane.training.trainable_avatar import NeuralTexture, TrainableAvatar, save_network  # noqa: E402

@@ -14,10 +14,10 @@ pytest.importorskip("scipy")
 pytest.importorskip("skimage")
 
 from trilane.errors import BadInputError  # noqa: E402
-from trilane.training import sample_files, step_loop  # noqa: E402
+from trilane.training import dataset, step_loop  # noqa: E402
+from trilane.training.dataset import U16, ShapeGroup, batches, create_group, open_groups  # noqa: E402
 from trilane.training.network import UNet, add_activation_noise  # noqa: E402
 from trilane.training.objective import drawn_behind, loss_terms, total_loss  # noqa: E402
-from trilane.training.sample_files import U16, ShapeGroup, batches, create_group, open_groups  # noqa: E402
 from trilane.training.step_loop import (  # noqa: E402
     MaskedAdamW,
     TrainingState,
@@ -71,7 +71,7 @@ def one_thread() -> Any:
 @pytest.fixture
 def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[ShapeGroup]:
     """Five samples of a small shape and four of a large one."""
-    monkeypatch.setattr(sample_files, "SMALL_PIXELS", math.prod(LARGE))
+    monkeypatch.setattr(dataset, "SMALL_PIXELS", math.prod(LARGE))
     rng = np.random.default_rng(0)
     for shape, count in ((SMALL, 5), (LARGE, 4)):
         group = create_group(tmp_path / "data", shape, (np.arange(count) % 2).astype(np.int8))

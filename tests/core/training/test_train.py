@@ -18,7 +18,7 @@ pytest.importorskip("skimage")
 from trilane.avatars.bundle import load_bundle  # noqa: E402
 from trilane.errors import BadInputError  # noqa: E402
 from trilane.training import train as command  # noqa: E402
-from trilane.training.sample_files import create_group  # noqa: E402
+from trilane.training.dataset import create_group  # noqa: E402
 from trilane.training.subject import Person, Subject  # noqa: E402
 from trilane.training.train import Places, train_avatar  # noqa: E402
 from trilane.training.trainable_avatar import NeuralTexture  # noqa: E402

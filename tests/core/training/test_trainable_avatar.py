@@ -19,7 +19,7 @@ from trilane.avatars.bundle import (  # noqa: E402
 )
 from trilane.avatars.network_file import reshaped  # noqa: E402
 from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime  # noqa: E402
-from trilane.training.sample_files import U16, ShapeGroup, create_group  # noqa: E402
+from trilane.training.dataset import U16, ShapeGroup, create_group  # noqa: E402
 from trilane.training.trainable_avatar import (  # noqa: E402
     NeuralTexture,
     level_of_detail,

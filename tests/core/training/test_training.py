@@ -14,6 +14,7 @@ pytest.importorskip("skimage")
 from trilane.scene.motion.builtin import BUILTIN  # noqa: E402
 from trilane.training import objective, step_loop  # noqa: E402
 from trilane.training.clothing import Layer  # noqa: E402
+from trilane.training.dataset import U16, ShapeGroup, batches, create_group, open_groups  # noqa: E402
 from trilane.training.network import (  # noqa: E402
     ENCODERS,
     NORMS,
@@ -21,9 +22,14 @@ from trilane.training.network import (  # noqa: E402
     add_activation_noise,
     export_onnx,
 )
-from trilane.training.random_poses import random_pose  # noqa: E402
-from trilane.training.random_views import ClothedSurface, View, look_at, perspective, vertex_reach  # noqa: E402
-from trilane.training.sample_files import U16, ShapeGroup, batches, create_group, open_groups  # noqa: E402
+from trilane.training.random_views import (  # noqa: E402
+    ClothedSurface,
+    View,
+    look_at,
+    perspective,
+    random_pose,
+    vertex_reach,
+)
 from trilane.training.trainable_avatar import (  # noqa: E402
     NeuralTexture,
     TrainableAvatar,

@@ -15,14 +15,8 @@ pytest.importorskip("scipy")
 pytest.importorskip("skimage")
 
 from trilane.errors import BadInputError  # noqa: E402
-from trilane.training import objective, sample_files, step_loop  # noqa: E402
-from trilane.training.network import (  # noqa: E402
-    NORMS,
-    UNet,
-    add_dropout,
-)
-from trilane.training.objective import Objective  # noqa: E402
-from trilane.training.sample_files import (  # noqa: E402
+from trilane.training import dataset, objective, step_loop  # noqa: E402
+from trilane.training.dataset import (  # noqa: E402
     U16,
     ShapeGroup,
     batch_stream,
@@ -32,6 +26,12 @@ from trilane.training.sample_files import (  # noqa: E402
     phases,
     zoom,
 )
+from trilane.training.network import (  # noqa: E402
+    NORMS,
+    UNet,
+    add_dropout,
+)
+from trilane.training.objective import Objective  # noqa: E402
 from trilane.training.step_loop import (  # noqa: E402
     TrainingState,
     add_gradients,
@@ -330,7 +330,7 @@ def test_only_whole_bodies_are_read_at_last(groups: list[ShapeGroup]) -> None:
 
 
 def test_small_samples_end_where_whole_bodies_begin(groups: list[ShapeGroup], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sample_files, "SMALL_PIXELS", 64 * 64)
+    monkeypatch.setattr(dataset, "SMALL_PIXELS", 64 * 64)
     asked = settings(small_until=0.8, batches={"full_body_from": 0.5})
     found = list(batch_stream(groups, asked, 10))
     assert len(found) == 10 and all(group.shape == (64, 32) for group, _ in found[:5])

@@ -14,13 +14,13 @@ torch = pytest.importorskip("torch")
 
 from trilane.apps.cli.avatar_train import EventLog  # noqa: E402
 from trilane.errors import MissingPartError  # noqa: E402
+from trilane.training.dataset import U16, ShapeGroup, create_group  # noqa: E402
 from trilane.training.objective import (  # noqa: E402
     Objective,
     drawn_behind,
     loss_terms,
     total_loss,
 )
-from trilane.training.sample_files import U16, ShapeGroup, create_group  # noqa: E402
 from trilane.training.step_loop import (  # noqa: E402
     chosen_device,
     probe_loss,

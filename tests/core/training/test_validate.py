@@ -21,11 +21,11 @@ from trilane.avatars.bundle import Bundle, load_bundle
 from trilane.avatars.manifest import digests_of
 from trilane.body.body import load_body
 from trilane.training import validate
-from trilane.training.backgrounds import scenes
 from trilane.training.clothing import LOOKS
 from trilane.training.image_error import (
     ImageError,
     image_error,
+    scenes,
 )
 from trilane.training.sample_renderer import SampleRenderer
 from trilane.training.validate import Evaluated, FloatNetwork, ValidationPlan, worst_sheet

@@ -17,7 +17,7 @@ from support.small_inputs import CAMERA, HEIGHT, WIDTH, fit, write_capture_folde
 from trilane.body.body import ShapedBody
 from trilane.errors import BadInputError
 from trilane.training.capture import check
-from trilane.training.capture.capture import frames_by_side, open_capture, widest_gap_deg
+from trilane.training.capture.capture import frames_by_side, open_capture, read_fit, widest_gap_deg
 from trilane.training.capture.capture_file import (
     OPENGL_FROM_OPENCV,
     Fault,
@@ -25,7 +25,6 @@ from trilane.training.capture.capture_file import (
     fault_lines,
     read_capture_file,
 )
-from trilane.training.capture.fits import read_fit
 
 Command = Callable[..., tuple[str, str]]
 

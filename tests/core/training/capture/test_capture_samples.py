@@ -19,7 +19,7 @@ from trilane.body.joints import JOINT_INDEX
 from trilane.body.kinematics import Skeleton
 from trilane.scene.lens import Lens
 from trilane.training import subject
-from trilane.training.capture.capture import Capture, open_capture
+from trilane.training.capture.capture import Capture, Fit, open_capture
 from trilane.training.capture.capture_samples import (
     Augmentation,
     BodyRaster,
@@ -39,7 +39,6 @@ from trilane.training.capture.capture_samples import (
     zoomed_view,
 )
 from trilane.training.capture.check import checked_frame, coverage_of
-from trilane.training.capture.fits import Fit
 from trilane.training.random_views import BANDS
 from trilane.training.sample_renderer import ANYWHERE_BAND
 from trilane.training.subject import captured_subject

@@ -15,6 +15,7 @@ from trilane.body.skinning import blend_matrices
 from trilane.errors import BadInputError
 from trilane.scene.lens import Lens
 from trilane.training.capture import check
+from trilane.training.capture.capture import Fit
 from trilane.training.capture.capture_samples import BodyRaster, projected
 from trilane.training.capture.check import (
     REGIONS,
@@ -27,7 +28,6 @@ from trilane.training.capture.check import (
     sheet,
     vertex_regions,
 )
-from trilane.training.capture.fits import Fit
 from trilane.training.surface import BodyArrays, body_arrays
 
 

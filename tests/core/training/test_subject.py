@@ -11,9 +11,9 @@ import pytest
 pytest.importorskip("scipy", reason="measuring outlines needs the train extra")
 
 from trilane.body.joints import JOINTS
-from trilane.training import stand_off as module
+from trilane.training import subject as module
 from trilane.training.random_views import look_at, perspective
-from trilane.training.stand_off import Outline, measured_heights, smoothed, stand_off
+from trilane.training.subject import Outline, measured_heights, smoothed, stand_off
 
 RADIUS, SHELL, DISTANCE = 0.5, 0.03, 12.0
 ROWS = 400

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from onnx import helper, numpy_helper
 
 from trilane.errors import BadInputError
-from trilane.training.quantising.power_of_two_scales import CannotRoundAlikeError, may_round_alike, power_of_two_weights
+from trilane.training.quantising.calibration import CannotRoundAlikeError, may_round_alike, power_of_two_weights
 from trilane.training.quantising.quantise import quantise
 
 FIRST, SECOND = "tensor", "made"
