@@ -98,7 +98,7 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 300, rounds
     return {"rows": rows, **verdicts, "absent": absent, "config": config}
 
 
-class Pair:
+class ChannelPair:
     """A producer and a consumer process that wait until they are asked."""
 
     def __init__(self, context: SpawnContext, channel: Channel, written: int) -> None:
@@ -198,7 +198,7 @@ def _answer(pipe: Connection) -> Any:
     return answer
 
 
-def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, int], Pair], dict[str, str]]:
+def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, int], ChannelPair], dict[str, str]]:
     """Return waiting processes for each variant and size, and why a variant is absent."""
     context = multiprocessing.get_context("spawn")
     pairs, absent = {}, {}
@@ -209,7 +209,7 @@ def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, in
             except ModuleNotFoundError as error:
                 absent[variant] = f"{error.name} is not installed: {install_line('peers')}"
                 break
-            pairs[variant, size] = Pair(context, channel, WRITTEN.get(variant, size * 1024))
+            pairs[variant, size] = ChannelPair(context, channel, WRITTEN.get(variant, size * 1024))
             stack.callback(pairs[variant, size].close)
     return pairs, absent
 

@@ -9,7 +9,7 @@ import io
 import math
 import warnings
 from collections.abc import Callable
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import numpy as np
 import onnx
@@ -32,7 +32,8 @@ from trilane.unet_tables import (
     squeeze_channels,
 )
 
-# The encoders in PyTorch: each turns (N, C, H, W) into features at strides 2, 4, 8, 16 and 32.
+# The encoders in PyTorch: each turns (N, C, H, W), sides multiples of 32, into features at strides 2, 4, 8, 16 and 32,
+# finest first. `channels` are those of the features.
 #
 # Rule: channel counts, kernels and strides come from `trilane.unet_tables`; this file only says what a row means.
 
@@ -42,18 +43,6 @@ Scale = Callable[[int], int]
 #: A strided 1x1 convolution of at least this many channels is trained unchanged: it fills a whole vector of floats.
 SAFE_CHANNELS = 16
 ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {"relu": nn.ReLU, "relu6": nn.ReLU6, "hardswish": nn.Hardswish}
-
-
-class Encoder(Protocol):
-    """Turns a picture into five features.
-
-    `channels`: channels of the features, from stride 2 to stride 32.
-    """
-
-    channels: tuple[int, ...]
-
-    def __call__(self, x: Tensor) -> list[Tensor]:
-        """Turn (N, C, H, W), sides multiples of 32, into five features, finest first."""
 
 
 class Shortcut(nn.Conv2d):

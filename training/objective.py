@@ -329,7 +329,7 @@ SLOPE = 0.2
 BETAS = (0.9, 0.999)
 
 
-class Judged(NamedTuple):
+class Judgement(NamedTuple):
     """The findings of a discriminator.
 
     `features`: features of each level, (N, C, H, W). `score` (N,): log odds that the picture is a true one.
@@ -351,12 +351,12 @@ class Discriminator(nn.Module):
         )
         self.score = nn.Conv2d(channels[-1], 1, 1)
 
-    def forward(self, x: Tensor) -> Judged:
+    def forward(self, x: Tensor) -> Judgement:
         features = []
         for level in self.levels:
             x = level(x)
             features.append(x)
-        return Judged(features, self.score(x).mean(dim=(1, 2, 3)))
+        return Judgement(features, self.score(x).mean(dim=(1, 2, 3)))
 
 
 class Adversary:
@@ -405,7 +405,7 @@ class Adversary:
         self.optimiser.step()
         return float(loss.detach())
 
-    def _judged(self, picture: Tensor, behind: Tensor) -> list[Judged]:
+    def _judged(self, picture: Tensor, behind: Tensor) -> list[Judgement]:
         seen = torch.cat((composite(picture, behind), picture[:, 3:]), dim=1)
         return [
             judge(functional.avg_pool2d(seen, shrunk, ceil_mode=True))

@@ -78,7 +78,7 @@ ANOTHER_WORK = "use another --work folder, or remove this one"
 
 
 @dataclass(frozen=True)
-class Places:
+class TrainingPlaces:
     """Folders and files of one training.
 
     `capture`: folder of the capture; None where the settings have a look. `out`: folder of the bundle. `work`: folder
@@ -106,7 +106,7 @@ class Listener(Protocol):
         """Take the `terms` of the loss at `step` of `total`, before weighting, and their weighted sum `loss`."""
 
 
-def train_avatar(places: Places, asked: TrainingSettings, listener: Listener) -> dict[str, Any]:
+def train_avatar(places: TrainingPlaces, asked: TrainingSettings, listener: Listener) -> dict[str, Any]:
     """Train as `asked`, write the bundle, and return facts about the training and about held-out frames.
 
     A training that was ended before goes on from its last state.
@@ -154,7 +154,7 @@ def train_avatar(places: Places, asked: TrainingSettings, listener: Listener) ->
     return facts | files | {"sheets": sheets, "seconds": round(time.monotonic() - started, 1)}
 
 
-def _subject(places: Places, settings: TrainingSettings, listener: Listener) -> Subject:
+def _subject(places: TrainingPlaces, settings: TrainingSettings, listener: Listener) -> Subject:
     """Return the person of the capture, or the default body in a look. Raises BadInputError for both or none."""
     if places.capture is None:
         if settings.look is None:
@@ -179,7 +179,7 @@ def with_vgg(asked: TrainingSettings, file: Path | None) -> TrainingSettings:
     return asked.model_copy(update={"vgg": digest})
 
 
-def _raised(subject: Subject, places: Places, settings: TrainingSettings, listener: Listener) -> Subject:
+def _raised(subject: Subject, places: TrainingPlaces, settings: TrainingSettings, listener: Listener) -> Subject:
     """Add the offsets of clothes and hair to `subject` where the settings ask for them."""
     if not settings.stand_off:
         return subject
@@ -207,7 +207,7 @@ def resumed_settings(path: Path, asked: TrainingSettings) -> TrainingSettings:
     return begun
 
 
-def _draw_samples(subject: Subject, places: Places, settings: TrainingSettings, listener: Listener) -> None:
+def _draw_samples(subject: Subject, places: TrainingPlaces, settings: TrainingSettings, listener: Listener) -> None:
     """Draw the samples into the work folder, unless they are there. Raises BadInputError where other samples are."""
     facts = places.work / SAMPLE_FACTS
     decides = ("samples", "seed", "stand_off")
@@ -245,7 +245,7 @@ def _sample_cost(subject: Subject, samples: list[Planned], settings: TrainingSet
     )
 
 
-def _first_avatar(subject: Subject, places: Places, settings: TrainingSettings) -> TrainableAvatar:
+def _first_avatar(subject: Subject, places: TrainingPlaces, settings: TrainingSettings) -> TrainableAvatar:
     """Return what training starts from; once a state is on the disk, only its shapes matter."""
     groups = open_groups(places.work / SAMPLES)
     network = UNet(norm=settings.norm, width=settings.width, channels=CHANNELS, input_skip=True)
@@ -264,7 +264,7 @@ def _first_avatar(subject: Subject, places: Places, settings: TrainingSettings) 
 
 
 def _with_steps(
-    avatar: TrainableAvatar, places: Places, settings: TrainingSettings, vgg: Vgg16 | None, listener: Listener
+    avatar: TrainableAvatar, places: TrainingPlaces, settings: TrainingSettings, vgg: Vgg16 | None, listener: Listener
 ) -> TrainingSettings:
     """Return `settings` with a number of steps, and say what they take; by default as many as fit into the minutes."""
     seconds = step_seconds(avatar, open_groups(places.work / SAMPLES), settings, vgg)
@@ -276,7 +276,7 @@ def _with_steps(
 
 
 def _train(
-    state: TrainingState, subject: Subject, places: Places, settings: TrainingSettings, listener: Listener
+    state: TrainingState, subject: Subject, places: TrainingPlaces, settings: TrainingSettings, listener: Listener
 ) -> None:
     """Do all steps that are left, with a sheet and a state on the disk now and then."""
     path, count = places.work / STATE, settings.steps or LEAST_STEPS
@@ -296,7 +296,7 @@ def _train(
     save_state(state, path)
 
 
-def _loss_before(state: TrainingState, places: Places, groups: list[ShapeGroup]) -> float:
+def _loss_before(state: TrainingState, places: TrainingPlaces, groups: list[ShapeGroup]) -> float:
     """Return the loss before the first step; a training that goes on reads it from the work folder."""
     path = places.work / LOSS_BEFORE
     if not (places.work / STATE).exists():
@@ -304,7 +304,7 @@ def _loss_before(state: TrainingState, places: Places, groups: list[ShapeGroup])
     return float(json.loads(read_text(path, "the loss before this training")))
 
 
-def _measure(places: Places, subject: Subject, settings: TrainingSettings) -> dict[str, Any]:
+def _measure(places: TrainingPlaces, subject: Subject, settings: TrainingSettings) -> dict[str, Any]:
     """Measure the bundle on frames that training never read, and write the error into it."""
     assert subject.frames is not None
     bundle = load_bundle(places.out)

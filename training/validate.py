@@ -50,7 +50,7 @@ from trilane.training.sample_renderer import BAND_NAMES, Sample, SampleRenderer
 Painter = Callable[[Any, NDArray[np.float32]], U8]
 
 
-class Drawn(Protocol):
+class PackedRenderer(Protocol):
     """A renderer whose samples the packed pass can draw."""
 
     ctx: Any
@@ -88,7 +88,7 @@ def evaluate(
             yield Evaluated(number, BAND_NAMES[sample.band], truth, pictures, known)
 
 
-def integer_painter(renderer: Drawn, bundle: Bundle, runtime: str, threads: int) -> Painter:
+def integer_painter(renderer: PackedRenderer, bundle: Bundle, runtime: str, threads: int) -> Painter:
     """Return a painter that runs the GPU unit's packed pass, then the integer network of `bundle` on `runtime`.
 
     `renderer`: the body and its OpenGL context.

@@ -111,12 +111,12 @@ def train(
     if asked.start != "new" and asked.width != DEFAULT_WIDTH:
         raise BadInputError("--width", str(asked.width), f"{DEFAULT_WIDTH} of a trained network", "or --start new")
     _require_torch()
-    from trilane.training.train import Places, train_avatar
+    from trilane.training.train import TrainingPlaces, train_avatar
 
     if tensorboard and not machine.here.has_package("tensorboard"):
         raise MissingPartError("a log for TensorBoard needs the package tensorboard", extra="tensorboard")
     work = out.parent / f"{out.name}-work" if work is None else work
-    places = Places(capture, out, work, out.name, vgg)
+    places = TrainingPlaces(capture, out, work, out.name, vgg)
     log = EventLog(work / LOG) if tensorboard else None
     with stdout_kept(), _shown(log) as listener:
         facts = train_avatar(places, asked, listener)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,7 +26,7 @@ from trilane.stages.gpu.opengl import open_context
 from trilane.stages.gpu.packed_pass import Placement
 from trilane.stages.gpu.skinned_mesh import BodyPose, SkinnedMesh, avatar_mesh
 from trilane.training.capture.capture import Capture, Fit
-from trilane.training.random_views import ANYWHERE, BANDS, OUTPUT_ROWS, SCREENS, Crop, Cropper, View
+from trilane.training.random_views import BANDS, OUTPUT_ROWS, SCREENS, Crop, Cropper, View
 from trilane.training.sample_renderer import ANYWHERE_BAND, BAND_NAMES, LEAST_PIXELS, UvRaster
 from trilane.training.surface import vertex_areas
 
@@ -58,25 +57,17 @@ class CaptureSample:
 class CaptureRenderer:
     """Plans and renders samples of a capture, with an OpenGL context of its own."""
 
-    def __init__(
-        self,
-        capture: Capture,
-        numbers: Sequence[int],
-        rule: ViewRule,
-        centres: Centres | None = None,
-        threads: int | None = None,
-    ) -> None:
+    def __init__(self, capture: Capture, numbers: Sequence[int], rule: ViewRule, threads: int | None = None) -> None:
         """Open the context.
 
         `capture`: capture whose frames are shown.
         `numbers`: numbers of these frames.
         `rule`: how views are drawn.
-        `centres`: draws the centres of views; None for vertices by area.
         `threads`: threads of a software OpenGL driver.
         Raises MissingPartError without OpenGL.
         """
         self.capture, self._numbers, self._rule = capture, list(numbers), rule
-        self._centres = centres or VertexCentres(capture.shaped)
+        self._centres = VertexCentres(capture.shaped)
         self._raster = BodyRaster(capture.shaped, threads)
         self.ctx, self.mesh = self._raster.ctx, self._raster.mesh
         self._cropper = Cropper(capture.shaped, pose_blend=True)
@@ -99,11 +90,8 @@ class CaptureRenderer:
 
     def whole_sample(self, number: int, size: str) -> CaptureSample | None:
         """Return frame `number` unaugmented, cropped to the person; None where nothing of the body is in it."""
-        posed, view, frame = (
-            self._raster.posed(self.capture.fits[number]),
-            self.capture.views[number],
-            self.capture.shape,
-        )
+        capture = self.capture
+        posed, view, frame = self._raster.posed(capture.fits[number]), capture.views[number], capture.shape
         crop = self._cropper.crop(posed, View(view, self._projection, frame[1] / frame[0]), shape_buckets(size))
         if crop is None:
             return None
@@ -318,30 +306,11 @@ def _inverse(matrix: F64) -> F64:
     return np.asarray(np.linalg.inv(matrix), np.float64)
 
 
-# Points of the body that close-ups are centred on: joints, or vertices drawn so that all parts of the surface are
-# equally probable.
+# Points of the body that close-ups are centred on: vertices, drawn so that all parts of the surface are equally
+# probable.
 #
 # Rule: a vertex is drawn by its share of the surface's area. SMPL-X has about as many vertices in the head as
 # elsewhere. To make up for that, the thesis (section 3.3) weights joints by the volume about them; areas do so exactly.
-
-
-class Centres(Protocol):
-    """Draws centres of views."""
-
-    def draw(self, rng: np.random.Generator, band: str, posed: Posed) -> F64:
-        """Draw a point (3,), world metres, of the body `posed` for a view of `band`.
-
-        `band`: a name of `BANDS`, or `anywhere`.
-        """
-
-
-class JointCentres:
-    """Draws the joints of a band with equal probability."""
-
-    def draw(self, rng: np.random.Generator, band: str, posed: Posed) -> F64:
-        """Draw a point as `Centres.draw` does."""
-        names = BANDS[band][0] if band in BANDS else ANYWHERE
-        return np.array(posed.joints[JOINT_INDEX[names[rng.integers(len(names))]]])
 
 
 class VertexCentres:
@@ -359,7 +328,7 @@ class VertexCentres:
         return np.asarray(area / area.sum())
 
     def draw(self, rng: np.random.Generator, band: str, posed: Posed) -> F64:
-        """Draw a point as `Centres.draw` does."""
+        """Draw a point (3,), world metres, of `posed` for a view of `band`: a name of `BANDS`, or `anywhere`."""
         vertex = int(rng.choice(len(self._area), p=self.shares(band)))
         weights = self._shaped.body.weights[vertex : vertex + 1].astype(np.float64)
         matrix = blend_matrices(weights, posed.matrices.reshape(JOINTS, 12).astype(np.float64)).reshape(3, 4)
@@ -419,7 +388,7 @@ def zoomed_view(
     band: str,
     posed: Posed,
     camera: SampleCamera,
-    centres: Centres,
+    centres: VertexCentres,
     rule: ViewRule,
     screen: Shape,
 ) -> F64 | None:

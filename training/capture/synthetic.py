@@ -242,14 +242,14 @@ cy = {float(lens.cy)!r}
 
 
 @dataclass(frozen=True)
-class Cost:
+class DrawingCost:
     """The measured cost of a frame: `seconds` and `disk_bytes`."""
 
     seconds: float
     disk_bytes: int
 
 
-def measured_cost(capture: SyntheticCapture, recipe: Recipe) -> Cost:
+def measured_cost(capture: SyntheticCapture, recipe: Recipe) -> DrawingCost:
     """Measure what a frame of `recipe` costs: one is drawn and written to memory, after another that warms up."""
     capture.frame(0)
     start = time.monotonic()
@@ -260,4 +260,4 @@ def measured_cost(capture: SyntheticCapture, recipe: Recipe) -> Cost:
         Image.fromarray(picture).save(file, "png", compress_level=FAST_PNG)
     for shot in shots:
         np.savez(file, **fit_arrays(shot.pose, shot.place, recipe.betas))
-    return Cost(time.monotonic() - start, file.tell())
+    return DrawingCost(time.monotonic() - start, file.tell())

@@ -70,7 +70,7 @@ def order(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
     names = (SLOT, BARE, "peer")
     channels: dict[str, Any] = {name: lambda size, _context, name=name: (name, size) for name in names}
-    for name, double in (("CHANNELS", {**channels, "gone": absent}), ("Pair", Pair), ("awake", awake)):
+    for name, double in (("CHANNELS", {**channels, "gone": absent}), ("ChannelPair", Pair), ("awake", awake)):
         monkeypatch.setattr(handoff, name, double)
     monkeypatch.setattr(handoff, "_through_pipeline", through)
     return done

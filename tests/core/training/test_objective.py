@@ -21,7 +21,7 @@ from trilane.training.objective import (  # noqa: E402  # noqa: E402
     JUDGES,
     WEIGHTS,
     Adversary,
-    Judged,
+    Judgement,
     Objective,
     bits,
     composite,
@@ -81,10 +81,10 @@ def test_terms_are_means_over_the_three(monkeypatch: pytest.MonkeyPatch) -> None
     """Odds of 1/4, 1/2 and 3/4 for what is painted; features differ by 1 and 3, 0 and 0, 2 and 6."""
     odds, gaps = (0.25, 0.5, 0.75), ((1.0, 3.0), (0.0, 0.0), (2.0, 6.0))
     painted = [
-        Judged([torch.full((1, 2), gap) for gap in gap_pair], torch.tensor([math.log(p / (1 - p))]))
+        Judgement([torch.full((1, 2), gap) for gap in gap_pair], torch.tensor([math.log(p / (1 - p))]))
         for p, gap_pair in zip(odds, gaps, strict=True)
     ]
-    true = [Judged([torch.zeros(1, 2), torch.zeros(1, 2)], torch.zeros(1)) for _ in odds]
+    true = [Judgement([torch.zeros(1, 2), torch.zeros(1, 2)], torch.zeros(1)) for _ in odds]
     mine, answers = adversary(), iter([painted, true])
     monkeypatch.setattr(mine, "_judged", lambda *_: next(answers))
     terms = mine.terms(*pictures(), BEHIND)

@@ -20,7 +20,7 @@ from trilane.errors import BadInputError  # noqa: E402
 from trilane.training import train as command  # noqa: E402
 from trilane.training.dataset import create_group  # noqa: E402
 from trilane.training.subject import Person, Subject  # noqa: E402
-from trilane.training.train import Places, train_avatar  # noqa: E402
+from trilane.training.train import TrainingPlaces, train_avatar  # noqa: E402
 from trilane.training.trainable_avatar import NeuralTexture  # noqa: E402
 from trilane.training.training_settings import TrainingSettings, parsed_settings, read_settings  # noqa: E402
 
@@ -112,8 +112,8 @@ def weights_of(avatar: Any) -> bytes:
     return b"".join(value.detach().numpy().tobytes() for value in avatar.state_dict().values())
 
 
-def places(folder: Path, work: str = "work") -> Places:
-    return Places(folder / "capture", folder / "mine", folder / work, "mine")
+def places(folder: Path, work: str = "work") -> TrainingPlaces:
+    return TrainingPlaces(folder / "capture", folder / "mine", folder / work, "mine")
 
 
 def settings(**others: Any) -> TrainingSettings:
@@ -182,7 +182,7 @@ def test_steps_are_counted_for_the_minutes(log: list[Any], tmp_path: Path, monke
 )
 def test_one_person_is_trained(capture: Path | None, look: str | None, said: str, tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=said):
-        train_avatar(Places(capture, tmp_path / "mine", tmp_path / "work", "mine"), settings(look=look), Told())
+        train_avatar(TrainingPlaces(capture, tmp_path / "mine", tmp_path / "work", "mine"), settings(look=look), Told())
 
 
 @pytest.mark.parametrize("name", ["default", "hiker"])

@@ -26,7 +26,7 @@ class Training(ModuleType):
         super().__init__("trilane.training.train")
         self.asked: list[Any] = []
 
-    def Places(self, *places: Any) -> Any:  # noqa: N802
+    def TrainingPlaces(self, *places: Any) -> Any:  # noqa: N802
         return places
 
     def train_avatar(self, places: Any, settings: TrainingSettings, listener: Any) -> dict[str, Any]:
