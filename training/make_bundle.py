@@ -24,13 +24,13 @@ from trilane.avatars.network_file import reshaped
 from trilane.body.body import ShapedBody
 from trilane.training.dataset import SIZES, TRAINING_SHARE, U16, VALIDATION_SIZE, ShapeGroup, motion_poses
 from trilane.training.first_texture import fill_along_surface, grown, used_texels
-from trilane.training.network import UNet, export_onnx
+from trilane.training.network import export_onnx
 from trilane.training.quantising.quantise import ByteRanges, Quantised, byte_ranges, quantise
 from trilane.training.random_views import random_pose
 from trilane.training.sample_renderer import BAND_NAMES, Sample, SampleRenderer
 from trilane.training.subject import Person
 from trilane.training.surface import BodyArrays, body_arrays
-from trilane.training.trainable_avatar import ByteGrid, TrainableAvatar, levels_of, load_network, read_levels
+from trilane.training.trainable_avatar import ByteGrid, TrainableAvatar, float_network_of, levels_of, read_levels
 from trilane.training.validate import BUILTIN_HELD_OUT, held_out_motions
 from trilane.writing import write_atomically, write_bytes
 
@@ -223,9 +223,7 @@ SEED = 17
 
 def float_model(bundle: Bundle, weights: Any) -> onnx.ModelProto:
     """Return the float network in file `weights`, for `bundle`, at the calibration's shape. Raises BadInputError."""
-    entry = bundle.manifest.network
-    untrained = UNet(entry.encoder, entry.norm, entry.width, entry.channels, input_skip=True)
-    return export_onnx(load_network(untrained, weights), *CALIBRATION_SHAPE)
+    return export_onnx(float_network_of(bundle, weights), *CALIBRATION_SHAPE)
 
 
 def training_views(renderer: SampleRenderer, bundle: Bundle, views: int) -> list[F32]:

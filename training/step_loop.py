@@ -76,18 +76,12 @@ def steps(
         torch.manual_seed(state.step << SEED_BITS | settings.seed)
         for group, peak in zip(state.optimiser.param_groups, peaks, strict=True):
             group["lr"] = peak * rate_share(share)  # kernels, the network's other weights, texture
-        _round(state.avatar, groups, settings, share)
+        if state.avatar.grid is not None and share > settings.bytes_from:
+            round_to_bytes(state.avatar, state.avatar.grid, groups, settings.seed)
         terms = _step(state, stream, settings, frozen=share > settings.freeze_norms_at)
         state.step += 1
         follow(state.average, state.avatar, 1 - 1 / max(1.0, settings.average_share * state.step))
         yield terms
-
-
-def _round(avatar: TrainableAvatar, groups: list[ShapeGroup], settings: TrainingSettings, share: float) -> None:
-    """Begin to round `avatar` to bytes once the `share` of the steps that are done passes `bytes_from`."""
-    if avatar.grid is None or share <= settings.bytes_from:
-        return
-    round_to_bytes(avatar, avatar.grid, groups, settings.seed)
 
 
 def _step(state: TrainingState, stream: Iterator[Batch], settings: TrainingSettings, frozen: bool) -> dict[str, float]:

@@ -213,6 +213,12 @@ def load_network(network: UNet, path: Path) -> UNet:
     return network
 
 
+def float_network_of(bundle: Bundle, weights: Path) -> UNet:
+    """Return the network of `bundle` with the weights of a file of `save_network`. Raises BadInputError."""
+    entry = bundle.manifest.network
+    return load_network(UNet(entry.encoder, entry.norm, entry.width, entry.channels, input_skip=True), weights)
+
+
 def save_network(avatar: TrainableAvatar, path: Path) -> None:
     """Write the network alone in half precision: a small file, precise enough to continue training from.
 
@@ -361,9 +367,7 @@ def float_painter_of(bundle: Bundle, weights: Path) -> Painter:
 
     Raises BadInputError.
     """
-    entry = bundle.manifest.network
-    network = load_network(UNet(norm=entry.norm, width=entry.width, channels=entry.channels, input_skip=True), weights)
-    return float_painter(network, *levels_of(bundle))
+    return float_painter(float_network_of(bundle, weights), *levels_of(bundle))
 
 
 # Training with the bundle's rounding: weights and activations of a network lie on the grid of its bytes.

@@ -345,12 +345,8 @@ SHEET_CELL = (256, 192)
 
 def worst_sheet(samples: Sequence[Evaluated], painters: Sequence[str]) -> NDArray[np.uint8]:
     """Return an image (height, width, 3) uint8 with a row for each of `samples`."""
-    return np.vstack([_cells(sample, painters) for sample in samples])
-
-
-def _cells(sample: Evaluated, painters: Sequence[str]) -> NDArray[np.uint8]:
-    """Put the ground truth and the pictures of `painters` side by side."""
-    return side_by_side((sample.truth, *(sample.pictures[name] for name in painters)))
+    rows = [(sample.truth, *(sample.pictures[name] for name in painters)) for sample in samples]
+    return np.vstack([side_by_side(row) for row in rows])
 
 
 def side_by_side(pictures: Iterable[NDArray[np.uint8]]) -> NDArray[np.uint8]:

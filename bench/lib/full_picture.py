@@ -292,12 +292,9 @@ def trained(bundle: Bundle, weights: Path) -> Paint:
     """Return the network of a file that training saved. Raises BadInputError, ImportError without PyTorch."""
     import torch
 
-    from trilane.training.network import UNet
-    from trilane.training.trainable_avatar import load_network
+    from trilane.training.trainable_avatar import float_network_of
 
-    entry = bundle.manifest.network
-    untrained = UNet(entry.encoder, entry.norm, entry.width, entry.channels, input_skip=True)
-    network = load_network(untrained, weights).eval()
+    network = float_network_of(bundle, weights).eval()
 
     def paint(tensor: F64) -> F32:
         planes = torch.from_numpy(np.ascontiguousarray(tensor.transpose(2, 0, 1), np.float32))[None]

@@ -176,3 +176,15 @@ def test_every_frame_is_compared_and_the_worst_ones_are_named() -> None:
     assert found["planned"]["worst_psnr_db"] == found["planned"]["worst_change_db"] == pytest.approx(two)
     assert found["planned"]["changes"] == 2
     assert planner.by_frame([2], chains, Told([0] * 6), truth.frame, truth) is None  # type: ignore[arg-type]
+
+
+def test_ranks_that_agree_and_ranks_that_do_not() -> None:
+    """By hand: 1 - 6 sum(d^2) / (n (n^2 - 1)) without equal values."""
+    assert placement.rank_correlation([1, 5, 9, 700], [2, 3, 4, 5]) == pytest.approx(1)
+    assert placement.rank_correlation([1, 2, 3], [9, 8, 7]) == pytest.approx(-1)
+    assert placement.rank_correlation([1, 2, 3, 4, 5], [2, 1, 4, 3, 5]) == pytest.approx(1 - 6 * 4 / (5 * 24))
+    # ranks 1, 2.5, 2.5, 4 and 1, 2, 3, 4: covariance 2.25 + 0 + 0 + 2.25 = 4.5, spreads 4.5 and 5
+    assert placement.rank_correlation([1, 2, 2, 3], [1, 2, 3, 4]) == pytest.approx(4.5 / (4.5 * 5) ** 0.5)
+    assert placement.rank_correlation([1, 1], [1, 2]) is None
+    with pytest.raises(ValueError, match="argument 2"):
+        placement.rank_correlation([1, 2], [1])
