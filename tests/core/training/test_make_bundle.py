@@ -204,7 +204,7 @@ def test_a_painter_in_floats_reads_the_texture_and_rounds_the_picture(tmp_path):
     assert np.abs(found - wanted).max() <= 1 and (found != wanted).mean() < 0.01
 
     save_network(made, tmp_path / "n.npz")
-    entry = SimpleNamespace(norm="batch", width=4, channels=CHANNELS)
+    entry = SimpleNamespace(encoder="resnet18", norm="batch", width=4, channels=CHANNELS)
     texture = image[0].permute(1, 2, 0).numpy()
     parts = {"read_texture": lambda: texture, "read_levels": lambda: None}
     bundle = SimpleNamespace(manifest=SimpleNamespace(network=entry), **parts)
