@@ -135,7 +135,7 @@ def write_dataset(
 
     `source`: opens the renderer in each process; it is sent there.
     `samples`: samples to render.
-    `folder`: folder of the arrays, see `sample_files`.
+    `folder`: folder of the arrays, see `create_group`.
     `processes`: number of rendering processes.
     `track`: wraps the list of parts to show progress.
     """

@@ -1,7 +1,7 @@
 """Makes the INT8 network: a float network is calibrated on real frames and becomes an integer one.
 
 Rule: activations are unsigned bytes; weights are signed and symmetric with a scale per channel; real 0 is exact; the
-output bytes are the picture. All runtimes round alike where the network allows it, see `power_of_two_scales`.
+output bytes are the picture. All runtimes round alike where the network allows it, see `calibration`.
 
 With `reduce_range`, weights stay within 64: on a CPU without VNNI, the sum of two products of larger ones overflows 16
 bits.
