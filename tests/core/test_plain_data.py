@@ -20,9 +20,8 @@ import trilane
 #: Imported with an extra, a driver or a fork alone.
 NEEDS_MORE = ("stages.dsp.openvino", "stages.dsp.qnn", "stages.dsp.cuda")
 CHANGING = {
-    "bench.lib.load.Queries",
-    "bench.lib.loadgen.LoadGenPlayer",
-    "bench.lib.loadgen.LoadGenVerdict",
+    "bench.scenario.Queries",
+    "bench.scenario.LoadGenPlayer",
     "bench.scenario._Player",
     "training.step_loop.TrainingState",
     "training.mesh_levels.Corners",
