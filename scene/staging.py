@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from trilane.body.body import ShapedBody
 from trilane.scene.camera.files import load_camera
 from trilane.scene.camera.path import CameraPath, Optics
-from trilane.scene.camera_placement import PlacedCamera, place_camera
-from trilane.scene.follow import Way
+from trilane.scene.camera_placement import PlacedCamera, Way, place_camera
 from trilane.scene.footage import Footage, filmed
 from trilane.scene.lens import Known, Lens
 from trilane.scene.motion.files import load_motion
