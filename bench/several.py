@@ -20,10 +20,9 @@ from trilane.bench.lib.fixture import ground_truth, load_drawable
 from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError
 from trilane.figure_sources import MEASURED
-from trilane.scene.crop import crop_projection
+from trilane.scene.crop import MARGIN_PX, TensorLayout, crop_projection, lay_out
 from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
 from trilane.scene.staging import stage_scene
-from trilane.scene.tensor_layout import MARGIN_PX, TensorLayout, lay_out
 from trilane.shapes import Shape, shape_buckets
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime

@@ -39,8 +39,7 @@ from typing import NamedTuple
 
 from trilane.arrays import Floats
 from trilane.errors import BadInputError
-from trilane.scene.crop import Rect
-from trilane.scene.tensor_layout import DenseLayout, apart, by_network, lay_out_at, tight_shape
+from trilane.scene.crop import DenseLayout, Rect, apart, by_network, lay_out_at, tight_shape
 from trilane.shapes import Shape, shapes_within
 
 

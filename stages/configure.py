@@ -25,10 +25,9 @@ from trilane.hw_profiles.profile_files import load_profile
 from trilane.memory import shortage
 from trilane.pipeline.memory import Assets
 from trilane.scene.footage import Footage
-from trilane.scene.missing_person import require_person
 from trilane.scene.planner import TensorBudget
 from trilane.scene.schema import BUILT_IN_PREFIX, FILE_KEYS, Scene, find_scene, load_scene, located, scene_from
-from trilane.scene.staging import Staged, stage_scene
+from trilane.scene.staging import Staged, require_person, stage_scene
 from trilane.stages.avatar_assets import AvatarData, load_avatar, networks_of_avatars, pack_assets
 from trilane.stages.config import NetworkCut, RunConfig
 from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve

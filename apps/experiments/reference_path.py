@@ -30,9 +30,8 @@ from trilane.body.body import Body
 from trilane.body.joints import JOINTS, POSE_FEATURES
 from trilane.body.kinematics import Posed, Skeleton
 from trilane.body.skinning import DETAILS, EVERYTHING, Detail, FrameSkinner
-from trilane.scene.crop import Rect, crop_projection
+from trilane.scene.crop import Cell, Rect, crop_projection
 from trilane.scene.planner import FrameWork
-from trilane.scene.tensor_layout import Cell
 from trilane.shapes import BUCKET_STEP, Shape
 from trilane.stages.avatar_assets import AvatarData
 from trilane.stages.configure import Checked

@@ -28,10 +28,9 @@ from trilane.machine import moved_of_kept
 from trilane.pipeline.memory import Assets, ByteCounter
 from trilane.pipeline.stage import Skip, UnitContext
 from trilane.scene.camera_placement import steered
-from trilane.scene.crop import SCREEN, Rect, Stretch, cheapest_within, error_px, least_w, stretch_of
+from trilane.scene.crop import SCREEN, Rect, Stretch, cheapest_within, error_px, lay_out_apart, least_w, stretch_of
 from trilane.scene.mover import Mover
 from trilane.scene.planner import FrameWork, HeldMesh, HeldShape, hold_mesh, plan_tensor, shown_by, work_of
-from trilane.scene.tensor_layout import lay_out_apart
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import bodies_drawn, distinct, mesh_levels_of, staged_of
 from trilane.stages.config import RunConfig, posed_vertices

@@ -8,7 +8,7 @@ pytest.importorskip("skimage")
 
 from trilane.bench import filters, several
 from trilane.errors import BadInputError
-from trilane.scene.tensor_layout import MARGIN_PX
+from trilane.scene.crop import MARGIN_PX
 from trilane.stages.gpu.packed_pass import FILTERS
 
 

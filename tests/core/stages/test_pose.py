@@ -19,10 +19,9 @@ from trilane.body.skinning import DETAILS, FrameSkinner
 from trilane.errors import BadInputError
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.stage import Skip, UnitContext
-from trilane.scene.crop import Rect
+from trilane.scene.crop import MARGIN_PX, Rect, lay_out
 from trilane.scene.planner import FrameWork, shown_by, work_of
 from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, Scene
-from trilane.scene.tensor_layout import MARGIN_PX, lay_out
 from trilane.shapes import shape_buckets
 from trilane.stages.avatar_assets import staged_of
 from trilane.stages.config import RunConfig, pose_dtype, posed_vertices, posed_vertices_bytes
