@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from trilane.arrays import F64
 from trilane.body.joints import JOINT_NAMES, JOINT_PARENTS, JOINTS
 from trilane.files import as_numbers, npz_names
-from trilane.scene.motion.bvh_retarget import UPS, among_all, feet_of, unit_of
+from trilane.scene.motion.bvh import UPS, among_all, feet_of, unit_of
 from trilane.scene.motion.motion import T_POSE
 from trilane.scene.motion.pickled import printable
 from trilane.scene.motion.recorded import RawMotion

@@ -18,7 +18,7 @@ from trilane.errors import BadInputError, did_you_mean
 from trilane.files import refuse_other, require_file
 from trilane.scene.motion.array_files import load_npy, load_npz, load_pickle
 from trilane.scene.motion.builtin import BUILTIN
-from trilane.scene.motion.bvh_retarget import load_retargeted
+from trilane.scene.motion.bvh import load_retargeted
 from trilane.scene.motion.motion import T_POSE, Motion, Wrap
 from trilane.scene.motion.recorded import RawMotion, centred, facing, motion_from_recording
 from trilane.scene.rotations import matrix_from_rotvec, rotvec_from_matrix
