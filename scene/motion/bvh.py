@@ -24,8 +24,7 @@ from trilane.scene.motion.joint_names import NO_MAP, STATED, match_names, plain
 from trilane.scene.motion.motion import T_POSE
 from trilane.scene.motion.recorded import RawMotion
 from trilane.scene.motion.retarget import retarget
-from trilane.scene.motion.tracks import SIDES, Tracks, angle_between, leg_length
-from trilane.scene.motion.turns import trunk_line
+from trilane.scene.motion.tracks import SIDES, Tracks, angle_between, leg_length, trunk_line
 from trilane.scene.recordings import Detected
 from trilane.scene.rotations import about
 

@@ -1,14 +1,14 @@
-"""Loads the motion of an avatar, built in or from a file, and plays it as the scene says.
+"""Loads the motion of a scene's avatar, a built-in one by name or a file, and plays the part that the scene asks for.
 
-`start_s` and `end_s` are times of the motion itself, before `speed`. A part of a motion is placed as a whole one: it
-faces +Z at first and is centred on the ground that it covers.
+The ending of the file decides which reader is used; the reader's errors name the file. A key that a format has no use
+for is refused, not ignored. `start_s` and `end_s` are times of the motion itself, before `speed`. A part of a motion is
+placed as a whole one: it faces +Z at first and is centred on the ground that it covers.
 
-The content of a `.npy`, `.npz` or `.pkl` file, not its ending, decides how it is read: poses, dicts of arrays, or only
-places of joints. Places of joints, as in HumanML3D, are (T, 22, 3) in the order of SMPL's joints. Turns have the same
-shapes, so the content tells them apart. An array has places if its bones, apart from the legs, are as long as a
-person's, alike on both sides, and rigid. The hips must also lie on either side of the pelvis, and the trunk must not be
-folded. `retarget.py` makes turns from places. What places cannot tell is chosen: a limb twists as its bend and the toes
-say, the head turns as the neck.
+Arrays hold poses, dicts of arrays, or only places of joints. Places, as in HumanML3D, are (T, 22, 3) in the order of
+SMPL's joints. Turns have the same shapes, so the content tells them apart. An array has places if its bones, apart from
+the legs, are as long as a person's, alike on both sides, and rigid. The hips must also lie on either side of the
+pelvis, and the trunk must not be folded. `retarget.py` makes turns from places. What places cannot tell is chosen: a
+limb twists as its bend and the toes say, the head turns as the neck.
 
 HumanML3D: https://github.com/EricGuo5513/HumanML3D (`new_joints`: 20 frames a second, metres, Y up).
 """

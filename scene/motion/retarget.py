@@ -17,21 +17,17 @@ from trilane.arrays import F64
 from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS, JOINTS
 from trilane.scene.motion.tracks import (
     SIDES,
+    Evidence,
     Tracks,
     angle_between,
     at_rest,
     built_alike,
-    leg_length,
-    planted_frames,
-    standing_frames,
-    unit,
-    upward,
-)
-from trilane.scene.motion.turns import (
-    Evidence,
     hinge,
+    leg_length,
     level_with,
     limb_turns,
+    planted_frames,
+    standing_frames,
     swung,
     transposed,
     trunk_line,
@@ -40,6 +36,8 @@ from trilane.scene.motion.turns import (
     turns_of_collars,
     turns_of_neck,
     turns_of_trunk,
+    unit,
+    upward,
     with_neck_on,
     with_shoulders_on,
 )
