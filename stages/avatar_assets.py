@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F32
 from trilane.avatars.bundle import Bundle
-from trilane.avatars.mesh_levels import levels_from_arrays, levels_to_arrays
+from trilane.avatars.mesh_levels import MeshLevel, levels_from_arrays, levels_to_arrays
 from trilane.avatars.network_file import NetworkFile, check_network, reshaped
 from trilane.body.body import Body, ShapedBody
-from trilane.body.mesh_levels import MeshLevel
 from trilane.errors import BadInputError
 from trilane.hw_profiles.network_work import Network, count_work, one_after_the_other
 from trilane.pipeline.memory import Assets

@@ -21,8 +21,7 @@ from trilane.body.joints import BODY_JOINTS, JOINT_INDEX
 from trilane.errors import BadInputError
 from trilane.files import read_text
 from trilane.scene.motion.joint_names import NO_MAP, STATED, match_names, plain
-from trilane.scene.motion.motion import T_POSE
-from trilane.scene.motion.recorded import RawMotion
+from trilane.scene.motion.motion import T_POSE, RawMotion
 from trilane.scene.motion.retarget import retarget
 from trilane.scene.motion.tracks import SIDES, Tracks, angle_between, leg_length, trunk_line
 from trilane.scene.recordings import Detected

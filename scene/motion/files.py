@@ -30,9 +30,8 @@ from trilane.errors import BadInputError, did_you_mean
 from trilane.files import as_numbers, npz_names, refuse_other, require_file
 from trilane.scene.motion.builtin import BUILTIN
 from trilane.scene.motion.bvh import UPS, among_all, feet_of, load_retargeted, unit_of
-from trilane.scene.motion.motion import T_POSE, Motion, Wrap
+from trilane.scene.motion.motion import T_POSE, Motion, RawMotion, Wrap, centred, facing, motion_from_recording
 from trilane.scene.motion.pickled import printable
-from trilane.scene.motion.recorded import RawMotion, centred, facing, motion_from_recording
 from trilane.scene.motion.retarget import retarget
 from trilane.scene.motion.smpl_files import KEYS, ROMP_PERSONS, ROMP_PLACES, ROMP_POSES, motion_of, motion_of_array
 from trilane.scene.motion.stored import npy_values, npz_values, pickle_values, plain

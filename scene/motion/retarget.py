@@ -1,7 +1,7 @@
 """Puts recorded joints on the 55 SMPL-X joints of an avatar.
 
 Turns come from places: limbs point where the recorded ones point; pelvis and trunk turn as hip line, trunk and shoulder
-line do. The file's own turns only say how limbs twist (`turns.py`), and how head and toes turn. So neither a file's
+line do. The file's own turns only say how limbs twist (`tracks.py`), and how head and toes turn. So neither a file's
 zero pose nor its axes matter. A joint that the file does not have follows its parent.
 """
 

@@ -28,9 +28,8 @@ from trilane.arrays import F64
 from trilane.body.joints import JOINT_INDEX, JOINTS
 from trilane.errors import BadInputError
 from trilane.files import as_numbers
-from trilane.scene.motion.motion import REST_PELVIS, SMPL_REST_PELVIS
+from trilane.scene.motion.motion import ANY, REST_PELVIS, SMPL_REST_PELVIS, WORLD, RawMotion
 from trilane.scene.motion.pickled import ARRAYS, printable
-from trilane.scene.motion.recorded import ANY, WORLD, RawMotion
 from trilane.scene.motion.stored import Found, contents, tables_in
 from trilane.scene.recordings import Detected
 from trilane.scene.rotations import matrix_from_rotvec, rotvec_from_matrix

@@ -11,8 +11,7 @@ import pytest
 from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
 from trilane.errors import BadInputError
 from trilane.scene.motion.bvh import load_retargeted
-from trilane.scene.motion.motion import T_POSE
-from trilane.scene.motion.recorded import RawMotion
+from trilane.scene.motion.motion import T_POSE, RawMotion
 from trilane.scene.motion.retarget import retarget
 from trilane.scene.motion.tracks import (
     Tracks,
