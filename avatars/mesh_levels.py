@@ -37,8 +37,7 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F32, F64, I32
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINTS
-from trilane.body.kinematics import Posed
+from trilane.body.joints import JOINTS, Posed
 from trilane.errors import BadInputError
 from trilane.files import read_npz
 

@@ -17,7 +17,7 @@ from trilane.arrays import U8
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M, load_bundle
 from trilane.avatars.network_file import reshaped
 from trilane.bench.lib.fixture import ground_truth, load_drawable
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.errors import BadInputError
 from trilane.figure_sources import MEASURED
 from trilane.scene.crop import MARGIN_PX, TensorLayout, crop_projection, lay_out

@@ -20,7 +20,7 @@ import numpy as np
 
 from trilane.arrays import F32, F64
 from trilane.body.body import ShapedBody
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.scene.camera.path import CameraPath
 from trilane.scene.mover import Mover, outline
 from trilane.scene.rotations import about

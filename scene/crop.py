@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from trilane.arrays import F64
-from trilane.body.kinematics import Posed
+from trilane.body.joints import Posed
 from trilane.errors import BadInputError
 from trilane.shapes import BUCKET_STEP, MOST_ASPECT, Shape
 

@@ -14,8 +14,7 @@ import numpy as np
 
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINT_NAMES
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import JOINT_NAMES, Skeleton
 from trilane.scene.mover import Mover, outline
 from trilane.scene.schema import BUILT_IN_PREFIX, Scene
 from trilane.shapes import Shape

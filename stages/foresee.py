@@ -20,7 +20,7 @@ from trilane.avatars.bundle import CLOTHES_STANDOFF_M
 from trilane.avatars.network_file import STRIDE, NetworkFile, reshaped
 from trilane.avatars.validation import SizeLoss
 from trilane.body.body import ShapedBody
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.errors import BadInputError
 from trilane.scene.crop import Rect
 from trilane.scene.planner import (

@@ -23,8 +23,7 @@ from scipy.sparse.csgraph import connected_components
 from trilane.arrays import F64, I64, Mask
 from trilane.avatars.mesh_levels import MeshLevel, grouped
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINTS
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import JOINTS, Skeleton
 from trilane.body.skinning import CpuSkinner, blend_reach, branch_sums
 from trilane.errors import MissingPartError
 from trilane.stages.gpu.skinned_mesh import split_corners

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from trilane.arrays import F64
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINT_INDEX, JOINTS
-from trilane.body.kinematics import Posed
+from trilane.body.joints import JOINT_INDEX, JOINTS, Posed
 from trilane.body.skinning import blend_matrices
 from trilane.scene.crop import choose_bucket, crop_projection
 from trilane.shapes import Shape

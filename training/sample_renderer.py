@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F32, F64, Floats
 from trilane.body.body import ShapedBody
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.body.skinning import largest_weights
 from trilane.shapes import shape_buckets
 from trilane.stages.gpu.opengl import open_context

@@ -19,8 +19,7 @@ from trilane.apps.experiments.accuracy import DrawnTensors
 from trilane.apps.experiments.hard_rotations import EXACT, HardNumber, worst
 from trilane.arrays import F64, U8
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINTS
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import JOINTS, Skeleton
 from trilane.errors import BadInputError
 from trilane.scene.camera.path import look_at, projection_matrix
 from trilane.stages.configure import Checked, configure

@@ -27,8 +27,7 @@ from trilane.bench.lib.full_picture import SAMPLES, FullBody, fineness, supersam
 from trilane.bench.lib.layers import Box, RasterLayer, enlarged, grown, laid_over, placed, premultiplied, shrunk
 from trilane.bench.lib.stage_chain import AvatarFrames
 from trilane.body.body import Body
-from trilane.body.joints import JOINTS, POSE_FEATURES
-from trilane.body.kinematics import Posed, Skeleton
+from trilane.body.joints import JOINTS, POSE_FEATURES, Posed, Skeleton
 from trilane.body.skinning import DETAILS, EVERYTHING, Detail, FrameSkinner
 from trilane.scene.crop import Cell, Rect, crop_projection
 from trilane.scene.planner import FrameWork

@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from trilane.arrays import F64, I64
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.body.skinning import CpuSkinner
 from trilane.pipeline.memory import Assets
 from trilane.scene.crop import Rect

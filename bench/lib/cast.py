@@ -13,7 +13,7 @@ import numpy as np
 from trilane.arrays import F32, F64
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M, load_bundle
 from trilane.bench.lib.layers import Box, box_around
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.scene.crop import crop_projection
 from trilane.scene.mover import Mover
 from trilane.shapes import Shape

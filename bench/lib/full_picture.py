@@ -28,8 +28,7 @@ from trilane.bench.lib.cast import Cast, CastView
 from trilane.bench.lib.full_network import Paint, float_network
 from trilane.bench.lib.layers import RasterLayer, blended, enlarged, grown, premultiplied, shrunk
 from trilane.body.body import Body
-from trilane.body.joints import JOINTS
-from trilane.body.kinematics import rodrigues
+from trilane.body.joints import JOINTS, rodrigues
 from trilane.scene.crop import crop_projection
 from trilane.shapes import BUCKET_STEP, Shape
 from trilane.stages.avatar_assets import AvatarData

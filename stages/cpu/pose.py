@@ -21,7 +21,7 @@ from trilane.arrays import F32, F64
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M
 from trilane.avatars.mesh_levels import MeshLevel
 from trilane.body.body import ShapedBody
-from trilane.body.kinematics import Posed, Skeleton
+from trilane.body.joints import Posed, Skeleton
 from trilane.body.skinning import DETAILS, DetailBounds, FrameSkinner
 from trilane.errors import TrilaneError
 from trilane.machine import moved_of_kept

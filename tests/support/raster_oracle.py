@@ -12,8 +12,7 @@ from trilane.avatars.bundle import bundle_folder
 from trilane.bench.lib import float_raster
 from trilane.bench.lib.fixture import ENCODING, standing
 from trilane.body.body import load_body
-from trilane.body.joints import JOINT_INDEX
-from trilane.body.kinematics import Skeleton, rodrigues
+from trilane.body.joints import JOINT_INDEX, Skeleton, rodrigues
 from trilane.shapes import Shape
 from trilane.stages.gpu.opengl import describe
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from trilane.arrays import F64, U8
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import Body, ShapedBody, load_body
-from trilane.body.kinematics import rodrigues
+from trilane.body.joints import rodrigues
 from trilane.errors import BadInputError
 from trilane.files import read_npz
 from trilane.shapes import Shape

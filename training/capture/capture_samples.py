@@ -17,8 +17,7 @@ from PIL import Image
 
 from trilane.arrays import F32, F64, U8, Mask
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINTS
-from trilane.body.kinematics import Posed, Skeleton
+from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINTS, Posed, Skeleton
 from trilane.body.skinning import blend_matrices
 from trilane.errors import BadInputError
 from trilane.scene.lens import Lens

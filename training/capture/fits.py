@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.body.body import Body
-from trilane.body.joints import JOINTS, LEFT_HAND, POSE_SIZE, RIGHT_HAND
-from trilane.body.kinematics import MAX_VALUE
+from trilane.body.joints import JOINTS, LEFT_HAND, MAX_VALUE, POSE_SIZE, RIGHT_HAND
 from trilane.scene.motion.smpl_files import WHOLE as WIDTHS
 from trilane.training.capture.capture_file import Fault
 

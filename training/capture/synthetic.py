@@ -18,8 +18,7 @@ from PIL import Image, ImageFilter
 
 from trilane.arrays import F64, U8, Floats
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINTS, LEFT_HAND, RIGHT_HAND
-from trilane.body.kinematics import rodrigues
+from trilane.body.joints import JOINTS, LEFT_HAND, RIGHT_HAND, rodrigues
 from trilane.scene.lens import Lens, centred
 from trilane.scene.rotations import rotvec_from_matrix
 from trilane.shapes import Shape

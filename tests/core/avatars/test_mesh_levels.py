@@ -23,8 +23,7 @@ from trilane.avatars.mesh_levels import (
     read_mesh_levels,
 )
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINT_INDEX, JOINTS
-from trilane.body.kinematics import Posed, Skeleton
+from trilane.body.joints import JOINT_INDEX, JOINTS, Posed, Skeleton
 from trilane.body.skinning import CpuSkinner
 from trilane.errors import BadInputError
 from trilane.scene.crop import error_px, least_w, stretch_of

@@ -10,8 +10,7 @@ import pytest
 
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINT_NAMES
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import JOINT_NAMES, Skeleton
 from trilane.scene import camera_placement as placement
 from trilane.scene import rotations as rot
 from trilane.scene.camera.path import BUILTIN as CAMERAS

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody, load_body
-from trilane.body.kinematics import Skeleton, rodrigues
+from trilane.body.joints import Skeleton, rodrigues
 from trilane.body.skinning import CpuSkinner
 from trilane.errors import BadInputError
 from trilane.scene.crop import SCREEN, Rect, choose_bucket, crop_projection

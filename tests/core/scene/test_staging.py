@@ -13,7 +13,7 @@ from support.camera_files import OPTICAL, write_tum
 from trilane.arrays import F64
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import ShapedBody, load_body
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.errors import BadInputError
 from trilane.scene.camera.files import load_camera
 from trilane.scene.camera.path import CameraPath, Optics, axes_towards

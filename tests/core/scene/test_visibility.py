@@ -9,7 +9,7 @@ import pytest
 
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.scene import rotations as rot
 from trilane.scene.camera.path import CameraPath, one_lens
 from trilane.scene.camera_placement import place_camera

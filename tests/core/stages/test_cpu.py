@@ -12,7 +12,7 @@ import pytest
 
 from support.small_pipeline import assets_of, without_bytes
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.body.skinning import FrameSkinner
 from trilane.errors import TrilaneError
 from trilane.pipeline.description import UnitSettings

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from support.small_pipeline import assets_of, without_bytes
 from trilane.avatars.bundle import add_mesh_levels, load_bundle
 from trilane.avatars.mesh_levels import MeshLevel
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.body.skinning import DETAILS, FrameSkinner
 from trilane.errors import BadInputError
 from trilane.pipeline.description import UnitSettings

@@ -31,7 +31,7 @@ from trilane.avatars.network_file import check_network, reshaped
 from trilane.bench.lib.full_network import as_written
 from trilane.bench.lib.layers import Box, RasterLayer
 from trilane.body.body import load_body
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.body.skinning import DETAILS
 from trilane.errors import BadInputError
 from trilane.stages.avatar_assets import AvatarData

@@ -15,8 +15,7 @@ from PIL import Image
 
 from support.small_inputs import write_capture_folder
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINT_INDEX
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import JOINT_INDEX, Skeleton
 from trilane.scene.lens import Lens
 from trilane.training import subject
 from trilane.training.capture.capture import Capture, open_capture

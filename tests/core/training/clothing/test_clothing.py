@@ -14,7 +14,7 @@ import pytest
 
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import ShapedBody, load_body
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.errors import BadInputError
 from trilane.shapes import shape_buckets
 from trilane.training import subject
