@@ -29,21 +29,23 @@ from trilane.pipeline.job_times import TASKS, CoreMeter, JobClock
 from trilane.pipeline.memory import EdgeRegion, map_assets
 from trilane.pipeline.stage import JoiningStage, Skip, SkippingStage, Stage, StageFactory, SteppedStage, UnitContext
 from trilane.scheduler.events import unpacked
-from trilane.transport.link import LINGER_MS, Link, context_on_cores
 from trilane.transport.messages import (
     BUILDING,
     CLOSING,
+    LINGER_MS,
     MAX_TEXT,
     Close,
     Closed,
     Failed,
     JobPipe,
     JobPipeEnd,
+    Link,
     MessageError,
     Ping,
     PongMessage,
     Ready,
     RunJob,
+    context_on_cores,
 )
 from trilane.transport.packets import FRAME_FIELDS, Packet, map_region
 from trilane.transport.wakeup import UNIT_NS, use_slice

@@ -28,16 +28,17 @@ from trilane.pipeline.memory import EdgeRegion
 from trilane.pipeline.result import RunLog, UnitError, after_stderr
 from trilane.pipeline.unit_loop import UnitSpec
 from trilane.pipeline.unit_starter import StartedUnit, UnitStarter, is_stopped
-from trilane.transport.link import Link, SocketFolder
 from trilane.transport.messages import (
     Close,
     Closed,
     Failed,
     JobPipe,
     JobPipeEnd,
+    Link,
     Message,
     MessageError,
     Ready,
+    SocketFolder,
     job_pipe_pair,
 )
 

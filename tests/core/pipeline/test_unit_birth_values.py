@@ -19,8 +19,7 @@ from support.small_pipeline import spec_of
 from trilane import machine
 from trilane.pipeline import unit_loop
 from trilane.pipeline.description import UnitSettings
-from trilane.transport.link import HeartbeatSocket
-from trilane.transport.messages import Close, Closed, JobPipe, Ready, job_pipe_pair
+from trilane.transport.messages import Close, Closed, HeartbeatSocket, JobPipe, Ready, job_pipe_pair
 
 UNIT_LIFE = """
 import ctypes, fcntl, json, os, signal, sys

@@ -25,8 +25,7 @@ from trilane.pipeline.memory import EdgeRegion
 from trilane.pipeline.unit_loop import UnitSpec
 from trilane.pipeline.unit_processes import UnitMessage, UnitProcesses
 from trilane.pipeline.unit_starter import StartedUnit, UnitStarter
-from trilane.transport.link import HeartbeatSocket
-from trilane.transport.messages import Done, JobPipe, JobPipeEnd, Ping, PongMessage, Ready
+from trilane.transport.messages import Done, HeartbeatSocket, JobPipe, JobPipeEnd, Ping, PongMessage, Ready
 from trilane.transport.packets import header_dtype
 
 PIPELINE = Pipeline(
