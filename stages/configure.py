@@ -205,7 +205,7 @@ def _footage(scene: Scene) -> Footage | None:
     """Return the facts of the background of `scene`; None for the room. Raises BadInputError."""
     if scene.background == ROOM:
         return None
-    from trilane.stages.gpu.survey import survey  # it is slow to import, and seldom needed here
+    from trilane.stages.gpu.background import survey  # it is slow to import, and seldom needed here
 
     return survey(Path(scene.background), scene.fps)
 
@@ -213,7 +213,7 @@ def _footage(scene: Scene) -> Footage | None:
 def _check_pictures(scene: Scene, staged: Staged) -> None:
     """Raise BadInputError when a picture that the run shows cannot be decoded."""
     if scene.background != ROOM:
-        from trilane.stages.gpu.survey import check_pictures
+        from trilane.stages.gpu.background import check_pictures
 
         check_pictures(Path(scene.background), scene.fps, scene.frames, staged.camera.path)
 

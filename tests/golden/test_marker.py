@@ -23,9 +23,8 @@ from trilane.scene.footage import filmed
 from trilane.scene.schema import CameraSpec, PlaneSpec
 from trilane.shapes import Shape
 from trilane.stages.config import pose_dtype
-from trilane.stages.gpu.background import open_background
+from trilane.stages.gpu.background import open_background, survey
 from trilane.stages.gpu.composite import CompositeStage
-from trilane.stages.gpu.survey import survey
 
 #: Of the camera in a world with Y up: x right, y down, z ahead (optical), and where it stands.
 YAW, PITCH = 0.3, 0.12
