@@ -22,7 +22,7 @@ from typing import Any, cast
 
 from trilane.arrays import U8
 from trilane.errors import MissingPartError, TrilaneError, UnitLostError
-from trilane.memory import shortage
+from trilane.machine import shortage
 from trilane.pipeline.description import Model, PipelineStage, UnitSettings
 from trilane.pipeline.hardware_counters import HardwareCounters, NoCounters, counters_here
 from trilane.pipeline.job_times import TASKS, CoreMeter, JobClock

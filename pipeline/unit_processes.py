@@ -21,7 +21,7 @@ import zmq
 
 from trilane import machine
 from trilane.errors import TrilaneError
-from trilane.memory import ended_by_system, shortage
+from trilane.machine import ended_by_system, shortage
 from trilane.pipeline.controls import Interrupts
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.memory import EdgeRegion

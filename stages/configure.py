@@ -22,7 +22,7 @@ from trilane.avatars.validation import DrawnAs, SizeLoss, accuracy_of, size_loss
 from trilane.errors import EGL_LINE, BadInputError, MissingPartError, TrilaneError, did_you_mean
 from trilane.hw_profiles.host import asked_cores, fastest_runtime, rule_placement, settings_of, usable_cores
 from trilane.hw_profiles.profile_files import load_profile
-from trilane.memory import shortage
+from trilane.machine import shortage
 from trilane.pipeline.memory import Assets
 from trilane.scene.footage import Footage
 from trilane.scene.planner import TensorBudget

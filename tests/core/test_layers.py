@@ -17,7 +17,6 @@ ROWS = (
         "cache",
         "errors",
         "machine",
-        "memory",
         "figure_sources",
         "files",
         "options",
