@@ -15,8 +15,8 @@ from typing import Any
 
 from trilane.avatars.bundle import BUILT_IN, Bundle, bundle_folder
 from trilane.avatars.manifest import CAPTURED, UNTRAINED, Validation, digests_of, figures_digest
-from trilane.figure_sources import NO_FIGURES, from_validation
 from trilane.shapes import parse_shape
+from trilane.units import NO_FIGURES, from_validation
 
 #: Name of each part of an avatar in a sentence.
 PARTS = {

@@ -25,12 +25,12 @@ from trilane.bench.lib.fixture import (
     summary_ms,
 )
 from trilane.errors import BadInputError
-from trilane.figure_sources import MEASURED
 from trilane.shapes import BUCKET_STEP
 from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
 from trilane.stages.gpu.opengl import describe
 from trilane.stages.gpu.packed_pass import FILTERS, PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
+from trilane.units import MEASURED
 
 MAX_SIDE = 2048
 

@@ -19,7 +19,6 @@ from trilane.bench.beside import measure_beside
 from trilane.bench.lib import networks
 from trilane.bench.lib.avatar_process import Asked
 from trilane.errors import BadInputError, TrilaneError
-from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
 from trilane.hw_profiles.host import host_units, usable_cores
 from trilane.pipeline.journal import records_of
 from trilane.pipeline.result import RunResult
@@ -33,7 +32,7 @@ from trilane.stages.configure import Checked, configure
 from trilane.stages.run_options import RunOptions
 from trilane.transport.slots import edge_rule
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import NS_PER_MS
+from trilane.units import COMPARED, COMPUTED, MEASURED, NS_PER_MS
 
 SEQUENTIAL = "sequential"
 MIN_FRAMES = 20

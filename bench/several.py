@@ -19,7 +19,6 @@ from trilane.avatars.network_file import reshaped
 from trilane.bench.lib.fixture import ground_truth, load_drawable
 from trilane.body.joints import Skeleton
 from trilane.errors import BadInputError
-from trilane.figure_sources import MEASURED
 from trilane.scene.crop import MARGIN_PX, TensorLayout, crop_projection, lay_out
 from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
 from trilane.scene.staging import stage_scene
@@ -29,6 +28,7 @@ from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 from trilane.unexpected_value import UnexpectedValue
+from trilane.units import MEASURED
 
 BOUND_DB = 0.5
 OUTPUT = (480, 640)

@@ -26,7 +26,7 @@ from trilane.apps.cli.commands import (
 )
 from trilane.apps.cli.console import print_facts, print_json, spinner, stderr_console, stdout_console, stdout_kept
 from trilane.errors import BadInputError, MissingPartError
-from trilane.figure_sources import MEASURED
+from trilane.units import MEASURED
 
 if TYPE_CHECKING:
     import onnx

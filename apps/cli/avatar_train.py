@@ -18,8 +18,8 @@ from trilane.apps.cli.commands import AvatarArgument, JsonOption, given
 from trilane.apps.cli.console import print_facts, stderr_console, stdout_console, stdout_kept
 from trilane.avatars.manifest import BANDS, CAPTURED
 from trilane.errors import BadInputError, MissingPartError, install_line, package_line
-from trilane.figure_sources import from_validation
 from trilane.stages.run_options import SIZE_HELP
+from trilane.units import from_validation
 
 if TYPE_CHECKING:
     from rich.console import Console

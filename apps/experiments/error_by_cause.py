@@ -36,9 +36,9 @@ from trilane.arrays import F64, U8
 from trilane.bench.lib.layers import Box, RasterLayer, laid_over
 from trilane.bench.lib.picture_error import psnr_db
 from trilane.errors import BadInputError
-from trilane.figure_sources import MEASURED
 from trilane.shapes import Shape
 from trilane.stages.configure import Checked
+from trilane.units import MEASURED
 from trilane.writing import write_bytes
 
 STEPS = 255

@@ -17,7 +17,6 @@ ROWS = (
         "cache",
         "errors",
         "machine",
-        "figure_sources",
         "files",
         "options",
         "shapes",
