@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from trilane.arrays import parse_shape
 from trilane.avatars.bundle import BUILT_IN, Bundle, bundle_folder
 from trilane.avatars.manifest import CAPTURED, UNTRAINED, Validation, digests_of, figures_digest
-from trilane.shapes import parse_shape
 from trilane.units import NO_FIGURES, from_validation
 
 #: Name of each part of an avatar in a sentence.

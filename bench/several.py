@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import U8
+from trilane.arrays import U8, Shape, shape_buckets
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M, load_bundle
 from trilane.avatars.network_file import reshaped
 from trilane.bench.lib.fixture import ground_truth, load_drawable
@@ -22,7 +22,6 @@ from trilane.errors import BadInputError
 from trilane.scene.crop import MARGIN_PX, TensorLayout, crop_projection, lay_out
 from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
 from trilane.scene.staging import stage_scene
-from trilane.shapes import Shape, shape_buckets
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement

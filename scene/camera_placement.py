@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trilane.arrays import F64
+from trilane.arrays import F64, Shape
 from trilane.body.body import ShapedBody
 from trilane.body.joints import JOINT_NAMES
 from trilane.scene.camera.path import CameraPath, view_from_pose
@@ -32,7 +32,6 @@ from trilane.scene.mover import HEAD, Mover
 from trilane.scene.rotations import about, quat_from_matrix, quat_multiply
 from trilane.scene.schema import MAX_DEPTH_RATIO, CameraSpec, Scene
 from trilane.scene.visibility import seen_at
-from trilane.shapes import Shape
 
 #: Step between samples of a way, and most samples; a longer motion has longer steps.
 STEP_S, MOST_SAMPLES = 0.1, 6000

@@ -18,13 +18,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trilane.arrays import F32, F64
+from trilane.arrays import F32, F64, Shape
 from trilane.body.body import ShapedBody
 from trilane.body.joints import Skeleton
 from trilane.scene.camera.path import CameraPath
 from trilane.scene.mover import Mover, outline
 from trilane.scene.rotations import about
-from trilane.shapes import Shape
 
 #: Number of moments at which a place is scored, evenly spread over the first SCORED_S seconds of the scene. A shorter
 #: motion or recording is repeated as in a run; what a longer one shows later does not count.

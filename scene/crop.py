@@ -30,10 +30,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from trilane.arrays import F64
+from trilane.arrays import BUCKET_STEP, F64, MOST_ASPECT, Shape
 from trilane.body.joints import Posed
 from trilane.errors import BadInputError
-from trilane.shapes import BUCKET_STEP, MOST_ASPECT, Shape
 
 #: Least height and width of a crop, in output pixels, however small the body is on the screen.
 LEAST_PIXELS = 1.0

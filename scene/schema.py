@@ -26,10 +26,10 @@ from pydantic import (
 )
 from pydantic.fields import FieldInfo
 
+from trilane.arrays import BUCKET_STEP, MAX_SIDE, checked_size
 from trilane.body.joints import JOINT_INDEX
 from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_text
-from trilane.shapes import BUCKET_STEP, MAX_SIDE, checked_size
 from trilane.unexpected_value import UnexpectedValue, unexpected_in
 
 MAX_DEPTH_RATIO = 1e6  # largest ratio of far to near clip plane; beyond it a depth buffer of 24 bits is too coarse

@@ -12,12 +12,11 @@ from typing import Protocol
 
 import numpy as np
 
-from trilane.arrays import F64
+from trilane.arrays import F64, Shape
 from trilane.body.body import ShapedBody
 from trilane.body.joints import JOINT_NAMES, Skeleton
 from trilane.scene.mover import Mover, outline
 from trilane.scene.schema import BUILT_IN_PREFIX, Scene
-from trilane.shapes import Shape
 
 #: Share of the picture's height below which a person is hard to find, in the median over the frames.
 SMALL = 0.08

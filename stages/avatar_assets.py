@@ -15,7 +15,7 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from trilane.arrays import F32
+from trilane.arrays import F32, Shape
 from trilane.avatars.bundle import Bundle
 from trilane.avatars.mesh_levels import MeshLevel, levels_from_arrays, levels_to_arrays
 from trilane.avatars.network_file import NetworkFile, check_network, reshaped
@@ -24,7 +24,6 @@ from trilane.errors import BadInputError
 from trilane.hw_profiles.network_work import Network, count_work, one_after_the_other
 from trilane.pipeline.memory import Assets
 from trilane.scene.staging import Staged, staged_from_arrays, staged_to_arrays
-from trilane.shapes import Shape
 from trilane.stages.config import RunConfig
 from trilane.stages.gpu.packed_pass import Quantisation
 

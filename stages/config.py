@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 from pydantic import Field, field_validator
 
-from trilane.arrays import F32, U8
+from trilane.arrays import F32, U8, Shape, shape_buckets
 from trilane.body.joints import JOINTS, POSE_FEATURES
 from trilane.pipeline.description import UnitSettings
 from trilane.scene.planner import ALL_WORK, TensorBudget
 from trilane.scene.schema import Scene, StrictModel
-from trilane.shapes import Shape, shape_buckets
 from trilane.transport.live_window import LiveWindow
 from trilane.transport.packets import header_dtype
 from trilane.unexpected_value import UnexpectedValue

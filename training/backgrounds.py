@@ -15,8 +15,7 @@ from functools import cache
 
 import numpy as np
 
-from trilane.arrays import F32
-from trilane.shapes import Shape
+from trilane.arrays import F32, Shape
 
 #: Side of a scene in pixels, number of scenes, and leaves in each scene.
 SIDE, SCENES, LEAVES = 512, 8, 700

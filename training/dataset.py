@@ -15,10 +15,9 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from trilane.arrays import F32, F64, U8
+from trilane.arrays import F32, F64, U8, Shape
 from trilane.body.body import load_body
 from trilane.scene.motion.motion import Motion
-from trilane.shapes import Shape
 from trilane.training.clothing.looks import look_named
 from trilane.training.random_views import Crop
 from trilane.training.sample_files import U16, create_group, open_groups

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.lib.format import open_memmap
 from numpy.typing import NDArray
 
+from trilane.arrays import Shape, parse_shape
 from trilane.errors import BadInputError
-from trilane.shapes import Shape, parse_shape
 from trilane.training.sample_renderer import BAND_NAMES
 from trilane.training.training_settings import TrainingSettings
 

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import F32, F64, Floats
+from trilane.arrays import F32, F64, Floats, shape_buckets
 from trilane.body.body import ShapedBody
 from trilane.body.joints import Skeleton
 from trilane.body.skinning import largest_weights
-from trilane.shapes import shape_buckets
 from trilane.stages.gpu.opengl import open_context
 from trilane.stages.gpu.packed_pass import Placement
 from trilane.stages.gpu.skinned_mesh import BodyPose, MeshDraw, SkinnedMesh, enough_weights, mesh_arrays

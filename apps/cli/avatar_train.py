@@ -245,9 +245,9 @@ def validate(
     It replaces an earlier validation.
     """
     from trilane.apps.run.report_facts import made_facts
+    from trilane.arrays import shape_buckets
     from trilane.avatars.bundle import load_bundle, require_writable_manifest
     from trilane.avatars.validation import no_truth, validation_facts
-    from trilane.shapes import shape_buckets
     from trilane.stages.dsp.runtime import installed, resolve
     from trilane.unexpected_value import UnexpectedValue
 

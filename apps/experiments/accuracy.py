@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from trilane.arrays import U8
+from trilane.arrays import U8, Shape
 from trilane.avatars.network_file import NetworkFile, reshaped
 from trilane.errors import BadInputError
 from trilane.pipeline.stage import UnitContext
-from trilane.shapes import Shape
 from trilane.stages.avatar_assets import networks_of
 from trilane.stages.avatar_pipeline import edge_bytes
 from trilane.stages.config import MAX_CHANNELS, network_parts, pose_dtype

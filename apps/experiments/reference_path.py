@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import F32, F64, U8, Mask
+from trilane.arrays import BUCKET_STEP, F32, F64, U8, Mask, Shape
 from trilane.avatars.network_file import Affine, NetworkFile, reshaped
 from trilane.bench.lib.cast import Cast, CastView
 from trilane.bench.lib.float_raster import quantise
@@ -31,7 +31,6 @@ from trilane.body.joints import JOINTS, POSE_FEATURES, Posed, Skeleton
 from trilane.body.skinning import DETAILS, EVERYTHING, Detail, FrameSkinner
 from trilane.scene.crop import Cell, Rect, crop_projection
 from trilane.scene.planner import FrameWork
-from trilane.shapes import BUCKET_STEP, Shape
 from trilane.stages.avatar_assets import AvatarData
 from trilane.stages.configure import Checked
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime

@@ -14,6 +14,7 @@ from typing import Any
 
 from trilane.apps.explain.scene_plan import PlannedFrame, ScenePlan, phases
 from trilane.apps.run.avatar_facts import worst_loss
+from trilane.arrays import Shape
 from trilane.avatars.network_file import NetworkFile
 from trilane.body.skinning import DETAILS, left_out
 from trilane.errors import BadInputError
@@ -24,7 +25,6 @@ from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.scene.planner import ALL_WORK, MOST_DENSITY, FrameWork
 from trilane.scheduler.placement import Ranked
-from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, mesh_levels_of, networks_of, painting, shaped_body
 from trilane.stages.configure import Checked
 from trilane.stages.cpu.pose import FramePlan

@@ -10,13 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from trilane.arrays import F32, F64
+from trilane.arrays import F32, F64, Shape
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M, load_bundle
 from trilane.bench.lib.layers import Box, box_around
 from trilane.body.joints import Skeleton
 from trilane.scene.crop import crop_projection
 from trilane.scene.mover import Mover
-from trilane.shapes import Shape
 from trilane.stages.avatar_assets import AvatarData, load_avatar, staged_of
 from trilane.stages.configure import Checked
 from trilane.stages.cpu.mesh_bounds import MeshBounds

@@ -16,12 +16,11 @@ import onnxruntime
 from onnx import helper, numpy_helper
 
 from trilane import machine
-from trilane.arrays import F32, F64
+from trilane.arrays import F32, F64, Shape
 from trilane.avatars.bundle import Bundle
 from trilane.avatars.manifest import sha256_of
 from trilane.avatars.network_file import NetworkFile, constants_of, reshaped
 from trilane.errors import MissingPartError
-from trilane.shapes import Shape
 
 #: Folder in which Trilane keeps the weights of float networks.
 WEIGHTS = Path(__file__).resolve().parents[2] / "training"

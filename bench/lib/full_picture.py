@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from trilane.arrays import F32, F64, U8
+from trilane.arrays import BUCKET_STEP, F32, F64, U8, Shape
 from trilane.avatars.bundle import BUILT_IN, bundle_folder
 from trilane.bench.lib import float_raster
 from trilane.bench.lib.cast import Cast, CastView
@@ -30,7 +30,6 @@ from trilane.bench.lib.layers import RasterLayer, blended, enlarged, grown, prem
 from trilane.body.body import Body
 from trilane.body.joints import JOINTS, rodrigues
 from trilane.scene.crop import crop_projection
-from trilane.shapes import BUCKET_STEP, Shape
 from trilane.stages.avatar_assets import AvatarData
 from trilane.stages.gpu.skinned_mesh import MeshArrays, avatar_mesh
 from trilane.training.clothing.clothed_body import ClothedBody

@@ -12,9 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trilane.arrays import F64, U8, Floats
+from trilane.arrays import BUCKET_STEP, F64, U8, Floats, Shape
 from trilane.scene.crop import Rect
-from trilane.shapes import BUCKET_STEP, Shape
 from trilane.stages.gpu.composite_painters import taps_of
 
 

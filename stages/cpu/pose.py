@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import F32, F64
+from trilane.arrays import F32, F64, Shape
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M
 from trilane.avatars.mesh_levels import MeshLevel
 from trilane.body.body import ShapedBody
@@ -31,7 +31,6 @@ from trilane.scene.camera_placement import steered
 from trilane.scene.crop import SCREEN, Rect, Stretch, cheapest_within, error_px, lay_out_apart, least_w, stretch_of
 from trilane.scene.mover import Mover
 from trilane.scene.planner import FrameWork, HeldMesh, HeldShape, hold_mesh, plan_tensor, shown_by, work_of
-from trilane.shapes import Shape
 from trilane.stages.avatar_assets import bodies_drawn, distinct, mesh_levels_of, staged_of
 from trilane.stages.config import RunConfig, posed_vertices
 from trilane.stages.cpu.mesh_bounds import MeshBounds

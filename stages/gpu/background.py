@@ -26,13 +26,12 @@ import numpy as np
 from PIL import ExifTags, Image, UnidentifiedImageError
 
 from trilane import machine
-from trilane.arrays import U8
+from trilane.arrays import U8, Shape
 from trilane.errors import BadInputError, reason
 from trilane.files import HEAD_BYTES, PICTURE, VIDEO, require_file, signature_of_head
 from trilane.scene.camera.path import CameraPath
 from trilane.scene.footage import Footage, Stored, film_of, in_order
 from trilane.scene.lens import cover
-from trilane.shapes import Shape
 from trilane.stages.gpu.video_reader import (
     DEFAULT_STEP_S,
     Pixels,

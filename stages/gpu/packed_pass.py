@@ -14,10 +14,9 @@ from typing import Any
 import moderngl
 import numpy as np
 
-from trilane.arrays import F32, U8, Floats
+from trilane.arrays import F32, U8, Floats, Shape
 from trilane.avatars.bundle import split_levels
 from trilane.errors import BadInputError
-from trilane.shapes import Shape
 from trilane.stages.gpu import opengl
 from trilane.stages.gpu.opengl import build_program, read_into, set_uniforms, upload
 from trilane.stages.gpu.skinned_mesh import BodyPose, Mesh, MeshDraw

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.arrays import Shape
 from trilane.body.body import ShapedBody
 from trilane.errors import TrilaneError
 from trilane.pipeline.stage import UnitContext
 from trilane.scene.crop import Rect, crop_projection
-from trilane.shapes import Shape
 from trilane.stages.avatar_assets import bodies_drawn, distinct, levels_of, quantisation_of, texture_of
 from trilane.stages.config import MAX_CHANNELS, RunConfig, network_parts, posed_vertices
 from trilane.stages.gpu.opengl import CONTEXT, checked, counter_of, describe, open_context

@@ -19,7 +19,6 @@ ROWS = (
         "machine",
         "files",
         "options",
-        "shapes",
         "signals",
         "student",
         "unet_tables",

@@ -14,13 +14,12 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import F64, U8
+from trilane.arrays import F64, U8, Shape
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import Body, ShapedBody, load_body
 from trilane.body.joints import rodrigues
 from trilane.errors import BadInputError
 from trilane.files import read_npz
-from trilane.shapes import Shape
 from trilane.training.capture.capture_file import (
     FRAME,
     MASK,

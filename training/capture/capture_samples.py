@@ -15,13 +15,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from PIL import Image
 
-from trilane.arrays import F32, F64, U8, Mask
+from trilane.arrays import F32, F64, U8, Mask, Shape, shape_buckets
 from trilane.body.body import ShapedBody
 from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINTS, Posed, Skeleton
 from trilane.body.skinning import blend_matrices
 from trilane.errors import BadInputError
 from trilane.scene.lens import Lens
-from trilane.shapes import Shape, shape_buckets
 from trilane.stages.gpu.opengl import open_context
 from trilane.stages.gpu.packed_pass import Placement
 from trilane.stages.gpu.skinned_mesh import BodyPose, SkinnedMesh, avatar_mesh

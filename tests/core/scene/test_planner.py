@@ -9,6 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from trilane.arrays import shapes_within
 from trilane.errors import BadInputError
 from trilane.scene.crop import (
     MARGIN_PX,
@@ -42,7 +43,6 @@ from trilane.scene.planner import (
     plan_tensor,
     serves,
 )
-from trilane.shapes import shapes_within
 
 OUTPUT = (480, 640)
 SIDES = st.integers(1, 40).map(lambda steps: 32 * steps)

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from trilane.arrays import shape_buckets
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.joints import Skeleton
 from trilane.errors import BadInputError
-from trilane.shapes import shape_buckets
 from trilane.training import subject
 from trilane.training.clothing.layers import GARMENTS, clothing_layers, shoe
 from trilane.training.clothing.looks import ANKLES, DEFAULT, HIKER, LOOKS, find_landmarks, look_named, look_of
