@@ -6,6 +6,7 @@ sentence names the difference and the command that measures the figure.
 
 from __future__ import annotations
 
+import datetime
 import math
 import shlex
 from collections.abc import Mapping, Sequence
@@ -16,7 +17,7 @@ from typing import Any
 from trilane.arrays import parse_shape
 from trilane.avatars.bundle import BUILT_IN, Bundle, bundle_folder
 from trilane.avatars.manifest import CAPTURED, UNTRAINED, Validation, digests_of, figures_digest
-from trilane.units import NO_FIGURES, from_validation
+from trilane.units import NO_FIGURES
 
 #: Name of each part of an avatar in a sentence.
 PARTS = {
@@ -49,6 +50,11 @@ class DrawnAs:
     size: str
     texture_filter: str = "linear"
     avatars: int = 1
+
+
+def from_validation(date: datetime.date | None) -> str:
+    """Return the source of a figure that an avatar's validation of `date` brought."""
+    return f"from the avatar's validation of {date}"
 
 
 def accuracy_of(bundle: Bundle, drawn: DrawnAs) -> dict[str, Any]:

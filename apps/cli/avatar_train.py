@@ -19,7 +19,6 @@ from trilane.apps.cli.console import print_facts, stderr_console, stdout_console
 from trilane.avatars.manifest import BANDS, CAPTURED
 from trilane.errors import BadInputError, MissingPartError, install_line, package_line
 from trilane.stages.run_options import SIZE_HELP
-from trilane.units import from_validation
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -286,6 +285,8 @@ def validate(
 def _band_table(validation: Validation) -> Table:
     """Return a table with a row for each band of zoom: the first runtime's errors, and what quantising cost."""
     from rich.table import Table
+
+    from trilane.avatars.validation import from_validation
 
     own = validation.on(validation.runtime) or validation
     cost = (validation.model_extra or {}).get("psnr_loss_db", {})

@@ -5,7 +5,6 @@ Rule: each list and each phrase stands once.
 
 from __future__ import annotations
 
-import datetime
 from enum import StrEnum
 from typing import Literal, get_args
 
@@ -53,8 +52,3 @@ COMPUTED = "computed"
 COMPARED = "measured in this run, over computed"
 #: Stands for a figure that is not this avatar's.
 NO_FIGURES = "no figures"
-
-
-def from_validation(date: datetime.date | None) -> str:
-    """Return the source of a figure that an avatar's validation of `date` brought."""
-    return f"from the avatar's validation of {date}"
