@@ -1,7 +1,7 @@
 """The camera in the scene: places a recorded one so that it films the avatars, and lets a person steer it.
 
 The recording is moved as one rigid, upright piece: it is turned about the vertical and shifted; its movement from frame
-to frame never changes. `camera_search` finds the place. At first the camera is in front of the avatars, in the
+to frame never changes. `best_place` finds the place. At first the camera is in front of the avatars, in the
 direction that a heading of 0 faces. Over a drawn background the camera is also tilted by one constant angle, so that it
 does not look down on people, unless that hides them. The moments are those of the scene's first seconds, however many
 frames a run shows and at whatever rate: a frame of a scene is the same picture in every run.
@@ -26,12 +26,11 @@ from trilane.arrays import F64, Shape
 from trilane.body.body import ShapedBody
 from trilane.body.joints import JOINT_NAMES
 from trilane.scene.camera.path import CameraPath, view_from_pose
-from trilane.scene.camera_search import SCORED_MOMENTS, SCORED_S, best_place, facing, filming, outermost_points
 from trilane.scene.motion.motion import Wrap, bracket, wrapped_time
 from trilane.scene.mover import HEAD, Mover
 from trilane.scene.rotations import about, quat_from_matrix, quat_multiply
 from trilane.scene.schema import MAX_DEPTH_RATIO, CameraSpec, Scene
-from trilane.scene.visibility import seen_at
+from trilane.scene.visibility import SCORED_MOMENTS, SCORED_S, best_place, facing, filming, outermost_points, seen_at
 
 #: Step between samples of a way, and most samples; a longer motion has longer steps.
 STEP_S, MOST_SAMPLES = 0.1, 6000
