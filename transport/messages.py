@@ -32,7 +32,7 @@ import msgpack
 import zmq
 
 from trilane.errors import TrilaneError, reason
-from trilane.transport.wakeup import SHORTEST_NS, use_slice
+from trilane.machine import SHORTEST_SLICE_NS, use_slice
 
 MAX_BYTES = 4096  # of a message; a pipe takes no more in one piece (PIPE_BUF of pipe(7))
 MAX_TEXT = 2000  # bytes of UTF-8 in `Failed.message`
@@ -386,7 +386,7 @@ def context_on_cores(cores: Sequence[int]) -> zmq.Context[zmq.Socket[bytes]]:
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     for core in cores:
         context.set(zmq.THREAD_AFFINITY_CPU_ADD, core)
-    use_slice(SHORTEST_NS)
+    use_slice(SHORTEST_SLICE_NS)
     return context
 
 
