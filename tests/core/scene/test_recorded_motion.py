@@ -11,7 +11,7 @@ import pytest
 
 from trilane.body.joints import JOINT_INDEX
 from trilane.errors import BadInputError
-from trilane.scene.motion import recorded as recorded_module
+from trilane.scene.motion import motion as recorded_module
 from trilane.scene.motion.bvh import UPS
 from trilane.scene.motion.files import load_motion, load_npy, load_npz
 from trilane.scene.motion.motion import (
