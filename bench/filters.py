@@ -27,7 +27,7 @@ from trilane.bench.lib.fixture import (
 from trilane.errors import BadInputError
 from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
 from trilane.stages.gpu.opengl import describe
-from trilane.stages.gpu.packed_pass import FILTERS, PackedAvatar, PackedPass, Placement
+from trilane.stages.gpu.raster import FILTERS, PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 from trilane.units import MEASURED
 

@@ -24,7 +24,7 @@ from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
 from trilane.scene.staging import stage_scene
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
-from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement
+from trilane.stages.gpu.raster import PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import MEASURED

@@ -24,8 +24,7 @@ from trilane.errors import BadInputError
 from trilane.hw_profiles.network_work import Network, count_work, one_after_the_other
 from trilane.pipeline.memory import Assets
 from trilane.scene.staging import Staged, staged_from_arrays, staged_to_arrays
-from trilane.stages.config import RunConfig
-from trilane.stages.gpu.packed_pass import Quantisation
+from trilane.stages.config import Quantisation, RunConfig
 
 SCENE = "scene/"
 HANDS = ("hand_components_left", "hand_components_right")

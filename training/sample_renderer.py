@@ -18,7 +18,7 @@ from trilane.body.body import ShapedBody
 from trilane.body.joints import Skeleton
 from trilane.body.skinning import largest_weights
 from trilane.stages.gpu.opengl import open_context
-from trilane.stages.gpu.packed_pass import Placement
+from trilane.stages.gpu.raster import Placement
 from trilane.stages.gpu.skinned_mesh import BodyPose, MeshDraw, SkinnedMesh, enough_weights, mesh_arrays
 from trilane.training.clothing.clothed_body import ClothedBody
 from trilane.training.clothing.layers import clothing_layers

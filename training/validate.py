@@ -31,8 +31,9 @@ from trilane.scene.motion.files import load_motion
 from trilane.scene.motion.motion import Motion
 from trilane.scene.planner import SIDES
 from trilane.scene.schema import AvatarSpec
+from trilane.stages.config import Quantisation
 from trilane.stages.dsp.runtime import RuntimeOptions, Session, load_runtime
-from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement, Quantisation
+from trilane.stages.gpu.raster import PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 from trilane.stages.machine_facts import package_version
 from trilane.training.backgrounds import SIDE, scenes

@@ -156,7 +156,7 @@ def assemble(base: Bundle, parts: Parts, out: Path) -> dict[str, Any]:
 
 def _drawable(network: NetworkFile) -> NetworkFile:
     """Return `network` if the units can feed it and show its picture. Raises BadInputError."""
-    from trilane.stages.gpu.packed_pass import CHANNELS
+    from trilane.stages.gpu.raster import CHANNELS
 
     check_integer_layers(network)
     if network.channels not in CHANNELS:

@@ -22,7 +22,7 @@ from trilane.arrays import F64, U8
 from trilane.bench.lib.cast import Cast
 from trilane.errors import BadInputError, did_you_mean
 from trilane.stages.configure import Checked, configure
-from trilane.stages.gpu.packed_pass import FILTERS
+from trilane.stages.gpu.raster import FILTERS
 from trilane.stages.run_options import RunOptions
 from trilane.training.quantising.calibration import METHODS
 from trilane.units import MEASURED

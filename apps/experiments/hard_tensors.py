@@ -22,15 +22,9 @@ from trilane.body.body import ShapedBody
 from trilane.body.joints import JOINTS, Skeleton
 from trilane.errors import BadInputError
 from trilane.scene.camera.path import look_at, projection_matrix
+from trilane.stages.config import Quantisation
 from trilane.stages.configure import Checked, configure
-from trilane.stages.gpu.packed_pass import (
-    PackedAvatar,
-    PackedPass,
-    Placement,
-    Quantisation,
-    check_texture,
-    texture_array,
-)
+from trilane.stages.gpu.raster import PackedAvatar, PackedPass, Placement, check_texture, texture_array
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh, mesh_arrays
 from trilane.stages.run_options import RunOptions
 

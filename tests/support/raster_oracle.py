@@ -14,7 +14,7 @@ from trilane.bench.lib.fixture import ENCODING, standing
 from trilane.body.body import load_body
 from trilane.body.joints import JOINT_INDEX, Skeleton, rodrigues
 from trilane.stages.gpu.opengl import describe
-from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement
+from trilane.stages.gpu.raster import PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 from trilane.training.sample_renderer import UvRaster
 

@@ -22,7 +22,7 @@ from trilane.body.skinning import blend_matrices
 from trilane.errors import BadInputError
 from trilane.scene.lens import Lens
 from trilane.stages.gpu.opengl import open_context
-from trilane.stages.gpu.packed_pass import Placement
+from trilane.stages.gpu.raster import Placement
 from trilane.stages.gpu.skinned_mesh import BodyPose, SkinnedMesh, avatar_mesh
 from trilane.training.capture.capture import Capture
 from trilane.training.capture.fits import Fit
