@@ -60,7 +60,7 @@ def from_validation(date: datetime.date | None) -> str:
 def accuracy_of(bundle: Bundle, drawn: DrawnAs) -> dict[str, Any]:
     """Return what may be said about the error of the avatar's pictures in a run that draws it as `drawn`.
 
-    With figures: `source`, which names the validation and its date; `runtime`, `size`; the keys of `Figures`.
+    With figures: `source`, which names the validation and its date; `runtime`, `size`; the keys of `AccuracyFigures`.
     Without: what `refused` returns, also where the avatar is drawn otherwise than in its validation.
     Raises BadInputError for a file that cannot be read.
     """

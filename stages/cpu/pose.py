@@ -55,7 +55,7 @@ class SeenAvatar:
 
 
 @dataclass(frozen=True)
-class Choice:
+class DetailChoice:
     """The choice for an avatar in a frame.
 
     `mesh`: level of the mesh. `level`: an index into `DETAILS`. `error_px`: bound of the error of both, pixels.
@@ -119,13 +119,13 @@ class ModelledBody:
     def skeleton(self) -> Skeleton:
         return Skeleton(self.shaped.joints, self.shaped.body.parents)
 
-    def choose(self, posed: Posed, clip: F64, output: Shape, before: HeldMesh | None = None) -> Choice:
+    def choose(self, posed: Posed, clip: F64, output: Shape, before: HeldMesh | None = None) -> DetailChoice:
         """Return the levels of a frame, and the bound on their error in pixels of a picture of `output`.
 
         `before`: level of the mesh in the frame before.
         """
         if not self.details and not self.levels:
-            return Choice(HeldMesh(0), FINEST, 0.0)
+            return DetailChoice(HeldMesh(0), FINEST, 0.0)
         w = least_w(posed, clip, self.detail.reach, self.detail.blend_m(posed))
         stretch = stretch_of(clip, output)
         moved = [0.0, *(self._moved_m(level, posed, stretch, w) for level in self.levels)]
@@ -133,7 +133,7 @@ class ModelledBody:
         details = self.detail.metres(posed) if self.details else [0.0]
         errors = [error_px(metres + moved[mesh.level], stretch, w) for metres in details]
         level = cheapest_within(errors, self.budget_px)
-        return Choice(mesh, level if self.details else FINEST, errors[level])
+        return DetailChoice(mesh, level if self.details else FINEST, errors[level])
 
     def _moved_m(self, level: MeshLevel, posed: Posed, stretch: Stretch, w: float) -> float:
         """Return the bound of `level` in metres, or its least in any pose where that is beyond the budget already."""
@@ -142,7 +142,7 @@ class ModelledBody:
         return level.metres(posed)
 
     def see(
-        self, posed: Posed, clip: F64, output: Shape, vertices: F32 | None, moved: ByteCounter, choice: Choice
+        self, posed: Posed, clip: F64, output: Shape, vertices: F32 | None, moved: ByteCounter, choice: DetailChoice
     ) -> SeenAvatar | None:
         """Skin the body into `vertices`, if given, and find its rectangle; None when nothing of it is visible.
 
