@@ -92,19 +92,10 @@ LEG_BELOW, PLANTED_SHARE = np.radians(35.0), 0.25
 NEAR_AXIS = np.cos(np.radians(30.0))
 #: Pairs of joints of one bone or one part: some of their distances are the same in two skeletons that are built alike.
 RIGID = (
-    ("left_hip", "right_hip"),
-    ("pelvis", "left_hip"),
-    ("pelvis", "spine1"),
-    ("left_hip", "spine1"),
-    ("spine1", "spine2"),
-    ("spine2", "spine3"),
-    ("spine3", "neck"),
-    ("spine3", "left_collar"),
-    ("neck", "left_collar"),
-    ("left_collar", "right_collar"),
-    ("left_collar", "left_shoulder"),
-    ("left_ankle", "left_foot"),
-)
+    ("left_hip", "right_hip"), ("pelvis", "left_hip"), ("pelvis", "spine1"), ("left_hip", "spine1"),
+    ("spine1", "spine2"), ("spine2", "spine3"), ("spine3", "neck"), ("spine3", "left_collar"), ("neck", "left_collar"),
+    ("left_collar", "right_collar"), ("left_collar", "left_shoulder"), ("left_ankle", "left_foot"),
+)  # fmt: skip
 #: Largest difference of such distances, as a share of them and of the legs.
 SAME_SHARE, SAME_LEGS = 0.02, 0.003
 
