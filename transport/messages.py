@@ -357,17 +357,26 @@ class HeartbeatSocket:
         self.socket.setsockopt(zmq.SNDHWM, HIGH_WATER)
         self.socket.setsockopt(zmq.RCVHWM, HIGH_WATER)
 
-    def fileno(self) -> int:
-        """Return a descriptor that is readable when the socket may have messages; then call `receive`."""
+    def bind(self, endpoint: str) -> None:
+        """Receive the unit's heartbeats at `endpoint` (the scheduler's end)."""
+        self.socket.bind(endpoint)
+
+    def connect(self, endpoint: str) -> None:
+        """Send heartbeats to `endpoint` (the unit's end)."""
+        self.socket.connect(endpoint)
+
+    @property
+    def heartbeat_fd(self) -> int:
+        """A descriptor that is readable when `heartbeats` should be called."""
         return self.socket.fileno()
 
-    def send(self, message: Heartbeat) -> None:
+    def send_heartbeat(self, message: Heartbeat) -> None:
         """Send without waiting; does nothing when the other end has stopped reading."""
         with contextlib.suppress(zmq.Again):
             self.socket.send(pack(message), zmq.DONTWAIT)
 
-    def receive(self) -> list[Message]:
-        """Return all messages since the last call; raises MessageError for bytes that are no message."""
+    def heartbeats(self) -> list[Message]:
+        """Return all heartbeats since the last call; raises MessageError for bytes that are no message."""
         messages = []
         while self.socket.poll(0):  # until it is empty: before that, ZeroMQ's descriptor does not become readable again
             messages.append(unpack(self.socket.recv(zmq.DONTWAIT)))
@@ -390,36 +399,15 @@ def context_on_cores(cores: Sequence[int]) -> zmq.Context[zmq.Socket[bytes]]:
     return context
 
 
-class Link:
-    """The `job_pipe` and the `heartbeat_socket` of one end; messages of each arrive in order or not at all."""
+class Link(HeartbeatSocket):
+    """One end of a unit's connection: heartbeats and the `job_pipe`; messages of each arrive in order or not at all."""
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], job_pipe: JobPipe, linger_ms: int = 0) -> None:
         """Take over `job_pipe`; `context` and `linger_ms` are those of `HeartbeatSocket`."""
+        super().__init__(context, linger_ms)
         self.job_pipe = job_pipe
-        self.heartbeat_socket = HeartbeatSocket(context, linger_ms)
-
-    def bind(self, endpoint: str) -> None:
-        """Receive the unit's heartbeats at `endpoint` (the scheduler's end)."""
-        self.heartbeat_socket.socket.bind(endpoint)
-
-    def connect(self, endpoint: str) -> None:
-        """Send heartbeats to `endpoint` (the unit's end)."""
-        self.heartbeat_socket.socket.connect(endpoint)
-
-    @property
-    def heartbeat_fd(self) -> int:
-        """A descriptor that is readable when `heartbeats` should be called."""
-        return self.heartbeat_socket.fileno()
-
-    def send_heartbeat(self, message: Heartbeat) -> None:
-        """Send without waiting; does nothing when the other end has stopped reading."""
-        self.heartbeat_socket.send(message)
-
-    def heartbeats(self) -> list[Message]:
-        """Return all heartbeats since the last call; raises MessageError for bytes that are no message."""
-        return self.heartbeat_socket.receive()
 
     def close(self) -> None:
         """Close both; heartbeats that were sent are delivered within `linger_ms`."""
-        self.heartbeat_socket.close()
+        super().close()
         self.job_pipe.close()

@@ -143,7 +143,7 @@ def test_a_whole_unit_connects_is_ready_and_ends_when_it_is_told(
     threading.Timer(0.05, pipe.send, [Close()]).start()
     raw = json.loads(spec.model_dump_json())
     assert unit_loop.serve(raw, {fd: fd for fd in spec.fds}) == 0
-    assert beats.socket.poll(2000) and beats.receive() == [Ready(os.getpid())]
+    assert beats.socket.poll(2000) and beats.heartbeats() == [Ready(os.getpid())]
     assert pipe.receive() == Closed()
     assert pipe.receive() is None and pipe.ended
     assert slices == [(1, 0), 1_000_000]

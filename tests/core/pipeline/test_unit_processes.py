@@ -124,7 +124,7 @@ def test_heartbeats_come_in_and_the_name_of_their_socket_goes(started: Started) 
     beats = HeartbeatSocket(context)
     endpoint = starter.specs["left"].endpoint
     beats.socket.connect(endpoint)
-    beats.send(Ready(5))
+    beats.send_heartbeat(Ready(5))
     assert heard(processes, 1) == [UnitMessage("left", Ready(5))]
     folder = Path(endpoint.removeprefix("ipc://")).parent
     assert folder.is_dir()
@@ -132,7 +132,7 @@ def test_heartbeats_come_in_and_the_name_of_their_socket_goes(started: Started) 
     processes.connected("left")
     processes.connected("nobody")
     assert not folder.exists()
-    beats.send(PongMessage())
+    beats.send_heartbeat(PongMessage())
     assert heard(processes, 1) == [UnitMessage("left", PongMessage())]
     beats.socket.send(b"\xffno")
     with pytest.raises(TrilaneError, match=r"^unit left sent bytes that are not a message: unknown message"):

@@ -283,8 +283,8 @@ def test_jobs_go_over_the_job_pipe_and_heartbeats_over_zeromq(links: tuple[Link,
     child.job_pipe.send(Failed(2, 2, "no such thing"))
     assert [parent.job_pipe.receive() for _ in range(3)] == [done, Failed(2, 2, "no such thing"), None]
     assert received(parent) == [PongMessage()]
-    child.heartbeat_socket.socket.send(bytes(1 << 17), zmq.DONTWAIT)
-    assert not parent.heartbeat_socket.socket.poll(300)
+    child.socket.send(bytes(1 << 17), zmq.DONTWAIT)
+    assert not parent.socket.poll(300)
 
 
 def test_every_heartbeat_that_came_is_received_in_order(context: zmq.Context, tmp_path: Path) -> None:
@@ -293,10 +293,10 @@ def test_every_heartbeat_that_came_is_received_in_order(context: zmq.Context, tm
     other.socket.connect(f"ipc://{tmp_path}/h")
     beats = [*(Ready(pid) for pid in range(5)), PongMessage()]
     for beat in beats:
-        other.send(beat)
+        other.send_heartbeat(beat)
     found: list[Message] = []
     while len(found) < 6 and one.socket.poll(2000):
-        found += one.receive()
+        found += one.heartbeats()
     assert found == beats
     one.close()
     other.close()
@@ -306,8 +306,8 @@ def test_a_heartbeat_socket_holds_little_takes_no_large_message_and_is_closed_at
     one = HeartbeatSocket(context)
     options = (zmq.TYPE, zmq.LINGER, zmq.MAXMSGSIZE, zmq.SNDHWM, zmq.RCVHWM)
     assert [one.socket.getsockopt(option) for option in options] == [zmq.PAIR, 0, 4096, 64, 64]
-    assert one.fileno() == one.socket.getsockopt(zmq.FD)
-    one.send(PongMessage())  # nobody is connected: it is dropped, and nobody waits
+    assert one.heartbeat_fd == one.socket.getsockopt(zmq.FD)
+    one.send_heartbeat(PongMessage())  # nobody is connected: it is dropped, and nobody waits
     one.close()
     assert one.socket.closed
 
@@ -315,7 +315,7 @@ def test_a_heartbeat_socket_holds_little_takes_no_large_message_and_is_closed_at
 def test_a_link_hands_its_linger_on_and_closes_both_ways(context: zmq.Context) -> None:
     ours, theirs = job_pipe_pair()
     link = Link(context, JobPipe(ours), 7)
-    socket = link.heartbeat_socket.socket
+    socket = link.socket
     assert socket.getsockopt(zmq.LINGER) == 7
     link.close()
     theirs.close()
