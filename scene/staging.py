@@ -71,6 +71,9 @@ def stage_scene(scene: Scene, bodies: Sequence[ShapedBody], base: Path, footage:
 Arrays = dict[str, NDArray[Any]]
 
 WRAPS, KNOWN = tuple(Wrap), tuple(Known)
+MOTION = ("times_s", "poses", "quats", "translation", "travels", "betas", "leg_m")
+MOVER = ("world", "scale", "shift", "lift_times_s", "lift_m")
+PATH = ("times_s", "quats", "places", "quarter", "is_held", "repeat_s", "began_s", "recorded")
 LENS = ("width_px", "height_px", "fx", "fy", "cx", "cy")
 
 
@@ -96,23 +99,13 @@ def _below(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Arrays:
     return {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
 
 
+def _arrays(of: object, keys: Sequence[str]) -> Arrays:
+    return {key: np.asarray(value) for key in keys if (value := getattr(of, key)) is not None}
+
+
 def _mover_arrays(mover: Mover) -> Arrays:
-    motion = mover.motion
-    optional = {"betas": motion.betas, "leg_m": motion.leg_m}
-    return {
-        "times_s": motion.times_s,
-        "poses": motion.poses,
-        "quats": motion.quats,
-        "translation": motion.translation,
-        "wrap": np.array(WRAPS.index(motion.wrap)),
-        "travels": np.array(motion.travels),
-        "world": mover.world,
-        "scale": np.array(mover.scale),
-        "shift": mover.shift,
-        "lift_times_s": mover.lift_times_s,
-        "lift_m": mover.lift_m,
-        **{key: np.asarray(value) for key, value in optional.items() if value is not None},
-    }
+    wrap = np.array(WRAPS.index(mover.motion.wrap))
+    return {**_arrays(mover.motion, MOTION), **_arrays(mover, MOVER), "wrap": wrap}
 
 
 def _mover(arrays: Arrays) -> Mover:
@@ -136,24 +129,15 @@ def _mover(arrays: Arrays) -> Mover:
 def _camera_arrays(camera: PlacedCamera) -> Arrays:
     path = camera.path
     return {
-        "times_s": path.times_s,
-        "quats": path.quats,
-        "places": path.places,
+        **_arrays(path, PATH),
         "lenses": np.array([[getattr(lens, key) for key in LENS] for lens in path.optics.lenses]),
         "known": np.array([KNOWN.index(lens.known) for lens in path.optics.lenses]),
         "clip_m": np.array([path.optics.near_m, path.optics.far_m]),
         "filmed": np.array(path.optics.filmed, np.int64).reshape(-1, 2),
         "turned": np.array(path.optics.turned, np.int64),
         "pictures": np.array(path.pictures, np.str_),
-        "quarter": np.array(path.quarter),
-        "is_held": np.array(path.is_held),
-        "repeat_s": np.array(path.repeat_s),
-        **({} if path.began_s is None else {"began_s": np.array(path.began_s)}),
         "wrap": np.array(WRAPS.index(path.wrap)),
-        "recorded": np.array(path.recorded),
-        "turn": camera.turn,
-        "shift": camera.shift,
-        "mount": camera.mount,
+        **_arrays(camera, ("turn", "shift", "mount")),
         "ways": np.array(len(camera.ways)),
         **{f"way.{index}.{key}": value for index, way in enumerate(camera.ways) for key, value in _way(way).items()},
     }
