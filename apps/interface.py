@@ -28,13 +28,13 @@ from trilane.apps.run.report import Report, read_report
 from trilane.apps.run.verdict import Verdict
 from trilane.apps.run.verdict_facts import predicted_verdict, verdict_of
 from trilane.errors import BadInputError, MissingPartError, TrilaneError, did_you_mean
-from trilane.figure_sources import COMPUTED, MEASURED, NO_FIGURES
 from trilane.options import EMPTY_PATH, Options
 from trilane.pipeline.journal import Record, Stepped
 from trilane.pipeline.timeline import Presented, Timeline
 from trilane.pipeline.unit_history import IdleSlice
 from trilane.scheduler.events import Event
 from trilane.stages.run_options import RunOptions
+from trilane.units import COMPUTED, MEASURED, NO_FIGURES
 
 if TYPE_CHECKING:
     import pandas

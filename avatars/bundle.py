@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F32
 from trilane.avatars.manifest import ByteRange, Manifest, digests_of, parse_manifest
-from trilane.avatars.mesh_levels import MESH_LEVELS, read_mesh_levels, save_mesh_levels
+from trilane.avatars.mesh_levels import MESH_LEVELS, MeshLevel, read_mesh_levels, save_mesh_levels
 from trilane.avatars.network_file import MAX_SIDE, Affine, NetworkFile, read_network
 from trilane.body.body import Body, ShapedBody, load_body
-from trilane.body.mesh_levels import MeshLevel
 from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_npz, read_text, require_file
 from trilane.writing import require_writable, write_atomically, write_bytes, write_folder

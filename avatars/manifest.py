@@ -104,7 +104,7 @@ class SeedFigures(_Model):
     least_psnr_db: Finite
 
 
-class Figures(_Model):
+class AccuracyFigures(_Model):
     """Image error of one network on one runtime, on poses and views that were not trained on.
 
     `psnr_db_by_band`: PSNR in dB, before random backgrounds, inside the box of the true mask. `see_through`: share of
@@ -181,7 +181,7 @@ class BySize(_Model):
 AT_THE_TOP = ("psnr_db_by_band", "psnr_db_by_background", "see_through", "iou", "ssim")
 
 
-class Validation(Figures):
+class Validation(AccuracyFigures):
     """The figures of an avatar, and what they were measured on.
 
     `date`: day of the validation, UTC. `date`, `digests`, `figures_digest` and `made_with` are None in a manifest that
@@ -205,15 +205,15 @@ class Validation(Figures):
     runtime: str = ""
     size: str = ""
     texture_filter: str = "linear"
-    integer: Figures | None = None
-    other_runtimes: dict[str, Figures] = {}
+    integer: AccuracyFigures | None = None
+    other_runtimes: dict[str, AccuracyFigures] = {}
     by_size: BySize | None = None
 
-    def on(self, runtime: str) -> Figures | None:
+    def on(self, runtime: str) -> AccuracyFigures | None:
         """Return the figures of `runtime`; None when nothing was painted on it."""
         if runtime != self.runtime:
             return self.other_runtimes.get(runtime)
-        return self.integer or Figures(**{key: getattr(self, key) for key in AT_THE_TOP})
+        return self.integer or AccuracyFigures(**{key: getattr(self, key) for key in AT_THE_TOP})
 
 
 class Manifest(_Model):

@@ -6,6 +6,7 @@ sentence names the difference and the command that measures the figure.
 
 from __future__ import annotations
 
+import datetime
 import math
 import shlex
 from collections.abc import Mapping, Sequence
@@ -13,10 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from trilane.arrays import parse_shape
 from trilane.avatars.bundle import BUILT_IN, Bundle, bundle_folder
 from trilane.avatars.manifest import CAPTURED, UNTRAINED, Validation, digests_of, figures_digest
-from trilane.figure_sources import NO_FIGURES, from_validation
-from trilane.shapes import parse_shape
+from trilane.units import NO_FIGURES
 
 #: Name of each part of an avatar in a sentence.
 PARTS = {
@@ -51,10 +52,15 @@ class DrawnAs:
     avatars: int = 1
 
 
+def from_validation(date: datetime.date | None) -> str:
+    """Return the source of a figure that an avatar's validation of `date` brought."""
+    return f"from the avatar's validation of {date}"
+
+
 def accuracy_of(bundle: Bundle, drawn: DrawnAs) -> dict[str, Any]:
     """Return what may be said about the error of the avatar's pictures in a run that draws it as `drawn`.
 
-    With figures: `source`, which names the validation and its date; `runtime`, `size`; the keys of `Figures`.
+    With figures: `source`, which names the validation and its date; `runtime`, `size`; the keys of `AccuracyFigures`.
     Without: what `refused` returns, also where the avatar is drawn otherwise than in its validation.
     Raises BadInputError for a file that cannot be read.
     """

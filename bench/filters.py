@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from trilane.arrays import U8
+from trilane.arrays import BUCKET_STEP, U8
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import reshaped
 from trilane.bench.lib.fixture import (
@@ -25,12 +25,11 @@ from trilane.bench.lib.fixture import (
     summary_ms,
 )
 from trilane.errors import BadInputError
-from trilane.figure_sources import MEASURED
-from trilane.shapes import BUCKET_STEP
 from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
 from trilane.stages.gpu.opengl import describe
-from trilane.stages.gpu.packed_pass import FILTERS, PackedAvatar, PackedPass, Placement
+from trilane.stages.gpu.raster import FILTERS, PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
+from trilane.units import MEASURED
 
 MAX_SIDE = 2048
 

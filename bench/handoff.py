@@ -24,12 +24,12 @@ from trilane.arrays import U8
 from trilane.bench.lib.handoff_variants import BARE, CHANNELS, SLOT, WRITTEN, Channel
 from trilane.errors import BadInputError, TrilaneError, install_line
 from trilane.hw_profiles.host import host_units
+from trilane.machine import UNIT_SLICE_NS, awake, use_slice
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage
 from trilane.pipeline.run import run_pipeline
 from trilane.pipeline.stage import UnitContext
 from trilane.scheduler.stats import median_interval, samples_needed
 from trilane.transport.packets import Packet
-from trilane.transport.wakeup import UNIT_NS, awake, use_slice
 
 #: KiB of a tensor of 16 channels at 128, 256, 512 and 1024 squared; no other sizes are accepted.
 SIZES_KIB = (256, 1024, 4096, 16384)
@@ -180,7 +180,7 @@ def _child(pipe: Connection, cores: tuple[int, ...]) -> Iterator[None]:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends it
     os.sched_setaffinity(0, cores)
     # The kernel schedules the processes of units with the same slice.
-    use_slice(UNIT_NS)
+    use_slice(UNIT_SLICE_NS)
     try:
         yield
     except (EOFError, BrokenPipeError, ConnectionResetError):

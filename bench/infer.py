@@ -18,13 +18,13 @@ import numpy as np
 import onnx
 
 from trilane import machine
+from trilane.arrays import parse_shape
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import read_network
 from trilane.bench import roofline
 from trilane.bench.lib.interleaved_processes import ProcessVariant, runners
 from trilane.bench.lib.networks import NetworkFixture, fixture_of_file, untrained, untrained_float
 from trilane.errors import BadInputError
-from trilane.shapes import parse_shape
 from trilane.stages.dsp.runtime import resolve
 from trilane.unexpected_value import UnexpectedValue
 

@@ -18,12 +18,12 @@ import numpy as np
 import onnx
 
 from trilane import machine
+from trilane.arrays import parse_shape
 from trilane.bench import roofline
 from trilane.bench.lib.interleaved_processes import ProcessVariant, runners
 from trilane.bench.lib.networks import untrained, untrained_float
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
 from trilane.scheduler.stats import median_interval
-from trilane.shapes import parse_shape
 from trilane.stages.dsp.runtime import resolve
 from trilane.unexpected_value import UnexpectedValue
 

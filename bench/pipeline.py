@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 from trilane.bench.lib import networks
 from trilane.bench.lib.interleaved_processes import answer_of, asked_processes
 from trilane.errors import BadInputError, TrilaneError
-from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
 from trilane.hw_profiles.application import application_graph
 from trilane.hw_profiles.host import host_units, usable_cores
 from trilane.pipeline.journal import records_of
@@ -38,7 +37,7 @@ from trilane.stages.configure import Checked, configure
 from trilane.stages.run_options import RunOptions
 from trilane.transport.slots import edge_rule
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import AFTER_INFER, BEFORE_INFER, NS_PER_MS
+from trilane.units import AFTER_INFER, BEFORE_INFER, COMPARED, COMPUTED, MEASURED, NS_PER_MS
 
 SEQUENTIAL, PIPELINED = "sequential", "pipelined"
 MIN_FRAMES = 20

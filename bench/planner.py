@@ -23,7 +23,6 @@ from trilane.bench.lib.picture_error import PictureErrors, box_psnr_db, psnr_of_
 from trilane.bench.lib.stage_chain import AvatarFrames
 from trilane.bench.pipeline import finished_run
 from trilane.errors import BadInputError
-from trilane.figure_sources import MEASURED
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.stats import median_interval
 from trilane.stages import PRELOAD
@@ -31,6 +30,7 @@ from trilane.stages.configure import Checked, configure
 from trilane.stages.gpu.opengl import describe
 from trilane.stages.placing import placed
 from trilane.stages.run_options import RunOptions
+from trilane.units import MEASURED
 from trilane.writing import write_folder
 
 SCENES = ("portrait", "full-body", "crowd", "walk-past", "top-to-floor", "leave-and-return")

@@ -18,16 +18,9 @@ from trilane.arrays import U8, Floats
 from trilane.bench.lib.fixture import ENCODING, INPUTS, SLOTS, Fixture, interleaved_ms, standing, summary_ms
 from trilane.body.skinning import FrameSkinner
 from trilane.errors import BadInputError, TrilaneError
+from trilane.stages.config import Quantisation
 from trilane.stages.gpu.opengl import describe, open_context
-from trilane.stages.gpu.packed_pass import (
-    CHANNELS,
-    PackedAvatar,
-    PackedPass,
-    Placement,
-    Quantisation,
-    check_texture,
-    texture_array,
-)
+from trilane.stages.gpu.raster import CHANNELS, PackedAvatar, PackedPass, Placement, check_texture, texture_array
 from trilane.stages.gpu.skinned_mesh import MeshDraw, PosedMesh, SkinnedMesh
 from trilane.training.sample_renderer import UvBytes
 

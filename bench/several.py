@@ -13,23 +13,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import U8
+from trilane.arrays import U8, Shape, shape_buckets
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M, load_bundle
 from trilane.avatars.network_file import reshaped
 from trilane.bench.lib.fixture import ground_truth, load_drawable
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.errors import BadInputError
-from trilane.figure_sources import MEASURED
-from trilane.scene.crop import crop_projection
+from trilane.scene.crop import MARGIN_PX, TensorLayout, crop_projection, lay_out
 from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
 from trilane.scene.staging import stage_scene
-from trilane.scene.tensor_layout import MARGIN_PX, TensorLayout, lay_out
-from trilane.shapes import Shape, shape_buckets
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
-from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement
+from trilane.stages.gpu.raster import PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 from trilane.unexpected_value import UnexpectedValue
+from trilane.units import MEASURED
 
 BOUND_DB = 0.5
 OUTPUT = (480, 640)

@@ -24,8 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from trilane.arrays import F32, F64
 from trilane.body.body import Body, ShapedBody
-from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINTS, POSE_FEATURES
-from trilane.body.kinematics import Posed, Skeleton
+from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINTS, POSE_FEATURES, Posed, Skeleton
 from trilane.cache import Arrays, cached_arrays
 from trilane.errors import BadInputError
 

@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 import onnx
 from onnx import TensorProto, helper
 
+from trilane.arrays import parse_shape
 from trilane.errors import BadInputError
 from trilane.hw_profiles.network_work import Network, Work, count_work
-from trilane.shapes import parse_shape
 from trilane.unet_tables import (
     DECODER,
     ENCODERS,

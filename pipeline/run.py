@@ -16,6 +16,7 @@ from typing import Any, Protocol
 from ddsketch import LogCollapsingLowestDenseDDSketch
 
 from trilane.errors import BadInputError, UnwrittenError
+from trilane.machine import awake
 from trilane.pipeline.controls import FrameRequestQueue, Interrupts, RunControls
 from trilane.pipeline.cpu_use import add_accounts
 from trilane.pipeline.description import Pipeline
@@ -43,7 +44,6 @@ from trilane.scheduler.events import Abort, Outcome, OutcomeKind, Settings
 from trilane.scheduler.ledger import Books
 from trilane.scheduler.policy import run_settings
 from trilane.scheduler.stats import MOST_EXACT, energy_score
-from trilane.transport.wakeup import awake
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import NS_PER_MS, NS_PER_S
 

@@ -21,13 +21,13 @@ import psutil
 
 from trilane import machine
 from trilane.errors import BadInputError, TrilaneError
+from trilane.machine import SHORTEST_SLICE_NS, USUAL_SLICE, use_slice
 from trilane.pipeline import fork_server
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.memory import Assets, edge_regions, share_assets
 from trilane.pipeline.run_metrics import ProcessorState
 from trilane.pipeline.unit_processes import UnitProcesses
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.transport.wakeup import DEFAULT, SHORTEST_NS, use_slice
 
 #: Number of files and sockets that a run holds open, with room for a unit that is restarted.
 LEAST_FILES = 96
@@ -160,11 +160,11 @@ def prompt_answers() -> Iterator[None]:
     switch_s, collects = sys.getswitchinterval(), gc.isenabled()
     sys.setswitchinterval(SWITCH_S)
     gc.disable()
-    use_slice(SHORTEST_NS)
+    use_slice(SHORTEST_SLICE_NS)
     try:
         yield
     finally:
-        use_slice(DEFAULT)
+        use_slice(USUAL_SLICE)
         sys.setswitchinterval(switch_s)
         if collects:
             gc.enable()

@@ -13,6 +13,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
+from trilane.machine import awake
 from trilane.pipeline.controls import Interrupts
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.memory import Assets
@@ -25,7 +26,6 @@ from trilane.scheduler.core import Core, run_loop
 from trilane.scheduler.events import Action, Event
 from trilane.scheduler.policy import run_settings
 from trilane.transport.messages import Message, RunJob
-from trilane.transport.wakeup import awake
 
 SLICE: Final = 16  # frames of a placement in its turn
 SKIPPED: Final = 6  # first frames of a slice that do not count, as they were under way when the units were moved

@@ -22,31 +22,32 @@ from typing import Any, cast
 
 from trilane.arrays import U8
 from trilane.errors import MissingPartError, TrilaneError, UnitLostError
-from trilane.memory import shortage
+from trilane.machine import UNIT_SLICE_NS, shortage, use_slice
 from trilane.pipeline.description import Model, PipelineStage, UnitSettings
 from trilane.pipeline.hardware_counters import HardwareCounters, NoCounters, counters_here
 from trilane.pipeline.job_times import TASKS, CoreMeter, JobClock
 from trilane.pipeline.memory import EdgeRegion, map_assets
 from trilane.pipeline.stage import JoiningStage, Skip, SkippingStage, Stage, StageFactory, SteppedStage, UnitContext
 from trilane.scheduler.events import unpacked
-from trilane.transport.link import LINGER_MS, Link, context_on_cores
 from trilane.transport.messages import (
     BUILDING,
     CLOSING,
+    LINGER_MS,
     MAX_TEXT,
     Close,
     Closed,
     Failed,
     JobPipe,
     JobPipeEnd,
+    Link,
     MessageError,
     Ping,
     PongMessage,
     Ready,
     RunJob,
+    context_on_cores,
 )
 from trilane.transport.packets import FRAME_FIELDS, Packet, map_region
-from trilane.transport.wakeup import UNIT_NS, use_slice
 from trilane.units import NS_PER_S
 
 
@@ -252,7 +253,7 @@ def serve(raw_spec: dict[str, Any], number_of: Mapping[int, int]) -> int:
     context = context_on_cores(spec.scheduler_cores)
     link = Link(context, JobPipe(spec.job_pipe, waits=True), LINGER_MS)
     # `context_on_cores` leaves this thread with the I/O thread's slice; a unit's is longer.
-    use_slice(UNIT_NS)
+    use_slice(UNIT_SLICE_NS)
     link.connect(spec.endpoint)
     try:
         return _serve(spec, link)

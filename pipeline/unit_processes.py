@@ -21,23 +21,24 @@ import zmq
 
 from trilane import machine
 from trilane.errors import TrilaneError
-from trilane.memory import ended_by_system, shortage
+from trilane.machine import ended_by_system, shortage
 from trilane.pipeline.controls import Interrupts
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.memory import EdgeRegion
 from trilane.pipeline.result import RunLog, UnitError, after_stderr
 from trilane.pipeline.unit_loop import UnitSpec
 from trilane.pipeline.unit_starter import StartedUnit, UnitStarter, is_stopped
-from trilane.transport.link import Link, SocketFolder
 from trilane.transport.messages import (
     Close,
     Closed,
     Failed,
     JobPipe,
     JobPipeEnd,
+    Link,
     Message,
     MessageError,
     Ready,
+    SocketFolder,
     job_pipe_pair,
 )
 

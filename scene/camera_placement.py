@@ -1,11 +1,14 @@
 """The camera in the scene: places a recorded one so that it films the avatars, and lets a person steer it.
 
 The recording is moved as one rigid, upright piece: it is turned about the vertical and shifted; its movement from frame
-to frame never changes. `camera_search` finds the place. At first the camera is in front of the avatars, in the
+to frame never changes. `best_place` finds the place. At first the camera is in front of the avatars, in the
 direction that a heading of 0 faces. Over a drawn background the camera is also tilted by one constant angle, so that it
 does not look down on people, unless that hides them. The moments are those of the scene's first seconds, however many
-frames a run shows and at whatever rate: a frame of a scene is the same picture in every run. A built-in camera goes
-along with people who would leave its picture.
+frames a run shows and at whatever rate: a frame of a scene is the same picture in every run.
+
+A built-in camera is a formula of time for a person at the origin. It goes along where a person would leave the picture:
+its place is moved by the mean of the avatars' ways over the floor. A way repeats as its motion does, so a frame does
+not depend on those before it. Steps and sways are smoothed out of it, because a camera that shows them shakes.
 
 A person turns the view about the vertical through a pivot, then about the level axis that runs to the camera's right.
 The camera stays upright, above the floor and off the pole; where the scene's own camera is beyond that, it is not
@@ -19,18 +22,73 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trilane.arrays import F64
+from trilane.arrays import F64, Shape
 from trilane.body.body import ShapedBody
 from trilane.body.joints import JOINT_NAMES
 from trilane.scene.camera.path import CameraPath, view_from_pose
-from trilane.scene.camera_search import SCORED_MOMENTS, SCORED_S, best_place, facing, filming, outermost_points
-from trilane.scene.follow import Way, way_cycle_s, way_of
-from trilane.scene.motion.motion import Wrap
+from trilane.scene.motion.motion import Wrap, bracket, wrapped_time
 from trilane.scene.mover import HEAD, Mover
 from trilane.scene.rotations import about, quat_from_matrix, quat_multiply
 from trilane.scene.schema import MAX_DEPTH_RATIO, CameraSpec, Scene
-from trilane.scene.visibility import seen_at
-from trilane.shapes import Shape
+from trilane.scene.visibility import SCORED_MOMENTS, SCORED_S, best_place, facing, filming, outermost_points, seen_at
+
+#: Step between samples of a way, and most samples; a longer motion has longer steps.
+STEP_S, MOST_SAMPLES = 0.1, 6000
+#: Standard deviation of the Gaussian that smooths a way. It leaves a sixth of a sway of 1 Hz and nothing of a step of
+#: 2 Hz; a runner at 6 m/s who turns at once is 1.4 m from the smoothed way.
+SMOOTH_S = 0.3
+#: Standard deviations after which the Gaussian ends.
+ENDS_AFTER = 3.0
+#: How an array of samples continues beyond its ends, by what follows the motion's last frame.
+PADDING = {Wrap.LOOP: "wrap", Wrap.BOUNCE: "reflect", Wrap.HOLD: "edge"}
+
+
+@dataclass(frozen=True)
+class Way:
+    """The smoothed way of an avatar over the floor.
+
+    `times_s` (T,): times from 0, strictly increasing. `places` (T, 3): places on the floor, metres. `wrap`: what
+    follows the last one.
+    """
+
+    times_s: F64
+    places: F64
+    wrap: Wrap
+
+    def at(self, t_s: float) -> F64:
+        """Return the place (3,) at `t_s`, linear between samples."""
+        i, j, fraction = bracket(self.times_s, wrapped_time(t_s, float(self.times_s[-1]), self.wrap))
+        return np.asarray(self.places[i] + (self.places[j] - self.places[i]) * fraction)
+
+
+def way_cycle_s(mover: Mover) -> float:
+    """Return the time after which the way of `mover` begins again; that of its motion where it holds its end."""
+    return mover.motion.duration_s * (2 if mover.motion.wrap is Wrap.BOUNCE else 1)
+
+
+def way_of(mover: Mover, body: ShapedBody) -> Way:
+    """Return the way of the pelvis of `mover`, who has `body`."""
+    motion = mover.motion
+    count = min(int(np.ceil(motion.duration_s / STEP_S)), MOST_SAMPLES - 1) + 1
+    times = np.linspace(0.0, motion.duration_s, count)
+    pelvises = motion.sample_all(times)[1] * mover.scale + mover.shift + body.joints[0]
+    places = pelvises @ mover.world[:3, :3].T + mover.world[:3, 3]
+    places[:, 1] = 0.0
+    return Way(times, smoothed(places, float(times[-1]) / max(count - 1, 1), motion.wrap), motion.wrap)
+
+
+def smoothed(places: F64, step_s: float, wrap: Wrap) -> F64:
+    """Return `places` (T, 3), `step_s` apart, smoothed by a Gaussian; beyond their ends they go on by `wrap`."""
+    if len(places) == 1:
+        return places
+    reach = int(np.ceil(ENDS_AFTER * SMOOTH_S / step_s))
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) * step_s / SMOOTH_S) ** 2)
+    weights /= weights.sum()
+    # The last sample of a loop is the first one of the next.
+    own = places[:-1] if wrap is Wrap.LOOP else places
+    padded = np.pad(own, ((reach, reach), (0, 0)), mode=PADDING[wrap])  # type: ignore[call-overload]
+    smooth = np.stack([np.convolve(column, weights, mode="valid") for column in padded.T], axis=1)
+    return np.concatenate([smooth, smooth[:1]]) if wrap is Wrap.LOOP else smooth
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,16 @@
-"""The crop: a rectangle of the screen, the tensor shape that fits it, and the projection that draws only that part.
+"""The crop: a rectangle of the screen, the tensor shape that fits it, its projection, and its place in the tensor.
 
 Rectangles are x0, y0, x1, y1 in normalised device coordinates, y up; a tensor's pixels are square on the screen.
 
-`error_px` leads from metres to pixels, with a proved bound. A vertex has the clip coordinates X, Y, W. The vectors r_x,
-r_y, r_w are the first three numbers of the clip matrix's rows. With x = X / W and y = Y / W, an error d moves it by
+**Layout.** One visible avatar has the whole tensor. Several are drawn at one scale in rows, so each has a share of the
+tensor in proportion to its area on the screen. At least `MARGIN_PX` of background lie between them. `lay_out` fills the
+tensor: the scale is the largest that the tensor has room for. `lay_out_at` stops at a density. At density 1 a tensor
+pixel is a pixel of the picture, on its grid; the rest of the tensor is background. Avatars of different networks have a
+tensor each, all of one shape: `apart` lays them out, network by network.
+
+**Error.** `error_px` leads from metres to pixels, with a proved bound. A vertex has the clip coordinates X, Y, W. The
+vectors r_x, r_y, r_w are the first three numbers of the clip matrix's rows. With x = X / W and y = Y / W, an error d
+moves it by
 
     (x' - x, y' - y) = J d / (W + r_w . d),   with the rows r_x - x r_w and r_y - y r_w of J,
 
@@ -16,16 +23,16 @@ least of the body: a skinned vertex is a mean of points that lie no further from
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from trilane.arrays import F64
-from trilane.body.kinematics import Posed
+from trilane.arrays import BUCKET_STEP, F64, MOST_ASPECT, Shape
+from trilane.body.joints import Posed
 from trilane.errors import BadInputError
-from trilane.shapes import Shape
 
 #: Least height and width of a crop, in output pixels, however small the body is on the screen.
 LEAST_PIXELS = 1.0
@@ -182,3 +189,222 @@ def _stretch(first: F64, second: F64) -> float:
 def cheapest_within(errors_px: Sequence[float], budget_px: float) -> int:
     """Return the index of the first level, from the least work on, whose error is within the budget; else the last."""
     return next((level for level, error in enumerate(errors_px) if error <= budget_px), len(errors_px) - 1)
+
+
+#: top, left, height, width in tensor pixels.
+Cell = tuple[int, int, int, int]
+
+#: Background between two avatars, tensor pixels: at this distance the default network paints each as if the other were
+#: not there. Measured by `trilane bench several`; the numbers are in docs/decisions/several-avatars.md.
+MARGIN_PX = 16
+
+
+@dataclass(frozen=True)
+class TensorLayout:
+    """A layout.
+
+    `shape`: (height, width) of the tensor. `crops`: crop rectangle and cell of each avatar.
+    """
+
+    shape: Shape
+    crops: tuple[tuple[Rect, Cell], ...]
+
+
+@dataclass(frozen=True)
+class DenseLayout:
+    """A layout, and its `density`: tensor pixels for one pixel of the picture, along a side."""
+
+    layout: TensorLayout
+    density: float
+
+
+@dataclass(frozen=True)
+class _Arrangement:
+    """An arrangement of the avatars in rows.
+
+    `rows`: numbers of the avatars, row by row, in a tensor of `shape`. `scale`: tensor pixels for one output pixel.
+    """
+
+    shape: Shape
+    rows: tuple[tuple[int, ...], ...]
+    scale: float
+
+
+def lay_out(rects: Sequence[Rect], output: Shape, buckets: Sequence[Shape], margin_px: int = MARGIN_PX) -> TensorLayout:
+    """Place the visible avatars in one tensor; margins shrink where it is too small for them.
+
+    `rects`: the avatars' mesh rectangles on the screen, at least one.
+    `output`: (height, width) of the picture in pixels.
+    `buckets`: tensor shapes (height, width) to choose from.
+    `margin_px`: background between two avatars, tensor pixels.
+    Raises BadInputError without buckets, or when no bucket has a pixel for every avatar.
+    """
+    if len(rects) == 1:
+        shape, grown = choose_bucket(rects[0], output, buckets)
+        return TensorLayout(shape, ((grown, (0, 0, *shape)),))
+    sizes = [(max(r.height * output[0] / 2, LEAST_PIXELS), max(r.width * output[1] / 2, LEAST_PIXELS)) for r in rects]
+    best = max(_arrangements(sizes, buckets, margin_px), key=lambda arrangement: arrangement.scale, default=None)
+    if best is not None and best.scale > 0:
+        return TensorLayout(best.shape, _crops(rects, sizes, output, best, margin_px))
+    if margin_px == 0:
+        raise _no_room(rects, buckets)
+    return lay_out(rects, output, buckets, margin_px // 2)
+
+
+def lay_out_at(
+    rects: Sequence[Rect], output: Shape, shape: Shape, most_density: float = 1.0, margin_px: int = MARGIN_PX
+) -> DenseLayout | None:
+    """Place the visible avatars in a tensor of `shape`, no denser than `most_density`; None without room for all.
+
+    `rects`: the avatars' mesh rectangles on the screen, at least one; each is widened to whole pixels of the picture.
+    `output`: (height, width) of the picture in pixels.
+    `margin_px`: background between two avatars, tensor pixels.
+    """
+    whole = [on_grid(rect, output) for rect in rects]
+    sizes = [_pixels(rect, output) for rect in whole]
+    if len(rects) == 1:
+        density = min(most_density, shape[0] / sizes[0][0], shape[1] / sizes[0][1])
+        grown = grow_on_grid(whole[0], output, (shape[0] / density, shape[1] / density))
+        return DenseLayout(TensorLayout(shape, ((grown, (0, 0, *shape)),)), density)
+    best = max(_arrangements(sizes, [shape], margin_px), key=lambda one: min(one.scale, most_density))
+    if best.scale <= 0:
+        return None
+    density = min(best.scale, most_density)
+    scaled = _Arrangement(best.shape, best.rows, density)
+    return DenseLayout(TensorLayout(shape, _crops(whole, sizes, output, scaled, margin_px)), density)
+
+
+def by_network(networks: Sequence[int]) -> list[list[int]]:
+    """Return the places of the avatars of each network. `networks`: network of each avatar in view."""
+    return [[place for place, one in enumerate(networks) if one == network] for network in sorted(set(networks))]
+
+
+def apart(
+    rects: Sequence[Rect], networks: Sequence[int], lay: Callable[[Sequence[Rect]], DenseLayout | None]
+) -> DenseLayout | None:
+    """Place the avatars of each network in a tensor of its own; None where one of them has no room.
+
+    `rects`, `networks`: mesh rectangle and network of each visible avatar.
+    `lay`: lays out those of one network, always in a tensor of the same shape. The density is the least of theirs.
+    """
+    groups = by_network(networks)
+    found = [lay([rects[place] for place in places]) for places in groups]
+    fits = [one for one in found if one is not None]
+    if len(fits) < len(groups):
+        return None
+    placed = {
+        place: crop
+        for places, one in zip(groups, fits, strict=True)
+        for place, crop in zip(places, one.layout.crops, strict=True)
+    }
+    crops = tuple(placed[place] for place in range(len(rects)))
+    return DenseLayout(TensorLayout(fits[0].layout.shape, crops), min(one.density for one in fits))
+
+
+def lay_out_apart(
+    rects: Sequence[Rect], networks: Sequence[int], output: Shape, buckets: Sequence[Shape]
+) -> TensorLayout:
+    """Place the visible avatars as `lay_out` does, those of each network in a tensor of its own.
+
+    All tensors have the shape in which the least dense one is densest.
+    `networks`: network of each avatar. The other parameters and the errors are those of `lay_out`.
+    """
+    if len(set(networks)) == 1:
+        return lay_out(rects, output, buckets)
+
+    def filled(shape: Shape) -> DenseLayout | None:
+        def lay(own: Sequence[Rect]) -> DenseLayout | None:
+            try:
+                layout = lay_out(own, output, [shape])
+            except BadInputError:
+                return None
+            crop, cell = layout.crops[0]
+            return DenseLayout(layout, cell[2] / (crop.height * output[0] / 2))
+
+        return apart(rects, networks, lay)
+
+    found = [one for shape in buckets if (one := filled(shape)) is not None]
+    if not found:
+        raise _no_room(rects, buckets)
+    return max(found, key=lambda one: one.density).layout
+
+
+def _no_room(rects: Sequence[Rect], buckets: Sequence[Shape]) -> BadInputError:
+    return BadInputError("tensor shapes", f"{list(buckets)}", f"room for {len(rects)} avatars", "use a larger --size")
+
+
+def tight_shape(rects: Sequence[Rect], output: Shape, density: float = 1.0, margin_px: int = MARGIN_PX) -> Shape:
+    """Return the shape of least area, sides in multiples of `BUCKET_STEP`, with room for the avatars at `density`.
+
+    For several avatars, no arrangement is longer than `MOST_ASPECT` times its width, unless all are. The parameters are
+    those of `lay_out_at`.
+    """
+    whole = [_pixels(on_grid(rect, output), output) for rect in rects]
+    sizes = [(math.ceil(height * density), math.ceil(width * density)) for height, width in whole]
+    if len(sizes) == 1:
+        return _whole_steps(sizes[0][0]), _whole_steps(sizes[0][1])
+    shapes = [_extent(sizes, rows, margin_px) for rows in _rows(sizes)]
+    return min(shapes, key=lambda shape: (max(shape) > MOST_ASPECT * min(shape), shape[0] * shape[1], max(shape)))
+
+
+def _pixels(rect: Rect, output: Shape) -> tuple[int, int]:
+    """Return height and width of a rectangle on the grid."""
+    return round(rect.height * output[0] / 2), round(rect.width * output[1] / 2)
+
+
+def _extent(sizes: Sequence[tuple[int, int]], rows: Sequence[Sequence[int]], margin: int) -> Shape:
+    """Return the extent of `rows`; a pixel of each side is reserved for rounding up, as in `_scale`."""
+    height = sum(max(sizes[k][0] for k in row) for row in rows) + margin * (len(rows) - 1) + len(rows)
+    width = max(sum(sizes[k][1] for k in row) + margin * (len(row) - 1) + len(row) for row in rows)
+    return _whole_steps(height), _whole_steps(width)
+
+
+def _whole_steps(side: int) -> int:
+    """Round `side` up to a multiple of `BUCKET_STEP`."""
+    return -(-side // BUCKET_STEP) * BUCKET_STEP
+
+
+def _arrangements(
+    sizes: Sequence[tuple[float, float]], buckets: Sequence[Shape], margin: int
+) -> Iterator[_Arrangement]:
+    """Yield the avatars' arrangements, tallest first, in each bucket: one row, two rows, up to a row for each."""
+    for rows in _rows(sizes):
+        for shape in buckets:
+            yield _Arrangement(shape, rows, _scale(sizes, shape, rows, margin))
+
+
+def _rows(sizes: Sequence[tuple[float, float]]) -> Iterator[tuple[tuple[int, ...], ...]]:
+    """Yield the avatars' numbers, tallest first, in one row, in two, and so on."""
+    order = sorted(range(len(sizes)), key=lambda k: -sizes[k][0])
+    for count in range(1, len(order) + 1):
+        each = math.ceil(len(order) / count)
+        yield tuple(tuple(order[start : start + each]) for start in range(0, len(order), each))
+
+
+def _scale(sizes: Sequence[tuple[float, float]], shape: Shape, rows: Sequence[Sequence[int]], margin: int) -> float:
+    """Return the largest scale at which all rows fit; one pixel of each side is reserved for rounding up."""
+    high = (shape[0] - margin * (len(rows) - 1) - len(rows)) / sum(max(sizes[k][0] for k in row) for row in rows)
+    wide = ((shape[1] - margin * (len(row) - 1) - len(row)) / sum(sizes[k][1] for k in row) for row in rows)
+    return min(high, *wide)
+
+
+def _crops(
+    rects: Sequence[Rect], sizes: Sequence[tuple[float, float]], output: Shape, arrangement: _Arrangement, margin: int
+) -> tuple[tuple[Rect, Cell], ...]:
+    """Return crop rectangle and cell of each avatar, in the order of `rects`."""
+    placed: dict[int, tuple[Rect, Cell]] = {}
+    top = 0
+    for row in arrangement.rows:
+        left = 0
+        for k in row:
+            height, width = (math.ceil(side * arrangement.scale) for side in sizes[k])
+            placed[k] = _grown(rects[k], output, (height, width), arrangement.scale), (top, left, height, width)
+            left += width + margin
+        top += max(cell[2] for _, cell in (placed[k] for k in row)) + margin
+    return tuple(placed[k] for k in range(len(rects)))
+
+
+def _grown(rect: Rect, output: Shape, cell: Shape, scale: float) -> Rect:
+    x0, x1 = grow(rect.x0, rect.x1, 2 * cell[1] / (scale * output[1]))
+    y0, y1 = grow(rect.y0, rect.y1, 2 * cell[0] / (scale * output[0]))
+    return Rect(x0, y0, x1, y1)

@@ -23,10 +23,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.arrays import Shape
 from trilane.scene.camera.path import CameraPath, Optics
 from trilane.scene.lens import Known, Lens, cover
 from trilane.scene.rotations import quat_from_matrix
-from trilane.shapes import Shape
 
 #: Least share of a film's neighbours that are one step apart, and most frames for each picture; else the numbers are
 #: not times.

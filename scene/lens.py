@@ -20,9 +20,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trilane.arrays import F64
+from trilane.arrays import F64, Shape
 from trilane.errors import BadInputError
-from trilane.shapes import Shape
 
 #: Size of the picture of a lens for which only an angle is known.
 ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX = 640.0, 480.0

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F32, F64
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINT_INDEX, JOINT_NAMES
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, Skeleton
 from trilane.scene.motion.motion import Motion, bracket, rest_leg_m, wrapped_time
 from trilane.scene.rotations import about
 from trilane.scene.schema import AvatarSpec

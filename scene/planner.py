@@ -37,11 +37,9 @@ from enum import IntEnum
 from itertools import combinations, pairwise
 from typing import NamedTuple
 
-from trilane.arrays import Floats
+from trilane.arrays import Floats, Shape, shapes_within
 from trilane.errors import BadInputError
-from trilane.scene.crop import Rect
-from trilane.scene.tensor_layout import DenseLayout, apart, by_network, lay_out_at, tight_shape
-from trilane.shapes import Shape, shapes_within
+from trilane.scene.crop import DenseLayout, Rect, apart, by_network, lay_out_at, tight_shape
 
 
 class FrameWork(IntEnum):

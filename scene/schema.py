@@ -10,7 +10,6 @@ import json
 import math
 import tomllib
 from collections.abc import Mapping
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
 
@@ -26,10 +25,10 @@ from pydantic import (
 )
 from pydantic.fields import FieldInfo
 
+from trilane.arrays import BUCKET_STEP, MAX_SIDE, checked_size
 from trilane.body.joints import JOINT_INDEX
 from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_text
-from trilane.shapes import BUCKET_STEP, MAX_SIDE, checked_size
 from trilane.unexpected_value import UnexpectedValue, unexpected_in
 
 MAX_DEPTH_RATIO = 1e6  # largest ratio of far to near clip plane; beyond it a depth buffer of 24 bits is too coarse
@@ -386,6 +385,7 @@ class Scene(Table):
 
 INPUT_SHOULD = "Input should be "
 ENDING = ".toml"
+SCENES = Path(__file__).parent / "scenes"
 LONGEST_FOUND = 80
 #: What was expected, by the type of a pydantic error, where pydantic's own text is not fit for people.
 EXPECTED = {
@@ -478,14 +478,13 @@ def scene_from(where: str | Path, values: Mapping[str, Any]) -> Scene:
 
 def scene_names() -> list[str]:
     """Return the names of the scenes that come with the package."""
-    folder = files("trilane.scene.scenes")
-    return sorted(item.name.removesuffix(ENDING) for item in folder.iterdir() if item.name.endswith(ENDING))
+    return sorted(file.stem for file in SCENES.glob(f"*{ENDING}"))
 
 
 def find_scene(name: str) -> Path:
     """Return the file of a scene: a path, or the name of one that comes with the package. Raises BadInputError."""
     if name in scene_names():
-        return Path(str(files("trilane.scene.scenes") / f"{name}{ENDING}"))
+        return SCENES / f"{name}{ENDING}"
     path = Path(name)
     if path.suffix != ENDING:
         expected = f"a {ENDING} file or one of {', '.join(scene_names())}"

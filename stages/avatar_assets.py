@@ -15,19 +15,16 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from trilane.arrays import F32
+from trilane.arrays import F32, Shape
 from trilane.avatars.bundle import Bundle
-from trilane.avatars.mesh_levels import levels_from_arrays, levels_to_arrays
+from trilane.avatars.mesh_levels import MeshLevel, levels_from_arrays, levels_to_arrays
 from trilane.avatars.network_file import NetworkFile, check_network, reshaped
 from trilane.body.body import Body, ShapedBody
-from trilane.body.mesh_levels import MeshLevel
 from trilane.errors import BadInputError
 from trilane.hw_profiles.network_work import Network, count_work, one_after_the_other
 from trilane.pipeline.memory import Assets
 from trilane.scene.staging import Staged, staged_from_arrays, staged_to_arrays
-from trilane.shapes import Shape
-from trilane.stages.config import RunConfig
-from trilane.stages.gpu.packed_pass import Quantisation
+from trilane.stages.config import Quantisation, RunConfig
 
 SCENE = "scene/"
 HANDS = ("hand_components_left", "hand_components_right")

@@ -15,6 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from trilane.arrays import Shape
 from trilane.hw_profiles.host import settings_of
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage
 from trilane.pipeline.memory import Assets
@@ -24,7 +25,6 @@ from trilane.pipeline.run import run_pipeline
 from trilane.pipeline.trial import SLICE, Group, Round, try_in_turns
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.places import CpuCore, Place, Placement
-from trilane.shapes import Shape
 from trilane.stages import FACTORIES, PRELOAD
 from trilane.stages.avatar_assets import only_network_of
 from trilane.stages.config import MAX_CHANNELS, PAINTED_CHANNELS, RunConfig, pose_dtype, posed_vertices_bytes

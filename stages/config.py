@@ -8,18 +8,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydantic import Field, field_validator
 
-from trilane.arrays import F32, U8
+from trilane.arrays import F32, U8, Shape, shape_buckets
 from trilane.body.joints import JOINTS, POSE_FEATURES
+from trilane.errors import BadInputError
 from trilane.pipeline.description import UnitSettings
 from trilane.scene.planner import ALL_WORK, TensorBudget
 from trilane.scene.schema import Scene, StrictModel
-from trilane.shapes import Shape, shape_buckets
 from trilane.transport.live_window import LiveWindow
 from trilane.transport.packets import header_dtype
 from trilane.unexpected_value import UnexpectedValue
@@ -92,6 +93,23 @@ def posed_vertices_bytes(counts: Sequence[int]) -> int:
 
 MAX_CHANNELS = 16  # channels of a tensor: the most that the GPU packs in one pass
 PAINTED_CHANNELS = 4  # of a network's picture: red, green, blue, alpha
+
+
+@dataclass(frozen=True)
+class Quantisation:
+    """How the tensor's bytes stand for real numbers: real = (q - zero_point) * scale, q in 0..255.
+
+    Raises BadInputError for a scale that is not positive or a zero point that is not a byte.
+    """
+
+    scale: float
+    zero_point: int
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.scale) and self.scale > 0):
+            raise BadInputError("quantisation scale", str(self.scale), "a positive number")
+        if not 0 <= self.zero_point <= 255:
+            raise BadInputError("quantisation zero point", str(self.zero_point), "0 to 255")
 
 
 class NetworkCut(StrictModel):

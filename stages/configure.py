@@ -22,13 +22,12 @@ from trilane.avatars.validation import DrawnAs, SizeLoss, accuracy_of, size_loss
 from trilane.errors import EGL_LINE, BadInputError, MissingPartError, TrilaneError, did_you_mean
 from trilane.hw_profiles.host import asked_cores, fastest_runtime, rule_placement, settings_of, usable_cores
 from trilane.hw_profiles.profile_files import load_profile
-from trilane.memory import shortage
+from trilane.machine import shortage
 from trilane.pipeline.memory import Assets
 from trilane.scene.footage import Footage
-from trilane.scene.missing_person import require_person
 from trilane.scene.planner import TensorBudget
 from trilane.scene.schema import BUILT_IN_PREFIX, FILE_KEYS, Scene, find_scene, load_scene, located, scene_from
-from trilane.scene.staging import Staged, stage_scene
+from trilane.scene.staging import Staged, require_person, stage_scene
 from trilane.stages.avatar_assets import AvatarData, load_avatar, networks_of_avatars, pack_assets
 from trilane.stages.config import NetworkCut, RunConfig
 from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve
@@ -206,7 +205,7 @@ def _footage(scene: Scene) -> Footage | None:
     """Return the facts of the background of `scene`; None for the room. Raises BadInputError."""
     if scene.background == ROOM:
         return None
-    from trilane.stages.gpu.survey import survey  # it is slow to import, and seldom needed here
+    from trilane.stages.gpu.background import survey  # it is slow to import, and seldom needed here
 
     return survey(Path(scene.background), scene.fps)
 
@@ -214,7 +213,7 @@ def _footage(scene: Scene) -> Footage | None:
 def _check_pictures(scene: Scene, staged: Staged) -> None:
     """Raise BadInputError when a picture that the run shows cannot be decoded."""
     if scene.background != ROOM:
-        from trilane.stages.gpu.survey import check_pictures
+        from trilane.stages.gpu.background import check_pictures
 
         check_pictures(Path(scene.background), scene.fps, scene.frames, staged.camera.path)
 

@@ -16,11 +16,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trilane.arrays import Shape
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M
 from trilane.avatars.network_file import STRIDE, NetworkFile, reshaped
 from trilane.avatars.validation import SizeLoss
 from trilane.body.body import ShapedBody
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.errors import BadInputError
 from trilane.scene.crop import Rect
 from trilane.scene.planner import (
@@ -43,7 +44,6 @@ from trilane.scene.planner import (
 from trilane.scene.schema import Scene
 from trilane.scene.staging import Staged
 from trilane.scheduler.policy import policy_named
-from trilane.shapes import Shape
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 
 KEY = "error_budget_db"

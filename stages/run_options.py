@@ -31,7 +31,7 @@ METHODS: Final = ("minmax", "percentile", "entropy")
 #: Calibration method of an untrained network that none was asked for, and number of views where none is given.
 METHOD, VIEWS = "minmax", 5
 MOST_VIEWS: Final = 1000
-#: Numbers of channels that the packed pass draws (`stages/gpu/packed_pass.py`).
+#: Numbers of channels that the packed pass draws (`stages/gpu/raster.py`).
 CHANNELS: Final = (4, 8, 12, 16)
 
 

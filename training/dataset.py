@@ -20,11 +20,10 @@ import numpy as np
 from numpy.lib.format import open_memmap
 from numpy.typing import NDArray
 
-from trilane.arrays import F32, F64, U8
+from trilane.arrays import F32, F64, U8, Shape, parse_shape
 from trilane.body.body import load_body
 from trilane.errors import BadInputError
 from trilane.scene.motion.motion import Motion
-from trilane.shapes import Shape, parse_shape
 from trilane.training.clothing import look_named
 from trilane.training.random_views import Crop
 from trilane.training.sample_renderer import BAND_NAMES, PoseSource, Sample, SampleRenderer

@@ -21,9 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.metrics import structural_similarity
 
-from trilane.arrays import F32, F64, U8, Mask
+from trilane.arrays import F32, F64, U8, Mask, Shape
 from trilane.avatars.manifest import BANDS
-from trilane.shapes import Shape
 
 HALF, OPAQUE = 128, 255
 SSIM_WINDOW = 7

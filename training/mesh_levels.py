@@ -2,7 +2,7 @@
 
 meshoptimizer collapses edges onto vertices that exist, keeps UV seams, and weighs UV as an attribute. Its error is a
 mean over quadrics, so single texels may be far off. So the distance is measured wherever the edges of both meshes cross
-in UV, and at each vertex that was left out (`body/mesh_levels.py` has the proof). Where it is too large, the vertex at
+in UV, and at each vertex that was left out (`avatars/mesh_levels.py` proves it). Where it is too large, the vertex at
 the worst place of each triangle is locked, and the mesh is simplified again.
 
 At a seam the level's edge is a chord of the whole mesh's. A vertex that is left out there is paired with the nearest
@@ -21,10 +21,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from trilane.arrays import F64, I64, Mask
+from trilane.avatars.mesh_levels import MeshLevel, grouped
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINTS
-from trilane.body.kinematics import Skeleton
-from trilane.body.mesh_levels import MeshLevel, grouped
+from trilane.body.joints import JOINTS, Skeleton
 from trilane.body.skinning import CpuSkinner, blend_reach, branch_sums
 from trilane.errors import MissingPartError
 from trilane.stages.gpu.skinned_mesh import split_corners

@@ -11,15 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import F64
+from trilane.arrays import F64, Shape
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINT_INDEX, JOINTS
-from trilane.body.kinematics import Posed
+from trilane.body.joints import JOINT_INDEX, JOINTS, Posed
 from trilane.body.skinning import blend_matrices
 from trilane.scene.crop import choose_bucket, crop_projection
 from trilane.scene.rotations import about, rotvec_from_matrix
-from trilane.shapes import Shape
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.training.clothing import Layer
 

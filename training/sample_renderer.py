@@ -15,13 +15,12 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import F32, F64, U8, Floats
+from trilane.arrays import F32, F64, U8, Floats, shape_buckets
 from trilane.body.body import ShapedBody
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.body.skinning import largest_weights
-from trilane.shapes import shape_buckets
 from trilane.stages.gpu.opengl import build_program, eye_of, open_context, set_uniforms
-from trilane.stages.gpu.packed_pass import Placement
+from trilane.stages.gpu.raster import Placement
 from trilane.stages.gpu.skinned_mesh import BodyPose, MeshDraw, SkinnedMesh, enough_weights, mesh_arrays
 from trilane.training import clothing as joint
 from trilane.training.clothing import DEFAULT, MATERIALS, Landmarks, Layer, Look, clothing_layers, find_landmarks

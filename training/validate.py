@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from trilane import machine
-from trilane.arrays import F64, U8
+from trilane.arrays import BUCKET_STEP, F64, U8, Shape
 from trilane.avatars.bundle import Bundle, write_manifest
 from trilane.avatars.manifest import (
     AT_THE_TOP,
@@ -31,9 +31,9 @@ from trilane.scene.motion.files import load_motion
 from trilane.scene.motion.motion import Motion
 from trilane.scene.planner import SIDES
 from trilane.scene.schema import AvatarSpec
-from trilane.shapes import BUCKET_STEP, Shape
+from trilane.stages.config import Quantisation
 from trilane.stages.dsp.runtime import RuntimeOptions, Session, load_runtime
-from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement, Quantisation
+from trilane.stages.gpu.raster import PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 from trilane.stages.machine_facts import package_version
 from trilane.training.clothing import look_of

@@ -24,10 +24,10 @@ from trilane.avatars.bundle import (
     write_bundle,
 )
 from trilane.avatars.manifest import CAPTURED, UNTRAINED, Manifest, network_entry
+from trilane.avatars.mesh_levels import MeshLevel
 from trilane.avatars.network_file import STRIDE, NetworkFile, check_integer_layers, read_network, reshaped
 from trilane.avatars.validation import refused, validation_facts
 from trilane.body.body import Body, load_body
-from trilane.body.mesh_levels import MeshLevel
 from trilane.errors import BadInputError
 from trilane.files import read_npz
 from trilane.hw_profiles.network_work import graph_facts
@@ -156,7 +156,7 @@ def assemble(base: Bundle, parts: Parts, out: Path) -> dict[str, Any]:
 
 def _drawable(network: NetworkFile) -> NetworkFile:
     """Return `network` if the units can feed it and show its picture. Raises BadInputError."""
-    from trilane.stages.gpu.packed_pass import CHANNELS
+    from trilane.stages.gpu.raster import CHANNELS
 
     check_integer_layers(network)
     if network.channels not in CHANNELS:

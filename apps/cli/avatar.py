@@ -22,7 +22,7 @@ from trilane.errors import BadInputError, MissingPartError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from trilane.shapes import Shape
+    from trilane.arrays import Shape
     from trilane.training.capture.capture import Capture
     from trilane.training.capture.synthetic import Recipe, SyntheticCapture
 

@@ -26,13 +26,13 @@ from trilane.apps.cli.commands import (
 )
 from trilane.apps.cli.console import print_facts, print_json, spinner, stderr_console, stdout_console, stdout_kept
 from trilane.errors import BadInputError, MissingPartError
-from trilane.figure_sources import MEASURED
+from trilane.units import MEASURED
 
 if TYPE_CHECKING:
     import onnx
 
+    from trilane.arrays import Shape
     from trilane.avatars.network_file import NetworkFile
-    from trilane.shapes import Shape
 
 EPILOG_NETWORK = """\b
 Examples:
@@ -71,8 +71,8 @@ def network(
     json: JsonOption = False,
 ) -> None:
     """Export an untrained float network: ONNX, static shape, input `tensor`, output `rgba`."""
+    from trilane.arrays import shape_buckets
     from trilane.hw_profiles.network_work import graph_facts
-    from trilane.shapes import shape_buckets
     from trilane.unexpected_value import UnexpectedValue
     from trilane.writing import write_bytes
 
@@ -151,7 +151,7 @@ def _both_sides(size: str) -> str:
 
 def _shape(size: str) -> Shape:
     """Return (height, width) of `--size`. Raises BadInputError."""
-    from trilane.shapes import parse_shape
+    from trilane.arrays import parse_shape
     from trilane.unexpected_value import UnexpectedValue
 
     try:

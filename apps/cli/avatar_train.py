@@ -18,7 +18,6 @@ from trilane.apps.cli.commands import AvatarArgument, JsonOption, given
 from trilane.apps.cli.console import print_facts, stderr_console, stdout_console, stdout_kept
 from trilane.avatars.manifest import BANDS, CAPTURED
 from trilane.errors import BadInputError, MissingPartError, install_line, package_line
-from trilane.figure_sources import from_validation
 from trilane.stages.run_options import SIZE_HELP
 
 if TYPE_CHECKING:
@@ -245,9 +244,9 @@ def validate(
     It replaces an earlier validation.
     """
     from trilane.apps.run.report_facts import made_facts
+    from trilane.arrays import shape_buckets
     from trilane.avatars.bundle import load_bundle, require_writable_manifest
     from trilane.avatars.validation import no_truth, validation_facts
-    from trilane.shapes import shape_buckets
     from trilane.stages.dsp.runtime import installed, resolve
     from trilane.unexpected_value import UnexpectedValue
 
@@ -286,6 +285,8 @@ def validate(
 def _band_table(validation: Validation) -> Table:
     """Return a table with a row for each band of zoom: the first runtime's errors, and what quantising cost."""
     from rich.table import Table
+
+    from trilane.avatars.validation import from_validation
 
     own = validation.on(validation.runtime) or validation
     cost = (validation.model_extra or {}).get("psnr_loss_db", {})

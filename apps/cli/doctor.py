@@ -119,7 +119,7 @@ def _dev_shm() -> PartCheck:
 
 def _wakeup() -> PartCheck:
     """Check whether cores stay awake. This is optional: a message to a sleeping core takes some 50 us longer."""
-    from trilane.transport.wakeup import AWAKE, LATENCY_FILE, awake
+    from trilane.machine import AWAKE, LATENCY_FILE, awake
 
     install = f'apt-get install acl; setfacl -m "u:$USER:w" {LATENCY_FILE}'
     with awake() as idle_cores:

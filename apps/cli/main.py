@@ -19,7 +19,7 @@ import typer
 from trilane.apps.cli.lazy_group import lazy_group
 from trilane.apps.old_names import in_new_names
 from trilane.errors import TrilaneError, install_line, reason
-from trilane.memory import require_memory, shortage
+from trilane.machine import require_memory, shortage
 from trilane.signals import interrupting
 
 #: Command: its module, and the line that `trilane --help` shows for it.

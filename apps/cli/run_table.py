@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
 
-from trilane.figure_sources import COMPUTED, MEASURED, NO_FIGURES
 from trilane.scheduler.stats import samples_needed
+from trilane.units import COMPUTED, MEASURED, NO_FIGURES
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -23,10 +23,9 @@ from trilane.apps.compare.frontier import SAME_DB, frontier, knees
 from trilane.apps.run.report import MAX_REPORT_BYTES
 from trilane.apps.sweep.store import TRIALS, read_trials
 from trilane.errors import BadInputError, MissingPartError
-from trilane.figure_sources import COMPUTED, MEASURED, NO_FIGURES
 from trilane.files import instead_of_file, require_file
 from trilane.scene.schema import Scene
-from trilane.units import HOST_CLOCK
+from trilane.units import COMPUTED, HOST_CLOCK, MEASURED, NO_FIGURES
 from trilane.writing import write_atomically
 
 #: What an error belongs to, and what an interval of the frame time holds.

@@ -12,12 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from trilane.arrays import U8
+from trilane.arrays import U8, Shape
 from trilane.avatars.network_file import NetworkFile, reshaped
 from trilane.errors import BadInputError
-from trilane.figure_sources import MEASURED
 from trilane.pipeline.stage import UnitContext
-from trilane.shapes import Shape
 from trilane.stages.avatar_assets import networks_of
 from trilane.stages.avatar_pipeline import edge_bytes
 from trilane.stages.config import MAX_CHANNELS, network_parts, pose_dtype
@@ -26,6 +24,7 @@ from trilane.stages.cpu.pose import build as build_pose
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
 from trilane.stages.gpu.raster import build as build_raster
 from trilane.transport.packets import Packet, SlotLayout, view_packet
+from trilane.units import MEASURED
 
 #: Bounds on the difference of any two runtimes, of 255.
 MEAN_BOUND, LARGEST_BOUND = 0.5, 4

@@ -32,13 +32,12 @@ from trilane.apps.experiments.reference_path import (
     up_to,
 )
 from trilane.apps.experiments.scene_pictures import region, spread
-from trilane.arrays import F64, U8
+from trilane.arrays import F64, U8, Shape
 from trilane.bench.lib.cast import Box, RasterLayer, laid_over
 from trilane.bench.lib.picture_error import psnr_db
 from trilane.errors import BadInputError
-from trilane.figure_sources import MEASURED
-from trilane.shapes import Shape
 from trilane.stages.configure import Checked
+from trilane.units import MEASURED
 from trilane.writing import write_bytes
 
 STEPS = 255

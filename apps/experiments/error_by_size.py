@@ -19,10 +19,10 @@ from trilane.apps.experiments.scene_pictures import ScenePictures, around, sprea
 from trilane.bench.lib.cast import Cast
 from trilane.bench.lib.picture_error import psnr_of_frames
 from trilane.errors import BadInputError
-from trilane.figure_sources import MEASURED
 from trilane.scheduler.stats import median_interval
 from trilane.stages.configure import Checked, configure
 from trilane.stages.run_options import RunOptions
+from trilane.units import MEASURED
 
 #: Jobs that an interval of 95 % needs: the median of n jobs lies between the least and the largest with 1 - 2 / 2^n.
 LEAST_JOBS = 6

@@ -21,11 +21,11 @@ from trilane.apps.experiments.scene_pictures import ScenePictures, around, wante
 from trilane.arrays import F64, U8
 from trilane.bench.lib.cast import Cast
 from trilane.errors import BadInputError, did_you_mean
-from trilane.figure_sources import MEASURED
 from trilane.stages.configure import Checked, configure
-from trilane.stages.gpu.packed_pass import FILTERS
+from trilane.stages.gpu.raster import FILTERS
 from trilane.stages.run_options import RunOptions
 from trilane.training.quantising.calibration import METHODS
+from trilane.units import MEASURED
 
 STEPS = 255
 

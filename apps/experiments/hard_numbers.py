@@ -17,8 +17,7 @@ import numpy as np
 from trilane.apps.experiments.hard_rotations import EXACT, HIGHAM, U32, HardNumber, U, gamma, in_mm, random_pose, worst
 from trilane.arrays import F64
 from trilane.body.body import Body, ShapedBody, weights_of_one
-from trilane.body.joints import JOINTS, POSE_FEATURES
-from trilane.body.kinematics import Posed, Skeleton, rodrigues
+from trilane.body.joints import JOINTS, POSE_FEATURES, Posed, Skeleton, rodrigues
 from trilane.body.skinning import WEIGHT_COUNTS, CpuSkinner, FrameSkinner, weight_error_bound
 from trilane.errors import BadInputError
 from trilane.scene.camera.path import load_builtin, look_at, projection_matrix

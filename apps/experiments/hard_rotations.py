@@ -1,7 +1,7 @@
 """Rotations at the angles where formulas break, a million at random, and the longest chain of joints.
 
 Rule: a bound follows from the formulas that are computed and from the precision of the numbers, never from a result. An
-error that is not a number is above every bound. The references share nothing with the tested code, body/kinematics.py.
+error that is not a number is above every bound. The references share nothing with the tested code, body/joints.py.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody
-from trilane.body.kinematics import Skeleton, rodrigues, turn
+from trilane.body.joints import Skeleton, rodrigues, turn
 from trilane.scene.rotations import quat_from_rotvec, rotvec_from_quat
 
 #: The unit roundoffs of float64 and float32.
@@ -254,7 +254,7 @@ def chain_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
 def walked(shaped: ShapedBody, pose: F64, root: F64) -> Wide:
     """Return world transforms (55, 3, 4) of the joints, one after the other from the root, in extended precision.
 
-    body/kinematics.py jumps from joint to joint by powers of two instead.
+    body/joints.py jumps from joint to joint by powers of two instead.
     """
     wide = np.longdouble
     found: Wide = np.zeros((len(shaped.joints), 3, 4), wide)

@@ -19,19 +19,12 @@ from trilane.apps.experiments.accuracy import DrawnTensors
 from trilane.apps.experiments.hard_rotations import EXACT, HardNumber, worst
 from trilane.arrays import F64, U8
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINTS
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import JOINTS, Skeleton
 from trilane.errors import BadInputError
 from trilane.scene.camera.path import look_at, projection_matrix
+from trilane.stages.config import Quantisation
 from trilane.stages.configure import Checked, configure
-from trilane.stages.gpu.packed_pass import (
-    PackedAvatar,
-    PackedPass,
-    Placement,
-    Quantisation,
-    check_texture,
-    texture_array,
-)
+from trilane.stages.gpu.raster import PackedAvatar, PackedPass, Placement, check_texture, texture_array
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh, mesh_arrays
 from trilane.stages.run_options import RunOptions
 

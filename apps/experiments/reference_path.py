@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import F32, F64, U8, Mask
+from trilane.arrays import BUCKET_STEP, F32, F64, U8, Mask, Shape
 from trilane.avatars.network_file import Affine, NetworkFile, reshaped
 from trilane.bench.lib.cast import (
     Box,
@@ -36,13 +36,10 @@ from trilane.bench.lib.float_raster import quantise
 from trilane.bench.lib.full_picture import SAMPLES, FullBody, Paint, as_written, fineness, float_network, supersampled
 from trilane.bench.lib.stage_chain import AvatarFrames
 from trilane.body.body import Body
-from trilane.body.joints import JOINTS, POSE_FEATURES
-from trilane.body.kinematics import Posed, Skeleton
+from trilane.body.joints import JOINTS, POSE_FEATURES, Posed, Skeleton
 from trilane.body.skinning import DETAILS, EVERYTHING, Detail, FrameSkinner
-from trilane.scene.crop import Rect, crop_projection
+from trilane.scene.crop import Cell, Rect, crop_projection
 from trilane.scene.planner import FrameWork
-from trilane.scene.tensor_layout import Cell
-from trilane.shapes import BUCKET_STEP, Shape
 from trilane.stages.avatar_assets import AvatarData
 from trilane.stages.configure import Checked
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime

@@ -14,14 +14,13 @@ from typing import Any
 
 from trilane import machine
 from trilane.apps.experiments.picture_errors import LEAST_MS_SSIM_PX
-from trilane.arrays import U8
+from trilane.arrays import U8, Shape
 from trilane.bench.lib.cast import Box, Cast
 from trilane.bench.lib.full_picture import FullPictures
 from trilane.bench.lib.stage_chain import StageChain, units_of
 from trilane.errors import BadInputError
 from trilane.pipeline.job_times import CoreMeter, preempted_ns
 from trilane.pipeline.stage import UnitContext
-from trilane.shapes import Shape
 from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.configure import Checked
 from trilane.stages.gpu.opengl import CONTEXT, open_context

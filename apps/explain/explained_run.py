@@ -20,7 +20,6 @@ from trilane.apps.run.report import Report, read_report
 from trilane.apps.run.verdict_facts import verdict_of
 from trilane.apps.watch.followed_run import CUT_OFF, FollowedRun, RunState
 from trilane.errors import BadInputError, MissingPartError
-from trilane.figure_sources import COMPUTED, MEASURED
 from trilane.pipeline.critical_path import WHATS, Part, Taken
 from trilane.pipeline.journal import NAME, Begun, Ended, Record, Said, Worked, config_of, journal_in, read_journal
 from trilane.pipeline.reckoning import Reckoning, places_of
@@ -28,7 +27,7 @@ from trilane.pipeline.result import MOST_MESSAGES
 from trilane.pipeline.timeline import ExplainedJob, Gone, Presented, Timeline
 from trilane.pipeline.tracks import UNKNOWN
 from trilane.pipeline.unit_history import PREEMPTED
-from trilane.units import HOST_CLOCK, NS_PER_MS
+from trilane.units import COMPUTED, HOST_CLOCK, MEASURED, NS_PER_MS
 from trilane.writing import write_atomically
 
 SCHEMA = 1

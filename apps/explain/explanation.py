@@ -14,10 +14,10 @@ from typing import Any
 
 from trilane.apps.explain.scene_plan import PlannedFrame, ScenePlan, phases
 from trilane.apps.run.avatar_facts import worst_loss
+from trilane.arrays import Shape
 from trilane.avatars.network_file import NetworkFile
 from trilane.body.skinning import DETAILS, left_out
 from trilane.errors import BadInputError
-from trilane.figure_sources import COMPUTED, MEASURED
 from trilane.hw_profiles.application import Plan, Variant, stage_times_ms, steady, workers_of
 from trilane.hw_profiles.host import described, host_cores, usable_cores
 from trilane.hw_profiles.host_model import place_units
@@ -25,11 +25,10 @@ from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.scene.planner import ALL_WORK, MOST_DENSITY, FrameWork
 from trilane.scheduler.placement import Ranked
-from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, mesh_levels_of, networks_of, painting, shaped_body
 from trilane.stages.configure import Checked
 from trilane.stages.cpu.pose import FramePlan
-from trilane.units import HOST, NS_PER_MS, UNITS, UnitName
+from trilane.units import COMPUTED, HOST, MEASURED, NS_PER_MS, UNITS, UnitName
 
 #: What every plan is compared with: the square that the reference application fills.
 FIXED: Shape = (512, 512)

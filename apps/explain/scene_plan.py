@@ -15,12 +15,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from trilane.arrays import F64, I64
-from trilane.body.kinematics import Skeleton
+from trilane.arrays import F64, I64, Shape
+from trilane.body.joints import Skeleton
 from trilane.body.skinning import CpuSkinner
 from trilane.pipeline.memory import Assets
 from trilane.scene.crop import Rect
-from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, mesh_levels_of, shaped_body, staged_of
 from trilane.stages.config import RunConfig, pose_dtype, posed_vertices, posed_vertices_bytes
 from trilane.stages.cpu.pose import FramePlan, PoseStage

@@ -20,8 +20,7 @@ from trilane.apps.inspect.inspection import Inspection, Length, used
 from trilane.errors import BadInputError, reason
 from trilane.scene.footage import Footage
 from trilane.scene.recordings import Detected
-from trilane.stages.gpu.background import is_picture, open_background, pictures_in, read_picture
-from trilane.stages.gpu.survey import MOST_PACKETS, survey
+from trilane.stages.gpu.background import MOST_PACKETS, is_picture, open_background, pictures_in, read_picture, survey
 from trilane.stages.gpu.video_reader import quarters_of
 
 THUMB = (160, 213)  # height, width

@@ -24,7 +24,7 @@ from trilane.arrays import F32
 from trilane.avatars.bundle import DEFAULT, MANIFEST, bundle_folder, load_bundle
 from trilane.avatars.network_file import read_network
 from trilane.body.body import ShapedBody, load_body
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.errors import BadInputError
 from trilane.files import MAX_TEXT_BYTES, read_npz, read_text
 from trilane.hw_profiles.graph_file import read_graph

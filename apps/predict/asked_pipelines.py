@@ -15,6 +15,7 @@ from trilane.apps.check.port_types import port_types, read_networks
 from trilane.apps.explain.scene_plan import ScenePlan
 from trilane.apps.predict.predict_options import PredictOptions
 from trilane.apps.run.verdict_facts import predicted_verdict
+from trilane.arrays import Shape
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import LEAST_FPS, MOST_FPS, NETWORK_UNITS, Variant
 from trilane.hw_profiles.graph_file import read_graph
@@ -26,7 +27,6 @@ from trilane.hw_profiles.tenants import NEWEST, SKIPS, FileTenant, Pipeline, Ten
 from trilane.pipeline.pipeline_file import checked_tables, is_pipeline_file, read_pipeline
 from trilane.scene.planner import FrameWork
 from trilane.scene.schema import ENDING
-from trilane.shapes import Shape
 from trilane.stages.avatar_assets import networks_of, painting
 from trilane.stages.configure import configure
 from trilane.stages.run_options import RunOptions

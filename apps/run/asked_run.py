@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from trilane.errors import BadInputError
-from trilane.memory import require_memory
+from trilane.machine import require_memory
 from trilane.stages.run_options import RunOptions
 
 if TYPE_CHECKING:

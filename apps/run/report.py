@@ -13,6 +13,7 @@ from typing import Any, Literal
 from pydantic import Field, ValidationError
 from pydantic_core import from_json
 
+from trilane.arrays import Shape
 from trilane.errors import BadInputError
 from trilane.files import require_file
 from trilane.pipeline.run_metrics import (
@@ -22,7 +23,6 @@ from trilane.pipeline.run_metrics import (
     RunMetrics,
     Temperature,
 )
-from trilane.shapes import Shape
 
 SCHEMA = 1
 MAX_REPORT_BYTES = 64 << 20

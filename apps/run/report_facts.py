@@ -13,10 +13,10 @@ from typing import Any, Final
 from trilane.apps.run.report import SCHEMA, Report
 from trilane.apps.run.verdict import judged
 from trilane.apps.run.verdict_facts import facts_of
-from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
 from trilane.machine import here
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run_metrics import PolicyMetrics, RunMetrics
+from trilane.units import COMPARED, COMPUTED, MEASURED
 
 CHECKOUT: Final = Path(__file__).resolve().parents[2]
 GIT_S: Final = 5.0

@@ -28,7 +28,7 @@ from trilane.apps.run.run_files import VIDEO, join_folder, write_files
 from trilane.apps.run.run_folder import RunFolder, default_place
 from trilane.apps.run.run_job import ENDLESS, Hooks, RunOutcome, error_of, exit_code_of, sensors
 from trilane.errors import BadInputError, UnwrittenError
-from trilane.memory import require_memory
+from trilane.machine import require_memory
 from trilane.pipeline import journal
 from trilane.pipeline.controls import Interrupts, RunControls
 from trilane.pipeline.description import Pipeline

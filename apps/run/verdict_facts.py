@@ -27,9 +27,9 @@ from trilane.apps.run.verdict import (
     judged,
     slow_percentile,
 )
-from trilane.figure_sources import NO_FIGURES
 from trilane.hw_profiles.rates import wanted_drops
 from trilane.scheduler.policy import POLICIES
+from trilane.units import NO_FIGURES
 
 if TYPE_CHECKING:
     from trilane.apps.run.report import Report

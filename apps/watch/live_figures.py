@@ -30,7 +30,6 @@ from trilane.apps.watch.figures import (
 )
 from trilane.apps.watch.followed_run import EXPECTED, NO_RECORD, FollowedRun, RunState
 from trilane.errors import BadInputError
-from trilane.figure_sources import COMPUTED, MEASURED
 from trilane.pipeline.journal import (
     Accounted,
     Begun,
@@ -49,7 +48,7 @@ from trilane.pipeline.unit_history import BUSY, IDLE_CAUSES, JOIN, NAMES, OVERHE
 from trilane.scheduler.events import NEVER, Finish, JobDone, Start
 from trilane.scheduler.ledger import STARVED
 from trilane.scheduler.stats import summary_ms
-from trilane.units import NS_PER_MS, NS_PER_S
+from trilane.units import COMPUTED, MEASURED, NS_PER_MS, NS_PER_S
 
 WINDOW_NS: Final = 5_000_000_000
 MOST_NOTES = 5

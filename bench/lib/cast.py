@@ -12,12 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trilane.arrays import F32, F64, U8, Floats
+from trilane.arrays import BUCKET_STEP, F32, F64, U8, Floats, Shape
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M, load_bundle
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.scene.crop import Rect, crop_projection
 from trilane.scene.mover import Mover
-from trilane.shapes import BUCKET_STEP, Shape
 from trilane.stages.avatar_assets import AvatarData, load_avatar, staged_of
 from trilane.stages.configure import Checked
 from trilane.stages.cpu.mesh_bounds import MeshBounds

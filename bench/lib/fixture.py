@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from trilane.arrays import F32
 from trilane.avatars.bundle import Bundle, bundle_folder, load_bundle
 from trilane.body.body import ShapedBody, load_body
-from trilane.body.joints import JOINT_INDEX
-from trilane.body.kinematics import Posed, Skeleton
+from trilane.body.joints import JOINT_INDEX, Posed, Skeleton
 from trilane.body.skinning import largest_weights
 from trilane.errors import MissingPartError
 from trilane.stages.avatar_assets import load_avatar
-from trilane.stages.gpu.packed_pass import Quantisation
+from trilane.stages.config import Quantisation
 from trilane.stages.gpu.skinned_mesh import MeshArrays, avatar_mesh, mesh_arrays
 
 TEXTURE_SIDE = 512

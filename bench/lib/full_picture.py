@@ -26,18 +26,16 @@ import onnxruntime
 from onnx import helper, numpy_helper
 
 from trilane import machine
-from trilane.arrays import F32, F64, U8
+from trilane.arrays import BUCKET_STEP, F32, F64, U8, Shape
 from trilane.avatars.bundle import BUILT_IN, Bundle, bundle_folder
 from trilane.avatars.manifest import sha256_of
 from trilane.avatars.network_file import NetworkFile, constants_of, reshaped
 from trilane.bench.lib import float_raster
 from trilane.bench.lib.cast import Cast, CastView, RasterLayer, blended, enlarged, grown, premultiplied, shrunk
 from trilane.body.body import Body
-from trilane.body.joints import JOINTS
-from trilane.body.kinematics import rodrigues
+from trilane.body.joints import JOINTS, rodrigues
 from trilane.errors import MissingPartError
 from trilane.scene.crop import crop_projection
-from trilane.shapes import BUCKET_STEP, Shape
 from trilane.stages.avatar_assets import AvatarData
 from trilane.stages.gpu.skinned_mesh import MeshArrays, avatar_mesh
 from trilane.training.clothing import clothing_layers, find_landmarks, look_of

@@ -20,8 +20,7 @@ import numpy as np
 import zmq
 
 from trilane.arrays import U8
-from trilane.transport.link import SocketFolder
-from trilane.transport.messages import JobPipe, JobPipeEnd, RunJob, job_pipe_pair
+from trilane.transport.messages import JobPipe, JobPipeEnd, RunJob, SocketFolder, job_pipe_pair
 from trilane.transport.packets import RegionLayout, SlotLayout, create_region, header_dtype, map_region
 
 WAIT_MS = 60_000

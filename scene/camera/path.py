@@ -11,13 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trilane.arrays import F64
+from trilane.arrays import F64, Shape
 from trilane.scene.lens import Lens, of_fov_y
 from trilane.scene.motion.motion import Wrap, bracket, wrapped_time
 from trilane.scene.recordings import NOTHING, Detected
 from trilane.scene.rotations import matrix_from_quat, quat_from_matrix, slerp
 from trilane.scene.schema import CameraSpec
-from trilane.shapes import Shape
 
 ROUNDING_S = 1e-6
 HALFWAY = 0.5

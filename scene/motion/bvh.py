@@ -1,20 +1,30 @@
-"""Reads BVH files: the skeleton, and the channels of every frame in the file's order.
+"""Reads the motion of a BVH file: its skeleton and channels; the joints are laid on the avatar's by `retarget.py`.
 
-Rule: this module knows syntax only; `bvh_retarget.py` interprets the joints' names. Every error names the line.
+The syntax is read first, and every error in it names the line. Joints are then matched by name. A BVH states no unit.
+With `auto` it is the one that makes the legs nearest to USUAL_LEG_M; where none makes human legs the file is scaled. A
+T pose at the beginning is no part of the motion when the recording jumps away from it; one from which it moves on is.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from trilane.arrays import F64
+from trilane.body.joints import BODY_JOINTS, JOINT_INDEX
 from trilane.errors import BadInputError
 from trilane.files import read_text
+from trilane.scene.motion.joint_names import NO_MAP, STATED, match_names, plain
+from trilane.scene.motion.motion import T_POSE, RawMotion
+from trilane.scene.motion.retarget import retarget
+from trilane.scene.motion.tracks import SIDES, Tracks, angle_between, leg_length, trunk_line
+from trilane.scene.recordings import Detected
 from trilane.scene.rotations import about
 
 EXPECTED = "a BVH file: HIERARCHY, MOTION, Frames, Frame Time, one line of channels a frame"
@@ -225,3 +235,195 @@ def _rows(path: Path, lines: list[str], start: int, count: int, columns: int) ->
         except ValueError as error:
             raise BadInputError(f"{path}, line {number}", str(error), "numbers") from None
     return frames
+
+
+#: Metres in one unit; `cmu` is the unit of the CMU recordings, 1/0.45 inches.
+UNITS_M = {"m": 1.0, "cm": 0.01, "in": 0.0254, "cmu": 0.0254 / 0.45}
+USUAL_LEG_M = 0.85
+#: Range of a human leg's length over USUAL_LEG_M.
+HUMAN_LEG = (0.6, 1.6)
+
+
+def unit_of(leg: float, units: str) -> tuple[str, float]:
+    """Return a note on the unit, and its length in metres.
+
+    `leg`: length of a leg in the file's units. `units`: a key of UNITS_M, or `auto` to guess.
+    """
+    if units != "auto":
+        return f"{units}, as given", UNITS_M[units]
+    name = min(UNITS_M, key=lambda unit: abs(np.log(leg * UNITS_M[unit] / USUAL_LEG_M)))
+    if HUMAN_LEG[0] < leg * UNITS_M[name] / USUAL_LEG_M < HUMAN_LEG[1]:
+        return f"{name}, by the length of the legs", UNITS_M[name]
+    return f"unknown, scaled to a leg of {USUAL_LEG_M} m", USUAL_LEG_M / leg
+
+
+#: Largest angle of arms to the line of the hips, and of legs to that of the trunk; largest turn of a still bone;
+#: radians.
+IN_T, STILL = np.radians(20.0), np.radians(2.0)
+#: Least turn between two frames with which a bone jumps, radians.
+JUMP = np.radians(20.0)
+CHAINS = (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"))
+
+
+def leading_t_pose(tracks: Tracks, trunk: F64) -> tuple[int, tuple[str, ...]]:
+    """Return the number of frames in a T pose before the motion jumps away from it, and a note on a T pose there.
+
+    `trunk`: line of the trunk, (T, 3).
+    """
+    pairs = [(f"{side}_{start}", f"{side}_{end}") for start, end in CHAINS for side in SIDES]
+    if tracks.frames < 2 or not all(tracks.has(*pair) for pair in pairs):
+        return 0, ()
+    bones = np.array([tracks.bone(*pair) for pair in pairs])
+    moved = np.flatnonzero(angle_between(bones, bones[:, :1]).max(axis=0) > STILL)
+    if not len(moved) or not _in_t(tracks, trunk, bones)[0]:
+        return 0, ()
+    first = int(moved[0])
+    if angle_between(bones[:, first], bones[:, first - 1]).max() < JUMP:
+        return 0, ("begins in a T pose and moves on from it; `start_s` leaves it out",)
+    return first, (f"a T pose before the motion, which jumps away from it: left out, {first} of the frames",)
+
+
+def _in_t(tracks: Tracks, trunk: F64, bones: F64) -> NDArray[np.bool_]:
+    """Return whether the bones (8, T, 3) of CHAINS are in a T pose, per frame (T,)."""
+    left = tracks.across("hip")
+    expected = np.array([left, -left, left, -left, -trunk, -trunk, -trunk, -trunk])
+    return np.asarray((angle_between(bones, expected) < IN_T).all(axis=0))
+
+
+LEAST_LENGTH = 1e-6
+#: Least distance of an end site from its joint, as a share of the legs; a nearer one is a mark, not the end of a bone.
+LEAST_TIP = 0.02
+#: Axes that are tried as up; along X a body would lie.
+UPS = ("y", "z", "-y", "-z")
+#: Largest coordinate in the file's units; a larger one is damaged.
+FARTHEST = 1e9
+
+
+def load_retargeted(path: Path, units: str, joint_map: Mapping[str, str] = NO_MAP, rest: F64 = T_POSE) -> RawMotion:
+    """Read a BVH file onto the 55 joints.
+
+    `units`: a key of UNITS_M or `auto`. `joint_map`: as in `match_names`. `rest` (55, 3): rest joints of the avatar,
+    metres. Raises BadInputError when the file is no BVH or its names belong to no known skeleton.
+    """
+    bvh = load_bvh(path)
+    dialect, index_of, of_roots = _person(path, bvh.joints, joint_map)
+    tracks, readable = tracks_of(bvh, index_of)
+    if not readable.any():
+        found = f"numbers that are not finite, or absurdly large, in all of {len(readable)} frames"
+        raise BadInputError(path, found, "at least half of the frames sound")
+    leg = leg_length(tracks)
+    if leg < LEAST_LENGTH or np.median(np.linalg.norm(tracks.across("hip"), axis=-1)) < LEAST_LENGTH:
+        raise BadInputError(path, "legs of no length or hips in one place", "a skeleton with OFFSETs")
+    unit, unit_m = unit_of(leg, units)
+    poses, places, how = retarget(tracks, rest)
+    in_t, of_t_pose = leading_t_pose(tracks, trunk_line(tracks).along(tracks))
+    start = int(np.flatnonzero(readable)[in_t])
+    partners = sorted(JOINT_INDEX[name] for name in index_of)
+    hands = sum(index >= 25 for index in partners)
+    rate = 1 / bvh.frame_time_s
+    notes = (
+        f"BVH, {len(bvh.joints)} joints named as in {dialect}, {len(bvh.frames)} frames at {rate:.4g}/s",
+        f"units: {unit} (leg of {leg * unit_m:.2f} m)",
+        f"{len(index_of)} joints have a partner, {hands} of them in the hands",
+        *_without_partner(index_of),
+        *of_roots,
+        *how,
+        *of_t_pose,
+        "betas: none in the format",
+    )
+    joints = {name: bvh.joints[index].name for name, index in index_of.items()}
+    others = tuple(joint.name for joint in bvh.joints if joint.name not in joints.values())
+    reason = f"HIERARCHY, with joint names of {dialect}"
+    detected = Detected("BVH", reason, unit=unit, rate="by `Frame Time`", joints=joints, unmapped=others)
+    times = np.arange(len(bvh.frames), dtype=np.float64) * bvh.frame_time_s
+    poses, places, feet = (
+        among_all(values, readable)[start:] for values in (poses, places * unit_m, feet_of(tracks) * unit_m)
+    )
+    return RawMotion(times[start:], poses, places, None, "y", notes, leg * unit_m, detected, UPS, feet)
+
+
+def _without_partner(index_of: Collection[str]) -> tuple[str, ...]:
+    """Return a note on the joints of the body, without the hands, that are not in `index_of`."""
+    missing = [name for name in BODY_JOINTS if name not in index_of]
+    if not missing:
+        return ()
+    return (f"{', '.join(missing)}: no partner, so they follow their parents; `{STATED}` of the avatar names partners",)
+
+
+def _person(
+    path: Path, joints: Sequence[BvhJoint], joint_map: Mapping[str, str]
+) -> tuple[str, dict[str, int], tuple[str, ...]]:
+    """Return the family of names, {SMPL-X name: index} of the person, and a note when there are several roots.
+
+    The person with the most joints is taken, or the first of equals; a person may also be spread over all roots. Raises
+    BadInputError as `match_names` does.
+    """
+    names = [joint.name for joint in joints]
+    roots = [index for index, joint in enumerate(joints) if joint.parent < 0]
+    if len(roots) == 1:
+        return *match_names(path, names, joint_map), ()
+    found: list[tuple[str, dict[str, int], int]] = []
+    for root, end in itertools.pairwise([*roots, len(joints)]):
+        try:
+            family, index_of = match_names(path, names[root:end], joint_map)
+        except BadInputError:
+            continue
+        found.append((family, {name: root + index for name, index in index_of.items()}, root))
+    if not found:
+        note = f"{len(roots)} ROOTs ({', '.join(names[root] for root in roots)}), taken for one person"
+        return *match_names(path, names, joint_map), (note,)
+    family, index_of, shown = max(found, key=lambda person: len(person[1]))
+    others = ", ".join(names[root] for root in roots if root != shown)
+    return family, index_of, (f"{len(roots)} ROOTs: the person of {names[shown]} is shown, not {others}",)
+
+
+def feet_of(tracks: Tracks) -> F64:
+    """Return places (T, 2, n, 3) of the ankles, and of the toes or another end of both feet."""
+    feet = [[tracks.places[f"{side}_ankle"]] for side in SIDES]
+    ends = [tracks.places.get(f"{side}_foot", tracks.tips.get(f"{side}_ankle")) for side in SIDES]
+    if all(end is not None for end in ends):
+        feet = [[*foot, end] for foot, end in zip(feet, ends, strict=True) if end is not None]
+    return np.moveaxis(np.array(feet), 2, 0)
+
+
+def tracks_of(bvh: Bvh, index_of: dict[str, int]) -> tuple[Tracks, NDArray[np.bool_]]:
+    """Return the named joints over the frames whose numbers are usable, and which frames (T,) these are."""
+    turns, places = bvh.forward()
+    with np.errstate(invalid="ignore"):
+        readable = np.asarray((np.abs(places) < FARTHEST).all(axis=(1, 2)) & np.isfinite(turns).all(axis=(1, 2, 3)))
+    turns, places = turns[readable], places[readable]
+    named = {name: places[:, index] for name, index in index_of.items()}
+    least = LEAST_TIP * leg_length(Tracks(named)) if len(places) else 0.0
+    tips = {name: _tip(bvh, index, turns, places, least) for name, index in index_of.items()}
+    return Tracks(
+        named,
+        {name: turns[:, index] for name, index in index_of.items()},
+        {name: tip for name, tip in tips.items() if tip is not None},
+    ), readable
+
+
+def _tip(bvh: Bvh, index: int, turns: F64, places: F64, least: float) -> F64 | None:
+    """Return the place (T, 3) where a joint's own bone ends: its end site or the furthest of the next joints below.
+
+    A joint at the same place counts as the joint itself; thumbs do not count. None when there is nothing below, or
+    nothing further than `least`, in the file's units.
+    """
+    here, found, reach = {index}, None, max(least, LEAST_LENGTH)
+    for k, joint in enumerate(bvh.joints):
+        ends = [places[:, k] + turns[:, k] @ joint.tip] if k in here and joint.tip is not None else []
+        if joint.parent in here:
+            if np.abs(joint.offset).max() < LEAST_LENGTH:
+                here.add(k)
+            ends.append(places[:, k])
+        for end in [] if "thumb" in plain(joint.name) or not len(places) else ends:
+            distance = float(np.linalg.norm(end - places[:, index], axis=-1).mean())
+            if distance > reach:
+                found, reach = end, distance
+    return found
+
+
+def among_all(values: F64, readable: NDArray[np.bool_]) -> F64:
+    """Put `values` of the readable frames among all frames; the others are NaN."""
+    spread = np.full((len(readable), *values.shape[1:]), np.nan)
+    spread[readable] = values
+    return spread

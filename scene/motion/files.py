@@ -3,26 +3,183 @@
 The ending of the file decides which reader is used; the reader's errors name the file. A key that a format has no use
 for is refused, not ignored. `start_s` and `end_s` are times of the motion itself, before `speed`. A part of a motion is
 placed as a whole one: it faces +Z at first and is centred on the ground that it covers.
+
+Arrays hold poses, dicts of arrays, or only places of joints. Places, as in HumanML3D, are (T, 22, 3) in the order of
+SMPL's joints. Turns have the same shapes, so the content tells them apart. An array has places if its bones, apart from
+the legs, are as long as a person's, alike on both sides, and rigid. The hips must also lie on either side of the
+pelvis, and the trunk must not be folded. `retarget.py` makes turns from places. What places cannot tell is chosen: a
+limb twists as its bend and the toes say, the head turns as the neck.
+
+HumanML3D: https://github.com/EricGuo5513/HumanML3D (`new_joints`: 20 frames a second, metres, Y up).
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from trilane.arrays import F64
+from trilane.body.joints import JOINT_NAMES, JOINT_PARENTS, JOINTS
 from trilane.errors import BadInputError, did_you_mean
-from trilane.files import refuse_other, require_file
-from trilane.scene.motion.array_files import load_npy, load_npz, load_pickle
+from trilane.files import as_numbers, npz_names, refuse_other, require_file
 from trilane.scene.motion.builtin import BUILTIN
-from trilane.scene.motion.bvh_retarget import load_retargeted
-from trilane.scene.motion.motion import T_POSE, Motion, Wrap
-from trilane.scene.motion.recorded import RawMotion, centred, facing, motion_from_recording
+from trilane.scene.motion.bvh import UPS, among_all, feet_of, load_retargeted, unit_of
+from trilane.scene.motion.motion import T_POSE, Motion, RawMotion, Wrap, centred, facing, motion_from_recording
+from trilane.scene.motion.pickled import printable
+from trilane.scene.motion.retarget import retarget
+from trilane.scene.motion.smpl_files import KEYS, ROMP_PERSONS, ROMP_PLACES, ROMP_POSES, motion_of, motion_of_array
+from trilane.scene.motion.stored import npy_values, npz_values, pickle_values, plain
+from trilane.scene.motion.tracks import Tracks, leg_length
+from trilane.scene.recordings import Detected
 from trilane.scene.rotations import matrix_from_rotvec, rotvec_from_matrix
 from trilane.scene.schema import BUILT_IN_PREFIX, AvatarSpec
+
+RATE_HZ = 20.0
+#: Joints that are read; further ones, such as SMPL's hands or fingers, are not.
+NAMES = JOINT_NAMES[:22]
+COUNTS = (22, 24, 52, JOINTS)
+_ENDS = np.arange(1, len(NAMES))
+_STARTS = np.array(JOINT_PARENTS[1 : len(NAMES)])
+#: Indices of thighs and shins among the bones.
+_LEGS = [index for index, end in enumerate(_ENDS) if NAMES[end].endswith(("knee", "ankle"))]
+#: Bones of the left side, and those of the right one in the same order.
+_LEFT, _RIGHT = (
+    [index for index, end in enumerate(_ENDS) if NAMES[end].startswith(side)] for side in ("left", "right")
+)
+_TRUNK = [index for index, end in enumerate(_ENDS) if "_" not in NAMES[end]]
+#: Largest factor by which a bone may be longer or shorter than a plain body's, apart from the legs: for limbs, and for
+#: the trunk, which skeletons divide as they like.
+LIKE_A_LIMB, LIKE_A_SPINE = 2.0, 4.0
+#: The same factor against the other side's bone, and against the bone's own median.
+LIKE_THE_OTHER, RIGID = 1.3, 1.25
+#: Least distance between the hips as a share of the way over the pelvis; least distance between pelvis and neck as a
+#: share of the way along the spine.
+HIPS_APART, TRUNK_STRAIGHT = 0.45, 0.7
+
+
+def places_in(array: NDArray[Any]) -> F64 | None:
+    """Return places (T, 22, 3) of joints in `array`, (T, J, 3) or (T, 3 J); None when it holds none."""
+    flat = array.reshape(len(array), -1) if array.ndim in (2, 3) and array.size else np.zeros((0, 0))
+    if flat.shape[1] not in [3 * count for count in COUNTS] or flat.dtype.kind not in "fiu":
+        return None
+    places = as_numbers("", flat[:, : 3 * len(NAMES)], "numbers").reshape(len(flat), -1, 3)
+    sound = _sound(places)
+    return places if 2 * np.count_nonzero(sound) > len(places) else None
+
+
+def _sound(places: F64) -> NDArray[np.bool_]:
+    """Return which frames (T,) have a person's bones, each as long as in the other frames."""
+    with np.errstate(all="ignore"):
+        bones = _bones(places)
+        usual = np.nanmedian(bones, axis=0) if np.isfinite(bones).any(axis=0).all() else np.zeros(len(_ENDS))
+        person = _bones(T_POSE[None, : len(NAMES)])[0]
+        likeness = (usual / usual[_LEGS].sum()) / (person / person[_LEGS].sum())
+        alike = (
+            _within(np.delete(likeness, _TRUNK), LIKE_A_LIMB)
+            and _within(likeness[_TRUNK], LIKE_A_SPINE)
+            and _within(usual[_LEFT] / usual[_RIGHT], LIKE_THE_OTHER)
+        )
+        if not alike:
+            return np.zeros(len(places), dtype=bool)
+        rigid = ((bones < RIGID * usual) & (bones > usual / RIGID)).all(axis=1)
+        return np.asarray(rigid & _upright_parts(places))
+
+
+def _upright_parts(places: F64) -> NDArray[np.bool_]:
+    """Return whether the hips are apart and the trunk is not folded, per frame (T,)."""
+    at = {name: places[:, index] for index, name in enumerate(NAMES)}
+
+    def way(*names: str) -> F64:
+        return np.asarray(sum(np.linalg.norm(at[b] - at[a], axis=-1) for a, b in itertools.pairwise(names)))
+
+    hips = way("left_hip", "right_hip") > HIPS_APART * way("left_hip", "pelvis", "right_hip")
+    trunk = way("pelvis", "neck") > TRUNK_STRAIGHT * way("pelvis", "spine1", "spine2", "spine3", "neck")
+    return np.asarray(hips & trunk)
+
+
+def _within(ratios: F64, times: float) -> bool:
+    """Return whether all `ratios` are between `times` and its inverse."""
+    return bool(((ratios < times) & (ratios > 1 / times)).all())
+
+
+def _bones(places: F64) -> F64:
+    """Return lengths (T, 21) of the bones between joints (T, 22, 3)."""
+    return np.asarray(np.linalg.norm(places[:, _ENDS] - places[:, _STARTS], axis=-1))
+
+
+def motion_of_places(source: str, places: F64, units: str, rest: F64) -> RawMotion:
+    """Return the motion of joints whose `places` (T, 22, 3) `places_in` found.
+
+    `source`: ending of the file, for people. `units`: a key of UNITS_M, or `auto`. `rest` (55, 3): rest joints of the
+    avatar, metres.
+    """
+    sound = _sound(places)
+    tracks = Tracks({name: places[sound, index] for index, name in enumerate(NAMES)})
+    unit, unit_m = unit_of(leg_length(tracks), units)
+    poses, pelvis, how = retarget(tracks, rest)
+    rate = f"{RATE_HZ:g} frames/s, as HumanML3D has them"
+    notes = (
+        f"places of 22 joints {source}, as of HumanML3D, {len(places)} frames, {rate}: their distances are a person's",
+        f"units: {unit} (leg of {leg_length(tracks) * unit_m:.2f} m)",
+        "turns are made from the places; how limbs twist follows from their bend, the head follows the neck",
+        *how,
+        "betas: none in the format",
+    )
+    detected = Detected(
+        f"places of joints ({source})", "distances between joints are a person's, and stay so", unit=unit, rate=rate
+    )
+    poses, pelvis, feet = (among_all(values, sound) for values in (poses, pelvis * unit_m, feet_of(tracks) * unit_m))
+    times = np.arange(len(places)) / RATE_HZ
+    leg_m = leg_length(tracks) * unit_m
+    return RawMotion(times, poses, pelvis, None, "y", notes, leg_m, detected, UPS, feet)
+
+
+EXPECTED = "a motion: arrays of axis-angle poses of SMPL, SMPL-H or SMPL-X"
+#: Name that NumPy gives to an array that is saved without one.
+NAMELESS = "arr_0"
+NPZ_KEYS = (*KEYS, ROMP_POSES, ROMP_PLACES, ROMP_PERSONS, NAMELESS)
+MOST_NAMED = 12
+
+
+def load_npy(path: Path, units: str = "auto", rest: F64 = T_POSE) -> RawMotion:
+    """Read a `.npy` file. Raises BadInputError.
+
+    `units`: unit of joints' places, a key of UNITS_M or `auto`. `rest` (55, 3): rest joints of the avatar, metres.
+    """
+    values = plain(npy_values(path, EXPECTED))
+    places = places_in(values) if isinstance(values, np.ndarray) else None
+    if places is not None:
+        return motion_of_places(path.suffix.lower(), places, units, rest)
+    return _motion(path, values)
+
+
+def load_npz(path: Path) -> RawMotion:
+    """Read an `.npz` file. Raises BadInputError."""
+    values = npz_values(path, NPZ_KEYS, EXPECTED)
+    names = [printable(name) for name in npz_names(path, EXPECTED)]
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    nameless = names == [NAMELESS]
+    return _motion(path, values[NAMELESS] if nameless else values, f"arrays {', '.join(names[:MOST_NAMED])}{more}")
+
+
+def load_pickle(path: Path) -> RawMotion:
+    """Read a pickle; nothing in it is executed. Raises BadInputError."""
+    return _motion(path, pickle_values(path, EXPECTED))
+
+
+def _motion(path: Path, values: Any, there: str = "") -> RawMotion:
+    source = path.suffix.lower()
+    array = plain(values)
+    if isinstance(array, np.ndarray):
+        return motion_of_array(str(path), source, array)
+    return motion_of(str(path), source, array, there)
+
 
 WRAPS = {"repeat": Wrap.LOOP, "back-and-forth": Wrap.BOUNCE, "hold": Wrap.HOLD}
 #: Least move of the body at a repeat that a note mentions, metres.

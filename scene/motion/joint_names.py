@@ -22,6 +22,7 @@ from pathlib import Path
 from trilane.body.joints import JOINT_NAMES
 from trilane.errors import BadInputError, did_you_mean
 
+NO_MAP: Mapping[str, str] = {}
 #: Prefixes before all names: a namespace, or those that Mixamo, 3ds Max, Rigify, VRoid and Character Creator write.
 _PREFIX = re.compile(r"^(?:.*:)?(?:mixamorig\d*_?(?=[a-z])|bip0*1|def-|org-|j_bip_|cc_base_)?")
 
@@ -31,14 +32,33 @@ def plain(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", _PREFIX.sub("", name.lower()))
 
 
-def _sided(pattern: dict[str, str], left: str, right: str, *, behind: bool = False) -> dict[str, str]:
-    """Return `pattern` for both sides, with the sides' marks before the names, or `behind` them."""
-    sides = ((left, "left"), (right, "right"))
-    return {
-        plain(source + side if behind else side + source): f"{name}_{target}"
-        for side, name in sides
-        for source, target in pattern.items()
-    }
+def _named(names: str, joints: str) -> dict[str, str]:
+    """Return the joint of each of `names`, which are in the order of `joints`; `-` stands for none."""
+    pairs = zip(names.split(), joints.split(), strict=True)
+    return {name: joint for name, joint in pairs if name != "-"}
+
+
+def _limbs(names: str) -> dict[str, str]:
+    """Return the joint of each of `names` of a leg and an arm, from the hip to the toes and from the collar."""
+    return _named(names, "hip knee ankle foot collar shoulder elbow wrist")
+
+
+def _family(
+    trunk: str,
+    limbs: Mapping[str, str],
+    sides: str = "left right",
+    more: Mapping[str, str] = NO_MAP,
+    behind: bool = False,
+) -> dict[str, str]:
+    """Return the table of a family of skeletons.
+
+    `trunk`: names of pelvis, three joints of the spine, neck and head. `limbs`: names on either side. `sides`: marks of
+    the left and the right side before those names, or `behind` them. `more`: further names.
+    """
+    table = {**_named(trunk, "pelvis spine1 spine2 spine3 neck head"), **more}
+    for mark, side in zip(sides.split(), ("left", "right"), strict=True):
+        table |= {plain(name + mark if behind else mark + name): f"{side}_{joint}" for name, joint in limbs.items()}
+    return table
 
 
 _FINGERS = ("index", "middle", "pinky", "ring", "thumb")
@@ -51,176 +71,78 @@ _RIGIFY_FINGERS = {
 }
 
 
-def _phalanges(thumb: tuple[str, str, str]) -> dict[str, str]:
+def _phalanges(thumb: str) -> dict[str, str]:
     """Return Unity's names of the fingers' bones.
 
     `thumb`: names of the thumb's three bones.
     """
-    usual = ("proximal", "intermediate", "distal")
     return {
         f"{theirs}{bone}": f"{ours}{k}"
         for theirs, ours in _LITTLE_FINGERS.items()
-        for k, bone in enumerate(thumb if ours == "thumb" else usual, 1)
+        for k, bone in enumerate((thumb if ours == "thumb" else "proximal intermediate distal").split(), 1)
     }
 
 
-_MIXAMO_LIMBS = {
-    "upleg": "hip", "leg": "knee", "foot": "ankle", "toebase": "foot", "shoulder": "collar",
-    "arm": "shoulder", "forearm": "elbow", "hand": "wrist",
-}  # fmt: skip
-_UNITY_LIMBS = {
-    "upperleg": "hip", "lowerleg": "knee", "foot": "ankle", "toes": "foot", "shoulder": "collar",
-    "upperarm": "shoulder", "lowerarm": "elbow", "hand": "wrist",
-}  # fmt: skip
-_ANATOMICAL_LIMBS = {
-    "hip": "hip", "knee": "knee", "ankle": "ankle", "toe": "foot", "collar": "collar",
-    "shoulder": "shoulder", "elbow": "elbow", "wrist": "wrist",
-}  # fmt: skip
-_UNREAL_LIMBS = {
-    "thigh": "hip", "calf": "knee", "foot": "ankle", "ball": "foot", "clavicle": "collar",
-    "upperarm": "shoulder", "lowerarm": "elbow", "hand": "wrist",
-}  # fmt: skip
-_RIGIFY_LIMBS = {
-    "thigh": "hip", "shin": "knee", "foot": "ankle", "toe": "foot", "shoulder": "collar",
-    "upperarm": "shoulder", "forearm": "elbow", "hand": "wrist",
-}  # fmt: skip
-_UNITY_TRUNK = {
-    "hips": "pelvis", "spine": "spine1", "chest": "spine2", "upperchest": "spine3", "neck": "neck", "head": "head",
-    "jaw": "jaw",
-}  # fmt: skip
+_MIXAMO = _limbs("upleg leg foot toebase shoulder arm forearm hand")
+_UNITY = _limbs("upperleg lowerleg foot toes shoulder upperarm lowerarm hand")
+_ANATOMICAL = _limbs("hip knee ankle toe collar shoulder elbow wrist")
+_UNREAL = {**_limbs("thigh calf foot ball clavicle upperarm lowerarm hand"), **_FINGERS_BY_TWO_DIGITS}
+_RIGIFY = _limbs("thigh shin foot toe shoulder upperarm forearm hand")
+_UNITY_TRUNK, _JAW = "hips spine chest upperchest neck head", {"jaw": "jaw"}
+_FACE = {**_JAW, "lefteye": "left_eye", "righteye": "right_eye"}
 
 #: Tables {plain name: SMPL-X name} by family of skeletons.
 DIALECTS: dict[str, dict[str, str]] = {
-    "Mixamo": {
-        "hips": "pelvis", "spine": "spine1", "spine1": "spine2", "spine2": "spine3", "neck": "neck", "head": "head",
-        **_sided({**_MIXAMO_LIMBS, **_FINGERS_BY_NUMBER}, "left", "right"),
-    },
-    "CMU": {
-        "hips": "pelvis", "lowerback": "spine1", "spine": "spine2", "spine1": "spine3", "neck": "neck", "head": "head",
-        **_sided({**_MIXAMO_LIMBS, "handindex1": "index1", "thumb": "thumb1"}, "left", "right"),
-    },
-    "MotionBuilder": {
-        "hips": "pelvis", "lowerback": "spine1", "chest": "spine2", "chest2": "spine3", "neck": "neck", "head": "head",
-        **_sided(_ANATOMICAL_LIMBS, "left", "right"),
-    },
-    "3ds Max Biped": {
-        "pelvis": "pelvis", "spine": "spine1", "spine1": "spine2", "spine2": "spine3", "neck": "neck", "head": "head",
-        **_sided(
-            {"thigh": "hip", "calf": "knee", "foot": "ankle", "toe0": "foot", "clavicle": "collar",
-             "upperarm": "shoulder", "forearm": "elbow", "hand": "wrist"},
-            "l", "r",
-        ),
-    },
-    "SMPL": {
-        **{name: name for name in ("pelvis", "spine1", "spine2", "spine3", "neck", "head")},
-        **_sided(
-            {name: name for name in ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist")},
-            "l", "r",
-        ),
-    },
+    "Mixamo": _family("hips spine spine1 spine2 neck head", {**_MIXAMO, **_FINGERS_BY_NUMBER}),
+    "CMU": _family(
+        "hips lowerback spine spine1 neck head", {**_MIXAMO, "handindex1": "index1", "thumb": "thumb1"}
+    ),
+    "MotionBuilder": _family("hips lowerback chest chest2 neck head", _ANATOMICAL),
+    "3ds Max Biped": _family(
+        "pelvis spine spine1 spine2 neck head", _limbs("thigh calf foot toe0 clavicle upperarm forearm hand"), "l r"
+    ),
+    "SMPL": _family(
+        "pelvis spine1 spine2 spine3 neck head", _limbs("hip knee ankle foot collar shoulder elbow wrist"), "l r"
+    ),
     "SMPL-X": {plain(name): name for name in JOINT_NAMES},
-    "LaFAN1": {
-        "hips": "pelvis", "spine": "spine1", "spine1": "spine2", "spine2": "spine3", "neck": "neck", "head": "head",
-        **_sided({**_MIXAMO_LIMBS, "toe": "foot"}, "left", "right"),
-    },
-    "Unity and VRM 0": {
-        **_UNITY_TRUNK, "lefteye": "left_eye", "righteye": "right_eye",
-        **_sided({**_UNITY_LIMBS, **_phalanges(("proximal", "intermediate", "distal"))}, "left", "right"),
-    },
-    "VRM 1": {
-        **_UNITY_TRUNK, "lefteye": "left_eye", "righteye": "right_eye",
-        **_sided({**_UNITY_LIMBS, **_phalanges(("metacarpal", "proximal", "distal"))}, "left", "right"),
-    },
-    "VRoid": {
-        **{f"c{theirs}": ours for theirs, ours in _UNITY_TRUNK.items() if ours != "jaw"},
-        **_sided({**_UNITY_LIMBS, "toebase": "foot", **_LITTLE_BY_NUMBER}, "l", "r"),
-    },
-    "Bandai Namco": {
-        **_UNITY_TRUNK,
-        **_sided(_UNITY_LIMBS, "l", "r", behind=True),
-    },
-    "Unreal 5": {
-        "pelvis": "pelvis", "spine01": "spine1", "spine03": "spine2", "spine05": "spine3", "neck01": "neck",
-        "head": "head",
-        **_sided({**_UNREAL_LIMBS, **_FINGERS_BY_TWO_DIGITS}, "l", "r", behind=True),
-    },
-    "Unreal 4": {
-        "pelvis": "pelvis", "spine01": "spine1", "spine02": "spine2", "spine03": "spine3", "neck01": "neck",
-        "head": "head",
-        **_sided({**_UNREAL_LIMBS, **_FINGERS_BY_TWO_DIGITS}, "l", "r", behind=True),
-    },
-    "Rigify": {
-        "spine": "pelvis", "spine001": "spine1", "spine002": "spine2", "spine003": "spine3", "spine004": "neck",
-        "spine006": "head", "jaw": "jaw",
-        **_sided({**_RIGIFY_LIMBS, "eye": "eye", **_RIGIFY_FINGERS}, "l", "r", behind=True),
-    },
-    "Rigify, basic": {
-        "spine": "pelvis", "spine001": "spine1", "spine002": "spine2", "spine003": "spine3", "spine004": "neck",
-        "spine005": "head",
-        **_sided(_RIGIFY_LIMBS, "l", "r", behind=True),
-    },
-    "Xsens": {
-        "hips": "pelvis", "chest": "spine1", "chest2": "spine2", "chest4": "spine3", "neck": "neck", "head": "head",
-        **_sided(_ANATOMICAL_LIMBS, "left", "right"),
-    },
-    "Xsens segments": {
-        "pelvis": "pelvis", "l5": "spine1", "t12": "spine2", "t8": "spine3", "neck": "neck", "head": "head",
-        **_sided(
-            {"upperleg": "hip", "lowerleg": "knee", "foot": "ankle", "toe": "foot", "shoulder": "collar",
-             "upperarm": "shoulder", "forearm": "elbow", "hand": "wrist"},
-            "left", "right",
-        ),
-    },
-    "Rokoko": {
-        "hips": "pelvis", "spine1": "spine1", "spine2": "spine2", "spine4": "spine3", "neck": "neck", "head": "head",
-        **_sided(
-            {"thigh": "hip", "shin": "knee", "foot": "ankle", "toe": "foot", "shoulder": "collar",
-             "arm": "shoulder", "forearm": "elbow", "hand": "wrist"},
-            "left", "right",
-        ),
-    },
-    "Character Creator": {
-        "hip": "pelvis", "waist": "spine1", "spine01": "spine2", "spine02": "spine3", "necktwist01": "neck",
-        "head": "head",
-        **_sided(
-            {"thigh": "hip", "calf": "knee", "foot": "ankle", "toebase": "foot", "clavicle": "collar",
-             "upperarm": "shoulder", "forearm": "elbow", "hand": "wrist"},
-            "l", "r",
-        ),
-    },
-    "Poser and Daz": {
-        "hip": "pelvis", "abdomen": "spine1", "chest": "spine3", "neck": "neck", "head": "head",
-        **_sided(
-            {"thigh": "hip", "shin": "knee", "foot": "ankle", "toe": "foot", "collar": "collar",
-             "shldr": "shoulder", "forearm": "elbow", "hand": "wrist"},
-            "l", "r",
-        ),
-    },
-    "OptiTrack": {
-        "hip": "pelvis", "ab": "spine1", "chest": "spine3", "neck": "neck", "head": "head",
-        **_sided(
-            {"thigh": "hip", "shin": "knee", "foot": "ankle", "toe": "foot", "shoulder": "collar",
-             "uarm": "shoulder", "farm": "elbow", "hand": "wrist"},
-            "l", "r",
-        ),
-    },
-    "mocopi": {
-        "root": "pelvis", "torso2": "spine1", "torso4": "spine2", "torso6": "spine3", "neck1": "neck", "head": "head",
-        **_sided(
-            {"upleg": "hip", "lowleg": "knee", "foot": "ankle", "toes": "foot", "shoulder": "collar",
-             "uparm": "shoulder", "lowarm": "elbow", "hand": "wrist"},
-            "l", "r",
-        ),
-    },
-    "Acclaim": {
-        "root": "pelvis", "lowerback": "spine1", "upperback": "spine2", "thorax": "spine3", "lowerneck": "neck",
-        "head": "head",
-        **_sided(
-            {"femur": "hip", "tibia": "knee", "foot": "ankle", "toes": "foot", "clavicle": "collar",
-             "humerus": "shoulder", "radius": "elbow", "wrist": "wrist", "hand": "wrist"},
-            "l", "r",
-        ),
-    },
+    "LaFAN1": _family("hips spine spine1 spine2 neck head", {**_MIXAMO, "toe": "foot"}),
+    "Unity and VRM 0": _family(
+        _UNITY_TRUNK, {**_UNITY, **_phalanges("proximal intermediate distal")}, more=_FACE
+    ),
+    "VRM 1": _family(_UNITY_TRUNK, {**_UNITY, **_phalanges("metacarpal proximal distal")}, more=_FACE),
+    "VRoid": _family(
+        "chips cspine cchest cupperchest cneck chead", {**_UNITY, "toebase": "foot", **_LITTLE_BY_NUMBER}, "l r"
+    ),
+    "Bandai Namco": _family(_UNITY_TRUNK, _UNITY, "l r", _JAW, behind=True),
+    "Unreal 5": _family("pelvis spine01 spine03 spine05 neck01 head", _UNREAL, "l r", behind=True),
+    "Unreal 4": _family("pelvis spine01 spine02 spine03 neck01 head", _UNREAL, "l r", behind=True),
+    "Rigify": _family(
+        "spine spine001 spine002 spine003 spine004 spine006",
+        {**_RIGIFY, "eye": "eye", **_RIGIFY_FINGERS}, "l r", _JAW, behind=True,
+    ),
+    "Rigify, basic": _family("spine spine001 spine002 spine003 spine004 spine005", _RIGIFY, "l r", behind=True),
+    "Xsens": _family("hips chest chest2 chest4 neck head", _ANATOMICAL),
+    "Xsens segments": _family(
+        "pelvis l5 t12 t8 neck head", _limbs("upperleg lowerleg foot toe shoulder upperarm forearm hand")
+    ),
+    "Rokoko": _family(
+        "hips spine1 spine2 spine4 neck head", _limbs("thigh shin foot toe shoulder arm forearm hand")
+    ),
+    "Character Creator": _family(
+        "hip waist spine01 spine02 necktwist01 head",
+        _limbs("thigh calf foot toebase clavicle upperarm forearm hand"), "l r",
+    ),
+    "Poser and Daz": _family(
+        "hip abdomen - chest neck head", _limbs("thigh shin foot toe collar shldr forearm hand"), "l r"
+    ),
+    "OptiTrack": _family("hip ab - chest neck head", _limbs("thigh shin foot toe shoulder uarm farm hand"), "l r"),
+    "mocopi": _family(
+        "root torso2 torso4 torso6 neck1 head", _limbs("upleg lowleg foot toes shoulder uparm lowarm hand"), "l r"
+    ),
+    "Acclaim": _family(
+        "root lowerback upperback thorax lowerneck head",
+        {**_limbs("femur tibia foot toes clavicle humerus radius wrist"), "hand": "wrist"}, "l r",
+    ),
 }  # fmt: skip
 
 
@@ -229,7 +151,6 @@ REQUIRED = ("pelvis", "left_hip", "right_hip", "left_knee", "right_knee", "left_
 PELVIS = ("hips", "pelvis", "hip")
 #: Source of the names of joints that are in no table.
 STATED = "joint_map"
-NO_MAP: Mapping[str, str] = {}
 
 
 def match_names(path: Path, names: list[str], joint_map: Mapping[str, str] = NO_MAP) -> tuple[str, dict[str, int]]:

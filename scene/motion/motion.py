@@ -1,20 +1,39 @@
 """A motion from any source: SMPL-X poses at increasing times, sampled at any time between and beyond them.
 
-A motion of one frame can be sampled like one of a thousand; nothing here depends on a file format.
+A motion of one frame can be sampled like one of a thousand; a `Motion` does not depend on a file format. A recording
+becomes one by `motion_from_recording`: bad frames left out, Y up, facing +Z at first, centred on its ground.
+
+**Up** is the axis that the scene states, else the one that the body's own up points along on average, else the usual
+one of the format. A body that lies or stands on its hands throughout does not turn the world over. Files that have a
+floor have it at 0, so a body is on the floor along an axis when its lowest joint hardly leaves 0. Where that does not
+tell either, a note says what else may be up.
+
+**Stance** says when the feet stand. Ankles and toes each have their own height while their foot stands; a person stands
+while at least one of them is at its height.
 """
 
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from trilane.arrays import F64
-from trilane.body.joints import JOINT_INDEX, JOINT_NAMES
-from trilane.scene.recordings import NOTHING, Detected
-from trilane.scene.rotations import quat_from_rotvec, rotvec_from_quat, slerp
+from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
+from trilane.errors import BadInputError
+from trilane.scene.recordings import NOTHING, Detected, usable_samples
+from trilane.scene.rotations import (
+    Y_UP_FROM_Z_UP,
+    about,
+    matrix_from_rotvec,
+    quat_from_rotvec,
+    rotvec_from_matrix,
+    rotvec_from_quat,
+    slerp,
+)
 
 #: Places in millimetres with the pelvis at the origin; right joints are the left ones, mirrored.
 _PLACES_MM = {
@@ -133,3 +152,211 @@ class Motion:
         poses = rotvec_from_quat(slerp(self.quats[i], self.quats[j], fraction[:, None]))
         start, end = self.translation[i], self.translation[j]
         return poses, start + (end - start) * fraction[:, None]
+
+
+#: Number of the body's joints; hands and face follow them.
+BODY_JOINT_COUNT = 22
+#: Most frames, evenly spread, that are examined.
+MOST_LOOKED_AT = 200
+#: Height of the lowest joint of a person who lies or stands on the hands: least and greatest, and largest range between
+#: a tenth and nine tenths of the frames. Joints of a lying person are up to half a trunk's depth above the floor.
+LIES_M, LIES_SPREAD_M = (-0.02, 0.17), 0.08
+#: The same for a person who walks; toes are 2 to 5 cm above the floor, and floors of recordings are off by centimetres.
+STANDS_M, STANDS_SPREAD_M = (-0.12, 0.25), 0.25
+
+
+def joint_places(poses: F64, places: F64, leg_m: float | None) -> F64:
+    """Return places (T, 22, 3) of a plain body's joints, scaled to legs of length `leg_m`; unscaled for None.
+
+    `poses` (T, 55, 3): axis-angle. `places` (T, 3): places of the pelvis, metres.
+    """
+    rest = T_POSE * (leg_m / rest_leg_m(T_POSE) if leg_m else 1.0)
+    turns = matrix_from_rotvec(poses[:, :BODY_JOINT_COUNT])
+    found = np.repeat(places[:, None], BODY_JOINT_COUNT, axis=1)
+    for joint, parent in enumerate(JOINT_PARENTS[1:BODY_JOINT_COUNT], 1):
+        found[:, joint] = found[:, parent] + turns[:, parent] @ (rest[joint] - rest[parent])
+        turns[:, joint] = turns[:, parent] @ turns[:, joint]
+    return found
+
+
+def lowest(poses: F64, places: F64, leg_m: float | None, up: F64) -> F64:
+    """Return heights (n,) along `up` (3,) of the lowest joint in at most MOST_LOOKED_AT of the frames.
+
+    The other parameters are those of `joint_places`.
+    """
+    some = np.linspace(0, len(poses) - 1, min(len(poses), MOST_LOOKED_AT)).round().astype(int)
+    return np.asarray((joint_places(poses[some], places[some], leg_m) @ up).min(axis=1))
+
+
+def lies(heights: F64) -> bool:
+    """Return whether `heights` (n,) of the lowest joint are those of a person lying, or on the hands, on the floor."""
+    return _are_within(heights, LIES_M, LIES_SPREAD_M)
+
+
+def stands(heights: F64) -> bool:
+    """Return whether `heights` (n,) are those of a person who stands or walks on the floor."""
+    return _are_within(heights, STANDS_M, STANDS_SPREAD_M)
+
+
+def _are_within(heights: F64, within: tuple[float, float], spread: float) -> bool:
+    low, middle, high = np.quantile(heights, (0.1, 0.5, 0.9))
+    return bool(within[0] <= middle <= within[1] and high - low <= spread)
+
+
+#: Percentile of a joint's heights that is the height at which it stands.
+STANDING_PERCENTILE = 5.0
+#: Height above that, up to which a joint still stands, and from which on it does not; metres.
+FOOT_STANDS_M, FOOT_FLIES_M = 0.03, 0.06
+
+
+def stance(heights: F64) -> F64:
+    """Return how much the person stands, per frame (T,): 1 on the floor, 0 in the air.
+
+    `heights` (T, 2, n): heights along up of the n recorded joints of both feet, left and right, metres.
+    """
+    standing = np.percentile(heights, STANDING_PERCENTILE, axis=(0, 1))
+    above = (heights - standing).min(axis=(1, 2))
+    return np.asarray(np.clip((FOOT_FLIES_M - above) / (FOOT_FLIES_M - FOOT_STANDS_M), 0.0, 1.0))
+
+
+MAX_FRAMES = 200_000
+MAX_ANGLE_RAD = 64.0
+MAX_PLACE_M = 10_000.0
+#: Turn (3, 3) that makes an axis +Y, by the axis.
+UPRIGHT: dict[str, F64] = {
+    "y": np.eye(3),
+    "z": Y_UP_FROM_Z_UP,
+    "x": about(2, np.pi / 2),
+    "-y": about(0, np.pi),
+    "-z": about(0, np.pi / 2),
+    "-x": about(2, -np.pi / 2),
+}
+#: Axes that may be up in a world, and in any coordinates, such as a camera's.
+WORLD, ANY = ("y", "z"), tuple(UPRIGHT)
+#: Least mean cosine between the body's own up and an axis with which it decides.
+LEAST_UP_COSINE = 0.7
+
+
+@dataclass(frozen=True)
+class RawMotion:
+    """The content of a motion file, before anything is left out or turned.
+
+    `times_s` (T,): seconds; NaNs and repeated times are still in. `poses` (T, 55, 3): axis-angle, radians, SMPL-X joint
+    order. `translation` (T, 3): places of the pelvis, metres; None when the format has none. `betas` (n,): coefficients
+    of the shape, or None. `up`: axis that is usually up in the format. `ups`: axes that may be up in it. `notes`: notes
+    on the file, for people. `leg_m`: hip to ankle of the recorded person; None when unknown. `detected`: facts about
+    the file, without its axes. `feet` (T, 2, n, 3): places of n joints of the left and the right foot, metres; None
+    when the format has no places.
+    """
+
+    times_s: F64
+    poses: F64
+    translation: F64 | None
+    betas: F64 | None
+    up: str
+    notes: tuple[str, ...]
+    leg_m: float | None = None
+    detected: Detected = NOTHING
+    ups: tuple[str, ...] = WORLD
+    feet: F64 | None = None
+
+
+def motion_from_recording(raw: RawMotion, where: str, up_axis: str) -> Motion:
+    """Return the motion of a file.
+
+    `raw`: content of the file. `where`: path of the file, for messages. `up_axis`: a key of UPRIGHT, or `auto`. Raises
+    BadInputError when it has more than MAX_FRAMES frames, is in degrees, or is unreadable in more than half of its
+    frames.
+    """
+    if len(raw.times_s) > MAX_FRAMES:
+        raise BadInputError(where, f"{len(raw.times_s)} frames", f"at most {MAX_FRAMES}")
+    shift = np.zeros((len(raw.poses), 3)) if raw.translation is None else raw.translation
+    usable, repairs = usable_samples(
+        where, raw.times_s, _readable(raw.poses, shift), broken_as=_broken_as(raw.poses, shift)
+    )
+    times, poses, shift = raw.times_s[usable], raw.poses[usable], shift[usable]
+    _check_angles(poses, where)
+    roots = matrix_from_rotvec(poses[:, 0])
+    up, how, doubt = _up_axis(poses, None if raw.translation is None else shift, raw, up_axis)
+    turn = UPRIGHT[up]
+    turn = facing(turn @ roots[0]) @ turn
+    poses = poses.copy()
+    poses[:, 0] = rotvec_from_matrix(turn @ roots)
+    translation = shift @ turn.T
+    axes = f"{up.upper()} up, {how}"
+    return Motion(
+        times - times[0],
+        poses,
+        centred(translation),
+        raw.betas,
+        (*raw.notes, axes, *doubt, *repairs),
+        Wrap.BOUNCE,
+        raw.leg_m,
+        raw.translation is not None,
+        replace(raw.detected, axes=axes),
+        None if raw.feet is None else stance((raw.feet[usable] @ turn.T)[..., 1]),
+    )
+
+
+def _readable(poses: F64, shift: F64) -> NDArray[np.bool_]:
+    """Return whether the numbers of each frame (T,) are finite and its place is within MAX_PLACE_M."""
+    finite = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(shift).all(axis=1)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(finite & (np.abs(shift) < MAX_PLACE_M).all(axis=1))
+
+
+def _broken_as(poses: F64, shift: F64) -> str:
+    """Say what is wrong with the unreadable frames."""
+    not_finite = not (np.isfinite(poses).all() and np.isfinite(shift).all())
+    with np.errstate(invalid="ignore"):
+        is_far = bool((np.abs(np.where(np.isfinite(shift), shift, 0.0)) >= MAX_PLACE_M).any())
+    far = f"{MAX_PLACE_M / 1000:g} km or more from the origin"
+    found = [words for words, holds in (("not finite", not_finite), (far, is_far)) if holds]
+    return " or ".join(found) or "without a time"
+
+
+def _check_angles(poses: F64, where: str) -> None:
+    largest = float(np.abs(poses).max())
+    if largest > MAX_ANGLE_RAD:
+        raise BadInputError(where, f"an angle of {largest:.3g}", "axis-angle in radians", "convert degrees to radians")
+
+
+def _up_axis(poses: F64, places: F64 | None, raw: RawMotion, stated: str) -> tuple[str, str, tuple[str, ...]]:
+    """Return the axis that is up, how it was decided, and a note where another one may be it.
+
+    `poses` (T, 55, 3), `places` (T, 3) of the pelvis, if recorded: those of the usable frames.
+    """
+    if stated != "auto":
+        return stated, "as given", ()
+    mean = matrix_from_rotvec(poses[:, 0])[:, :, 1].mean(axis=0)
+    name = next((name for name in raw.ups if (UPRIGHT[name] @ mean)[1] > LEAST_UP_COSINE), None)
+    if name is None:
+        return raw.up, "as usual for the format", ()
+    if name == raw.up or places is None or raw.ups == ANY:
+        return name, "as the body stands", ()
+    heights, usual = (lowest(poses, places, raw.leg_m, UPRIGHT[axis][1]) for axis in (name, raw.up))
+    if stands(heights):
+        return name, "as the body stands", ()
+    if lies(usual):
+        what = f"`up_axis` {name.upper()} if it stands there"
+        return raw.up, f"as the body lies, or is upside down, on the file's floor: {what}", ()
+    doubt = f"up: one who lies, or is upside down, throughout needs `up_axis` {raw.up.upper()}"
+    return name, "as the body stands", (doubt,)
+
+
+def facing(root: F64) -> F64:
+    """Return the turn about Y (3, 3) after which a body with root turn `root` (3, 3) faces +Z.
+
+    It is the identity for a body that lies.
+    """
+    x, _, z = root[:, 2]
+    if np.hypot(x, z) < 0.3:
+        return np.eye(3)
+    return about(1, -np.arctan2(x, z))
+
+
+def centred(translation: F64) -> F64:
+    """Shift `translation` (T, 3) so that the rectangle of ground that it covers has its middle at the origin."""
+    low, high = translation.min(axis=0), translation.max(axis=0)
+    middle = (low + high) / 2
+    return np.asarray(translation - np.array([middle[0], 0.0, middle[2]]))

@@ -1,7 +1,7 @@
 """Puts recorded joints on the 55 SMPL-X joints of an avatar.
 
 Turns come from places: limbs point where the recorded ones point; pelvis and trunk turn as hip line, trunk and shoulder
-line do. The file's own turns only say how limbs twist (`turns.py`), and how head and toes turn. So neither a file's
+line do. The file's own turns only say how limbs twist (`tracks.py`), and how head and toes turn. So neither a file's
 zero pose nor its axes matter. A joint that the file does not have follows its parent.
 """
 
@@ -17,21 +17,17 @@ from trilane.arrays import F64
 from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS, JOINTS
 from trilane.scene.motion.tracks import (
     SIDES,
+    Evidence,
     Tracks,
     angle_between,
     at_rest,
     built_alike,
-    leg_length,
-    planted_frames,
-    standing_frames,
-    unit,
-    upward,
-)
-from trilane.scene.motion.turns import (
-    Evidence,
     hinge,
+    leg_length,
     level_with,
     limb_turns,
+    planted_frames,
+    standing_frames,
     swung,
     transposed,
     trunk_line,
@@ -40,6 +36,8 @@ from trilane.scene.motion.turns import (
     turns_of_collars,
     turns_of_neck,
     turns_of_trunk,
+    unit,
+    upward,
     with_neck_on,
     with_shoulders_on,
 )

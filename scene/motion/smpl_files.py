@@ -28,10 +28,9 @@ from trilane.arrays import F64
 from trilane.body.joints import JOINT_INDEX, JOINTS
 from trilane.errors import BadInputError
 from trilane.files import as_numbers
-from trilane.scene.motion.motion import REST_PELVIS, SMPL_REST_PELVIS
+from trilane.scene.motion.motion import ANY, REST_PELVIS, SMPL_REST_PELVIS, WORLD, RawMotion
 from trilane.scene.motion.pickled import ARRAYS, printable
-from trilane.scene.motion.recorded import ANY, WORLD, RawMotion
-from trilane.scene.motion.stored import Found, contents, tables_in
+from trilane.scene.motion.stored import FoundTable, contents, tables_in
 from trilane.scene.recordings import Detected
 from trilane.scene.rotations import matrix_from_rotvec, rotvec_from_matrix
 
@@ -250,7 +249,7 @@ ROMP_RATE_HZ = 30.0
 _NUMBER = re.compile(r"(\d+)(?:\.[A-Za-z]+)?$")
 
 
-def motion_of_frames(found: list[Found], source: str) -> RawMotion:
+def motion_of_frames(found: list[FoundTable], source: str) -> RawMotion:
     """Return the motion of one person over the frames `found`, which all have ROMP_POSES.
 
     `source`: ending of the file, for people. Raises BadInputError when a frame's arrays are no arrays, or do not fit.
@@ -284,7 +283,7 @@ def motion_of_frames(found: list[Found], source: str) -> RawMotion:
     )
 
 
-def _frame_numbers(found: list[Found]) -> tuple[NDArray[np.int64], str]:
+def _frame_numbers(found: list[FoundTable]) -> tuple[NDArray[np.int64], str]:
     """Return the number of each frame, by its name where all names end in different numbers, and a note."""
     matches = [_NUMBER.search(frame.name) for frame in found]
     named = [int(match[1][-9:]) for match in matches if match is not None]
@@ -293,7 +292,7 @@ def _frame_numbers(found: list[Found]) -> tuple[NDArray[np.int64], str]:
     return np.arange(len(found)), "in the file's order"
 
 
-def _rows_of_person(found: list[Found]) -> tuple[list[int], str]:
+def _rows_of_person(found: list[FoundTable]) -> tuple[list[int], str]:
     """Return the row of the person in each frame, -1 where there is none; and a note on who it is."""
     counts = [len(_rows_in(frame, ROMP_POSES)) for frame in found]
     if all(frame.has(ROMP_PERSONS) for frame in found):
@@ -317,11 +316,11 @@ def _rows_of_person(found: list[Found]) -> tuple[list[int], str]:
     return [0 if count else -1 for count in counts], f"the first person of each frame is read{several}"
 
 
-def _row_turns(frame: Found, row: int) -> JointTurns:
+def _row_turns(frame: FoundTable, row: int) -> JointTurns:
     return turns_in(f"{frame.where}[{ROMP_POSES}]", _rows_in(frame, ROMP_POSES)[row : row + 1], WHOLE)
 
 
-def _row_place(frame: Found, row: int) -> F64 | None:
+def _row_place(frame: FoundTable, row: int) -> F64 | None:
     """Return the place (3,) of the body in the camera's coordinates, metres."""
     if not frame.has(ROMP_PLACES):
         return None
@@ -333,7 +332,7 @@ def _row_place(frame: Found, row: int) -> F64 | None:
     return as_numbers(f"{frame.where}[{ROMP_PLACES}]", places[row], "numbers")
 
 
-def _rows_in(frame: Found, key: str) -> NDArray[np.generic]:
+def _rows_in(frame: FoundTable, key: str) -> NDArray[np.generic]:
     array = frame.array(key)
     if not array.ndim:
         raise BadInputError(f"{frame.where}[{key}]", "one number", "a row for each person")
@@ -351,7 +350,9 @@ def motion_of(where: str, source: str, values: Any, there: str = "") -> RawMotio
     `where`: name of the file. `source`: ending of the file, for people. `there`: content of the file, for messages,
     when `values` are not all of it. Raises BadInputError when no layout fits.
     """
-    tables = [Found(f"{where}[{printable(name)}]" if name else where, name, table) for name, table in tables_in(values)]
+    tables = [
+        FoundTable(f"{where}[{printable(name)}]" if name else where, name, table) for name, table in tables_in(values)
+    ]
     frames_of_romp = [table for table in tables if table.has(ROMP_POSES)]
     if frames_of_romp:
         return motion_of_frames(frames_of_romp, source)
@@ -393,7 +394,7 @@ def motion_of(where: str, source: str, values: Any, there: str = "") -> RawMotio
     )
 
 
-def _layout_of(tables: list[Found]) -> tuple[ArrayLayout, list[Found]] | None:
+def _layout_of(tables: list[FoundTable]) -> tuple[ArrayLayout, list[FoundTable]] | None:
     """Return the first layout that one of `tables` has, and all tables that have it."""
     for layout in LAYOUTS:
         found = [table for table in tables if all(table.has(key) for key in layout.needs)]
@@ -402,7 +403,7 @@ def _layout_of(tables: list[Found]) -> tuple[ArrayLayout, list[Found]] | None:
     return None
 
 
-def _turns(layout: ArrayLayout, found: Found) -> JointTurns:
+def _turns(layout: ArrayLayout, found: FoundTable) -> JointTurns:
     """Return the turns of all of the layout's arrays, which add up since each has joints of its own."""
     parts, notes = [], []
     for array in layout.arrays:
@@ -422,7 +423,7 @@ def _turns(layout: ArrayLayout, found: Found) -> JointTurns:
     return JointTurns(np.sum([part.turns for part in parts], axis=0), whole.columns, whole.whose, said)
 
 
-def _rate(layout: ArrayLayout, found: Found) -> tuple[float, str]:
+def _rate(layout: ArrayLayout, found: FoundTable) -> tuple[float, str]:
     for key in RATE_KEYS:
         if found.has(key):
             value = found.numbers(key)
@@ -436,7 +437,7 @@ def _rate(layout: ArrayLayout, found: Found) -> tuple[float, str]:
     return layout.rate_hz, layout.rate_why
 
 
-def _places(layout: ArrayLayout, found: Found, frames: int) -> tuple[F64 | None, tuple[str, ...]]:
+def _places(layout: ArrayLayout, found: FoundTable, frames: int) -> tuple[F64 | None, tuple[str, ...]]:
     """Return places of the pelvis (T, 3), metres, or None; and notes."""
     key = layout.place
     if not found.has(key):
@@ -456,7 +457,7 @@ def _places(layout: ArrayLayout, found: Found, frames: int) -> tuple[F64 | None,
     return (places if layout.rest_pelvis is None else layout.rest_pelvis + places), notes
 
 
-def _scale(layout: ArrayLayout, found: Found) -> float:
+def _scale(layout: ArrayLayout, found: FoundTable) -> float:
     value = found.numbers(layout.scale)
     if value.size != 1 or not 0 < value.item() <= LARGEST_SCALE:
         where = f"{found.where}[{layout.scale}]"
@@ -464,7 +465,7 @@ def _scale(layout: ArrayLayout, found: Found) -> float:
     return float(value.item())
 
 
-def _measured(layout: ArrayLayout, found: Found, frames: int) -> NDArray[np.bool_]:
+def _measured(layout: ArrayLayout, found: FoundTable, frames: int) -> NDArray[np.bool_]:
     """Return which frames (T,) hold the person; all where the layout does not say."""
     if not found.has(layout.mask):
         return np.ones(frames, dtype=bool)
@@ -474,7 +475,7 @@ def _measured(layout: ArrayLayout, found: Found, frames: int) -> NDArray[np.bool
     return np.asarray(mask != 0)
 
 
-def _betas(layout: ArrayLayout, found: Found) -> F64 | None:
+def _betas(layout: ArrayLayout, found: FoundTable) -> F64 | None:
     """Return the betas of the whole motion; the mean where each frame has its own."""
     if not found.has(layout.betas):
         return None
@@ -486,7 +487,7 @@ def _betas(layout: ArrayLayout, found: Found) -> F64 | None:
     return flat
 
 
-def _notes_on_persons(found: list[Found], chosen: Found) -> tuple[str, ...]:
+def _notes_on_persons(found: list[FoundTable], chosen: FoundTable) -> tuple[str, ...]:
     if len(found) == 1:
         return (f"read from {printable(chosen.name)}",) if chosen.name else ()
     return (f"{len(found)} persons in the file: {printable(chosen.name)}, the one with the most frames, is read",)

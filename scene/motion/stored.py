@@ -128,7 +128,7 @@ def contents(value: Any) -> str:
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundTable:
     """A dict of a file.
 
     `where`: its place, for messages. `name`: its own name in the file, empty for the outermost.

@@ -1,12 +1,23 @@
-"""Places, turns and end sites of named joints over time: the input of retargeting, from any file.
+"""Tracks of named joints over time, and the turns that they mean: the input of retargeting, from any file.
 
 Names are those of the SMPL-X joints; units and axes are the file's own, the same in all arrays. Places alone tell which
 frames stand, and whether a skeleton is built like the avatar's: the file's zero pose does not matter.
+
+**Trunk.** Hip line, line of the trunk and shoulder line define frames, alike in the recording and in the avatar's rest
+pose; a joint's turn takes one to the other. Programs put the joints of the trunk at different depths in the body. In a
+skeleton that is not built like the avatar's, the constant pitch of each part therefore comes from the moments in which
+the person stands straight.
+
+**Limbs.** A bone points where the recorded one points. The twist about it follows the file's own turns, so it never
+flips where a limb is straight. Those turns are right up to one constant angle. At this angle elbows and knees bend, and
+toes and fingers point, as the avatar's do, on average over the recording. No zero pose is needed for it.
+
+Functions take (T, 3) and (T, 3, 3) arrays and give proper turns where their input is finite.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,6 +25,7 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.body.joints import JOINT_NAMES
+from trilane.scene.rotations import about, matrix_from_quat, matrix_from_rotvec, normalised
 
 SIDES = ("left", "right")
 
@@ -80,19 +92,10 @@ LEG_BELOW, PLANTED_SHARE = np.radians(35.0), 0.25
 NEAR_AXIS = np.cos(np.radians(30.0))
 #: Pairs of joints of one bone or one part: some of their distances are the same in two skeletons that are built alike.
 RIGID = (
-    ("left_hip", "right_hip"),
-    ("pelvis", "left_hip"),
-    ("pelvis", "spine1"),
-    ("left_hip", "spine1"),
-    ("spine1", "spine2"),
-    ("spine2", "spine3"),
-    ("spine3", "neck"),
-    ("spine3", "left_collar"),
-    ("neck", "left_collar"),
-    ("left_collar", "right_collar"),
-    ("left_collar", "left_shoulder"),
-    ("left_ankle", "left_foot"),
-)
+    ("left_hip", "right_hip"), ("pelvis", "left_hip"), ("pelvis", "spine1"), ("left_hip", "spine1"),
+    ("spine1", "spine2"), ("spine2", "spine3"), ("spine3", "neck"), ("spine3", "left_collar"), ("neck", "left_collar"),
+    ("left_collar", "right_collar"), ("left_collar", "left_shoulder"), ("left_ankle", "left_foot"),
+)  # fmt: skip
 #: Largest difference of such distances, as a share of them and of the legs.
 SAME_SHARE, SAME_LEGS = 0.02, 0.003
 
@@ -156,3 +159,318 @@ def built_alike(tracks: Tracks, rest: Tracks) -> bool:
         if abs(ours - theirs) > SAME_SHARE * ours + SAME_LEGS * leg_length(tracks):
             return False
     return ("spine1", "spine2") in pairs or ("spine3", "neck") in pairs
+
+
+#: Share of a direction at right angles to another one below which it is too short to tell a turn.
+TOO_SHORT = 1e-6
+
+
+def transposed(turns: F64) -> F64:
+    """Return the inverse of each turn (T, 3, 3)."""
+    return np.swapaxes(turns, -1, -2)
+
+
+def turned(turns: F64, vectors: F64) -> F64:
+    """Return vectors (T, 3) or (3,) under turns (T, 3, 3) or (3, 3)."""
+    return np.asarray((turns @ vectors[..., None])[..., 0])
+
+
+def beside(vectors: F64, axis: F64) -> F64:
+    """Return the part of vectors (T, 3) that is perpendicular to unit vectors `axis` (T, 3)."""
+    return np.asarray(vectors - (vectors * axis).sum(axis=-1, keepdims=True) * axis)
+
+
+def frames_along(exact: F64, other: F64, first: str) -> F64:
+    """Return frames (T, 3, 3) with left, up and forward as columns.
+
+    `first`: `left` when `exact` (T, 3) is the left and `other` (T, 3) is towards up; `up` when it is the other way
+    round. Where both are along one line, any perpendicular direction takes the place of `other`.
+    """
+    a = unit(exact)
+    b = beside(unit(other), a)
+    along = np.linalg.norm(b, axis=-1, keepdims=True) < TOO_SHORT
+    b = unit(np.where(along, np.cross(a, np.eye(3)[np.abs(a).argmin(axis=-1)]), b) if along.any() else b)
+    left, up = (a, b) if first == "left" else (b, a)
+    return np.stack([left, up, np.cross(left, up)], axis=-1)
+
+
+def least_turns(source: F64, target: F64) -> F64:
+    """Return the turn (T, 3, 3) of the least angle from each direction `source` (T, 3) to `target` (T, 3).
+
+    As a quaternion it is (1 + cos, cross product), at unit length. Between opposite directions the axis is any
+    perpendicular one.
+    """
+    a, b = unit(source), unit(target)
+    a, b = np.broadcast_arrays(a, b)
+    axis, cosine = np.cross(a, b), (a * b).sum(axis=-1)
+    opposite = cosine < -1 + TOO_SHORT**2
+    if opposite.any():
+        axis = np.where(opposite[..., None], np.cross(a, np.eye(3)[np.abs(a).argmin(axis=-1)]), axis)
+    quats = np.concatenate([np.where(opposite, 0.0, 1 + cosine)[..., None], axis], axis=-1)
+    return matrix_from_quat(normalised(quats))
+
+
+def mean_turn(turns: F64) -> F64:
+    """Return the rotation (3, 3) nearest to the mean of turns (T, 3, 3), by least squares of their entries.
+
+    Moakher, "Means and averaging in the group of rotations", SIAM J. Matrix Analysis 24(1), 2002.
+    """
+    u, _, v = np.linalg.svd(turns.mean(axis=0))
+    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v)
+
+
+def level_with(turns: F64, base: F64, where: NDArray[np.bool_]) -> F64:
+    """Return `turns` (T, 3, 3) after one constant turn, so that on average over `where` (T,) they equal `base`."""
+    return np.asarray(turns @ mean_turn(transposed(base[where]) @ turns[where]).T)
+
+
+#: Sine of the bend below which a limb counts as straight, so that a knee bent backwards a little turns nothing round.
+LEAST_BEND = np.sin(np.radians(15.0))
+
+#: Evidence for a twist: a direction in the avatar at rest (3,), and where it points in the recording (T, 3). Their
+#: length beside the bone is their weight.
+Evidence = tuple[F64, F64]
+
+
+def limb_turns(bone: F64, recorded: F64, carrier: F64, evidence: Sequence[Evidence]) -> F64:
+    """Return global turns (T, 3, 3) that lay the avatar's rest bone (3,) on the recorded ones (T, 3).
+
+    `carrier` (T, 3, 3): turns that the bone takes part in; only their change over time counts. `evidence`: evidence for
+    the twist; without any, the twist is the least one from the rest pose to the carrier.
+    """
+    target = unit(recorded)
+    within = unit(turned(transposed(carrier), target).mean(axis=0))
+    held = least_turns(turned(carrier, within), target) @ carrier
+    laid = least_turns(bone[None], within[None])[0]
+    return np.asarray(held @ _twist(held, within, laid, evidence) @ laid)
+
+
+def _twist(held: F64, axis: F64, laid: F64, evidence: Sequence[Evidence]) -> F64:
+    """Return the turn (3, 3) about `axis` (3,) that brings all of the evidence closest to the recorded directions."""
+    cosine = sine = 0.0
+    inside = transposed(held)
+    for ours, theirs in evidence:
+        expected = unit(beside((laid @ ours)[None], axis[None]))
+        found = beside(turned(inside, theirs), axis[None]).sum(axis=0)
+        cosine += float(found @ expected[0])
+        sine += float(found @ np.cross(axis, expected[0]))
+    if np.hypot(cosine, sine) < TOO_SHORT:
+        return np.eye(3)
+    return matrix_from_rotvec(axis * np.arctan2(sine, cosine))
+
+
+def hinge(upper: F64, lower: F64) -> F64:
+    """Return axes (T, 3) about which a limb bends from `upper` to `lower` (T, 3).
+
+    Their length grows with the bend, up to 1.
+    """
+    axes = np.cross(unit(upper), unit(lower))
+    sines = np.linalg.norm(axes, axis=-1, keepdims=True)
+    return np.asarray(axes * np.clip(1 - LEAST_BEND / np.maximum(sines, TOO_SHORT), 0.0, 1.0))
+
+
+def swung(parent: F64, bone: F64, recorded: F64) -> F64:
+    """Return turns (T, 3, 3) that lay `bone` (3,) on `recorded` (T, 3) with the least turn from `parent` (T, 3, 3)."""
+    return least_turns(turned(parent, bone), recorded) @ parent
+
+
+SPINE = ("spine1", "spine2", "spine3")
+#: Upper end of the trunk's line: the first of these that the recording has.
+TOPS = ("neck", "shoulder", "head", "spine3")
+#: Least distance of the collar joints, as a share of the shoulders', at which they count as apart from the spine.
+LEAST_COLLARS = 0.1
+#: Share of the turn from the hips' left to the shoulders' left that each part of the spine has made.
+TWIST = {"pelvis": 0.0, "spine1": 1 / 3, "spine2": 2 / 3, "spine3": 1.0}
+
+
+@dataclass(frozen=True)
+class TrunkLine:
+    """The line of the trunk.
+
+    `top`: a name of TOPS, or `knee` for a recording without trunk, which is seen from the hips.
+    """
+
+    top: str
+
+    def end(self, tracks: Tracks) -> F64:
+        """Return its upper end (T, 3)."""
+        if self.top == "shoulder":
+            return tracks.between("shoulder")
+        if self.top == "knee":
+            return 2 * tracks.between("hip") - tracks.between("knee")
+        return tracks.places[self.top]
+
+    def along(self, tracks: Tracks) -> F64:
+        """Return the way (T, 3) from the pelvis to its upper end."""
+        return self.end(tracks) - tracks.places["pelvis"]
+
+    def points(self, tracks: Tracks) -> F64:
+        """Return the middle of the hips, the recorded joints of the spine, and the upper end: (n, T, 3)."""
+        inner = [tracks.places[name] for name in self.inner if name in tracks.places]
+        return np.stack([tracks.between("hip"), *inner, self.end(tracks)])
+
+    @property
+    def inner(self) -> tuple[str, ...]:
+        """Names of the joints of the spine that may lie between its ends."""
+        return {"knee": (), "spine3": SPINE[:2]}.get(self.top, SPINE)
+
+    def shares(self, rest: Tracks) -> F64:
+        """Return how far along the line (3,) the spine's joints are in an avatar; 1 for those at its end and above."""
+        inner = line_shares(self.points(rest))[1:-1, 0]
+        return np.append(inner, np.ones(len(SPINE) - len(inner)))
+
+
+def trunk_line(tracks: Tracks) -> TrunkLine:
+    """Return the line of the trunk that the joints of `tracks` allow."""
+    for top in TOPS:
+        names = [f"{side}_{top}" for side in SIDES] if top == "shoulder" else [top]
+        if tracks.has(*names):
+            return TrunkLine(top)
+    return TrunkLine("knee")
+
+
+def line_shares(points: F64) -> F64:
+    """Return how far along a line (n, T, 3) each of its points lies: 0 at its beginning, 1 at its end, (n, T)."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=-1)
+    reached = np.concatenate([np.zeros((1, points.shape[1])), np.cumsum(steps, axis=0)])
+    return np.asarray(reached / np.where(reached[-1] > 0, reached[-1], 1.0))
+
+
+def points_at(points: F64, shares: F64) -> F64:
+    """Return the points (m, T, 3) of a line (n, T, 3) at constant `shares` (m,) of its length."""
+    at = line_shares(points)
+    found = np.empty((len(shares), *points.shape[1:]))
+    for k, share in enumerate(shares):
+        after = np.clip((at < share).sum(axis=0), 1, len(points) - 1)
+        frame = np.arange(points.shape[1])
+        low, high = at[after - 1, frame], at[after, frame]
+        part = (share - low) / np.where(high > low, high - low, 1.0)
+        found[k] = points[after - 1, frame] + part[:, None] * (points[after, frame] - points[after - 1, frame])
+    return found
+
+
+@dataclass(frozen=True)
+class Trunk:
+    """Frames over time of a trunk, before they are laid on the avatar's.
+
+    `frames`: frame (T, 3, 3) of each joint, with left, up and forward as columns. `line` (T, 3): line of the trunk.
+    """
+
+    frames: dict[str, F64]
+    line: F64
+
+
+def trunk_of(tracks: Tracks, line: TrunkLine, shares: F64, by_collars: bool) -> Trunk:
+    """Return the frames of pelvis and spine, with the joints of the spine at `shares` (3,) of the line.
+
+    `by_collars`: whether the chest turns with its collar joints, where they are apart, or with the shoulders.
+    """
+    low, *inner, top = points_at(line.points(tracks), np.array([0.0, *shares, 1.0]))
+    hips = unit(tracks.across("hip"))
+    chest = _across_chest(tracks, hips, by_collars)
+    frames = {"pelvis": frames_along(hips, inner[0] - low, "left")}
+    for name, start, end in zip(SPINE, inner, [*inner[1:], top], strict=True):
+        left = (1 - TWIST[name]) * hips + TWIST[name] * chest
+        up = np.where(np.linalg.norm(end - start, axis=-1, keepdims=True) > 0, end - start, line.along(tracks))
+        frames[name] = frames_along(left, up, "left") if name == "spine3" else frames_along(up, left, "up")
+    return Trunk(frames, line.along(tracks))
+
+
+def _across_chest(tracks: Tracks, hips: F64, by_collars: bool) -> F64:
+    """Return the left (T, 3) of the chest: along the collar joints if they are apart, else along the shoulders."""
+    if not tracks.has("left_shoulder", "right_shoulder"):
+        return hips
+    shoulders = tracks.across("shoulder")
+    if by_collars and collars_apart(tracks):
+        return unit(tracks.across("collar"))
+    return unit(shoulders)
+
+
+def collars_apart(tracks: Tracks) -> bool:
+    """Return whether the recording has collar joints that stand beside the spine, not in it."""
+    if not tracks.has("left_collar", "right_collar", "left_shoulder", "right_shoulder"):
+        return False
+    widths = [np.median(np.linalg.norm(tracks.across(part), axis=-1)) for part in ("collar", "shoulder")]
+    return bool(widths[0] > LEAST_COLLARS * widths[1])
+
+
+def pitch_in(frames: F64, vectors: F64) -> F64:
+    """Return the angle (T,) of vectors (T, 3) from up to forward, in frames (T, 3, 3); radians."""
+    local = turned(transposed(frames), vectors)
+    return np.asarray(np.arctan2(local[:, 2], local[:, 1]))
+
+
+def turns_of_trunk(recorded: Trunk, rest: Trunk, stands: NDArray[np.bool_], own: bool) -> dict[str, F64]:
+    """Return global turns (T, 3, 3) of pelvis and spine.
+
+    `recorded`, `rest`: trunk of the recording, and of the avatar. `stands` (T,): frames in which the person stands
+    straight, which give the pitch of each part unless `own`. `own`: whether the skeleton is built like the avatar's.
+    """
+    turns = {}
+    for name, frames in recorded.frames.items():
+        ours = rest.frames[name]
+        offset = 0.0
+        if not own and stands.any():
+            offset = float(np.median(pitch_in(frames, recorded.line)[stands]) - pitch_in(ours, rest.line)[0])
+        turns[name] = frames @ about(0, offset) @ ours[0].T
+    return turns
+
+
+def with_neck_on(line: F64, turns: dict[str, F64], rest: Tracks) -> dict[str, F64]:
+    """Turn the lower two parts of the spine once more, so that the neck lies along `line` (T, 3).
+
+    `line`: direction from the pelvis, of any length. The neck is at q + R c: R is the turn to find, c the way from the
+    lowest joint of the spine to the highest, and q the rest of the way. So the neck is at s times the direction of
+    `line`, for the s at which q is |c| from it.
+    """
+    joint = {name: rest.places[name][0] for name in ("pelvis", *SPINE, "neck")}
+    along = unit(line)
+    c = turned(turns["spine1"], joint["spine2"] - joint["spine1"])
+    c += turned(turns["spine2"], joint["spine3"] - joint["spine2"])
+    q = turned(turns["pelvis"], joint["spine1"] - joint["pelvis"])
+    q += turned(turns["spine3"], joint["neck"] - joint["spine3"])
+    ahead = (along * q).sum(axis=-1, keepdims=True)
+    beside = (q * q).sum(axis=-1, keepdims=True) - ahead**2
+    reach = np.sqrt(np.maximum((c * c).sum(axis=-1, keepdims=True) - beside, 0.0))
+    once_more = least_turns(c, (ahead + reach) * along - q)
+    return turns | {name: once_more @ turns[name] for name in ("spine1", "spine2")}
+
+
+def turns_of_collars(tracks: Tracks, rest: Tracks, chest: F64, stands: NDArray[np.bool_], own: bool) -> dict[str, F64]:
+    """Return global turns (T, 3, 3) of both collar joints from where they point in the chest, whose turns are `chest`.
+
+    With `own` false they point, on average over the frames that stand, as the avatar's do at rest, the same on both
+    sides. When none stands, they stay as at rest in the chest.
+    """
+    still = {f"{side}_collar": chest for side in SIDES}
+    if not tracks.has(*still, "left_shoulder", "right_shoulder") or not (own or stands.any()):
+        return still
+    inside = transposed(chest)
+    local = {side: unit(turned(inside, tracks.bone(f"{side}_collar", f"{side}_shoulder"))) for side in SIDES}
+    bones = {side: unit(rest.bone(f"{side}_collar", f"{side}_shoulder")) for side in SIDES}
+    if not own:
+        mirror = np.array([-1.0, 1.0, 1.0])
+        middle = unit((local["left"][stands].mean(axis=0) + mirror * local["right"][stands].mean(axis=0))[None])
+        back = least_turns(middle, bones["left"])[0]
+        flip = np.diag(mirror)
+        local = {"left": turned(back, local["left"]), "right": turned(flip @ back @ flip, local["right"])}
+    return {f"{side}_collar": chest @ least_turns(bones[side], local[side]) for side in SIDES}
+
+
+def with_shoulders_on(across: F64, turns: dict[str, F64], rest: Tracks) -> dict[str, F64]:
+    """Turn chest and collars once more by the least turn that lays the shoulders along `across` (T, 3)."""
+    ends = []
+    for side in SIDES:
+        chest, collar, shoulder = (rest.places[name][0] for name in ("spine3", f"{side}_collar", f"{side}_shoulder"))
+        ends.append(turned(turns["spine3"], collar - chest) + turned(turns[f"{side}_collar"], shoulder - collar))
+    once_more = least_turns(ends[0] - ends[1], across)
+    return turns | {name: once_more @ turns[name] for name in ("spine3", "left_collar", "right_collar")}
+
+
+def turns_of_neck(tracks: Tracks, rest: Tracks, chest: F64) -> F64:
+    """Return global turns (T, 3, 3) of the neck: it points to the head as recorded; its left is the chest's."""
+    if not tracks.has("neck", "head"):
+        return chest
+    left = chest[:, :, 0]
+    ours = frames_along(rest.bone("neck", "head"), np.array([[1.0, 0.0, 0.0]]), "up")
+    return np.asarray(frames_along(tracks.bone("neck", "head"), left, "up") @ ours[0].T)

@@ -1,11 +1,19 @@
-"""Names for the array types in annotations. Rule: a name states the element type; docstrings state the shape."""
+"""Names for array types in annotations, and sizes of tensors as text and as shape buckets.
+
+Rules: the name of a type states its elements, docstrings state the shape; a tensor's shape is (height, width), with
+sides that are multiples of `BUCKET_STEP`.
+"""
 
 from __future__ import annotations
 
+import math
+import re
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from trilane.unexpected_value import UnexpectedValue
 
 U8 = NDArray[np.uint8]
 I32 = NDArray[np.int32]
@@ -15,3 +23,54 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Floats = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
+
+
+MAX_SIDE = 4096
+BUCKET_STEP = 32
+MOST_ASPECT = 4  # largest ratio of a bucket's longer side to its shorter one
+
+Shape = tuple[int, int]
+
+
+def parse_shape(text: str) -> Shape:
+    """Parse `HxW` as (height, width). Raises UnexpectedValue."""
+    match = re.fullmatch(r"(\d+)x(\d+)", text)
+    if match is None:
+        raise UnexpectedValue(repr(text), "HEIGHTxWIDTH such as 256x256")
+    return int(match[1]), int(match[2])
+
+
+def shape_buckets(size: str) -> list[Shape]:
+    """Return the tensor shapes (height, width) that `size` allows.
+
+    `HxW` gives that one shape. A single number S gives shapes of at most S² pixels, with sides in multiples of 32 and
+    an aspect within 1:4. No shape contains another: they are tall for a standing body, wide for a lying one, S x S
+    between. Raises UnexpectedValue when a side is no multiple of 32 or out of range.
+    """
+    if re.fullmatch(r"\d+", size):
+        return shapes_within(_check_side(int(size)) ** 2)
+    height, width = parse_shape(size)
+    return [(_check_side(height), _check_side(width))]
+
+
+def shapes_within(pixels: int) -> list[Shape]:
+    """Return the shapes (height, width) of at most `pixels`, at least `BUCKET_STEP`²; none contains another.
+
+    Their sides are multiples of `BUCKET_STEP`, the longer one at most `MOST_ASPECT` times the shorter one.
+    """
+    longest = math.isqrt(MOST_ASPECT * pixels)
+    widest = [(h, pixels // h // BUCKET_STEP * BUCKET_STEP) for h in range(BUCKET_STEP, longest + 1, BUCKET_STEP)]
+    shapes = [(h, w) for h, w in widest if w and max(h, w) <= min(MOST_ASPECT * min(h, w), MAX_SIDE)]
+    return [(h, w) for h, w in shapes if not any(b > h and v >= w for b, v in shapes)]
+
+
+def _check_side(side: int) -> int:
+    if side % BUCKET_STEP or not BUCKET_STEP <= side <= MAX_SIDE:
+        raise UnexpectedValue(f"side {side}", f"a multiple of {BUCKET_STEP} from {BUCKET_STEP} to {MAX_SIDE}")
+    return side
+
+
+def checked_size(size: str) -> str:
+    """Return `size` itself. Raises UnexpectedValue as `shape_buckets`."""
+    shape_buckets(size)
+    return size

@@ -3,22 +3,38 @@
 Only this module asks, so a test can put another machine in place of `here`. Ruff refuses the calls below in every other
 file (`banned-api` in pyproject.toml). Two things are asked elsewhere, each in one place: OpenGL by
 `trilane.stages.gpu.opengl`, and clocks by the code that measures, because a clock is read in every job.
+
+Whether a failure comes from a **lack of memory** is decided here too, by the need of a run and its limits. Rule: a
+shortage is reported only where a limit is below what a run takes, or where the kernel has ended a process for it. The
+figures are measured (docs/limits.md); a larger scene, avatar or background takes more.
+
+A process is **woken soon** by a message where the kernel does what is asked; a refusal changes only the speed. Linux
+makes a woken thread wait until the time slice of the running one ends, about 3 ms. The woken thread need not wait if it
+asks for a shorter slice (EEVDF since Linux 6.12; older kernels ignore the request). With another process busy on the
+same core, the measured 99th percentile of the wake-up went from 3.4 ms to 0.2 ms. This matters most for ZeroMQ's I/O
+threads. A unit that has sent a message begins its next job at once. The thread that carries the message then waits on
+the same core for the end of that job's slice: 1.6 ms between two units.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import errno
 import importlib.util
 import os
 import platform
+import resource
 import shutil
+import struct
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 import psutil
+
+from trilane.errors import TrilaneError, reason
 
 #: Number of the system call perf_event_open, by architecture.
 PERF_EVENT_OPEN: Final = {"x86_64": 298, "aarch64": 241, "riscv64": 241}
@@ -216,3 +232,104 @@ def _cache_bytes(caches: Path) -> int:
 def _bytes(text: str) -> int:
     """Return the bytes of a size as the kernel writes it, such as 307200K."""
     return int(text[:-1]) * KERNEL_UNITS[text[-1]] if text[-1:] in KERNEL_UNITS else int(text)
+
+
+MB: Final = 1 << 20
+#: Addresses of the largest process of a default run: unit dsp, with OpenVINO.
+ADDRESS_BYTES: Final = 1700 * MB
+#: Addresses without which no run can begin: no OpenGL driver loads. NumPy ends a process that has fewer than half.
+LEAST_ADDRESS_BYTES: Final = 512 * MB
+#: Memory without which the kernel ends the processes of the smallest run: tensors of 64x64, pictures of 160x120.
+LEAST_RUN_BYTES: Final = 255 * MB
+#: Memory of all processes of a default run, with shared pages counted once.
+RUN_BYTES: Final = 600 * MB
+NEEDED: Final = f"a run takes {RUN_BYTES // MB} MB"
+
+_KILLS = here.oom_kills()
+
+
+def require_memory(part: int = 1) -> None:
+    """Raise TrilaneError when a limit is below a `part`th of what the smallest run takes."""
+    if (limit := _address_limit()) < LEAST_ADDRESS_BYTES // part:
+        found = f"found a limit of {limit // MB} MB of addresses (ulimit -v)"
+        expected = f"expected at least {ADDRESS_BYTES // MB} MB for a run"
+        raise TrilaneError(f"memory: {found}, {expected}: ulimit -v unlimited")
+    group = here.memory_limit_bytes()
+    if group is not None and group < LEAST_RUN_BYTES // part:
+        found = f"found a limit of {group // MB} MB for the control group"
+        raise TrilaneError(f"memory: {found}, expected at least {RUN_BYTES // MB} MB for a run")
+
+
+def shortage() -> str:
+    """Return the evidence that memory is short, as part of a sentence; "" without evidence.
+
+    Call it after a failure that a lack of memory may have caused: a run of small tensors may need less than the limit.
+    """
+    if (limit := _address_limit()) < ADDRESS_BYTES:
+        needed = f"a run's largest process takes {ADDRESS_BYTES // MB} MB: ulimit -v unlimited"
+        return f"each process may have {limit // MB} MB of addresses (ulimit -v), and {needed}"
+    group = here.memory_limit_bytes()
+    if group is not None and group < RUN_BYTES:
+        return f"the control group may have {group // MB} MB of memory, and {NEEDED}"
+    return ended_by_system()
+
+
+def ended_by_system() -> str:
+    """Return that the kernel has ended a process since this one began, as part of a sentence; "" where it has not."""
+    if here.oom_kills() <= _KILLS:
+        return ""
+    free = f"{here.free_bytes() // MB} MB are free now"
+    return f"the system has meanwhile ended a process because memory ran out, and {NEEDED}; {free}"
+
+
+def _address_limit() -> float:
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return float("inf") if limit == resource.RLIM_INFINITY else limit
+
+
+SHORTEST_SLICE_NS = 100_000
+UNIT_SLICE_NS = 1_000_000  # shorter than the slice of other programs, longer than the scheduler's
+USUAL_SLICE = 0
+#: <asm/unistd.h>
+SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
+#: The struct sched_attr of <linux/sched/types.h>: size, policy, flags, nice, priority, runtime, deadline, period.
+SCHED_ATTR = "=IIQiIQQQ"
+SCHED_OTHER = 0
+#: Linux's "PM QoS" file. The integer written to it is a time in us; while the file is open, no core sleeps so deeply
+#: that waking it takes longer.
+LATENCY_FILE = Path("/dev/cpu_dma_latency")
+AWAKE = "wait awake"
+
+
+def use_slice(slice_ns: int) -> bool:
+    """Ask for a time slice of `slice_ns` for this thread and the processes it starts.
+
+    Return whether the kernel accepted it.
+    """
+    number = SCHED_SETATTR.get(here.architecture())
+    if number is None or os.sched_getscheduler(0) != os.SCHED_OTHER:
+        return False
+    nice = os.getpriority(os.PRIO_PROCESS, 0)
+    attributes = struct.pack(SCHED_ATTR, struct.calcsize(SCHED_ATTR), SCHED_OTHER, 0, nice, 0, slice_ns, 0, 0)
+    return bool(ctypes.CDLL(None).syscall(number, 0, attributes, 0) == 0)
+
+
+@contextlib.contextmanager
+def awake(wanted: bool = True) -> Iterator[str]:
+    """Keep idle cores of the whole machine awake inside the `with` block. Yield AWAKE, or `sleep: ` and the reason.
+
+    A sleeping core takes 50 us and more to react to a message; a core that is kept awake takes power. Usually only root
+    may do this. The kernel undoes it when the process ends.
+    """
+    if not wanted:
+        yield "sleep: the performance profile asks for no haste"
+        return
+    with contextlib.ExitStack() as stack:
+        try:
+            file = os.open(LATENCY_FILE, os.O_WRONLY | os.O_CLOEXEC)
+            stack.callback(os.close, file)
+            os.write(file, struct.pack("=i", 0))
+            idle_cores = AWAKE
+        except OSError as error:
+            idle_cores = f"sleep: {LATENCY_FILE}: {reason(error)}"
+        yield idle_cores

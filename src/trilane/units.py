@@ -1,4 +1,7 @@
-"""Names that all folders share: units, profiles, the host's name, the avatar's stages. Rule: each list stands once."""
+"""Words that all folders share: units, profiles, the host's name, the avatar's stages, sources of figures.
+
+Rule: each list and each phrase stands once.
+"""
 
 from __future__ import annotations
 
@@ -41,3 +44,11 @@ AFTER_INFER: tuple[tuple[str, UnitName], ...] = (("composite", "gpu"), ("present
 LATENCY_TO = "composite"
 #: Frames that need no new picture of the avatars skip the stages between these two.
 BYPASS = ("pose", "composite")
+
+
+MEASURED = "measured in this run"
+COMPUTED = "computed"
+#: Source of a ratio of a measured figure to a computed one.
+COMPARED = "measured in this run, over computed"
+#: Stands for a figure that is not this avatar's.
+NO_FIGURES = "no figures"

@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageOps, UnidentifiedImageError
 
-from trilane.arrays import U8
+from trilane.arrays import U8, Shape
 from trilane.errors import BadInputError
 from trilane.pipeline.ports import Arrays, PortedStage
 from trilane.pipeline.stage import UnitContext
-from trilane.shapes import Shape
 from trilane.stages.gpu.video_reader import VideoReader, video_stream
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")

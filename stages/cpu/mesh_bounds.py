@@ -35,8 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from trilane.arrays import F32, F64, I64, Mask
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINTS
-from trilane.body.kinematics import Posed
+from trilane.body.joints import JOINTS, Posed
 from trilane.body.skinning import blend_matrices, branch_sums, joint_distance, largest_weights
 from trilane.cache import Arrays, cached_arrays
 from trilane.scene.crop import Rect

@@ -17,22 +17,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import F32, F64
+from trilane.arrays import F32, F64, Shape
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M
+from trilane.avatars.mesh_levels import MeshLevel
 from trilane.body.body import ShapedBody
-from trilane.body.kinematics import Posed, Skeleton
-from trilane.body.mesh_levels import MeshLevel
+from trilane.body.joints import Posed, Skeleton
 from trilane.body.skinning import DETAILS, DetailBounds, FrameSkinner
 from trilane.errors import TrilaneError
 from trilane.machine import moved_of_kept
 from trilane.pipeline.memory import Assets, ByteCounter
 from trilane.pipeline.stage import Skip, UnitContext
 from trilane.scene.camera_placement import steered
-from trilane.scene.crop import SCREEN, Rect, Stretch, cheapest_within, error_px, least_w, stretch_of
+from trilane.scene.crop import SCREEN, Rect, Stretch, cheapest_within, error_px, lay_out_apart, least_w, stretch_of
 from trilane.scene.mover import Mover
 from trilane.scene.planner import FrameWork, HeldMesh, HeldShape, hold_mesh, plan_tensor, shown_by, work_of
-from trilane.scene.tensor_layout import lay_out_apart
-from trilane.shapes import Shape
 from trilane.stages.avatar_assets import bodies_drawn, distinct, mesh_levels_of, staged_of
 from trilane.stages.config import RunConfig, posed_vertices
 from trilane.stages.cpu.mesh_bounds import MeshBounds
@@ -57,7 +55,7 @@ class SeenAvatar:
 
 
 @dataclass(frozen=True)
-class Choice:
+class DetailChoice:
     """The choice for an avatar in a frame.
 
     `mesh`: level of the mesh. `level`: an index into `DETAILS`. `error_px`: bound of the error of both, pixels.
@@ -121,13 +119,13 @@ class ModelledBody:
     def skeleton(self) -> Skeleton:
         return Skeleton(self.shaped.joints, self.shaped.body.parents)
 
-    def choose(self, posed: Posed, clip: F64, output: Shape, before: HeldMesh | None = None) -> Choice:
+    def choose(self, posed: Posed, clip: F64, output: Shape, before: HeldMesh | None = None) -> DetailChoice:
         """Return the levels of a frame, and the bound on their error in pixels of a picture of `output`.
 
         `before`: level of the mesh in the frame before.
         """
         if not self.details and not self.levels:
-            return Choice(HeldMesh(0), FINEST, 0.0)
+            return DetailChoice(HeldMesh(0), FINEST, 0.0)
         w = least_w(posed, clip, self.detail.reach, self.detail.blend_m(posed))
         stretch = stretch_of(clip, output)
         moved = [0.0, *(self._moved_m(level, posed, stretch, w) for level in self.levels)]
@@ -135,7 +133,7 @@ class ModelledBody:
         details = self.detail.metres(posed) if self.details else [0.0]
         errors = [error_px(metres + moved[mesh.level], stretch, w) for metres in details]
         level = cheapest_within(errors, self.budget_px)
-        return Choice(mesh, level if self.details else FINEST, errors[level])
+        return DetailChoice(mesh, level if self.details else FINEST, errors[level])
 
     def _moved_m(self, level: MeshLevel, posed: Posed, stretch: Stretch, w: float) -> float:
         """Return the bound of `level` in metres, or its least in any pose where that is beyond the budget already."""
@@ -144,7 +142,7 @@ class ModelledBody:
         return level.metres(posed)
 
     def see(
-        self, posed: Posed, clip: F64, output: Shape, vertices: F32 | None, moved: ByteCounter, choice: Choice
+        self, posed: Posed, clip: F64, output: Shape, vertices: F32 | None, moved: ByteCounter, choice: DetailChoice
     ) -> SeenAvatar | None:
         """Skin the body into `vertices`, if given, and find its rectangle; None when nothing of it is visible.
 

@@ -21,15 +21,14 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
-from trilane.stages.dsp.ort import LOAD_ERRORS, PROVIDER, settings_of
+from trilane.stages.dsp.ort import LOAD_ERRORS, PROVIDER, Named, OrtSession, settings_of
 from trilane.stages.dsp.runtime import RuntimeOptions, quiet_openvino, resolve, said_by_openvino
 
-Named = Mapping[str, NDArray[Any]]
 Shapes = Mapping[str, Sequence[int]]
 ORT, OPENVINO, QNN, CUDA = "ort", "openvino", "qnn", "cuda"
 
 
-class Engine(Protocol):
+class LoadedNetwork(Protocol):
     """A loaded network. `outputs`: names of its outputs, in its order."""
 
     outputs: Sequence[str]
@@ -39,25 +38,6 @@ class Engine(Protocol):
 
         All inputs are given. An output that is left out is computed, and nobody gets it.
         """
-
-
-class OrtEngine:
-    """A session of ONNX Runtime, on the cores or on a device."""
-
-    def __init__(self, session: onnxruntime.InferenceSession) -> None:
-        self._session = session
-        self.outputs: Sequence[str] = [each.name for each in session.get_outputs()]
-
-    def bound(self, inputs: Named, outputs: Named) -> Callable[[], object]:
-        binding = self._session.io_binding()
-        for name, array in inputs.items():
-            binding.bind_input(name, "cpu", 0, array.dtype, array.shape, array.ctypes.data)
-        for name, array in outputs.items():
-            binding.bind_output(name, "cpu", 0, array.dtype, array.shape, array.ctypes.data)
-        for name in self.outputs:
-            if name not in outputs:
-                binding.bind_output(name, "cpu")
-        return lambda: self._session.run_with_iobinding(binding)
 
 
 class OpenvinoEngine:
@@ -90,7 +70,7 @@ def _writeable(array: NDArray[Any]) -> NDArray[Any]:
     return np.frombuffer(memoryview(memory), array.dtype).reshape(array.shape)
 
 
-def engine_of(path: Path, runtime: str, shapes: Shapes, options: RuntimeOptions) -> Engine:
+def engine_of(path: Path, runtime: str, shapes: Shapes, options: RuntimeOptions) -> LoadedNetwork:
     """Load the network in `path`.
 
     `shapes`: shape of each input by name. Raises BadInputError for a network that the runtime does not load,
@@ -99,26 +79,26 @@ def engine_of(path: Path, runtime: str, shapes: Shapes, options: RuntimeOptions)
     return _ENGINES[resolve(runtime)](path, shapes, options)
 
 
-def _ort(path: Path, _shapes: Shapes, options: RuntimeOptions) -> Engine:
+def _ort(path: Path, _shapes: Shapes, options: RuntimeOptions) -> LoadedNetwork:
     try:
-        return OrtEngine(onnxruntime.InferenceSession(str(path), settings_of(options), providers=[PROVIDER]))
+        return OrtSession(onnxruntime.InferenceSession(str(path), settings_of(options), providers=[PROVIDER]))
     except LOAD_ERRORS as error:
         raise BadInputError(path, str(error), "a network that ONNX Runtime loads") from error
 
 
-def _cuda(path: Path, _shapes: Shapes, options: RuntimeOptions) -> Engine:
+def _cuda(path: Path, _shapes: Shapes, options: RuntimeOptions) -> LoadedNetwork:
     from trilane.stages.dsp.cuda import gpu_session
 
-    return OrtEngine(gpu_session(str(path), str(path), options.device))
+    return OrtSession(gpu_session(str(path), str(path), options.device))
 
 
-def _qnn(path: Path, _shapes: Shapes, options: RuntimeOptions) -> Engine:
+def _qnn(path: Path, _shapes: Shapes, options: RuntimeOptions) -> LoadedNetwork:
     from trilane.stages.dsp.qnn import DEFAULTS, htp_session
 
-    return OrtEngine(htp_session(str(path), str(path), {**DEFAULTS, **options.device}, {}))
+    return OrtSession(htp_session(str(path), str(path), {**DEFAULTS, **options.device}, {}))
 
 
-def _openvino(path: Path, shapes: Shapes, options: RuntimeOptions) -> Engine:
+def _openvino(path: Path, shapes: Shapes, options: RuntimeOptions) -> LoadedNetwork:
     openvino = quiet_openvino()
     settings = {
         "PERFORMANCE_HINT": "LATENCY",
@@ -137,7 +117,7 @@ def _openvino(path: Path, shapes: Shapes, options: RuntimeOptions) -> Engine:
         raise BadInputError(path, said_by_openvino(error), "a network that OpenVINO loads") from error
 
 
-_ENGINES: Mapping[str, Callable[[Path, Shapes, RuntimeOptions], Engine]] = {
+_ENGINES: Mapping[str, Callable[[Path, Shapes, RuntimeOptions], LoadedNetwork]] = {
     ORT: _ort,
     OPENVINO: _openvino,
     QNN: _qnn,

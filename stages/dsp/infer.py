@@ -20,7 +20,7 @@ import onnx
 from numpy.typing import NDArray
 
 from trilane import machine
-from trilane.arrays import U8
+from trilane.arrays import U8, Shape
 from trilane.avatars.network_file import NetworkFile, constants_of, reshaped
 from trilane.avatars.network_split import NetworkPart, Shapes, split
 from trilane.cache import Arrays, cached_arrays
@@ -28,7 +28,6 @@ from trilane.errors import BadInputError
 from trilane.machine import moved_of_kept
 from trilane.pipeline.memory import ByteCounter
 from trilane.pipeline.stage import UnitContext
-from trilane.shapes import Shape
 from trilane.stages.avatar_assets import networks_of
 from trilane.stages.config import MAX_CHANNELS, PAINTED_CHANNELS, RunConfig, network_parts
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, Session, copies_slots, has_device, load_runtime, resolve

@@ -6,12 +6,13 @@ Rule: after the first run of a session nothing is allocated and nothing is copie
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import onnx
 import onnxruntime
+from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as state
 
 from trilane.arrays import U8
@@ -31,32 +32,43 @@ LOAD_ERRORS = (
     state.RuntimeException,
 )
 ERRORS_ONLY = 3
+Named = Mapping[str, NDArray[Any]]
 
 
 class OrtBinding:
-    """An ONNX Runtime IOBinding to the buffers' addresses."""
+    """An ONNX Runtime IOBinding to the addresses of the buffers, by name; an output without a buffer is computed."""
 
-    def __init__(self, session: onnxruntime.InferenceSession, inputs: Sequence[U8], outputs: Sequence[U8]) -> None:
-        self._buffers = (*inputs, *outputs)
+    def __init__(self, session: onnxruntime.InferenceSession, inputs: Named, outputs: Named) -> None:
+        self._buffers = (*inputs.values(), *outputs.values())
         self._session = session
         self._io = session.io_binding()
-        for source, array in zip(session.get_inputs(), inputs, strict=True):
-            self._io.bind_input(source.name, "cpu", 0, np.uint8, array.shape, array.ctypes.data)
-        for target, array in zip(session.get_outputs(), outputs, strict=True):
-            self._io.bind_output(target.name, "cpu", 0, np.uint8, array.shape, array.ctypes.data)
+        for name, array in inputs.items():
+            self._io.bind_input(name, "cpu", 0, array.dtype, array.shape, array.ctypes.data)
+        for name, array in outputs.items():
+            self._io.bind_output(name, "cpu", 0, array.dtype, array.shape, array.ctypes.data)
+        for each in session.get_outputs():
+            if each.name not in outputs:
+                self._io.bind_output(each.name, "cpu")
 
     def run(self) -> None:
         self._session.run_with_iobinding(self._io)
 
 
 class OrtSession:
-    """One inference session, which has its own threads."""
+    """One session, which has its own threads. `outputs`: names of its outputs, in its order."""
 
     def __init__(self, session: onnxruntime.InferenceSession) -> None:
         self._session = session
+        self._inputs = [each.name for each in session.get_inputs()]
+        self.outputs: Sequence[str] = [each.name for each in session.get_outputs()]
 
     def bind(self, inputs: Sequence[U8], outputs: Sequence[U8]) -> OrtBinding:
-        return OrtBinding(self._session, inputs, outputs)
+        return OrtBinding(
+            self._session, dict(zip(self._inputs, inputs, strict=True)), dict(zip(self.outputs, outputs, strict=True))
+        )
+
+    def bound(self, inputs: Named, outputs: Named) -> Callable[[], object]:
+        return OrtBinding(self._session, inputs, outputs).run
 
 
 def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:

@@ -27,11 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from trilane.arrays import F64, Floats
+from trilane.arrays import F64, Floats, Shape
 from trilane.pipeline.stage import UnitContext
 from trilane.scene.planner import FrameWork
 from trilane.scene.schema import PlaneSpec
-from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, shaped_body, staged_of
 from trilane.stages.config import PAINTED_CHANNELS, RunConfig, network_parts
 from trilane.stages.gpu import opengl

@@ -1,30 +1,302 @@
-"""The raster stage: from a pose packet to the network's input tensor.
+"""The raster stage, from a pose packet to the network's input tensor, and the packed pass that draws it.
 
-Rule: the tensor is written straight into the output slot; a frame with nothing to show costs one fill.
+Rule of the stage: the tensor is written straight into the output slot; a frame with nothing to show costs one fill.
+
+The packed pass draws a posed mesh with its neural texture as the tensor, in bytes. They leave the GPU in tensor order
+(NHWC, row 0 on top) and already have the network's scale and zero point. The neural texture is an array texture of four
+channels a layer. Its texels are FP16; what FP16 cannot hold is refused before anything is uploaded.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
+import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.arrays import F32, U8, Floats, Shape
+from trilane.avatars.bundle import split_levels
 from trilane.body.body import ShapedBody
-from trilane.errors import TrilaneError
+from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.stage import UnitContext
 from trilane.scene.crop import Rect, crop_projection
-from trilane.shapes import Shape
 from trilane.stages.avatar_assets import bodies_drawn, distinct, levels_of, quantisation_of, texture_of
-from trilane.stages.config import MAX_CHANNELS, RunConfig, network_parts, posed_vertices
-from trilane.stages.gpu.opengl import CONTEXT, checked, counter_of, describe, open_context
-from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement
-from trilane.stages.gpu.skinned_mesh import Mesh, PosedMesh, SkinnedMesh, avatar_mesh
+from trilane.stages.config import MAX_CHANNELS, Quantisation, RunConfig, network_parts, posed_vertices
+from trilane.stages.gpu import opengl
+from trilane.stages.gpu.opengl import (
+    CONTEXT,
+    build_program,
+    checked,
+    counter_of,
+    describe,
+    open_context,
+    read_into,
+    set_uniforms,
+    upload,
+)
+from trilane.stages.gpu.skinned_mesh import BodyPose, Mesh, MeshDraw, PosedMesh, SkinnedMesh, avatar_mesh
 from trilane.transport.packets import Packet
+
+#: How the neural texture is read: the filter when it is shrunk, and the greatest anisotropy, which a driver may limit.
+FILTERS = {
+    "linear": (moderngl.LINEAR, 1.0),
+    "mipmap": (moderngl.LINEAR_MIPMAP_LINEAR, 1.0),
+    "anisotropic": (moderngl.LINEAR_MIPMAP_LINEAR, 16.0),
+}
+FP16_MAX = float(np.finfo(np.float16).max)
+HALF_EXPONENTS = 16  # FP16 numbers are below 2**16
+HALF_BIAS, FLOAT_BIAS = 15, 127  # what is added to the exponent of a number
+
+
+def texture_array(ctx: Any, texture: Floats, filtering: str = "linear", levels: Sequence[Floats] = ()) -> Any:
+    """Return an FP16 array texture of C/4 RGBA layers from `texture` (H,W,C), clamped at its edge.
+
+    `filtering`: one of FILTERS. `levels`: smaller levels that were learnt. They replace the driver's means, and no
+    level is read below them, so `linear` becomes `mipmap`.
+    """
+    height, width, channels = texture.shape
+    array = ctx.texture_array((width, height, channels // 4), 4, _pixels(texture), dtype="f2")
+    shrunk, anisotropy = FILTERS[filter_of(filtering, bool(levels))]
+    if shrunk != moderngl.LINEAR:
+        array.build_mipmaps(**({"max_level": len(levels)} if levels else {}))
+    for number, level in enumerate(levels, 1):
+        size = (level.shape[1], level.shape[0], channels // 4)
+        opengl.write_level(array.glo, number, size, _pixels(level))
+    array.filter = (shrunk, moderngl.LINEAR)
+    array.anisotropy = anisotropy
+    array.repeat_x = array.repeat_y = False
+    return array
+
+
+def texture_words(ctx: Any, texture: Floats) -> tuple[Any, float]:
+    """Return a texture of words with the FP16 numbers of `texture` (H,W,C), as `packed_tensor.frag` reads it deferred.
+
+    Also return its uniform `unit`. The numbers are first multiplied by a power of two, as large as FP16 allows, so that
+    small numbers are not subnormal. The shader turns the bits of such a number into a float, and multiplies by `unit`.
+    """
+    height, width, channels = texture.shape
+    halves = texture.astype(np.float16)
+    raised = HALF_EXPONENTS - int(np.frexp(np.abs(halves).max(initial=0).astype(np.float64))[1])
+    eighths = -(-channels // 8)
+    padded = np.zeros((height, width, 8 * eighths), np.float16)
+    padded[:, :, :channels] = np.ldexp(halves.astype(np.float32), raised)
+    bits = padded.view(np.uint16).reshape(height, width, eighths, 2, 4).astype(np.uint32)
+    words = bits[:, :, :, 0] | bits[:, :, :, 1] << 16
+    made = ctx.texture((width * eighths, height), 4, np.ascontiguousarray(words).tobytes(), dtype="u4")
+    made.filter = (moderngl.NEAREST, moderngl.NEAREST)
+    return made, 2.0 ** (FLOAT_BIAS - HALF_BIAS - raised)
+
+
+def filter_of(asked: str, learnt: bool) -> str:
+    """Return the filter of a texture for which the scene has `asked`; `learnt` levels are always read."""
+    return "mipmap" if learnt and asked == "linear" else asked
+
+
+def _pixels(texture: Floats) -> bytes:
+    height, width, channels = texture.shape
+    layers = texture.reshape(height, width, channels // 4, 4).transpose(2, 0, 1, 3)
+    return np.ascontiguousarray(layers, np.float16).tobytes()
+
+
+def check_texture(texture: Floats, channels: int) -> None:
+    """Raise BadInputError unless `texture` is (H,W,channels) and all its numbers fit into FP16."""
+    if texture.ndim != 3 or texture.shape[2] != channels:
+        raise BadInputError("neural texture", f"shape {texture.shape}", f"(height, width, {channels})")
+    largest = float(np.abs(texture).max()) if texture.size else 0.0
+    if not largest <= FP16_MAX:
+        raise BadInputError("neural texture", f"a value of {largest}", f"numbers within FP16's ±{FP16_MAX:.0f}")
+
+
+CHANNELS = (4, 8, 12, 16)
+WORD_TYPES = {1: "uint", 2: "uvec2", 3: "uvec4", 4: "uvec4"}
+#: Number of 32-bit words in a target's pixel, by the tensor's. OpenGL does not promise drawable targets of three words,
+#: so those have four, and the fourth is not read back.
+TARGET_WORDS = {1: 1, 2: 2, 3: 4, 4: 4}
+
+
+@dataclass(frozen=True)
+class Placement:
+    """One avatar in a tensor.
+
+    `rect`: top, left, height, width in tensor pixels. `clip_projection` (4,4): projection of its crop. `joints`,
+    `feature`, `vertices`: its pose, as in `BodyPose`. `mesh`: number of the mesh that is drawn.
+    """
+
+    joints: F32
+    clip_projection: Floats
+    rect: tuple[int, int, int, int]
+    feature: F32 | None = None
+    vertices: F32 | None = None
+    mesh: int = 0
+
+    @property
+    def pose(self) -> BodyPose:
+        """The pose, as the mesh takes it."""
+        return BodyPose(self.joints, self.feature, self.vertices)
+
+
+@dataclass(frozen=True)
+class Target:
+    """A target of the pass.
+
+    `words`: framebuffer of the tensor. `uv_image`, `uv`: image of u and v in a deferred pass, and its framebuffer; they
+    share one depth. `blank`: bytes of an empty tensor, which software drivers copy faster than they clear a target.
+    """
+
+    words: Any
+    uv_image: Any = None
+    uv: Any = None
+    blank: U8 | None = None
+
+
+class PackedPass:
+    """Draws meshes, each with its neural texture, into tensors."""
+
+    def __init__(
+        self, ctx: Any, channels: int, quantisation: Quantisation, deferred: bool, filtering: str = "linear"
+    ) -> None:
+        """Check the settings; targets are made on first use.
+
+        `ctx`: OpenGL context.
+        `channels`: channels of the tensors and textures, one of `CHANNELS`.
+        `quantisation`: scale and zero point of the bytes.
+        `deferred`: whether to draw u and v of every pixel first, then read the texture once for each visible pixel. The
+        bytes are the same. It is faster on software drivers, which shade whole blocks of pixels for each small
+        triangle.
+        `filtering`: a name of `FILTERS`. A deferred pass has no derivatives of u and v, so it takes only `linear`.
+        Raises BadInputError.
+        """
+        if filtering not in FILTERS:
+            raise BadInputError("texture filter", repr(filtering), f"one of {', '.join(FILTERS)}")
+        if deferred and filtering != "linear":
+            raise BadInputError("texture filter", filtering, "linear", "draw mesh and texture in one pass")
+        if channels not in CHANNELS:
+            raise BadInputError("network input", f"{channels} channels", "4, 8, 12 or 16", "pad with zero channels")
+        self.ctx, self.channels, self.quantisation, self.deferred = ctx, channels, quantisation, deferred
+        self.filtering = filtering
+        self._targets: dict[Shape, Target] = {}
+        self._background = (0x01010101 * quantisation.zero_point,) * 4
+
+    @property
+    def layers(self) -> int:
+        return self.channels // 4
+
+    @property
+    def uniforms(self) -> dict[str, float]:
+        """Uniforms of `packed_tensor.frag`."""
+        encoding = self.quantisation
+        return {"neural": 0, "uv_image": 1, "scale": encoding.scale, "zero_point": float(encoding.zero_point)}
+
+    def target(self, shape: Shape) -> Target:
+        """Return the target for tensors of `shape` (height, width); it is made on first use."""
+        if shape not in self._targets:
+            self._targets[shape] = self._make_target(shape[::-1])
+        return self._targets[shape]
+
+    def begin(self, shape: Shape) -> Target:
+        """Fill the target of `shape` with the zero point and the greatest depth, and return it."""
+        target = self.target(shape)
+        target.words.use()
+        target.words.viewport = (0, 0, shape[1], shape[0])
+        target.words.depth_mask = True
+        if target.blank is None:
+            opengl.clear_unsigned(self._background)
+        else:
+            upload(self.ctx, target.words.color_attachments[0], target.blank)
+        opengl.clear_depth()
+        return target
+
+    def read_into(self, shape: Shape, tensor: U8) -> None:
+        """Copy the target of `shape` to `tensor`, (h * w * channels,) uint8."""
+        box = (0, 0, shape[1], shape[0])
+        words = self.target(shape).words
+        read_into(self.ctx, words, tensor, box, components=self.layers, dtype="u4", alignment=1)
+
+    def background(self, tensor: U8) -> None:
+        """Fill `tensor` with the zero point, the content of a frame without avatars."""
+        tensor[:] = self.quantisation.zero_point
+
+    def _make_target(self, size: tuple[int, int]) -> Target:
+        depth = self.ctx.depth_renderbuffer(size)
+        words = self.ctx.framebuffer([self.ctx.texture(size, TARGET_WORDS[self.layers], dtype="u4")], depth)
+        if not self.deferred:
+            return Target(words)
+        image = self.ctx.texture(size, 2, dtype="f4")
+        image.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        blank = np.full(size[0] * size[1] * 4 * TARGET_WORDS[self.layers], self.quantisation.zero_point, np.uint8)
+        return Target(words, image, self.ctx.framebuffer([image], depth), blank)
+
+
+class PackedAvatar:
+    """One avatar's meshes and texture, which a `PackedPass` draws."""
+
+    def __init__(
+        self,
+        packed: PackedPass,
+        mesh: Mesh,
+        texture: Floats,
+        levels: Floats | None = None,
+        coarser: Sequence[Mesh] = (),
+    ) -> None:
+        """Upload `texture` (H,W,C) and its smaller `levels`, which a deferred pass cannot read.
+
+        `mesh`, `coarser`: the whole mesh, number 0, and its levels.
+
+        Raises BadInputError when FP16 cannot hold a texture, or C is not the pass's number of channels.
+        """
+        check_texture(texture, packed.channels)
+        smaller = split_levels(levels, texture.shape[1])
+        for level in smaller:
+            check_texture(level, packed.channels)
+        if smaller and packed.deferred:
+            raise BadInputError("neural texture", "learnt levels", "one level", "draw mesh and texture in one pass")
+        self.meshes, self._ctx = (mesh, *coarser), packed.ctx
+        defines: dict[str, int | str] = {"LAYERS": packed.layers, "WORDS": WORD_TYPES[packed.layers]}
+        if packed.deferred:
+            self._texture, unit = texture_words(packed.ctx, texture)
+            self._draws = [MeshDraw(packed.ctx, one, "uv_only.frag") for one in self.meshes]
+            defines |= {"DEFERRED": 1, "EIGHTHS": -(-packed.channels // 8)}
+            pack = build_program(packed.ctx, "farthest.vert", "packed_tensor.frag", **defines)
+            set_uniforms(pack, {**packed.uniforms, "unit": unit})
+            self._screen = packed.ctx.vertex_array(pack, [])
+        else:
+            self._texture = texture_array(packed.ctx, texture, packed.filtering, smaller)
+            self._draws = [MeshDraw(packed.ctx, one, "packed_tensor.frag", **defines) for one in self.meshes]
+            for draw in self._draws:
+                draw.set(packed.uniforms)
+
+    def draw(self, target: Target, view: Floats, placement: Placement) -> None:
+        """Draw into `target`, which `PackedPass.begin` has cleared.
+
+        `target`: target of the pass.
+        `view`: matrix (4,4) of the camera.
+        `placement`: pose, crop and rectangle of the avatar.
+        """
+        top, left, height, width = placement.rect
+        box = (left, top, width, height)
+        self._texture.use(0)
+        self.meshes[placement.mesh].prepare(self._ctx)
+        first = target.words if target.uv is None else target.uv
+        first.use()
+        first.viewport = box
+        self._draws[placement.mesh].draw(placement.pose, view, placement.clip_projection)
+        if target.uv is not None:
+            self._write_words(target, box)
+
+    def _write_words(self, target: Target, box: tuple[int, int, int, int]) -> None:
+        target.words.use()
+        target.words.viewport = box
+        target.words.depth_mask = False
+        self._ctx.enable_only(moderngl.DEPTH_TEST)
+        self._ctx.depth_func = ">"
+        target.uv_image.use(1)
+        self._screen.render(vertices=3)
+        self._ctx.depth_func = "<"
 
 
 class RasterStage:

@@ -24,10 +24,9 @@ import numpy as np
 from av.sidedata.sidedata import Type
 from numpy.typing import NDArray
 
-from trilane.arrays import F32, F64, U8
+from trilane.arrays import F32, F64, U8, Shape
 from trilane.errors import BadInputError, TrilaneError
 from trilane.scene.lens import cover
-from trilane.shapes import Shape
 
 PQ, HLG = "PQ", "HLG"
 #: Light of white in the result, and the brightest light that can be told from it, cd/m2.

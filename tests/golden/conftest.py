@@ -15,7 +15,7 @@ from PIL import Image
 from trilane.arrays import F32, F64
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import Body, load_body
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.body.skinning import largest_weights
 from trilane.errors import MissingPartError
 from trilane.stages.gpu.opengl import open_context

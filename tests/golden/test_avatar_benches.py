@@ -8,8 +8,8 @@ pytest.importorskip("skimage")
 
 from trilane.bench import filters, several
 from trilane.errors import BadInputError
-from trilane.scene.tensor_layout import MARGIN_PX
-from trilane.stages.gpu.packed_pass import FILTERS
+from trilane.scene.crop import MARGIN_PX
+from trilane.stages.gpu.raster import FILTERS
 
 
 def test_neighbours_cost_less_than_the_bound() -> None:

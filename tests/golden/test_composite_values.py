@@ -15,20 +15,20 @@ from PIL import Image, ImageDraw, ImageFont
 from support.small_pipeline import without_bytes
 from trilane.arrays import F64, U8
 from trilane.bench.lib import float_raster
-from trilane.scene.crop import Rect
+from trilane.scene.crop import Rect, lay_out_at
 from trilane.scene.schema import PlaneSpec
-from trilane.scene.tensor_layout import lay_out_at
 from trilane.stages.config import pose_dtype
 from trilane.stages.gpu import composite, composite_painters, opengl
-from trilane.stages.gpu.builtin_room import Extent, room_mesh
 from trilane.stages.gpu.composite import CompositeStage
 from trilane.stages.gpu.composite_painters import (
     AvatarPainter,
+    Extent,
     PicturePainter,
     PlanePainter,
     RoomPainter,
     ShadowPainter,
     half_sides,
+    room_mesh,
 )
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 

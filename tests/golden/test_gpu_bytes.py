@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from trilane.scene.planner import FrameWork
-from trilane.stages.config import pose_dtype, posed_vertices
+from trilane.stages.config import Quantisation, pose_dtype, posed_vertices
 from trilane.stages.gpu.composite import CompositeStage
-from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Quantisation
-from trilane.stages.gpu.raster import RasterStage
+from trilane.stages.gpu.raster import PackedAvatar, PackedPass, RasterStage
 from trilane.stages.gpu.skinned_mesh import PosedMesh, SkinnedMesh
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 

@@ -18,12 +18,11 @@ from trilane.errors import TrilaneError, UnitLostError
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.stage import UnitContext
 from trilane.scene.schema import PlaneSpec, Scene
-from trilane.stages.config import RunConfig, pose_dtype
+from trilane.stages.config import Quantisation, RunConfig, pose_dtype
 from trilane.stages.gpu import composite
 from trilane.stages.gpu import raster as raster_stage
 from trilane.stages.gpu.composite import CompositeStage
-from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Quantisation
-from trilane.stages.gpu.raster import RasterStage
+from trilane.stages.gpu.raster import PackedAvatar, PackedPass, RasterStage
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 TENSOR = (96, 64)

@@ -9,7 +9,8 @@ import pytest
 
 from trilane.avatars.bundle import pack_levels
 from trilane.errors import BadInputError
-from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Quantisation
+from trilane.stages.config import Quantisation
+from trilane.stages.gpu.raster import PackedAvatar, PackedPass
 
 torch = pytest.importorskip("torch")
 

@@ -17,15 +17,13 @@ import pytest
 from PIL import ExifTags, Image
 
 from support.camera_files import LENS, WRITERS, Writer, write_nerf
-from trilane.arrays import F64, U8
+from trilane.arrays import F64, U8, Shape
 from trilane.scene.camera.files import load_camera
 from trilane.scene.footage import filmed
 from trilane.scene.schema import CameraSpec, PlaneSpec
-from trilane.shapes import Shape
 from trilane.stages.config import pose_dtype
-from trilane.stages.gpu.background import open_background
+from trilane.stages.gpu.background import open_background, survey
 from trilane.stages.gpu.composite import CompositeStage
-from trilane.stages.gpu.survey import survey
 
 #: Of the camera in a world with Y up: x right, y down, z ahead (optical), and where it stands.
 YAW, PITCH = 0.3, 0.12

@@ -15,7 +15,8 @@ from support import raster_oracle
 from trilane.arrays import F64, U8
 from trilane.bench.lib import float_raster
 from trilane.bench.raster import SplitPass
-from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement, Quantisation
+from trilane.stages.config import Quantisation
+from trilane.stages.gpu.raster import PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import MeshArrays, PosedMesh, SkinnedMesh, mesh_arrays
 from trilane.training.sample_renderer import UvRaster
 

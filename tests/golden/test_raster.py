@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from trilane.avatars.mesh_levels import MeshLevel
 from trilane.bench.lib import float_raster
-from trilane.body.mesh_levels import MeshLevel
 from trilane.body.skinning import FrameSkinner
-from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement, Quantisation
+from trilane.stages.config import Quantisation
+from trilane.stages.gpu.raster import PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import PosedMesh, SkinnedMesh, avatar_mesh, mesh_arrays
 from trilane.training.sample_renderer import UvBytes, UvRaster
 

@@ -24,9 +24,8 @@ from trilane import machine
 from trilane.apps.run.report import read_report
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_split import cuts
-from trilane.figure_sources import COMPUTED, NO_FIGURES
 from trilane.pipeline.fork_server import process_name
-from trilane.units import UNITS
+from trilane.units import COMPUTED, NO_FIGURES, UNITS
 
 FRAMES = 20
 PATIENCE_S = 60.0

@@ -12,8 +12,8 @@ import pytest
 from trilane.bench import handoff, pipeline, scheduler
 from trilane.bench.lib import handoff_variants
 from trilane.errors import BadInputError
-from trilane.figure_sources import NO_FIGURES
 from trilane.scheduler.ledger import JobRecord
+from trilane.units import NO_FIGURES
 
 
 def job(ready: int, dispatch: int, begin: int, end: int) -> JobRecord:

@@ -1,6 +1,6 @@
 """Places of joints by a chain of their own, to compare motions by: a joint at a time, from the pelvis outwards.
 
-Rule: nothing of `body/kinematics.py` or `scene/motion/retarget.py` is used, so that they can be held against this.
+Rule: nothing of `body/joints.py` or `scene/motion/retarget.py` is used, so that they can be held against this.
 """
 
 from __future__ import annotations

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trilane.arrays import F64
+from trilane.arrays import F64, Shape
 from trilane.body.body import ShapedBody
 from trilane.scene.camera.path import CameraPath
 from trilane.scene.mover import Mover
-from trilane.shapes import Shape
 
 LOWEST_EYE_M = 0.3
 #: Number of directions in which the outermost vertices are the points of a body.

@@ -7,16 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import F64
+from trilane.arrays import F64, Shape
 from trilane.avatars.bundle import bundle_folder
 from trilane.bench.lib import float_raster
 from trilane.bench.lib.fixture import ENCODING, standing
 from trilane.body.body import load_body
-from trilane.body.joints import JOINT_INDEX
-from trilane.body.kinematics import Skeleton, rodrigues
-from trilane.shapes import Shape
+from trilane.body.joints import JOINT_INDEX, Skeleton, rodrigues
 from trilane.stages.gpu.opengl import describe
-from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement
+from trilane.stages.gpu.raster import PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 from trilane.training.sample_renderer import UvRaster
 

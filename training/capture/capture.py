@@ -14,15 +14,13 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import F64, U8
+from trilane.arrays import F64, U8, Shape
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import Body, ShapedBody, load_body
-from trilane.body.joints import JOINTS, LEFT_HAND, POSE_SIZE, RIGHT_HAND
-from trilane.body.kinematics import MAX_VALUE, rodrigues
+from trilane.body.joints import JOINTS, LEFT_HAND, MAX_VALUE, POSE_SIZE, RIGHT_HAND, rodrigues
 from trilane.errors import BadInputError
 from trilane.files import read_npz
 from trilane.scene.motion.smpl_files import WHOLE as WIDTHS
-from trilane.shapes import Shape
 from trilane.training.capture.capture_file import (
     FRAME,
     MASK,

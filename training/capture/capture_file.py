@@ -17,12 +17,11 @@ import numpy as np
 from PIL import Image
 from pydantic import Field, ValidationError
 
-from trilane.arrays import F64, U8
+from trilane.arrays import F64, MAX_SIDE, U8, Shape
 from trilane.errors import BadInputError, did_you_mean, reason
 from trilane.files import read_text
 from trilane.scene.lens import Lens
 from trilane.scene.schema import LISTED, Finite, Table
-from trilane.shapes import MAX_SIDE, Shape
 from trilane.unexpected_value import UnexpectedValue
 
 # The faults of a capture: they are listed together, so that a person fixes all of them before trying again.

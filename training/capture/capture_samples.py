@@ -14,16 +14,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from PIL import Image
 
-from trilane.arrays import F32, F64, U8, Mask
+from trilane.arrays import F32, F64, U8, Mask, Shape, shape_buckets
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINTS
-from trilane.body.kinematics import Posed, Skeleton
+from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINTS, Posed, Skeleton
 from trilane.body.skinning import blend_matrices
 from trilane.errors import BadInputError
 from trilane.scene.lens import Lens
-from trilane.shapes import Shape, shape_buckets
 from trilane.stages.gpu.opengl import open_context
-from trilane.stages.gpu.packed_pass import Placement
+from trilane.stages.gpu.raster import Placement
 from trilane.stages.gpu.skinned_mesh import BodyPose, SkinnedMesh, avatar_mesh
 from trilane.training.capture.capture import Capture, Fit
 from trilane.training.random_views import BANDS, OUTPUT_ROWS, SCREENS, Crop, Cropper, View

@@ -16,13 +16,11 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageFilter
 
-from trilane.arrays import F64, U8, Floats
+from trilane.arrays import F64, U8, Floats, Shape
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINTS, LEFT_HAND, RIGHT_HAND
-from trilane.body.kinematics import rodrigues
+from trilane.body.joints import JOINTS, LEFT_HAND, RIGHT_HAND, rodrigues
 from trilane.scene.lens import Lens, centred
 from trilane.scene.rotations import rotvec_from_matrix
-from trilane.shapes import Shape
 from trilane.training.capture.capture_file import FAR_M, NAME, NEAR_M, OPENGL_FROM_OPENCV
 from trilane.training.clothing import DEFAULT_NAME, look_named
 from trilane.training.random_views import look_at, random_pose

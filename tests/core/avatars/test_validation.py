@@ -23,9 +23,9 @@ from trilane.avatars.bundle import load_bundle, write_bundle, write_manifest
 from trilane.avatars.manifest import digests_of, sha256_of, with_figures_digest
 from trilane.avatars.validation import DrawnAs, accuracy_of, validation_facts
 from trilane.errors import BadInputError
-from trilane.figure_sources import NO_FIGURES
 from trilane.stages.configure import configure
 from trilane.stages.run_options import RunOptions
+from trilane.units import NO_FIGURES
 
 
 def _shuffle_texture(folder: Path) -> None:

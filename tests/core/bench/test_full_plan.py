@@ -18,7 +18,7 @@ from trilane.avatars.network_file import check_network, reshaped
 from trilane.bench.lib import full_picture
 from trilane.bench.lib.full_picture import SAMPLES, FullBody, supersampled
 from trilane.body.body import load_body
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.body.skinning import CpuSkinner
 from trilane.stages.gpu.skinned_mesh import MeshArrays, avatar_mesh
 

@@ -25,8 +25,8 @@ from trilane.body.joints import (
     POSE_FEATURES,
     POSE_SIZE,
     RIGHT_HAND,
+    Skeleton,
 )
-from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import (
     CpuSkinner,
     FrameSkinner,

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody, load_body
-from trilane.body.joints import JOINT_INDEX, JOINTS
-from trilane.body.kinematics import Skeleton, rodrigues
+from trilane.body.joints import JOINT_INDEX, JOINTS, Skeleton, rodrigues
 from trilane.body.skinning import (
     CARRIED_BY,
     DETAILS,

@@ -28,7 +28,7 @@ from trilane.pipeline.rehearsal import Rehearsed
 from trilane.pipeline.stage import UnitContext
 from trilane.scheduler.places import UnitWork
 from trilane.stages import machine_facts
-from trilane.stages.dsp import any_network, bare_calls
+from trilane.stages.dsp import bare_calls, ort
 from trilane.units import BURST
 
 ANY: Any = None
@@ -161,7 +161,7 @@ def test_frames_are_calls_with_distinct_inputs_in_turn(
     """Four, then the first again; a network of integers is bound to them."""
     seen: list[bytes] = []
 
-    def bound(engine: any_network.OrtEngine, inputs: dict[str, Any], outputs: dict[str, Any]) -> Callable[[], None]:
+    def bound(engine: ort.OrtSession, inputs: dict[str, Any], outputs: dict[str, Any]) -> Callable[[], None]:
         (given,) = inputs.values()
         found = np.empty_like(given)
         call = real(engine, inputs, {**outputs, "y": found})
@@ -178,8 +178,8 @@ def test_frames_are_calls_with_distinct_inputs_in_turn(
             assert inputs[0].shape == (1, 64, 64, 5) and outputs[0].shape == (1, 64, 64, 4)
             return SimpleNamespace(run=lambda: seen.append(inputs[0].tobytes()))
 
-    real = any_network.OrtEngine.bound
-    monkeypatch.setattr(any_network.OrtEngine, "bound", bound)
+    real = ort.OrtSession.bound
+    monkeypatch.setattr(ort.OrtSession, "bound", bound)
     is_ours = kind == TensorProto.UINT8
     if is_ours:
         monkeypatch.setattr(bare_calls, "load_runtime", lambda _: SimpleNamespace(load=lambda *_: Session()))

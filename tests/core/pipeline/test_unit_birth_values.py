@@ -19,8 +19,7 @@ from support.small_pipeline import spec_of
 from trilane import machine
 from trilane.pipeline import unit_loop
 from trilane.pipeline.description import UnitSettings
-from trilane.transport.link import HeartbeatSocket
-from trilane.transport.messages import Close, Closed, JobPipe, Ready, job_pipe_pair
+from trilane.transport.messages import Close, Closed, HeartbeatSocket, JobPipe, Ready, job_pipe_pair
 
 UNIT_LIFE = """
 import ctypes, fcntl, json, os, signal, sys
@@ -144,7 +143,7 @@ def test_a_whole_unit_connects_is_ready_and_ends_when_it_is_told(
     threading.Timer(0.05, pipe.send, [Close()]).start()
     raw = json.loads(spec.model_dump_json())
     assert unit_loop.serve(raw, {fd: fd for fd in spec.fds}) == 0
-    assert beats.socket.poll(2000) and beats.receive() == [Ready(os.getpid())]
+    assert beats.socket.poll(2000) and beats.heartbeats() == [Ready(os.getpid())]
     assert pipe.receive() == Closed()
     assert pipe.receive() is None and pipe.ended
     assert slices == [(1, 0), 1_000_000]

@@ -25,8 +25,7 @@ from trilane.pipeline.memory import EdgeRegion
 from trilane.pipeline.unit_loop import UnitSpec
 from trilane.pipeline.unit_processes import UnitMessage, UnitProcesses
 from trilane.pipeline.unit_starter import StartedUnit, UnitStarter
-from trilane.transport.link import HeartbeatSocket
-from trilane.transport.messages import Done, JobPipe, JobPipeEnd, Ping, PongMessage, Ready
+from trilane.transport.messages import Done, HeartbeatSocket, JobPipe, JobPipeEnd, Ping, PongMessage, Ready
 from trilane.transport.packets import header_dtype
 
 PIPELINE = Pipeline(
@@ -125,7 +124,7 @@ def test_heartbeats_come_in_and_the_name_of_their_socket_goes(started: Started) 
     beats = HeartbeatSocket(context)
     endpoint = starter.specs["left"].endpoint
     beats.socket.connect(endpoint)
-    beats.send(Ready(5))
+    beats.send_heartbeat(Ready(5))
     assert heard(processes, 1) == [UnitMessage("left", Ready(5))]
     folder = Path(endpoint.removeprefix("ipc://")).parent
     assert folder.is_dir()
@@ -133,7 +132,7 @@ def test_heartbeats_come_in_and_the_name_of_their_socket_goes(started: Started) 
     processes.connected("left")
     processes.connected("nobody")
     assert not folder.exists()
-    beats.send(PongMessage())
+    beats.send_heartbeat(PongMessage())
     assert heard(processes, 1) == [UnitMessage("left", PongMessage())]
     beats.socket.send(b"\xffno")
     with pytest.raises(TrilaneError, match=r"^unit left sent bytes that are not a message: unknown message"):

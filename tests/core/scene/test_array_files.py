@@ -14,11 +14,9 @@ from hypothesis import strategies as st
 from support.joint_chain import chained_places, degrees_between, limb_directions
 from trilane.body.joints import JOINT_NAMES
 from trilane.errors import BadInputError
-from trilane.scene.motion.array_files import load_npy, load_npz, load_pickle, places_in
 from trilane.scene.motion.builtin import walk_wave_turn
-from trilane.scene.motion.files import load_motion
-from trilane.scene.motion.motion import SMPL_REST_PELVIS, T_POSE, Motion
-from trilane.scene.motion.recorded import RawMotion
+from trilane.scene.motion.files import load_motion, load_npy, load_npz, load_pickle, places_in
+from trilane.scene.motion.motion import SMPL_REST_PELVIS, T_POSE, Motion, RawMotion
 from trilane.scene.rotations import matrix_from_rotvec
 from trilane.scene.schema import AvatarSpec
 

@@ -12,11 +12,19 @@ import pytest
 
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import ShapedBody, load_body
-from trilane.body.joints import JOINT_INDEX
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import JOINT_INDEX, Skeleton
 from trilane.scene.motion import builtin
-from trilane.scene.motion.builtin import BUILD, BUILTIN, SWINGS
-from trilane.scene.motion.footsteps import FootTrack, Swing, Walker, blurred, smooth_step, solve_leg
+from trilane.scene.motion.builtin import (
+    BUILD,
+    BUILTIN,
+    SWINGS,
+    FootTrack,
+    Swing,
+    Walker,
+    blurred,
+    smooth_step,
+    solve_leg,
+)
 from trilane.scene.motion.motion import Wrap
 from trilane.scene.mover import Mover, make_mover
 from trilane.scene.rotations import about, matrix_from_rotvec, rotvec_from_matrix

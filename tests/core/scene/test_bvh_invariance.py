@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS, Skeleton
 from trilane.body.skinning import CpuSkinner
 from trilane.scene.motion.builtin import BUILTIN
 from trilane.scene.motion.files import load_motion

@@ -12,13 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from trilane.arrays import F64
+from trilane.arrays import F64, shape_buckets
 from trilane.body.body import ShapedBody, load_body
-from trilane.body.kinematics import Skeleton, rodrigues
+from trilane.body.joints import Skeleton, rodrigues
 from trilane.body.skinning import CpuSkinner
 from trilane.errors import BadInputError
 from trilane.scene.crop import SCREEN, Rect, choose_bucket, crop_projection
-from trilane.shapes import shape_buckets
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 
 DEFAULT = Path(__file__).resolve().parents[3] / "avatars" / "default" / "body.npz"

@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS, Skeleton
 from trilane.body.skinning import CpuSkinner
-from trilane.scene.motion.bvh_retarget import feet_of
-from trilane.scene.motion.motion import rest_leg_m
-from trilane.scene.motion.recorded import RawMotion, motion_from_recording
+from trilane.scene.motion.bvh import feet_of
+from trilane.scene.motion.motion import RawMotion, motion_from_recording, rest_leg_m
 from trilane.scene.motion.retarget import HEEL_BEHIND, retarget
 from trilane.scene.motion.tracks import Tracks
 from trilane.scene.mover import DEEPEST_M, make_mover

@@ -8,7 +8,7 @@ import pytest
 
 from trilane.body.joints import JOINT_NAMES
 from trilane.errors import BadInputError
-from trilane.scene.motion.bvh_retarget import unit_of
+from trilane.scene.motion.bvh import unit_of
 from trilane.scene.motion.joint_names import DIALECTS, REQUIRED, match_names, plain
 
 HERE = Path("a.bvh")

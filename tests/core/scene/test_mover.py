@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINT_INDEX
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import JOINT_INDEX, Skeleton
 from trilane.body.skinning import CpuSkinner
-from trilane.scene.motion.motion import Motion, Wrap, rest_leg_m
-from trilane.scene.motion.recorded import stance
+from trilane.scene.motion.motion import Motion, Wrap, rest_leg_m, stance
 from trilane.scene.mover import DIRECTIONS, feet, floor_lift, ground_rule, make_mover, outline
 from trilane.scene.schema import AvatarSpec
 

@@ -24,12 +24,11 @@ from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import ShapedBody, load_body
 from trilane.errors import BadInputError
 from trilane.scene.camera.path import axes_towards
-from trilane.scene.missing_person import require_person
 from trilane.scene.motion.files import load_motion
 from trilane.scene.mover import make_mover
 from trilane.scene.rotations import about
 from trilane.scene.schema import AvatarSpec, CameraSpec, Scene, axes_of
-from trilane.scene.staging import stage_scene
+from trilane.scene.staging import require_person, stage_scene
 
 COUNT, MORE = 40, 20
 POSES = 90

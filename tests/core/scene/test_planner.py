@@ -9,8 +9,20 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from trilane.arrays import shapes_within
 from trilane.errors import BadInputError
-from trilane.scene.crop import ROUNDING_PX, SCREEN, Rect, grow_on_grid, on_grid
+from trilane.scene.crop import (
+    MARGIN_PX,
+    ROUNDING_PX,
+    SCREEN,
+    Rect,
+    grow_on_grid,
+    lay_out,
+    lay_out_apart,
+    lay_out_at,
+    on_grid,
+    tight_shape,
+)
 from trilane.scene.planner import (
     AS_GOOD,
     MOST_DENSITY,
@@ -31,8 +43,6 @@ from trilane.scene.planner import (
     plan_tensor,
     serves,
 )
-from trilane.scene.tensor_layout import MARGIN_PX, lay_out, lay_out_apart, lay_out_at, tight_shape
-from trilane.shapes import shapes_within
 
 OUTPUT = (480, 640)
 SIDES = st.integers(1, 40).map(lambda steps: 32 * steps)

@@ -11,12 +11,21 @@ import pytest
 
 from trilane.body.joints import JOINT_INDEX
 from trilane.errors import BadInputError
-from trilane.scene.motion import recorded as recorded_module
-from trilane.scene.motion.array_files import load_npy, load_npz
-from trilane.scene.motion.bvh_retarget import UPS
-from trilane.scene.motion.files import load_motion
-from trilane.scene.motion.motion import REST_PELVIS, Motion, Wrap, bracket, wrapped_time
-from trilane.scene.motion.recorded import ANY, WORLD, RawMotion, lowest, motion_from_recording
+from trilane.scene.motion import motion as recorded_module
+from trilane.scene.motion.bvh import UPS
+from trilane.scene.motion.files import load_motion, load_npy, load_npz
+from trilane.scene.motion.motion import (
+    ANY,
+    REST_PELVIS,
+    WORLD,
+    Motion,
+    RawMotion,
+    Wrap,
+    bracket,
+    lowest,
+    motion_from_recording,
+    wrapped_time,
+)
 from trilane.scene.motion.smpl_files import median_step_rad
 from trilane.scene.recordings import usable_samples
 from trilane.scene.rotations import matrix_from_rotvec

@@ -10,12 +10,20 @@ import pytest
 
 from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
 from trilane.errors import BadInputError
-from trilane.scene.motion.bvh_retarget import load_retargeted
-from trilane.scene.motion.motion import T_POSE
-from trilane.scene.motion.recorded import RawMotion
+from trilane.scene.motion.bvh import load_retargeted
+from trilane.scene.motion.motion import T_POSE, RawMotion
 from trilane.scene.motion.retarget import retarget
-from trilane.scene.motion.tracks import Tracks, angle_between, unit
-from trilane.scene.motion.turns import frames_along, hinge, least_turns, level_with, limb_turns, mean_turn
+from trilane.scene.motion.tracks import (
+    Tracks,
+    angle_between,
+    frames_along,
+    hinge,
+    least_turns,
+    level_with,
+    limb_turns,
+    mean_turn,
+    unit,
+)
 from trilane.scene.rotations import about, matrix_from_rotvec
 
 REST = {name: T_POSE[index] for name, index in JOINT_INDEX.items()}

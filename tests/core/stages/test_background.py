@@ -13,8 +13,7 @@ import pytest
 from PIL import Image
 
 from trilane.errors import BadInputError
-from trilane.stages.gpu.background import open_background
-from trilane.stages.gpu.survey import survey
+from trilane.stages.gpu.background import open_background, survey
 from trilane.stages.gpu.video_reader import HLG, PQ, Pixels, fitted, pq_code, pq_light, roll_off, to_srgb
 
 

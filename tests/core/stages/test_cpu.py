@@ -11,16 +11,15 @@ import numpy as np
 import pytest
 
 from support.small_pipeline import assets_of, without_bytes
+from trilane.arrays import shape_buckets
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.body.skinning import FrameSkinner
 from trilane.errors import TrilaneError
 from trilane.pipeline.description import UnitSettings
-from trilane.scene.crop import Rect, choose_bucket, grow
+from trilane.scene.crop import Rect, choose_bucket, grow, lay_out
 from trilane.scene.planner import TensorBudget, plan_tensor
 from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, Scene
-from trilane.scene.tensor_layout import lay_out
-from trilane.shapes import shape_buckets
 from trilane.stages.avatar_assets import shaped_body, staged_of
 from trilane.stages.config import RunConfig, pose_dtype, posed_vertices, posed_vertices_bytes
 from trilane.stages.cpu import pose

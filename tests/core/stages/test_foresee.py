@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from trilane.arrays import shape_buckets
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import reshaped
 from trilane.pipeline.description import UnitSettings
@@ -23,7 +24,6 @@ from trilane.scene.planner import (
 )
 from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, Scene
 from trilane.scene.staging import Staged, stage_scene
-from trilane.shapes import shape_buckets
 from trilane.stages.avatar_assets import AvatarData, load_avatar
 from trilane.stages.config import RunConfig
 from trilane.stages.configure import configure

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody, load_body
-from trilane.body.kinematics import Posed, Skeleton
+from trilane.body.joints import Posed, Skeleton
 from trilane.body.skinning import CpuSkinner
 from trilane.scene.crop import Rect
 from trilane.stages.cpu import mesh_bounds

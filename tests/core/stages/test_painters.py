@@ -12,8 +12,15 @@ from trilane.body.joints import JOINT_INDEX, JOINTS
 from trilane.errors import MissingPartError, TrilaneError, UnitLostError
 from trilane.scene.schema import PlaneSpec
 from trilane.stages.gpu import opengl
-from trilane.stages.gpu.builtin_room import Extent, floor_texture, paint_texture, room_mesh, wall_texture
-from trilane.stages.gpu.composite_painters import floor_discs, half_sides
+from trilane.stages.gpu.composite_painters import (
+    Extent,
+    floor_discs,
+    floor_texture,
+    half_sides,
+    paint_texture,
+    room_mesh,
+    wall_texture,
+)
 from trilane.stages.gpu.opengl import target_clip
 
 

@@ -12,18 +12,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from support.small_pipeline import assets_of, without_bytes
+from trilane.arrays import shape_buckets
 from trilane.avatars.bundle import add_mesh_levels, load_bundle
-from trilane.body.kinematics import Skeleton
-from trilane.body.mesh_levels import MeshLevel
+from trilane.avatars.mesh_levels import MeshLevel
+from trilane.body.joints import Skeleton
 from trilane.body.skinning import DETAILS, FrameSkinner
 from trilane.errors import BadInputError
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.stage import Skip, UnitContext
-from trilane.scene.crop import Rect
+from trilane.scene.crop import MARGIN_PX, Rect, lay_out
 from trilane.scene.planner import FrameWork, shown_by, work_of
 from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, Scene
-from trilane.scene.tensor_layout import MARGIN_PX, lay_out
-from trilane.shapes import shape_buckets
 from trilane.stages.avatar_assets import staged_of
 from trilane.stages.config import RunConfig, pose_dtype, posed_vertices, posed_vertices_bytes
 from trilane.stages.cpu.pose import PoseStage, build

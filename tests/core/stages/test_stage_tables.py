@@ -15,7 +15,6 @@ from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_split import cuts
 from trilane.body.body import Body
 from trilane.errors import BadInputError, MissingPartError
-from trilane.figure_sources import NO_FIGURES
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.memory import BYTES
 from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, Scene
@@ -28,6 +27,7 @@ from trilane.stages.gpu.composite import CompositeStage
 from trilane.stages.gpu.raster import RasterStage
 from trilane.stages.run_options import RunOptions
 from trilane.transport.packets import Packet
+from trilane.units import NO_FIGURES
 
 
 def configured(folder: Path, **values: Any) -> RunConfig:

@@ -17,8 +17,7 @@ from PIL import Image, ImageOps
 from trilane.errors import BadInputError
 from trilane.scene.camera.path import CameraPath, one_lens
 from trilane.scene.footage import Stored, filmed
-from trilane.stages.gpu.background import open_background
-from trilane.stages.gpu.survey import check_pictures, survey
+from trilane.stages.gpu.background import check_pictures, open_background, survey
 from trilane.stages.gpu.video_reader import Pixels, fitted, pq_code
 
 WIDTH, HEIGHT, WHITE_PX = 64, 48, 16

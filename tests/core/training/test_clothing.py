@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from trilane.arrays import shape_buckets
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import ShapedBody, load_body
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.errors import BadInputError
-from trilane.shapes import shape_buckets
 from trilane.training import subject
 from trilane.training.clothing import (
     ANKLES,

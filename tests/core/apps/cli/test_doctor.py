@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
+from trilane import machine
 from trilane.apps.cli import doctor
 from trilane.apps.cli.doctor import PartCheck
 from trilane.pipeline import hardware_counters
 from trilane.stages import machine_facts
-from trilane.transport import wakeup
 
 Command = Callable[..., tuple[str, str]]
 GL = {"renderer": "a [driver]", "version": "4.5", "hardware": True}
@@ -61,7 +61,7 @@ def test_a_machine_that_has_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: P
         (machine_facts, "package_version", lambda _: None),
         (machine_facts, "cpu_facts", lambda: CPU),
         (machine_facts, "runtime_facts", broken),
-        (wakeup, "awake", asleep),
+        (machine, "awake", asleep),
         (hardware_counters, "absence", lambda: "kernel.perf_event_paranoid is 3"),
         (doctor, "SHM", tmp_path / "none"),
         (os, "memfd_create", refused),
@@ -70,7 +70,7 @@ def test_a_machine_that_has_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     ):
         monkeypatch.setattr(place, name, value)
     found = [(row.name, row.found, row.works, row.needed, row.install) for row in doctor.checks(None)]
-    acl = f'apt-get install acl; setfacl -m "u:$USER:w" {wakeup.LATENCY_FILE}'
+    acl = f'apt-get install acl; setfacl -m "u:$USER:w" {machine.LATENCY_FILE}'
     no_int8, memfd = (
         "no; INT8 networks run on AVX2 or NEON alone",
         "needs Linux 3.17 or newer with memfd_create allowed",

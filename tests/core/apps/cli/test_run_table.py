@@ -11,7 +11,7 @@ import pytest
 from support.run_report import SHARE, SHOWN, TIMES, make_report
 from trilane.apps.cli.run_table import run_table
 from trilane.apps.run.report import Report
-from trilane.figure_sources import NO_FIGURES
+from trilane.units import NO_FIGURES
 
 
 def table_text(report: dict[str, Any]) -> str:

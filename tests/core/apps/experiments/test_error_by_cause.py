@@ -31,7 +31,7 @@ from trilane.avatars.network_file import check_network, reshaped
 from trilane.bench.lib.cast import Box, RasterLayer
 from trilane.bench.lib.full_picture import as_written
 from trilane.body.body import load_body
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.body.skinning import DETAILS
 from trilane.errors import BadInputError
 from trilane.stages.avatar_assets import AvatarData

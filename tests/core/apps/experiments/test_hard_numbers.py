@@ -15,9 +15,9 @@ from trilane.apps.experiments import hard_numbers, hard_rotations
 from trilane.apps.experiments.hard_numbers import time_cases
 from trilane.apps.experiments.hard_rotations import PI, HardNumber, U, exact_turn, turn_error, worst
 from trilane.avatars.bundle import bundle_folder
-from trilane.body import kinematics, skinning
+from trilane.body import joints, skinning
 from trilane.body.body import ShapedBody, load_body, weights_of_one
-from trilane.body.kinematics import Posed, Skeleton
+from trilane.body.joints import Posed, Skeleton
 from trilane.body.skinning import TopWeights
 from trilane.errors import BadInputError
 
@@ -182,7 +182,7 @@ def test_a_kind_of_case_that_an_error_ends_is_a_row_that_fails() -> None:
 
 def test_a_fault_that_gives_no_number_is_told_row_by_row(monkeypatch: pytest.MonkeyPatch) -> None:
     """As JSON has it, which knows no NaN."""
-    monkeypatch.setattr(kinematics, "_TINY", 0.0)
+    monkeypatch.setattr(joints, "_TINY", 0.0)
     monkeypatch.setattr(hard_rotations, "ANGLES", {"0": 0.0, "1e-3": 1e-3})
     monkeypatch.setattr(
         hard_numbers, "_cases", lambda: hard_numbers.kept_going("rotations", hard_rotations.rotation_cases())

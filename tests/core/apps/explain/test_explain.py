@@ -26,7 +26,7 @@ from trilane.apps.explain.scene_plan import (
 )
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import reshaped
-from trilane.body.kinematics import Skeleton
+from trilane.body.joints import Skeleton
 from trilane.body.skinning import DETAILS, CpuSkinner
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import Plan, stage_times_ms, steady

@@ -21,7 +21,7 @@ from trilane.apps.run.report import Report, read_report, write_report
 from trilane.apps.run.report_facts import NO_FIGURES_UNDER, sources_of
 from trilane.apps.run.run_folder import RunFolder, default_place
 from trilane.errors import BadInputError, TrilaneError, UnwrittenError
-from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
+from trilane.units import COMPARED, COMPUTED, MEASURED
 from trilane.writing import WRITABLE, write_atomically
 
 

@@ -16,7 +16,6 @@ from trilane.apps.run.pace import Pace
 from trilane.apps.run.report import read_report
 from trilane.apps.run.run_job import Hooks, Prepared, RunOutcome, asked_frames, run_to_folder
 from trilane.errors import BadInputError, TrilaneError
-from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
 from trilane.hw_profiles.application import application_graph
 from trilane.hw_profiles.governor import Governor
 from trilane.pipeline.description import UnitSettings
@@ -33,7 +32,7 @@ from trilane.stages.configure import Checked
 from trilane.stages.cpu.present import KEPT_FOLDER, SEGMENTS, PresentStage
 from trilane.stages.run_options import RunOptions
 from trilane.transport.packets import SlotLayout, view_packet
-from trilane.units import PerformanceProfile
+from trilane.units import COMPARED, COMPUTED, MEASURED, PerformanceProfile
 
 MS = 1_000_000
 FRAMES, WIDTH, HEIGHT = 6, 96, 64

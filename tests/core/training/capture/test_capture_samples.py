@@ -16,8 +16,7 @@ from PIL import Image
 from support.small_inputs import write_capture_folder
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody
-from trilane.body.joints import JOINT_INDEX
-from trilane.body.kinematics import Posed, Skeleton
+from trilane.body.joints import JOINT_INDEX, Posed, Skeleton
 from trilane.scene.lens import Lens
 from trilane.training import subject
 from trilane.training.capture.capture import Capture, Fit, open_capture

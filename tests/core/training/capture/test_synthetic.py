@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from trilane.body.body import ShapedBody
-from trilane.body.kinematics import Skeleton, rodrigues
+from trilane.body.joints import Skeleton, rodrigues
 from trilane.errors import BadInputError
 from trilane.training.capture import synthetic
 from trilane.training.capture.capture import camera_direction, frames_by_side, open_capture

@@ -11,14 +11,13 @@ import psutil
 import pytest
 
 from trilane import machine
-from trilane.transport import wakeup
-from trilane.transport.wakeup import AWAKE, DEFAULT, SHORTEST_NS, UNIT_NS, awake, use_slice
+from trilane.machine import AWAKE, SHORTEST_SLICE_NS, UNIT_SLICE_NS, USUAL_SLICE, awake, use_slice
 
 
 def test_a_slice_is_asked_for_and_given_back() -> None:
     """Whether the kernel takes the wish or not, what this thread may do and its niceness stay as they were."""
     before = os.sched_getscheduler(0), os.getpriority(os.PRIO_PROCESS, 0)
-    assert use_slice(SHORTEST_NS) == use_slice(DEFAULT)
+    assert use_slice(SHORTEST_SLICE_NS) == use_slice(USUAL_SLICE)
     assert (os.sched_getscheduler(0), os.getpriority(os.PRIO_PROCESS, 0)) == before
 
 
@@ -40,8 +39,8 @@ def test_a_slice_is_asked_for_by_sched_setattr(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setattr("ctypes.CDLL", lambda _: libc)
     monkeypatch.setattr("os.getpriority", lambda which, who: {(os.PRIO_PROCESS, 0): 3}[which, who])
     monkeypatch.setattr(machine.here, "architecture", lambda: "aarch64")
-    assert use_slice(UNIT_NS) is accepted
-    assert libc.calls == [(274, 0, struct.pack("=IIQiIQQQ", 48, 0, 0, 3, 0, UNIT_NS, 0, 0), 0)]
+    assert use_slice(UNIT_SLICE_NS) is accepted
+    assert libc.calls == [(274, 0, struct.pack("=IIQiIQQQ", 48, 0, 0, 3, 0, UNIT_SLICE_NS, 0, 0), 0)]
 
 
 def test_where_slices_are_unknown_or_not_ours_nothing_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -59,7 +58,7 @@ def test_the_file_that_keeps_cores_awake_is_held_open_inside_the_block(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = tmp_path / "latency"
-    monkeypatch.setattr(wakeup, "LATENCY_FILE", file)
+    monkeypatch.setattr(machine, "LATENCY_FILE", file)
     with awake() as idle_cores:
         assert idle_cores == f"sleep: {file}: no such file or directory"
     file.touch()

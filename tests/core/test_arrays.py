@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from trilane.shapes import checked_size, parse_shape, shape_buckets
+from trilane.arrays import checked_size, parse_shape, shape_buckets
 from trilane.unexpected_value import UnexpectedValue
 
 

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from trilane import machine, memory
+from trilane import machine
 from trilane.apps.cli.main import describe
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
 from trilane.machine import Machine
@@ -32,27 +32,27 @@ def plenty(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     """No limit, and no process ended for lack of memory."""
     monkeypatch.setattr(resource, "getrlimit", lambda _kind: (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     monkeypatch.setattr(machine.here, "memory_limit_bytes", lambda: None)
-    monkeypatch.setattr(machine.here, "oom_kills", lambda: memory._KILLS)
+    monkeypatch.setattr(machine.here, "oom_kills", lambda: machine._KILLS)
     monkeypatch.setattr(machine.here, "free_bytes", lambda: 77 * MB)
     return monkeypatch
 
 
 def test_plenty_of_memory_is_never_short(plenty: pytest.MonkeyPatch) -> None:
-    memory.require_memory()
-    assert memory.shortage() == ""
-    plenty.setattr(machine.here, "memory_limit_bytes", lambda: memory.RUN_BYTES)
-    assert memory.shortage() == ""
+    machine.require_memory()
+    assert machine.shortage() == ""
+    plenty.setattr(machine.here, "memory_limit_bytes", lambda: machine.RUN_BYTES)
+    assert machine.shortage() == ""
 
 
 def test_each_shortage_says_what_is_there_and_what_is_needed(plenty: pytest.MonkeyPatch) -> None:
-    plenty.setattr(machine.here, "oom_kills", lambda: memory._KILLS + 1)
+    plenty.setattr(machine.here, "oom_kills", lambda: machine._KILLS + 1)
     ended = "the system has meanwhile ended a process because memory ran out, and a run takes 600 MB"
-    assert memory.shortage() == memory.ended_by_system() == f"{ended}; 77 MB are free now"
+    assert machine.shortage() == machine.ended_by_system() == f"{ended}; 77 MB are free now"
     plenty.setattr(machine.here, "memory_limit_bytes", lambda: 200 * MB)
-    assert memory.shortage() == "the control group may have 200 MB of memory, and a run takes 600 MB"
+    assert machine.shortage() == "the control group may have 200 MB of memory, and a run takes 600 MB"
     plenty.setattr(resource, "getrlimit", lambda _kind: (900 * MB, 900 * MB))
     said = "each process may have 900 MB of addresses (ulimit -v), and a run's largest process takes 1700 MB"
-    assert memory.shortage() == f"{said}: ulimit -v unlimited"
+    assert machine.shortage() == f"{said}: ulimit -v unlimited"
 
 
 def limit_addresses(plenty: pytest.MonkeyPatch, bytes_: int) -> None:
@@ -63,24 +63,24 @@ def limit_addresses(plenty: pytest.MonkeyPatch, bytes_: int) -> None:
 
 def test_addresses_are_short_below_what_the_largest_process_takes(plenty: pytest.MonkeyPatch) -> None:
     """docs/limits.md has the figure, and the measured one that it is rounded up from, by less than a twentieth."""
-    row = next(line for line in LIMITS.read_text().splitlines() if line.startswith("| `memory.ADDRESS_BYTES`"))
+    row = next(line for line in LIMITS.read_text().splitlines() if line.startswith("| `machine.ADDRESS_BYTES`"))
     needed, measured_mb = int(row.split("|")[2]), int(re.findall(r"measured, .*?: (\d+) MB", row)[0])
     assert measured_mb * MB <= needed < 1.05 * measured_mb * MB
     limit_addresses(plenty, needed)
-    assert memory.shortage() == ""
+    assert machine.shortage() == ""
     limit_addresses(plenty, needed - 1)
     said = f"(ulimit -v), and a run's largest process takes {needed // MB} MB: ulimit -v unlimited"
-    assert memory.shortage() == f"each process may have {(needed - 1) // MB} MB of addresses {said}"
+    assert machine.shortage() == f"each process may have {(needed - 1) // MB} MB of addresses {said}"
 
 
 @pytest.mark.parametrize("part", [1, 2])
 def test_a_limit_of_addresses_that_no_run_fits_in_is_refused(plenty: pytest.MonkeyPatch, part: int) -> None:
-    least = memory.LEAST_ADDRESS_BYTES // part
+    least = machine.LEAST_ADDRESS_BYTES // part
     limit_addresses(plenty, least)
-    memory.require_memory(part)
+    machine.require_memory(part)
     limit_addresses(plenty, least - 1)
     with pytest.raises(TrilaneError) as raised:
-        memory.require_memory(part)
+        machine.require_memory(part)
     found = f"memory: found a limit of {(least - 1) // MB} MB of addresses (ulimit -v)"
     assert str(raised.value) == f"{found}, expected at least 1700 MB for a run: ulimit -v unlimited"
 
@@ -88,12 +88,12 @@ def test_a_limit_of_addresses_that_no_run_fits_in_is_refused(plenty: pytest.Monk
 @pytest.mark.parametrize("part", [1, 2])
 def test_a_control_group_that_no_run_fits_in_is_refused(plenty: pytest.MonkeyPatch, part: int) -> None:
     """The kernel would end a process of it, which says nothing."""
-    least = memory.LEAST_RUN_BYTES // part
+    least = machine.LEAST_RUN_BYTES // part
     plenty.setattr(machine.here, "memory_limit_bytes", lambda: least)
-    memory.require_memory(part)
+    machine.require_memory(part)
     plenty.setattr(machine.here, "memory_limit_bytes", lambda: least - 1)
     with pytest.raises(TrilaneError) as raised:
-        memory.require_memory(part)
+        machine.require_memory(part)
     found = f"memory: found a limit of {(least - 1) // MB} MB for the control group"
     assert str(raised.value) == f"{found}, expected at least 600 MB for a run"
 
@@ -150,7 +150,7 @@ def test_a_unit_that_ends_before_the_run_where_memory_is_short_says_so(plenty: p
     processes = SimpleNamespace(listen=lambda _ms: [("gpu", None)], why_ended=lambda _unit: "; it wrote last: x")
     with pytest.raises(TrilaneError, match=r"^unit gpu ended before the run began; it wrote last: x$"):
         listen_before_run(processes, SimpleNamespace(count=0))  # type: ignore[arg-type]
-    plenty.setattr(machine.here, "oom_kills", lambda: memory._KILLS + 1)
+    plenty.setattr(machine.here, "oom_kills", lambda: machine._KILLS + 1)
     with pytest.raises(TrilaneError, match=r"^unit gpu ended before the run began; memory is short: the system has"):
         listen_before_run(processes, SimpleNamespace(count=0))  # type: ignore[arg-type]
 

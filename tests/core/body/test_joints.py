@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trilane.arrays import F64
-from trilane.body.joints import JOINT_PARENTS
-from trilane.body.kinematics import Skeleton, rodrigues, turn
+from trilane.body.joints import JOINT_PARENTS, Skeleton, rodrigues, turn
 from trilane.errors import BadInputError
 
 PARENTS = np.array(JOINT_PARENTS, np.int32)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from trilane.errors import BadInputError, MissingPartError, TrilaneError, UnitLostError
+from trilane.stages.config import Quantisation
 from trilane.stages.gpu import opengl
 from trilane.stages.gpu.opengl import shader_source
-from trilane.stages.gpu.packed_pass import PackedPass, Quantisation, check_texture
+from trilane.stages.gpu.raster import PackedPass, check_texture
 
 
 @pytest.mark.parametrize(("scale", "zero_point"), [(0.0, 0), (-1.0, 0), (np.nan, 0), (np.inf, 0), (1, -1), (1, 256)])

@@ -1,1 +1,0 @@
-"""The scenes that come with Trilane, as TOML files (data)."""
