@@ -1,7 +1,8 @@
 """Entry point of the `trilane` command: the table of commands, the global options and the exit codes.
 
-Rule: each line of `COMMANDS` names a module with a Typer `app`, which is imported when its command is called. An error
-that a person can cause becomes one sentence on stderr and an exit code, never a traceback.
+Rule: each line of `COMMANDS` names a module with a Typer `app`, which is imported when its command is called. Nothing
+slow is imported before. An error that a person can cause becomes one sentence on stderr and an exit code, never a
+traceback.
 """
 
 from __future__ import annotations
@@ -12,11 +13,12 @@ import importlib
 import io
 import os
 import sys
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, NoReturn
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
-from trilane.apps.cli.lazy_group import lazy_group
 from trilane.apps.old_names import in_new_names
 from trilane.errors import TrilaneError, install_line, reason
 from trilane.memory import require_memory, shortage
@@ -76,6 +78,25 @@ def command_of(name: str) -> Any:
     command = getattr(command, "commands", {}).get(name, command)  # small commands share a module
     command.name = name
     return command
+
+
+def lazy_group(lines: Mapping[str, str], command_of: Callable[[str], Any]) -> type[TyperGroup]:
+    """Return the class of a group of commands. A mistyped name is answered with the most similar ones.
+
+    `lines`: the line of each command for `--help`, by name. `command_of`: function that imports a command by its name.
+    """
+
+    class LazyGroup(TyperGroup):
+        def __init__(self, **settings: Any) -> None:
+            super().__init__(**settings)
+            # Stand-ins are enough for `--help`, completion and suggestions.
+            self.commands = {name: TyperCommand(name, help=line) for name, line in lines.items()}
+
+        def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+            name, stand_in, rest = super().resolve_command(ctx, args)
+            return name, None if name is None or stand_in is None else command_of(name), rest
+
+    return LazyGroup
 
 
 app = typer.Typer(
