@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from support.compared_runs import simulated, write_run
-from trilane.apps.cli.compare_table import sweep_lines
+from trilane.apps.cli.compare import sweep_lines
 from trilane.apps.compare.compared_sweeps import SweepComparison, compare_sweeps
 from trilane.apps.compare.difference import Finding
 from trilane.apps.compare.gate import Outcome, judge, read_gate

@@ -23,7 +23,7 @@ import pytest
 
 from support.compared_runs import STAGES, on_a_machine, simulated, write_run
 from support.run_report import make_report
-from trilane.apps.cli.github import annotation, summary
+from trilane.apps.cli.compare import annotation, summary
 from trilane.apps.compare.comparison import compare
 from trilane.apps.compare.difference import Difference
 from trilane.apps.compare.gate import METRICS, Outcome, Pair, Weighed, judge, read_gate, runs_needed, whole

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from trilane.apps.cli.plan import app
+from trilane.apps.cli.explain import app
 from trilane.apps.explain.explanation import ALWAYS, PIPELINED, CostModel, least_frame_ms
 from trilane.apps.explain.scene_plan import (
     BODY,
@@ -71,7 +71,7 @@ def checked(folder: Path) -> Checked:
 
 def explained(folder: Path, *options: str) -> Any:
     chip = [] if "--profile" in options else ["--profile", CHIP]
-    result = CliRunner().invoke(app, [str(folder / "small.toml"), *chip, *options])
+    result = CliRunner().invoke(app, ["plan", str(folder / "small.toml"), *chip, *options])
     assert result.exit_code == 0, result.output
     return result
 
@@ -285,7 +285,7 @@ def test_what_a_run_may_be_asked_can_be_explained(folder: Path, tmp_path: Path) 
     assert [row["tensor"] for row in document["phases"]] == [list(group[0].plan.shape or ()) for group in groups]
     assert document["avatars"][0]["skinned_on"] == "gpu"
     assert "--picture: found '12', expected WIDTHxHEIGHT" in str(
-        CliRunner().invoke(app, [str(folder / "small.toml"), "--picture", "12"]).exception
+        CliRunner().invoke(app, ["plan", str(folder / "small.toml"), "--picture", "12"]).exception
     )
 
 
@@ -374,16 +374,16 @@ def test_the_picture_shows_bodies_and_rectangles(checked: Checked, tmp_path: Pat
     ],
 )
 def test_wrong_options_are_named(folder: Path, options: list[str], words: str) -> None:
-    result = CliRunner().invoke(app, [str(folder / "small.toml"), *options])
+    result = CliRunner().invoke(app, ["plan", str(folder / "small.toml"), *options])
     assert result.exit_code != 0
     assert words in result.output + str(result.exception)
 
 
 def test_the_full_plan_is_not_run(tiny_bundle: Path, tmp_path: Path) -> None:
     (tmp_path / "full.toml").write_text(f'plan = "full"\n[[avatars]]\nbundle = "{tiny_bundle}"\n')
-    result = CliRunner().invoke(app, [str(tmp_path / "full.toml")])
+    result = CliRunner().invoke(app, ["plan", str(tmp_path / "full.toml")])
     said = f"{tmp_path / 'full.toml'}: plan: found full, expected planned or fixed; `trilane bench planner` draws"
     assert said in str(result.exception)
     (tmp_path / "both.toml").write_text('plan = "fixed"\nsize = "auto"\n')
-    result = CliRunner().invoke(app, [str(tmp_path / "both.toml")])
+    result = CliRunner().invoke(app, ["plan", str(tmp_path / "both.toml")])
     assert 'size = "auto" with plan = "fixed"' in str(result.exception)
