@@ -41,7 +41,7 @@ COMMANDS = {
     "inspect": ("trilane.apps.cli.inspect", "Say what a file is, and what to do if it is not usable."),
     "init": ("trilane.apps.cli.init", "Write a first pipeline file that runs networks on a video."),
     "check": ("trilane.apps.cli.check", "Check a pipeline file: its graph, least period and memory."),
-    "times": ("trilane.apps.cli.times", "Read what other tools measured: runs, layers, traces."),
+    "times": ("trilane.apps.cli.inspect", "Read what other tools measured: runs, layers, traces."),
     "avatar": ("trilane.apps.cli.avatar", "Look into avatars, export and quantise their networks."),
     "body": ("trilane.apps.cli.body", "Look into body files, pose them, build one."),
     "profiles": ("trilane.apps.cli.profiles", "List, show, check and fit the hardware profiles."),
