@@ -134,7 +134,7 @@ def _run_live(options: RunOptions, command: tuple[str, ...], port: int | None) -
 
     tell = lambda text: stderr_console().print(text, soft_wrap=True, markup=False)  # noqa: E731
     if is_pipeline_file(Path(options.scene)):
-        from trilane.apps.dashboard.live_file import run_file_live
+        from trilane.apps.dashboard.live_run import run_file_live
 
         return run_file_live(options, _hooks, command, port, tell)
     from trilane.apps.dashboard.live_run import run_live
