@@ -110,6 +110,8 @@ def _causes(causes_ms: Mapping[str, float]) -> str:
 
 
 def _show_run(document: Mapping[str, Any]) -> None:
+    from trilane.apps.explain.explained_run import join_text
+
     console = stdout_console()
     if document["verdict"] and not document["remark"]:
         print_verdict(document["verdict"]["lines"])
@@ -123,9 +125,7 @@ def _show_run(document: Mapping[str, Any]) -> None:
         console.print(line, soft_wrap=True, markup=False)
     console.print(_waits(document["waits"]))
     for row in document.get("joins", ()):
-        from trilane.apps.explain.joins import said
-
-        console.print(said(row), soft_wrap=True, markup=False)
+        console.print(join_text(row), soft_wrap=True, markup=False)
     console.print(_slowest(document))
     for line in document["advice"]:
         console.print(f"try: {line}", soft_wrap=True, markup=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from trilane.apps.explain.joins import Joins, said
+from trilane.apps.explain.explained_run import Joins, join_text
 from trilane.pipeline.critical_path import WORK, Budget, Paths
 from trilane.pipeline.journal import Stepped, Worked, journal_of
 from trilane.pipeline.timeline import ExplainedJob, Timeline
@@ -53,7 +53,7 @@ def test_a_join_waited_for_what_came_last_of_each_frame() -> None:
         "stage": "composite",
         "inputs": {"depth": {"last": 32, "after_ms": 4.0}, "seg": {"last": 8, "after_ms": 6.0}},
     }
-    assert said(row) == (
+    assert join_text(row) == (
         "composite waited for depth in 32 of 40 jobs, 4.00 ms after the others; "
         "for seg in 8 of 40 jobs, 6.00 ms after the others"
     )
