@@ -12,25 +12,27 @@ import hashlib
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import onnx
 from numpy.typing import NDArray
 
 from trilane.arrays import F32
 from trilane.avatars.bundle import MANIFEST, TEXTURE_KEYS, Bundle, load_bundle, write_bundle
 from trilane.avatars.manifest import UNTRAINED, Manifest, digests_of, network_entry, sha256_of
+from trilane.avatars.network_file import NetworkFile, reshaped
 from trilane.bench.lib.full_network import float_weights, weights_name
 from trilane.cache import cache_dir
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
 from trilane.files import read_npz
+from trilane.stages.avatar_assets import distinct, with_network
+from trilane.stages.configure import Checked
 from trilane.stages.run_options import METHOD, VIEWS, RunOptions, calibration_of
 
 if TYPE_CHECKING:
-    import onnx
-
     from trilane.training.quantising.quantise import Quantised
 
 #: Of an untrained network's weights.
@@ -174,8 +176,69 @@ def _float_model(bundle: Bundle, recipe: _Recipe) -> onnx.ModelProto:
         torch.manual_seed(SEED)
         untrained = UNet(own.encoder, own.norm, recipe.width, recipe.channels, input_skip=True)
         return export_onnx(untrained, *CALIBRATION_SHAPE)
+    return float_model(bundle, _named_weights(bundle))
+
+
+def _named_weights(bundle: Bundle) -> Path:
+    """Return the file of the float network of `bundle`. Raises BadInputError without one."""
     weights = float_weights(bundle)
     if weights is None:
         remedy = "`trilane avatar validate --float-network` notes which it is"
         raise BadInputError(bundle.folder, "no float network that its manifest names", "one to quantise", remedy)
-    return float_model(bundle, weights)
+    return weights
+
+
+#: The name for the network of the avatar's own file.
+AS_IT_IS = "as-it-is"
+#: Number of views that networks are calibrated on that are compared with each other.
+COMPARED_VIEWS = 50
+
+
+class Calibrations:
+    """The network of the first avatar of `checked` by several methods of calibration, each made once.
+
+    It is quantised from the avatar's own float network, on views drawn as in the training. Nothing else changes.
+    """
+
+    def __init__(self, checked: Checked) -> None:
+        self._folder = distinct(checked.config)[0]
+        self._material: tuple[onnx.ModelProto, list[F32]] | None = None
+        self._made: dict[str, NetworkFile] = {}
+
+    def changed(self, checked: Checked, method: str) -> Checked:
+        """Return `checked` with the network by `method`, which is `AS_IT_IS` or a name of METHODS.
+
+        Raises BadInputError without the float network, MissingPartError without PyTorch.
+        """
+        if method == AS_IT_IS:
+            return checked
+        return replace(checked, assets=with_network(checked.assets, self._network(method)))
+
+    def _network(self, method: str) -> NetworkFile:
+        from trilane.training.quantising.quantise import quantise
+
+        if method not in self._made:
+            if self._material is None:
+                self._material = drawn_material(str(self._folder), COMPARED_VIEWS, 0)
+            model, frames = self._material
+            shape = load_bundle(str(self._folder)).read_network().shape[1:3]
+            self._made[method] = reshaped(quantise(model, frames, method).network, *shape)
+        return self._made[method]
+
+
+def drawn_material(avatar: str, views: int, held_out: int) -> tuple[onnx.ModelProto, list[F32]]:
+    """Return the float network of `avatar`, and inputs (H,W,C): `views` of the training's kind, then `held_out` others.
+
+    Raises BadInputError for an avatar without a float network here, MissingPartError without PyTorch or OpenGL.
+    """
+    bundle = load_bundle(avatar)
+    weights = _named_weights(bundle)
+    try:
+        from trilane.training.make_bundle import float_model, held_out_views, training_views
+    except ImportError as error:
+        raise MissingPartError(f"quantising an avatar again needs {error.name}", extra="train") from None
+    from trilane.training.validate import open_renderer
+
+    renderer = open_renderer(bundle, 1)
+    frames = training_views(renderer, bundle, views) + held_out_views(renderer, bundle, held_out)
+    return float_model(bundle, weights), frames

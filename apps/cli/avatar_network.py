@@ -304,7 +304,7 @@ def _material(source: Path | None, frames: Path | None, avatar: str | None) -> t
     from trilane.training.quantising.calibration_table import COUNTS, EVALUATED
 
     if avatar is not None and source is None and frames is None:
-        from trilane.apps.experiments.calibrated_network import drawn_material
+        from trilane.apps.avatar.remade_avatar import drawn_material
 
         with spinner(f"drawing {max(COUNTS)} views of the training's kind"):
             return *drawn_material(avatar, max(COUNTS), HELD_OUT), HELD_OUT

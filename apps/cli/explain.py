@@ -291,8 +291,7 @@ def plan(
     Nothing runs. `trilane explain` says where the time of a run went.
     """
     _refuse_other_things(Path(scene))
-    from trilane.apps.explain.explanation import explain
-    from trilane.apps.explain.scene_plan import draw_plan
+    from trilane.apps.explain.scene_plan import draw_plan, explain
     from trilane.stages.configure import configure
     from trilane.writing import require_writable
 

@@ -14,14 +14,17 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from trilane.apps.cli.explain import app
-from trilane.apps.explain.explanation import ALWAYS, PIPELINED, CostModel, least_frame_ms
 from trilane.apps.explain.scene_plan import (
+    ALWAYS,
     BODY,
     MESH,
+    PIPELINED,
     TENSOR,
+    CostModel,
     PlannedFrame,
     ScenePlan,
     draw_plan,
+    least_frame_ms,
     phases,
 )
 from trilane.avatars.bundle import load_bundle
@@ -246,7 +249,7 @@ def test_on_this_machine_units_are_placed_as_in_a_prediction(
     """For the shape of most frames, on two cores."""
     for module in ("host", "predict"):
         monkeypatch.setattr(f"trilane.hw_profiles.{module}.usable_cores", lambda: (0, 1))
-    monkeypatch.setattr("trilane.apps.explain.explanation.usable_cores", lambda: (0, 1))
+    monkeypatch.setattr("trilane.apps.explain.scene_plan.usable_cores", lambda: (0, 1))
     document = json.loads(explained(folder, "--json", "--profile", "host").stdout)
     frames = {tuple(row["tensor"]): 0 for row in document["phases"]}
     for row in document["phases"]:
@@ -291,7 +294,7 @@ def test_what_a_run_may_be_asked_can_be_explained(folder: Path, tmp_path: Path) 
 
 def test_cores_that_are_asked_for_are_kept(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of two cores: the other units go where frames are shortest; a network on both cores may share them."""
-    for module in ("hw_profiles.host", "hw_profiles.predict", "apps.explain.explanation"):
+    for module in ("hw_profiles.host", "hw_profiles.predict", "apps.explain.scene_plan"):
         monkeypatch.setattr(f"trilane.{module}.usable_cores", lambda: (0, 1))
     costs = CostModel([load_bundle(tiny_bundle).read_network()], "host", CAP)
     free = costs.placement((96, 64))
