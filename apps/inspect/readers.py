@@ -1,7 +1,7 @@
-"""Describes motions, cameras, bodies, avatars, networks, scenes, traces and runs, each by a command's own reader.
+"""Describes motions, cameras, pictures, bodies, avatars, networks, scenes and runs, each by a command's own reader.
 
-Rule: the reader finds all facts; this file only adds words. Nothing is placed in a scene, so all facts are about the
-file alone.
+Rule: the reader finds all facts and decides whether a file is usable; this file only adds words. Nothing is placed in a
+scene, so all facts are about the file alone. Pictures and videos are read as a background is.
 """
 
 from __future__ import annotations
