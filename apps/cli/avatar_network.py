@@ -225,7 +225,7 @@ def quantise(
     json: JsonOption = False,
 ) -> None:
     """Quantise a float network, calibrated on real frames; input and output are bytes."""
-    from trilane.apps.avatar.assembled_avatar import network_facts
+    from trilane.apps.avatar_files import network_facts
     from trilane.avatars.network_file import parse_network
     from trilane.training.quantising.quantise import equalised
     from trilane.training.quantising.quantise import quantise as quantise_on
@@ -304,7 +304,7 @@ def _material(source: Path | None, frames: Path | None, avatar: str | None) -> t
     from trilane.training.quantising.calibration_table import COUNTS, EVALUATED
 
     if avatar is not None and source is None and frames is None:
-        from trilane.apps.avatar.remade_avatar import drawn_material
+        from trilane.apps.avatar_files import drawn_material
 
         with spinner(f"drawing {max(COUNTS)} views of the training's kind"):
             return *drawn_material(avatar, max(COUNTS), HELD_OUT), HELD_OUT

@@ -18,7 +18,7 @@ import av
 import numpy as np
 from PIL import ExifTags, Image, ImageDraw
 
-from trilane.apps.avatar.assembled_avatar import bundle_facts
+from trilane.apps.avatar_files import bundle_facts
 from trilane.apps.compare.overview import read_entries
 from trilane.apps.explain.trace import NAME as TRACE_NAME
 from trilane.apps.inspect.inspection import Inspection, Length, drawn_cameras, drawn_points, drawn_skeletons, used
