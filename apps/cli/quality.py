@@ -163,7 +163,7 @@ def _sources(rows: list[dict[str, Any]]) -> Iterator[str]:
 
 
 def _scene(scene: str, avatar: str | None, size: str | None, frames: int, names: list[str], as_json: bool) -> bool:
-    from trilane.apps.experiments.accuracy import runtime_differences
+    from trilane.apps.experiments.scene_pictures import runtime_differences
     from trilane.stages.configure import configure, required_machine
     from trilane.stages.run_options import RunOptions
 

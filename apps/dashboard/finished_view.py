@@ -21,9 +21,21 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.apps.dashboard.pages import ChangesSaid, Client, ControlSaid, Seek, shown
 from trilane.apps.dashboard.run_facts import RunFacts, facts_of_folder
-from trilane.apps.dashboard.view import Message, RunMeter, TimelineRows, described, jpeg_of, note, slices
+from trilane.apps.dashboard.view import (
+    ChangesSaid,
+    Client,
+    ControlSaid,
+    Message,
+    RunMeter,
+    Seek,
+    TimelineRows,
+    described,
+    jpeg_of,
+    note,
+    shown,
+    slices,
+)
 from trilane.apps.watch.followed_run import CUT_OFF, FollowedRun, RunState
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import NAME, Begun, Ended, Record, Stepped, journal_in, read_journal

@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from trilane.apps.experiments.accuracy import DrawnTensors
 from trilane.apps.experiments.hard_rotations import EXACT, HIGHAM, U32, HardNumber, U, gamma, in_mm, random_pose, worst
+from trilane.apps.experiments.scene_pictures import DrawnTensors
 from trilane.arrays import F64, U8
 from trilane.body.body import Body, ShapedBody, weights_of_one
 from trilane.body.joints import JOINTS, POSE_FEATURES

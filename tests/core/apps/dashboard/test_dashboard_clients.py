@@ -6,8 +6,8 @@ import asyncio
 
 import pytest
 
-from trilane.apps.dashboard import pages
-from trilane.apps.dashboard.pages import MOST_CLIENTS, MOST_QUEUED, Client, Clients
+from trilane.apps.dashboard import view
+from trilane.apps.dashboard.view import MOST_CLIENTS, MOST_QUEUED, Client, Clients
 
 
 class Socket:
@@ -63,7 +63,7 @@ def test_a_client_that_leaves_too_much_unsent_is_dropped_once() -> None:
 
 
 def test_a_client_that_takes_nothing_for_so_long_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pages, "SEND_S", 0.01)
+    monkeypatch.setattr(view, "SEND_S", 0.01)
 
     async def run() -> None:
         socket, gone = Socket(), list[int]()

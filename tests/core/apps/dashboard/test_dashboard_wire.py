@@ -20,8 +20,8 @@ from trilane.apps.dashboard.channel import (
     packed,
     unpacked,
 )
-from trilane.apps.dashboard.pages import ControlSaid, MalformedError, PictureAsked, Seek, heard, said, shown
 from trilane.apps.dashboard.run_facts import Control, control_of, controls_of_run
+from trilane.apps.dashboard.view import ControlSaid, MalformedError, PictureAsked, Seek, heard, said, shown
 from trilane.unexpected_value import UnexpectedValue
 
 
