@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from trilane.apps.compare.compared_sweeps import SweepComparison, TrialPair
     from trilane.apps.compare.comparison import Comparison
-    from trilane.apps.compare.gate import Gate, Judged
+    from trilane.apps.compare.gate import Gate, JudgedLimit
     from trilane.apps.compare.overview import Entry
     from trilane.apps.compare.rows import Figure
     from trilane.apps.compare.sides import Change
@@ -120,20 +120,20 @@ def compare(
     _leave(judged)
 
 
-_Answer = tuple[Iterator["str | Table"], dict[str, Any], list["Judged"]]
+_Answer = tuple[Iterator["str | Table"], dict[str, Any], list["JudgedLimit"]]
 
 
 def _of_runs(base: str, others: list[str], html: Path | None, show_all: bool, gates: Sequence[Gate]) -> _Answer:
     from trilane.apps.compare.comparison import compare as compared
     from trilane.apps.compare.comparison import document
-    from trilane.apps.compare.gate import Pair, as_json, judge
+    from trilane.apps.compare.gate import GatedPair, as_json, judge
     from trilane.apps.compare.sides import read_side
 
     comparisons = compared(read_side(base), [read_side(other) for other in others])
     if html is not None:
         _write_page(html, comparisons)
     judged = judge(
-        gates, [Pair(each.other.name, each.base, each.other, each.rows, each.changes) for each in comparisons]
+        gates, [GatedPair(each.other.name, each.base, each.other, each.rows, each.changes) for each in comparisons]
     )
     shown = (part for comparison in comparisons for part in comparison_lines(comparison, show_all))
     return shown, {**document(comparisons), **(as_json(judged) if gates else {})}, judged
@@ -165,7 +165,7 @@ def _gates(asked: Sequence[str], slower: str | None) -> list[Gate]:
     return found
 
 
-def _say(judged: Sequence[Judged]) -> None:
+def _say(judged: Sequence[JudgedLimit]) -> None:
     """Say what each limit came to."""
     several = len({each.name for each in judged}) > 1
     for each in judged:
@@ -173,11 +173,11 @@ def _say(judged: Sequence[Judged]) -> None:
         stderr_console().print(said, soft_wrap=True, markup=False)
 
 
-def _leave(judged: Sequence[Judged]) -> None:
+def _leave(judged: Sequence[JudgedLimit]) -> None:
     """Leave with the exit code of the gate."""
-    from trilane.apps.compare.gate import Outcome, whole
+    from trilane.apps.compare.gate import LimitOutcome, whole
 
-    codes = {Outcome.KEPT: 0, Outcome.BROKEN: BROKEN, Outcome.UNKNOWN: CANNOT_TELL}
+    codes = {LimitOutcome.KEPT: 0, LimitOutcome.BROKEN: BROKEN, LimitOutcome.UNKNOWN: CANNOT_TELL}
     if code := codes[whole(judged)]:
         raise typer.Exit(code)
 
@@ -330,7 +330,7 @@ MAX_SUMMARY_BYTES: Final = 1 << 20
 LEVELS: Final = {"kept": "notice", "broken": "error", "cannot tell": "warning"}
 
 
-def write_to_github(judged: Sequence[Judged], verdict: str) -> None:
+def write_to_github(judged: Sequence[JudgedLimit], verdict: str) -> None:
     """Write an annotation for each limit, and add a summary to the file that GITHUB_STEP_SUMMARY names, if any.
 
     Raises BadInputError for a file that cannot be written.
@@ -348,7 +348,7 @@ def write_to_github(judged: Sequence[Judged], verdict: str) -> None:
         raise BadInputError.of_os_error(f"{SUMMARY}={name}", error, WRITABLE) from None
 
 
-def annotation(judged: Judged) -> str:
+def annotation(judged: JudgedLimit) -> str:
     """Return a workflow command, such as `::error title=slower=5%25 broken::infer takes longer`."""
     title = f"{judged.gate.text} {judged.outcome}"
     in_title = _escaped(title).replace(":", "%3A").replace(",", "%2C")
@@ -359,7 +359,7 @@ def _escaped(text: str) -> str:
     return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
 
 
-def summary(judged: Sequence[Judged], verdict: str) -> str:
+def summary(judged: Sequence[JudgedLimit], verdict: str) -> str:
     """Return the summary: the gate's outcome, the verdict on the runs, and a table with a row for each limit.
 
     It has as many rows as GitHub keeps.

@@ -17,7 +17,15 @@ from pathlib import Path
 from typing import Any, Final
 
 from trilane.apps.dashboard.access import listen
-from trilane.apps.dashboard.channel import ChangesAsked, ControlAsked, Message, Refused, RunBegins, ServerLink, StateIs
+from trilane.apps.dashboard.channel import (
+    ChangesAsked,
+    ChangesRefused,
+    ControlAsked,
+    Message,
+    RunBegins,
+    ServerLink,
+    StateIs,
+)
 from trilane.apps.dashboard.run_facts import (
     OF_A_NEW_RUN,
     controls_of_file,
@@ -99,7 +107,7 @@ class _Runs:
                 if following is None:
                     self.link.send(StateIs(FAILED, str(error)))
                     raise
-                self.link.send(Refused("", f"the run did not begin: {error}"))
+                self.link.send(ChangesRefused("", f"the run did not begin: {error}"))
                 now, before = following, None
                 continue
             following = self.director.take_next()
@@ -186,7 +194,7 @@ class Director:
             changes = {name: RunOptions.value_of(name, word) for name, word in values.items()}
             prepared = self._prepare(current.options.changed(**changes))
         except TrilaneError as error:
-            self._send(Refused(next(iter(values)) if len(values) == 1 else RESTART, str(error)))
+            self._send(ChangesRefused(next(iter(values)) if len(values) == 1 else RESTART, str(error)))
             return
         with self._lock:
             self._next = prepared

@@ -14,7 +14,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
-from trilane.apps.explain.reasons import MOST_SAMPLES, Shown, SlowFrames, Usual, advice, notes, reasons
+from trilane.apps.explain.reasons import MOST_SAMPLES, ShownFrame, SlowFrames, Usual, advice, notes, reasons
 from trilane.apps.run.report import Report, read_report
 from trilane.apps.run.verdict_facts import verdict_of
 from trilane.apps.watch.followed_run import CUT_OFF, FollowedRun, RunState
@@ -309,7 +309,7 @@ def _wait_row(stage: str, unit: str, jobs: int, waits_ns: Mapping[str, int]) -> 
     }
 
 
-def _slow_row(shown: Shown, usual: Usual) -> dict[str, Any]:
+def _slow_row(shown: ShownFrame, usual: Usual) -> dict[str, Any]:
     return {
         "frame": shown.now.frame,
         "presented_ns": shown.now.end_ns,

@@ -11,9 +11,9 @@ import pytest
 
 from trilane.apps.dashboard.channel import (
     ChangesAsked,
+    ChangesRefused,
     ControlAsked,
     Opened,
-    Refused,
     RunBegins,
     StateIs,
     channel_pair,
@@ -70,7 +70,7 @@ def test_the_page_is_told_in_bytes_that_are_written_down() -> None:
 
 MESSAGES = [
     Opened("token", 480, 640), RunBegins("/runs/a", {"name": "a"}, [{"name": "play"}]), StateIs("paused", ""),
-    Refused("size", "found 17"),
+    ChangesRefused("size", "found 17"),
     ControlAsked("zoom", 2.5), ControlAsked("pause", None), ChangesAsked({"policy": "latest", "size": "128"}),
 ]  # fmt: skip
 
@@ -108,7 +108,7 @@ def test_a_channel_carries_messages_and_the_end_and_waits_for_nobody() -> None:
     assert theirs.recv(1 << 16) == packed(StateIs("running", ""))
     theirs.send(packed(ControlAsked("pause", None)))
     assert ours.receive() == ControlAsked("pause", None)
-    sent = [ours.send(Refused("x", "y" * 10_000)) for _ in range(1000)]  # nobody reads
+    sent = [ours.send(ChangesRefused("x", "y" * 10_000)) for _ in range(1000)]  # nobody reads
     assert sent[0] and not sent[-1]
     theirs.close()
     assert not ours.send(StateIs("ended", ""))

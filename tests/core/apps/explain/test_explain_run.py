@@ -15,7 +15,7 @@ import pytest
 
 from support.run_folders import write_run
 from trilane.apps.explain.explained_run import COLUMNS, Joins, explain_frame, explain_run, join_text, write_jobs
-from trilane.apps.explain.reasons import MOST_SAMPLES, EvenSample, Shown, advice, notes
+from trilane.apps.explain.reasons import MOST_SAMPLES, EvenSample, ShownFrame, advice, notes
 from trilane.apps.watch.followed_run import CUT_OFF
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.application import application_graph
@@ -126,7 +126,7 @@ def test_a_frame_that_skips_or_has_another_rung_says_so(tmp_path: Path) -> None:
 def test_what_was_unlike_the_frame_before_is_noted() -> None:
     now = Presented(7, 20, 100, 50, 70, skips=True, rung=2)
     before = Presented(3, 10, 50, None, 40, skips=False, rung=0)
-    shown = Shown(now, before, 50, {}, {})
+    shown = ShownFrame(now, before, 50, {}, {})
     assert notes(shown) == [
         "frames 4 to 6 before it were dropped or lost",
         "its work changed from rung 0 to 2",
