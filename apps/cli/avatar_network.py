@@ -24,7 +24,15 @@ from trilane.apps.cli.commands import (
     OutFileOption,
     WidthOption,
 )
-from trilane.apps.cli.console import print_facts, print_json, spinner, stderr_console, stdout_console, stdout_kept
+from trilane.apps.cli.console import (
+    print_facts,
+    print_json,
+    print_line,
+    spinner,
+    stderr_console,
+    stdout_console,
+    stdout_kept,
+)
 from trilane.errors import BadInputError, MissingPartError
 from trilane.figure_sources import MEASURED
 
@@ -295,7 +303,7 @@ def calibrations(
         figures = (f"{row['psnr_db']:.2f}", f"{row['mean']:.2f}", f"{row['largest']:.0f}")
         table.add_row(row["method"], str(row["count"]), *figures)
     stdout_console().print(table)
-    stdout_console().print(f"recommended: {line}", soft_wrap=True)
+    print_line(f"recommended: {line}")
 
 
 def _material(source: Path | None, frames: Path | None, avatar: str | None) -> tuple[Any, list[Any], int]:

@@ -19,7 +19,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from trilane.apps.cli.commands import Commands, JsonOption
-from trilane.apps.cli.console import print_json, print_kept, stderr_console, stdout_console, without_controls
+from trilane.apps.cli.console import (
+    print_json,
+    print_kept,
+    print_line,
+    say,
+    stderr_console,
+    stdout_console,
+    without_controls,
+)
 from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -170,7 +178,7 @@ def _say(judged: Sequence[JudgedLimit]) -> None:
     several = len({each.name for each in judged}) > 1
     for each in judged:
         said = without_controls(f"{each.name}: {each.said}" if several else each.said)
-        stderr_console().print(said, soft_wrap=True, markup=False)
+        say(said)
 
 
 def _leave(judged: Sequence[JudgedLimit]) -> None:
@@ -198,7 +206,7 @@ def _write_page(path: Path, comparisons: list[Comparison]) -> None:
     from trilane.writing import write_bytes
 
     write_bytes(path, page(comparisons).encode(), "choose another --html")
-    stderr_console().print(f"page: {path}", soft_wrap=True, markup=False)
+    say(f"page: {path}")
 
 
 #: Measures of which one statistic is shown even where nothing differs.
@@ -441,7 +449,7 @@ def report(
         print_json({"schema": 1, "entries": rows, "files": [str(target) for target in targets]})
     else:
         _print(entries, rows)
-    stderr_console().print("written: " + ", ".join(map(str, targets)), soft_wrap=True, markup=False)
+    say("written: " + ", ".join(map(str, targets)))
 
 
 def _print(entries: list[Entry], rows: list[dict[str, Any]]) -> None:
@@ -456,10 +464,10 @@ def _print(entries: list[Entry], rows: list[dict[str, Any]]) -> None:
         cells.append([_shown(shown[key]) for key in SHOWN])
     stdout_console().print(_table(titles, cells))
     for sentence in told_choices(entries):
-        stdout_console().print(sentence, soft_wrap=True, markup=False)
+        print_line(sentence)
     for entry in entries:
         if entry.failure:
-            stdout_console().print(f"{entry.name}: {entry.failure}", soft_wrap=True, markup=False)
+            print_line(f"{entry.name}: {entry.failure}")
 
 
 def _shown(value: Any) -> str:

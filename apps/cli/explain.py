@@ -14,10 +14,11 @@ import typer
 from trilane.apps.cli.commands import Commands, JsonOption, NewestRunArgument, PerformanceProfileOption, with_options
 from trilane.apps.cli.console import (
     print_json,
+    print_line,
     print_verdict,
+    say,
     shown_messages,
     spinner,
-    stderr_console,
     stdout_console,
     without_controls,
 )
@@ -80,7 +81,7 @@ def explain(
         document = explain_run(folder, slowest) if frame is None else explain_frame(folder, frame)
         count = write_jobs(folder, jobs) if jobs is not None else 0
     if jobs is not None:
-        stderr_console().print(f"jobs: {jobs}, {count} rows", soft_wrap=True, markup=False)
+        say(f"jobs: {jobs}, {count} rows")
     if json:
         print_json(document)
         return
@@ -94,7 +95,7 @@ def _show_frame(document: Mapping[str, Any]) -> None:
     cause = "" if document["cause"] is None else f", cause {document['cause']} (docs/policies-and-edges.md)"
     latency = "" if document["latency_ms"] is None else f", latency {document['latency_ms']:.1f} ms"
     console = stdout_console()
-    console.print(f"Frame {document['frame']}: {document['outcome']}{after}{cause}{latency}", soft_wrap=True)
+    print_line(f"Frame {document['frame']}: {document['outcome']}{after}{cause}{latency}")
     if not document["jobs"]:
         console.print("no job of it began")
         return
@@ -117,19 +118,19 @@ def _show_run(document: Mapping[str, Any]) -> None:
         print_verdict(document["verdict"]["lines"])
         console.print()
     for line in _head(document):
-        console.print(line, soft_wrap=True, markup=False)
+        print_line(line)
     if not document["budget"]:
         return
     console.print(_budget(document))
     for line in _shared(document["shared_cores"]):
-        console.print(line, soft_wrap=True, markup=False)
+        print_line(line)
     console.print(_waits(document["waits"]))
     for row in document.get("joins", ()):
-        console.print(join_text(row), soft_wrap=True, markup=False)
+        print_line(join_text(row))
     console.print(_slowest(document))
     for line in document["advice"]:
-        console.print(f"try: {line}", soft_wrap=True, markup=False)
-    console.print(f"times: {document['sources']['frames, waits_ms, service_ms, preempted_ms']}", soft_wrap=True)
+        print_line(f"try: {line}")
+    print_line(f"times: {document['sources']['frames, waits_ms, service_ms, preempted_ms']}")
 
 
 def _head(document: Mapping[str, Any]) -> Iterator[str]:
@@ -303,10 +304,10 @@ def plan(
         checked = configure(options.changed(scene=scene), Path.cwd())
         explanation = explain(checked, profile, str(performance_profile))
     for note in checked.notes:
-        stderr_console().print(note, soft_wrap=True, markup=False)
+        say(note)
     if out is not None:
         draw_plan(explanation.plan, explanation.first_frames, out)
-        stderr_console().print(f"picture: {out}\nin the picture: {RECTANGLES}", soft_wrap=True, markup=False)
+        say(f"picture: {out}\nin the picture: {RECTANGLES}")
     if json:
         print_json(explanation.document)
         return
@@ -326,28 +327,27 @@ def _refuse_other_things(path: Path) -> None:
 def _show_plan(document: dict[str, Any]) -> None:
     console, config = stdout_console(), document["config"]
     height, width = config["output"]
-    console.print(
+    print_line(
         f"Scene {document['scene']}: {config['frames']} frames of {width}x{height}, plan {config['plan']}, tensor size "
         f"{config['size']}, error budget {config['error_budget_px']:g} px",
-        soft_wrap=True,
     )
     shapes = ", ".join(f"{h}x{w}" for h, w in document["shapes"])
-    console.print(f"tensor shapes that are made ready: {shapes}", soft_wrap=True)
+    print_line(f"tensor shapes that are made ready: {shapes}")
     for line in dict.fromkeys(_drawn(row) for row in document["avatars"]):
-        console.print(line, soft_wrap=True, markup=False)
+        print_line(line)
     console.print(_phase_table(document["phases"]))
     left = len(document["phases"]) - MOST_ROWS
     if left > 0:
         console.print(f"{left} more phases: --json has all of them")
     for line in (*_left_out(document["phases"]), _image(document["image"])):
-        console.print(line, soft_wrap=True, markup=False)
-    console.print(READ_PLAN_SO, soft_wrap=True)
+        print_line(line)
+    print_line(READ_PLAN_SO)
     firsts = {phase["why"]: phase["first_frame"] for phase in reversed(document["phases"])}
     for why, first in sorted(firsts.items(), key=lambda one: one[1]):
-        console.print(f"frame {first} and others like it: {why}", soft_wrap=True)
-    console.print(f"placement: {document['placement']['why']}", soft_wrap=True, markup=False)
+        print_line(f"frame {first} and others like it: {why}")
+    print_line(f"placement: {document['placement']['why']}")
     for line in _totals(document["totals"], config):
-        console.print(line, soft_wrap=True)
+        print_line(line)
 
 
 def _drawn(row: dict[str, Any]) -> str:

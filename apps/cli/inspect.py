@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from trilane.apps.cli.commands import Commands, JsonOption
-from trilane.apps.cli.console import note, print_json, spinner, stderr_console, stdout_console, without_controls
+from trilane.apps.cli.console import note, print_json, print_line, say, spinner, stdout_console, without_controls
 from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -64,9 +64,9 @@ def inspect(file: FileArgument, out: SheetOption = None, json: JsonOption = Fals
         print_json(document)
     else:
         for line in lines(without_controls(document)):
-            stdout_console().print(line, soft_wrap=True, markup=False)
+            print_line(line)
     if out is not None and sheet is None:
-        stderr_console().print(f"no sheet: nothing to draw of {document['what']}", soft_wrap=True, markup=False)
+        say(f"no sheet: nothing to draw of {document['what']}")
     if not found.usable:
         raise typer.Exit(UNUSABLE)
 
@@ -208,9 +208,9 @@ def times(
     for read in reads:
         _show(read)
     for path in written:
-        stdout_console().print(f"written: {without_controls(str(path))}", markup=False, soft_wrap=True)
+        print_line(f"written: {without_controls(str(path))}")
     for line in row_says:
-        stdout_console().print(without_controls(line), markup=False, soft_wrap=True)
+        print_line(without_controls(line))
 
 
 def _check_results(paths: Sequence[Path | None]) -> None:
@@ -232,7 +232,7 @@ def _stage_of(text: str) -> tuple[Path, str]:
 def _show(read: Measurements) -> None:
     console = stdout_console()
     name = without_controls(str(read.path))
-    console.print(f"{name}: {read.tool}: {read.says}", markup=False, soft_wrap=True)
+    print_line(f"{name}: {read.tool}: {read.says}")
     for kind in ("run", "wall", "layer"):
         of_kind = [each for each in read.measurements if each.kind == kind]
         if kind == "layer":
@@ -247,7 +247,7 @@ def _show(read: Measurements) -> None:
     if read.refused_count > len(refused):
         refused.append(f"refused: {read.refused_count - len(refused)} more")
     for line in (*hints, *skipped, *refused):
-        console.print(without_controls(line), markup=False, soft_wrap=True)
+        print_line(without_controls(line))
 
 
 def _table(kind: str, measurements: Sequence[Measurement]) -> Table:

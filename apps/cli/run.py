@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from trilane.apps.cli.commands import Commands, JsonOption, PortOption, with_options
-from trilane.apps.cli.console import print_json, print_verdict, shown_messages, stderr_console, stdout_console
+from trilane.apps.cli.console import print_json, print_verdict, say, shown_messages, stderr_console, stdout_console
 from trilane.errors import BadInputError
 from trilane.figure_sources import COMPUTED, MEASURED, NO_FIGURES
 from trilane.stages.run_options import RunOptions
@@ -132,7 +132,7 @@ def _run_live(options: RunOptions, command: tuple[str, ...], port: int | None) -
     require_server()
     from trilane.pipeline.pipeline_file import is_pipeline_file
 
-    tell = lambda text: stderr_console().print(text, soft_wrap=True, markup=False)  # noqa: E731
+    tell = lambda text: say(text)  # noqa: E731
     if is_pipeline_file(Path(options.scene)):
         from trilane.apps.dashboard.live_run import run_file_live
 
@@ -153,11 +153,11 @@ def _print_outcome(outcome: RunOutcome, as_json: bool, with_table: bool) -> None
         print_verdict(verdict_of(report, str(outcome.folder)).lines())
         if with_table:
             stdout_console().print(run_table(report))
-    stderr_console().print(f"run folder: {outcome.folder}", soft_wrap=True, markup=False)
+    say(f"run folder: {outcome.folder}")
     for message in shown_messages(report.messages, report.failure):
-        stderr_console().print(f"in the run: {message}", soft_wrap=True, markup=False)
+        say(f"in the run: {message}")
     if report.failure:
-        stderr_console().print(f"the run failed: {report.failure}", soft_wrap=True, markup=False)
+        say(f"the run failed: {report.failure}")
 
 
 DASH = "–"

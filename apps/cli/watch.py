@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from trilane.apps.cli.commands import Commands, NewestRunArgument, PortOption
-from trilane.apps.cli.console import print_json, spinner, stderr_console, stdout_console, verdict_text
+from trilane.apps.cli.console import print_json, say, spinner, stdout_console, verdict_text
 from trilane.apps.cli.run import DASH, TOO_FEW, accuracy_line, needed, too_few_note
 from trilane.errors import BadInputError, MissingPartError
 
@@ -157,7 +157,7 @@ def show(run: NewestRunArgument = None, port: PortOption = None) -> None:
 
     with closing(FinishedView(followed.folder)) as view, closing(listen(port)) as place:
         answers = DashboardApp(view, place.port, place.token)
-        stderr_console().print(f"dashboard: {place.url}", soft_wrap=True, markup=False)
+        say(f"dashboard: {place.url}")
         asyncio.run(server(answers).serve(sockets=[place.listener]))
 
 
@@ -178,7 +178,7 @@ def trace(run: NewestRunArgument = None, chrome_json: ChromeOption = False, out:
     target = out or followed.folder / (CHROME_NAME if chrome_json else NAME)
     with spinner("writing the trace"):
         write_run(followed.whole(), target, chrome=chrome_json)
-    stderr_console().print(f"trace: {target}", soft_wrap=True, markup=False)
+    say(f"trace: {target}")
 
 
 BAR = 20
