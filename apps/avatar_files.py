@@ -13,7 +13,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -241,13 +241,10 @@ def _kind(base: Bundle, network: NetworkFile) -> tuple[str, str, int]:
 
     The width is the number of channels of the first convolution.
     """
-    own, operators = base.manifest.network, [_operators(each.model) for each in (base.read_network(), network)]
-    names = (own.encoder, own.norm) if operators[0] == operators[1] else (OTHER, OTHER)
+    own = base.manifest.network
+    before, now = ([node.op_type for node in each.model.graph.node] for each in (base.read_network(), network))
+    names = (own.encoder, own.norm) if before == now else (OTHER, OTHER)
     return *names, _width(network.model)
-
-
-def _operators(model: onnx.ModelProto) -> Sequence[str]:
-    return [node.op_type for node in model.graph.node]
 
 
 def _width(model: onnx.ModelProto) -> int:

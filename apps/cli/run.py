@@ -130,16 +130,11 @@ def _run_live(options: RunOptions, command: tuple[str, ...], port: int | None) -
     from trilane.apps.dashboard.access import require_server
 
     require_server()
+    from trilane.apps.dashboard.live_run import run_file_live, run_live
     from trilane.pipeline.pipeline_file import is_pipeline_file
 
-    tell = lambda text: say(text)  # noqa: E731
-    if is_pipeline_file(Path(options.scene)):
-        from trilane.apps.dashboard.live_run import run_file_live
-
-        return run_file_live(options, _hooks, command, port, tell)
-    from trilane.apps.dashboard.live_run import run_live
-
-    return run_live(options, _hooks, command, port, tell)
+    run = run_file_live if is_pipeline_file(Path(options.scene)) else run_live
+    return run(options, _hooks, command, port, say)
 
 
 def _print_outcome(outcome: RunOutcome, as_json: bool, with_table: bool) -> None:

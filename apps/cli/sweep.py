@@ -276,39 +276,26 @@ def seconds_left(elapsed_s: float, ended: int, left: int) -> float:
 @contextmanager
 def progress(left: int, whole: int) -> Iterator[Callable[[Mapping[str, Any]], None]]:
     """Yield a function to call for each trial that ended. `left`: number of the `whole` trials that are not done."""
-    console = stderr_console()
-    if not console.is_terminal:
-        yield _plain(console, left, whole)
-        return
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+    console = stderr_console()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[left]}"))
-    with Progress(*columns, console=console) as bar:
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("trials", total=whole, completed=whole - left, left="")
         begin, ended = time.monotonic(), 0
 
         def told(record: Mapping[str, Any]) -> None:
             nonlocal ended
             ended += 1
-            if record["status"] != "done":
+            remaining = f"{_time(seconds_left(time.monotonic() - begin, ended, left - ended))} left"
+            done = whole - left + ended
+            if not console.is_terminal:
+                console.print(f"{done}/{whole} {_line(record)}; {remaining}", soft_wrap=True, markup=False)
+            elif record["status"] != "done":
                 console.print(_line(record), soft_wrap=True, markup=False)
-            text = f"{_time(seconds_left(time.monotonic() - begin, ended, left - ended))} left"
-            bar.update(task, completed=whole - left + ended, left=text)
+            bar.update(task, completed=done, left=remaining)
 
         yield told
-
-
-def _plain(console: Any, left: int, whole: int) -> Callable[[Mapping[str, Any]], None]:
-    begin, ended = time.monotonic(), 0
-
-    def told(record: Mapping[str, Any]) -> None:
-        nonlocal ended
-        ended += 1
-        remaining = _time(seconds_left(time.monotonic() - begin, ended, left - ended))
-        place = f"{whole - left + ended}/{whole}"
-        console.print(f"{place} {_line(record)}; {remaining} left", soft_wrap=True, markup=False)
-
-    return told
 
 
 def _line(record: Mapping[str, Any]) -> str:

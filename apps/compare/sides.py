@@ -372,7 +372,8 @@ def imported(document: Mapping[str, Any], path: Path) -> dict[str, Any]:
         "machine": {},
         "frame_time_ms": _imported_statistics(frames) if frames else {},
         "latency_ms": {},
-        "deviation": _deviation(rows),
+        # Of every figure: the largest standard error that is known.
+        "deviation": max((error for row in rows if (error := row.error) is not None), default=None),
     }
 
 
@@ -400,8 +401,3 @@ def _frames(rows: Sequence[ImportedTime]) -> ImportedTime | None:
 
 def _imported_statistics(row: ImportedTime) -> dict[str, float]:
     return {"mean": row.ms} | ({} if row.p50_ms is None else {"p50": row.p50_ms})
-
-
-def _deviation(rows: Sequence[ImportedTime]) -> float | None:
-    """Return the standard error that a comparison takes for every figure: the largest that is known, None for none."""
-    return max((error for row in rows if (error := row.error) is not None), default=None)

@@ -377,7 +377,7 @@ def inspect_folder(path: Path) -> Inspection:
     """Read a folder of pictures. Raises BadInputError when one of them is not usable."""
     names, footage = pictures_in(path), survey(path, FOLDER_FPS)
     for name in names:
-        _require_whole(name)
+        read_picture(name, (8, 8))  # which decodes it to its end
     sizes = sorted({(facts["width"], facts["height"]) for _, facts in map(picture_facts, names)})
     chosen = [names[k] for k in _spread(len(names))]
     first = f"{sizes[0][0]}x{sizes[0][1]}"
@@ -401,11 +401,6 @@ def _folder_rate(footage: Footage) -> str:
     """Return the rate of the pictures in a scene, and what is missing."""
     own = footage.rate if footage.clock_s else ("the scene's, one a frame", *footage.rate[1:])
     return "; ".join(own)
-
-
-def _require_whole(path: Path) -> None:
-    """Raise BadInputError for a picture that cannot be decoded to its end."""
-    read_picture(path, (8, 8))
 
 
 def inspect_video(path: Path) -> Inspection:
