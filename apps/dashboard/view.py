@@ -25,7 +25,6 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from trilane.apps.watch.followed_run import RunState
 from trilane.apps.watch.live_figures import LiveFigures
-from trilane.apps.watch.metrics import openmetrics
 from trilane.pipeline.journal import Begun, Record, Stepped, Worked
 from trilane.pipeline.journal import Said as SaidRecord
 from trilane.pipeline.timeline import Timeline
@@ -345,6 +344,8 @@ class RunMeter:
 
     def metrics(self, now_ns: int | None = None, state: RunState | None = None) -> str:
         """Return the figures in OpenMetrics, without the end mark. `state`: as of `LiveFigures.now`."""
+        from trilane.apps.watch.metrics import openmetrics  # which needs a package of the extra `dashboard`
+
         return openmetrics(self._figures.now(now_ns, state)).decode().removesuffix(END)
 
 
