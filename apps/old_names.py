@@ -58,7 +58,8 @@ def in_new_names(words: Sequence[str], note: Note) -> list[str]:
         return []
     first, rest = words[0], list(words[1:])
     if first in WITH_COMMAND:
-        place = next((place for place, word in enumerate(rest) if word in COMMANDS or _has_options(word)), len(rest))
+        known = {*COMMANDS, *(each.command for each in OPTIONS)}
+        place = next((place for place, word in enumerate(rest) if word in known), len(rest))
         return [first, *rest[:place], *in_new_names(rest[place:], note)]
     command = COMMANDS.get(first, first)
     if first == "explain" and _is_of_a_scene(rest):
@@ -90,10 +91,6 @@ def _options(command: str, words: Sequence[str], note: Note) -> Iterator[str]:
         else:
             note(_said(name, new))
             yield f"{new}{equals}{own}"
-
-
-def _has_options(command: str) -> bool:
-    return any(each.command == command for each in OPTIONS)
 
 
 def _is_of_a_scene(words: Sequence[str]) -> bool:

@@ -56,7 +56,7 @@ SHEET = "check-data.png"
 @app.command(epilog=EPILOG_INSPECT)
 def inspect(name: AvatarArgument, json: JsonOption = False) -> None:
     """Say what an avatar contains and how good it is, after every check that a run makes."""
-    from trilane.apps.avatar.assembled_avatar import bundle_facts
+    from trilane.apps.avatar_files import bundle_facts
     from trilane.avatars.bundle import load_bundle
 
     print_facts(bundle_facts(load_bundle(name)), json)
@@ -79,7 +79,7 @@ def create(
 
     To train an avatar of a person: docs/own-avatar.md.
     """
-    from trilane.apps.avatar.assembled_avatar import Parts, assemble
+    from trilane.apps.avatar_files import Parts, assemble
     from trilane.avatars.bundle import load_bundle
 
     print_facts(assemble(load_bundle(name), Parts(network, texture, body), out), json)
@@ -95,7 +95,7 @@ def levels(name: AvatarArgument, json: JsonOption = False) -> None:
 
     bundle = load_bundle(name)
     try:
-        from trilane.apps.avatar.assembled_avatar import add_levels
+        from trilane.apps.avatar_files import add_levels
 
         with spinner("making levels of the mesh"):
             facts = add_levels(bundle)

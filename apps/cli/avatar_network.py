@@ -24,7 +24,15 @@ from trilane.apps.cli.commands import (
     OutFileOption,
     WidthOption,
 )
-from trilane.apps.cli.console import print_facts, print_json, spinner, stderr_console, stdout_console, stdout_kept
+from trilane.apps.cli.console import (
+    print_facts,
+    print_json,
+    print_line,
+    spinner,
+    stderr_console,
+    stdout_console,
+    stdout_kept,
+)
 from trilane.errors import BadInputError, MissingPartError
 from trilane.units import MEASURED
 
@@ -225,7 +233,7 @@ def quantise(
     json: JsonOption = False,
 ) -> None:
     """Quantise a float network, calibrated on real frames; input and output are bytes."""
-    from trilane.apps.avatar.assembled_avatar import network_facts
+    from trilane.apps.avatar_files import network_facts
     from trilane.avatars.network_file import parse_network
     from trilane.training.quantising.quantise import equalised
     from trilane.training.quantising.quantise import quantise as quantise_on
@@ -295,7 +303,7 @@ def calibrations(
         figures = (f"{row['psnr_db']:.2f}", f"{row['mean']:.2f}", f"{row['largest']:.0f}")
         table.add_row(row["method"], str(row["count"]), *figures)
     stdout_console().print(table)
-    stdout_console().print(f"recommended: {line}", soft_wrap=True)
+    print_line(f"recommended: {line}")
 
 
 def _material(source: Path | None, frames: Path | None, avatar: str | None) -> tuple[Any, list[Any], int]:
@@ -304,7 +312,7 @@ def _material(source: Path | None, frames: Path | None, avatar: str | None) -> t
     from trilane.training.quantising.calibration_table import COUNTS, EVALUATED
 
     if avatar is not None and source is None and frames is None:
-        from trilane.apps.experiments.calibrated_network import drawn_material
+        from trilane.apps.avatar_files import drawn_material
 
         with spinner(f"drawing {max(COUNTS)} views of the training's kind"):
             return *drawn_material(avatar, max(COUNTS), HELD_OUT), HELD_OUT

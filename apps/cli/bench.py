@@ -17,7 +17,7 @@ import typer
 
 from trilane.apps.cli.commands import POLICY_HELP, Commands, JsonOption
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console, stdout_kept
-from trilane.apps.cli.lazy_group import lazy_group
+from trilane.apps.cli.main import lazy_group
 from trilane.apps.predict.predict_options import ENCODER_HELP, NORM_HELP
 from trilane.stages.run_options import RUNTIME_HELP, SIZE_HELP, WIDTH_HELP
 

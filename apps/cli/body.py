@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from trilane.apps.cli.commands import BodyFileArgument, BodyFileOption, Commands, JsonOption
-from trilane.apps.cli.console import print_json, stderr_console, stdout_console
+from trilane.apps.cli.console import print_json, say, stderr_console, stdout_console
 from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def vertices(
     if json:
         print_json({"file": str(out), "shape": shape})
     else:
-        stderr_console().print(f"wrote {out}: {shape[0]} poses of {shape[1]} vertices", soft_wrap=True)
+        say(f"wrote {out}: {shape[0]} poses of {shape[1]} vertices")
 
 
 def _check_poses(path: Path, frames: NDArray[np.float64], expected: str) -> NDArray[np.float64]:
@@ -170,4 +170,4 @@ def from_anny(
     if json:
         print_json(facts)
     else:
-        stderr_console().print(f"wrote {out}: {facts['vertices']} vertices, {facts['height_m']} m tall", soft_wrap=True)
+        say(f"wrote {out}: {facts['vertices']} vertices, {facts['height_m']} m tall")

@@ -1,26 +1,44 @@
-"""`trilane compare`: runs, reports and predictions beside each other, a verdict with its uncertainty, and a gate.
+"""`trilane compare`: runs beside each other, a verdict and a gate. `trilane report`: many runs on one page.
 
-Rule: this module reads options and shows; every figure comes from `trilane.apps.compare`.
+Rule: this module reads options and shows; every figure comes from `trilane.apps.compare`. A verdict comes first, then
+its evidence, then the uncertain figures. A gate tells GitHub too, by annotations and a summary in Markdown
+(docs.github.com, "Workflow commands for GitHub Actions" and "Adding a job summary"). All texts of files are escaped
+there, so that none is a command to GitHub or Markdown. Annotations go to stderr, which GitHub reads too, so that --json
+stays one document.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import os
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 from trilane.apps.cli.commands import Commands, JsonOption
-from trilane.apps.cli.console import print_json, print_kept, stderr_console, without_controls
+from trilane.apps.cli.console import (
+    print_json,
+    print_kept,
+    print_line,
+    say,
+    stderr_console,
+    stdout_console,
+    without_controls,
+)
 from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from trilane.apps.compare.compared_sweeps import SweepComparison, TrialPair
     from trilane.apps.compare.comparison import Comparison
-    from trilane.apps.compare.gate import Gate, Judged
+    from trilane.apps.compare.gate import Gate, JudgedLimit
+    from trilane.apps.compare.overview import Entry
+    from trilane.apps.compare.rows import Figure
+    from trilane.apps.compare.sides import Change
 
 app = Commands()
 
@@ -100,8 +118,6 @@ def compare(
     else:
         shown, document, judged = _of_runs(base, others, html, show_all, gates)
     if github:
-        from trilane.apps.cli.github import write_to_github
-
         write_to_github(judged, document["verdict"])
     _say(judged)
     if json:
@@ -112,28 +128,26 @@ def compare(
     _leave(judged)
 
 
-_Answer = tuple[Iterator["str | Table"], dict[str, Any], list["Judged"]]
+_Answer = tuple[Iterator["str | Table"], dict[str, Any], list["JudgedLimit"]]
 
 
 def _of_runs(base: str, others: list[str], html: Path | None, show_all: bool, gates: Sequence[Gate]) -> _Answer:
-    from trilane.apps.cli.compare_table import comparison_lines
     from trilane.apps.compare.comparison import compare as compared
     from trilane.apps.compare.comparison import document
-    from trilane.apps.compare.gate import Pair, as_json, judge
+    from trilane.apps.compare.gate import GatedPair, as_json, judge
     from trilane.apps.compare.sides import read_side
 
     comparisons = compared(read_side(base), [read_side(other) for other in others])
     if html is not None:
         _write_page(html, comparisons)
     judged = judge(
-        gates, [Pair(each.other.name, each.base, each.other, each.rows, each.changes) for each in comparisons]
+        gates, [GatedPair(each.other.name, each.base, each.other, each.rows, each.changes) for each in comparisons]
     )
     shown = (part for comparison in comparisons for part in comparison_lines(comparison, show_all))
     return shown, {**document(comparisons), **(as_json(judged) if gates else {})}, judged
 
 
 def _of_sweeps(base: str, others: list[str], html: Path | None, show_all: bool, gates: Sequence[Gate]) -> _Answer:
-    from trilane.apps.cli.compare_table import sweep_lines
     from trilane.apps.compare.compared_sweeps import compare_sweeps
     from trilane.apps.compare.gate import as_json, judge
 
@@ -159,19 +173,19 @@ def _gates(asked: Sequence[str], slower: str | None) -> list[Gate]:
     return found
 
 
-def _say(judged: Sequence[Judged]) -> None:
+def _say(judged: Sequence[JudgedLimit]) -> None:
     """Say what each limit came to."""
     several = len({each.name for each in judged}) > 1
     for each in judged:
         said = without_controls(f"{each.name}: {each.said}" if several else each.said)
-        stderr_console().print(said, soft_wrap=True, markup=False)
+        say(said)
 
 
-def _leave(judged: Sequence[Judged]) -> None:
+def _leave(judged: Sequence[JudgedLimit]) -> None:
     """Leave with the exit code of the gate."""
-    from trilane.apps.compare.gate import Outcome, whole
+    from trilane.apps.compare.gate import LimitOutcome, whole
 
-    codes = {Outcome.KEPT: 0, Outcome.BROKEN: BROKEN, Outcome.UNKNOWN: CANNOT_TELL}
+    codes = {LimitOutcome.KEPT: 0, LimitOutcome.BROKEN: BROKEN, LimitOutcome.UNKNOWN: CANNOT_TELL}
     if code := codes[whole(judged)]:
         raise typer.Exit(code)
 
@@ -192,4 +206,271 @@ def _write_page(path: Path, comparisons: list[Comparison]) -> None:
     from trilane.writing import write_bytes
 
     write_bytes(path, page(comparisons).encode(), "choose another --html")
-    stderr_console().print(f"page: {path}", soft_wrap=True, markup=False)
+    say(f"page: {path}")
+
+
+#: Measures of which one statistic is shown even where nothing differs.
+ALWAYS = ("frame time", "latency", "instructions", "time of an instruction", "work", "busy")
+ALWAYS_STATISTICS = ("mean", "typical", "share")
+MOST_CHANGES = 12
+
+
+def comparison_lines(comparison: Comparison, show_all: bool) -> Iterator[str | Table]:
+    """Yield texts and tables of one comparison. `show_all`: also show figures that do not differ."""
+    from trilane.apps.compare.comparison import METHOD, bounds_text
+
+    yield f"{comparison.other.name} beside {comparison.base.name}"
+    yield f"verdict: {comparison.verdict}"
+    yield from comparison.unsure
+    if said := bounds_text(comparison.bounds):
+        yield said
+    most = len(comparison.changes) if show_all else MOST_CHANGES
+    if comparison.changes:
+        yield _change_table(comparison.changes[:most])
+    if len(comparison.changes) > most:
+        yield f"{len(comparison.changes) - most} more settings changed: --all shows them"
+    shown = [figure for figure in comparison.rows if show_all or _is_shown(figure, comparison)]
+    yield _figure_table(comparison, shown)
+    yield from _left_out(comparison, shown)
+    yield from comparison.notes
+    yield METHOD
+
+
+#: Why a configuration of a sweep has no partner.
+LEFT_OUT = {
+    "not_done": "not done in both",
+    "base_alone": "in the base alone",
+    "other_alone": "in the other alone",
+}
+
+
+def sweep_lines(comparison: SweepComparison, show_all: bool) -> Iterator[str | Table]:
+    """Yield texts and tables of two sweeps. `show_all`: also show trials that do not differ."""
+    from trilane.apps.compare.compared_sweeps import METHOD
+
+    yield f"{comparison.other} beside {comparison.base}: {len(comparison.pairs)} trials of equal configuration"
+    yield f"verdict: {comparison.verdict}"
+    if said := comparison.bound:
+        yield said
+    if comparison.changes:
+        yield _change_table(comparison.changes[:MOST_CHANGES])
+    shown = [pair for pair in comparison.pairs if show_all or pair.differs]
+    if shown:
+        yield _trial_table(shown)
+    if left := len(comparison.pairs) - len(shown):
+        more = "trial does" if left == 1 else "trials do"
+        yield f"{left} more {more} not differ, or it cannot be told: --all shows them"
+    for reason, names in comparison.left_out.items():
+        if names:
+            yield f"{LEFT_OUT[reason]}: {len(names)} ({', '.join(names[:4])}{', ...' * (len(names) > 4)})"
+    yield from comparison.notes
+    yield METHOD
+
+
+def _trial_table(pairs: Sequence[TrialPair]) -> Table:
+    """Return a table of the options that vary, the mean frame times, their change and its interval."""
+    from trilane.apps.compare.comparison import change_of, interval_of, setting
+    from trilane.apps.compare.rows import MS
+
+    names = [
+        name
+        for name in dict.fromkeys(name for pair in pairs for name in pair.options)
+        if len({str(pair.options.get(name)) for pair in pairs}) > 1
+    ] or ["trial"]
+    rows = []
+    for pair in pairs:
+        row = pair.frame_time
+        values = [setting(pair.options.get(name, pair.name)) for name in names]
+        figures = (f"{row.base:.4g}", f"{row.other:.4g}", change_of(row, MS), interval_of(row, MS))
+        rows.append((*values, *figures, str(pair.outcome)))
+    return _table((*names, "base, ms", "other, ms", "change", "95 % interval", "outcome"), rows)
+
+
+def _table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+    """Return a table whose cells are no markup."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(*titles)
+    for row in rows:
+        table.add_row(*map(Text, row))
+    return table
+
+
+def _left_out(comparison: Comparison, shown: Sequence[Figure]) -> Iterator[str]:
+    """Say how many figures the table leaves out: figures without a difference, then uncertain ones."""
+    from trilane.apps.compare.difference import Finding
+
+    left = [comparison.outcome(figure) for figure in comparison.rows if figure not in shown]
+    unknown = left.count(Finding.UNKNOWN)
+    if alike := len(left) - unknown:
+        yield f"{alike} more {'figure does' if alike == 1 else 'figures do'} not differ: --all shows them"
+    if unknown:
+        yield f"of {unknown} more {'figure' if unknown == 1 else 'figures'} it cannot be told: --all shows them"
+
+
+def _is_shown(figure: Figure, comparison: Comparison) -> bool:
+    return figure in comparison.differing or (figure.measure in ALWAYS and figure.statistic in ALWAYS_STATISTICS)
+
+
+def _change_table(changes: Sequence[Change]) -> Table:
+    from trilane.apps.compare.comparison import setting
+
+    rows = ((change.key, setting(change.base), setting(change.other)) for change in changes)
+    return _table(("changed", "base", "other"), rows)
+
+
+def _figure_table(comparison: Comparison, figures: list[Figure]) -> Table:
+    from trilane.apps.compare.comparison import change_of, interval_of, name_of, value_of
+
+    rows = []
+    for figure in figures:
+        row, unit = comparison.rows[figure], figure.unit
+        values = (value_of(row.base, unit), value_of(row.other, unit), change_of(row, unit), interval_of(row, unit))
+        rows.append((name_of(figure), figure.statistic, *values, str(comparison.outcome(figure))))
+    return _table(("figure", "statistic", "base", "other", "change", "95 % interval", "outcome"), rows)
+
+
+SUMMARY: Final = "GITHUB_STEP_SUMMARY"
+#: GitHub keeps at most 1 MiB of a step's summary.
+MAX_SUMMARY_BYTES: Final = 1 << 20
+#: Outcome of a limit -> level of its annotation.
+LEVELS: Final = {"kept": "notice", "broken": "error", "cannot tell": "warning"}
+
+
+def write_to_github(judged: Sequence[JudgedLimit], verdict: str) -> None:
+    """Write an annotation for each limit, and add a summary to the file that GITHUB_STEP_SUMMARY names, if any.
+
+    Raises BadInputError for a file that cannot be written.
+    """
+    for each in judged:
+        stderr_console().file.write(annotation(each) + "\n")
+    if not (name := os.environ.get(SUMMARY)):
+        return
+    try:
+        with Path(name).open("a", encoding="utf-8") as file:
+            file.write(summary(judged, verdict))
+    except OSError as error:
+        from trilane.writing import WRITABLE
+
+        raise BadInputError.of_os_error(f"{SUMMARY}={name}", error, WRITABLE) from None
+
+
+def annotation(judged: JudgedLimit) -> str:
+    """Return a workflow command, such as `::error title=slower=5%25 broken::infer takes longer`."""
+    title = f"{judged.gate.text} {judged.outcome}"
+    in_title = _escaped(title).replace(":", "%3A").replace(",", "%2C")
+    return f"::{LEVELS[judged.outcome]} title={in_title}::{_escaped(f'{judged.name}: {judged.reason}')}"
+
+
+def _escaped(text: str) -> str:
+    return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
+
+
+def summary(judged: Sequence[JudgedLimit], verdict: str) -> str:
+    """Return the summary: the gate's outcome, the verdict on the runs, and a table with a row for each limit.
+
+    It has as many rows as GitHub keeps.
+    """
+    from trilane.apps.compare.gate import whole
+
+    rows = [
+        f"| {_plain(each.name)} | {_plain(each.gate.text)} | {each.outcome} | {_plain(each.reason)} |\n"
+        for each in judged
+    ]
+    text = f"### Trilane: {whole(judged)}\n\n{_plain(verdict)}\n\n| run | limit | outcome | why |\n|---|---|---|---|\n"
+    for row in rows:
+        if len((text + row).encode()) > MAX_SUMMARY_BYTES:
+            break
+        text += row
+    return text + "\n"
+
+
+def _plain(text: str) -> str:
+    """Return `text` on one line, as Markdown that shows it as it is."""
+    return re.sub(r"([\\`*_{}\[\]<>()#+!|~&])", r"\\\1", " ".join(text.split()))
+
+
+EPILOG_REPORT = """\b
+Examples:
+  trilane report runs
+  trilane report runs/a runs/b --out a-and-b.html
+  trilane report sweeps/sizes --csv sizes.csv --parquet sizes.parquet
+  trilane report runs prediction.json --json
+"""
+SHOWN = (
+    *("name", "verdict", "bound", "trust", "other_programs", "frame_ms", "low_ms", "high_ms"),
+    *("psnr_db", "worst_psnr_db", "p1_psnr_db", "on_frontier", "error_source"),
+)
+
+PlacesArgument = Annotated[
+    list[Path],
+    typer.Argument(metavar="DIR...", help="Run folders, sweeps' folders, folders of these, saved predictions."),
+]
+OutOption = Annotated[Path, typer.Option(help="The page to write.")]
+TitleOption = Annotated[str, typer.Option(help="Heading of the page.")]
+CsvOption = Annotated[Path | None, typer.Option("--csv", help="Write the table as CSV too.")]
+ParquetOption = Annotated[Path | None, typer.Option("--parquet", help="Write the table as Parquet too (extra table).")]
+
+
+@app.command(epilog=EPILOG_REPORT)
+def report(
+    places: PlacesArgument,
+    out: OutOption = Path("report.html"),
+    title: TitleOption = "Runs and trials",
+    csv: CsvOption = None,
+    parquet: ParquetOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Write one page of many runs, predictions and trials, with the frontier of frame time against error.
+
+    The page is one self-contained file. It has a table to sort and filter, pictures to lay over each other, the
+    machines, and the command of each entry. An error comes from the run itself (`run --check`), else from its avatar's
+    validation; the table names the source.
+    """
+    from trilane.apps.compare.overview import read_entries, table_rows, write_csv, write_parquet
+    from trilane.apps.compare.overview_page import page
+    from trilane.writing import require_writable, write_bytes
+
+    targets = [target for target in (out, csv, parquet) if target is not None]
+    if len(set(targets)) < len(targets):
+        raise BadInputError("options", f"{targets[-1]} twice", "a file of its own for each")
+    entries = read_entries(places)
+    for target in targets:
+        require_writable(target)
+    if csv is not None:
+        write_csv(csv, entries)
+    if parquet is not None:
+        write_parquet(parquet, entries)
+    with stderr_console().status("the page"):
+        write_bytes(out, page(title, entries).encode(), "choose another --out")
+    rows = table_rows(entries)
+    if json:
+        print_json({"schema": 1, "entries": rows, "files": [str(target) for target in targets]})
+    else:
+        _print(entries, rows)
+    say("written: " + ", ".join(map(str, targets)))
+
+
+def _print(entries: list[Entry], rows: list[dict[str, Any]]) -> None:
+    from trilane.apps.compare.overview import told_choices
+
+    times, errors = ("frame, ms", "from, ms", "to, ms"), ("PSNR, dB", "worst", "1st pct.")
+    titles = ("entry", "verdict", "bound", "trust", "others", *times, *errors, "frontier", "where the error comes from")
+    cells = []
+    for row in rows:
+        share = row["other_programs"]
+        shown = row | {"other_programs": None if share is None else f"{100 * share:.1f} %"}
+        cells.append([_shown(shown[key]) for key in SHOWN])
+    stdout_console().print(_table(titles, cells))
+    for sentence in told_choices(entries):
+        print_line(sentence)
+    for entry in entries:
+        if entry.failure:
+            print_line(f"{entry.name}: {entry.failure}")
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else ""
+    return f"{value:.2f}" if isinstance(value, float) else "" if value is None else str(value)

@@ -77,12 +77,17 @@ def stdout_console() -> Console:
 
 def say(text: str) -> None:
     """Print a message, on one line however long it is."""
-    stderr_console().print(text, soft_wrap=True)
+    stderr_console().print(text, soft_wrap=True, markup=False)
+
+
+def print_line(text: str) -> None:
+    """Print a line of a result, however long it is."""
+    stdout_console().print(text, soft_wrap=True, markup=False)
 
 
 def note(text: str) -> None:
     """Print what a person should know although nothing is wrong, on one line."""
-    stderr_console().print(without_controls(f"note: {text}"), soft_wrap=True, markup=False)
+    say(without_controls(f"note: {text}"))
 
 
 @contextmanager

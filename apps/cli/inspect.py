@@ -1,18 +1,26 @@
-"""`trilane inspect`: what a file is, what was detected in it, and what to do if it is not usable.
+"""`trilane inspect`: what a file is, and what to do if it is not usable. `trilane times`: what other tools measured.
 
-Rule: this module shows what `trilane.apps.inspect` found; nothing is decided here.
+Rule: this module shows and writes what `trilane.apps.inspect` and `trilane.apps.imported_times` made of files; nothing
+is computed here but bars.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from trilane.apps.cli.commands import Commands, JsonOption
-from trilane.apps.cli.console import print_json, spinner, stderr_console, stdout_console, without_controls
+from trilane.apps.cli.console import note, print_json, print_line, say, spinner, stdout_console, without_controls
+from trilane.errors import BadInputError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from trilane.pipeline.measurements.measurement import Measurement
+    from trilane.pipeline.measurements.read_file import Measurements
 
 app = Commands()
 
@@ -42,7 +50,6 @@ def inspect(file: FileArgument, out: SheetOption = None, json: JsonOption = Fals
     Nothing is run. The sheet shows a skeleton or the path of a camera from three sides, or pictures.
     """
     from trilane.apps.inspect.inspect_file import inspect_file
-    from trilane.errors import BadInputError
     from trilane.writing import require_writable
 
     if out is not None:
@@ -57,9 +64,9 @@ def inspect(file: FileArgument, out: SheetOption = None, json: JsonOption = Fals
         print_json(document)
     else:
         for line in lines(without_controls(document)):
-            stdout_console().print(line, soft_wrap=True, markup=False)
+            print_line(line)
     if out is not None and sheet is None:
-        stderr_console().print(f"no sheet: nothing to draw of {document['what']}", soft_wrap=True, markup=False)
+        say(f"no sheet: nothing to draw of {document['what']}")
     if not found.usable:
         raise typer.Exit(UNUSABLE)
 
@@ -90,8 +97,8 @@ def lines(document: Mapping[str, Any]) -> Iterator[str]:
     for key, value in rows.items():
         if value:
             yield f"  {key}: {value}"
-    for note in document["notes"]:
-        yield f"  note: {note}"
+    for said in document["notes"]:
+        yield f"  note: {said}"
     if document["sheet"]:
         yield f"  sheet: {document['sheet']}"
     if document["advice"]:
@@ -121,3 +128,175 @@ def _joints(joints: Mapping[str, Any]) -> dict[str, str]:
 def _listed(names: list[str]) -> str:
     more = f" and {len(names) - MOST_JOINTS} more" if len(names) > MOST_JOINTS else ""
     return f"{len(names)}: {', '.join(names[:MOST_JOINTS])}{more}" if names else ""
+
+
+EPILOG_TIMES = """\b
+Examples:
+  trilane times profile.csv
+  trilane times onnxruntime_profile.json --name model_run --stage street.toml:segmenter
+  trilane times benchmark.txt --rows chip.csv --network seg.onnx --hardware dsp --precision int8
+  trilane times trace.pftrace --csv samples.csv
+
+\b
+Exit codes:
+  0 done, 2 a file of no known tool or without a usable time
+"""
+BARS, WIDTH = " ▁▂▃▄▅▆▇█", 16
+MOST_ROWS = 40
+
+FilesArgument = Annotated[
+    list[Path], typer.Argument(help="Files of other tools. The kind of each file is recognised by its content.")
+]
+NameOption = Annotated[str, typer.Option(help="Measurement for --stage or --rows; if not given, the only run.")]
+StageOption = Annotated[str | None, typer.Option(help="Write the measurement as the time of a stage, FILE.toml:STAGE.")]
+RowsOption = Annotated[
+    Path | None, typer.Option(help="Add the measurement to this table for `trilane profiles fit` (.csv).")
+]
+NetworkOption = Annotated[str | None, typer.Option(help="Measured network: its path from the folder of the table.")]
+HardwareOption = Annotated[
+    str | None, typer.Option(help="Unit that ran the network: cpu, gpu or dsp; if not given, as the file says, or dsp.")
+]
+PrecisionOption = Annotated[
+    str | None, typer.Option(help="Precision of the network: int8 (if not given), fp16 or fp32.")
+]
+RuntimeOption = Annotated[
+    str | None, typer.Option(help="Runtime of a tensor engine: tflite (if not given) or qnn_dlc.")
+]
+CsvOption = Annotated[Path | None, typer.Option("--csv", help="File for every single time (.csv).")]
+
+
+@app.command(epilog=EPILOG_TIMES)
+def times(
+    files: FilesArgument,
+    name: NameOption = "",
+    stage: StageOption = None,
+    rows: RowsOption = None,
+    network: NetworkOption = None,
+    hardware: HardwareOption = None,
+    precision: PrecisionOption = None,
+    runtime: RuntimeOption = None,
+    samples: CsvOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Read measurements of other tools, say what each time contains, and refuse rows that cannot be right. The formats:
+
+    QNN profiles, QHAS, ONNX Runtime, benchmark_model, LoadGen and MLPerf's app, TensorRT, AI Hub, ExecuTorch, Perfetto.
+    """
+    from trilane.apps.imported_times import document, one_of, samples_csv, stage_text, with_row
+    from trilane.pipeline.measurements.read_file import read_measurements
+    from trilane.writing import write_bytes
+
+    reads = [read_measurements(path) for path in files]
+    _check_results([*files, *([_stage_of(stage)[0]] if stage else []), rows, samples])
+    written: dict[Path, str] = {}
+    row_says: list[str] = []
+    if stage is not None:
+        path, name_of_stage = _stage_of(stage)
+        written[path] = stage_text(path, name_of_stage, *one_of(reads, name))
+    if rows is not None:
+        asked = {"unit": hardware, "precision": precision, "runtime": runtime}
+        written[rows], row_says = with_row(rows, *one_of(reads, name), network, asked)
+    if samples is not None:
+        written[samples] = samples_csv(reads)
+    for path, text in written.items():
+        write_bytes(path, text.encode())
+    if json:
+        print_json(document(reads))
+        for line in row_says:
+            note(line)
+        return
+    for read in reads:
+        _show(read)
+    for path in written:
+        print_line(f"written: {without_controls(str(path))}")
+    for line in row_says:
+        print_line(without_controls(line))
+
+
+def _check_results(paths: Sequence[Path | None]) -> None:
+    """Refuse a result that would replace a file that is read, or another result. Raises BadInputError."""
+    known: set[Path] = set()
+    for path in filter(None, paths):
+        if path.resolve() in known:
+            raise BadInputError(path, "the same file twice", "a file for each result", "choose another name")
+        known.add(path.resolve())
+
+
+def _stage_of(text: str) -> tuple[Path, str]:
+    path, colon, stage = text.rpartition(":")
+    if not colon or not path or not stage:
+        raise BadInputError("--stage", repr(text), "FILE.toml:STAGE, such as street.toml:segmenter")
+    return Path(path), stage
+
+
+def _show(read: Measurements) -> None:
+    console = stdout_console()
+    name = without_controls(str(read.path))
+    print_line(f"{name}: {read.tool}: {read.says}")
+    for kind in ("run", "wall", "layer"):
+        of_kind = [each for each in read.measurements if each.kind == kind]
+        if kind == "layer":
+            of_kind.sort(key=lambda each: -(each.share or 0) or -(each.mean_ms or 0))
+        if of_kind:
+            console.print(_table(kind, of_kind[:MOST_ROWS]))
+        if len(of_kind) > MOST_ROWS:
+            console.print(f"and {len(of_kind) - MOST_ROWS} more; --json has all")
+    hints = [f"{each.name}: {each.hint}" for each in read.measurements if each.hint]
+    skipped = [f"left aside: {reason} ({count})" for reason, count in read.skipped.items()]
+    refused = [f"refused: {each.row}: {each.reason}" for each in read.refused[:MOST_ROWS]]
+    if read.refused_count > len(refused):
+        refused.append(f"refused: {read.refused_count - len(refused)} more")
+    for line in (*hints, *skipped, *refused):
+        print_line(without_controls(line))
+
+
+def _table(kind: str, measurements: Sequence[Measurement]) -> Table:
+    """Return a row for each measurement, without the columns that none of them fills."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    cells = [_cells(each) for each in measurements]
+    columns = [name for name in cells[0] if any(row[name] for row in cells)]
+    table = Table(kind)
+    for name in columns:
+        table.add_column(name, no_wrap=name != "what")
+    for each, row in zip(measurements, cells, strict=True):
+        label = without_controls(each.name if len(each.name) <= 60 else f"{each.name[:40]}…{each.name[-19:]}")
+        table.add_row(escape(label), *(escape(row[name]) for name in columns))
+    return table
+
+
+def _cells(each: Measurement) -> dict[str, str]:
+    return {
+        "count": "" if each.count is None else str(each.count),
+        "mean, ms": _figure(each.mean_ms),
+        "sd": _figure(each.sd_ms),
+        "p50": _figure(each.p50_ms),
+        "p95": _figure(each.p95_ms),
+        "share": "" if each.share is None else f"{100 * each.share:.1f} %",
+        "distribution, ms": _distribution(each),
+        "on": without_controls(each.hardware),
+        "what": without_controls(each.what),
+    }
+
+
+def _figure(value: float | None) -> str:
+    return "" if value is None else f"{value:.4g}"
+
+
+def _distribution(measurement: Measurement) -> str:
+    """Draw the samples as bars from the least to the largest, or the figures of a distribution on a line."""
+    low, high = measurement.min_ms, measurement.max_ms
+    if low is None or high is None or high <= low:
+        return ""
+    if measurement.samples_ms:
+        counts = [0] * WIDTH
+        for ms in measurement.samples_ms:
+            counts[min(int((ms - low) / (high - low) * WIDTH), WIDTH - 1)] += 1
+        most = max(counts)
+        drawn = "".join(BARS[-(-count * (len(BARS) - 1) // most)] for count in counts)
+    else:
+        marks = {each: "|" for each in (measurement.p50_ms, measurement.p95_ms) if each is not None}
+        places = {min(int((at - low) / (high - low) * WIDTH), WIDTH - 1): mark for at, mark in marks.items()}
+        drawn = "".join(places.get(place, "-") for place in range(WIDTH))
+    return f"{low:.3g} {drawn} {high:.3g}"

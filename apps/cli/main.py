@@ -1,7 +1,8 @@
 """Entry point of the `trilane` command: the table of commands, the global options and the exit codes.
 
-Rule: each line of `COMMANDS` names a module with a Typer `app`, which is imported when its command is called. An error
-that a person can cause becomes one sentence on stderr and an exit code, never a traceback.
+Rule: each line of `COMMANDS` names a module with a Typer `app`, which is imported when its command is called. Nothing
+slow is imported before. An error that a person can cause becomes one sentence on stderr and an exit code, never a
+traceback.
 """
 
 from __future__ import annotations
@@ -12,11 +13,12 @@ import importlib
 import io
 import os
 import sys
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, NoReturn
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
-from trilane.apps.cli.lazy_group import lazy_group
 from trilane.apps.old_names import in_new_names
 from trilane.errors import TrilaneError, install_line, reason
 from trilane.machine import require_memory, shortage
@@ -26,20 +28,20 @@ from trilane.signals import interrupting
 COMMANDS = {
     "run": ("trilane.apps.cli.run", "Run a scene on the three units and write a run folder."),
     "predict": ("trilane.apps.cli.predict", "Predict frame time, idleness, heat and energy on a chip."),
-    "plan": ("trilane.apps.cli.plan", "Say what a scene models, what it leaves out, and the work this saves."),
+    "plan": ("trilane.apps.cli.explain", "Say what a scene models, what it leaves out, and the work this saves."),
     "explain": ("trilane.apps.cli.explain", "Say where the time of a run went."),
     "show": ("trilane.apps.cli.watch", "Show a finished run in a browser."),
     "watch": ("trilane.apps.cli.watch", "Show the live figures of a run in a terminal."),
     "trace": ("trilane.apps.cli.watch", "Write the timeline of a run for Perfetto or Chrome."),
     "compare": ("trilane.apps.cli.compare", "Say what differs between runs, by how much and why."),
-    "report": ("trilane.apps.cli.report", "Write one page of many runs, with frame times and image errors."),
+    "report": ("trilane.apps.cli.compare", "Write one page of many runs, with frame times and image errors."),
     "sweep": ("trilane.apps.cli.sweep", "Try many configurations of a command, on one machine or many."),
     "tune": ("trilane.apps.cli.tune", "Find the fastest configuration within given limits, in few trials."),
     "quality": ("trilane.apps.cli.quality", "Compare runtimes on a scene, and with float on hard cases."),
     "inspect": ("trilane.apps.cli.inspect", "Say what a file is, and what to do if it is not usable."),
     "init": ("trilane.apps.cli.init", "Write a first pipeline file that runs networks on a video."),
     "check": ("trilane.apps.cli.check", "Check a pipeline file: its graph, least period and memory."),
-    "times": ("trilane.apps.cli.times", "Read what other tools measured: runs, layers, traces."),
+    "times": ("trilane.apps.cli.inspect", "Read what other tools measured: runs, layers, traces."),
     "avatar": ("trilane.apps.cli.avatar", "Look into avatars, export and quantise their networks."),
     "body": ("trilane.apps.cli.body", "Look into body files, pose them, build one."),
     "profiles": ("trilane.apps.cli.profiles", "List, show, check and fit the hardware profiles."),
@@ -76,6 +78,25 @@ def command_of(name: str) -> Any:
     command = getattr(command, "commands", {}).get(name, command)  # small commands share a module
     command.name = name
     return command
+
+
+def lazy_group(lines: Mapping[str, str], command_of: Callable[[str], Any]) -> type[TyperGroup]:
+    """Return the class of a group of commands. A mistyped name is answered with the most similar ones.
+
+    `lines`: the line of each command for `--help`, by name. `command_of`: function that imports a command by its name.
+    """
+
+    class LazyGroup(TyperGroup):
+        def __init__(self, **settings: Any) -> None:
+            super().__init__(**settings)
+            # Stand-ins are enough for `--help`, completion and suggestions.
+            self.commands = {name: TyperCommand(name, help=line) for name, line in lines.items()}
+
+        def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+            name, stand_in, rest = super().resolve_command(ctx, args)
+            return name, None if name is None or stand_in is None else command_of(name), rest
+
+    return LazyGroup
 
 
 app = typer.Typer(

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from trilane.apps.cli.commands import Commands, JsonOption
-from trilane.apps.cli.console import print_json, stderr_console, stdout_console, without_controls
+from trilane.apps.cli.console import print_json, print_line, stderr_console, stdout_console, without_controls
 from trilane.errors import BadInputError
 from trilane.files import read_text
 from trilane.writing import WRITABLE, write_bytes
@@ -163,7 +163,7 @@ def fit(
     write_bytes(write, as_toml(result.numbers, head, f"trilane profiles fit --from {source}", count).encode())
     if not json:
         for line in (f"written: {write}", *_next_command(result, write, networks or source.parent)):
-            stdout_console().print(without_controls(line), markup=False, soft_wrap=True)
+            print_line(without_controls(line))
 
 
 def _next_command(result: ProfileFit | Calibrated, profile: Path, networks: Path) -> list[str]:
@@ -284,7 +284,7 @@ def _show_calibrated(result: Calibrated) -> None:
     before, after = (_median_error(getattr(row, key) for row in result.rows) for key in ("error_before", "error_after"))
     console.print(f"median error: {100 * before:.0f} % before, {100 * after:.0f} % on rows left out")
     for text in result.notes:
-        console.print(without_controls(f"note: {text}"), markup=False, soft_wrap=True)
+        print_line(without_controls(f"note: {text}"))
     numbers = Table("number", "value", "± %")
     for key, (value, spread) in result.numbers.items():
         numbers.add_row(key, f"{value:.4g}", f"{100 * spread:.0f}")

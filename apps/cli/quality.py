@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from trilane.apps.cli.commands import Commands, JsonOption, SceneArgument, SceneAvatarOption, SceneSizeOption
-from trilane.apps.cli.console import print_json, stderr_console, stdout_console, stdout_kept
+from trilane.apps.cli.console import print_json, print_line, say, stderr_console, stdout_console, stdout_kept
 from trilane.errors import BadInputError
 
 app = Commands()
@@ -149,12 +149,12 @@ def _hard_cases(names: list[str], as_json: bool) -> bool:
         marks = {source: f"[{number}]" for number, source in enumerate(dict.fromkeys(_sources(numbers)), start=1)}
         _print_rows([{**row, "from": marks[row["source"]]} for row in numbers], NUMBER_COLUMNS)
         for source, mark in marks.items():
-            stdout_console().print(f"{mark} bound: {source}", soft_wrap=True, markup=False)
+            print_line(f"{mark} bound: {source}")
         _print_rows(networks, HARD_COLUMNS)
-        stdout_console().print(f"{UNIT}; bound: {SOURCE}", soft_wrap=True, markup=False)
+        print_line(f"{UNIT}; bound: {SOURCE}")
     failed = [row for row in rows if not row["passed"]]
     for row in failed:
-        stderr_console().print(f"{row['name']}: {row['verdict']}", soft_wrap=True, markup=False)
+        say(f"{row['name']}: {row['verdict']}")
     return not failed
 
 
@@ -163,7 +163,7 @@ def _sources(rows: list[dict[str, Any]]) -> Iterator[str]:
 
 
 def _scene(scene: str, avatar: str | None, size: str | None, frames: int, names: list[str], as_json: bool) -> bool:
-    from trilane.apps.experiments.accuracy import runtime_differences
+    from trilane.apps.experiments.scene_pictures import runtime_differences
     from trilane.stages.configure import configure, required_machine
     from trilane.stages.run_options import RunOptions
 
@@ -182,7 +182,7 @@ def _scene(scene: str, avatar: str | None, size: str | None, frames: int, names:
         )
     out = [sentence for row in result["rows"] for sentence in _out_of_bounds(row, result["bounds"])]
     for sentence in out:
-        stderr_console().print(sentence, soft_wrap=True, markup=False)
+        say(sentence)
     return not out
 
 
@@ -237,7 +237,7 @@ def _show_by_cause(scene: str, request: dict[str, Any], frames: int, files: _Cau
     else:
         _print_causes(result)
     if out is not None:
-        stderr_console().print(f"heat maps: {out}", soft_wrap=True, markup=False)
+        say(f"heat maps: {out}")
 
 
 def _tracked(numbers: Sequence[int]) -> Iterable[int]:
@@ -252,10 +252,9 @@ def _print_causes(result: dict[str, Any]) -> None:
 
     console = stdout_console()
     config, sums, whole = result["config"], result["sums"], result["whole"]
-    console.print(
+    print_line(
         f"{config['scene']}, plan {config['plan']}, size {config['size']}, {config['runtime']}: "
         f"frames {', '.join(map(str, result['frames']))}; measured in this run",
-        soft_wrap=True,
     )
     shown = [name for name in HEADS if name != "lpips" or whole["lpips"] is not None]
     heads = (HEADS[name] for name in shown)
@@ -269,7 +268,7 @@ def _print_causes(result: dict[str, Any]) -> None:
         alone.add_row(f"{name} against truth", *_cells(figures, shown), "")
     console.print(alone)
     if result["empty_frames"]:
-        console.print(f"nobody is in view in frames {', '.join(map(str, result['empty_frames']))}", soft_wrap=True)
+        print_line(f"nobody is in view in frames {', '.join(map(str, result['empty_frames']))}")
     order = Table("in order", "MAE adds", "mean square adds", "share", "so far: MAE", "PSNR dB", "SSIM", "FLIP")
     for row in result["causes"]:
         adds, far = row["adds"], row["so_far"]
@@ -278,7 +277,7 @@ def _print_causes(result: dict[str, Any]) -> None:
         order.add_row(row["cause"], _number(adds["mae"]), _number(adds["square"]), f"{share:.1%}", *so_far)
     console.print(order)
     for line in _sums(sums, whole, result):
-        console.print(line, soft_wrap=True, markup=False)
+        print_line(line)
 
 
 def _sums(sums: dict[str, Any], whole: dict[str, Any], result: dict[str, Any]) -> list[str]:

@@ -1,27 +1,46 @@
 """`trilane run`: a scene through the three units, to a run folder and a table.
 
-Rule: this file talks to the person; `trilane.apps.run.asked_run` does the work.
+Rule: this file talks to the person; `trilane.apps.run.asked_run` does the work. Every figure of the table is one of
+report.json's, and its source stands below the table. A figure that was not measured is a dash, and one that rests on
+too few frames says so.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from trilane.apps.cli.commands import Commands, JsonOption, PortOption, with_options
-from trilane.apps.cli.console import print_json, print_verdict, shown_messages, stderr_console, stdout_console
+from trilane.apps.cli.console import print_json, print_verdict, say, shown_messages, stderr_console, stdout_console
 from trilane.errors import BadInputError
 from trilane.stages.run_options import RunOptions
+from trilane.units import COMPUTED, MEASURED, NO_FIGURES
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
+    from rich.table import Table
 
+    from trilane.apps.run.report import Check, FrameErrors, Made, PaceComparison, Report
     from trilane.apps.run.run_job import Hooks, RunOutcome
+    from trilane.pipeline.run_metrics import (
+        Caps,
+        FrameCounts,
+        MovedBytes,
+        PathShare,
+        PolicyMetrics,
+        StageTimes,
+        Temperature,
+        TimeSummary,
+        UnitShares,
+    )
+
+    Rows = Iterator[tuple[str, str, list[str]]]
 
 app = Commands()
 
@@ -111,16 +130,11 @@ def _run_live(options: RunOptions, command: tuple[str, ...], port: int | None) -
     from trilane.apps.dashboard.access import require_server
 
     require_server()
+    from trilane.apps.dashboard.live_run import run_file_live, run_live
     from trilane.pipeline.pipeline_file import is_pipeline_file
 
-    tell = lambda text: stderr_console().print(text, soft_wrap=True, markup=False)  # noqa: E731
-    if is_pipeline_file(Path(options.scene)):
-        from trilane.apps.dashboard.live_file import run_file_live
-
-        return run_file_live(options, _hooks, command, port, tell)
-    from trilane.apps.dashboard.live_run import run_live
-
-    return run_live(options, _hooks, command, port, tell)
+    run = run_file_live if is_pipeline_file(Path(options.scene)) else run_live
+    return run(options, _hooks, command, port, say)
 
 
 def _print_outcome(outcome: RunOutcome, as_json: bool, with_table: bool) -> None:
@@ -133,11 +147,280 @@ def _print_outcome(outcome: RunOutcome, as_json: bool, with_table: bool) -> None
     else:
         print_verdict(verdict_of(report, str(outcome.folder)).lines())
         if with_table:
-            from trilane.apps.cli.run_table import run_table
-
             stdout_console().print(run_table(report))
-    stderr_console().print(f"run folder: {outcome.folder}", soft_wrap=True, markup=False)
+    say(f"run folder: {outcome.folder}")
     for message in shown_messages(report.messages, report.failure):
-        stderr_console().print(f"in the run: {message}", soft_wrap=True, markup=False)
+        say(f"in the run: {message}")
     if report.failure:
-        stderr_console().print(f"the run failed: {report.failure}", soft_wrap=True, markup=False)
+        say(f"the run failed: {report.failure}")
+
+
+DASH = "–"
+IDLE = ("starved", "blocked", "throttled", "preempted", "overhead")
+UNSAID = "the report does not say where they come from"
+STATISTICS = ("mean", "p50", "p90", "p95", "p99", "max")
+TOO_SHORT = "too short to tell"
+TOO_FEW = " *"
+
+
+@cache
+def needed() -> dict[str, int]:
+    """Return how many samples each percentile needs."""
+    from trilane.scheduler.stats import samples_needed
+
+    return {name: samples_needed(int(name[1:]) / 100) for name in ("p90", "p95", "p99")}
+
+
+def too_few_note() -> str:
+    """Say what the mark at a percentile means."""
+    return f"{TOO_FEW} of too few frames: " + ", ".join(f"{name} needs {count}" for name, count in needed().items())
+
+
+def run_table(report: Report) -> Table:
+    """Return rows of stages, units, times and rates; a column for the run and one for its baseline."""
+    from rich.table import Table
+
+    runs: list[PolicyMetrics] = [report, report.baseline] if report.baseline else [report]
+    table = Table(title=_title(report), title_justify="left", caption=_caption(report), caption_justify="left")
+    table.add_column("")
+    table.add_column("")
+    for run in runs:
+        table.add_column(f"{run.policy}, {run.frames.presented} frames", justify="right")
+    for section in (_stage_rows, _byte_rows, _unit_rows, _core_rows, _time_rows, _rate_rows):
+        for name, measure, cells in section(runs):
+            table.add_row(name, measure, *cells)
+        table.add_section()
+    return table
+
+
+def _title(report: Report) -> str:
+    scene = report.config["scene"]
+    if "pipeline" in report.config:
+        return f"Pipeline {scene['name']}: {len(report.stages)} stages"
+    return f"Scene {scene['name']}: {scene['output']['width']}x{scene['output']['height']}, tensor size {scene['size']}"
+
+
+def _caption(report: Report) -> str:
+    from rich.markup import escape
+
+    cpu, gl = report.machine.cpu, report.machine.gl
+    cores = ", ".join(f"{unit} {','.join(map(str, shares.cores))}" for unit, shares in report.units.items())
+    lines = [
+        f"stages, units, times, rates: {MEASURED}",
+        f"{cpu.model} ({' '.join(cpu.flags)}); cores: {cores}; idle cores {report.idle_cores}",
+    ]
+    if "runtime" in report.config:
+        lines.append(f"network on {report.config['runtime']}; OpenGL on {gl.renderer if gl else DASH}")
+    if report.made:
+        lines.insert(0, _made(report.made))
+    if report.frames.skipped:
+        lines.append(_skipped(report))
+    lines.append("in brackets: 95 % interval, by the scatter of this run's frames; two runs may differ by more")
+    runs: list[PolicyMetrics] = [report, report.baseline] if report.baseline else [report]
+    summaries = [times for run in runs for times in (run.frame_time_ms, run.latency_ms)]
+    if any(_too_few(times, name) for times in summaries for name in needed()):
+        lines.append(too_few_note().strip())
+    if report.pace:
+        lines.append(_pace(report.pace))
+    if report.caps.performance_profile:
+        lines.append(_caps(report.caps, report.temperature_c))
+    if report.check:
+        lines += _check(report.check)
+    lines += [accuracy_line(name, facts) for name, facts in report.accuracy.items()]
+    return escape("\n".join(lines))
+
+
+def _made(made: Made) -> str:
+    revision = f" at {made.revision[:10]}{', modified' if made.modified else ''}" if made.revision else ""
+    return f"{made.at}: trilane {made.trilane or DASH}{revision}"
+
+
+def _pace(pace: PaceComparison) -> str:
+    slower = ", ".join(f"{stage} {count}" for stage, count in pace.host_slower.items()) or "none"
+    slow_motion = f", {pace.slow_motion:g} times slower" if pace.slow_motion != 1 else ""
+    return (
+        f"held to {pace.profile}{slow_motion}: {_number(pace.measured_ms, 2)} ms a frame ({MEASURED}), in virtual time "
+        f"{_number(pace.virtual_ms, 2)} ms ({COMPUTED}), ratio {_number(pace.ratio, 3)}; jobs too slow here: {slower}"
+    )
+
+
+def _check(check: Check) -> list[str]:
+    """Return a line for each thing that the frames were compared with."""
+    errors = [check, *([check.float_path] if check.float_path else [])]
+    return [f"of this run, {check.frames} frames against {_errors(each)} ({MEASURED})" for each in errors]
+
+
+def _errors(found: FrameErrors) -> str:
+    return (
+        f"{found.against}: PSNR mean {found.psnr_db:.1f} dB, 1st percentile {_number(found.p1_psnr_db, 1)}, worst "
+        f"{found.worst_psnr_db:.1f}; MAE {found.mae:.2f} of 255; FLIP {found.flip:.3f}; IoU of all but background "
+        f"{found.iou:.3f}"
+    )
+
+
+def _caps(caps: Caps, temperature: Temperature) -> str:
+    duties = ", ".join(f"{unit} {cap.duty_mean:.0%}" for unit, cap in caps.units.items())
+    return (
+        f"capped as {caps.performance_profile}: duty cycles {duties}, which is the most that units may work; lowered "
+        f"further for heat {caps.throttled_share:.0%} of the time; {temperature.kind}: at most "
+        f"{_number(temperature.junction_max)} C ({COMPUTED})"
+    )
+
+
+def accuracy_line(name: str, facts: Mapping[str, Any]) -> str:
+    """Say how wrong an avatar's pictures are and where the figures come from; else why there are none.
+
+    A report of an older Trilane does not say where its figures come from, so they are not shown.
+    """
+    source = facts.get("source", NO_FIGURES)
+    if source == NO_FIGURES:
+        return f"avatar {name}: {NO_FIGURES} of accuracy: {facts.get('why', UNSAID)}"
+    bands = ", ".join(f"{band} {value:.1f}" for band, value in facts["psnr_db_by_band"].items())
+    body = f"; of the body alone {facts['body_psnr_db']:.1f}" if "body_psnr_db" in facts else ""
+    return (
+        f"avatar {name}: PSNR on held-out views before random backgrounds, dB: {bands}{body}{_worst(facts)}; "
+        f"{facts['see_through']:.1%} of the inside lets more than a tenth through; mask IoU {facts['iou']:.3f} "
+        f"({source}, on {facts['runtime']} at tensor size {facts['size']})"
+    )
+
+
+def _worst(facts: Mapping[str, Any]) -> str:
+    if "worst" not in facts:
+        return ""
+    return f"; worst of {facts['samples']} views (seeds {', '.join(facts['by_seed'])}) {facts['worst']['psnr_db']:.1f}"
+
+
+def _stage_rows(runs: Sequence[PolicyMetrics]) -> Rows:
+    for stage, times in runs[0].stages.items():
+        cells = [_service_and_wait(run.stages.get(stage)) for run in runs]
+        yield f"{stage} ({times.unit})", "service + wait, ms", cells
+
+
+def _service_and_wait(times: StageTimes | None) -> str:
+    return f"{_number(times.service_ms.mean)} + {_number(times.wait_ms.mean)}" if times else DASH
+
+
+def _byte_rows(runs: Sequence[PolicyMetrics]) -> Rows:
+    """Yield rows of the bytes that each stage moves for a frame, and of their sum beside the least; else none."""
+    if not any(run.bytes for run in runs):
+        return
+    counting = [stage for stage, times in runs[0].stages.items() if times.bytes]
+    rows = [" ".join(_megabytes(_bytes_of(run, stage)) for stage in counting) for run in runs]
+    yield "moved a frame", f"{' '.join(counting)}, MB", rows
+    yield "", "all, MB (times the least); GB/s", [_all_moved(run) for run in runs]
+
+
+def _bytes_of(run: PolicyMetrics, stage: str) -> MovedBytes | None:
+    return run.stages[stage].bytes if stage in run.stages else None
+
+
+def _all_moved(run: PolicyMetrics) -> str:
+    if run.bytes is None:
+        return DASH
+    return f"{_megabytes(run.bytes)} ({_number(run.bytes.ratio, 2)}); {_number(run.bytes.gb_per_second, 2)}"
+
+
+def _megabytes(moved: MovedBytes | None) -> str:
+    return DASH if moved is None else f"{moved.all / 1e6:.2f}"
+
+
+def _unit_rows(runs: Sequence[PolicyMetrics]) -> Rows:
+    for unit in runs[0].units:
+        joins = "join" in runs[0].units[unit].idle.model_fields_set
+        causes = (*IDLE, "join") if joins else IDLE
+        yield unit, "busy / " + " ".join(causes) + ", %", [_shares(run.units.get(unit), causes) for run in runs]
+
+
+def _shares(unit: UnitShares | None, causes: Sequence[str]) -> str:
+    if unit is None:
+        return DASH
+    return f"{_percent(unit.busy)} / " + " ".join(_percent(getattr(unit.idle, cause)) for cause in causes)
+
+
+def _core_rows(runs: Sequence[PolicyMetrics]) -> Rows:
+    """Yield the CPU time of the units of each set of cores; nothing for a report without such figures."""
+    for index, first in enumerate(runs[0].core_shares):
+        shares = [run.core_shares[index] if index < len(run.core_shares) else None for run in runs]
+        name = f"core{'s' if len(first.cores) > 1 else ''} {','.join(map(str, first.cores))}"
+        cells = [_percent(share.cpu if share else None) for share in shares]
+        yield name, f"CPU time of {', '.join(first.units)}, %", cells
+
+
+def _percent(share: float | None) -> str:
+    return DASH if share is None else f"{100 * share:.0f}"
+
+
+def _time_rows(runs: Sequence[PolicyMetrics]) -> Rows:
+    for key, name in (("frame_time_ms", "frame time"), ("latency_ms", "latency")):
+        for statistic in STATISTICS:
+            cells = [_time(run, getattr(run, key), statistic) for run in runs]
+            yield name if statistic == "mean" else "", f"{statistic}, ms", cells
+
+
+def _time(run: PolicyMetrics, times: TimeSummary, statistic: str) -> str:
+    value = _number(_of_several(run, getattr(times, statistic)))
+    if statistic == "mean" and times is run.frame_time_ms:
+        return f"{value} ({_between(run.frame_time_ms.mean_low, run.frame_time_ms.mean_high)})"
+    return value + (TOO_FEW if _too_few(times, statistic) else "")
+
+
+def _too_few(times: TimeSummary, statistic: str) -> bool:
+    """Say whether a percentile rests on too few samples; an older report does not count them."""
+    return times.samples is not None and times.samples < needed().get(statistic, 0)
+
+
+def _between(low: float | None, high: float | None) -> str:
+    """Return a 95 % interval."""
+    return TOO_SHORT if low is None or high is None else f"{_number(low)} to {_number(high)}"
+
+
+def _skipped(report: Report) -> str:
+    """Say which of the presented frames needed no new picture of the avatars, and why."""
+    frames, composite = report.frames, report.stages["composite"]
+    means = report.stage_metrics.get("composite", {})
+    why = {"reused": "reused", "nobody on the screen": "nobody", "without their picture": "stale"}
+    counts = {said: round(means.get(key, 0.0) * composite.jobs) for said, key in why.items()}
+    parts = ", ".join(f"{said} {count}" for said, count in counts.items() if count)
+    return f"skipped raster and infer: {frames.skipped} of {frames.presented} frames ({parts})"
+
+
+def _of_several(run: PolicyMetrics, value: float | None) -> float | None:
+    """Return a frame time or a latency; None for a single frame, which gives no statistic."""
+    return value if run.frames.presented > 1 else None
+
+
+def _rate_rows(runs: Sequence[PolicyMetrics]) -> Rows:
+    rates = [f"{_number(_of_several(run, run.fps))} ({_between(run.fps_low, run.fps_high)})" for run in runs]
+    yield "rate", "frames per second", rates
+    yield "efficiency", "slowest unit's work / frame time", [_number(run.efficiency, 2) for run in runs]
+    yield "", "busiest core's work / frame time", [_number(run.core_efficiency, 2) for run in runs]
+    yield "", "all work / time of all cores", [_number(run.machine_efficiency, 2) for run in runs]
+    units, stages = ([getattr(run.bound, kind, None) for run in runs] for kind in ("unit", "stage"))
+    is_slowed = any(part is not None and part.cost is not None for part in units)
+    what = "% longer if 20 % slower" if is_slowed else "% of the path (95 % interval)"
+    yield "bound", f"unit, {what}", [_bounds(part, is_slowed=is_slowed) for part in units]
+    yield "", f"stage, {what}", [_bounds(part, is_slowed=is_slowed) for part in stages]
+    yield "frames", "lost + dropped + not begun", [_left_out(run.frames) for run in runs]
+    yield "", "deadline misses", [str(run.deadline_misses) for run in runs]
+
+
+def _left_out(frames: FrameCounts) -> str:
+    not_begun = DASH if frames.not_begun is None else frames.not_begun
+    return f"{frames.lost} + {sum(frames.dropped.values())} + {not_begun}"
+
+
+def _bounds(part: PathShare | None, *, is_slowed: bool) -> str:
+    """Return what slowing a unit or a stage costs, or its share of the path where that is not known."""
+    if part is None:
+        return DASH
+    if part.cost is None:
+        value, low, high = part.share, part.share_low, part.share_high
+    else:
+        value, low, high = part.cost, part.cost_low, part.cost_high
+    between = "" if low is None or high is None else f" ({_percent(low)} to {_percent(high)})"
+    of_path = " of the path" if is_slowed and part.cost is None else ""
+    return f"{part.names if between else part.name} {_percent(value)}{between}{of_path}"
+
+
+def _number(value: float | None, digits: int = 1) -> str:
+    return DASH if value is None else f"{value:.{digits}f}"

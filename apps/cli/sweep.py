@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from trilane.apps.cli.commands import Commands, JsonOption
-from trilane.apps.cli.console import print_json, stderr_console, stdout_console, stdout_kept
+from trilane.apps.cli.console import print_json, print_line, say, stderr_console, stdout_console, stdout_kept
 from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -220,7 +220,7 @@ def _run(
         print_json(document)
     else:
         print_summary(document, definition, records)
-    stderr_console().print(f"sweep folder: {folder}", soft_wrap=True, markup=False)
+    say(f"sweep folder: {folder}")
     return bool(ended["counts"]["failed"] or ended["counts"]["lost"])
 
 
@@ -255,7 +255,7 @@ def _say_interrupted(trials: Sequence[Trial], store: Store) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # what is left to do is to say so
     ended = sum(is_ended(store.done.get(trial.id)) for trial in trials)
     text = f"interrupted: {ended} of {len(trials)} trials are done; --resume goes on ({store.folder})"
-    stderr_console().print(text, soft_wrap=True, markup=False)
+    say(text)
 
 
 def _print_planned(trials: Sequence[Trial], as_json: bool) -> None:
@@ -276,39 +276,26 @@ def seconds_left(elapsed_s: float, ended: int, left: int) -> float:
 @contextmanager
 def progress(left: int, whole: int) -> Iterator[Callable[[Mapping[str, Any]], None]]:
     """Yield a function to call for each trial that ended. `left`: number of the `whole` trials that are not done."""
-    console = stderr_console()
-    if not console.is_terminal:
-        yield _plain(console, left, whole)
-        return
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+    console = stderr_console()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[left]}"))
-    with Progress(*columns, console=console) as bar:
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("trials", total=whole, completed=whole - left, left="")
         begin, ended = time.monotonic(), 0
 
         def told(record: Mapping[str, Any]) -> None:
             nonlocal ended
             ended += 1
-            if record["status"] != "done":
+            remaining = f"{_time(seconds_left(time.monotonic() - begin, ended, left - ended))} left"
+            done = whole - left + ended
+            if not console.is_terminal:
+                console.print(f"{done}/{whole} {_line(record)}; {remaining}", soft_wrap=True, markup=False)
+            elif record["status"] != "done":
                 console.print(_line(record), soft_wrap=True, markup=False)
-            text = f"{_time(seconds_left(time.monotonic() - begin, ended, left - ended))} left"
-            bar.update(task, completed=whole - left + ended, left=text)
+            bar.update(task, completed=done, left=remaining)
 
         yield told
-
-
-def _plain(console: Any, left: int, whole: int) -> Callable[[Mapping[str, Any]], None]:
-    begin, ended = time.monotonic(), 0
-
-    def told(record: Mapping[str, Any]) -> None:
-        nonlocal ended
-        ended += 1
-        remaining = _time(seconds_left(time.monotonic() - begin, ended, left - ended))
-        place = f"{whole - left + ended}/{whole}"
-        console.print(f"{place} {_line(record)}; {remaining} left", soft_wrap=True, markup=False)
-
-    return told
 
 
 def _line(record: Mapping[str, Any]) -> str:
@@ -356,10 +343,10 @@ def print_summary(document: Mapping[str, Any], definition: Definition, records: 
     if again := [row for row in document["trials"] if row.get("repeated")]:
         unsure = sum(bool(row["unsure"]) for row in again)
         disturbed = f"the machine was not quiet: runs done again: {len(again)}, UNSURE still: {unsure}"
-        stdout_console().print(disturbed, soft_wrap=True, markup=False)
+        print_line(disturbed)
     errors = Counter((row["status"], row["error"]) for row in document["trials"] if row["error"])
     for (status, error), count in errors.items():
-        stdout_console().print(f"{count} {status}: {error}", soft_wrap=True, markup=False)
+        print_line(f"{count} {status}: {error}")
 
 
 def _answer(result: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from trilane.apps.cli.commands import Commands, JsonOption
-from trilane.apps.cli.console import print_json, stderr_console, stdout_console
+from trilane.apps.cli.console import print_json, print_line, say, stdout_console
 from trilane.apps.cli.sweep import (
     ENDING,
     INTERRUPTED,
@@ -135,7 +135,7 @@ def tune(
         print_json(document)
     else:
         _print(document, list(definition.axes))
-    stderr_console().print(f"sweep folder: {folder}", soft_wrap=True, markup=False)
+    say(f"sweep folder: {folder}")
     raise typer.Exit(NOTHING_KEEPS if document["best"] is None else 0)
 
 
@@ -221,7 +221,7 @@ def _tune(
                 tune(search, do, budget, together, short)
         except KeyboardInterrupt:
             said = f"interrupted: {len(search.tried)} of {budget} configurations are tried; --resume goes on ({folder})"
-            stderr_console().print(said, soft_wrap=True, markup=False)
+            say(said)
             raise typer.Exit(INTERRUPTED) from None
         known = {trial.id: store.done[trial.id] for trial in space.trials if trial.id in store.done}
     return {
@@ -275,29 +275,29 @@ def _print(document: Mapping[str, Any], axes: Sequence[str]) -> None:
         _print_frontier(document, axes)
     left, rows = document["not_tried"], document["trials"]
     untried = "".join(f"; no trial with {name} {', '.join(map(str, each))}" for name, each in left["values"].items())
-    said = partial(stdout_console().print, soft_wrap=True, markup=False)
-    said(f"{len(rows)} of {left['of']} configurations tried, {left['count']} not{untried}; {document['clock']} clock")
+    print_line(
+        f"{len(rows)} of {left['of']} configurations tried, {left['count']} not{untried}; {document['clock']} clock"
+    )
     for status in ("failed", "lost", "pruned"):
         these = [row for row in rows if row["status"] == status]
         errors = "; ".join(dict.fromkeys(row["error"] for row in these if row["error"]))
         if these:
-            said(f"{len(these)} {status}" + (f": {errors}" if errors else ""))
+            print_line(f"{len(these)} {status}" + (f": {errors}" if errors else ""))
 
 
 def _print_answer(document: Mapping[str, Any], axes: Sequence[str]) -> None:
-    said = partial(stdout_console().print, soft_wrap=True, markup=False)
     shown, head = document["best"], "best"
     if shown is None:
         shown = document["nearest"]
         if shown is None:
-            said("no trial has the figures that are asked for")
+            print_line("no trial has the figures that are asked for")
             return
-        said(f"no configuration that was tried keeps {', '.join(document['keep'])}")
+        print_line(f"no configuration that was tried keeps {', '.join(document['keep'])}")
         head = f"nearest, misses {', '.join(shown['misses'])}"
-    said(f"{head}: {words_text({name: shown['options'][name] for name in axes})}: {_figures(shown['metrics'])}")
-    said(shlex.join(shown["command"]))
+    print_line(f"{head}: {words_text({name: shown['options'][name] for name in axes})}: {_figures(shown['metrics'])}")
+    print_line(shlex.join(shown["command"]))
     for reason in shown["unsure"]:
-        said(f"UNSURE: {reason}")
+        print_line(f"UNSURE: {reason}")
 
 
 def _print_frontier(document: Mapping[str, Any], axes: Sequence[str]) -> None:

@@ -23,7 +23,7 @@ from trilane.apps.compare.comparison import (
     interval_of,
 )
 from trilane.apps.compare.difference import ALPHA, LEAST_FRAMES, Difference, Finding, combined, rejected
-from trilane.apps.compare.gate import Pair
+from trilane.apps.compare.gate import GatedPair
 from trilane.apps.compare.rows import BUSY_MACHINE, FRAME_TIME, MS, Figure, rows_of
 from trilane.apps.compare.sides import Change, ComparedRun, RunKind, Side, changes, read_told
 from trilane.apps.run.report import Report
@@ -54,7 +54,7 @@ class TrialPair:
     runs: int
     frame_time: Difference
     differs: bool
-    sides: Pair
+    sides: GatedPair
     bounds: Bounds
 
     @property
@@ -190,12 +190,12 @@ def _compared(
     return SweepComparison(base, other, pairs, combined(rows), left, shared, tuple(_notes(documents)))
 
 
-def _pair(name: str, base: Side, other: Side) -> Pair:
+def _pair(name: str, base: Side, other: Side) -> GatedPair:
     """Return the figures of a trial. Raises BadInputError for one without frame times."""
     rows = rows_of(base, other)
     if MEAN not in rows:
         raise BadInputError(base.name, "trials without a frame time", "a sweep of `run` or `predict`")
-    return Pair(name, base, other, rows, tuple(changes(base.runs[0].document, other.runs[0].document)))
+    return GatedPair(name, base, other, rows, tuple(changes(base.runs[0].document, other.runs[0].document)))
 
 
 def _configurations(folder: Path) -> dict[str, dict[int, Mapping[str, Any]]]:

@@ -47,7 +47,7 @@ WALL: Final = (FRAME_TIME, LATENCY)
 MOST_SAID: Final = 4
 
 
-class Outcome(StrEnum):
+class LimitOutcome(StrEnum):
     """The outcome of a limit."""
 
     KEPT = "kept"
@@ -55,7 +55,7 @@ class Outcome(StrEnum):
     UNKNOWN = "cannot tell"
 
 
-class Metric(NamedTuple):
+class GateMetric(NamedTuple):
     """A figure that may have a limit.
 
     `says`: what breaks the limit. `of`: measures and their statistics. `unit`: unit of the limit. `is_timed`: whether
@@ -71,7 +71,7 @@ class Metric(NamedTuple):
 
 #: Name in --fail-if: its metric. A share of the frames has a limit in points of percent.
 METRICS: Final = {
-    "slower": Metric(
+    "slower": GateMetric(
         "frames or the jobs of any stage take longer",
         (
             (FRAME_TIME, "mean"),
@@ -82,15 +82,15 @@ METRICS: Final = {
             (SERVICE, "mean"),
         ),
     ),
-    "frame-time": Metric("frames take longer in the mean", ((FRAME_TIME, "mean"),)),
-    "frame-time-p99": Metric("the slowest 1 % of the frames take longer", ((FRAME_TIME, "p99"),)),
-    "latency": Metric("frames are shown later in the mean", ((LATENCY, "mean"),)),
-    "latency-p99": Metric("the latest 1 % of the frames are shown later", ((LATENCY, "p99"),)),
-    "instructions": Metric("a stage executes more instructions", ((INSTRUCTIONS, "mean"),), is_timed=False),
-    "cpu": Metric("a stage takes more CPU time", ((CPU, "typical"), (CPU, "mean"))),
-    "lost": Metric("more of the frames are lost or dropped", ((LOST, "share"), (DROPPED, "share"))),
-    "psnr": Metric("the frames of --check are worse in the mean", ((CHECKED, "psnr_db"),), DECIBELS, False, -1),
-    "worst-psnr": Metric("the worst frame of --check is worse", ((CHECKED, "worst_psnr_db"),), DECIBELS, False, -1),
+    "frame-time": GateMetric("frames take longer in the mean", ((FRAME_TIME, "mean"),)),
+    "frame-time-p99": GateMetric("the slowest 1 % of the frames take longer", ((FRAME_TIME, "p99"),)),
+    "latency": GateMetric("frames are shown later in the mean", ((LATENCY, "mean"),)),
+    "latency-p99": GateMetric("the latest 1 % of the frames are shown later", ((LATENCY, "p99"),)),
+    "instructions": GateMetric("a stage executes more instructions", ((INSTRUCTIONS, "mean"),), is_timed=False),
+    "cpu": GateMetric("a stage takes more CPU time", ((CPU, "typical"), (CPU, "mean"))),
+    "lost": GateMetric("more of the frames are lost or dropped", ((LOST, "share"), (DROPPED, "share"))),
+    "psnr": GateMetric("the frames of --check are worse in the mean", ((CHECKED, "psnr_db"),), DECIBELS, False, -1),
+    "worst-psnr": GateMetric("the worst frame of --check is worse", ((CHECKED, "worst_psnr_db"),), DECIBELS, False, -1),
 }
 #: Why there may be no figure.
 ABSENT: Final = {
@@ -107,7 +107,7 @@ class Gate(NamedTuple):
     text: str
 
     @property
-    def metric(self) -> Metric:
+    def metric(self) -> GateMetric:
         return METRICS[self.name]
 
 
@@ -125,7 +125,7 @@ def read_gate(text: str, option: str = "--fail-if") -> Gate:
 
 
 @dataclass(frozen=True)
-class Pair:
+class GatedPair:
     """Two sides that are judged. `rows`: their figures. `changes`: settings and facts of the machine that changed."""
 
     name: str
@@ -150,7 +150,7 @@ class Weighed(NamedTuple):
     most: float
     limit: float
     probability: float
-    outcome: Outcome = Outcome.UNKNOWN
+    outcome: LimitOutcome = LimitOutcome.UNKNOWN
     runs: float | None = None
 
     @property
@@ -171,7 +171,7 @@ class Weighed(NamedTuple):
         return f"{change}, {100 * expm1(left):+.1f} % with other programs' share taken out"
 
 
-class Judged(NamedTuple):
+class JudgedLimit(NamedTuple):
     """The judgement of one limit for one pair.
 
     `name`: name of the other side. `reason`: a sentence. `runs`: as in `Weighed`, for all its figures together; None
@@ -180,7 +180,7 @@ class Judged(NamedTuple):
 
     gate: Gate
     name: str
-    outcome: Outcome
+    outcome: LimitOutcome
     reason: str
     figures: tuple[Weighed, ...]
     runs: float | None = None
@@ -206,13 +206,15 @@ class Judged(NamedTuple):
         }
 
 
-def whole(judged: Sequence[Judged]) -> Outcome:
+def whole(judged: Sequence[JudgedLimit]) -> LimitOutcome:
     """Return the outcome of all limits: one that is broken decides, then one that cannot be told."""
     found = [each.outcome for each in judged]
-    return next((outcome for outcome in (Outcome.BROKEN, Outcome.UNKNOWN) if outcome in found), Outcome.KEPT)
+    return next(
+        (outcome for outcome in (LimitOutcome.BROKEN, LimitOutcome.UNKNOWN) if outcome in found), LimitOutcome.KEPT
+    )
 
 
-def judge(gates: Sequence[Gate], pairs: Sequence[Pair]) -> list[Judged]:
+def judge(gates: Sequence[Gate], pairs: Sequence[GatedPair]) -> list[JudgedLimit]:
     """Judge every limit for every pair. All figures are tested together, so that they raise few false alarms."""
     asked = [(gate, pair, list(_weighed(gate, pair))) for pair in pairs for gate in gates]
     every = [each for _, _, figures in asked for each in figures if each.row.deviation]
@@ -225,7 +227,7 @@ def judge(gates: Sequence[Gate], pairs: Sequence[Pair]) -> list[Judged]:
     return found
 
 
-def _weighed(gate: Gate, pair: Pair) -> Iterator[Weighed]:
+def _weighed(gate: Gate, pair: GatedPair) -> Iterator[Weighed]:
     relief, metric = relief_of(pair.base, pair.other), gate.metric
     rows = exact_rows(pair.base, pair.other, CHECKED, "dB") if metric.of[0][0] == CHECKED else pair.rows
     is_quiet = not [*spoilt(_runs(pair))]
@@ -242,7 +244,7 @@ def _weighed(gate: Gate, pair: Pair) -> Iterator[Weighed]:
         yield Weighed(figure, row, least, most, limit, _chance_of(least, row))
 
 
-def _is_said(figure: Figure, row: Difference, work: Difference | None, metric: Metric, is_quiet: bool) -> bool:
+def _is_said(figure: Figure, row: Difference, work: Difference | None, metric: GateMetric, is_quiet: bool) -> bool:
     """Return whether the stage's `work` says the same: service time that grew as much, CPU time that is as long.
 
     The typical job says nothing of few that take much longer; then the mean is weighed too. Beside other programs few
@@ -263,15 +265,15 @@ def _chance_of(least: float, row: Difference) -> float:
     return student_tails(least / row.deviation, row.freedom) / 2 if row.deviation else 0.0
 
 
-def _settled(each: Weighed, is_sure: bool, tests: int, pair: Pair) -> Weighed:
+def _settled(each: Weighed, is_sure: bool, tests: int, pair: GatedPair) -> Weighed:
     """Return a figure with its outcome. `is_sure`: whether it is surely worse. `tests`: number of figures tested."""
     row = each.row
     if row.deviation is None:
         return each
     if each.most + student_quantile(row.freedom) * row.deviation <= each.limit:
-        return each._replace(outcome=Outcome.KEPT)
+        return each._replace(outcome=LimitOutcome.KEPT)
     if is_sure or (row.deviation == 0 and each.least > 0):
-        return each._replace(outcome=Outcome.BROKEN)
+        return each._replace(outcome=LimitOutcome.BROKEN)
     return each._replace(runs=runs_needed(each, (len(pair.base.runs), len(pair.other.runs)), tests))
 
 
@@ -293,41 +295,41 @@ def runs_needed(each: Weighed, sizes: tuple[int, int], tests: int) -> float | No
     return inf
 
 
-def _judged(gate: Gate, pair: Pair, figures: tuple[Weighed, ...]) -> Judged:
-    worse = [each for each in figures if each.outcome is Outcome.BROKEN]
+def _judged(gate: Gate, pair: GatedPair, figures: tuple[Weighed, ...]) -> JudgedLimit:
+    worse = [each for each in figures if each.outcome is LimitOutcome.BROKEN]
     if worse:
-        return Judged(gate, pair.name, Outcome.BROKEN, f"{gate.metric.says}: {_list(worse)}", figures)
+        return JudgedLimit(gate, pair.name, LimitOutcome.BROKEN, f"{gate.metric.says}: {_list(worse)}", figures)
     if not figures and gate.metric is METRICS["lost"] and all("frames" in run.document for run in _runs(pair)):
-        return Judged(gate, pair.name, Outcome.KEPT, "no run lost or dropped a frame", figures)
+        return JudgedLimit(gate, pair.name, LimitOutcome.KEPT, "no run lost or dropped a frame", figures)
     if not figures:
         reason = ABSENT.get(gate.metric.of[0][0], "the two sides share no such figure")
-        return Judged(gate, pair.name, Outcome.UNKNOWN, reason, figures)
+        return JudgedLimit(gate, pair.name, LimitOutcome.UNKNOWN, reason, figures)
     if gate.metric.of[0][0] != CHECKED and (missing := _missing(pair)):
-        return Judged(gate, pair.name, Outcome.UNKNOWN, f"not on both sides: {', '.join(missing)}", figures)
+        return JudgedLimit(gate, pair.name, LimitOutcome.UNKNOWN, f"not on both sides: {', '.join(missing)}", figures)
     unsure = [*spoilt(_runs(pair))]
     decisive = _decisive(gate, pair, figures)
-    unknown = [each for each in decisive if each.outcome is Outcome.UNKNOWN]
+    unknown = [each for each in decisive if each.outcome is LimitOutcome.UNKNOWN]
     if not unknown:
         if unsure and gate.metric.is_timed:
-            return Judged(gate, pair.name, Outcome.UNKNOWN, f"{'; '.join(unsure)}; repeat it", figures)
-        return Judged(gate, pair.name, Outcome.KEPT, _list(decisive), figures)
+            return JudgedLimit(gate, pair.name, LimitOutcome.UNKNOWN, f"{'; '.join(unsure)}; repeat it", figures)
+        return JudgedLimit(gate, pair.name, LimitOutcome.KEPT, _list(decisive), figures)
     counts = [each.runs for each in unknown]
     runs = None if None in counts else max(count for count in counts if count is not None)
     reason = f"{_list(unknown)}; {_remedy(unknown, runs, unsure)}"
-    return Judged(gate, pair.name, Outcome.UNKNOWN, reason, figures, runs)
+    return JudgedLimit(gate, pair.name, LimitOutcome.UNKNOWN, reason, figures, runs)
 
 
-def _missing(pair: Pair) -> list[str]:
+def _missing(pair: GatedPair) -> list[str]:
     """Return the stages that some run lacks: nobody knows what became of them."""
     stages = [{*run.document.get("stages", {})} for run in _runs(pair)]
     return sorted(set().union(*stages) - set[str]().union(*stages[:1]).intersection(*stages))
 
 
-def _runs(pair: Pair) -> tuple[ComparedRun, ...]:
+def _runs(pair: GatedPair) -> tuple[ComparedRun, ...]:
     return (*pair.base.runs, *pair.other.runs)
 
 
-def _decisive(gate: Gate, pair: Pair, figures: Sequence[Weighed]) -> list[Weighed]:
+def _decisive(gate: Gate, pair: GatedPair, figures: Sequence[Weighed]) -> list[Weighed]:
     """Return the figures that must keep the limit.
 
     For `slower` these are the counted instructions, if every stage has them, nothing changed, and the frame time does
@@ -359,6 +361,6 @@ def _list(figures: Sequence[Weighed]) -> str:
     return ", ".join(each.said for each in first) + more
 
 
-def as_json(judged: Sequence[Judged]) -> Mapping[str, Any]:
+def as_json(judged: Sequence[JudgedLimit]) -> Mapping[str, Any]:
     """Return the keys that a gate adds to the output of `trilane compare --json`."""
     return {"outcome": str(whole(judged)), "gates": [each.as_json() for each in judged]}

@@ -278,7 +278,8 @@ def exact_rows(base: Side, other: Side, key: str, unit: str) -> Rows:
     """
     sides = [[told.document.get(key) or {} for told in side.runs] for side in (base, other)]
     every = [found for side in sides for found in side]
-    alike = {str(sorted((name, value) for name, value in each.items() if _is_about(value))) for each in every}
+    about = (str, list, tuple, int)
+    alike = {str(sorted((name, value) for name, value in each.items() if isinstance(value, about))) for each in every}
     if not all(every) or len(alike) > 1:
         return {}
     rows = {}
@@ -292,10 +293,6 @@ def exact_rows(base: Side, other: Side, key: str, unit: str) -> Rows:
             row = settled(values, [np.array(side) for side in values], 0.0, Chance(freedom=0), is_ratio=False)
         rows[Figure(key, "", "", name, unit)] = row
     return rows
-
-
-def _is_about(value: Any) -> bool:
-    return isinstance(value, str | list | tuple | int)
 
 
 def _numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:

@@ -1,24 +1,29 @@
-"""The runs to compare, read from disk: run folders, reports and predictions, with their settings.
+"""The runs to compare, read from disk: run folders, reports, predictions and imported times, with their settings.
 
 Rule: what cannot be compared is refused by name. A run folder with a journal has every frame; a report alone, or a
 prediction, has summaries. A run that was killed has no report: its journal gives the keys that a comparison reads, and
 `NOT_KNOWN` names those that the journal lacks.
+
+Each imported time stands beside one of its name, or beside the stage of a run. The only wall time stands for the frame
+time. Nobody knows the machine's state, so two imported times scatter as any two runs on the host clock.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from math import sqrt
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from statistics import stdev
+from typing import Annotated, Any, Final, NamedTuple
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import from_json, to_json
 
 from trilane.apps.compare.difference import STATISTICS
-from trilane.apps.compare.imported_times import MEASUREMENTS, imported
 from trilane.apps.compare.run_frames import Key, RunFrames, read_frames
 from trilane.apps.run.report import MAX_REPORT_BYTES, read_report
 from trilane.apps.watch.followed_run import FollowedRun, RunState, folder_of
@@ -28,6 +33,7 @@ from trilane.pipeline.journal import NAME as JOURNAL
 from trilane.pipeline.journal import read_journal
 from trilane.pipeline.reckoning import places_of, reckoned
 from trilane.pipeline.run_metrics import RunMetrics
+from trilane.units import HOST_CLOCK
 
 EXPECTED: Final = (
     "a run folder, its report.json, what `trilane predict --json` printed, or a JSON file with `measurements`"
@@ -299,3 +305,99 @@ def _flat(name: str, value: Any) -> Iterator[tuple[str, Any]]:
             yield from _flat(f"{name}.{place}", inner)
     else:
         yield name, value
+
+
+MEASUREMENTS: Final = "measurements"
+EXPECTED_TIMES: Final = "imported times: JSON with `measurements`, each with `name`, `kind` and `mean_ms`"
+WALL: Final = "wall"
+#: Unit that imported stages stand on; nothing is known of it.
+UNIT: Final = "imported"
+#: Longest and shortest time that can be one, in ms: an hour, and a millionth of a nanosecond.
+LONGEST_MS, SHORTEST_MS = 3.6e6, 1e-12
+Ms = Annotated[float, Field(ge=0, le=LONGEST_MS)]
+
+
+class ImportedTime(BaseModel):
+    """One imported time, which is the time of a job of the stage with its name.
+
+    `kind`: such as `run`, `layer` or `wall`. `count`, `sd_ms`: number and standard deviation of the values.
+    `samples_ms`: every value, where the file has it. `file`: file that it was read from.
+    """
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    name: str = Field(min_length=1)
+    kind: str
+    count: int | None = Field(default=None, ge=0, le=1 << 53)
+    mean_ms: Ms | None = None
+    sd_ms: Ms | None = None
+    p50_ms: Ms | None = None
+    samples_ms: tuple[Ms, ...] = ()
+    file: str = ""
+
+    @property
+    def ms(self) -> float:
+        """The mean, else the median; 0 for a measurement in another unit, such as cycles."""
+        return self.mean_ms or self.p50_ms or 0.0
+
+    @property
+    def error(self) -> float | None:
+        """Standard error of the mean as a share of it; None where nothing shows it."""
+        count = len(self.samples_ms) or self.count or 0
+        deviation = stdev(self.samples_ms) if len(self.samples_ms) > 1 else self.sd_ms
+        return None if deviation is None or count < 2 else deviation / sqrt(count) / self.ms
+
+
+def imported(document: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """Return the keys of a report that a comparison reads. Raises BadInputError naming the first wrong key."""
+    rows = [_imported_time(row, f"{path}: {MEASUREMENTS}.{place}") for place, row in enumerate(document[MEASUREMENTS])]
+    rows = [row for row in rows if row.ms >= SHORTEST_MS]
+    if not rows:
+        raise BadInputError(f"{path}: {MEASUREMENTS}", "no time", "one or more", "docs/compare.md has the keys")
+    if len(files := {row.file for row in rows}) > 1:
+        remedy = "give several runs of one kind as A.json,B.json"
+        raise BadInputError(path, f"times of {len(files)} files", "the times of one file", remedy)
+    rows = _told_apart(rows)
+    names = [row.name for row in rows]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise BadInputError(f"{path}: {MEASUREMENTS}", f"{twice!r} twice", "each name once")
+    frames = _frames(rows)
+    return {
+        "clock": HOST_CLOCK,
+        "stages": {
+            row.name: {"unit": UNIT, "service_ms": _imported_statistics(row)} for row in rows if row is not frames
+        },
+        "units": {},
+        "config": {},
+        "machine": {},
+        "frame_time_ms": _imported_statistics(frames) if frames else {},
+        "latency_ms": {},
+        # Of every figure: the largest standard error that is known.
+        "deviation": max((error for row in rows if (error := row.error) is not None), default=None),
+    }
+
+
+def _imported_time(row: Any, where: str) -> ImportedTime:
+    try:
+        return ImportedTime.model_validate(row)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise BadInputError(f"{where}.{key}".rstrip("."), first["msg"].lower(), EXPECTED_TIMES) from None
+
+
+def _told_apart(rows: Sequence[ImportedTime]) -> list[ImportedTime]:
+    """Return the measurements, with its kind in the name of each whose name another kind has too."""
+    counts = Counter(row.name for row in rows)
+    longer = [row.model_copy(update={"name": f"{row.name} ({row.kind})"}) for row in rows]
+    return [long if counts[row.name] > 1 else row for row, long in zip(rows, longer, strict=True)]
+
+
+def _frames(rows: Sequence[ImportedTime]) -> ImportedTime | None:
+    """Return the measurement that stands for a frame: the only wall time."""
+    found = [row for row in rows if row.kind == WALL]
+    return found[0] if len(found) == 1 else None
+
+
+def _imported_statistics(row: ImportedTime) -> dict[str, float]:
+    return {"mean": row.ms} | ({} if row.p50_ms is None else {"p50": row.p50_ms})

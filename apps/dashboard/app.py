@@ -22,7 +22,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from trilane.apps.dashboard.access import MOST_HEAD_BYTES, Asgi, Guard, Refusal, Refusals, refusal_of_head
-from trilane.apps.dashboard.pages import (
+from trilane.apps.dashboard.view import (
     MOST_BYTES,
     ChangesSaid,
     Client,
@@ -30,11 +30,11 @@ from trilane.apps.dashboard.pages import (
     Heard,
     MalformedError,
     PictureAsked,
+    RunView,
     Seek,
     heard,
     said,
 )
-from trilane.apps.dashboard.view import RunView
 
 PAGE: Final = Path(__file__).with_name("page")
 NEWS_S: Final = 0.1

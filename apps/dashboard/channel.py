@@ -52,7 +52,7 @@ class StateIs(NamedTuple):
     why: str
 
 
-class Refused(NamedTuple):
+class ChangesRefused(NamedTuple):
     """A message to the server: the requested change of a control is refused."""
 
     control: str
@@ -72,15 +72,15 @@ class ChangesAsked(NamedTuple):
     values: Mapping[str, str]
 
 
-Message = Opened | RunBegins | StateIs | Refused | ControlAsked | ChangesAsked
+Message = Opened | RunBegins | StateIs | ChangesRefused | ControlAsked | ChangesAsked
 
-MESSAGES: Final[tuple[type[Any], ...]] = (Opened, RunBegins, StateIs, Refused, ControlAsked, ChangesAsked)
+MESSAGES: Final[tuple[type[Any], ...]] = (Opened, RunBegins, StateIs, ChangesRefused, ControlAsked, ChangesAsked)
 
 _FIELDS: Final[dict[type[Any], tuple[type | tuple[type, ...], ...]]] = {
     Opened: (str, int, int),
     RunBegins: (str, dict, list),
     StateIs: (str, str),
-    Refused: (str, str),
+    ChangesRefused: (str, str),
     ControlAsked: (str, (str, float, int, type(None))),
     ChangesAsked: (dict,),
 }

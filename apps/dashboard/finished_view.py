@@ -12,6 +12,7 @@ import os
 import tempfile
 import threading
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import IO, Any, Final, NamedTuple
@@ -21,9 +22,21 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.apps.dashboard.pages import ChangesSaid, Client, ControlSaid, Seek, shown
 from trilane.apps.dashboard.run_facts import RunFacts, facts_of_folder
-from trilane.apps.dashboard.view import Message, RunMeter, TimelineRows, described, jpeg_of, note, slices
+from trilane.apps.dashboard.view import (
+    ChangesSaid,
+    Client,
+    ControlSaid,
+    Message,
+    RunMeter,
+    Seek,
+    TimelineRows,
+    described,
+    jpeg_of,
+    note,
+    shown,
+    slices,
+)
 from trilane.apps.watch.followed_run import CUT_OFF, FollowedRun, RunState
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import NAME, Begun, Ended, Record, Stepped, journal_in, read_journal
@@ -202,28 +215,41 @@ class _FinishedRun:
 
 
 class _RunPictures:
-    """The pictures of a video that may be missing, for one thread at a time."""
+    """The pictures of a video of `trilane run`, which may be missing, for one thread at a time.
+
+    Frame n is shown from n / `fps` on.
+    """
 
     def __init__(self, path: Path, fps: float) -> None:
         self._lock = threading.Lock()
-        try:
-            self._frames: _VideoFrames | None = _VideoFrames(path, fps)
-        except (OSError, av.error.FFmpegError):
-            self._frames = None  # the run was not recorded
+        self._fps = fps
+        self._container: Any = None
+        with suppress(OSError, av.error.FFmpegError):  # the run was not recorded
+            self._container = av.open(str(path))
+            self._stream: Any = self._container.streams.video[0]
 
     @property
     def is_missing(self) -> bool:
-        return self._frames is None
+        return self._container is None
 
     def jpeg(self, frame: int) -> bytes | None:
-        """Return the picture that was shown with frame `frame`; None if there is none."""
+        """Return the picture that was shown with frame `frame`; None if there is none, or the video ends before it."""
+        if self._container is None:
+            return None
+        one = 1 / Fraction(self._fps).limit_denominator(1001) / self._stream.time_base
+        pts, newest = int(frame * one), None
         with self._lock:
-            return None if self._frames is None else self._frames.jpeg(frame)
+            self._container.seek(pts, stream=self._stream, backward=True)
+            for picture in self._container.decode(self._stream):
+                if newest is not None and picture.pts > pts + one / 2:
+                    break
+                newest = picture
+            return None if newest is None else jpeg_of(newest.to_image())
 
     def close(self) -> None:
         """Let go of the video."""
-        if self._frames is not None:
-            self._frames.close()
+        if self._container is not None:
+            self._container.close()
 
 
 class _Piece(NamedTuple):
@@ -319,31 +345,3 @@ class _TextStore:
     def close(self) -> None:
         """Remove the file."""
         self._file.close()
-
-
-class _VideoFrames:
-    """The pictures of `path`, a video of `trilane run`, in which frame n is shown from n / `fps` on.
-
-    Raises OSError and av.error.FFmpegError.
-    """
-
-    def __init__(self, path: Path, fps: float) -> None:
-        self._container: Any = av.open(str(path))
-        self._stream: Any = self._container.streams.video[0]
-        self._fps = fps
-
-    def jpeg(self, frame: int) -> bytes | None:
-        """Return the picture that was shown with frame `frame`; None if the video ends before it."""
-        at = Fraction(frame) / Fraction(self._fps).limit_denominator(1001)
-        pts = int(at / self._stream.time_base)
-        self._container.seek(pts, stream=self._stream, backward=True)
-        newest = None
-        half = Fraction(1, 2) / Fraction(self._fps).limit_denominator(1001) / self._stream.time_base
-        for picture in self._container.decode(self._stream):
-            if newest is not None and picture.pts > pts + half:
-                break
-            newest = picture
-        return None if newest is None else jpeg_of(newest.to_image())
-
-    def close(self) -> None:
-        self._container.close()

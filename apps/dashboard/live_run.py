@@ -2,7 +2,7 @@
 
 Rule: this process runs the pipeline; the page's server is another process, and neither waits for the other. Some
 settings change during the run. Any other change is checked as a command line is; then the run ends cleanly, and a new
-run starts with a folder of its own.
+run starts with a folder of its own. A pipeline file has one run.
 """
 
 from __future__ import annotations
@@ -17,8 +17,22 @@ from pathlib import Path
 from typing import Any, Final
 
 from trilane.apps.dashboard.access import listen
-from trilane.apps.dashboard.channel import ChangesAsked, ControlAsked, Message, Refused, RunBegins, ServerLink, StateIs
-from trilane.apps.dashboard.run_facts import OF_A_NEW_RUN, controls_of_run, facts_of_checked
+from trilane.apps.dashboard.channel import (
+    ChangesAsked,
+    ChangesRefused,
+    ControlAsked,
+    Message,
+    RunBegins,
+    ServerLink,
+    StateIs,
+)
+from trilane.apps.dashboard.run_facts import (
+    OF_A_NEW_RUN,
+    controls_of_file,
+    controls_of_run,
+    facts_of_checked,
+    facts_of_file,
+)
 from trilane.apps.run.asked_run import early_processes, prepare, run_prepared
 from trilane.apps.run.run_job import ENDLESS, Hooks, Prepared, RunOutcome, Watched
 from trilane.apps.watch.followed_run import run_name
@@ -26,6 +40,7 @@ from trilane.avatars.bundle import BUILT_IN, MANIFEST
 from trilane.errors import TrilaneError
 from trilane.options import option_of
 from trilane.pipeline.controls import ALL, RunControls
+from trilane.pipeline.description import Pipeline
 from trilane.stages.configure import Checked, GlFacts, required_machine
 from trilane.stages.dsp.runtime import installed
 from trilane.stages.run_options import RunOptions
@@ -92,7 +107,7 @@ class _Runs:
                 if following is None:
                     self.link.send(StateIs(FAILED, str(error)))
                     raise
-                self.link.send(Refused("", f"the run did not begin: {error}"))
+                self.link.send(ChangesRefused("", f"the run did not begin: {error}"))
                 now, before = following, None
                 continue
             following = self.director.take_next()
@@ -179,7 +194,7 @@ class Director:
             changes = {name: RunOptions.value_of(name, word) for name, word in values.items()}
             prepared = self._prepare(current.options.changed(**changes))
         except TrilaneError as error:
-            self._send(Refused(next(iter(values)) if len(values) == 1 else RESTART, str(error)))
+            self._send(ChangesRefused(next(iter(values)) if len(values) == 1 else RESTART, str(error)))
             return
         with self._lock:
             self._next = prepared
@@ -210,3 +225,77 @@ def _neighbours(avatar: str) -> Iterator[str]:
     folder = Path(avatar)
     if avatar not in BUILT_IN and folder.is_dir():
         yield from [str(manifest.parent) for manifest in sorted(folder.parent.glob(f"*/{MANIFEST}"))[:MOST_AVATARS]]
+
+
+#: Sides of the window where the file writes no video, so that it has no picture.
+NO_PICTURE: Final = (2, 2)
+
+
+def run_file_live(
+    options: RunOptions, hooks: OpenHooks, command: tuple[str, ...], port: int | None, tell: Callable[[str], None]
+) -> RunOutcome:
+    """Run the pipeline file of `options` until an interrupt, or for its number of frames.
+
+    The page holds the run, steps it and kills units: what else changes it is in the file. The parameters, and what is
+    raised, are those of `run_live`.
+    """
+    from trilane.apps.run.run_file import run_file
+
+    with contextlib.ExitStack() as stack:
+        place = stack.enter_context(contextlib.closing(listen(port)))
+        watch = FileWatch(
+            lambda height, width, hear: stack.enter_context(
+                contextlib.closing(ServerLink(place, height, width, hear, tell))
+            )
+        )
+        tell(f"dashboard: {place.url}")
+        try:
+            outcome = run_file(options, hooks, command, watch)
+        except TrilaneError as error:
+            watch.ends(FAILED, str(error))
+            raise
+        failure = outcome.report.failure
+        watch.ends(FAILED if failure else ENDED, failure or "")
+        return outcome
+
+
+class FileWatch:
+    """A `trilane.apps.run.run_file.Watch`: the page of the run.
+
+    `link`: function that makes the link to the page's server, from the height and width of pictures and from the
+    function that hears requests, on a thread of its own.
+    """
+
+    def __init__(self, link: Callable[[int, int, Callable[[ControlAsked | ChangesAsked], None]], ServerLink]) -> None:
+        self.controls = RunControls()
+        self._make = link
+        self._link: ServerLink | None = None
+
+    def begins(self, folder: Path, pipeline: Pipeline, facts: Mapping[str, Any]) -> Path:
+        config = facts["config"]
+        output = config["scene"].get("output")
+        sides = (output["height"], output["width"]) if output else NO_PICTURE
+        height, width = (max(side // 2 * 2, 2) for side in sides)  # as the video has them
+        link = self._link = self._make(height, width, self.do)
+        said = facts_of_file(run_name(folder), config, facts["machine"])
+        controls = controls_of_file(list(pipeline.units))
+        link.send(RunBegins(str(folder), asdict(said), [asdict(control) for control in controls]))
+        link.send(StateIs(RUNNING, ""))
+        return link.window
+
+    def ends(self, state: str, why: str) -> None:
+        """Tell the page that the run is over."""
+        if self._link is not None:
+            self._link.send(StateIs(state, why))
+
+    def do(self, asked: ControlAsked | ChangesAsked) -> None:
+        """Carry out a request of the page, whose server has already checked name and value: it asks for no changes."""
+        if isinstance(asked, ChangesAsked):
+            return
+        if asked.control in HOLDS:
+            frames, state = HOLDS[asked.control]
+            self.controls.hold(frames)
+            if self._link is not None:
+                self._link.send(StateIs(state, ""))
+        elif asked.control == "kill":
+            self.controls.kill(str(asked.value))

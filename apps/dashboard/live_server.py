@@ -22,19 +22,31 @@ from typing import Any, Final
 from PIL import Image
 
 from trilane.apps.dashboard.app import DashboardApp, server
-from trilane.apps.dashboard.channel import ChangesAsked, ChannelEnd, ControlAsked, Opened, Refused, RunBegins, StateIs
+from trilane.apps.dashboard.channel import (
+    ChangesAsked,
+    ChangesRefused,
+    ChannelEnd,
+    ControlAsked,
+    Opened,
+    RunBegins,
+    StateIs,
+)
 from trilane.apps.dashboard.channel import Message as FromRun
-from trilane.apps.dashboard.pages import ChangesSaid, Client, ControlSaid, Seek, shown
 from trilane.apps.dashboard.run_facts import OF_A_NEW_RUN, OF_THE_CAMERA, Control, RunFacts, Value, control_of
 from trilane.apps.dashboard.view import (
+    ChangesSaid,
+    Client,
+    ControlSaid,
     IdleRow,
     JobRow,
     Message,
     RunMeter,
+    Seek,
     TimelineRows,
     described,
     jpeg_of,
     note,
+    shown,
     slices,
 )
 from trilane.apps.watch.followed_run import FollowedRun, run_name
@@ -169,7 +181,7 @@ class LiveView:
             self._unread = iter(())
         elif isinstance(message, StateIs):
             self._state, self._why, self._is_news = message.state, message.why, True
-        elif isinstance(message, Refused):
+        elif isinstance(message, ChangesRefused):
             self._told.append({"type": "refused", "control": message.control, "why": message.why})
 
     def greeting(self) -> Iterable[Message]:

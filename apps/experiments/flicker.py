@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from trilane.apps.experiments.calibrated_network import AS_IT_IS, Calibrations
+from trilane.apps.avatar_files import AS_IT_IS, Calibrations
 from trilane.apps.experiments.error_by_size import refuse_twice
 from trilane.apps.experiments.scene_pictures import ScenePictures, around, wanted_pictures
 from trilane.arrays import F64, U8

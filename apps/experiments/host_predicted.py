@@ -14,7 +14,7 @@ from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from trilane.apps.avatar.remade_avatar import remade_avatar
+from trilane.apps.avatar_files import remade_avatar
 from trilane.apps.predict.asked_prediction import answer_of, application_of, predict_networks
 from trilane.apps.predict.predict_options import PredictOptions
 from trilane.apps.run.asked_run import run_asked

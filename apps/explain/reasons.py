@@ -43,7 +43,7 @@ MOST_ADVICE: Final = 4
 T = TypeVar("T")
 
 
-class Shown(NamedTuple):
+class ShownFrame(NamedTuple):
     """A presented frame and the one that was presented before it.
 
     `frame_ns`: time from the one to the other, ns. `parts_ns`: parts of that time, ns. `longest`: for each part the job
@@ -104,7 +104,7 @@ class SlowFrames:
         self._unit_of = {stage.name: stage.unit for stage in graph.stages}
         self._waiting: deque[ExplainedJob] = deque()
         self._before: Presented | None = None
-        self._slowest: list[tuple[int, int, Shown]] = []
+        self._slowest: list[tuple[int, int, ShownFrame]] = []
         self._frames: EvenSample[tuple[int, Mapping[Part, int]]] = EvenSample()
         self._services: dict[str, EvenSample[int]] = {stage.name: EvenSample() for stage in graph.stages}
 
@@ -117,7 +117,7 @@ class SlowFrames:
         if len(self._waiting) > DELAY:
             self._look(self._waiting.popleft())
 
-    def close(self) -> tuple[list[Shown], Usual]:
+    def close(self) -> tuple[list[ShownFrame], Usual]:
         """Return the slowest frames, the slowest first, and the usual lengths of parts. Call it after the last job."""
         while self._waiting:
             self._look(self._waiting.popleft())
@@ -152,9 +152,9 @@ class SlowFrames:
         if len(self._slowest) == self._most and self._slowest[0][0] >= end_ns - begin_ns:
             return
         jobs = {part: job for part, (_, job) in longest.items()}
-        self._keep(Shown(now, before, end_ns - begin_ns, sums, jobs))
+        self._keep(ShownFrame(now, before, end_ns - begin_ns, sums, jobs))
 
-    def _keep(self, shown: Shown) -> None:
+    def _keep(self, shown: ShownFrame) -> None:
         entry = (shown.frame_ns, -shown.now.frame, shown)
         if len(self._slowest) < self._most:
             heappush(self._slowest, entry)
@@ -166,7 +166,7 @@ def _median(values: Sequence[int]) -> float:
     return float(median(values)) if values else 0.0
 
 
-def reasons(shown: Shown, usual: Usual) -> list[Reason]:
+def reasons(shown: ShownFrame, usual: Usual) -> list[Reason]:
     """Return why a frame took longer than the median, the most important reason first; empty if it hardly did."""
     longer_ns = shown.frame_ns - usual.frame_ns
     found = [
@@ -182,7 +182,7 @@ def reasons(shown: Shown, usual: Usual) -> list[Reason]:
     ]
 
 
-def notes(shown: Shown) -> list[str]:
+def notes(shown: ShownFrame) -> list[str]:
     """Return the other differences from the frame before."""
     said = []
     now, before = shown.now, shown.before
@@ -197,7 +197,7 @@ def notes(shown: Shown) -> list[str]:
     return said
 
 
-def _text(shown: Shown, usual: Usual, part: Part, longer_ns: float) -> str:
+def _text(shown: ShownFrame, usual: Usual, part: Part, longer_ns: float) -> str:
     what, stage = part
     job, unit = shown.longest[part], usual.unit_of[stage]
     whose = "" if job.frame == shown.now.frame else f" of frame {job.frame}"
@@ -221,7 +221,7 @@ def _text(shown: Shown, usual: Usual, part: Part, longer_ns: float) -> str:
     return words.get(what, "before what is known")
 
 
-def _work(shown: Shown, usual: Usual, job: JobRecord, longer_ns: float) -> str:
+def _work(shown: ShownFrame, usual: Usual, job: JobRecord, longer_ns: float) -> str:
     """Return why a stage had a larger part: its job was long, or more of the job lay between the two frames."""
     service_ns, usual_ns = job.end_ns - job.begin_ns, usual.service_ns.get(job.stage, 0.0)
     times = f"{service_ns / NS_PER_MS:.1f} ms, median {usual_ns / NS_PER_MS:.1f}"

@@ -1,29 +1,46 @@
-"""The plan that a run makes for each frame of a scene, also as a picture.
+"""The plan that a run makes for each frame of a scene: in words and figures, with costs and savings, and drawn.
 
 Rule: the run's own pose stage decides. `ScenePlan` measures how far a level of detail moves vertices on the picture,
-against the whole body in float64. The picture shows the plan, not the painted frame: the bodies' vertices, their
-rectangles and the tensor's, for a frame of each phase.
+against the whole body in float64. Costs are computed, never measured, by the same model as `trilane predict`; joints
+and vertices count for each avatar in view. Every figure says whether it is a bound, measured or computed. The drawing
+shows the plan, not the painted frame: the bodies' vertices, their rectangles and the tensor's, for a frame of each
+phase.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw
 
+from trilane.apps.run.avatar_facts import worst_loss
 from trilane.arrays import F64, I64, Shape
+from trilane.avatars.network_file import NetworkFile
 from trilane.body.joints import Skeleton
-from trilane.body.skinning import CpuSkinner
+from trilane.body.skinning import DETAILS, CpuSkinner, left_out
+from trilane.errors import BadInputError
+from trilane.hw_profiles.application import Plan, Variant, stage_times_ms, steady, workers_of
+from trilane.hw_profiles.host import described, host_cores, usable_cores
+from trilane.hw_profiles.host_model import place_units
+from trilane.hw_profiles.profile_files import load_runnable
+from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.pipeline.memory import Assets
 from trilane.scene.crop import Rect
-from trilane.stages.avatar_assets import distinct, mesh_levels_of, shaped_body, staged_of
+from trilane.scene.planner import ALL_WORK, MOST_DENSITY, FrameWork
+from trilane.scheduler.placement import Ranked
+from trilane.stages.avatar_assets import distinct, mesh_levels_of, networks_of, painting, shaped_body, staged_of
 from trilane.stages.config import RunConfig, pose_dtype, posed_vertices, posed_vertices_bytes
+from trilane.stages.configure import Checked
 from trilane.stages.cpu.pose import FramePlan, PoseStage
 from trilane.transport.packets import Packet, SlotLayout, view_packet
+from trilane.units import COMPUTED, HOST, MEASURED, NS_PER_MS, UNITS, UnitName
 from trilane.writing import write_atomically
 
 MOST_FRAMES = 9
@@ -169,3 +186,315 @@ def _label(planned: PlannedFrame) -> str:
         return f"frame {planned.frame}: nobody in view"
     density = "" if planned.plan.density is None else f", density {planned.plan.density:.2f}"
     return f"frame {planned.frame}: tensor {shape[0]}x{shape[1]}{density}"
+
+
+#: What every plan is compared with: the square that the reference application fills.
+FIXED: Shape = (512, 512)
+BOUND = "proved bound, in pixels of the picture"
+WHY = {
+    FrameWork.NONE: "nobody is on the screen: nothing is drawn, packed or inferred",
+    FrameWork.REUSE: "nothing has changed: the picture that is there is shown again",
+}
+PIPELINED = Variant("pipelined", "double")
+#: Numbers of the networks that paint a frame.
+Networks = tuple[int, ...]
+FIRST: Networks = (0,)
+#: Stages that a frame needs even with nobody in view.
+ALWAYS = ("pose", "composite", "present")
+
+
+@dataclass(frozen=True)
+class PlanExplanation:
+    """An explained plan.
+
+    `document`: keys of `trilane plan --json`. `plan`, `first_frames`: plan and first frame of each phase, to be
+    drawn.
+    """
+
+    document: dict[str, Any]
+    plan: ScenePlan
+    first_frames: Sequence[PlannedFrame]
+
+
+def explain(checked: Checked, profile: str, performance_profile: str, most_measured: int = 24) -> PlanExplanation:
+    """Explain the plan of a scene that was checked.
+
+    `profile`, `performance_profile`: hardware profile and performance profile that the costs are computed with.
+    `most_measured`: number of phases whose error is measured, at one frame each.
+    Raises BadInputError for an unknown profile.
+    """
+    scene, plan = checked.config.scene, ScenePlan(checked.config, checked.assets)
+    networks, painters = networks_of(checked.assets), checked.config.networks_of
+    costs = CostModel(networks, profile, performance_profile, painters)
+    rows: list[list[float | None]] = []
+    frames: list[PlannedFrame] = []
+    for frame in range(scene.frames):
+        planned = plan.decide(frame)
+        if len(phases([*frames[-1:], planned])) > len(frames[-1:]):
+            measured = len(rows) < most_measured
+            rows.append([plan.measured_px(frame, avatar) if measured else None for avatar in planned.plan.seen])
+        frames.append(planned)
+    groups, bodies = phases(frames), _Bodies(checked)
+    names = [str(spec.name) for spec in scene.avatars]
+    document = {
+        "scene": scene.name,
+        "config": {
+            "frames": scene.frames,
+            "fps": scene.fps,
+            "output": [scene.output.height, scene.output.width],
+            "plan": scene.plan,
+            "size": scene.size,
+            "error_budget_px": scene.error_budget_px,
+            "error_budget_db": scene.error_budget_db,
+            "profile": profile,
+            "performance_profile": performance_profile,
+        },
+        "shapes": [list(shape) for shape in checked.config.buckets],
+        "avatars": [_avatar(checked, number) for number in range(len(scene.avatars))],
+        "phases": [_phase(group, errors, costs, names, bodies) for group, errors in zip(groups, rows, strict=True)],
+        "image": _image(checked),
+        "totals": _totals(frames, costs),
+        "placement": costs.placement(*_usual(frames, costs), checked.asked_cores),
+        "notes": list(checked.notes),
+        "sources": {
+            "bound_px": BOUND,
+            "measured_px": f"{MEASURED}, at a phase's first frame, at the vertices that are drawn",
+            "pixels, gmac": "counted",
+            "ms": COMPUTED,
+        },
+    }
+    return PlanExplanation(document, plan, [group[0] for group in groups])
+
+
+class _Bodies:
+    """The bodies of the avatars, and what each level of detail leaves out of them."""
+
+    def __init__(self, checked: Checked) -> None:
+        folders = distinct(checked.config)
+        bodies = [shaped_body(checked.assets, number).body for number in range(len(folders))]
+        self._bodies = [bodies[folders.index(folder)] for folder in checked.config.avatar_dirs]
+        self.left_out = cache(self._left_out)
+
+    def triangles(self, avatar: int) -> int:
+        """Return the number of triangles of the whole mesh."""
+        return len(self._bodies[avatar].faces)
+
+    def _left_out(self, avatar: int, level: int) -> list[str]:
+        return left_out(DETAILS[level], self._bodies[avatar])
+
+
+def _image(checked: Checked) -> dict[str, Any]:
+    """Return the size of a planned tensor as a share of its network's own pixels, and the loss that it costs."""
+    if not checked.config.scene.plans_tensor:
+        return {"work": None, "psnr_loss_db": None, "source": "the scene fixes the tensor's size"}
+    work = checked.config.works[0]
+    sources = "; ".join(dict.fromkeys(loss.source for loss in checked.losses))
+    return {"work": work / ALL_WORK, "psnr_loss_db": worst_loss(work, checked.losses), "source": sources}
+
+
+def _avatar(checked: Checked, number: int) -> dict[str, Any]:
+    config = checked.config
+    where = "cpu" if config.posed_vertices else "gpu"
+    return {
+        "avatar": number,
+        "name": config.scene.avatars[number].name,
+        "bundle": config.scene.avatars[number].bundle,
+        "skinned_on": where,
+        "expression": "part of the avatar's shape: it costs nothing per frame",
+        "detail": "by its bound in pixels" if where == "cpu" and config.budget_px else "everything",
+        "mesh_levels": len(mesh_levels_of(checked.assets, distinct(config).index(config.avatar_dirs[number]))),
+        "texture_filter": config.scene.texture_filter,
+    }
+
+
+def _phase(
+    group: Sequence[PlannedFrame],
+    errors: Sequence[float | None],
+    costs: CostModel,
+    names: Sequence[str],
+    bodies: _Bodies,
+) -> dict[str, Any]:
+    first = group[0].plan
+    cost = _cost(first, costs)
+    return {
+        "first_frame": group[0].frame,
+        "last_frame": group[-1].frame,
+        "frames": len(group),
+        "work": first.work.name.lower(),
+        "tensor": list(first.shape) if first.shape else None,
+        "density": [_least(group), _most(group)] if first.shape and first.density is not None else None,
+        "avatars": [
+            {
+                "avatar": number,
+                "name": names[number],
+                "modelled": DETAILS[one.level].name,
+                "mesh": {"level": one.mesh, "triangles": one.triangles, "of": bodies.triangles(number)},
+                "left_out": bodies.left_out(number, one.level),
+                "bound_px": max(planned.plan.seen[number].error_px for planned in group),
+                "measured_px": error,
+            }
+            for (number, one), error in zip(first.seen.items(), errors, strict=True)
+        ],
+        "why": _why(group),
+        "cost": cost.as_json(),
+        "saved": _saved(cost, costs.of(FIXED, *costs.in_view(first))),
+    }
+
+
+def _cost(plan: FramePlan, costs: CostModel) -> FrameCost:
+    return costs.of(plan.shape, *costs.in_view(plan)) if plan.work is FrameWork.FULL else costs.of(None)
+
+
+def _least(group: Sequence[PlannedFrame]) -> float:
+    return min(planned.plan.density or 0.0 for planned in group)
+
+
+def _most(group: Sequence[PlannedFrame]) -> float:
+    return max(planned.plan.density or 0.0 for planned in group)
+
+
+def _why(group: Sequence[PlannedFrame]) -> str:
+    """Say why the tensor of a phase is as it is."""
+    first = group[0].plan
+    if first.work in WHY:
+        return WHY[first.work]
+    if first.density is None:
+        return "the scene fixes the tensor's size"
+    if _most(group) >= MOST_DENSITY:
+        return f"{MOST_DENSITY:g} tensor pixels along a side of a pixel of the picture: more could not be seen"
+    return "the pixels that the network was trained to paint, in the shape that fits best of those that are ready"
+
+
+def _saved(cost: FrameCost, fixed: FrameCost) -> dict[str, float]:
+    return {
+        "pixels": fixed.pixels - cost.pixels,
+        "gmac": fixed.gmac - cost.gmac,
+        "work_ms": fixed.work_ms - cost.work_ms,
+    }
+
+
+def _usual(frames: Sequence[PlannedFrame], costs: CostModel) -> tuple[Shape | None, int, Networks]:
+    """Return the shape of most full frames, and what is in view there; None, 0 and the first network without any."""
+    full = [one.plan for one in frames if one.plan.work is FrameWork.FULL]
+    kinds = Counter((plan.shape, *costs.in_view(plan)) for plan in full)
+    return kinds.most_common(1)[0][0] if kinds else (None, 0, FIRST)
+
+
+def _totals(frames: Sequence[PlannedFrame], costs: CostModel) -> dict[str, Any]:
+    """Add up all frames, as planned and with the fixed square that shows the same avatars."""
+    planned = [_cost(one.plan, costs) for one in frames]
+    fixed = [costs.of(FIXED, *costs.in_view(one.plan)) for one in frames]
+    return {
+        "pixels": sum(cost.pixels for cost in planned),
+        "fixed_pixels": sum(cost.pixels for cost in fixed),
+        "gmac": sum(cost.gmac for cost in planned),
+        "fixed_gmac": sum(cost.gmac for cost in fixed),
+        "work_ms": sum(cost.work_ms for cost in planned),
+        "fixed_work_ms": sum(cost.work_ms for cost in fixed),
+        "frame_ms": sum(cost.frame_ms for cost in planned) / len(frames),
+        "fixed_frame_ms": sum(cost.frame_ms for cost in fixed) / len(frames),
+    }
+
+
+@dataclass(frozen=True)
+class FrameCost:
+    """The cost of one frame.
+
+    `pixels`: pixels of its tensors. `gmac`: products of the networks, 1e9. `work_ms`: time of all stages, one after the
+    other.
+    `frame_ms`: time between frames of its kind when they are pipelined.
+    """
+
+    pixels: int
+    gmac: float
+    work_ms: float
+    frame_ms: float
+
+    def as_json(self) -> dict[str, Any]:
+        return {"pixels": self.pixels, "gmac": self.gmac, "work_ms": self.work_ms, "frame_ms": self.frame_ms}
+
+
+def least_frame_ms(chip: Profile, times: Mapping[tuple[str, UnitName], float]) -> float:
+    """Return the time between frames whose jobs take `times`, ms by stage and unit.
+
+    It is the time of the busiest core, and no less than that of the display.
+    """
+    worker = workers_of(chip)
+    busy = (sum(ms for (_, unit), ms in times.items() if worker[unit] == one) for one in set(worker.values()))
+    return max(*busy, chip.application.display_ms.or_else(0))
+
+
+class CostModel:
+    """The costs of frames on the chip `profile`. Raises BadInputError for an unknown profile."""
+
+    def __init__(
+        self,
+        networks: Sequence[NetworkFile],
+        profile: str,
+        performance_profile: str,
+        painters: Callable[[Iterable[int]], Networks] = lambda _avatars: FIRST,
+    ) -> None:
+        """Take the chip.
+
+        `painters`: numbers of the networks that paint avatars, given by their numbers.
+        """
+        self._networks, self._chip, self._painters = networks, load_runnable(profile), painters
+        self._corners = corners_of(self._chip, performance_profile)
+        self.of = cache(self._of)
+
+    def in_view(self, plan: FramePlan) -> tuple[int, Networks]:
+        """Return the number of avatars that a frame shows, and the networks that paint them."""
+        return len(plan.seen), self._painters(plan.seen) or FIRST
+
+    def _of(self, shape: Shape | None, avatars: int = 1, networks: Networks = FIRST) -> FrameCost:
+        """Return the cost of a frame whose tensors have `shape`, None for no tensor, with `avatars` avatars in view.
+
+        `networks`: numbers of the networks that paint them, each on a tensor. A frame with nobody in view still counts
+        one avatar's pose, because the pose stage looks for somebody.
+        """
+        plan = self._plan(shape, avatars, networks)
+        times = stage_times_ms(self._chip, plan, self._corners)
+        if shape is None:
+            kept = {key: ms for key, ms in times.items() if key[0] in ALWAYS}
+            return FrameCost(0, 0.0, sum(kept.values()), least_frame_ms(self._chip, kept))
+        steady_ms = steady(self._chip, plan, self._corners, quick=True).frame_ms
+        return FrameCost(plan.network.pixels, plan.network.work.macs / 1e9, sum(times.values()), steady_ms)
+
+    def placement(
+        self,
+        shape: Shape | None,
+        avatars: int = 1,
+        networks: Networks = FIRST,
+        asked: Mapping[str, tuple[int, ...]] | None = None,
+    ) -> dict[str, Any]:
+        """Say where the units are best placed for frames of `shape` with `avatars` avatars in view, and why.
+
+        The model of `trilane predict` decides. `networks`: as in `of`. `asked`: cores of units of this machine. Raises
+        BadInputError when cores of another chip are asked for.
+        """
+        asked = asked or {}
+        if self._chip.name != HOST:
+            if asked:
+                raise BadInputError("--cores", f"cores of {self._chip.name}", f"--profile {HOST}, which has cores")
+            return {
+                "units": None,
+                "predicted_ms": None,
+                "why": f"each unit of {self._chip.name} is hardware of its own",
+            }
+        plan = self._plan(shape, avatars, networks)
+        cores = sorted({*usable_cores(), *(core for own in asked.values() for core in own)})
+        placed = place_units(self._chip, plan, self._corners, host_cores(cores), asked)
+        chosen = {key: placed.facts[key] for key in ("units", "predicted_ms")}
+        return {**chosen, "why": f"{described(placed.best.placement)}: {_why_placed(asked, placed.rule)}"}
+
+    def _plan(self, shape: Shape | None, avatars: int, networks: Networks) -> Plan:
+        files = [self._networks[number] for number in networks]
+        return Plan(painting(files, shape or files[0].shape[1:3], {}), "dsp", PIPELINED, avatars=max(1, avatars))
+
+
+def _why_placed(asked: Mapping[str, tuple[int, ...]], rule: Ranked) -> str:
+    if len(asked) == len(UNITS):
+        return "as asked"
+    how = "as asked, the others for the least predicted frame time" if asked else "the least predicted frame time"
+    by_rule = f"{described(rule.placement)}, {rule.frame_ns / NS_PER_MS:.1f} ms"
+    return f"{how}; by the rule for any run, {by_rule}. A run measures and decides for itself"

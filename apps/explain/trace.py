@@ -145,11 +145,6 @@ def write_trace(records: Iterable[Record], file: IO[bytes]) -> None:
     write_tracks(PacketSink(file), {"trilane": records})
 
 
-def write_chrome_trace(records: Iterable[Record], file: IO[str]) -> None:
-    """Write the trace of a journal's `records` as Chrome's JSON."""
-    write_tracks(ChromeSink(file), {"trilane": records})
-
-
 def write_tracks(sink: Sink, runs: Mapping[str, Iterable[Record]]) -> None:
     """Write several runs to one trace, one after the other, each as a group of tracks by its name; close the sink."""
     for number, (name, records) in enumerate(runs.items()):
@@ -177,7 +172,7 @@ def write_run(records: Iterable[Record], target: Path, *, chrome: bool = False) 
     with write_atomically(target) as draft:
         if chrome:
             with draft.open("w", encoding="utf-8") as text:
-                write_chrome_trace(records, text)
+                write_tracks(ChromeSink(text), {"trilane": records})
         else:
             with draft.open("wb") as file:
                 write_trace(records, file)

@@ -14,13 +14,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from trilane.apps.inspect.inspection import Inspection, refused
-from trilane.apps.inspect.pictures import inspect_folder, inspect_picture, inspect_video
 from trilane.apps.inspect.readers import (
     inspect_avatar,
     inspect_body,
     inspect_camera,
+    inspect_folder,
     inspect_motion,
     inspect_network,
+    inspect_picture,
     inspect_profile,
     inspect_report,
     inspect_run,
@@ -29,6 +30,7 @@ from trilane.apps.inspect.readers import (
     inspect_sweep_file,
     inspect_texture,
     inspect_trace,
+    inspect_video,
 )
 from trilane.avatars.bundle import MANIFEST
 from trilane.errors import BadInputError

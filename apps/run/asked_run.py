@@ -98,7 +98,7 @@ def _with_remade_avatar(options: RunOptions) -> tuple[RunOptions, tuple[str, ...
 
     Raises BadInputError, MissingPartError.
     """
-    from trilane.apps.avatar.remade_avatar import is_untrained, remade_avatar
+    from trilane.apps.avatar_files import is_untrained, remade_avatar
     from trilane.avatars.bundle import load_bundle
     from trilane.stages.configure import requested_scene
 

@@ -37,7 +37,7 @@ KEEP = re.compile(r"\s*([A-Za-z][\w.-]*)\s*(<=|>=|<|>)\s*([-+]?[\d.]+(?:e[-+]?\d
 Do = Callable[[Sequence[Trial]], Mapping[str, Record]]
 
 
-class Metric(NamedTuple):
+class GoalMetric(NamedTuple):
     """A figure of a result. `path`: its keys in the `--json` document, empty for the PSNR, which has several places."""
 
     unit: str
@@ -46,15 +46,15 @@ class Metric(NamedTuple):
 
 
 METRICS = {
-    "fps": Metric("fps", True, ("fps",)),
-    "frame": Metric("ms", False, ("frame_time_ms", "mean")),
-    "p95": Metric("ms", False, ("frame_time_ms", "p95")),
-    "p99": Metric("ms", False, ("frame_time_ms", "p99")),
-    "latency": Metric("ms", False, ("latency_ms", "mean")),
-    "power": Metric("W", False, ("power_w",)),
-    "energy": Metric("mJ", False, ("energy_mj_per_frame",)),
-    "psnr": Metric("dB", True, ()),
-    "worst-psnr": Metric("dB", True, ("check", "worst_psnr_db")),
+    "fps": GoalMetric("fps", True, ("fps",)),
+    "frame": GoalMetric("ms", False, ("frame_time_ms", "mean")),
+    "p95": GoalMetric("ms", False, ("frame_time_ms", "p95")),
+    "p99": GoalMetric("ms", False, ("frame_time_ms", "p99")),
+    "latency": GoalMetric("ms", False, ("latency_ms", "mean")),
+    "power": GoalMetric("W", False, ("power_w",)),
+    "energy": GoalMetric("mJ", False, ("energy_mj_per_frame",)),
+    "psnr": GoalMetric("dB", True, ()),
+    "worst-psnr": GoalMetric("dB", True, ("check", "worst_psnr_db")),
 }
 #: Figures that the frontier weighs beside those asked for, where every trial has them.
 WEIGHED = ("psnr", "power")

@@ -32,14 +32,15 @@ def test_every_package_folder_is_linked_into_the_namespace_and_typed() -> None:
         assert (link / "py.typed").is_file()
 
 
-def test_every_data_file_has_an_ending_that_is_packed() -> None:
-    """Every folder is packed, with `__init__.py` or without, unless `namespaces` is false."""
+def test_every_data_file_has_an_ending_that_is_packed_and_is_in_a_folder_that_is() -> None:
+    """Folders without `__init__.py` are packed too, unless `namespaces` is false; none with a dot in its name is."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     patterns = settings["tool"]["setuptools"]["package-data"]["*"]
     assert settings["tool"]["setuptools"]["packages"]["find"].get("namespaces", True)
     names = {link.name for link in LINKS}
     for path in (path for path in tracked() if path.parts[0] in names):
         assert path.suffix == ".py" or any(fnmatch(path.name, pattern) for pattern in patterns), path
+        assert not any("." in folder.name for folder in path.parents), path
 
 
 def test_the_version_is_the_distributions(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from trilane.apps.experiments.hard_tensors import NUMBERS, STEPS, tensor_cases
+from trilane.apps.experiments.hard_numbers import NUMBERS, STEPS, tensor_cases
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import ShapedBody, load_body
 from trilane.stages.gpu import opengl

@@ -21,7 +21,7 @@ playwright = pytest.importorskip("playwright.sync_api", reason="the extra browse
 
 from support.dashboard_double import DoubleView, Served  # noqa: E402
 from trilane import machine  # noqa: E402
-from trilane.apps.dashboard.pages import PICTURE_KIND, ChangesSaid, ControlSaid, Seek  # noqa: E402
+from trilane.apps.dashboard.view import PICTURE_KIND, ChangesSaid, ControlSaid, Seek  # noqa: E402
 
 pytestmark = pytest.mark.slow
 

@@ -29,7 +29,7 @@ websockets = pytest.importorskip("websockets.sync.client", reason="the extra das
 from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
 
 from support.dashboard_client import PATIENCE_S, Page, Served, serving  # noqa: E402
-from trilane.apps.dashboard.pages import MOST_CLIENTS  # noqa: E402
+from trilane.apps.dashboard.view import MOST_CLIENTS  # noqa: E402
 from trilane.apps.run.report import read_report  # noqa: E402
 
 pytestmark = pytest.mark.slow

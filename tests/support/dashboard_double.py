@@ -20,7 +20,7 @@ from PIL import Image, ImageDraw
 
 from trilane.apps.dashboard.access import listen
 from trilane.apps.dashboard.app import DashboardApp, server
-from trilane.apps.dashboard.pages import ChangesSaid, Client, ControlSaid, Seek, shown
+from trilane.apps.dashboard.view import ChangesSaid, Client, ControlSaid, Seek, shown
 
 PERIOD_MS = 1000 / 60
 STAGES = (("pose", "cpu"), ("raster", "gpu"), ("infer", "dsp"), ("composite", "gpu"), ("present", "cpu"))

@@ -19,7 +19,7 @@ from PIL import Image
 from rich.console import Console
 
 from support.small_inputs import validated
-from trilane.apps.avatar.assembled_avatar import bundle_facts
+from trilane.apps.avatar_files import bundle_facts
 from trilane.apps.cli.avatar_train import _band_table
 from trilane.avatars.bundle import load_bundle, write_manifest
 from trilane.avatars.manifest import BANDS, Validation

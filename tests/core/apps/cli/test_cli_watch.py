@@ -18,7 +18,7 @@ from rich.console import Console
 from support.run_report import make_report
 from support.told_journal import told_journal
 from trilane.apps.cli import watch as cli_watch
-from trilane.apps.cli.watch_view import line, screen
+from trilane.apps.cli.watch import line, screen
 from trilane.apps.run.report import Report
 from trilane.apps.run.verdict_facts import verdict_of
 from trilane.apps.watch.followed_run import RunState

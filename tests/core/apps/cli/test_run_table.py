@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from support.run_report import SHARE, SHOWN, TIMES, make_report
-from trilane.apps.cli.run_table import run_table
+from trilane.apps.cli.run import run_table
 from trilane.apps.run.report import Report
 from trilane.units import NO_FIGURES
 

@@ -15,7 +15,7 @@ import pytest
 
 from support.compared_runs import STAGES, on_a_machine, simulated
 from support.run_report import make_report
-from trilane.apps.cli.compare_table import comparison_lines
+from trilane.apps.cli.compare import comparison_lines
 from trilane.apps.compare.comparison import NO_DIFFERENCE, Bounds, Comparison, bounds_text, compare
 from trilane.apps.compare.difference import Finding
 from trilane.apps.compare.page import page

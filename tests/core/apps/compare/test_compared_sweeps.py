@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from support.compared_runs import simulated, write_run
-from trilane.apps.cli.compare_table import sweep_lines
+from trilane.apps.cli.compare import sweep_lines
 from trilane.apps.compare.compared_sweeps import SweepComparison, compare_sweeps
 from trilane.apps.compare.difference import Finding
-from trilane.apps.compare.gate import Outcome, judge, read_gate
+from trilane.apps.compare.gate import LimitOutcome, judge, read_gate
 from trilane.errors import BadInputError
 
 SweepOf = Callable[..., Path]
@@ -68,7 +68,10 @@ def test_trials_of_equal_configuration_are_paired(sweep: SweepOf) -> None:
     assert left == {"not_done": [128], "base_alone": [160], "other_alone": [192]}
     assert found.verdict.startswith("frame time differs in 1 of 2 trials, 1 of them slower; over all +9.")
     judged = [judge([read_gate(f"slower={limit}%")], [pair.sides for pair in found.pairs]) for limit in (15, 25)]
-    assert [[each.outcome for each in one] for one in judged] == [[Outcome.KEPT, Outcome.BROKEN], [Outcome.KEPT] * 2]
+    assert [[each.outcome for each in one] for one in judged] == [
+        [LimitOutcome.KEPT, LimitOutcome.BROKEN],
+        [LimitOutcome.KEPT] * 2,
+    ]
     assert compared(base, base).verdict.startswith("no difference in any of 4 trials; over all +0.0 %")
 
 

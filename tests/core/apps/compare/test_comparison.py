@@ -17,7 +17,7 @@ from support.run_report import make_report
 from trilane.apps.compare import run_frames
 from trilane.apps.compare.comparison import NO_DIFFERENCE, TOO_FEW, Comparison, compare, document
 from trilane.apps.compare.difference import Chance, Finding
-from trilane.apps.compare.gate import Outcome, Pair, judge, read_gate, whole
+from trilane.apps.compare.gate import GatedPair, LimitOutcome, judge, read_gate, whole
 from trilane.apps.compare.page import page
 from trilane.apps.compare.rows import Figure, noise_between, remarks
 from trilane.apps.compare.run_frames import Key, frames_of
@@ -111,8 +111,8 @@ def test_a_frame_time_that_doubles_is_named_whatever_else_runs(others: tuple[flo
     )
     found = pair(base, other)
     assert re.match(r"frame time \+(9\d|10\d) % \(", found.verdict)
-    judged = judge([read_gate("frame-time=5%")], [Pair("b", found.base, found.other, found.rows, found.changes)])
-    assert whole(judged) is Outcome.BROKEN
+    judged = judge([read_gate("frame-time=5%")], [GatedPair("b", found.base, found.other, found.rows, found.changes)])
+    assert whole(judged) is LimitOutcome.BROKEN
 
 
 def test_what_other_programs_may_have_done_to_the_frame_time_is_not_the_programs() -> None:

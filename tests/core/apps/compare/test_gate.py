@@ -23,10 +23,10 @@ import pytest
 
 from support.compared_runs import STAGES, on_a_machine, simulated, write_run
 from support.run_report import make_report
-from trilane.apps.cli.github import annotation, summary
+from trilane.apps.cli.compare import annotation, summary
 from trilane.apps.compare.comparison import compare
 from trilane.apps.compare.difference import Difference
-from trilane.apps.compare.gate import METRICS, Outcome, Pair, Weighed, judge, read_gate, runs_needed, whole
+from trilane.apps.compare.gate import METRICS, GatedPair, LimitOutcome, Weighed, judge, read_gate, runs_needed, whole
 from trilane.apps.compare.rows import FRAME_TIME, MS, Figure
 from trilane.apps.compare.run_frames import frames_of
 from trilane.apps.compare.sides import ComparedRun, RunKind, Side
@@ -55,13 +55,13 @@ def run(
     return ComparedRun(f"run {seed}", RunKind.RUN, make_report(**{**simulation.report, **facts}), frames_of(records))
 
 
-def outcome(base: ComparedRun, other: ComparedRun, *limits: str) -> Outcome:
+def outcome(base: ComparedRun, other: ComparedRun, *limits: str) -> LimitOutcome:
     return whole(judge([*map(read_gate, limits)], [pair(base, other)]))
 
 
-def pair(base: ComparedRun, other: ComparedRun) -> Pair:
+def pair(base: ComparedRun, other: ComparedRun) -> GatedPair:
     found = compare(Side(base.name, (base,)), [Side(other.name, (other,))])[0]
-    return Pair(other.name, found.base, found.other, found.rows, found.changes)
+    return GatedPair(other.name, found.base, found.other, found.rows, found.changes)
 
 
 def reason(base: ComparedRun, other: ComparedRun, limit: str) -> str:
@@ -69,23 +69,23 @@ def reason(base: ComparedRun, other: ComparedRun, limit: str) -> str:
 
 
 def test_with_instructions_a_gate_tells_3_percent_of_one_stage_from_none() -> None:
-    assert outcome(run(1), run(2), "slower=2%") is Outcome.KEPT
-    assert outcome(run(1), run(2, {"raster": 1.03}), "slower=2%") is Outcome.BROKEN
-    assert outcome(run(1), run(2, {"raster": 1.03}), "slower=5%") is Outcome.KEPT
-    assert outcome(run(1), run(2, {"raster": 0.9}), "slower=2%") is Outcome.KEPT
+    assert outcome(run(1), run(2), "slower=2%") is LimitOutcome.KEPT
+    assert outcome(run(1), run(2, {"raster": 1.03}), "slower=2%") is LimitOutcome.BROKEN
+    assert outcome(run(1), run(2, {"raster": 1.03}), "slower=5%") is LimitOutcome.KEPT
+    assert outcome(run(1), run(2, {"raster": 0.9}), "slower=2%") is LimitOutcome.KEPT
 
 
 def test_without_instructions_one_run_of_each_kind_cannot_tell_and_says_how_many_would() -> None:
     said = reason(run(1, counted=False), run(2, counted=False), "slower=5%")
     assert said.startswith("slower=5%: cannot tell: ") and "runs of each side would be needed (A1,A2,A3)" in said
-    assert outcome(run(1, counted=False), run(2, counted=False), "slower=100%") is Outcome.KEPT
+    assert outcome(run(1, counted=False), run(2, counted=False), "slower=100%") is LimitOutcome.KEPT
 
 
 @pytest.mark.parametrize("others", [(0.0, 0.0), (0.1, 0.1), (0.5, 0.5), (0.0, 0.1)])
 @pytest.mark.parametrize("stage", ["infer", "present"])
 def test_a_stage_that_takes_twice_as_long_breaks_it_whatever_else_runs(stage: str, others: tuple[float, float]) -> None:
     base, other = run(1, counted=False, others=others[0]), run(2, {stage: 2.0}, counted=False, others=others[1])
-    assert outcome(base, other, "slower=5%") is Outcome.BROKEN
+    assert outcome(base, other, "slower=5%") is LimitOutcome.BROKEN
 
 
 def test_a_frame_time_that_doubles_without_more_instructions_never_passes() -> None:
@@ -126,17 +126,17 @@ def test_other_programs_share_is_taken_out_of_the_frame_time_in_one_direction() 
 @pytest.mark.parametrize("place", [0, 1])
 def test_a_run_that_was_disturbed_never_passes(facts: dict[str, Any], place: int) -> None:
     sides = [run(1), run(2)]
-    assert outcome(*sides, "slower=5%") is Outcome.KEPT
+    assert outcome(*sides, "slower=5%") is LimitOutcome.KEPT
     sides[place] = run(place + 1, **facts)
     said = reason(*sides, "slower=5%")
     assert said.startswith(f"slower=5%: cannot tell: run {place + 1} is UNSURE: ") and said.endswith("; repeat it")
-    assert outcome(*sides, "instructions=5%") is Outcome.KEPT  # other programs do not change them
+    assert outcome(*sides, "instructions=5%") is LimitOutcome.KEPT  # other programs do not change them
 
 
 def test_a_setting_that_changed_leaves_the_times_to_decide() -> None:
     """Instructions of another number of frames, or of another runtime, do not stand for the whole program."""
     config = {**make_report()["config"], "runtime": "openvino"}
-    assert outcome(run(1), run(2, config=config), "slower=5%") is Outcome.UNKNOWN
+    assert outcome(run(1), run(2, config=config), "slower=5%") is LimitOutcome.UNKNOWN
 
 
 def checked(psnr: float, worst: float, numbers: tuple[int, ...] = (1, 2)) -> dict[str, Any]:
@@ -145,18 +145,18 @@ def checked(psnr: float, worst: float, numbers: tuple[int, ...] = (1, 2)) -> dic
 
 def test_the_error_of_the_frames_has_a_limit_in_decibels() -> None:
     base, other = run(1, **checked(35.0, 30.0)), run(2, **checked(34.6, 30.5))
-    assert outcome(base, other, "psnr=0.5dB") is Outcome.KEPT
-    assert outcome(base, other, "psnr=0.3dB") is Outcome.BROKEN
-    assert outcome(base, other, "worst-psnr=0.1dB", "psnr=0.5dB") is Outcome.KEPT
-    assert outcome(other, base, "psnr=0.1dB") is Outcome.KEPT
-    assert outcome(base, run(3), "psnr=0.5dB") is Outcome.UNKNOWN
-    assert outcome(base, run(3, **checked(35.0, 30.0, (1, 3))), "psnr=0.5dB") is Outcome.UNKNOWN
+    assert outcome(base, other, "psnr=0.5dB") is LimitOutcome.KEPT
+    assert outcome(base, other, "psnr=0.3dB") is LimitOutcome.BROKEN
+    assert outcome(base, other, "worst-psnr=0.1dB", "psnr=0.5dB") is LimitOutcome.KEPT
+    assert outcome(other, base, "psnr=0.1dB") is LimitOutcome.KEPT
+    assert outcome(base, run(3), "psnr=0.5dB") is LimitOutcome.UNKNOWN
+    assert outcome(base, run(3, **checked(35.0, 30.0, (1, 3))), "psnr=0.5dB") is LimitOutcome.UNKNOWN
     assert "--check" in reason(base, run(3), "psnr=0.5dB")
     sides = [Side(name, tuple(run(seed, **checked(db, 30.0)) for seed, db in enumerate(values, 1)))
              for name, values in (("a", (35.0, 35.1, 35.2)), ("b", (34.0, 34.1, 34.2)))]  # fmt: skip
     found = compare(sides[0], [sides[1]])[0]
-    several = judge([read_gate("psnr=0.5dB")], [Pair("b", *sides, found.rows, found.changes)])[0]
-    assert several.outcome is Outcome.BROKEN
+    several = judge([read_gate("psnr=0.5dB")], [GatedPair("b", *sides, found.rows, found.changes)])[0]
+    assert several.outcome is LimitOutcome.BROKEN
     row = several.figures[0].row
     assert (row.change, row.deviation, row.freedom) == (pytest.approx(-1), pytest.approx(0.1 * sqrt(2 / 3)), 4)
 
@@ -359,7 +359,7 @@ LOADS = (0.0, 0.1, 0.5)
 CHANGES = (1.0, 1.03, 1.05, 1.1, 2.0)
 
 
-def pairs(load: float, change: float, number: int, *, counted: bool, runs: int = 1) -> Iterator[tuple[str, Pair]]:
+def pairs(load: float, change: float, number: int, *, counted: bool, runs: int = 1) -> Iterator[tuple[str, GatedPair]]:
     """Pairs of runs under load, the changed stage in turn, and the stage."""
     seeds = count(1 + 10_000 * LOADS.index(load) + 1000 * CHANGES.index(change))
     for place in range(number):
@@ -369,10 +369,10 @@ def pairs(load: float, change: float, number: int, *, counted: bool, runs: int =
             for name, factors in (("base", {}), ("other", {stage: change}))
         ]
         found = compare(made[0], [made[1]])[0]
-        yield stage, Pair("other", *made, found.rows, found.changes)
+        yield stage, GatedPair("other", *made, found.rows, found.changes)
 
 
-def tallied(load: float, change: float, number: int, limit: str, *, counted: bool) -> Counter[Outcome]:
+def tallied(load: float, change: float, number: int, limit: str, *, counted: bool) -> Counter[LimitOutcome]:
     gate = [read_gate(limit)]
     return Counter(whole(judge(gate, [each])) for _, each in pairs(load, change, number, counted=counted))
 
@@ -383,20 +383,20 @@ def tallied(load: float, change: float, number: int, limit: str, *, counted: boo
 def test_how_often_the_gate_is_right(load: float, counted: bool) -> None:
     """20 pairs each; docs/decisions/comparing-runs.md has the table."""
     found = {change: tallied(load, change, 20, "slower=2%", counted=counted) for change in CHANGES}
-    assert found[1.0][Outcome.BROKEN] <= 1
-    assert found[2.0][Outcome.BROKEN] == 20
-    assert not any(found[change][Outcome.KEPT] for change in CHANGES[1:])
+    assert found[1.0][LimitOutcome.BROKEN] <= 1
+    assert found[2.0][LimitOutcome.BROKEN] == 20
+    assert not any(found[change][LimitOutcome.KEPT] for change in CHANGES[1:])
     if counted:
-        assert found[1.05][Outcome.BROKEN] >= 16
+        assert found[1.05][LimitOutcome.BROKEN] >= 16
     if load > 0.05:
-        assert not found[1.0][Outcome.KEPT]
+        assert not found[1.0][LimitOutcome.KEPT]
 
 
 def test_runs_that_lost_nothing_keep_a_limit_of_losses() -> None:
     assert reason(run(1), run(2), "lost=1%") == "lost=1%: kept: no run lost or dropped a frame"
     frames = run(2).document["frames"]
     losing = {**frames, "presented": frames["presented"] - 30, "dropped": {"raster->infer": 30}}
-    assert outcome(run(1), run(2, frames=losing), "lost=1%") is Outcome.BROKEN
+    assert outcome(run(1), run(2, frames=losing), "lost=1%") is LimitOutcome.BROKEN
 
 
 def at_times(seed: int, slow: str = "", others: float = QUIET) -> ComparedRun:
@@ -417,7 +417,7 @@ def at_times(seed: int, slow: str = "", others: float = QUIET) -> ComparedRun:
 
 
 def test_beside_other_programs_few_long_jobs_are_neither_passed_nor_called_slower() -> None:
-    assert outcome(at_times(1, others=0.5), at_times(2, "present", others=0.5), "slower=12%") is Outcome.UNKNOWN
+    assert outcome(at_times(1, others=0.5), at_times(2, "present", others=0.5), "slower=12%") is LimitOutcome.UNKNOWN
 
 
 def of_four(name: str, first_seed: int, slow: str = "") -> Side:
@@ -427,12 +427,12 @@ def of_four(name: str, first_seed: int, slow: str = "") -> Side:
 @pytest.mark.parametrize("stage", ["pose", "present"])
 def test_few_jobs_that_take_much_longer_are_not_passed_though_the_typical_job_is_as_before(stage: str) -> None:
     """The mean doubles while the middle half does not change, and neither stage bounds the frame time."""
-    for other, expected in ((of_four("slow", 9, stage), Outcome.BROKEN), (of_four("same", 20), Outcome.KEPT)):
+    for other, expected in ((of_four("slow", 9, stage), LimitOutcome.BROKEN), (of_four("same", 20), LimitOutcome.KEPT)):
         found = compare(of_four("base", 0), [other])[0]
-        pairs = [Pair(other.name, found.base, found.other, found.rows, found.changes)]
+        pairs = [GatedPair(other.name, found.base, found.other, found.rows, found.changes)]
         judged = judge([read_gate("slower=12%")], pairs)[0]
         assert judged.outcome is expected
-        assert (f"service of {stage}" in judged.said) == (expected is Outcome.BROKEN)
+        assert (f"service of {stage}" in judged.said) == (expected is LimitOutcome.BROKEN)
 
 
 def test_a_stage_that_one_side_lacks_is_not_passed() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from trilane.apps.dashboard import live_run, run_facts
-from trilane.apps.dashboard.channel import ChangesAsked, ControlAsked, Message, Refused, StateIs
+from trilane.apps.dashboard.channel import ChangesAsked, ChangesRefused, ControlAsked, Message, StateIs
 from trilane.apps.dashboard.live_run import Director, _numbered, choices_of, reasons_against
 from trilane.apps.run.run_job import Prepared
 from trilane.errors import BadInputError
@@ -76,7 +76,7 @@ def test_one_that_cannot_be_run_changes_nothing(run: tuple[Director, RunControls
     director.do(ChangesAsked({"size": "17"}))
     director.do(ChangesAsked({"policy": "latest", "size": "17"}))
     assert controls.taken() == ([], []) and director.take_next() is None
-    assert told == [Refused("size", why), Refused("restart", why)]
+    assert told == [ChangesRefused("size", why), ChangesRefused("restart", why)]
 
 
 @pytest.mark.parametrize(
@@ -148,7 +148,7 @@ def test_a_word_that_stands_for_no_value_is_refused(
 ) -> None:
     monkeypatch.setattr(live_run, "OF_A_NEW_RUN", (name,))
     run[0].do(ChangesAsked({name: word}))
-    assert (told, run[0].take_next()) == ([Refused(name, said)], None)
+    assert (told, run[0].take_next()) == ([ChangesRefused(name, said)], None)
 
 
 def test_what_is_in_force_can_be_chosen_and_a_pace_is_capped_already(tmp_path: Any) -> None:

@@ -19,8 +19,8 @@ pytest.importorskip("prometheus_client", reason="the extra dashboard is not inst
 
 from support.run_report import make_report
 from trilane.apps.dashboard.finished_view import CUT_OFF, MOST_JOBS, NO_VIDEO, PIECE_ROWS, FinishedView, TimeTable
-from trilane.apps.dashboard.pages import Client, ControlSaid, Seek
 from trilane.apps.dashboard.run_facts import facts_of_report
+from trilane.apps.dashboard.view import Client, ControlSaid, Seek
 from trilane.apps.run.report import Report
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import NAME, Ended, JournalWriter, journal_of

@@ -10,7 +10,7 @@ import pytest
 
 from trilane import machine
 from trilane.apps.dashboard import access, live_run
-from trilane.apps.dashboard.channel import ChangesAsked, Message, Refused, StateIs
+from trilane.apps.dashboard.channel import ChangesAsked, ChangesRefused, Message, StateIs
 from trilane.apps.dashboard.live_run import ENDLESS, _Runs
 from trilane.apps.run.run_job import Prepared, Watched
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
@@ -77,8 +77,8 @@ def test_a_change_that_cannot_begin_is_taken_back(monkeypatch: pytest.MonkeyPatc
     world = World(monkeypatch, lambda: world.ask("latest"), dies, lambda: (130, None))
     world.run_all()
     assert [policy for policy, _, _ in world.begun] == ["pipelined", "latest", "pipelined"]
-    assert [message for message in world.told if isinstance(message, Refused)] == [
-        Refused("", "the run did not begin: unit dsp could not start")
+    assert [message for message in world.told if isinstance(message, ChangesRefused)] == [
+        ChangesRefused("", "the run did not begin: unit dsp could not start")
     ]
 
 

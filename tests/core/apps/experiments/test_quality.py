@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from trilane.apps.cli import quality as cli
-from trilane.apps.experiments import accuracy, hard_cases, hard_numbers
-from trilane.apps.experiments.accuracy import runtime_differences
+from trilane.apps.experiments import hard_cases, hard_numbers, scene_pictures
+from trilane.apps.experiments.scene_pictures import runtime_differences
 from trilane.errors import BadInputError
 from trilane.stages import configure
 
@@ -33,7 +33,7 @@ def rows(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[Any]]:
 
     monkeypatch.setattr(configure, "configure", lambda *_: "checked")
     monkeypatch.setattr(configure, "required_machine", dict)
-    monkeypatch.setattr(accuracy, "runtime_differences", differences)
+    monkeypatch.setattr(scene_pictures, "runtime_differences", differences)
     monkeypatch.setattr(hard_numbers, "hard_numbers", lambda: iter(found["numbers"]))
     monkeypatch.setattr(hard_cases, "hard_cases", lambda _: iter(found["networks"]))
     return found
@@ -136,10 +136,10 @@ def frames(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int, int]]:
             tensor[0, 0, 0] = first
             yield number, 0, tensor
 
-    monkeypatch.setattr(accuracy, "_tensors", tensors)
-    monkeypatch.setattr(accuracy, "networks_of", lambda _: [None, None])
-    monkeypatch.setattr(accuracy, "reshaped", lambda *_: None)
-    monkeypatch.setattr(accuracy, "load_runtime", runtimes.__getitem__)
+    monkeypatch.setattr(scene_pictures, "_tensors", tensors)
+    monkeypatch.setattr(scene_pictures, "networks_of", lambda _: [None, None])
+    monkeypatch.setattr(scene_pictures, "reshaped", lambda *_: None)
+    monkeypatch.setattr(scene_pictures, "load_runtime", runtimes.__getitem__)
     return shown
 
 
@@ -190,7 +190,7 @@ def test_a_frame_with_two_networks_counts_once(monkeypatch: pytest.MonkeyPatch) 
     """Both tensors are compared: the second differs by 16 in one pixel of 8, as its first byte is 2."""
     tensors = np.zeros((2, 2, 4, 3), np.uint8)
     tensors[:, 0, 0, 0] = 1, 2
-    monkeypatch.setattr(accuracy, "_tensors", lambda *_: iter([(4, 0, tensors[0]), (4, 1, tensors[1])]))
+    monkeypatch.setattr(scene_pictures, "_tensors", lambda *_: iter([(4, 0, tensors[0]), (4, 1, tensors[1])]))
     found = runtime_differences(CHECKED, ("ort", "qnn"), 1)
     assert found["frames"] == [4]
     assert [tuple(row.values()) for row in found["rows"]] == [("ort", "qnn", 1.5, 16, 4)]

@@ -13,15 +13,18 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from trilane.apps.cli.plan import app
-from trilane.apps.explain.explanation import ALWAYS, PIPELINED, CostModel, least_frame_ms
+from trilane.apps.cli.explain import app
 from trilane.apps.explain.scene_plan import (
+    ALWAYS,
     BODY,
     MESH,
+    PIPELINED,
     TENSOR,
+    CostModel,
     PlannedFrame,
     ScenePlan,
     draw_plan,
+    least_frame_ms,
     phases,
 )
 from trilane.avatars.bundle import load_bundle
@@ -71,7 +74,7 @@ def checked(folder: Path) -> Checked:
 
 def explained(folder: Path, *options: str) -> Any:
     chip = [] if "--profile" in options else ["--profile", CHIP]
-    result = CliRunner().invoke(app, [str(folder / "small.toml"), *chip, *options])
+    result = CliRunner().invoke(app, ["plan", str(folder / "small.toml"), *chip, *options])
     assert result.exit_code == 0, result.output
     return result
 
@@ -246,7 +249,7 @@ def test_on_this_machine_units_are_placed_as_in_a_prediction(
     """For the shape of most frames, on two cores."""
     for module in ("host", "predict"):
         monkeypatch.setattr(f"trilane.hw_profiles.{module}.usable_cores", lambda: (0, 1))
-    monkeypatch.setattr("trilane.apps.explain.explanation.usable_cores", lambda: (0, 1))
+    monkeypatch.setattr("trilane.apps.explain.scene_plan.usable_cores", lambda: (0, 1))
     document = json.loads(explained(folder, "--json", "--profile", "host").stdout)
     frames = {tuple(row["tensor"]): 0 for row in document["phases"]}
     for row in document["phases"]:
@@ -285,13 +288,13 @@ def test_what_a_run_may_be_asked_can_be_explained(folder: Path, tmp_path: Path) 
     assert [row["tensor"] for row in document["phases"]] == [list(group[0].plan.shape or ()) for group in groups]
     assert document["avatars"][0]["skinned_on"] == "gpu"
     assert "--picture: found '12', expected WIDTHxHEIGHT" in str(
-        CliRunner().invoke(app, [str(folder / "small.toml"), "--picture", "12"]).exception
+        CliRunner().invoke(app, ["plan", str(folder / "small.toml"), "--picture", "12"]).exception
     )
 
 
 def test_cores_that_are_asked_for_are_kept(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of two cores: the other units go where frames are shortest; a network on both cores may share them."""
-    for module in ("hw_profiles.host", "hw_profiles.predict", "apps.explain.explanation"):
+    for module in ("hw_profiles.host", "hw_profiles.predict", "apps.explain.scene_plan"):
         monkeypatch.setattr(f"trilane.{module}.usable_cores", lambda: (0, 1))
     costs = CostModel([load_bundle(tiny_bundle).read_network()], "host", CAP)
     free = costs.placement((96, 64))
@@ -374,16 +377,16 @@ def test_the_picture_shows_bodies_and_rectangles(checked: Checked, tmp_path: Pat
     ],
 )
 def test_wrong_options_are_named(folder: Path, options: list[str], words: str) -> None:
-    result = CliRunner().invoke(app, [str(folder / "small.toml"), *options])
+    result = CliRunner().invoke(app, ["plan", str(folder / "small.toml"), *options])
     assert result.exit_code != 0
     assert words in result.output + str(result.exception)
 
 
 def test_the_full_plan_is_not_run(tiny_bundle: Path, tmp_path: Path) -> None:
     (tmp_path / "full.toml").write_text(f'plan = "full"\n[[avatars]]\nbundle = "{tiny_bundle}"\n')
-    result = CliRunner().invoke(app, [str(tmp_path / "full.toml")])
+    result = CliRunner().invoke(app, ["plan", str(tmp_path / "full.toml")])
     said = f"{tmp_path / 'full.toml'}: plan: found full, expected planned or fixed; `trilane bench planner` draws"
     assert said in str(result.exception)
     (tmp_path / "both.toml").write_text('plan = "fixed"\nsize = "auto"\n')
-    result = CliRunner().invoke(app, [str(tmp_path / "both.toml")])
+    result = CliRunner().invoke(app, ["plan", str(tmp_path / "both.toml")])
     assert 'size = "auto" with plan = "fixed"' in str(result.exception)

@@ -22,11 +22,10 @@ from trilane.apps.explain.trace import (
     Lanes,
     Tiles,
     TraceWriter,
-    write_chrome_trace,
     write_trace,
     write_tracks,
 )
-from trilane.apps.explain.trace_sinks import PLAIN_BYTES, PacketSink, packets_in
+from trilane.apps.explain.trace_sinks import PLAIN_BYTES, ChromeSink, PacketSink, packets_in
 from trilane.hw_profiles.application import application_graph
 from trilane.pipeline.journal import (
     SCHEMA,
@@ -283,7 +282,7 @@ def test_a_killed_run_ends_where_its_journal_does() -> None:
 def test_chrome_json_has_the_same_slices_and_counters() -> None:
     for name in ("pipelined", "latest", "deaths"):
         trace, text = trace_of(records_of(run_named(name))), io.StringIO()
-        write_chrome_trace(records_of(run_named(name)), text)
+        write_tracks(ChromeSink(text), {"trilane": records_of(run_named(name))})
         events = json.loads(text.getvalue())["traceEvents"]
         of_kind = defaultdict(list)
         for event in events:

@@ -1,1 +1,0 @@
-"""The files of the dashboard's page, as a browser takes them: no step builds them."""

@@ -1,1 +1,0 @@
-"""Files of others that the page needs, unchanged, each with its licence."""
