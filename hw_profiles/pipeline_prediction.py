@@ -66,7 +66,7 @@ class StagePrice:
 
     `source`: where it comes from. `low_ms`, `high_ms`: 80 % interval of the mean, the mean itself for times that the
     file gives; None where nobody knows the error. `why`: reasons for its width, or why there is none. `is_modelled`:
-    whether it follows from the network and the chip alone.
+    whether it follows from the network and the chip alone. `is_measured`: whether it is from a run on this machine.
     """
 
     time: StageTime
@@ -75,6 +75,7 @@ class StagePrice:
     high_ms: float | None = None
     why: tuple[str, ...] = ()
     is_modelled: bool = False
+    is_measured: bool = False
 
     @property
     def mean_ns(self) -> int:
@@ -125,7 +126,7 @@ def measured_price(file: PipelineFile, name: str, measured: Measured) -> StagePr
     time = measured.times[name].times(factor)
     source = f"measured in {measured.run}" + (f", times {factor:g}" if measured.chip != HOST else "")
     around = math.exp(NORMAL_80 * MODEL_ERROR)
-    return StagePrice(time, source, time.mean_ms / around, time.mean_ms * around)
+    return StagePrice(time, source, time.mean_ms / around, time.mean_ms * around, is_measured=True)
 
 
 def prices_of(

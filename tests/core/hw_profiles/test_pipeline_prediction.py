@@ -16,6 +16,7 @@ import pytest
 
 from support.pipeline_files import BRANCHES, CUT, DEPTH, STREET, network, write_file
 from support.run_folders import write_run
+from support.run_report import make_report
 from trilane.hw_profiles.application import Plan, Variant, simulated, stage_times_ms
 from trilane.hw_profiles.pipeline_prediction import given_price, predict_file, prices_of, steady_ms
 from trilane.hw_profiles.profile_files import load_runnable
@@ -488,6 +489,54 @@ def test_here_a_job_takes_its_unit_from_the_moment_it_is_handed_over(documents: 
     assert on_chip["pipelines"][0]["stages"]["a"]["alone_ms"] == 60
 
 
+def test_a_chip_loses_no_time_to_other_programs_of_this_machine(documents: Predict, tmp_path: Path) -> None:
+    """Of the 8 ms of each job, its unit had no core for 3; a journal that says more than the job had leaves nothing."""
+    text = """
+    [stages]
+    a = { block = "busy", unit = "a", load_ms = 1, scale = { snapdragon-888 = 10 } }
+    b = { block = "busy", unit = "b", load_ms = 1, scale = { snapdragon-888 = 10 }, in = "a" }
+    """
+    file = read_pipeline(write_file(tmp_path, text))
+    done = simulate(graph_of(file, edge_rules(file)), Settings(40), lambda *_: 8_000_000, keep=True)
+    lost = [job._replace(preempted_ns={"a": 3_000_000, "b": 9_000_000}[job.stage]) for job in done.jobs]
+    run = str(write_run(tmp_path / "run", done, lost))
+    here, on_chip = (documents(text, "--measured", run, "--profile", chip) for chip in ("host", "snapdragon-888"))
+    alone = [found["pipelines"][0]["stages"]["a"]["alone_ms"] for found in (here, on_chip)]
+    assert alone == [8, 50]
+    assert on_chip["pipelines"][0]["stages"]["b"]["alone_ms"] == 0
+    clocks = [[note for note in found["notes"] if note.startswith("measured")] for found in (here, on_chip)]
+    assert clocks == [
+        ["measured times count from the hand-over of a job, with its waits for a core"],
+        ["measured times leave out the waits for a core that this machine's kernel counted"],
+    ]
+
+
+@pytest.mark.parametrize(
+    ("others", "said"),
+    [
+        (0.27, "UNSURE: its times are from an UNSURE run: other programs took 27 % of its cores; computed"),
+        (None, "UNSURE: its times are from an UNSURE run: nobody knows what other programs took of its cores; "),
+        (0.01, "computed, and the whole 80 % interval is on one side of the target"),
+    ],
+)
+def test_a_prediction_is_trusted_no_more_than_the_run_whose_times_it_takes(
+    documents: Predict, tmp_path: Path, others: float | None, said: str
+) -> None:
+    """`None`: the run was ended before it wrote a report. A file that states all times takes none of the run."""
+    text = '[stages]\na = { python = "m:f", unit = "a" }'
+    file = read_pipeline(write_file(tmp_path, text))
+    done = simulate(graph_of(file, edge_rules(file)), Settings(40), lambda *_: 8_000_000, keep=True)
+    run = write_run(tmp_path / "run", done)
+    (run / "report.json").unlink()
+    if others is not None:
+        (run / "report.json").write_text(json.dumps(make_report(other_programs=others)), encoding="utf-8")
+    verdict = documents(text, "--measured", str(run))["pipelines"][0]["verdict"]
+    assert dict(verdict["lines"])["TRUST"].startswith(said)
+    assert verdict["trusted"] is (others == 0.01)
+    own = documents(text.replace("m:f", 'm:f", time_ms = 5, unit = "a" }#'), "--measured", str(run))["pipelines"][0]
+    assert dict(own["verdict"]["lines"])["TRUST"] == "computed; the times have no interval"
+
+
 def test_what_a_frame_needs_has_no_part_of_the_start(predict: Predict) -> None:
     stages = 't = { unit = "u", time_ms = 12 }\nd = { unit = "u", in = "t", time_ms = 45, every = 3 }'
     assert predict(f"[stages]\n{stages}")["needs_ms"]["mean"] == 27
@@ -590,6 +639,6 @@ def test_a_run_gives_the_share_of_its_frames_that_skipped(documents: Predict, tm
     run = write_run(tmp_path / "run", done)
     found = documents(text, "--measured", str(run))
     assert found["pipelines"][0]["frames"]["skipped"] == pytest.approx(750, abs=3 * sqrt(1000 * 0.75 * 0.25))
-    assert found["notes"] == []
+    assert len(found["notes"]) == 1  # which clock it is, not that nobody knows the share
     said = documents(ROUND.format("share = 0"), "--measured", str(run))["pipelines"][0]
     assert said["frames"]["skipped"] == 0
