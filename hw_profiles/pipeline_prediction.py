@@ -129,6 +129,17 @@ def measured_price(file: PipelineFile, name: str, measured: Measured) -> StagePr
     return StagePrice(time, source, time.mean_ms / around, time.mean_ms * around, is_measured=True)
 
 
+def stages_without_time(file: PipelineFile, measured: Measured = NOTHING_MEASURED) -> list[str]:
+    """Return the names of the stages whose time nobody knows: no network, not measured, and none in the file."""
+    return [
+        name
+        for name, stage in file.stages.items()
+        if not isinstance(stage, OnnxStage)
+        and given_price(file, name) is None
+        and measured_price(file, name, measured) is None
+    ]
+
+
 def prices_of(
     file: PipelineFile,
     graphs: Mapping[str, GraphFile],
@@ -142,14 +153,7 @@ def prices_of(
 
     `graphs`: graphs of the networks, by the stage's name. `corners_of_chip`: corners of a chip's units.
     """
-    unknown = [
-        name
-        for name, stage in file.stages.items()
-        if not isinstance(stage, OnnxStage)
-        and given_price(file, name) is None
-        and measured_price(file, name, measured) is None
-    ]
-    if unknown:
+    if unknown := stages_without_time(file, measured):
         raise _without_a_time(file, unknown, measured)
     found = {}
     for name, stage in file.stages.items():
@@ -169,8 +173,11 @@ def _without_a_time(file: PipelineFile, names: Sequence[str], measured: Measured
     first = names[0]
     found = f"{file.stages[first].named_kind} without a time"
     if names[1:]:
-        found += f", as {', '.join(names[1:])}"
-    remedy = 'add time_ms to each: a number, or { from = "FILE" } for what `trilane times` reads'
+        found += f" (others without one: {', '.join(names[1:])})"
+    remedy = "add time_ms = MS to each"
+    if measured.chip:
+        remedy += f", or all in one --set {','.join(f'stages.{name}.time_ms=MS' for name in names)}"
+    remedy += '; time_ms = { from = "FILE" } takes what `trilane times` reads'
     if first in measured.times:
         remedy += f"; or scale = {{ {measured.chip} = ... }} for its measured time"
     elif measured.chip and not measured.times:

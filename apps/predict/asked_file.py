@@ -5,7 +5,7 @@ Rule: nothing is printed here and no Python of the file is imported. `trilane.hw
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,9 +15,10 @@ from trilane.apps.predict.predict_options import PredictOptions
 from trilane.apps.run.report import read_report
 from trilane.apps.run.trust import Trust, trust_of
 from trilane.apps.run.verdict_facts import predicted_verdict
+from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_file import GraphFile
 from trilane.hw_profiles.network_time import Computes
-from trilane.hw_profiles.pipeline_prediction import Measured, predict_file, prices_of
+from trilane.hw_profiles.pipeline_prediction import Measured, predict_file, prices_of, stages_without_time
 from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.pipeline.file_keys import MOST_SAMPLES, OnnxStage, StageTime
@@ -26,6 +27,7 @@ from trilane.pipeline.pipeline_file import PipelineFile, assignments, read_pipel
 from trilane.units import HOST, INFER, NS_PER_MS, UnitName
 
 NONE_SKIPS: Final = "no frame takes the bypass of {}: its table says neither share nor pattern"
+NO_BASE: Final = "the file as it is has no prediction, because only --set says the times of: {}"
 FROM_HAND_OVER: Final = "measured times count from the hand-over of a job, with its waits for a core"
 WITH_A_CORE: Final = "measured times leave out the waits for a core that this machine's kernel counted"
 APART: Final = "networks are priced alone: units that work at once share memory and heat, which is not in these times"
@@ -41,8 +43,16 @@ def predict_asked_file(options: PredictOptions, path: Path, say: Callable[[str],
     if options.measured:
         measured, of_run = _measured(options.measured, chips.name), _trust_in(options.measured)
     file = _with_share(read_pipeline(path), measured)
-    variants = [("", file)] + [(text, file.changed(assignments(text))) for text in options.changes]
-    answers = [_answer(each, text, options, chips, measured, of_run) for text, each in variants]
+    lacking = stages_without_time(file, measured) if options.changes else []
+    variants = [] if lacking else [("", file)]
+    variants += [(text, file.changed(assignments(text))) for text in options.changes]
+    answers = []
+    for text, each in variants:
+        try:
+            answers.append(_answer(each, text, options, chips, measured, of_run))
+        except BadInputError as error:
+            where = f"{error.where}, with --set {text}" if text else error.where
+            raise BadInputError(where, error.found, error.expected, error.remedy) from None
     chip = chips.used
     return {
         "schema": 1,
@@ -50,7 +60,7 @@ def predict_asked_file(options: PredictOptions, path: Path, say: Callable[[str],
         "machine": {"profile": chip.name, "title": chip.title} if chip else None,
         "config": {"performance_profile": options.cap if chip else None, "seed": options.seed},
         "pipelines": answers,
-        "notes": [*([APART] if chip else []), *_clock(measured), *_without_share(file)],
+        "notes": [*([APART] if chip else []), *_clock(measured), *_without_share(file), *_without_base(lacking)],
     }
 
 
@@ -61,6 +71,11 @@ def _clock(measured: Measured) -> list[str]:
 
 def _without_share(file: PipelineFile) -> list[str]:
     return [NONE_SKIPS.format(file.bypass[0])] if file.bypass and file.bypass[1].taken is None else []
+
+
+def _without_base(lacking: Sequence[str]) -> list[str]:
+    """Say that the file as it is has no prediction beside its variants. `lacking`: stages without a time in it."""
+    return [NO_BASE.format(", ".join(lacking))] if lacking else []
 
 
 class _Chips:

@@ -248,8 +248,8 @@ BAD = {
         SIX.replace("time_ms = 6", 'python = "crop:best"')
         + '\nb = { unit = "cpu", block = "encode", path = "x.mp4", in = "a" }',
         "",
-        "stages.a: found python without a time, as b, expected a stage whose time is known; add time_ms to each: "
-        'a number, or { from = "FILE" } for what `trilane times` reads',
+        "stages.a: found python without a time (others without one: b), expected a stage whose time is known; "
+        'add time_ms = MS to each; time_ms = { from = "FILE" } takes what `trilane times` reads',
     ),
     "a missing network": (ONE.replace("add.", "none."), "", "stages.net.onnx"),
     "ports that do not fit": (

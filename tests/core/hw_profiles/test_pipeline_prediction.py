@@ -341,17 +341,37 @@ def test_a_rate_that_jitter_breaks_is_not_held(predict: Predict) -> None:
 
 def test_a_stage_without_a_time_is_refused_by_name(command: Command, tmp_path: Path) -> None:
     error = " ".join(command("predict", write_file(tmp_path, STREET), code=2)[1].split())
-    assert "stages.camera: found video without a time, as small, crop, overlay, video, expected" in error
-    assert 'add time_ms to each: a number, or { from = "FILE" } for what `trilane times` reads' in error
+    others = ["small", "crop", "overlay", "video"]
+    assert f"stages.camera: found video without a time (others without one: {', '.join(others)}), expected" in error
+    keys = ",".join(f"stages.{name}.time_ms=MS" for name in ("camera", *others))
+    assert f"add time_ms = MS to each, or all in one --set {keys}; " in error
+    assert 'time_ms = { from = "FILE" } takes what `trilane times` reads' in error
     assert "--measured RUN and scale = { snapdragon-888 = ... } in each" in error
     error = " ".join(command("predict", write_file(tmp_path, BRANCHES), code=2)[1].split())
-    assert "stages.frame: found video without a time, as composite, expected" in error
+    assert "stages.frame: found video without a time (others without one: composite), expected" in error
     options = (tmp_path / "pipeline.toml", "--profile", "host")
     out, error = command("predict", *options, code=2)
     assert "measuring" not in out + error and "scale" not in error
     text = STREET.replace("block =", "time_ms = 2, block =")
     error = " ".join(command("predict", write_file(tmp_path, text), code=2)[1].split())
     assert "stages.crop: found python without a time" in error
+
+
+def test_a_set_may_say_the_times_that_the_file_lacks(command: Command, documents: Predict, tmp_path: Path) -> None:
+    """The file itself then has no row; a --set that leaves a stage without a time is named in the refusal."""
+    text = '[stages]\na = { python = "m:f", unit = "a" }\nb = { python = "m:f", unit = "b", in = "a" }'
+    both = "stages.a.time_ms=4,stages.b.time_ms=6"
+    found = documents(text, "--set", both)
+    assert [(each["what_if"], each["period_ms"]) for each in found["pipelines"]] == [(both, 6)]
+    assert "the file as it is has no prediction, because only --set says the times of: a, b" in found["notes"]
+    file = tmp_path / "pipeline.toml"
+    shown = command("predict", file, "--set", both)[0]
+    assert f"with {both}" in shown.splitlines()
+    two = documents(text, "--set", both, "--set", both.replace("6", "9"))["pipelines"]
+    assert [each["period_ms"] for each in two] == [6, 9]
+    error = " ".join(command("predict", file, "--set", both, "--set", "stages.b.time_ms=9", code=2)[1].split())
+    assert "pipeline.toml: stages.a, with --set stages.b.time_ms=9: found python without a time, expected" in error
+    assert "all in one --set stages.a.time_ms=MS; " in error
 
 
 @pytest.mark.parametrize(
