@@ -27,6 +27,10 @@ from trilane.pipeline.pipeline_file import PipelineFile, assignments, read_pipel
 from trilane.units import HOST, INFER, NS_PER_MS, UnitName
 
 NONE_SKIPS: Final = "no frame takes the bypass of {}: its table says neither share nor pattern"
+ASSUMED: Final = (
+    "networks whose file says no precision, and what is assumed because their unit computes so: {}; "
+    "`precision` of the stage or --precision says another"
+)
 NO_BASE: Final = "the file as it is has no prediction, because only --set says the times of: {}"
 FROM_HAND_OVER: Final = "measured times count from the hand-over of a job, with its waits for a core"
 WITH_A_CORE: Final = "measured times leave out the waits for a core that this machine's kernel counted"
@@ -60,7 +64,13 @@ def predict_asked_file(options: PredictOptions, path: Path, say: Callable[[str],
         "machine": {"profile": chip.name, "title": chip.title} if chip else None,
         "config": {"performance_profile": options.cap if chip else None, "seed": options.seed},
         "pipelines": answers,
-        "notes": [*([APART] if chip else []), *_clock(measured), *_without_share(file), *_without_base(lacking)],
+        "notes": [
+            *([APART] if chip else []),
+            *([ASSUMED.format(", ".join(chips.assumed))] if chips.assumed else []),
+            *_clock(measured),
+            *_without_share(file),
+            *_without_base(lacking),
+        ],
     }
 
 
@@ -82,16 +92,18 @@ class _Chips:
     """The chip, loaded when the first network needs it, and as each network uses it.
 
     `name`: its name; this machine's where a run was measured and no chip is asked for. `used`: None until it is loaded.
+    `assumed`: stages and precisions, in order, of the networks that say none.
     """
 
     def __init__(self, options: PredictOptions, say: Callable[[str], None]) -> None:
         self._options, self._say = options, say
         self._known: dict[Hashable, Profile] = {}
         is_asked = "profile" in options.model_fields_set
+        self.assumed: dict[str, None] = {}
         self.used = load_runnable(options.profile) if is_asked else None
         self.name = self.used.name if self.used else HOST if options.measured else options.profile
 
-    def chip_for(self, stage: OnnxStage, graph: GraphFile, unit: UnitName) -> Profile:
+    def chip_for(self, name: str, stage: OnnxStage, graph: GraphFile, unit: UnitName) -> Profile:
         """Return the chip with `unit` as it computes the network of `stage`; this machine measures it first."""
         options, asked = self._options, stage.precision or self._options.numbers
         key = graph.path, tuple(sorted(stage.shapes.items())), unit, asked, stage.runtime
@@ -103,6 +115,8 @@ class _Chips:
 
                 chip = with_file(chip, graph, stage.shapes, self._say, runtime=stage.runtime)
             self._known[key] = chip
+        if asked is None and graph.numbers == "not said":
+            self.assumed[f"{name} {self._known[key].units[unit].precision}"] = None
         return self._known[key]
 
 
@@ -158,7 +172,7 @@ def _answer(
     def chip_for(name: str, graph: GraphFile, unit: UnitName) -> Profile:
         stage = file.stages[name]
         assert isinstance(stage, OnnxStage)
-        return chips.chip_for(stage, graph, unit)
+        return chips.chip_for(name, stage, graph, unit)
 
     prices = prices_of(file, graphs, chip_for, lambda chip: corners_of(chip, options.cap), measured)
     answer = predict_file(file, prices, options.frames or 0, options.seed)

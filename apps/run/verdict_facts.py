@@ -205,6 +205,7 @@ def predicted_verdict(answer: Mapping[str, Any], of_run: Trust | None = None) ->
     low, high = times.get("low"), times.get("high")
     least, most = (None, None) if low is None or high is None or not low else (1e3 / high, 1e3 / low)
     units, latency = answer.get("units") or {}, answer.get("latency_ms")
+    is_own = "cycle" in answer or answer.get("kind") == "pipeline"  # by itself, and beside others
     return judged(
         Facts(
             Rate(1e3 / times["mean"] if times["mean"] else inf, least, most, "80 %"),
@@ -215,7 +216,7 @@ def predicted_verdict(answer: Mapping[str, Any], of_run: Trust | None = None) ->
             latency_ms=latency["mean"] if latency and latency.get("samples", 1) else None,
             bound=_predicted_bound(answer, times["mean"]),
             idle={unit: (1 - row["busy"], _causes(row["idle"])) for unit, row in units.items()},
-            image="trilane quality measures it here: a prediction has no pictures",
+            image=NO_TRUTH if is_own else "trilane quality measures it here: a prediction has no pictures",
             tries=tuple(_predicted_tries(answer, times["mean"] * target > 1e3)),
             source=COMPUTED,
         )

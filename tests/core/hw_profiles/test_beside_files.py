@@ -293,6 +293,8 @@ def test_a_file_beside_others_as_a_table_and_as_json(
     missed = f"at 40 fps {answer['pipelines'][0]['deadline_misses']} of {due} frames late, 3 dropped"
     assert answer["pipelines"][0]["verdict"]["lines"][0][1].endswith(missed)
     assert [row["verdict"]["bound"]["unit"] for row in answer["pipelines"]] == ["npu", "mine", "dsp"]
+    images = [dict(row["verdict"]["lines"])["IMAGE"].startswith("nothing to compare") for row in answer["pipelines"]]
+    assert images == [True, True, False]
     assert answer["config"]["performance_profile"] == SUSTAINED
     (mine,) = answer["pipelines"][1]["units"].values()
     assert answer["units"]["gpu"]["by_pipeline"]["file1"] == pytest.approx(mine["busy"], rel=0.01)

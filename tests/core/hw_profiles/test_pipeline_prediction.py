@@ -272,6 +272,34 @@ def test_precision_is_the_networks_the_files_or_that_of_the_option(documents: Pr
     assert source(own, "--precision", "float") == "snapdragon-888, dsp in int8"
 
 
+def test_a_precision_that_nobody_says_is_told(documents: Predict, tmp_path: Path) -> None:
+    """A graph without weights says none, so the DSP's own counts, and the GPU's in the variant."""
+    write_file(tmp_path, DEPTH)
+    model = onnx.load(tmp_path / "depth.onnx")
+    sizes = list(model.graph.initializer.pop().dims)
+    model.graph.input.append(onnx.helper.make_tensor_value_info("weights", onnx.TensorProto.FLOAT, sizes))
+    onnx.save(model, tmp_path / "bare.onnx")
+    text = """
+    [stages]
+    a = { unit = "a", time_ms = 1 }
+    bare = { onnx = "bare.onnx", unit = "dsp", in = "a" }
+    full = { onnx = "depth.onnx", unit = "dsp", in = "a" }
+    """
+    chip = ("--profile", "snapdragon-8-gen-3")
+    notes = documents(text, *chip, "--set", "stages.bare.unit=gpu")["notes"]
+    (said,) = [note for note in notes if note.startswith("networks whose file says no precision")]
+    assert ": bare int8, bare fp16; `precision`" in said
+    own = text.replace('"bare.onnx"', '"bare.onnx", precision = "fp16"')
+    for notes in (documents(text, *chip, "--precision", "w8a8")["notes"], documents(own, *chip)["notes"]):
+        assert len(notes) == 1  # that networks are priced alone
+
+
+def test_the_picture_of_an_own_pipeline_has_nothing_to_compare_with(predict: Predict) -> None:
+    """As `trilane run` says of it."""
+    lines = dict(predict(DEPTH)["verdict"]["lines"])
+    assert lines["IMAGE"] == "nothing to compare with: a pipeline of your own has no true picture"
+
+
 def test_each_set_is_a_row(documents: Predict) -> None:
     rows = documents(
         DEPTH,
