@@ -67,7 +67,8 @@ class StagePrice:
 
     `source`: where it comes from. `low_ms`, `high_ms`: 80 % interval of the mean, the mean itself for times that the
     file gives; None where nobody knows the error. `why`: reasons for the interval's width, or for its absence.
-    `is_modelled`: whether it follows from the network and the chip alone.
+    `is_modelled`: whether it follows from the network and the chip alone. `is_measured`: whether it is from a run on
+    this machine.
     """
 
     time: StageTime
@@ -76,6 +77,7 @@ class StagePrice:
     high_ms: float | None = None
     why: tuple[str, ...] = ()
     is_modelled: bool = False
+    is_measured: bool = False
 
     @property
     def mean_ns(self) -> int:
@@ -129,7 +131,18 @@ def measured_price(file: PipelineFile, name: str, measured: Measured) -> StagePr
     time = measured.times[name].times(factor)
     source = f"measured in {measured.run}" + (f", times {factor:g}" if measured.chip != HOST else "")
     around = math.exp(NORMAL_80 * MODEL_ERROR)
-    return StagePrice(time, source, time.mean_ms / around, time.mean_ms * around)
+    return StagePrice(time, source, time.mean_ms / around, time.mean_ms * around, is_measured=True)
+
+
+def stages_without_time(file: PipelineFile, measured: Measured = NOTHING_MEASURED) -> list[str]:
+    """Return the names of the stages whose time nobody knows: no network, not measured, and none in the file."""
+    return [
+        name
+        for name, stage in file.stages.items()
+        if not isinstance(stage, OnnxStage)
+        and given_price(file, name) is None
+        and measured_price(file, name, measured) is None
+    ]
 
 
 def prices_of(
@@ -145,14 +158,7 @@ def prices_of(
 
     `graphs`: graphs of the networks, by the stage's name. `corners_of_chip`: corners of a chip's units.
     """
-    unknown = [
-        name
-        for name, stage in file.stages.items()
-        if not isinstance(stage, OnnxStage)
-        and given_price(file, name) is None
-        and measured_price(file, name, measured) is None
-    ]
-    if unknown:
+    if unknown := stages_without_time(file, measured):
         raise _without_a_time(file, unknown, measured)
     found = {}
     for name, stage in file.stages.items():
@@ -172,8 +178,11 @@ def _without_a_time(file: PipelineFile, names: Sequence[str], measured: Measured
     first = names[0]
     found = f"{file.stages[first].named_kind} without a time"
     if names[1:]:
-        found += f", as {', '.join(names[1:])}"
-    remedy = 'add time_ms to each: a number, or { from = "FILE" } for what `trilane times` reads'
+        found += f" (others without one: {', '.join(names[1:])})"
+    remedy = "add time_ms = MS to each"
+    if measured.chip:
+        remedy += f", or all in one --set {','.join(f'stages.{name}.time_ms=MS' for name in names)}"
+    remedy += '; time_ms = { from = "FILE" } takes what `trilane times` reads'
     if first in measured.times:
         remedy += f"; or scale = {{ {measured.chip} = ... }} for its measured time"
     elif measured.chip and not measured.times:

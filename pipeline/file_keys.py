@@ -109,7 +109,8 @@ class RunKeys(Keys):
     )
     policy: Annotated[str, one_of(*POLICIES)] = Field(
         default="pipelined",
-        description="sequential, pipelined, latest or deadline; the last two need fps or arrivals.",
+        description="sequential, pipelined, latest or deadline; the last two need fps or arrivals. "
+        "If absent, pipelined.",
     )
     edge: EdgeRule | None = Field(
         default=None,
@@ -212,7 +213,8 @@ class InputKeys(Keys):
     source: str = Field(alias="from", description="Stage, or stage.port, that the input reads.")
     sync: Literal["frame", "latest"] = Field(
         default="frame",
-        description="frame: the same frame as the other inputs; latest: the newest frame that there is.",
+        description="frame: the same frame as the other inputs; latest: the newest frame that there is. "
+        "If absent, frame.",
     )
     max_age_ms: float | None = Field(
         default=None,
@@ -488,7 +490,7 @@ class OnnxStage(StageKeys):
         default=None, description="int8, fp16 or fp32 on a chip; if absent, the network and its unit decide."
     )
     runtime: Annotated[str, one_of(*RUNTIMES)] = Field(
-        default="ort", description="Runtime of the network on this machine: ort, openvino, qnn or cuda."
+        default="ort", description="Runtime of the network on this machine: ort, openvino, qnn or cuda; if absent, ort."
     )
     shapes: dict[str, Annotated[tuple[int, ...], BeforeValidator(_sizes)]] = Field(
         default={}, description="Sizes of inputs that the file leaves open: `{ image = '1x3x224x224' }`."
@@ -540,7 +542,8 @@ class PrepareBlock(BlockStage):
     like: str = Field(pattern=NAME, description="Stage of the network for whose input the picture is prepared.")
     port: str = Field(default="", description="Input of that network, if it has several.")
     fit: Literal["stretch", "letterbox", "crop"] = Field(
-        default="stretch", description="How a picture gets another shape: stretch, letterbox or crop."
+        default="stretch",
+        description="How a picture gets another shape: stretch, letterbox or crop; if absent, stretch.",
     )
     layout: Literal["nchw", "nhwc"] | None = Field(
         default=None, description="nchw or nhwc; if absent, the layout of the network's input."
@@ -562,7 +565,7 @@ class OverlayBlock(BlockStage):
 
     writes_one = True
     in_ports = {"frame": True, "mask": False, "depth": False, "boxes": False}
-    alpha: float = Field(default=0.5, ge=0, le=1, description="Opacity of the drawing, 0 to 1.")
+    alpha: float = Field(default=0.5, ge=0, le=1, description="Opacity of the drawing, 0 to 1; if absent, 0.5.")
 
 
 class EncodeBlock(BlockStage):

@@ -1,7 +1,8 @@
 """Writes a pipeline file that runs networks on a video, ready to be run, with sizes and rate read from the files.
 
 Each network looks at every frame of the video, on a branch of its own: a stage `prepare` makes its input, and a stage
-`discard` takes what it finds. A person then joins the branches as the pipeline needs it.
+`discard` takes what it finds. Commented stages below it write a video of what the network finds. A person then joins
+the branches as the pipeline needs it.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import av
 
-from trilane.apps.check.port_types import NETWORK_CHANNELS, port_types, read_networks, value_type
+from trilane.apps.check.port_types import NETWORK_CHANNELS, port_types, read_networks, require_weights, value_type
 from trilane.errors import BadInputError, TrilaneError
 from trilane.files import require_file
 from trilane.hw_profiles.graph_file import fed_inputs, read_graph
@@ -23,7 +24,8 @@ from trilane.pipeline.pipeline_file import read_pipeline
 from trilane.writing import write_bytes
 
 A_VIDEO = "a video that PyAV reads"
-SUFFIXES = len("-in0") + 2  # of names that are made of a network's
+SUFFIXES = len("-99-video")  # of names that are made of a network's
+ON_A_CHIP = "on a chip, each block but discard needs time_ms = MS, or scale = { CHIP = FACTOR } and --measured RUN"
 
 
 def write_new_file(
@@ -40,7 +42,7 @@ def write_new_file(
     `shapes`: sizes of inputs that the networks leave open, by the input's name.
 
     Raises BadInputError for a file that exists, for files that cannot be read or lie elsewhere, and for a network that
-    does not take pictures; nothing is left behind.
+    does not take pictures or has no weights; nothing is left behind.
     """
     if out.exists():
         raise BadInputError(out, "a file that exists", "another name, as nothing is overwritten")
@@ -48,6 +50,7 @@ def write_new_file(
     width, height, rate = _video(video)
     lines = [
         f"# networks over a video: {len(networks)}; docs/pipeline-file.md has every key",
+        f"# {ON_A_CHIP}",
         "[run]",
         f"fps = {rate:g}",
         "[stages]",
@@ -72,11 +75,12 @@ def _branch(
 ) -> list[str]:
     """Return the lines of a network's stages; `names`: names of stages so far, to which these are added."""
     graph = read_graph(network, dict(shapes))
+    require_weights(graph, network)
     inputs = [_picture_input(network, value.name, value_type(value)) for value in fed_inputs(graph)]
     stem = re.sub(r"[^\w-]", "-", network.stem, flags=re.ASCII)[: LONGEST_NAME - SUFFIXES] or "network"
     name = next(each for each in (stem, *(f"{stem}-{n}" for n in range(2, 100))) if each not in names)
     prepared = [f"{name}-in{place}" if len(inputs) > 1 else f"{name}-in" for place in range(len(inputs))]
-    names |= {name, *prepared, f"{name}-out"}
+    names |= {name, *prepared, f"{name}-out", f"{name}-drawn", f"{name}-video"}
     lines = []
     for stage, port in zip(prepared, inputs, strict=True):
         of = f", port = {dumps(port)}" if len(inputs) > 1 else ""
@@ -88,9 +92,30 @@ def _branch(
     known = ", ".join(f"{dumps(port)} = {dumps(sizes)}" for port, sizes in open_sizes.items())
     given = f", shapes = {{ {known} }}" if known else ""
     lines.append(f'{name} = {{ onnx = {_inside(network, folder)}, unit = "{unit}", in = {reads}{given} }}')
-    first = graph.model.graph.output[0].name
-    lines.append(f'{name}-out = {{ block = "discard", unit = "cpu", in = {dumps(f"{name}.{first}")} }}')
-    return lines
+    first = graph.model.graph.output[0]
+    found = dumps(f"{name}.{first.name}")
+    lines.append(f'{name}-out = {{ block = "discard", unit = "cpu", in = {found} }}')
+    return lines + [f"# {line}" for line in _video_of(name, found, value_type(first))]
+
+
+def _video_of(name: str, found: str, of: PortType | None) -> list[str]:
+    """Return lines that write a video of what network `name` finds, after one that says how to use them.
+
+    `found`: its output, quoted. `of`: type of the output; one that `overlay` cannot draw gets that first line alone.
+    """
+    shape = of.shape if of is not None else ()
+    is_plane = len(shape) == 4 and sum(size > 1 for size in shape) in (2, 3)
+    port = "mask" if is_plane else "boxes" if shape[-1:] in ((4,), (5,)) else ""
+    if not port:
+        return [
+            f"{name} finds {of or 'no numbers'}: a stage with python makes a mask or boxes of it for overlay and encode"
+        ]
+    frame = f'{{ frame = "camera", {port} = {found} }}'
+    return [
+        f"for a video of what {name} finds ({port}, or depth), take the # from the next two lines",
+        f'{name}-drawn = {{ block = "overlay", unit = "cpu", in = {frame} }}',
+        f'{name}-video = {{ block = "encode", unit = "cpu", in = "{name}-drawn", path = "{name}-video.mp4" }}',
+    ]
 
 
 def _picture_input(network: Path, name: str, of: PortType | None) -> str:

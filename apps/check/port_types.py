@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import onnx
@@ -41,6 +42,8 @@ PortTypes = dict[str, dict[str, PortType]]
 CODES = {name: code for code, name in TYPES.items()}
 PICTURE_CHANNELS = (1, 3, 4)
 NETWORK_CHANNELS = (1, 3)
+A_WHOLE_NETWORK = "a network with its weights"
+BARE_REMEDY = "export it with its weights; `trilane check` and `trilane predict` take it as it is"
 
 
 def read_networks(file: PipelineFile) -> dict[str, GraphFile]:
@@ -58,6 +61,19 @@ def read_networks(file: PipelineFile) -> dict[str, GraphFile]:
             if each.stage in found:
                 _check_output(file, name, each, [one.name for one in found[each.stage].model.graph.output])
     return found
+
+
+def require_weights(graph: GraphFile, where: str | Path) -> None:
+    """Raise BadInputError about `where` for a network whose weights have no values: no runtime runs it."""
+    held = {each.name for each in graph.model.graph.initializer} | {each.name for each in fed_inputs(graph)}
+    if bare := [value.name for value in graph.model.graph.input if value.name not in held]:
+        without = f"{graph.path.name} without weights: {len(bare)} are inputs without values"
+        raise BadInputError(where, without, A_WHOLE_NETWORK, BARE_REMEDY)
+    tensors = onnx.load(graph.path, load_external_data=False).graph.initializer
+    stored = [entry.value for tensor in tensors for entry in tensor.external_data if entry.key == "location"]
+    if absent := [name for name in stored if not (graph.path.parent / name).is_file()]:
+        without = f"{graph.path.name} without weights: they are in {absent[0]}, which is not there"
+        raise BadInputError(where, without, A_WHOLE_NETWORK, f"put {absent[0]} beside it, or {BARE_REMEDY}")
 
 
 def _read(file: PipelineFile, name: str, stage: OnnxStage) -> GraphFile:

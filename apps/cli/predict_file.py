@@ -35,6 +35,8 @@ def predict_pipeline_file(options: PredictOptions, path: Path, as_json: bool) ->
     where = f"{machine['title']}, {answer['config']['performance_profile']}" if machine else "times of the file"
     name = without_controls(path.name)
     console.print(f"{name} (virtual clock), {where}; {requested} frames, seed {answer['config']['seed']}", markup=False)
+    if first["what_if"]:  # the file itself lacks times
+        console.print(f"with {without_controls(first['what_if'])}", markup=False, soft_wrap=True)
     _show(console, first)
     if len(answer["pipelines"]) > 1:
         console.print(_what_ifs(answer["pipelines"]))

@@ -5,17 +5,20 @@ Rule: nothing is printed here and no Python of the file is imported. `trilane.hw
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from trilane.apps.check.port_types import port_types, read_networks
 from trilane.apps.explain.explained_run import open_journal
 from trilane.apps.predict.predict_options import PredictOptions
+from trilane.apps.run.report import read_report
+from trilane.apps.run.trust import Trust, trust_of
 from trilane.apps.run.verdict_facts import predicted_verdict
+from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_file import GraphFile
 from trilane.hw_profiles.network_time import Computes
-from trilane.hw_profiles.pipeline_prediction import Measured, predict_file, prices_of
+from trilane.hw_profiles.pipeline_prediction import Measured, predict_file, prices_of, stages_without_time
 from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.pipeline.file_keys import MOST_SAMPLES, OnnxStage, StageTime
@@ -24,6 +27,13 @@ from trilane.pipeline.pipeline_file import PipelineFile, assignments, read_pipel
 from trilane.units import HOST, INFER, NS_PER_MS, UnitName
 
 NONE_SKIPS: Final = "no frame takes the bypass of {}: its table says neither share nor pattern"
+ASSUMED: Final = (
+    "networks whose file says no precision, and what is assumed because their unit computes so: {}; "
+    "`precision` of the stage or --precision says another"
+)
+NO_BASE: Final = "the file as it is has no prediction, because only --set says the times of: {}"
+FROM_HAND_OVER: Final = "measured times count from the hand-over of a job, with its waits for a core"
+WITH_A_CORE: Final = "measured times leave out the waits for a core that this machine's kernel counted"
 APART: Final = "networks are priced alone: units that work at once share memory and heat, which is not in these times"
 
 
@@ -33,10 +43,20 @@ def predict_asked_file(options: PredictOptions, path: Path, say: Callable[[str],
     `say`: function that is told before something takes seconds.
     """
     chips = _Chips(options, say)
-    measured = _measured(options.measured, chips.name) if options.measured else Measured({}, "", chips.name)
+    measured, of_run = Measured({}, "", chips.name), None
+    if options.measured:
+        measured, of_run = _measured(options.measured, chips.name), _trust_in(options.measured)
     file = _with_share(read_pipeline(path), measured)
-    variants = [("", file)] + [(text, file.changed(assignments(text))) for text in options.changes]
-    answers = [_answer(each, text, options, chips, measured) for text, each in variants]
+    lacking = stages_without_time(file, measured) if options.changes else []
+    variants = [] if lacking else [("", file)]
+    variants += [(text, file.changed(assignments(text))) for text in options.changes]
+    answers = []
+    for text, each in variants:
+        try:
+            answers.append(_answer(each, text, options, chips, measured, of_run))
+        except BadInputError as error:
+            where = f"{error.where}, with --set {text}" if text else error.where
+            raise BadInputError(where, error.found, error.expected, error.remedy) from None
     chip = chips.used
     return {
         "schema": 1,
@@ -44,28 +64,46 @@ def predict_asked_file(options: PredictOptions, path: Path, say: Callable[[str],
         "machine": {"profile": chip.name, "title": chip.title} if chip else None,
         "config": {"performance_profile": options.cap if chip else None, "seed": options.seed},
         "pipelines": answers,
-        "notes": [*([APART] if chip else []), *_without_share(file)],
+        "notes": [
+            *([APART] if chip else []),
+            *([ASSUMED.format(", ".join(chips.assumed))] if chips.assumed else []),
+            *_clock(measured),
+            *_without_share(file),
+            *_without_base(lacking),
+        ],
     }
+
+
+def _clock(measured: Measured) -> list[str]:
+    """Say which part of a job counts as its measured time; nothing where none is measured."""
+    return [FROM_HAND_OVER if measured.chip == HOST else WITH_A_CORE] if measured.times else []
 
 
 def _without_share(file: PipelineFile) -> list[str]:
     return [NONE_SKIPS.format(file.bypass[0])] if file.bypass and file.bypass[1].taken is None else []
 
 
+def _without_base(lacking: Sequence[str]) -> list[str]:
+    """Say that the file as it is has no prediction beside its variants. `lacking`: stages without a time in it."""
+    return [NO_BASE.format(", ".join(lacking))] if lacking else []
+
+
 class _Chips:
     """The chip, loaded when the first network needs it, and as each network uses it.
 
     `name`: its name; this machine's where a run was measured and no chip is asked for. `used`: None until it is loaded.
+    `assumed`: stages and precisions, in order, of the networks that say none.
     """
 
     def __init__(self, options: PredictOptions, say: Callable[[str], None]) -> None:
         self._options, self._say = options, say
         self._known: dict[Hashable, Profile] = {}
         is_asked = "profile" in options.model_fields_set
+        self.assumed: dict[str, None] = {}
         self.used = load_runnable(options.profile) if is_asked else None
         self.name = self.used.name if self.used else HOST if options.measured else options.profile
 
-    def chip_for(self, stage: OnnxStage, graph: GraphFile, unit: UnitName) -> Profile:
+    def chip_for(self, name: str, stage: OnnxStage, graph: GraphFile, unit: UnitName) -> Profile:
         """Return the chip with `unit` as it computes the network of `stage`; this machine measures it first."""
         options, asked = self._options, stage.precision or self._options.numbers
         key = graph.path, tuple(sorted(stage.shapes.items())), unit, asked, stage.runtime
@@ -77,6 +115,8 @@ class _Chips:
 
                 chip = with_file(chip, graph, stage.shapes, self._say, runtime=stage.runtime)
             self._known[key] = chip
+        if asked is None and graph.numbers == "not said":
+            self.assumed[f"{name} {self._known[key].units[unit].precision}"] = None
         return self._known[key]
 
 
@@ -84,18 +124,26 @@ def _measured(folder: Path, chip: str) -> Measured:
     """Return the times of the jobs of a run, for `chip`.
 
     On this machine a job takes its unit from the moment at which it is handed over: a unit whose core is busy, with the
-    scheduler's own work or another's, begins later. On a chip it takes what it computes.
+    scheduler's own work or another's, begins later. On a chip, other programs of this machine take no core of it, so
+    the parts of a job do not count in which its unit had none. With one thread these parts are exact
+    (docs/decisions/preempted-time.md).
     """
     samples: dict[str, list[float]] = {}
     free_ns: dict[str, int] = {}
     for record in open_journal(folder)[1]:
         if isinstance(record, Worked):
             job = record.job
-            from_ns = max(job.dispatch_ns, free_ns.get(job.unit, 0)) if chip == HOST else job.begin_ns
+            handed_ns = max(job.dispatch_ns, free_ns.get(job.unit, 0))
+            from_ns = handed_ns if chip == HOST else min(job.begin_ns + job.preempted_ns, job.end_ns)
             free_ns[job.unit] = job.end_ns
             samples.setdefault(job.stage, []).append((job.end_ns - from_ns) / NS_PER_MS)
     times = {name: StageTime(samples=tuple(each[:MOST_SAMPLES])) for name, each in samples.items()}
     return Measured(times, str(folder), chip)
+
+
+def _trust_in(folder: Path) -> Trust:
+    """Return whether the machine of a run was quiet; a run without a report was not judged."""
+    return trust_of(read_report(folder).as_json() if (folder / "report.json").exists() else {})
 
 
 def _with_share(file: PipelineFile, measured: Measured) -> PipelineFile:
@@ -111,7 +159,12 @@ def _with_share(file: PipelineFile, measured: Measured) -> PipelineFile:
 
 
 def _answer(
-    file: PipelineFile, text: str, options: PredictOptions, chips: _Chips, measured: Measured
+    file: PipelineFile,
+    text: str,
+    options: PredictOptions,
+    chips: _Chips,
+    measured: Measured,
+    of_run: Trust | None,
 ) -> dict[str, Any]:
     graphs = read_networks(file)
     port_types(file, graphs)
@@ -119,8 +172,9 @@ def _answer(
     def chip_for(name: str, graph: GraphFile, unit: UnitName) -> Profile:
         stage = file.stages[name]
         assert isinstance(stage, OnnxStage)
-        return chips.chip_for(stage, graph, unit)
+        return chips.chip_for(name, stage, graph, unit)
 
     prices = prices_of(file, graphs, chip_for, lambda chip: corners_of(chip, options.cap), measured)
     answer = predict_file(file, prices, options.frames or 0, options.seed)
-    return {"what_if": text, **answer, "verdict": predicted_verdict(answer).shown()}
+    rests_on_run = any(each.is_measured for each in prices.values())
+    return {"what_if": text, **answer, "verdict": predicted_verdict(answer, of_run if rests_on_run else None).shown()}

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from trilane.apps.check.port_types import PortTypes, port_types, read_networks, value_type
+from trilane.apps.check.port_types import PortTypes, port_types, read_networks, require_weights, value_type
 from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_file import GraphFile, fed_inputs
 from trilane.hw_profiles.host import settings_of, usable_cores
@@ -249,11 +249,7 @@ def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str
         resolve(stage.runtime)
         graph = networks[name]
         values = [(value.name, value_type(value)) for value in fed_inputs(graph)]
-        held = {each.name for each in graph.model.graph.initializer} | {each for each, _ in values}
-        if bare := [value.name for value in graph.model.graph.input if value.name not in held]:
-            without = f"{stage.onnx} without weights: {len(bare)} are inputs without values"
-            remedy = "export it with its weights; `trilane check` and `trilane predict` take it as it is"
-            raise BadInputError(f"{file.path}: stages.{name}.onnx", without, "a network with its weights", remedy)
+        require_weights(graph, f"{file.path}: stages.{name}.onnx")
         keys["inputs"] = {}
         for each, found in values:
             if found is None:

@@ -26,6 +26,8 @@ UNKNOWN: Final = "not known"
 NO_RATE: Final = f"the rate is {UNKNOWN}: fewer than two frames were presented"
 #: What figures are of that are not a finished run's.
 SO_FAR, COMPUTED = "so far", "computed"
+#: Which rate it is that a prediction names beside the one that frames come at.
+ALWAYS_FED: Final = "if always fed"
 #: Name of the bound of a prediction that the chip's display holds back.
 DISPLAY: Final = "display"
 #: Names of the path that are no unit's -> what they mean to a person.
@@ -198,18 +200,26 @@ def _late(found: Lateness) -> str:
 
 
 def _held(facts: Facts) -> str:
-    """Return the rate beside what is asked for, such as `96 fps (92 to 102), at 30 fps 0 of 299 frames late`."""
+    """Return the rate beside what is asked for, such as `96 fps (92 to 102), at 30 fps 0 of 299 frames late`.
+
+    Where frames came at a rate, it is said which rate the first one is: of the frames that were shown, or of a
+    prediction whose source always has a frame.
+    """
     if facts.failure:
         return f"the run ended early: {facts.failure}"
     if facts.rate is None:
         return NO_RATE
     found, target = _apart(facts.rate.fps, facts.target_fps)
     late = f"at {target} fps {_late(facts.lateness)}" if facts.lateness else f"asked for {target} fps"
+    if facts.is_held_to_rate and facts.lateness:
+        late = f"asked for {target} fps: {_late(facts.lateness)}"
     around = ""
     if facts.rate.low is not None and facts.rate.high is not None and facts.rate.low < facts.rate.high:
         share = "" if facts.rate.share == Rate._field_defaults["share"] else f", {facts.rate.share}"
         around = f" ({_number(facts.rate.low)} to {_number(facts.rate.high)}{share})"
-    source = f" {facts.source}" if facts.source else ""
+    shown = "shown" if facts.is_held_to_rate else ""
+    fed = ALWAYS_FED if facts.is_computed and facts.lateness else ""
+    source = "".join(f" {each}" for each in (shown, facts.source, fed) if each)
     return f"{found} fps{around}{source}, {late}"
 
 
@@ -245,8 +255,12 @@ def _bound(facts: Facts) -> str:
 
 
 def _stages(bound: Bound, *, is_own: bool) -> str:
-    """Return the stages of the bound's unit, or of other units, with their ms and a space at the end."""
+    """Return the stages of the bound's unit, or of other units, with their ms and a space at the end.
+
+    Stages are left out whose time is none when it is rounded, such as `discard`.
+    """
     rows = [(stage, ms) for stage, ms in bound.stages.items() if (stage in bound.of_unit) == is_own]
+    rows = [(stage, ms) for stage, ms in rows if ms is None or _ms(ms) != _ms(0.0)]
     said = " + ".join(stage if ms is None else f"{stage} {_ms(ms)}" for stage, ms in rows)
     return f"{said} " if said else ""
 

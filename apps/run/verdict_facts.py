@@ -192,11 +192,12 @@ def _shorter(document: Mapping[str, Any], bound: Bound | None) -> Iterator[str]:
     yield f"{stage}: {SHORTER.get(stage, 'less work, or a unit of its own')}".replace("`", "")
 
 
-def predicted_verdict(answer: Mapping[str, Any]) -> Verdict:
+def predicted_verdict(answer: Mapping[str, Any], of_run: Trust | None = None) -> Verdict:
     """Return the verdict of a prediction: of an application, a network by itself, or a pipeline.
 
     `answer`: what `trilane predict --json` says of it. Everything is computed; it can be trusted where the interval of
     its frame time is known and does not hold the time that the rate leaves.
+    `of_run`: judgement of the run whose times it takes. The prediction is not trusted more than this run.
     """
     times = _needed(answer)
     config = answer.get("config") or {}
@@ -204,17 +205,18 @@ def predicted_verdict(answer: Mapping[str, Any]) -> Verdict:
     low, high = times.get("low"), times.get("high")
     least, most = (None, None) if low is None or high is None or not low else (1e3 / high, 1e3 / low)
     units, latency = answer.get("units") or {}, answer.get("latency_ms")
+    is_own = "cycle" in answer or answer.get("kind") == "pipeline"  # by itself, and beside others
     return judged(
         Facts(
             Rate(1e3 / times["mean"] if times["mean"] else inf, least, most, "80 %"),
             target,
             _predicted_lateness(answer),
-            _trust_in(least, most, target, is_held=_is_held_by_display(answer)),
+            _resting_on(of_run, _trust_in(least, most, target, is_held=_is_held_by_display(answer))),
             frame_ms=times["mean"],
             latency_ms=latency["mean"] if latency and latency.get("samples", 1) else None,
             bound=_predicted_bound(answer, times["mean"]),
             idle={unit: (1 - row["busy"], _causes(row["idle"])) for unit, row in units.items()},
-            image="trilane quality measures it here: a prediction has no pictures",
+            image=NO_TRUTH if is_own else "trilane quality measures it here: a prediction has no pictures",
             tries=tuple(_predicted_tries(answer, times["mean"] * target > 1e3)),
             source=COMPUTED,
         )
@@ -249,6 +251,13 @@ def _trust_in(low: float | None, high: float | None, target: float, *, is_held: 
         return Trust(True, ("computed, and the whole 80 % interval is on one side of the target",))
     why = "the display holds the rate over the whole 80 % interval" if is_held else "the times have no interval"
     return Trust(True, (f"computed; {why}",))
+
+
+def _resting_on(of_run: Trust | None, trust: Trust) -> Trust:
+    """Return the judgement `trust` of a prediction that takes times of a run; None: of no run."""
+    if of_run is None or of_run.trusted:
+        return trust
+    return Trust(False, (f"its times are from an UNSURE run: {', '.join(of_run.reasons)}", *trust.reasons))
 
 
 def _is_held_by_display(answer: Mapping[str, Any]) -> bool:

@@ -248,8 +248,8 @@ BAD = {
         SIX.replace("time_ms = 6", 'python = "crop:best"')
         + '\nb = { unit = "cpu", block = "encode", path = "x.mp4", in = "a" }',
         "",
-        "stages.a: found python without a time, as b, expected a stage whose time is known; add time_ms to each: "
-        'a number, or { from = "FILE" } for what `trilane times` reads',
+        "stages.a: found python without a time (others without one: b), expected a stage whose time is known; "
+        'add time_ms = MS to each; time_ms = { from = "FILE" } takes what `trilane times` reads',
     ),
     "a missing network": (ONE.replace("add.", "none."), "", "stages.net.onnx"),
     "ports that do not fit": (
@@ -293,6 +293,8 @@ def test_a_file_beside_others_as_a_table_and_as_json(
     missed = f"at 40 fps {answer['pipelines'][0]['deadline_misses']} of {due} frames late, 3 dropped"
     assert answer["pipelines"][0]["verdict"]["lines"][0][1].endswith(missed)
     assert [row["verdict"]["bound"]["unit"] for row in answer["pipelines"]] == ["npu", "mine", "dsp"]
+    images = [dict(row["verdict"]["lines"])["IMAGE"].startswith("nothing to compare") for row in answer["pipelines"]]
+    assert images == [True, True, False]
     assert answer["config"]["performance_profile"] == SUSTAINED
     (mine,) = answer["pipelines"][1]["units"].values()
     assert answer["units"]["gpu"]["by_pipeline"]["file1"] == pytest.approx(mine["busy"], rel=0.01)

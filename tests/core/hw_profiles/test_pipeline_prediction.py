@@ -16,6 +16,7 @@ import pytest
 
 from support.pipeline_files import BRANCHES, CUT, DEPTH, STREET, network, write_file
 from support.run_folders import write_run
+from support.run_report import make_report
 from trilane.hw_profiles.application import Plan, Variant, simulated, stage_times_ms
 from trilane.hw_profiles.pipeline_prediction import given_price, predict_file, prices_of, steady_ms
 from trilane.hw_profiles.profile_files import load_runnable
@@ -271,6 +272,34 @@ def test_precision_is_the_networks_the_files_or_that_of_the_option(documents: Pr
     assert source(own, "--precision", "float") == "snapdragon-888, dsp in int8"
 
 
+def test_a_precision_that_nobody_says_is_told(documents: Predict, tmp_path: Path) -> None:
+    """A graph without weights says none, so the DSP's own counts, and the GPU's in the variant."""
+    write_file(tmp_path, DEPTH)
+    model = onnx.load(tmp_path / "depth.onnx")
+    sizes = list(model.graph.initializer.pop().dims)
+    model.graph.input.append(onnx.helper.make_tensor_value_info("weights", onnx.TensorProto.FLOAT, sizes))
+    onnx.save(model, tmp_path / "bare.onnx")
+    text = """
+    [stages]
+    a = { unit = "a", time_ms = 1 }
+    bare = { onnx = "bare.onnx", unit = "dsp", in = "a" }
+    full = { onnx = "depth.onnx", unit = "dsp", in = "a" }
+    """
+    chip = ("--profile", "snapdragon-8-gen-3")
+    notes = documents(text, *chip, "--set", "stages.bare.unit=gpu")["notes"]
+    (said,) = [note for note in notes if note.startswith("networks whose file says no precision")]
+    assert ": bare int8, bare fp16; `precision`" in said
+    own = text.replace('"bare.onnx"', '"bare.onnx", precision = "fp16"')
+    for notes in (documents(text, *chip, "--precision", "w8a8")["notes"], documents(own, *chip)["notes"]):
+        assert len(notes) == 1  # that networks are priced alone
+
+
+def test_the_picture_of_an_own_pipeline_has_nothing_to_compare_with(predict: Predict) -> None:
+    """As `trilane run` says of it."""
+    lines = dict(predict(DEPTH)["verdict"]["lines"])
+    assert lines["IMAGE"] == "nothing to compare with: a pipeline of your own has no true picture"
+
+
 def test_each_set_is_a_row(documents: Predict) -> None:
     rows = documents(
         DEPTH,
@@ -340,17 +369,37 @@ def test_a_rate_that_jitter_breaks_is_not_held(predict: Predict) -> None:
 
 def test_a_stage_without_a_time_is_refused_by_name(command: Command, tmp_path: Path) -> None:
     error = " ".join(command("predict", write_file(tmp_path, STREET), code=2)[1].split())
-    assert "stages.camera: found video without a time, as small, crop, overlay, video, expected" in error
-    assert 'add time_ms to each: a number, or { from = "FILE" } for what `trilane times` reads' in error
+    others = ["small", "crop", "overlay", "video"]
+    assert f"stages.camera: found video without a time (others without one: {', '.join(others)}), expected" in error
+    keys = ",".join(f"stages.{name}.time_ms=MS" for name in ("camera", *others))
+    assert f"add time_ms = MS to each, or all in one --set {keys}; " in error
+    assert 'time_ms = { from = "FILE" } takes what `trilane times` reads' in error
     assert "--measured RUN and scale = { snapdragon-888 = ... } in each" in error
     error = " ".join(command("predict", write_file(tmp_path, BRANCHES), code=2)[1].split())
-    assert "stages.frame: found video without a time, as composite, expected" in error
+    assert "stages.frame: found video without a time (others without one: composite), expected" in error
     options = (tmp_path / "pipeline.toml", "--profile", "host")
     out, error = command("predict", *options, code=2)
     assert "measuring" not in out + error and "scale" not in error
     text = STREET.replace("block =", "time_ms = 2, block =")
     error = " ".join(command("predict", write_file(tmp_path, text), code=2)[1].split())
     assert "stages.crop: found python without a time" in error
+
+
+def test_a_set_may_say_the_times_that_the_file_lacks(command: Command, documents: Predict, tmp_path: Path) -> None:
+    """The file itself then has no row; a --set that leaves a stage without a time is named in the refusal."""
+    text = '[stages]\na = { python = "m:f", unit = "a" }\nb = { python = "m:f", unit = "b", in = "a" }'
+    both = "stages.a.time_ms=4,stages.b.time_ms=6"
+    found = documents(text, "--set", both)
+    assert [(each["what_if"], each["period_ms"]) for each in found["pipelines"]] == [(both, 6)]
+    assert "the file as it is has no prediction, because only --set says the times of: a, b" in found["notes"]
+    file = tmp_path / "pipeline.toml"
+    shown = command("predict", file, "--set", both)[0]
+    assert f"with {both}" in shown.splitlines()
+    two = documents(text, "--set", both, "--set", both.replace("6", "9"))["pipelines"]
+    assert [each["period_ms"] for each in two] == [6, 9]
+    error = " ".join(command("predict", file, "--set", both, "--set", "stages.b.time_ms=9", code=2)[1].split())
+    assert "pipeline.toml: stages.a, with --set stages.b.time_ms=9: found python without a time, expected" in error
+    assert "all in one --set stages.a.time_ms=MS; " in error
 
 
 @pytest.mark.parametrize(
@@ -488,6 +537,54 @@ def test_here_a_job_takes_its_unit_from_the_moment_it_is_handed_over(documents: 
     assert on_chip["pipelines"][0]["stages"]["a"]["alone_ms"] == 60
 
 
+def test_a_chip_loses_no_time_to_other_programs_of_this_machine(documents: Predict, tmp_path: Path) -> None:
+    """Of the 8 ms of each job, its unit had no core for 3; a journal that says more than the job had leaves nothing."""
+    text = """
+    [stages]
+    a = { block = "busy", unit = "a", load_ms = 1, scale = { snapdragon-888 = 10 } }
+    b = { block = "busy", unit = "b", load_ms = 1, scale = { snapdragon-888 = 10 }, in = "a" }
+    """
+    file = read_pipeline(write_file(tmp_path, text))
+    done = simulate(graph_of(file, edge_rules(file)), Settings(40), lambda *_: 8_000_000, keep=True)
+    lost = [job._replace(preempted_ns={"a": 3_000_000, "b": 9_000_000}[job.stage]) for job in done.jobs]
+    run = str(write_run(tmp_path / "run", done, lost))
+    here, on_chip = (documents(text, "--measured", run, "--profile", chip) for chip in ("host", "snapdragon-888"))
+    alone = [found["pipelines"][0]["stages"]["a"]["alone_ms"] for found in (here, on_chip)]
+    assert alone == [8, 50]
+    assert on_chip["pipelines"][0]["stages"]["b"]["alone_ms"] == 0
+    clocks = [[note for note in found["notes"] if note.startswith("measured")] for found in (here, on_chip)]
+    assert clocks == [
+        ["measured times count from the hand-over of a job, with its waits for a core"],
+        ["measured times leave out the waits for a core that this machine's kernel counted"],
+    ]
+
+
+@pytest.mark.parametrize(
+    ("others", "said"),
+    [
+        (0.27, "UNSURE: its times are from an UNSURE run: other programs took 27 % of its cores; computed"),
+        (None, "UNSURE: its times are from an UNSURE run: nobody knows what other programs took of its cores; "),
+        (0.01, "computed, and the whole 80 % interval is on one side of the target"),
+    ],
+)
+def test_a_prediction_is_trusted_no_more_than_the_run_whose_times_it_takes(
+    documents: Predict, tmp_path: Path, others: float | None, said: str
+) -> None:
+    """`None`: the run was ended before it wrote a report. A file that states all times takes none of the run."""
+    text = '[stages]\na = { python = "m:f", unit = "a" }'
+    file = read_pipeline(write_file(tmp_path, text))
+    done = simulate(graph_of(file, edge_rules(file)), Settings(40), lambda *_: 8_000_000, keep=True)
+    run = write_run(tmp_path / "run", done)
+    (run / "report.json").unlink()
+    if others is not None:
+        (run / "report.json").write_text(json.dumps(make_report(other_programs=others)), encoding="utf-8")
+    verdict = documents(text, "--measured", str(run))["pipelines"][0]["verdict"]
+    assert dict(verdict["lines"])["TRUST"].startswith(said)
+    assert verdict["trusted"] is (others == 0.01)
+    own = documents(text.replace("m:f", 'm:f", time_ms = 5, unit = "a" }#'), "--measured", str(run))["pipelines"][0]
+    assert dict(own["verdict"]["lines"])["TRUST"] == "computed; the times have no interval"
+
+
 def test_what_a_frame_needs_has_no_part_of_the_start(predict: Predict) -> None:
     stages = 't = { unit = "u", time_ms = 12 }\nd = { unit = "u", in = "t", time_ms = 45, every = 3 }'
     assert predict(f"[stages]\n{stages}")["needs_ms"]["mean"] == 27
@@ -590,6 +687,6 @@ def test_a_run_gives_the_share_of_its_frames_that_skipped(documents: Predict, tm
     run = write_run(tmp_path / "run", done)
     found = documents(text, "--measured", str(run))
     assert found["pipelines"][0]["frames"]["skipped"] == pytest.approx(750, abs=3 * sqrt(1000 * 0.75 * 0.25))
-    assert found["notes"] == []
+    assert len(found["notes"]) == 1  # which clock it is, not that nobody knows the share
     said = documents(ROUND.format("share = 0"), "--measured", str(run))["pipelines"][0]
     assert said["frames"]["skipped"] == 0

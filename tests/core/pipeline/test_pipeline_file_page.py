@@ -76,6 +76,15 @@ def test_every_key_says_what_it_means() -> None:
         assert not re.search(r"\|  \|$", table(name), re.MULTILINE), name
 
 
+def test_every_default_that_is_a_word_or_a_number_is_said() -> None:
+    models = [*MODELS.values(), *BLOCKS.values()]
+    fields = {(model, name): field for model in models for name, field in model.model_fields.items()}
+    chosen = {key: field for key, field in fields.items() if isinstance(field.default, str | float) and field.default}
+    assert {name for _, name in chosen} == {"policy", "sync", "runtime", "fit", "alpha"}
+    for (model, name), field in chosen.items():
+        assert f"if absent, {field.default}." in (field.description or "").lower(), (model, name)
+
+
 def test_the_files_of_the_page_can_be_read(tmp_path: Path) -> None:
     examples = re.findall(r"```toml\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     assert len(examples) == 3

@@ -15,6 +15,7 @@ from onnx import TensorProto, helper
 
 from support.pipeline_files import network
 from trilane.apps.check.new_file import write_new_file
+from trilane.apps.run.file_pipeline import pipeline_of
 from trilane.errors import BadInputError
 from trilane.pipeline.pipeline_file import read_pipeline
 
@@ -66,6 +67,73 @@ def test_one_network_twice_has_two_names(folder: Path) -> None:
     assert {"det-net", "det-net-2"} <= read_pipeline(folder / "new.toml").stages.keys()
 
 
+def test_the_commented_stages_write_a_video(folder: Path) -> None:
+    """Without their # they are stages that a run takes."""
+    out = folder / "new.toml"
+    text = write_new_file(out, [folder / "det net.onnx"] * 2, folder / "clip.mp4")
+    assert "\n# for a video of what det-net finds (mask, or depth), take the # from the next two lines\n# det" in text
+    out.write_text(text.replace("\n# det", "\ndet"), encoding="utf-8")
+    stages = read_pipeline(out).stages
+    drawn, video = stages["det-net-2-drawn"], stages["det-net-2-video"]
+    assert [(each.port, each.stage, each.from_port) for each in drawn.inputs] == [
+        ("frame", "camera", ""),
+        ("mask", "det-net-2", "heat"),
+    ]
+    assert video.model_dump(include={"block", "path"}) == {"block": "encode", "path": "det-net-2-video.mp4"}
+    made = pipeline_of(read_pipeline(out), folder)
+    assert len(made.stages) == len(stages) == 11
+
+
+def test_what_cannot_be_drawn_has_no_stages_in_comments(folder: Path) -> None:
+    values = [helper.make_tensor_value_info("x", TensorProto.FLOAT, [1, 3, 8, 8])]
+    for shape in ([1, 1000, 1, 1], [2, 300, 4]):
+        found = helper.make_tensor_value_info("y", TensorProto.FLOAT, shape)
+        sizes = helper.make_tensor("sizes", TensorProto.INT64, [len(shape)], shape)
+        made = helper.make_node("ConstantOfShape", ["sizes"], ["y"])
+        used = helper.make_node("Relu", ["x"], ["z"])
+        graph = helper.make_graph([made, used], "g", values, [found], [sizes])
+        onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)]), folder / "odd.onnx")
+        text = write_new_file(folder / f"{len(shape)}.toml", [folder / "odd.onnx"], folder / "clip.mp4")
+        assert ("odd-video" in text) is (shape[-1] == 4)
+        assert ("# odd finds f32 1x1000x1x1: a stage with python makes a mask or boxes of it" in text) is (
+            shape[-1] == 1
+        )
+    assert 'boxes = "odd.y" }' in text
+
+
+def test_the_times_that_a_chip_needs_are_said(folder: Path, command: Callable[..., tuple[str, str]]) -> None:
+    """The file says which keys to write; with them it is predicted on a chip."""
+    out = folder / "new.toml"
+    text = write_new_file(out, [folder / "det net.onnx"], folder / "clip.mp4")
+    assert "# on a chip, each block but discard needs time_ms = MS, or scale = { CHIP = FACTOR }" in text
+    asked = ("predict", out, "--profile", "snapdragon-8-gen-3")
+    error = " ".join(command(*asked, code=2)[1].split())
+    keys = "stages.camera.time_ms=MS,stages.det-net-in.time_ms=MS"
+    assert f"--set {keys};" in error
+    command(*asked, "--set", keys.replace("MS", "2"))
+
+
+def _without_weights(folder: Path) -> list[Path]:
+    model = network(16, "heat")
+    sizes = list(model.graph.initializer.pop().dims)
+    model.graph.input.append(helper.make_tensor_value_info("weights", TensorProto.FLOAT, sizes))
+    onnx.save(model, folder / "bare.onnx")
+    return [folder / "bare.onnx"]
+
+
+def _without_data(folder: Path) -> list[Path]:
+    path = folder / "outside.onnx"
+    onnx.save(network(16, "heat"), path, save_as_external_data=True, location="weights.bin", size_threshold=0)
+    (folder / "weights.bin").unlink()
+    return [path]
+
+
+def test_weights_beside_the_network_are_taken(folder: Path) -> None:
+    (path,) = _without_data(folder)
+    onnx.save(network(16, "heat"), path, save_as_external_data=True, location="weights.bin", size_threshold=0)
+    write_new_file(folder / "new.toml", [path], folder / "clip.mp4")
+
+
 def _vector(folder: Path) -> list[Path]:
     values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 10]) for name in ("x", "y")]
     graph = helper.make_graph([helper.make_node("Relu", ["x"], ["y"])], "g", values[:1], values[1:])
@@ -82,6 +150,8 @@ def _vector(folder: Path) -> list[Path]:
         (lambda f: [f / "det net.onnx"], "det net.onnx", "new.toml", "a video"),
         (lambda f: [f / "det net.onnx"], "clip.mp4", "sub/new.toml", "outside"),
         (_vector, "clip.mp4", "new.toml", "vector"),
+        (_without_weights, "clip.mp4", "new.toml", "bare.onnx without weights: 1 are inputs without values"),
+        (_without_data, "clip.mp4", "new.toml", "without weights: they are in weights.bin, which is not there"),
     ],
 )
 def test_what_is_wrong_leaves_no_file(

@@ -15,7 +15,7 @@ from trilane.apps.explain.explained_run import explain_run
 from trilane.apps.interface import load_run
 from trilane.apps.run.report import Report, read_report
 from trilane.apps.run.trust import Trust
-from trilane.apps.run.verdict import Facts, Lateness, Rate, judged
+from trilane.apps.run.verdict import COMPUTED, SO_FAR, Bound, Facts, Lateness, Rate, judged
 from trilane.apps.run.verdict_facts import predicted_verdict, verdict_of
 from trilane.apps.watch.followed_run import FollowedRun
 from trilane.apps.watch.live_figures import looks
@@ -116,6 +116,28 @@ def test_what_the_display_holds_back_is_bound_by_it() -> None:
 def test_frames_that_gave_way_to_newer_ones_are_told_beside_the_rate() -> None:
     found = judged(replace(FAST, lateness=Lateness(34, 0, replaced=85)))
     assert "at 30 fps 0 of 34 frames late, 85 replaced by newer ones" in dict(found.lines())["PASS"]
+
+
+def test_a_rate_beside_another_one_says_which_it_is() -> None:
+    """30.9 fps of a source at 30: what was shown, from the first frame on. 59 fps: what a prediction could have."""
+    paced = replace(FAST, rate=Rate(30.9), is_held_to_rate=True, lateness=Lateness(300, 1, 2))
+    computed = replace(FAST, rate=Rate(59.0), source=COMPUTED)
+    said = {
+        paced: "30.9 fps shown, asked for 30 fps: 1 of 300 frames late, 2 dropped",
+        replace(paced, source=SO_FAR): "30.9 fps shown so far, asked for 30 fps: 1 of 300 frames late, 2 dropped",
+        computed: "59 fps computed if always fed, at 30 fps 0 of 299 frames late",
+        replace(computed, lateness=None): "59 fps computed, asked for 30 fps",  # the only rate that there is
+        FAST: "96 fps (92 to 102), at 30 fps 0 of 299 frames late",
+    }
+    assert {facts: judged(facts).lines()[0][1] for facts in said} == said
+
+
+def test_stages_that_round_to_no_time_bound_nothing_that_is_told() -> None:
+    bound = Bound(
+        "cpu", {"a": 3.0, "end": 0.004, "b": 0.006, "c": None}, 0.5, of_unit=frozenset({"a", "b", "c", "end"})
+    )
+    said = dict(judged(replace(FAST, bound=bound)).lines())["BOUND"]
+    assert said.startswith("cpu: a 3.0 + b 0.01 + c of 10.4 ms ")
 
 
 def test_frames_that_every_leaves_out_are_not_dropped_ones() -> None:
