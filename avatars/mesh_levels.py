@@ -45,7 +45,7 @@ from trilane.files import read_npz
 ROUNDING_M = 5e-6
 TURNS = JOINTS - 1
 #: About so many rows of terms bound a level.
-MOST_ROWS = 2048
+BOUND_ROWS = 2048
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def grouped(rest: F64, swing: F64, blend: F64) -> tuple[F32, F32, F32]:
     key = two[:, 0] * TURNS + two[:, 1]
     order = np.lexsort((most, key))
     begins = np.diff(key[order], prepend=-1) != 0
-    begins[:: max(len(rest) // MOST_ROWS, 1)] = True
+    begins[:: max(len(rest) // BOUND_ROWS, 1)] = True
     starts = np.flatnonzero(begins)
     tops = [np.maximum.reduceat(rows[order], starts, axis=0) for rows in (rest, swing, blend)]
     # Rounded up, so that a term in float32 is never smaller than it was.
