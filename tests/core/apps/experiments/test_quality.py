@@ -143,7 +143,7 @@ def frames(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int, int]]:
     return shown
 
 
-CHECKED: Any = SimpleNamespace(assets=None, config=SimpleNamespace(scene=SimpleNamespace(name="away")))
+CHECKED: Any = SimpleNamespace(assets=None, config=SimpleNamespace(scene=SimpleNamespace(name="away", frames=9)))
 
 
 @pytest.mark.usefixtures("frames")
