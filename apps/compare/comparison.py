@@ -66,6 +66,7 @@ WAITS: Final = {
     "throttled": "is held by its cap",
     "preempted": "has no core",
     "overhead": "waits for messages or its process",
+    "join": "waits for the other inputs of a frame",
 }
 DASH: Final = "–"
 IN_THOUSANDS: Final = 10_000
@@ -366,7 +367,7 @@ def _waits(found: Rows, rows: Rows, stages: Mapping[str, Sequence[str]]) -> Iter
     ]
     busy = {figure.of: row.base for figure, row in rows.items() if figure.measure == BUSY}
     for figure, row in sorted(telling, key=lambda each: (each[1].change < 0, -busy.get(each[0].of, 0.0)))[:MOST_NAMED]:
-        what = WAITS.get(figure.cause, f"is {figure.cause}")
+        what = WAITS[figure.cause]
         names = ", ".join(stages.get(figure.of, ()))
         yield f"unit {figure.of} ({names}) {what} {100 * row.other:.0f} % of the time, was {100 * row.base:.0f} %"
 
