@@ -7,6 +7,7 @@ question to the user: the message names both and what settles it. A note gives t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from itertools import permutations
@@ -45,6 +46,7 @@ from trilane.scene.camera.recorded import (
     UP,
     RawCamera,
     are_rotations,
+    find_upright,
     is_of_body,
     meeting_point,
     path_from_recording,
@@ -108,9 +110,13 @@ LEAST_AWAY, MOST_MISSED = 1.0, 0.2
 BELOW_M = 0.7, 2.5
 #: Times of a device's clock, in seconds since it was switched on: later than the start of a recording, before 1970's.
 OF_A_DEVICE_S = 60.0, 1e9
-#: Another order of a quaternion's parts is likely when it is cheaper by the first, and possible when it is not dearer
-#: by the second. The user is asked about both.
-MUCH_DEARER, AS_DEAR = 0.1, 0.02
+#: Another order of numbers is possible unless it is dearer by this.
+MUCH_DEARER = 0.1
+#: Its camera looks clearly more astray by the first for one of the 24 orders of a quaternion, by the second for one of
+#: a matrix. Matrices that differ by less than the last, as turns by 5 degrees do, are the same.
+MUCH_ASTRAY, AS_ASTRAY, SAME = 0.3, 0.1, 2 * math.sin(math.radians(2.5))
+#: Sine of the mean elevation up to which a camera looks ahead: one degree.
+LEVEL = 0.02
 WHICH_MATRIX = (
     'set camera.format to "kitti" if the camera looks along +Z of its axes (x right, y down), to "arkit" if along -Z '
     "(x right, y up); camera.axes states other axes"
@@ -253,35 +259,54 @@ def _of_matrices(path: Path, numbers: F64, up_axis: str, axes: str) -> Guess:
             found = f"{columns}matrices that are nearly rotations, but not as exactly as their digits"
             raise BadInputError(path, found, "numbers row by row", WHICH_MATRIX)
     is_readable = 0 < len(rows) >= len(numbers) / 2  # otherwise the reader names the rows that are no rotation
-    if is_readable and (has_time or not path.with_name(KITTI_TIMES).is_file()):
-        if has_time:
-            _require_clock(path, rows, (4, 8, 12))
-        if has_time and axes == AUTO:
-            _require_row_order(path, matrices[sound, :, :3], columns)
+    has_times = has_time or path.with_name(KITTI_TIMES).is_file()
+    if is_readable and has_time:
+        _require_clock(path, rows, (4, 8, 12))
+    if is_readable and has_times and axes == AUTO:
+        _require_row_order(path, matrices[sound], columns, usual, -AS_ASTRAY)
+    if is_readable and (has_time or not has_times):
         signs = _signs(matrices[sound], up_axis, rows[:, 0] if has_time else None)
         if axes == AUTO and (signs["kitti" if has_time else "arkit"] or not signs[usual]):
             why = " and ".join((*signs["kitti"], *signs["arkit"])) or "which do not tell where the camera looks"
             raise BadInputError(path, f"{columns}3x4 matrices, {why}", "what fits one format", WHICH_MATRIX)
+    if is_readable and not has_times and axes == AUTO:
+        _require_row_order(path, matrices[sound], columns, usual, AS_ASTRAY)
     return Guess(usual, f"{columns}a 3x4 matrix{'' if numbers.shape[1] > MATRIX else ' without a time'}")
 
 
-def _require_row_order(path: Path, turns: F64, columns: str) -> None:
-    """Raise BadInputError where the pictures of turns (N, 3, 3) are more level with their numbers in another order.
+def _require_row_order(path: Path, matrices: F64, columns: str, kind: str, slack: float) -> None:
+    """Raise BadInputError where matrices (N, 3, 4) of the format `kind` fit better with their numbers in another order.
 
-    `columns`: the table's columns, in words. People hold a camera level while it pans. Transposed, or seen along
-    another axis, its picture swings.
+    `columns`: the table's columns, in words. `slack`: how much more astray the other order may look to be a question;
+    negative where it must look less astray. People hold a camera level while it pans. Transposed, or seen along another
+    axis, its picture swings, or it looks up, or elsewhere than it goes. KITTI's poses begin without a turn and are as
+    level when transposed.
     """
+    turns, places = matrices[:, :, :3], matrices[:, :, 3]
+    if len(turns) < LEAST_ROWS:
+        return
+    back, is_kitti, axes = turns.swapaxes(1, 2), kind == "kitti", _axes(kind, AUTO)
     others = {
-        "each is transposed, as of world to camera": turns.swapaxes(1, 2),
-        "their columns are y, z, x": turns[:, :, [1, 2, 0]],
-        "their columns are z, x, y": turns[:, :, [2, 0, 1]],
+        "each is transposed, as of world to camera": (back, places),
+        "each is that of world to camera": (back, -(back @ places[:, :, None])[:, :, 0]),
     }
-    prices = {how: price_of_horizons(other) for how, other in others.items()}
-    best = min(prices, key=lambda how: prices[how])
-    if len(turns) >= LEAST_ROWS and prices[best] < price_of_horizons(turns) - MUCH_DEARER:
-        found = f"{columns}3x4 matrices whose pictures are more level if {best}"
-        remedy = f"write rotations from camera to world in this order; {WHICH_MATRIX}"
-        raise BadInputError(path, found, ROW_ORDER, remedy)
+    if not is_kitti:
+        others["their columns are y, z, x"] = turns[:, :, [1, 2, 0]], places
+        others["their columns are z, x, y"] = turns[:, :, [2, 0, 1]], places
+
+    def astray(turns: F64, places: F64) -> float:
+        is_steep = not is_kitti and _skywards(turns @ axes) > LEAST_SKYWARDS
+        return min(_astray(turns @ axes, places), 1.0) + is_steep
+
+    price, own = price_of_horizons(turns), astray(turns, places)
+    for how, other in others.items():
+        dearer = price_of_horizons(other[0]) - price
+        is_nearer = dearer < MUCH_DEARER and astray(*other) < own + slack
+        is_cheaper = dearer < -MUCH_DEARER and not is_kitti
+        if (is_nearer or is_cheaper) and np.abs(other[0] - turns).max() > SAME:
+            found = f"{columns}3x4 matrices that fit {'as well' if slack > 0 else 'better'} if {how}"
+            remedy = f"write rotations from camera to world in this order; {WHICH_MATRIX}"
+            raise BadInputError(path, found, ROW_ORDER, remedy)
 
 
 def _signs(matrices: F64, up_axis: str, times: F64 | None) -> dict[str, tuple[str, ...]]:
@@ -337,13 +362,21 @@ def _along(turns: F64, places: F64) -> float:
 
 def _meet(turns: F64, places: F64) -> bool:
     """Return whether cameras with OpenGL axes (N, 3, 3) at places (N, 3) look at one point that they go round."""
+    return _missed(turns, places) < MOST_MISSED
+
+
+def _missed(turns: F64, places: F64) -> float:
+    """Return by how much lines of sight miss the point that cameras go round, as a share of its distance.
+
+    Infinity where they go round none. `turns` (N, 3, 3), `places` (N, 3): OpenGL axes.
+    """
     point = meeting_point(turns, places) if len(turns) >= LEAST_ROWS else None
     if point is None:
-        return False
+        return math.inf
     towards, ahead = point - places, -turns[:, :, 2]
     along = (towards * ahead).sum(axis=1)
     missed = np.linalg.norm(towards - along[:, None] * ahead, axis=1)
-    return bool(np.median(along) > LEAST_AWAY and np.median(missed) < MOST_MISSED * np.median(along))
+    return float(np.median(missed) / np.median(along)) if np.median(along) > LEAST_AWAY else math.inf
 
 
 def _is_of_device(times: F64) -> bool:
@@ -355,10 +388,10 @@ def _is_of_device(times: F64) -> bool:
 def _require_one_order(path: Path, numbers: F64, names: tuple[str, ...], axes: F64) -> None:
     """Raise BadInputError where the quaternion's parts may be in another order than `names` of a table's columns.
 
-    This holds where another order makes cameras more level, or where the other usual one (scalar first or last) makes
-    them as level. It also holds where another order makes cameras as level, and only these look where they go. A map of
-    SLAM that begins without a turn has the 1 where its scalar is. `axes` (3, 3): columns are the directions of the
-    camera's axes, in the coordinates of a pose.
+    Each order makes a camera. Four of the 24 are equally level, as they only mirror where it turns to. What tells them
+    apart: a camera looks where it goes, or at one point that it goes round, and not up. A map of SLAM that begins
+    without a turn has the 1 where its scalar is; of its six orders the most level one counts.
+    `axes` (3, 3): columns are the directions of the camera's axes, in the coordinates of a pose.
     """
     at = names.index("qw"), names.index("qx"), names.index("qy"), names.index("qz")
     first_of = min(at)
@@ -374,22 +407,25 @@ def _require_one_order(path: Path, numbers: F64, names: tuple[str, ...], axes: F
     own = tuple(k - first_of for k in at)
     one = np.abs(np.abs(quats[0]) - 1) < EXACT
     every = len(quats) // 100 + 1
+    places = numbers[::every, [names.index(axis) for axis in "xyz"]]
     cameras = {
         order: matrix_from_quat(normalised(quats[::every, order])) @ axes
         for order in permutations(range(4))
         if not one.any() or one[order[0]]
     }
     prices = {order: price_of(turns, "z") for order, turns in cameras.items()}
-    other = (3, 0, 1, 2) if own[0] == 0 else (0, 1, 2, 3)
-    mine = prices.get(own, np.inf)
-    places = numbers[::every, [names.index(axis) for axis in "xyz"]]
-    fitting = {order for order in prices if prices[order] < mine + MUCH_DEARER}
-    led = {order for order in fitting if len(places) >= LEAST_LED and _leads(cameras[order], places)}
-    is_best = mine < min(prices.values()) + MUCH_DEARER and mine < prices.get(other, np.inf) - AS_DEAR
-    if not is_best or (led and own not in led):
+    if one.any():
+        fitting = {min(prices, key=lambda order: prices[order])}
+    else:
+        most = min(prices.values()) + MUCH_DEARER
+        level = [order for order, price in prices.items() if price < most and _skywards(cameras[order]) < LEVEL]
+        astray = {order: _astray(cameras[order], places) for order in level}
+        off = min(1.0, min(astray.values(), default=1.0) + MUCH_ASTRAY)
+        fitting = {order for order in level if astray[order] < off}
+    if fitting != {own}:
         raise BadInputError(
             path,
-            f"{where} with quaternions whose order does not follow from how the camera is held",
+            f"{where} with quaternions whose order does not follow from how the camera is held and moves",
             "an order that makes a level camera that looks where it goes, and no other",
             'set camera.format to "tum" (qx qy qz qw) or "euroc" (qw qx qy qz), or ' + SAY_ORDER,
         )
@@ -400,9 +436,19 @@ def _has_digits(numbers: F64) -> bool:
     return bool((np.abs(numbers - np.round(numbers, 3)) > EXACT).any())
 
 
-def _leads(turns: F64, places: F64) -> bool:
-    """Return whether cameras with OpenGL axes (N, 3, 3) look where they go, or at one point that they go round."""
-    return _along(turns, places) < -ALONG or _meet(turns, places)
+def _astray(turns: F64, places: F64) -> float:
+    """Return how far cameras look from where they go, or from the point that they go round: below 1 where they do.
+
+    `turns` (N, 3, 3), `places` (N, 3): OpenGL axes.
+    """
+    if len(places) < LEAST_LED:
+        return math.inf
+    return min((1 + _along(turns, places)) / (1 - ALONG), _missed(turns, places) / MOST_MISSED)
+
+
+def _skywards(turns: F64) -> float:
+    """Return the sine of the mean elevation of the views of cameras with OpenGL axes (N, 3, 3)."""
+    return -float(turns[:, :, 2].mean(axis=0) @ find_upright(turns, "z", False).up)
 
 
 #: Reader of each table, called with a path and the scene's clock.

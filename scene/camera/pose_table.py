@@ -29,9 +29,10 @@ MAX_ROWS = 1_000_000
 #: Number of rows that tell what columns hold.
 HEAD = 3000
 #: Units of times in seconds, the longest first. Poses follow each other by less than 1 s and are at least LEAST_STEP_S
-#: apart, so the steps of one unit are no steps of another.
+#: apart, so the steps of one unit are no steps of another. Those up to FAST_STEP_S may be: few programs save 300 poses
+#: a second and more, and some save key frames.
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-LEAST_STEP_S = 0.9e-3
+LEAST_STEP_S, FAST_STEP_S = 0.9e-3, 3e-3
 #: Poses that follow each other within the first are likely, as of key frames, if the times are those of a clock since
 #: 1970 or have fractions. Up to the second they may as well have another unit.
 SURE_STEP_S, LONGEST_STEP_S = 3.0, 60.0
@@ -263,7 +264,8 @@ def units_of(column: NDArray[np.float64]) -> tuple[str, ...]:
     if clock:
         return (clock,) if clock == film or step * SECONDS[clock] <= SURE_STEP_S else (clock, film)
     if film != "ms":
-        return (film,)
+        longer = {"us": "ms", "ns": "us"}.get(film, "") if step * SECONDS[film] <= FAST_STEP_S else ""
+        return (longer, film) if longer else (film,)
     if (finite % 1 == 0).all() and finite.min() >= 0 and finite.max() < MOST_FRAMES:
         return ("s", "ms", FRAMES)
     return ("s",) if step <= SURE_STEP_S else ("s", "ms")

@@ -19,6 +19,7 @@ from trilane.errors import BadInputError, UnwrittenError
 
 WRITABLE = "a place that can be written"
 PREFIX = ".trilane-"
+REMOVED = "it was removed while it was written"
 
 
 @contextmanager
@@ -54,7 +55,7 @@ def require_writable(path: Path) -> None:
 def require_name(path: Path, fd: int) -> None:
     """Raise UnwrittenError when somebody has removed the file `path`, which is still open as `fd`."""
     if not os.fstat(fd).st_nlink:
-        raise UnwrittenError(path, FileNotFoundError(errno.ENOENT, "it was removed while it was written"))
+        raise UnwrittenError(path, FileNotFoundError(errno.ENOENT, REMOVED))
 
 
 def write_bytes(path: Path, content: bytes, remedy: str = "") -> None:

@@ -8,6 +8,7 @@ run are kept as arrays beside it.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import time
@@ -28,7 +29,7 @@ from trilane.pipeline.memory import ByteCounter
 from trilane.pipeline.stage import UnitContext
 from trilane.stages.config import RunConfig
 from trilane.transport.packets import Packet
-from trilane.writing import require_name
+from trilane.writing import REMOVED, require_name
 
 SEGMENTS = "segments"
 KEYFRAME_EVERY = 30
@@ -136,7 +137,7 @@ class PresentStage:
         self._kept = KeptFrames(config.out_dir, config.kept)
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
-        """Make views of the slots as frames, and the encoder. Raises ValueError when the stage has outputs."""
+        """Make views of the slots as frames, and the encoder. Raises ValueError for outputs, or UnwrittenError."""
         if outputs:
             raise ValueError("the present stage has no output edge")
         size = self._height * self._width * 3
@@ -145,7 +146,10 @@ class PresentStage:
         if self._folder is not None:
             self._folder.mkdir(parents=True, exist_ok=True)
             path = self._folder / f"{time.monotonic_ns():020d}-{os.getpid()}.mp4"
-            self._segment = Segment(path, self._fps, self._height, self._width)
+            try:
+                self._segment = Segment(path, self._fps, self._height, self._width)
+            except FileNotFoundError as error:  # between the folder and the second file
+                raise UnwrittenError(path, FileNotFoundError(errno.ENOENT, REMOVED)) from error
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
         """Present `inputs[slot_in]` as frame `frame`. Raises ValueError when `slot_in` is None."""

@@ -143,9 +143,11 @@ def nerf_matrix(matrix: Any, frames: slice = slice(0, 1)) -> str:
 
 
 def columns(text: str, change: Callable[[list[str]], list[str]], first: int = 0) -> str:
-    """A table whose rows from `first` on are changed."""
+    """A table whose rows from `first` on are changed; its comments stay before them."""
+    comments = [line for line in text.splitlines() if line.startswith("#")]
     rows = [line for line in text.splitlines() if not line.startswith("#")]
-    return "\n".join(" ".join(change(row.split())) if k >= first else row for k, row in enumerate(rows)) + "\n"
+    changed = [" ".join(change(row.split())) if k >= first else row for k, row in enumerate(rows)]
+    return "\n".join([*comments, *changed]) + "\n"
 
 
 def avatar(change: Callable[[Path], Any]) -> Callable[[Path], None]:
@@ -286,8 +288,8 @@ TABLES: dict[str, tuple[Content, str]] = {
     "words": ("a letter\nof words\n", "columns"),
     "brackets without end": ("1 2 " + "[" * 200_000 + "\n", "found 3 columns"),
     "comments alone": ("# time\n# and place\n", "columns"),
-    "a row of seven": (columns(TUM, lambda row: row[:7], first=3), "line 4: found 7 columns"),
-    "a word": (columns(TUM, lambda row: [*row[:7], "x"], first=3), "line 4: found"),
+    "a row of seven": (columns(TUM, lambda row: row[:7], first=3), "line 5: found 7 columns"),
+    "a word": (columns(TUM, lambda row: [*row[:7], "x"], first=3), "line 5: found"),
     "no rotation": (columns(TUM, lambda row: [*row[:4], "0", "0", "0", "0"]), "5 samples that are "),
     "mirrored": (columns(ARKIT, lambda row: [*row[:1], row[3], row[2], row[1], *row[4:]]), "of 5"),
     "nan": (columns(ARKIT, lambda row: ["nan" for _ in row]), "of 5"),

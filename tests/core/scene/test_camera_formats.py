@@ -101,19 +101,16 @@ def test_a_lens_of_stray_scanner_that_sees_nothing_is_refused(tmp_path: Path) ->
 
 
 def test_the_order_of_columns_is_that_of_their_names(tmp_path: Path) -> None:
-    """The same turn with the scalar first and last, with and without names, in seconds and in nanoseconds."""
+    """The same turn with the scalar first and last, by names or by the format, in seconds and in nanoseconds."""
     w, x, y, z = 0.5, -0.5, 0.1, 0.7
     last, first = f"1 2 3 {x} {y} {z} {w}", f"1 2 3 {w} {x} {y} {z}"
     names = "timestamp tx ty tz"
     texts = {
-        f"0.5 {last}\n1.5 {last}": ("TUM", "8 columns: the quaternion's scalar is taken to be last"),
+        f"0.5 {last}\n1.5 {last}": ("TUM", "as given"),
         f"# {names} qx qy qz qw\n0.5 {last}\n1.5 {last}": ("TUM", "column names with the quaternion's scalar last"),
         f"{names} qw qx qy qz\n0.5 {first}\n1.5 {first}": ("TUM", "column names with the quaternion's scalar first"),
-        f"0 {last}\n1000000000 {last}": ("TUM", "8 columns: the quaternion's scalar is taken to be last"),
-        f"0,{first}\n1000000000,{first}".replace(" ", ","): (
-            "EuRoC",
-            "8 columns with commas and times in ns: the quaternion's scalar is taken to be first",
-        ),
+        f"0 {last}\n1000000000 {last}": ("TUM", "as given"),
+        f"0,{first}\n1000000000,{first}".replace(" ", ","): ("EuRoC", "as given"),
         f"{EUROC_NAMES}0,{first} 0 0 0\n1000000000,{first} 0 0 0".replace(" 0 0 0", ",0,0,0").replace(
             first, first.replace(" ", ",")
         ): ("EuRoC", "column names with the quaternion's scalar first"),
@@ -121,7 +118,7 @@ def test_the_order_of_columns_is_that_of_their_names(tmp_path: Path) -> None:
     turns = []
     for text, (name, reason) in texts.items():
         (tmp_path / "a.txt").write_text(text)
-        camera = load(tmp_path / "a.txt", up_axis="z")
+        camera = load(tmp_path / "a.txt", up_axis="z", format=name.lower() if reason == "as given" else "auto")
         assert camera.detected.format.startswith(name) and camera.detected.reason == reason
         assert camera.times_s == pytest.approx([0, 1]) and camera.places[0] == pytest.approx([1, 3, -2])
         turns.append(camera.quats[0])

@@ -110,6 +110,21 @@ def test_a_segment_that_is_removed_is_told_at_the_next_frame(tmp_path: Path, rem
     stage.close()
 
 
+def test_a_segment_whose_folder_is_removed_while_its_files_are_made_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage, opened = PresentStage(make_config(tmp_path)), av.open
+
+    def open_and_remove(file: str, *words: Any, **options: Any) -> Any:
+        container = opened(file, *words, **options)
+        shutil.rmtree(tmp_path / SEGMENTS)
+        return container
+
+    monkeypatch.setattr(av, "open", open_and_remove)
+    with pytest.raises(UnwrittenError, match=r"\.mp4: it was removed while it was written$"):
+        stage.bind([make_slot()], [])
+
+
 @pytest.mark.parametrize(
     ("removed", "shown", "is_told"),
     [
