@@ -16,10 +16,12 @@ from __future__ import annotations
 
 import ctypes
 import os
+import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -59,6 +61,10 @@ def open_context(threads: int | None = None) -> Any:
     """
     if threads is not None:
         os.environ["LP_NUM_THREADS"] = str(threads if threads > 1 else 0)
+    if "torch" in sys.modules:
+        # PyTorch's compiler and Mesa each bring LLVM. If Mesa's comes first, the compiler ends the process (SIGSEGV).
+        with suppress(ModuleNotFoundError):
+            import_module("triton")
     try:
         create: Any = moderngl.create_context
         return create(require=REQUIRED_VERSION, standalone=True, backend="egl", libegl=LIBRARY, libgl=LIBRARY)
