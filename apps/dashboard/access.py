@@ -148,7 +148,7 @@ def headers(port: int) -> dict[str, str]:
 
 
 def refusal_of_head(scope: Mapping[str, Any]) -> Refusal | None:
-    """Return why a request is refused whatever it asks for: its version, its length, or that it has a body."""
+    """Return why a request is refused before its path is read: wrong version, too long, or with a body."""
     lines = [scope["raw_path"] + scope["query_string"], *(name + value for name, value in scope["headers"])]
     if sum(map(len, lines)) > MOST_HEAD_BYTES:
         return Refusal.OVERSIZED

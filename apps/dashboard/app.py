@@ -1,7 +1,7 @@
 """The server's answers: the page's files, one WebSocket, metrics and the trace. Rule: it decides nothing about the run.
 
 Pictures are pulled: a client that asks gets the newest picture that it has not seen, and no other until it asks again.
-Everything else is sent to all clients as it happens. The system gives up what a client does not take or send in time.
+Everything else is sent to all clients as it happens. A client that does not take or send in time loses its connection.
 """
 
 from __future__ import annotations
@@ -53,9 +53,10 @@ SWITCHING: Final = 101  # status of a WebSocket that begins
 
 
 class DashboardApp:
-    """The ASGI application `asgi` for `view` on `port`, for those who know `token`. `refusals`: its server's counts.
+    """The ASGI application `asgi` that shows `view` on `port` to clients that know `token`.
 
-    `stop`: function that ends the server, for an app that can no longer tell its clients the news.
+    `refusals`: counts of refused requests. `stop`: function that ends the server; the app calls it when it can no
+    longer send news.
     """
 
     def __init__(self, view: RunView, port: int, token: str) -> None:
@@ -75,7 +76,7 @@ class DashboardApp:
         self.asgi: Asgi = Guard(app, port, token, self.refusals)
 
     async def finish(self) -> None:
-        """Send all clients the remaining messages, and give them a moment to receive these."""
+        """Send the remaining messages to all clients, then wait for LAST_S, in which the clients receive them."""
         await self._tell_newest()
         await asyncio.sleep(LAST_S)
 

@@ -1,6 +1,6 @@
-"""The messages between a run and its server, which are two processes. Rule: msgpack, and only those of this table.
+"""The messages between a run and its server, which are two processes. Rule: msgpack, and only messages in MESSAGES.
 
-A message is an array of its place in MESSAGES and its fields. It goes as one packet over a pair of sockets that only
+A message is an array: its place in MESSAGES, then its fields. It goes as one packet over a pair of sockets that only
 these two processes have. Neither process waits for the other: a message that cannot be sent at once is left out.
 `ServerLink` starts the server's process and ends it; if that process ends by itself, the run goes on without it.
 """
@@ -38,7 +38,7 @@ class Opened(NamedTuple):
 
 
 class RunBegins(NamedTuple):
-    """To the server: a run writes its journal into `folder`. `facts`: of `RunFacts`, `controls`: of `Control`."""
+    """To the server: a run writes its journal into `folder`. `facts`, `controls`: fields of `RunFacts`, `Control`."""
 
     folder: str
     facts: Mapping[str, Any]
@@ -93,7 +93,7 @@ def packed(message: Message) -> bytes:
 
 
 def unpacked(data: bytes) -> Message:
-    """Return the message of a packet. Raises UnexpectedValue for bytes that are none."""
+    """Return the message of a packet. Raises UnexpectedValue for bytes that are no message."""
     try:
         place, *fields = msgpack.unpackb(data)
         kind = MESSAGES[place]
@@ -118,7 +118,7 @@ class ChannelEnd:
         return self._end.fileno()
 
     def send(self, message: Message) -> bool:
-        """Send `message`; returns whether it was sent. An end that is gone, or left too much unread, gets nothing."""
+        """Send `message` and return whether it was sent. An end that is gone, or has too much to read, gets nothing."""
         try:
             self._end.send(packed(message))
         except OSError:

@@ -263,8 +263,8 @@ class TimeTable:
     """Rows with a begin and an end, many more than memory should hold, found by their time.
 
     `dtype`: type of a row, with the fields `begin` and `end` in any unit of time. Rows lie in a temporary file, in
-    pieces; memory holds the place, earliest begin and latest end of each piece. Rows need not be in order, but those of
-    about one time should be added together.
+    pieces; memory holds the place, earliest begin and latest end of each piece. Rows need not be in order, but add rows
+    of about the same time together.
     """
 
     def __init__(self, dtype: np.dtype[Any]) -> None:
@@ -289,7 +289,7 @@ class TimeTable:
             self._fresh = []
 
     def near(self, time: float, reach: float, most: int) -> NDArray[Any]:
-        """Return rows that touch `time - reach` to `time + reach`, by their begins; of too many, the nearest `most`."""
+        """Return the `most` nearest rows that touch `time - reach` to `time + reach`, sorted by their begins."""
         low, high = time - reach, time + reach
         touching = [piece for piece in self._pieces if piece.begin <= high and piece.end >= low]
         touching.sort(key=lambda piece: _away(time, piece.begin, piece.end))

@@ -136,7 +136,7 @@ def _numbered(folder: Path, number: int) -> Path:
 
 
 class Director:
-    """Directs the successive runs under one page. Another thread calls `do` than all other methods.
+    """Directs the successive runs under one page. One thread calls `do`; another one calls all other methods.
 
     `prepare`: function that checks a run. `send`: function that hands a message to the server.
     """
@@ -149,7 +149,7 @@ class Director:
         self._controls: RunControls | None = None
 
     def begin(self, prepared: Prepared) -> RunControls:
-        """Begin the run of `prepared`; returns the controls of it."""
+        """Begin the run of `prepared` and return its controls."""
         with self._lock:
             self._now, self._next, self._controls = prepared, None, RunControls()
             return self._controls
@@ -165,7 +165,7 @@ class Director:
         self._send(StateIs(RUNNING, ""))
 
     def take_next(self) -> Prepared | None:
-        """Return, once, the run that shall follow the one that has ended."""
+        """Return the run that follows the ended one; the next call returns it no more."""
         with self._lock:
             taken, self._next = self._next, None
             return taken
@@ -204,7 +204,7 @@ class Director:
 
 
 def choices_of(config: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
-    """Return the choices of each control for a new run; the value in `config`, which is in force, is among them."""
+    """Return the choices of each control for a new run, including its present value in `config`."""
     found = {"runtime": installed(), "avatar": (*BUILT_IN, *_neighbours(str(config["avatar"])))}
     choices = {}
     for name in OF_A_NEW_RUN:
@@ -214,7 +214,7 @@ def choices_of(config: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
 
 
 def reasons_against(options: RunOptions) -> dict[str, str]:
-    """Return by name why a control of a new run cannot be used beside `options`."""
+    """Return, for each control of a new run that `options` forbid, its name and the reason."""
     if options.pace:
         return {"performance_profile": "the run is held to a chip's pace, which is capped already"}
     return {}
@@ -236,8 +236,8 @@ def run_file_live(
 ) -> RunOutcome:
     """Run the pipeline file of `options` until an interrupt, or for its number of frames.
 
-    The page holds the run, steps it and kills units: what else changes it is in the file. The parameters, and what is
-    raised, are those of `run_live`.
+    The page can only hold the run, step it and kill units; all other settings are in the file. The parameters and
+    errors are those of `run_live`.
     """
     from trilane.apps.run.run_file import run_file
 
@@ -262,8 +262,8 @@ def run_file_live(
 class FileWatch:
     """A `trilane.apps.run.run_file.Watch`: the page of the run.
 
-    `link`: function that makes the link to the page's server, from the height and width of pictures and from the
-    function that hears requests, on a thread of its own.
+    `link`: function that makes the link to the page's server. It takes the height and the width of pictures, and a
+    function that gets each request on a thread of its own.
     """
 
     def __init__(self, link: Callable[[int, int, Callable[[ControlAsked | ChangesAsked], None]], ServerLink]) -> None:
@@ -289,7 +289,7 @@ class FileWatch:
             self._link.send(StateIs(state, why))
 
     def do(self, asked: ControlAsked | ChangesAsked) -> None:
-        """Carry out a request of the page, whose server has already checked name and value: it asks for no changes."""
+        """Carry out a request of the page, whose server has already checked it. No request asks for changes."""
         if isinstance(asked, ChangesAsked):
             return
         if asked.control in HOLDS:

@@ -152,7 +152,7 @@ class _Course:
 class LiveView:
     """The `RunView` of successive runs, which `hear` announces.
 
-    `window`: window into them. `ask`: function that hands a request to the run and returns whether it could.
+    `window`: window into the runs. `ask`: function that hands a request to the run, and returns whether the run got it.
     """
 
     def __init__(self, window: LiveWindow, ask: Callable[[ControlAsked | ChangesAsked], bool]) -> None:

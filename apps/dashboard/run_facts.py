@@ -56,7 +56,7 @@ class RunFacts:
 
     @classmethod
     def of_row(cls, row: Mapping[str, Any]) -> RunFacts:
-        """Return the facts that were sent as `asdict` has them."""
+        """Return the facts whose fields `asdict` wrote into a message."""
         width, height = row["output"]
         return cls(**{**row, "output": (width, height)})
 
@@ -72,16 +72,17 @@ class RunFacts:
         }
 
     def state(self, state: str, why: str = "") -> dict[str, Any]:
-        """Return the message that says what the run does, and under what configuration."""
+        """Return the message with the state of the run and its configuration."""
         facts = {"plan": self.plan, "placement": self.placement, "accuracy": self.accuracy, "bound": self.bound}
         facts["verdict"] = self.verdict
         return {"type": "state", "is": state, "why": why, "config": self.config, **facts}
 
 
 def config_in_force(config: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the value in force of each control of a new run, as one of the words of its choices.
+    """Return the present value of each control of a new run, as its choices spell it.
 
-    `config`: block of report.json, with the values of options that were left open. `options`: given options, by name.
+    `config`: block of report.json, which has a value for every option that nobody gave. `options`: given options, by
+    name.
     """
     if "pipeline" in config:  # the controls before a run are those of the avatar's scenes
         return {name: str(config[name]) for name in ("policy", "edge")}
@@ -202,9 +203,9 @@ def facts_of_folder(folder: Path, begun: Begun) -> RunFacts:
 class Control:
     """One control.
 
-    `kind`: action, choice, number or drag. `live`: whether the run goes on when it is used, or starts again.
-    `choices`: values of a choice. `min`, `max`: range of a number, and of both numbers of a drag. `why_not`: reason why
-    it cannot be used now, "" when it can.
+    `kind`: action, choice, number or drag. `live`: whether the run goes on when somebody uses the control; otherwise
+    the run starts again. `choices`: values of a choice. `min`, `max`: range of a number, and of both numbers of a drag.
+    `why_not`: reason why nobody can use the control now, "" when somebody can.
     """
 
     name: str
@@ -216,7 +217,7 @@ class Control:
     why_not: str = ""
 
     def refusal(self, value: Value) -> str:
-        """Return why it cannot have `value`, "" when it can."""
+        """Return why the control cannot have `value`, "" when it can."""
         if self.why_not:
             return self.why_not
         if self.kind == ACTION:
@@ -235,19 +236,22 @@ class Control:
         return is_number and self.min <= number <= self.max
 
     def as_json(self, value: Any) -> dict[str, Any]:
-        """Return its row in the hello, with the value in force."""
+        """Return the control's row in the hello, with its present `value`."""
         return {**asdict(self), "value": value}
 
 
 def control_of(row: Mapping[str, Any]) -> Control:
-    """Return the control that was sent as `asdict` has it."""
+    """Return the control whose fields `asdict` wrote into a message."""
     return Control(**{**row, "choices": tuple(row["choices"])})
 
 
 def controls_of_run(
     units: Sequence[str], choices: Mapping[str, Sequence[str]], why_not: Mapping[str, str]
 ) -> tuple[Control, ...]:
-    """Return the controls of a run with these `units`. `choices`, `why_not`: by name, for those of OF_A_NEW_RUN."""
+    """Return the controls of a run with these `units`.
+
+    `choices`, `why_not`: choices and reasons by name, for the controls in OF_A_NEW_RUN.
+    """
     camera = (
         Control("orbit", DRAG, True, min=-MOST_DRAG_DEG, max=MOST_DRAG_DEG),
         Control("zoom", NUMBER, True, min=LEAST_ZOOM, max=MOST_ZOOM),

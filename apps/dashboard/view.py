@@ -1,13 +1,13 @@
 """What a server shows of a live run (`live_server.py`) or a finished one (`finished_view.py`), and the messages.
 
 Rule: a view answers at once or awaits; it never blocks the loop that all clients share. `TimelineRows` forgets rows
-once they are taken. It turns times into milliseconds since the run's first step, and names of units and stages into
-their places in the hello. The page and /metrics get the same figures.
+after `take` returned them. It writes times as milliseconds since the run's first step. It writes units and stages as
+their numbers in the hello. The page and /metrics get the same figures.
 
 A message is a kind, then a payload; every message of a page is checked. Kind 1 is JSON in UTF-8, both ways. Kind 2, to
 the page alone, is a picture: the frame's number (uint32), its time in the scene and its age (float64, ms), all
-little-endian, then a JPEG. No page can make anything wait: each has a queue of its own and a task that empties it. A
-page whose queue is full, or that takes nothing for SEND_S, is dropped and counted.
+little-endian, then a JPEG. No page delays the others: each has a queue of its own, and a task sends what is in the
+queue. The server drops and counts a page whose queue is full, or that takes nothing for SEND_S.
 """
 
 from __future__ import annotations
@@ -48,17 +48,17 @@ class Socket(Protocol):
     """The server's end of a WebSocket."""
 
     async def send_bytes(self, data: bytes) -> None:
-        """Return when the bytes are with the system, or will be soon."""
+        """Send `data`; return when the system has the bytes or will soon have them."""
 
     async def close(self, code: int = 1000, reason: str | None = None) -> None:
-        """Send nothing more."""
+        """Close the connection with `code` and `reason`."""
 
 
 class Client:
-    """A page that looks at a run. `gone`: function that is called once when it is dropped.
+    """A page that looks at a run. `gone`: function that is called once when the page is dropped.
 
-    `asks_picture`: whether it waits for a picture. `had_frame`: number of the last frame that it got. `faults`: number
-    of malformed messages.
+    `asks_picture`: whether the page waits for a picture. `had_frame`: number of the last frame that the page got.
+    `faults`: number of malformed messages.
     """
 
     def __init__(self, socket: Socket, gone: Callable[[], None]) -> None:
@@ -149,7 +149,7 @@ class PictureAsked(_PageMessage):
 
 
 class ControlSaid(_PageMessage):
-    """The page requests that the control `name` gets `value`; the control decides whether it can."""
+    """The page requests `value` for the control `name`; the control may refuse it."""
 
     type: Literal["control"]
     name: str = Field(max_length=40)
@@ -183,7 +183,7 @@ _MESSAGES: TypeAdapter[Heard] = TypeAdapter(Annotated[Heard, Field(discriminator
 
 
 class MalformedError(ValueError):
-    """The bytes are nothing that a client may say."""
+    """The bytes are no message of a client."""
 
 
 def heard(data: bytes) -> Heard:
@@ -234,7 +234,7 @@ class RunView(Protocol):
         """
 
     def control(self, asked: ControlSaid) -> str:
-        """Carry out a request, or begin to. Return the reason for a refusal, "" for none."""
+        """Carry out a request, or begin to. Return the reason for a refusal, "" without a refusal."""
 
     def restart(self, asked: ChangesSaid) -> Mapping[str, str]:
         """Begin a new run with the changes, or do nothing. Return the reason for each refusal, by control."""
@@ -247,7 +247,7 @@ class RunView(Protocol):
 
     @property
     def trace(self) -> Path | None:
-        """The run's trace, as far as it is written."""
+        """Return the file of the run's trace, or of the part that is written so far."""
 
 
 class TimelineRows:
@@ -268,7 +268,7 @@ class TimelineRows:
         self._notes: list[tuple[float, str]] = []
 
     def add(self, record: Record) -> None:
-        """Take the next record, but for the first."""
+        """Take the next record of the journal; its first record is `begun`."""
         if isinstance(record, Stepped):
             self.now_ms = self._ms(record.now_ns)
         elif isinstance(record, Worked):
@@ -280,11 +280,11 @@ class TimelineRows:
         self._add_idle(fact for fact in self._timeline.add(record) if isinstance(fact, IdleSlice))
 
     def end(self) -> None:
-        """Take the slices that are left after the last record."""
+        """Collect the slices that are still open after the last record."""
         self._add_idle(self._timeline.end())
 
     def take(self) -> tuple[list[JobRow], list[IdleRow], list[tuple[float, str]]]:
-        """Return what came since the last call."""
+        """Return the rows that were collected since the last call."""
         taken = self._jobs, self._idle, self._notes
         self._jobs, self._idle, self._notes = [], [], []
         return taken
@@ -302,7 +302,7 @@ class TimelineRows:
 
 
 def described(graph: Graph) -> dict[str, Any]:
-    """Return the part of the hello that explains a timeline's numbers."""
+    """Return the part of the hello that names the units and stages by their numbers."""
     return {
         "stages": [{"name": stage.name, "unit": stage.unit} for stage in graph.stages],
         "units": list(graph.units),
@@ -323,7 +323,7 @@ def note(t_ms: float, text: str) -> dict[str, Any]:
 class RunMeter:
     """Takes the records after `begun`, in order, and gives the figures of a moment.
 
-    `finds_bound`: as of `LiveFigures`.
+    `finds_bound`: as in `LiveFigures`.
     """
 
     def __init__(self, begun: Begun, *, finds_bound: bool = True) -> None:
@@ -334,7 +334,7 @@ class RunMeter:
         self._figures.add(record)
 
     def message(self, now_ns: int | None = None) -> dict[str, Any]:
-        """Return the message with the figures at `now_ns`; at the last record where it is None."""
+        """Return the message with the figures at `now_ns`, or at the last record if `now_ns` is None."""
         return {"type": "figures", **self._figures.now(now_ns).as_json()}
 
     @property
@@ -343,7 +343,7 @@ class RunMeter:
         return self._figures.has_frames
 
     def metrics(self, now_ns: int | None = None, state: RunState | None = None) -> str:
-        """Return the figures in OpenMetrics, without the end mark. `state`: as of `LiveFigures.now`."""
+        """Return the figures in OpenMetrics, without the end mark. `state`: as in `LiveFigures.now`."""
         from trilane.apps.watch.metrics import openmetrics  # which needs a package of the extra `dashboard`
 
         return openmetrics(self._figures.now(now_ns, state)).decode().removesuffix(END)
