@@ -45,8 +45,8 @@ class TrialPair:
     """One configuration in both sweeps.
 
     `name`: name of its first trial in the base. `runs`: number of runs a side. `frame_time`: mean frame time of both.
-    `differs`: whether the test of all pairs together calls it different. `sides`: its figures of both sides, to be
-    judged. `bounds`: what bounded its runs.
+    `differs`: whether the test of all pairs together calls it different. `sides`: figures of both sides, for the gates.
+    `bounds`: bounds of its runs.
     """
 
     name: str

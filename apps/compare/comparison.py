@@ -75,8 +75,8 @@ IN_THOUSANDS: Final = 10_000
 class Bounds(NamedTuple):
     """The `bound` of each run of either side, as in report.json; None where it is unknown.
 
-    `outcome` says whether the bounding unit changed. A run whose bound has rivals does not say so surely. A report
-    without rivals says so surely where the unit has more than half of the path.
+    `outcome` says whether the bounding unit changed. A run whose bound has rivals is no sure evidence of that. A report
+    without rivals is sure evidence where the unit has more than half of the path.
     """
 
     base: tuple[Mapping[str, Any] | None, ...]
@@ -164,7 +164,7 @@ def compare(base: Side, others: Sequence[Side]) -> list[Comparison]:
 def document(comparisons: Sequence[Comparison]) -> dict[str, Any]:
     """Return what `trilane compare --json` prints.
 
-    With several others `verdict` names each of them, and `changes` say whose they are.
+    With several other sides, `verdict` names each of them, and each of `changes` names its side.
     """
     several = len(comparisons) > 1
     return {

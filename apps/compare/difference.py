@@ -67,8 +67,8 @@ class Chance(NamedTuple):
     """How much a figure differs between runs of one kind beyond what their frames show; nothing in virtual time.
 
     `relative`, `absolute`: standard deviations of one run's figure, as a share of it and in its unit. `freedom`: number
-    of runs that this knowledge is worth. `explained`: part of a change that has another cause, as a logarithm of the
-    ratio, or in the figure's unit where the change is no ratio.
+    of runs that would give equal knowledge. `explained`: part of a change that has another cause. It is a logarithm of
+    the ratio, or in the figure's unit where the change is no ratio.
     """
 
     relative: float = 0.0
@@ -82,11 +82,11 @@ class Difference(NamedTuple):
 
     `base`, `other`: value of each side, over all frames of its run; the arithmetic mean of several runs. `change`:
     change from base to other, with its 95 % interval from `low` to `high`, as a share of the base where `is_ratio`,
-    else in the statistic's unit. It is taken over the frames that all runs have, and of several runs a side between
-    their geometric means, so it need not be the ratio of the values. `probability`: chance of a change as large as this
-    between runs of one kind. `low`, `high` and `probability` are None where nobody can tell. `deviation`: standard
-    deviation of the change, or of its logarithm where `is_ratio`. `freedom`: degrees of freedom of the deviation.
-    `explained`: as in `Chance`.
+    else in the statistic's unit. The change only covers frames that all runs have. Of several runs on a side, their
+    geometric mean counts. Therefore the change need not be the ratio of the values. `probability`: chance of a change
+    as large as this between runs of one kind. `low`, `high` and `probability` are None where nobody can tell.
+    `deviation`: standard deviation of the change, or of its logarithm where `is_ratio`. `freedom`: degrees of freedom
+    of the deviation. `explained`: as in `Chance`.
     """
 
     base: float
@@ -149,8 +149,8 @@ def difference(
 ) -> Difference:
     """Return the change of `statistic` from the runs `base` to the runs `other`, over each one's last `MOST_FRAMES`.
 
-    `is_ratio`: whether the change is a share of the base; where a value is zero it is not. Frames that all runs have
-    are compared frame with frame, so the different work in the scene's frames does not count as scatter.
+    `is_ratio`: whether the change is a share of the base; a value of zero makes it a plain difference. Frames that all
+    runs have are compared frame with frame, so the different work in the scene's frames does not count as scatter.
     """
     reduce = STATISTICS[statistic]
     sides = [[each.at(slice(-MOST_FRAMES, None)) for each in side] for side in (base, other)]
@@ -177,8 +177,8 @@ def settled(
 ) -> Difference:
     """Return the difference of two sides.
 
-    `values`: figures of each side's runs. `effects`: the same on the scale of the deviations. `within`: variance of the
-    change by what scatters within the runs.
+    `values`: figures of each side's runs. `effects`: the same figures on the scale of the deviations. `within`:
+    variance of the change due to scatter within runs.
     """
     first, second = (float(side.mean()) for side in effects)
     scale = 1.0 if is_ratio else max(abs(first), abs(second))
@@ -292,11 +292,11 @@ def _jackknife(values: F64) -> float:
 
 
 def rejected(probabilities: Sequence[float], alpha: float = ALPHA) -> list[bool]:
-    """Return which of the hypotheses "no difference" fall.
+    """Return which of the hypotheses "no difference" are rejected.
 
-    `probabilities`: for each hypothesis the probability of what was seen under it. The chance that any of them falls
-    wrongly is at most `alpha`, also where they depend on each other: Holm, "A simple sequentially rejective multiple
-    test procedure", Scandinavian Journal of Statistics 6 (1979).
+    `probabilities`: probability of the observation under each hypothesis. The chance of any false rejection is at most
+    `alpha`, even if the hypotheses depend on each other: Holm, "A simple sequentially rejective multiple test
+    procedure", Scandinavian Journal of Statistics 6 (1979).
     """
     order = sorted(range(len(probabilities)), key=probabilities.__getitem__)
     fallen = [False] * len(probabilities)

@@ -1,6 +1,6 @@
 """Which of many entries are worth a look: the frontier of frame time against error, and its knee.
 
-Rule: pure. A difference that nobody can tell beats nothing: times by their intervals, pictures by `SAME_DB`.
+Rule: pure. Only a sure difference counts: intervals decide for times, `SAME_DB` decides for pictures.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ LEAST_OF_A_KNEE: Final = 3
 
 
 class Scored(Protocol):
-    """What can be on a frontier. Less `frame_ms` and more `psnr_db` are better, within one `group`.
+    """An entry that can be on a frontier. Less `frame_ms` and more `psnr_db` are better, within one `group`.
 
     `low_ms`, `high_ms`: interval of `frame_ms`; None where there is none.
     """

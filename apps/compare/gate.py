@@ -1,11 +1,11 @@
 """A comparison as a gate: each limit is kept, broken, or it cannot be told, with the runs that would tell.
 
-Rule: whoever wants to pass bears the proof. A limit is broken if something surely became worse and more than the limit
-is not excluded. It is kept if more than the limit is excluded, on a machine that was quiet. All else cannot be told.
+Rule: whoever wants to pass bears the proof. A limit is broken if a figure surely became worse, and its interval reaches
+beyond the limit. A limit is kept if the whole interval lies within it, on a quiet machine. Otherwise nobody can tell.
 
 Time is weighed three ways: frame time with other programs' share taken out, each stage's time and CPU time of a job,
-and its counted instructions. Instructions repeat to 0.1 %, so they alone may keep `slower` where every stage has them
-and no setting changed. The frame time must not contradict them.
+and its counted instructions. Instructions repeat to 0.1 %. Therefore they alone may keep the limit `slower`, if every
+stage has counts and no setting changed. The frame time must not contradict them.
 """
 
 from __future__ import annotations
@@ -138,10 +138,10 @@ class GatedPair:
 class Weighed(NamedTuple):
     """One figure against its limit.
 
-    `least`, `most`: change for the worse that is left when known causes explain all, or none, of it. Logarithms of the
-    ratio where the row is one. `limit`: on the same scale. `probability`: chance that runs of one kind are worse by
-    `least`. `outcome`: of this figure alone. `runs`: runs of each side that would tell, inf for more than `MOST_RUNS`,
-    None where no number does.
+    `least`, `most`: change for the worse, less all or nothing of what known causes can explain. For a ratio, both are
+    logarithms. `limit`: on the same scale. `probability`: chance that runs of one kind are worse by `least`. `outcome`:
+    outcome of this figure alone. `runs`: number of runs of each side that would decide, inf for more than `MOST_RUNS`,
+    None where no number decides.
     """
 
     figure: Figure
@@ -174,8 +174,8 @@ class Weighed(NamedTuple):
 class JudgedLimit(NamedTuple):
     """The judgement of one limit for one pair.
 
-    `name`: name of the other side. `reason`: a sentence. `runs`: as in `Weighed`, for all its figures together; None
-    too where more runs do not help or are not needed.
+    `name`: name of the other side. `reason`: a sentence. `runs`: as in `Weighed`, for all figures of the limit
+    together; also None where more runs are of no help or no need.
     """
 
     gate: Gate
@@ -278,7 +278,7 @@ def _settled(each: Weighed, is_sure: bool, tests: int, pair: GatedPair) -> Weigh
 
 
 def runs_needed(each: Weighed, sizes: tuple[int, int], tests: int) -> float | None:
-    """Return how many runs of each side would tell, if they scatter as these and their means stay where they are.
+    """Return how many runs of each side would decide, if further runs have the same means and the same scatter.
 
     `sizes`: runs of both sides now. `tests`: number of figures that are tested together.
     """

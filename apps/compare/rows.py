@@ -1,10 +1,10 @@
 """The figures of two sides as rows, each with its random variation. Rule: a table names each measure's statistics.
 
 In runs with a journal, every figure comes from the frames. A report alone or a prediction only has summaries. Each
-counts as uncertain as the mean frame time, because nothing else is known.
+summary gets the uncertainty of the mean frame time, because no other one is known.
 
-`Noise` says how much a figure differs between runs of one kind beyond what their frames show. Each number has its
-source beside it.
+`Noise` says how much more a figure differs between runs of one kind than their frames show. The source of each number
+stands beside the number.
 """
 
 from __future__ import annotations
@@ -107,10 +107,10 @@ def rows_of(base: Side, other: Side) -> Rows:
 
 
 def named(rows: Rows) -> list[Figure]:
-    """Return the figures that a verdict rests on; all others are there to explain them.
+    """Return the figures that a verdict rests on; all other figures explain these.
 
-    Counted instructions stand for a stage's program, and the time of one instruction for the machine. Without counts
-    its time on the core stands for the program, or its service time where that is unknown.
+    Counted instructions stand for a stage's program, and the time of one instruction for the machine. Without counts,
+    the stage's time on its core stands for the program. Where that time is unknown, its service time does.
     """
     counted, worked = ({figure.of for figure in rows if figure.measure == each} for each in (INSTRUCTION_TIME, WORK))
 
@@ -272,9 +272,9 @@ def _of_errors(base: Side, other: Side) -> Iterator[tuple[Figure, Difference]]:
 
 
 def exact_rows(base: Side, other: Side, key: str, unit: str) -> Rows:
-    """Return the numbers under `key` of the reports, which scatter from run to run alone; empty where one has none.
+    """Return the numbers under `key` of the reports; empty where a report has none. They only scatter between runs.
 
-    Their lists and texts, such as the frames that were checked and against what, have to be the same.
+    Lists and texts under `key`, such as the checked frames and their reference, must be the same in all reports.
     """
     sides = [[told.document.get(key) or {} for told in side.runs] for side in (base, other)]
     every = [found for side in sides for found in side]
@@ -305,7 +305,7 @@ def _numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:
 
 
 class Noise(NamedTuple):
-    """What makes runs of one kind differ, beside what their frames show.
+    """The causes that make runs of one kind differ, apart from what their frames show.
 
     Times on the host clock depend on what a process cannot see of itself. Its memory lies elsewhere, caches are warmer,
     other programs use the cores, and other machines use what these cores share. (Mytkowicz et al., "Producing wrong
@@ -313,9 +313,9 @@ class Noise(NamedTuple):
     time", ISMM 2013.) In virtual time there is no such thing. A held job is timed by the
     clock alone. Counted instructions are the program's, whatever the machine does.
 
-    `is_real`: whether a run was on the host clock. `others`: what a larger share of the cores for other programs
-    explains of times on the clock, of a stage's time on its core, and of shares of the time. `slower`: per stage, what
-    its cores' own speed explains. `held`: stages whose jobs last as long as they were told to, in all runs.
+    `is_real`: whether a run was on the host clock. `others`: change that other programs explain by their larger share
+    of the cores: of times on the clock, of a stage's time on its core, and of shares of the time. `slower`: per stage,
+    change that its cores' own speed explains. `held`: stages whose jobs last as long as they were told to, in all runs.
     """
 
     is_real: bool
@@ -368,9 +368,10 @@ def noise_between(base: Documents, other: Documents, effects: Mapping[str, float
 
 
 def relief_of(base: Side, other: Side) -> float:
-    """Return the change of times on the clock by other programs' share taken out, as a logarithm.
+    """Return how times on the clock change when other programs' share is taken out, as a logarithm.
 
-    It is below 0 where they had more in `other`: frames would take that much less without them, at most.
+    The change is below 0 where other programs had more of the cores in `other`. Without them, frames would take at most
+    that much less time.
     """
     sides = [[told.document for told in side.runs if told.document["clock"] == HOST_CLOCK] for side in (base, other)]
     return _wall(*map(_others, sides)) if all(sides) else 0.0

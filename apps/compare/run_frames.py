@@ -1,7 +1,7 @@
-"""The frames of a run as series, from its journal. Rule: every figure here is a frame's, in the order of presentation.
+"""The frames of a run as series, from its journal. Rule: each figure belongs to a frame, in the order of presentation.
 
-A frame's own time begins when the frame before it is presented and ends when the frame itself is. What units do in that
-time is the frame's share of them.
+A frame's own time begins when the frame before it is presented, and ends when the frame itself is presented. The work
+of the units in that time counts for this frame.
 """
 
 from __future__ import annotations

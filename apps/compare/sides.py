@@ -4,8 +4,9 @@ Rule: what cannot be compared is refused by name. A run folder with a journal ha
 prediction, has summaries. A run that was killed has no report: its journal gives the keys that a comparison reads, and
 `NOT_KNOWN` names those that the journal lacks.
 
-Each imported time stands beside one of its name, or beside the stage of a run. The only wall time stands for the frame
-time. Nobody knows the machine's state, so two imported times scatter as any two runs on the host clock.
+Each imported time is compared with the imported time, or the stage of a run, that has the same name. A single wall time
+stands for the frame time. Nobody knows the machine's state, so two imported times scatter as any two runs on the host
+clock.
 """
 
 from __future__ import annotations
