@@ -129,18 +129,18 @@ class MomentFigures:
     `t_ms`: time since the first step. `window_s`, `run_s`: lengths of the window and of the run.
     `clock`: "host" or "virtual". `is_over`: whether the journal has the run's end.
     `state`: "goes on", "finished", "killed" or "removed".
-    `run_fps`: frames presented a second between the first and the last presented one, as in report.json; null for fewer
-    than two. `fps`: the same of a finished run; of any other, frames presented a second in the window.
+    `run_fps`: presented frames a second, from the first presented frame to the last, as in report.json; null for fewer
+    than two. `fps`: `run_fps` for a finished run; otherwise presented frames a second in the window.
     `frame_time_ms`, `latency_ms`: exact mean, p50, p90, p95, p99, max and samples, of the window.
     `units`, `stages`: figures by name, in the order of the pipeline.
     `temperature_c`, `duty`: last values by place and by unit. `memory_bytes`: memory of the processes, by unit.
     `notes`: the last few messages.
     `bound`: what bounds the run so far, as in report.json; null before 63 frames, and where it is not looked for.
-    `verdict`: keys of report.json, with `lines` for people; of the run so far while it goes on. Null without times.
+    `verdict`: keys of the verdict in report.json, with `lines` for people, for the run so far. Null without times.
     `frame_times`, `latencies`: times of the whole run.
     `began_at`: UTC, ISO 8601; "" where the journal does not say.
     `accuracy`: by avatar, as in report.json; empty where the journal does not say.
-    `sources`: key to the source of the figures below it, as in report.json.
+    `sources`: source of the figures below each key, as in report.json.
     """
 
     t_ms: float
@@ -169,7 +169,7 @@ class MomentFigures:
     sources: Mapping[str, str]
 
     def as_json(self) -> dict[str, Any]:
-        """Return the same names and values as JSON takes them."""
+        """Return the same names and values in a form for JSON."""
         return asdict(self)
 
 

@@ -77,7 +77,7 @@ class FollowedRun:
 
     @property
     def silent_ns(self) -> int:
-        """Return for how long the run has written nothing although it goes on; 0 while that is no longer than usual."""
+        """Return how long a live run has written nothing; 0 while that time is no longer than usual."""
         silent_ns = time.monotonic_ns() - self._heard_ns
         return silent_ns if silent_ns > SILENCE_NS and self.state is RunState.GOES_ON else 0
 
@@ -115,8 +115,8 @@ def follow(given: Path | None, *, wait: bool = False, sleep: Callable[[float], N
     """Find the run that is meant. Raises BadInputError.
 
     `given`: its folder, its journal, or its name below runs/; None for the newest below runs/.
-    `wait`: whether to wait until it has begun; without, one that has not begun is an error. `sleep`: function that
-    waits, s.
+    `wait`: whether to wait until the run has begun; otherwise a run that has not begun is an error. `sleep`: function
+    that waits for a time in seconds.
     """
     while True:
         found = _newest(RUNS.glob(f"*/{NAME}")) if given is None else folder_of(given)

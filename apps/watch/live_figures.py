@@ -76,8 +76,8 @@ PARTS = (ASSIGNED, *NAMES.values(), BUSY, PREEMPTED)
 class LiveFigures:
     """Takes the records that follow `begun`, in order, and gives the figures of a moment that is not before them.
 
-    `finds_bound`: whether to find what bounds the run, which takes three times as long as all else. The end of a
-    journal says it, so it need not be found for a run that is over.
+    `finds_bound`: whether to find the bound of the run, which takes three times as long as all else. The end of a
+    finished run's journal has the bound already.
     """
 
     def __init__(self, begun: Begun, *, finds_bound: bool = True) -> None:
@@ -136,7 +136,7 @@ class LiveFigures:
                 self._reckoning.add(fact)
 
     def now(self, now_ns: int | None = None, state: RunState | None = None) -> MomentFigures:
-        """Return the figures at `now_ns`, of the run's clock; at the last record where it is None or earlier.
+        """Return the figures at `now_ns` of the run's clock. None or an earlier time means the time of the last record.
 
         `state`: state of the run, which the journal of a killed run does not show; None to take it from the journal.
         After the run's last step the moment stays at that step, because no frames follow.
