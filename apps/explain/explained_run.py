@@ -386,7 +386,7 @@ MOST_ENDS: Final = 1024  # frames whose ends are kept for each stage; far more t
 
 
 class Joins:
-    """What stages with several inputs waited for: which input of each frame came last, how long after the others.
+    """For stages with several inputs: which input of each frame came last, and how long after the others.
 
     It takes the jobs of a run in the order of their ends: an input came when the job that wrote it ended. Inputs of the
     newest frame are not waited for.
@@ -428,7 +428,7 @@ class Joins:
 
 
 def join_text(row: dict[str, Any]) -> str:
-    """Return a sentence on a row of `Joins.rows`: what the stage waited for, what was last most often first."""
+    """Return a sentence on a row of `Joins.rows`: the inputs of the stage, the most frequent last one first."""
     inputs = sorted(row["inputs"].items(), key=lambda each: -each[1]["last"])
     jobs = sum(each["last"] for _, each in inputs)
     found = [

@@ -1,8 +1,8 @@
 """Why a run takes its time, in words: its slowest frames with their reasons, what bounded it, and what to try.
 
 Rule: each cause names its evidence. A frame's time is the path that ends with it, from the presentation of the frame
-before to its own. The usual length of a part is its median over the run's frames; the parts that were longer than usual
-made the frame slow.
+before to its own. The usual length of a part of the path is its median over the run's frames. Parts that took longer
+than usual made the frame slow.
 """
 
 from __future__ import annotations
@@ -183,7 +183,7 @@ def reasons(shown: ShownFrame, usual: Usual) -> list[Reason]:
 
 
 def notes(shown: ShownFrame) -> list[str]:
-    """Return the other differences from the frame before."""
+    """Return what else differs from the frame before: frames lost between the two, the rung, and the bypass."""
     said = []
     now, before = shown.now, shown.before
     missing = now.frame - before.frame - 1
@@ -236,7 +236,7 @@ def _work(shown: ShownFrame, usual: Usual, job: JobRecord, longer_ns: float) -> 
 def bound_text(bound: Mapping[str, Any]) -> str:
     """Return a report's `bound` in words: the unit and the stage, what slowing them costs and their shares of the path.
 
-    Where others have most of the path, they stand behind.
+    Units and stages with most of the path, if others than the bound, come last.
     """
     named = ", and of stages most ".join(part_text(part) for part in (bound["unit"], bound["stage"]) if part)
     path = bound.get("path") or {}

@@ -467,7 +467,7 @@ class CostModel:
         networks: Networks = FIRST,
         asked: Mapping[str, tuple[int, ...]] | None = None,
     ) -> dict[str, Any]:
-        """Say where the units are best placed for frames of `shape` with `avatars` avatars in view, and why.
+        """Return the best placement of the units for frames of `shape` that show `avatars` avatars, and why.
 
         The model of `trilane predict` decides. `networks`: as in `of`. `asked`: cores of units of this machine. Raises
         BadInputError when cores of another chip are asked for.

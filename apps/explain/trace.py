@@ -364,7 +364,7 @@ class Tiles(Generic[Item]):
         self._until_ns = at_ns
 
     def take(self, *, rest: bool = False) -> Iterator[tuple[int, int, Item]]:
-        """Yield (begin, end, item) of the slices that can be written now; with `rest`, of all."""
+        """Yield (begin, end, item) of each slice that can be written now; with `rest`, of every slice that is left."""
         waiting = self._waiting
         while waiting and (rest or len(waiting) > MOST_WAITING or self._reaches(waiting[0][0])):
             begin_ns, end_ns, _, item = heappop(waiting)
