@@ -65,10 +65,11 @@ def error_by_cause(
 
     `out`: folder for heat maps; None for none. `shown`: passes the frames' numbers on, such as a progress bar. `lpips`:
     computes LPIPS; None leaves it out.
-    Keys: `causes`, a row of each: `cause`, `what`, `needs`, `alone` and `step` (figures against the picture without
-    the cause: in the reference, and in the sequence), `so_far` (against the reference), `adds` (`mae`, `square`,
-    `product`), `moved` of causes of the body; `whole`; `sums`; `remainder` of the run's own frames against the
-    sequence's end; `truth`; `frames`, `empty_frames` (nobody in view), `network`, `sources`, `config`.
+    Keys: `causes`, with a row for each cause; `whole`; `sums`; `remainder`, the difference of the run's own frames from
+    the sequence's end; `truth`; `frames`; `empty_frames` (nobody in view); `network`; `sources`; `config`. Each row has
+    `cause`, `what` and `needs`. `alone` and `step` compare with the picture without the cause, in the reference and in
+    the sequence. `so_far` compares with the reference. `adds` has `mae`, `square` and `product`. Causes of the body
+    also have `moved`.
     Raises BadInputError, MissingPartError.
     """
     numbers = spread(checked.config.scene.frames, frames)
@@ -310,7 +311,7 @@ def heat_map(title: str, picture: F64, reference: F64) -> U8:
 
 
 def shown_factor(difference: F64) -> int:
-    """Return the largest power of two that keeps nearly all of `difference`, in 0..1, at most 1.
+    """Return the largest power of two that, times `difference` in 0..1, keeps nearly all of it at most 1.
 
     It is at most `LARGEST_FACTOR`, and 1 when nothing differs.
     """

@@ -1,8 +1,8 @@
 """What does a speed cost in image error, for each size of tensor on each runtime?
 
 Rule: all rows use the same moments and the same part of the picture, where the avatars are. The pictures are made
-first, as a warm-up. The rows then take turns at the frames in the scene's order, one job at a time; with two frames or
-more, no frame follows itself. Time without a core does not count.
+first, as a warm-up. After that, the rows take turns, one job at a time, over the frames in the scene's order. With two
+frames or more, no frame follows itself. Time without a core does not count.
 """
 
 from __future__ import annotations

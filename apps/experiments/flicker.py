@@ -1,8 +1,8 @@
 """How restless is the error of successive frames, which a person sees as flicker?
 
 Rule: flicker of a pair of frames is the mean change of the error, |(P_t - G_t) - (P_t-1 - G_t-1)|, with P the picture
-and G what it should be. So neither the motion of the scene nor an error that stays in place is flicker. An error that
-moves with a surface counts where it passes over a pixel, because surfaces are not followed.
+and G what it should be. Therefore neither the motion of the scene nor an error that stays in place is flicker. An error
+that moves with a surface counts where it passes over a pixel, because surfaces are not followed.
 """
 
 from __future__ import annotations

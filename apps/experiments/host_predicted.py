@@ -49,11 +49,11 @@ def measure(
     Two rows for each network: `what` is `run` (time between frames of a run of `frames` frames) or `network` (median of
     the calls of `seconds` seconds). `predicted_ms`, `low_ms`, `high_ms`; `measured_ms`; `error`: predicted over
     measured, less 1; `inside`: whether the measured time is in the 80 % interval; `others`: share of the cores that
-    other programs had in the run, with more than 0.1 the row says little.
+    other programs had in the run. Above 0.1, the row says little.
 
-    `run`, `network`: of the rows of that kind `inside`, `of`; `median_error`: of the errors without sign;
-    `leave_one_out_error`: root mean square of the errors as logarithms; `inside_left_out`: how many rows are in the
-    interval that follows from the errors of the others alone.
+    `run`, `network`: summary of the rows of that kind. `inside`: number of rows in their interval, out of `of` rows.
+    `median_error`: median of the absolute errors. `leave_one_out_error`: root mean square of the errors as logarithms.
+    `inside_left_out`: number of rows in the interval that follows from the other rows' errors alone.
 
     Raises BadInputError, MissingPartError without PyTorch, TrilaneError when a run fails.
     """

@@ -1,10 +1,10 @@
 """How far a picture is from another one, and a mask from another one, by the usual measures.
 
 Rule: pictures are (h,w,3) sRGB, bytes or real numbers in 0..1, masks (h,w) of bools. SSIM is as in the avatars'
-validations: windows of 7 x 7 pixels, mean over the colours. LPIPS has weights that somebody gives by path: nothing is
-downloaded, and nothing but tensors is read from the file. Sources: SSIM: Wang et al., "Image Quality Assessment", IEEE
-TIP 13 (2004); MS-SSIM: Wang, Simoncelli and Bovik, "Multiscale structural similarity", Asilomar 2003; FLIP: Andersson
-et al., HPG 2020, at 67 pixels a degree; LPIPS: Zhang et al., "Unreasonable Effectiveness", CVPR 2018, version 0.1.
+validations: windows of 7 x 7 pixels, mean over the colours. The weights of LPIPS come from a given file: nothing is
+downloaded, and only tensors are read from it. Sources: SSIM: Wang et al., "Image Quality Assessment", IEEE TIP 13
+(2004); MS-SSIM: Wang, Simoncelli and Bovik, "Multiscale structural similarity", Asilomar 2003; FLIP: Andersson et al.,
+HPG 2020, at 67 pixels a degree; LPIPS: Zhang et al., "Unreasonable Effectiveness", CVPR 2018, version 0.1.
 """
 
 from __future__ import annotations

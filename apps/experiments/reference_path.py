@@ -1,4 +1,4 @@
-"""The reference path of a frame, and the same with causes of error switched on, up to the run's own picture.
+"""The reference path of a frame. Causes of error can be switched on, up to those of the run's own picture.
 
 Rule: with no cause it is the plan `full` (`bench/lib/full_picture.py`): float64 body with everything on, supersampled
 float64 raster, float texture, unrounded tensor of the network's own area, FP32 network, blend in linear light in
@@ -112,8 +112,8 @@ def require_complete(causes: Iterable[Cause]) -> Causes:
 class RunBody:
     """The body of one distinct avatar.
 
-    In float64 it is written out joint by joint; in float32 it is Trilane's own skinning, so with everything on the CPU
-    unit's vertices come out to the bit. `on_cpu`: whether the CPU unit skins it, else the GPU unit does.
+    In float64, the body is computed joint by joint. In float32, Trilane's own skinning computes it. With all causes on,
+    it has the CPU unit's vertices to the bit. `on_cpu`: whether the CPU unit skins it, else the GPU unit does.
     """
 
     def __init__(self, data: AvatarData, *, on_cpu: bool) -> None:
@@ -224,7 +224,7 @@ class ReferencePath:
         return self.moment(number).frame(NOTHING)
 
     def moment(self, number: int) -> ReferenceMoment:
-        """Return frame `number`, which can be made with any causes."""
+        """Return frame `number` in a form that can be drawn with any causes."""
         return ReferenceMoment(self, number)
 
 
