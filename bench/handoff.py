@@ -1,7 +1,7 @@
 """How soon after the producer's last write can the consumer process read all bytes, and when has it read them?
 
-Rule: one definition holds for every variant, and all run interleaved; the producer writes every byte again, then reads
-the clock. The variant that is judged and compared with the peers is a real run through the scheduler. Its units form a
+Rule: one definition holds for all variants, which run interleaved. The producer writes every byte again, then reads the
+clock. The variant that is judged and compared with the peers is a real run through the scheduler. Its units form a
 chain: the second one fills its slot, the third one reads every byte of it, and the others do nothing.
 """
 
@@ -50,9 +50,9 @@ STAGES = (("pose", "cpu"), (WRITER, "gpu"), (READER, "dsp"), ("present", "cpu"))
 def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 300, rounds: int = 6) -> dict[str, Any]:
     """The time from the producer's last byte written until the consumer can read them all, by variant and size.
 
-    `kib`: sizes, of 256, 1024, 4096 and 16384.
+    `kib`: sizes in KiB, some of 256, 1024, 4096 and 16384.
     `frames`: hand-overs of each variant and size in a round.
-    `rounds`: all variants take part in each.
+    `rounds`: number of rounds, in which all variants take part.
 
     Rows: `way` (the variant), `kib`, `frames`; `p50_us` and `p99_us` until every byte can be read, `read_p50_us` and
     `read_p99_us` until every byte was read and checked: medians of the rounds' percentiles, with the 95 % interval of
@@ -69,8 +69,8 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 300, rounds
     `absent`: peers that are not installed. `met`: our variants against p50 <= 150 us and p99 <= 500 us at the largest
     size; null without a p99. `slower_us`: of each peer and size, its p50 less that of `slot through the scheduler` in
     the same round: the interval of the median. `read_slower_us`: the same, until every byte was read.
-    `slower_than_slot_us`, `read_slower_than_slot_us`: the same less `slot`. `ahead`, `read_ahead`: of each peer,
-    whether ours through the scheduler is the faster at every size (the interval lies above 0).
+    `slower_than_slot_us`, `read_slower_than_slot_us`: the same less `slot`. `ahead`, `read_ahead`: for each peer,
+    whether our slot through the scheduler is faster at every size (the interval lies above 0).
     Raises BadInputError for other sizes than 256, 1024, 4096, 16384 KiB.
     """
     if unknown := set(kib) - set(SIZES_KIB):
@@ -142,7 +142,7 @@ class ChannelPair:
 
 
 def produce(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[int, ...], written: int) -> None:
-    """Run the process that writes; it answers each number of frames with the instants of writing, ns."""
+    """Run the writing process, which answers a number of frames with the instants at which it wrote them, ns."""
     with _child(pipe, cores):
         end = channel.producer()
         pipe.send("ready")

@@ -45,7 +45,7 @@ def measure(
     seconds: float = 5.0,
     period: float = 1.0,
 ) -> dict[str, Any]:
-    """One row per network and runtime. Times are those of one frame; FP32 infers one frame at a time in any batch.
+    """One row per network and runtime. Times are for one frame; FP32 always infers one frame at a time.
 
     Rows: the network's settings, `parameters`, `gmac`, `runtime`, `startup_cold_ms` and `startup_warm_ms` (libraries
     imported and network loaded, with an empty and with a filled cache), `frames`, `min_ms`, `mean_ms`, `p50_ms`,

@@ -47,10 +47,10 @@ def measure(
     `ratios.ort_over_fp32`, `ratios.openvino_over_fp32`: ours in INT8 over ONNX Runtime in FP32 with its defaults.
     `ratios.openvino_of_roofline`: share of the rate of the best INT8 layer of the same runtimes, measured here.
     `ratios.openvino_of_instruction_peak`: share of what the instruction set allows (null where that is not known).
-    `peaks`: which peak each of the two is of. `ratios.openvino_over_benchmark_app`: ours over OpenVINO's own tool on
-    the same file. `low`, `high`: of each ratio, the 95 % interval of its median over the rounds (with fewer than six
-    the least and largest). `rows`: median and number of runs of each variant. Each variant runs for `seconds` in each
-    round.
+    `peaks`: peak that each of these two shares refers to. `ratios.openvino_over_benchmark_app`: ours over OpenVINO's
+    own tool on the same file. `low`, `high`: 95 % interval of each ratio's median over the rounds (with fewer than six
+    rounds the least and largest). `rows`: median and number of runs of each variant. Each variant runs for `seconds` in
+    each round.
 
     Raises MissingPartError without OpenVINO or PyTorch.
     """

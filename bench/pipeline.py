@@ -75,16 +75,16 @@ def measure(
     Rows: `frame_ms`, `fps`; `latency_p50_ms`, `latency_p99_ms`: from a frame's sampled pose to its composited picture,
     over the presented frames of all rounds (no p99 of fewer than 299); `efficiency`: the slowest unit's work over the
     frame time, by CPU time; `slowest`: the unit that takes longest for a frame in the `sequential` runs before and
-    after, without the time in which it had no core, and `alone_ms`: how long; `busiest`: the unit with the most work,
+    after, without the time in which it had no core; `alone_ms`: that time; `busiest`: the unit with the most work,
     `idle`: its share without a job from its first job's begin to its last one's end, and the causes: `starved` (no
     input), `undispatched` (input, but no free slot, or not dispatched yet), `overhead` (dispatched, but not begun).
 
     `gain`: over the mean of the `sequential` runs before and after. `bound`: sum(t) / max(t), where sum(t) is what all
     units take in those runs (`all_alone_ms`) and their hand-overs, and max(t) what the slowest takes.
-    `in_run_over_alone`: what that unit takes in this run, without the time in which it had no core, over `alone_ms`.
-    `gain_of_bound`: one over the other; `of_bound_low`, `of_bound_high`: the 95 % interval of its median (with fewer
-    than six rounds the least and largest). `hops_ms`: what a sequential run takes for a frame beyond its stages.
-    `dropped`, `lost`: frames of all rounds. `accuracy`: the error of the avatar's pictures and its
+    `in_run_over_alone`: time of the unit `slowest` in this run, without the time in which it had no core, over
+    `alone_ms`. `gain_of_bound`: `gain` over `bound`; `of_bound_low`, `of_bound_high`: the 95 % interval of its median
+    (with fewer than six rounds the least and largest). `hops_ms`: what a sequential run takes for a frame beyond its
+    stages. `dropped`, `lost`: frames of all rounds. `accuracy`: the error of the avatar's pictures and its
     source, or why there are no figures.
 
     With `beside`, a second avatar of `beside_size`, two runs go on at once, each with a scheduler and units of its own

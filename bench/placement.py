@@ -1,8 +1,8 @@
 """Is the placement that a run chooses the best one, what does it gain over the rule, and does the model predict it?
 
-Rule: a run's own choice is made first, then everything is tried again. All placements run in turns, a few frames each.
-Those that could be the best run in further rounds, which alone decide. Whole runs of the chosen placement and of the
-rule's stand beside them. Other numbers of cores are computed in virtual time, and the results say so.
+Rule: a run's own choice is made first; after that, everything is tried again. All placements run in turns, a few frames
+each. The placements that could be the best run in further rounds, which alone decide. Whole runs compare the chosen
+placement with the rule's. Other numbers of cores are computed in virtual time, and the results say so.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ def measure(
     """A row for each size, number of cores and placement.
 
     Rows: `predicted_ms`; `tried_ms`: median of the `rounds` in which all are tried, in turns of 16 frames, 10 of which
-    count; `frame_ms`: of the `further` rounds, null for placements that are not in them: in them are the chosen one,
-    that of the rule for any run and the `finalists` that were fastest beside them; `is_chosen`, `is_rule`.
+    count; `frame_ms`: median of the `further` rounds, null for placements that are not in them; `is_chosen`, `is_rule`.
+    The further rounds have the chosen placement, the rule's, and the `finalists` fastest of the others.
 
     `sizes`: a row for each size and number of cores. `how`: what chose: the run's own trial, or the prediction.
     `chosen_over_best`: frame time of the chosen placement over that of the best other one in the further rounds, the

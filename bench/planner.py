@@ -2,8 +2,9 @@
 
 Rule: both plans run interleaved, on the same moments of the same scenes. Each has the cores that are best for it, as
 `trilane run` places it. The compared pictures are made by the runs' own stages from the very configurations that were
-timed. Their reference, the plan `full`, is a second implementation (`bench/lib/full_picture.py`). Single bad frames are
-seen but hidden by means, so every frame of both runs is also compared with the truth, which is quicker to draw.
+timed. Their reference, the plan `full`, is a second implementation (`bench/lib/full_picture.py`). People see single bad
+frames, but means hide them. Therefore every frame of both runs is also compared with the truth, which is quicker to
+draw.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ PLANS = {"fixed": fixed, "planned": planned}
 
 
 def in_frames(checked: Checked, frames: int) -> Checked:
-    """Spread the whole scene over `frames` frames: fewer, at longer steps; unchanged when it has no more than those."""
+    """Spread the whole scene over `frames` frames, at longer steps; a scene with no more frames stays unchanged."""
     scene = checked.config.scene
     if frames >= scene.frames:
         return checked

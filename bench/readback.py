@@ -34,10 +34,10 @@ def measure(
 ) -> dict[str, Any]:
     """One row for each size, number of channels and variant: `kind` (readback, upload), `way`, `lag`, `move`, `turn`.
 
-    `lag`: how many frames later the bytes arrive. `move`: the copy isolated, when the GPU has nothing else to do
-    (uploads: with a copy to another framebuffer). `turn`: the copy with the draw of the tensor before it. `fastest`:
-    for each kind the variant with the smallest sum of medians, of `turn` on a hardware driver and of `move` on a
-    software one, where nothing runs beside the caller.
+    `lag`: how many frames later the bytes arrive. `move`: time of the copy alone, while the GPU has nothing else to do
+    (uploads: with a copy to another framebuffer). `turn`: time of the copy and of the tensor's draw before it.
+    `fastest`: for each kind the variant with the smallest sum of medians, of `turn` on a hardware driver and of `move`
+    on a software one, where nothing runs beside the caller.
 
     Raises MissingPartError.
     """

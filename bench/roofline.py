@@ -1,4 +1,4 @@
-"""What is the most this machine's cores can do, in INT8, in FP32, and from memory?
+"""What are the highest rates of this machine's cores, in INT8, in FP32, and from memory?
 
 Rule: there are two peaks for INT8, and each figure names its own. The first is the best rate that any layer of the
 installed runtimes reached here, on layers that suit them. The second is what the instruction set allows: the documented
@@ -45,8 +45,9 @@ def measure(threads: int = 0) -> dict[str, Any]:
 
     Keys: `int8_gmac_s` and `fp32_gmac_s`: rate of the best layer of the runtimes, in 1e9 multiply-accumulates a second;
     `int8_instruction_gmac_s`: peak of the instruction set, null where it is not known; `layer_of_instruction`:
-    `int8_gmac_s` over this peak; `memory_gb_s`: 1e9 bytes a second, read and written by one thread; `instructions`: how
-    the peak of the instruction set follows, or why it is not known; `rows`: the rate of each INT8 layer that was tried.
+    `int8_gmac_s` over this peak; `memory_gb_s`: 1e9 bytes a second, read and written by one thread; `instructions`:
+    derivation of the instruction set's peak, or why it is not known; `rows`: the rate of each INT8 layer that was
+    tried.
     """
     threads = threads or len(machine.here.cores())
     rows = _int8_rows(threads)
@@ -70,8 +71,8 @@ def instruction_peak(flags: Sequence[str], threads: int) -> dict[str, Any]:
 
     `set`, `sequence`, `source`: entries of `INSTRUCTION_SETS`. `macs_a_cycle`: documented value for one core.
     `issued_macs_a_cycle`: value that a loop of registers alone reached. `clock_ghz`: clock under that load, with its
-    95 % interval. `cores`: number of cores. `gmac_s`: macs_a_cycle x clock x cores. `absent`: why there is none; it
-    stands alone.
+    95 % interval. `cores`: number of cores. `gmac_s`: macs_a_cycle x clock x cores. `absent`: reason why there is no
+    peak; all other keys are then missing.
     """
     widest = instruction_set_of(flags)
     if widest is None:
@@ -374,7 +375,7 @@ def _loop(kernel: Kernel, body: bytes) -> bytes:
 
 
 def measure_issued(name: str, cores: Sequence[int]) -> Issued:
-    """Measure what every one of `cores` does while all of them work.
+    """Measure the rate of each of `cores` while all of them work.
 
     `name`: key of `KERNELS` for a set that this CPU has. Raises OSError when the kernel refuses machine code in memory
     or the tiles of AMX.

@@ -52,7 +52,7 @@ def measure(
     Scenarios: single-stream, multi-stream (`samples` frames a query), server (`rate` queries a second at random
     moments, each to be answered within `limit_ms`), offline. A row's `verdict` is VALID when it lasted `seconds`, has
     as many queries as its percentile needs, and for a server when few enough were late; `because` says why not.
-    `percentile_ms`: the latency that `percentile` of all queries are within.
+    `percentile_ms`: latency that the share `percentile` of all queries does not exceed.
 
     Raises BadInputError, MissingPartError, TrilaneError when a run fails.
     """
@@ -364,7 +364,7 @@ def queries_needed(percentile: float, late: int = 1) -> int:
 def bound_ms(latencies_ms: list[float], percentile: float) -> float | None:
     """Return the latency that `percentile` of all queries are within, at `CONFIDENCE`; None with too few queries.
 
-    It is the k-th largest, with k the number of queries that may be late, as in LoadGen.
+    The result is the k-th largest latency. k is the number of queries that may be late, as in LoadGen.
     """
     if len(latencies_ms) < queries_needed(percentile):
         return None

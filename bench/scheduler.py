@@ -43,25 +43,26 @@ Run = Callable[[], list[int]]
 def measure(minutes: float = 15.0, rounds: int = 7, seeds: int = 10, events: str = "") -> dict[str, Any]:
     """The speed of Trilane's scheduler and of SimPy, and whether equal inputs give equal runs.
 
-    `minutes`: of the avatar's pipeline at 60 frames a second, policy `pipelined`, edges `double`.
-    `rounds`: runs of each, interleaved.
-    `seeds`: for how many seeds equal runs are compared.
-    `events`: a run's folder or events.jsonl, to be replayed.
+    `minutes`: length of a run of the avatar's pipeline, at 60 frames a second, with policy `pipelined` and edges
+    `double`.
+    `rounds`: number of runs of each way, interleaved.
+    `seeds`: number of seeds for which equal runs are compared.
+    `events`: folder of a run, or events.jsonl, to replay.
 
-    Ways: `trilane` (with its report), the same with `no report` and `recorded` for replay; `simpy`: the model in
-    SimPy's own parts, processes and resources; `simpy lean`: one timeout a job and callbacks. The two of SimPy keep no
-    accounts and know no faults, policies or drops.
+    The ways are the variants. `trilane` makes its report; its other two ways have `no report`, or are `recorded` for
+    replay. `simpy` is the model in SimPy's own parts, processes and resources. `simpy lean` has one timeout a job, and
+    callbacks. Both ways of SimPy keep no accounts and know no faults, policies or drops.
 
     Rows: `way`, `frames`, median CPU `seconds` and the 95 % interval of that median (`seconds_low`, `seconds_high`;
     with fewer than six rounds the least and largest), `events_per_s` (an event is a frame's release or a job's end;
     their number is the same in all ways), `processed` (events by the way's own count; SimPy takes several for a job).
-    `over_trilane`: seconds of each way over those of `trilane` in the same round, median and interval; below 1, the way
-    is faster than Trilane. `over_simpy`, `over_simpy_lean`: how many times as fast as each Trilane is, from the same
-    rounds.
+    `over_trilane`: seconds of each way, divided by those of `trilane` in the same round: median and interval. Below 1,
+    the way is faster than Trilane. `over_simpy`, `over_simpy_lean`: how many times as fast Trilane is as each way, from
+    the same rounds.
     `agree`: number of frames that all ways present at the same nanosecond. `same_traces`: number of seeds for which 10
     repeats of a run, in which a unit dies, give one trace. `different_traces`: number of different traces over the
-    seeds. `replay`: `steps` of the replayed `events`, and how many are answered differently. Raises BadInputError when
-    `events` is not a recording, TrilaneError when SimPy disagrees.
+    seeds. `replay`: number of `steps` of the replayed `events`, and number of steps with a different answer. Raises
+    BadInputError when `events` is not a recording, TrilaneError when SimPy disagrees.
     """
     if minutes <= 0 or rounds < 1 or seeds < 1:
         found = f"minutes {minutes:g}, rounds {rounds}, seeds {seeds}"
@@ -88,7 +89,10 @@ def measure(minutes: float = 15.0, rounds: int = 7, seeds: int = 10, events: str
 
 
 def compared(seconds: dict[str, list[float]]) -> dict[str, Any]:
-    """Return ratios within each round, from the `seconds` of each way's rounds."""
+    """Return the ratios `over_trilane`, `over_simpy` and `over_simpy_lean` of `measure`.
+
+    `seconds`: CPU seconds of each round, by way. Each ratio compares two ways in the same round.
+    """
     ours = seconds[TRILANE]
     ratios = {
         way: [other / own for other, own in zip(runs, ours, strict=True)]

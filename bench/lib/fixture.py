@@ -142,8 +142,8 @@ def interleaved_ms(
 ) -> dict[str, list[float]]:
     """Return milliseconds of each variant in each of `repeats` rounds, after a warm-up.
 
-    A round runs each variant once, with the number of the round, from 0: it says which input and which slot. `prepare`
-    is called with the same number before each, and is not timed.
+    A round runs each variant once, with the number of the round, from 0, which selects the input and the slot.
+    `prepare` is called with the same number before each run, and is not timed.
     """
     times: dict[str, list[float]] = {name: [] for name in variants}
     for number in range(WARM_UP + repeats):

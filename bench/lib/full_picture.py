@@ -3,12 +3,13 @@
 Rule: it is a second, slow implementation where that is possible. The body has every weight and every blend shape in
 float64. The neural texture is read at SAMPLES x SAMPLES points of a tensor pixel, whose mean is not rounded. Each
 avatar has a tensor of its own, of about the area that its network is for, where it paints best. The tensor lies on the
-picture's grid, so that a square of pixels of one is a pixel of the other. The network is in FP32; its picture is
+picture's grid: one pixel of either covers a square of pixels of the other. The network is in FP32; its picture is
 blended in linear light, in float64, over the run's own background.
 
 Beside it stands the picture with the clothed body itself, drawn as training draws its samples. An avatar's network was
 trained to paint that picture, so it shows how good every plan's picture is, including `full`. Only the bundled avatars
-have one. Clothes are put on the skin, not on an avatar's offsets, which are these clothes already.
+have such a picture. Clothes are put on the skin, not on an avatar's offsets, because the offsets are these clothes
+already.
 """
 
 from __future__ import annotations

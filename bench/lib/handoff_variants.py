@@ -63,9 +63,9 @@ class Channel(Protocol):
 class SlotChannel:
     """The pipeline's way: a slot of a sealed memfd region, announced by a message over a `JobPipe`.
 
-    There is one slot: a run writes the slot that was given back last (transport/slots.py), and here each is given back
-    before the next is written. iceoryx2 does the same with its samples. Two slots by turns would double the memory that
-    passes through the caches, and with it the time of reading.
+    There is one slot. A run writes the slot that was given back last (transport/slots.py), and here a slot is given
+    back before the next hand-over. iceoryx2 does the same with its samples. Two slots in turns would double the memory
+    that passes through the caches, and the time of reading.
     """
 
     def __init__(self, size: int, _context: SpawnContext) -> None:

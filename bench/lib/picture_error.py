@@ -1,7 +1,7 @@
 """How far the frames of one plan are from those of another: PSNR, SSIM and FLIP.
 
-Rule: all pictures count alike, including those with nobody in view; so the PSNR is that of the mean square over all of
-them. Figures in the box count only the pixels of the boxes, where avatars are.
+Rule: all pictures count alike, including those with nobody in view; the PSNR follows from the mean square over all
+pictures. Box figures only count the pixels of the boxes, where avatars are.
 
 Sources: Wang et al., "Image Quality Assessment", IEEE TIP 13 (2004), by scikit-image; Andersson et al., "FLIP: A
 Difference Evaluator for Alternating Images", HPG 2020, by its authors' flip-evaluator, at 67 pixels a degree.

@@ -61,12 +61,12 @@ class StageChain:
             self._stages.append(BoundStage(stage.name, made, inputs, [output], 0, unit, stage.name == begin))
 
     def run(self, frame: int, last: int | None = None) -> Packet:
-        """Run frame `frame` up to stage number `last`, or the last one; return the input of the stage behind it."""
+        """Run frame `frame` up to stage number `last`, or up to the last stage; return the input of the next stage."""
         self._next, self._slot_in = 0, -1
         return self.go_on(frame, last)
 
     def go_on(self, frame: int, last: int | None = None) -> Packet:
-        """Do the same for the stages that an earlier `run` of the frame left out."""
+        """Run the stages that an earlier `run` of the frame left out, up to stage `last`; return as `run` does."""
         last = len(self._stages) - 1 if last is None else last
         while self._next <= last:
             number = self._next
