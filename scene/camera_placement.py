@@ -1,4 +1,4 @@
-"""The camera in the scene: places a recorded one so that it films the avatars, and lets a person steer it.
+"""The camera in the scene: places a recorded camera so that it films the avatars, and lets a person steer it.
 
 The recording is moved as one rigid, upright piece: it is turned about the vertical and shifted; its movement from frame
 to frame never changes. `best_place` finds the place. At first the camera is in front of the avatars, in the
@@ -62,7 +62,7 @@ class Way:
 
 
 def way_cycle_s(mover: Mover) -> float:
-    """Return the time after which the way of `mover` begins again; that of its motion where it holds its end."""
+    """Return the time after which the way of `mover` repeats; the motion's length if the motion holds its end."""
     return mover.motion.duration_s * (2 if mover.motion.wrap is Wrap.BOUNCE else 1)
 
 

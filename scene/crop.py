@@ -110,8 +110,8 @@ def _whole_pixels(low: float, high: float, side: int) -> tuple[float, float]:
 def grow_on_grid(rect: Rect, output: Shape, size: tuple[float, float]) -> Rect:
     """Grow `rect`, which lies on the pixel grid of a picture of `output`, to `size` (height, width) in its pixels.
 
-    The result begins on the grid, so where `size` is whole each of its pixels is a pixel of the picture. It has `rect`
-    in its middle, unless it has to be moved onto the screen, where it fits.
+    The result begins on the grid, and where `size` is whole, each of its pixels is a pixel of the picture. It has
+    `rect` in its middle, unless it has to be moved onto the screen, where it fits.
     """
     x0, x1 = _grow_from_pixel(rect.x0, rect.x1, size[1], output[1])
     y0, y1 = _grow_from_pixel(rect.y0, rect.y1, size[0], output[0])
@@ -285,7 +285,8 @@ def apart(
     """Place the avatars of each network in a tensor of its own; None where one of them has no room.
 
     `rects`, `networks`: mesh rectangle and network of each visible avatar.
-    `lay`: lays out those of one network, always in a tensor of the same shape. The density is the least of theirs.
+    `lay`: lays out the avatars of one network, always in a tensor of the same shape. The least density of these tensors
+    counts.
     """
     groups = by_network(networks)
     found = [lay([rects[place] for place in places]) for places in groups]
@@ -304,7 +305,7 @@ def apart(
 def lay_out_apart(
     rects: Sequence[Rect], networks: Sequence[int], output: Shape, buckets: Sequence[Shape]
 ) -> TensorLayout:
-    """Place the visible avatars as `lay_out` does, those of each network in a tensor of its own.
+    """Place the visible avatars as `lay_out` does; each network has a tensor of its own.
 
     All tensors have the shape in which the least dense one is densest.
     `networks`: network of each avatar. The other parameters and the errors are those of `lay_out`.

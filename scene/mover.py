@@ -3,7 +3,7 @@
 A body touches the floor with its outermost vertices, not with its joints; pose blend shapes are left out. The rule
 `sequence` lifts the whole motion by one amount, so that jumps leave the floor. `frame` lifts each frame by its own
 amount, so that some point always touches it. `stance` is for a recording that says when its feet stand: standing feet
-are on the floor, and other frames are lifted by the average of those.
+are on the floor, and other frames are lifted by the average lift of the standing frames.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def outline(body: ShapedBody, joints: Collection[str] = JOINT_NAMES) -> BodyOutl
 
 
 def feet(body: ShapedBody) -> BodyOutline:
-    """Return all vertices that ankles and toes move most: those that stand on the floor to the millimetre."""
+    """Return all vertices that ankles and toes move most; these stand on the floor to the millimetre."""
     return _of(body, np.flatnonzero(np.isin(body.body.weights.argmax(axis=1), [JOINT_INDEX[name] for name in FEET])))
 
 

@@ -7,8 +7,8 @@ loses the face, much larger it paints ragged edges. So each avatar in view gets 
 to paint. A body that has more pixels on the picture than in its tensor loses detail, so it gets up to `MOST_GROWTH`
 times the pixels (docs/decisions/planner.md has the figures).
 
-Avatars of different networks have a tensor each, of one shape. The budgets of a frame are those of the network that
-needs most, and its density is that of the least dense tensor.
+Avatars of different networks have a tensor each, of one shape. The network that needs most sets the budgets of a frame,
+and the least dense tensor sets its density.
 
 **Mesh.** An avatar whose surface may move by less than the error budget is drawn with fewer triangles. `hold_mesh`
 keeps a level while it can, and goes to coarser ones step by step.
@@ -115,7 +115,7 @@ class TensorBudget:
         return replace(self, work=work)
 
     def most_of(self, avatars: int) -> int:
-        """Return the pixels for so many `avatars` in view, however large they are."""
+        """Return the most pixels for `avatars` avatars in view, whatever their size."""
         return self._allowed(avatars * self.own * MOST_GROWTH)
 
     def of(self, rects: Sequence[Rect], output: Shape) -> int:
@@ -283,8 +283,8 @@ def foreseen_changes(
     """Return the shape from the first of `looks` on, at least one, and every change of shape with its frame.
 
     `networks`: network of each avatar of the scene; empty where one paints all.
-    The way through the good shapes is the cheapest in pixels: those of all frames, and the cost of the changes. A shape
-    that is not good at a look is left in the first frame after the look before.
+    The chosen sequence of good shapes is the cheapest in pixels: the pixels of all frames, plus the cost of the
+    changes. A shape that is not good at a look is left in the first frame after the look before.
     """
     order = sorted(shapes, key=lambda shape: (area(shape), shape))
     costs, origins, needed = dict.fromkeys(order, 0.0), [], []

@@ -1,8 +1,8 @@
 """What a reader finds in the file of a motion or a camera, and which of its samples are usable.
 
-A sample is left out when its reader finds it unreadable, or when its time is not after that of the last usable one.
-Sampling interpolates across the hole, and a note says how many are left out. A file with more bad samples than good
-ones is refused.
+A sample is left out when its reader finds it unreadable, or when its time is not after the time of the last usable
+sample. Sampling interpolates across the hole, and a note says how many are left out. A file with more bad samples than
+good ones is refused.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def usable_samples(
     """Return indices of the usable samples, and notes on the others and on gaps in time.
 
     `where`: file, for messages. `times_s` (T,): times of the samples. `readable` (T,): whether their values are
-    readable. `place_of`: place of each in the file. `broken_as`: words for those that are not readable. Raises
+    readable. `place_of`: place of each sample in the file. `broken_as`: words for samples that are not readable. Raises
     BadInputError when less than half of the samples are usable.
     """
     timed = readable & np.isfinite(times_s)

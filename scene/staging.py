@@ -1,6 +1,6 @@
 """A scene with everything in its place: the motions on the floor, and a camera that films them.
 
-`stage_scene` is the only way from a scene and its bodies to what is sampled per frame, so the pose stage does what the
+`stage_scene` is the only way from a scene and its bodies to what is sampled per frame, and the pose stage does what the
 command line reports. Other processes get a staged scene as plain arrays. That round trip is exact: every mover and the
 camera sample to the same bits afterwards; notes do not travel. A key is `mover.N.FIELD` or `camera.FIELD`; a field that
 is None has no key.

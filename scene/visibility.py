@@ -4,8 +4,8 @@
 between the clip planes. Nobody is seen when all points of every body are beyond one side of the picture.
 
 **Best place.** A place is where the scene's origin comes to in the recording's world. The bodies turn about the
-vertical there, so that a heading of 0 faces the first eye. The best place shows whole bodies at the most moments; among
-those that show about as many, bodies that are larger and nearer to the middle of the picture win. Places are proposed
+vertical there, so that a heading of 0 faces the first eye. The best place shows whole bodies at the most moments. Among
+places with about as many, the place with larger bodies, nearer to the middle of the picture, wins. Places are proposed
 where the camera looks: along rays through its pictures, at distances from one that fills the picture with the bodies to
 many times the length of the path. So the search has no scale of its own. The best of them climb, in steps that are
 shares of the distance.

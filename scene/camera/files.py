@@ -142,7 +142,7 @@ OF_FILES = (
 
 
 def detect(path: Path, up_axis: str = AUTO, axes: str = AUTO) -> Guess:
-    """Return the format of `path`. Raises BadInputError when it is none, or may be two.
+    """Return the format of `path`. Raises BadInputError for an unknown format, or when two formats fit.
 
     `up_axis`: axis that is up, by the scene. `axes`: where x, y and z of a pose point, by the scene.
     """

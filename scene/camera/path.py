@@ -91,7 +91,8 @@ class Optics:
     def lens(self, i: int, j: int, fraction: float, output: Shape) -> Lens:
         """Return the lens for a picture of `output` (height, width), a `fraction` of the way from sample `i` to `j`.
 
-        Over a background that the camera filmed it is cut as that is; else the picture's height is the camera's.
+        Over a background that the camera filmed, the lens is cut as the background is; otherwise the picture has the
+        camera's height.
         """
         first = self._shown(i, output)
         is_one = len(self.lenses) == 1 and len(self.filmed) <= 1
@@ -274,7 +275,7 @@ def _pace(camera: Orbit | Descent | Stand) -> str:
 
 
 def load_builtin(name: str, spec: CameraSpec) -> CameraPath | None:
-    """Return the camera `name`, or None when there is none of that name."""
+    """Return the built-in camera `name`, or None when no camera has that name."""
     camera = BUILTIN.get(name)
     if camera is None:
         return None

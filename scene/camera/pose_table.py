@@ -95,7 +95,7 @@ class TableLayout(NamedTuple):
 
     `columns`: number of columns. `names`: content of each, by KNOWN, "" for others; none without column names.
     `has_commas`: whether commas separate the numbers. `is_ns`: whether the first column has times in nanoseconds.
-    `unit`: unit of the times by the column names, `auto` without one. `lengths`: that of the places, "" without one.
+    `unit`: unit of the times by the column names, `auto` without one. `lengths`: unit of the places, "" without one.
     """
 
     columns: int
@@ -191,7 +191,7 @@ class ColumnName(NamedTuple):
 
 
 def columns_in(line: str) -> tuple[ColumnName, ...]:
-    """Return the names of the columns if `line`, maybe a comment, has four or more known ones; else nothing."""
+    """Return the column names in `line`, maybe a comment, if it has four or more known names; otherwise nothing."""
     text = UNIT.sub(lambda unit: re.sub(r"[\s,]+", "_", unit[0]), _parted(line.strip().lstrip("#")))
     text = re.sub(r"(?<!\s)\s+(?=[\[(])", "", text)  # a unit belongs to the name before it
     columns = tuple(map(_named, text.split(",") if "," in text else text.split()))
@@ -310,9 +310,9 @@ class ColumnTimes(NamedTuple):
 
 
 def times_of(where: str | Path, column: NDArray[np.float64], clock: Clock) -> ColumnTimes:
-    """Return the times in a column (N,) of the table `where`, or those of its numbers of frames.
+    """Return the times in a column (N,) of the table `where`, or times that follow from its frame numbers.
 
-    Raises BadInputError where the unit may be another one, or is none for these steps.
+    Raises BadInputError where another unit is as likely, or no unit fits these steps.
     """
     units = units_of(column) if clock.unit == AUTO else (clock.unit,)
     since, step = elapsed(column)

@@ -253,7 +253,7 @@ def price_of_horizons(turns: F64) -> float:
 
 
 def is_of_body(turns: F64, of_body: F64, usual: str) -> bool:
-    """Return whether poses are rather those of a level vehicle than of a camera.
+    """Return whether the poses more likely show a level vehicle than a camera.
 
     As a camera's `turns` (N, 3, 3) they need two corrections at once: a turned picture, and a view that is steeply up.
     As `of_body` (N, 3, 3) they need none, look ahead or down, and are cheaper by NEAR. `usual`: axis usually up.

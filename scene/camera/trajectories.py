@@ -42,7 +42,7 @@ PHONE = centred(1920, 1080, 540 / math.tan(math.radians(18.0)), Known.LONG)
 def load_arkit(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
     """Read an ARKit log: `time r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz` a line, camera to world, metres, Y up.
 
-    Axes are those of the sensor in landscape (x right, y up, looks along -Z). Raises BadInputError with the line.
+    The axes belong to the sensor in landscape (x right, y up, looks along -Z). Raises BadInputError with the line.
     """
     read = read_matrix_table(path, clock, ARKIT)
     count = len(read.turns)
@@ -168,7 +168,7 @@ SENSOR_KEYS = {"data": 16, "resolution": 2, "intrinsics": 4, "distortion_coeffic
 def load_euroc(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
     """Read EuRoC MAV poses, `data.csv`: time in nanoseconds, place, quaternion `w, x, y, z`, then any other columns.
 
-    Poses are those of the device's body. `cam0/sensor.yaml` beside them leads to the camera; without it the body's axes
+    The poses describe the device's body. `cam0/sensor.yaml` beside them leads to the camera; without it the body's axes
     are used. Camera axes are optical; the world's Z is up.
     Raises BadInputError with the line.
     Format: M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.

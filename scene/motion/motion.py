@@ -5,8 +5,8 @@ becomes one by `motion_from_recording`: bad frames left out, Y up, facing +Z at 
 
 **Up** is the axis that the scene states, else the one that the body's own up points along on average, else the usual
 one of the format. A body that lies or stands on its hands throughout does not turn the world over. Files that have a
-floor have it at 0, so a body is on the floor along an axis when its lowest joint hardly leaves 0. Where that does not
-tell either, a note says what else may be up.
+floor have it at 0, so a body is on the floor along an axis when its lowest joint hardly leaves 0. If that does not
+decide either, a note says which other axis may be up.
 
 **Stance** says when the feet stand. Ankles and toes each have their own height while their foot stands; a person stands
 while at least one of them is at its height.
@@ -189,12 +189,12 @@ def lowest(poses: F64, places: F64, leg_m: float | None, up: F64) -> F64:
 
 
 def lies(heights: F64) -> bool:
-    """Return whether `heights` (n,) of the lowest joint are those of a person lying, or on the hands, on the floor."""
+    """Return whether `heights` (n,) of the lowest joint show a person who lies on the floor or stands on the hands."""
     return _are_within(heights, LIES_M, LIES_SPREAD_M)
 
 
 def stands(heights: F64) -> bool:
-    """Return whether `heights` (n,) are those of a person who stands or walks on the floor."""
+    """Return whether `heights` (n,) show a person who stands or walks on the floor."""
     return _are_within(heights, STANDS_M, STANDS_SPREAD_M)
 
 

@@ -2,8 +2,8 @@
 
 Rule: only None, numbers, text, bytes, lists, tuples, dicts and NumPy arrays of numbers are built; nothing else is
 imported, called or built. `pickletools` splits the file into operations, and the tables below execute those that make
-such values. Anything else that the file wants built becomes a `Foreign`, which holds only its name. An operation that
-is not in a table ends the reading.
+such values. Any other object in the file becomes a `Foreign`, which only holds the object's name. An operation that is
+not in a table ends the reading.
 
 The size of a file limits the memory that it can take. Text and bytes are pieces of the file; an array is a view of such
 bytes and must have exactly as many as its shape says. The number of operations is limited. Keys of dicts are text

@@ -1,7 +1,7 @@
 """The content of a `.npy`, `.npz` or `.pkl` file as plain values: dicts, lists, numbers, text and arrays.
 
 Rule: sizes are known before memory is taken; nothing in a file is executed (`pickled.py`); only requested arrays of an
-archive are read. Nesting may be endless, so a search goes a few levels deep.
+archive are read. Nesting may be endless. Therefore a search only goes a few levels deep.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def _items(value: dict[str, Any] | list[Any]) -> list[tuple[Any, Any]]:
 
 
 def array_of(value: Any) -> NDArray[Any] | None:
-    """Return `value` as an array, if it is one, a number, or a list of numbers; else None."""
+    """Return `value` as an array if it is an array, a number or a list of numbers; otherwise None."""
     value = plain(value)
     if isinstance(value, np.ndarray):
         return value
@@ -139,11 +139,11 @@ class FoundTable:
     table: Mapping[str, Any]
 
     def has(self, key: str) -> bool:
-        """Return whether there is a value, not None, of that name."""
+        """Return whether `key` has a value that is not None."""
         return bool(key) and self.table.get(key) is not None
 
     def array(self, key: str) -> NDArray[Any]:
-        """Return the array `key`. Raises BadInputError when it is none."""
+        """Return the array `key`. Raises BadInputError when its value is no array."""
         value = self.table[key]
         array = array_of(value)
         if array is None:

@@ -1,4 +1,4 @@
-"""Tracks of named joints over time, and the turns that they mean: the input of retargeting, from any file.
+"""Tracks of named joints over time, and turns computed from them: the input of retargeting, from any file.
 
 Names are those of the SMPL-X joints; units and axes are the file's own, the same in all arrays. Places alone tell which
 frames stand, and whether a skeleton is built like the avatar's: the file's zero pose does not matter.
