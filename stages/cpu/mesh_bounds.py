@@ -16,8 +16,8 @@ at most sum_b |E_b| |G_b c - G_parent c|, where E_b is the sum of w_j - u_j over
 about its centre c_b by its own angle t_b, |G_b c - G_parent c| <= 2 sin(t_b / 2) |c - c_b|.
 
 **Skinned bodies** are projected in float32, in memory that is allocated once. Vertices whose place on the screen is
-within twice the rounding error of the furthest one are handed on, and float64 decides between them. So the furthest of
-them in float64 is the furthest of all.
+within twice the rounding error of the furthest one are handed on, and float64 decides between them. Therefore the
+furthest of them in float64 is the furthest of all vertices.
 
 The rounding error follows with u = 2**-24. A clip coordinate c = r . v + d is a sum of three products of rounded
 factors and d, so it is off by at most 6 u (sum |r_k| |v_k| + |d|). The bound e_c is 8 u of that, with the sphere's
@@ -55,9 +55,10 @@ class Outermost:
         self._is_far = np.empty(count, np.bool_)
 
     def of(self, vertices: F32, camera: F64, radius: float) -> I64 | None:
-        """Return numbers (N,) of the vertices whose spheres of `radius` metres about `vertices` (V,3) may be outermost.
+        """Return numbers (N,) of the `vertices` (V,3) that may be outermost, each with a sphere of `radius` metres.
 
-        `camera`: matrix (4,4) to clip space. None when a sphere may reach over the screen's edge or a clip plane.
+        `camera`: matrix (4,4) to clip space. The result is None when a sphere may reach over the screen's edge or a
+        clip plane.
         """
         reach = radius * np.linalg.norm(camera[:, :3], axis=1)
         error = self._project(vertices, camera, reach)

@@ -44,7 +44,7 @@ class SeenAvatar:
     """An avatar on the screen.
 
     `level`: an index into `DETAILS`. `error_px`: bound of the error of both levels on the picture, pixels. `mesh`:
-    level of the mesh, 0 for the whole one. `triangles`: number of triangles that it has.
+    level of the mesh, 0 for the whole mesh. `triangles`: number of triangles of that level.
     """
 
     rect: Rect
@@ -67,7 +67,7 @@ class DetailChoice:
 
 
 class DrawnMesh:
-    """One level of a body's mesh, with what posing it needs.
+    """One level of a body's mesh, with the data for posing it.
 
     `shaped`: the body with the vertices of the level. `skins`: whether the CPU unit skins it. `details`: whether levels
     of detail may leave something out.
@@ -95,7 +95,7 @@ class DrawnMesh:
 
 
 class ModelledBody:
-    """A body that several avatars of a scene may share, with what each of its levels needs.
+    """A body that several avatars of a scene may share, with the data of each of its levels.
 
     `bodies`: the whole body, then those of its mesh `levels`. `skins`: whether the CPU unit skins it. `budget_px`:
     largest error on the picture, pixels; with 0 everything is modelled.
@@ -147,8 +147,8 @@ class ModelledBody:
         """Skin the body into `vertices`, if given, and find its rectangle; None when nothing of it is visible.
 
         `posed`: pose of the frame. `clip`: projection @ view, (4,4). `output`: (height, width) of the picture. `moved`:
-        counter of the vertices, which are written, then read to find the rectangle, and of what skinning reads from
-        memory. `choice`: what `choose` returned for the frame.
+        counter of moved bytes: vertices that are written, then read to find the rectangle, and what skinning reads.
+        `choice`: what `choose` returned for the frame.
         """
         mesh = self.meshes[choice.mesh.level]
         own = None if vertices is None else mesh.pose(posed, choice.level, vertices, moved)
@@ -189,7 +189,7 @@ class _Actor:
 class FramePlan:
     """The decisions for a frame.
 
-    They are its work, the tensor's shape, None with nobody in view, and each visible avatar by its number.
+    They are the frame's work, the tensor's shape (None with nobody in view), and each visible avatar by its number.
     """
 
     work: FrameWork
@@ -269,7 +269,7 @@ class PoseStage:
         Metrics: `visible`, number of visible avatars; for a full frame `level` of `body.skinning.DETAILS` and
         `error_px`, the bound on the error on the picture, both of the worst avatar; `triangles` of all avatars;
         `density` of a planned tensor; the bytes moved.
-        The least bytes: what was sampled of motions and camera, the header, and the vertices of skinned avatars.
+        The least bytes count the samples of motions and camera, the header, and the vertices of skinned avatars.
 
         Raises ValueError without `slot_out`, TrilaneError when a number of the frame is not finite.
         """

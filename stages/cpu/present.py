@@ -56,7 +56,7 @@ class Segment:
     """One file of H.264 video, written frame by frame, and a text file of digests beside it.
 
     A digest line is the frame's number and the SHA-256 of its bytes (row 0 first, RGB). `moved`: bytes that the latest
-    frame moved; the least are those of a new frame, and those that the encoder gave.
+    frame moved. The least bytes are a new frame's and the encoder's output.
     """
 
     def __init__(self, path: Path, fps: float, height: int, width: int) -> None:
@@ -79,7 +79,8 @@ class Segment:
     def digest(self, frame: int, pixels: NDArray[np.uint8], repeats: bool = False) -> None:
         """Write the digest of `pixels`, (height, width, 3) and C-contiguous.
 
-        `repeats`: whether they are those of the last call. Raises UnwrittenError, also when the file was removed.
+        `repeats`: whether the pixels equal those of the last call. Raises UnwrittenError, also when the file was
+        removed.
         """
         if not repeats:
             self._digest = hashlib.sha256(pixels.data).hexdigest()
@@ -91,7 +92,7 @@ class Segment:
     def add(self, frame: int, pixels: NDArray[np.uint8], repeats: bool = False) -> None:
         """Show `pixels`, (height, width, 3) RGB, from the instant of frame number `frame` on.
 
-        `repeats`: whether they are those of the last call, which are converted for the encoder already. Raises
+        `repeats`: whether the pixels equal those of the last call, which the encoder's format already holds. Raises
         UnwrittenError.
         """
         if not repeats:
@@ -122,7 +123,7 @@ class Segment:
 class PresentStage:
     """Stage `present` of the CPU unit: one input edge of frames, no output.
 
-    Figures of a recorded job: `digest_ms`, `encode_ms`, and the bytes moved; of any other job, that none were.
+    A recorded job reports `digest_ms`, `encode_ms` and the bytes moved. Any other job reports no bytes moved.
     """
 
     def __init__(self, config: RunConfig) -> None:
