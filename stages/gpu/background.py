@@ -1,9 +1,9 @@
-"""Backgrounds from the user's files: a picture, a folder of pictures, a video; what they are is found out before a run.
+"""Backgrounds from the user's files: a picture, a folder of pictures, or a video, each examined before a run.
 
 Every frame covers the output: `cover` scales the picture until no border is left, and crops the overhang equally on
 both sides; the picture's lens is changed alike. Videos and folders start again when they end; photos that belong to the
-camera's views are shown with them. A picture is turned as its EXIF tag says, unless its reader is told otherwise. What
-Pillow would show wrongly is converted to eight bits, or refused.
+camera's views are shown with these views. A picture is turned as its EXIF tag says, unless its reader is told
+otherwise. What Pillow would show wrongly is converted to eight bits, or refused.
 
 `survey` says size, rate and range of a background. Rule: everything that the run will show is opened before it: each
 picture is decoded, and a video's frames are counted. A broken file is then named before a process is started.
@@ -82,7 +82,7 @@ def check_picture(path: Path) -> None:
 def read_picture(path: Path, shape: Shape, turned: int | None = None) -> U8:
     """Return the picture in `path` covering `shape` (h,w): (h,w,3) uint8. Raises BadInputError.
 
-    `turned`: number of quarters that it is turned clockwise; None for its EXIF tag.
+    `turned`: number of clockwise quarter turns; None for the turn of the EXIF tag.
     """
     with _opened(path) as image:
         how = BY_TAG.get(_orientation(image)) if turned is None else CLOCKWISE.get(turned % 4)
@@ -123,7 +123,7 @@ class Background(Protocol):
     """A background of a fixed shape (height, width)."""
 
     def at(self, time_s: float) -> U8 | None:
-        """Return the picture (h,w,3) uint8 sRGB at `time_s`, or None when it is that of the last call."""
+        """Return the picture (h,w,3) uint8 sRGB at `time_s`, or None when the last call returned the same one."""
 
     def close(self) -> None:
         """Release files and threads."""
@@ -218,7 +218,7 @@ EIGHT_BITS = 8
 
 
 def survey(path: Path, fps: float) -> Footage:
-    """Return what `path` is; a folder's pictures follow each other at `fps`. Raises BadInputError."""
+    """Return size, rate and range of `path`; a folder's pictures follow each other at `fps`. Raises BadInputError."""
     if path.is_dir():
         return _folder(path, fps)
     require_file(path, A_VIDEO)

@@ -1,7 +1,7 @@
 """The composite stage: draws background, planes, contact shadow, avatars and display, in that order.
 
-Avatars are drawn far to near; one that is not visible leaves no trace. A frame that would equal one that an output slot
-still holds is copied instead of drawn. Only the composite writes to its output slots, so their bytes stay until it
+Avatars are drawn far to near; one that is not visible leaves no trace. If an output slot still holds an equal frame,
+the new frame is copied instead of drawn. Only the composite writes to its output slots, so their bytes stay until it
 writes there again.
 
 While the camera stands still, everything under the avatars is drawn twice and copied from then on. The first frame of a
@@ -9,8 +9,8 @@ view is only drawn, because most views of a moving camera never come again. The 
 software driver copies it from there in a tenth of a millisecond, and takes twenty times as long to copy between
 framebuffers.
 
-The display shows frame number and time of the picture. This stage measures rate and age. They are updated four times a
-second so that they can be read, and start again when frame numbers do.
+The display shows frame number and time of the picture. This stage measures rate and age. Both are updated four times a
+second, so that a person can read them. They start again when frame numbers do.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class DrawnFrames:
     def note(self, slot: int, drawing: Drawing | None, frame: int, copied_from: int | None) -> int:
         """Note that `slot` holds `drawing` of `frame` from now on; return `repeats` of the frame's header.
 
-        `copied_from`: slot that held it already; None when it was drawn now.
+        `copied_from`: slot that held the drawing already; None when it was drawn now.
         """
         drawn = frame if copied_from is None else self._slots[copied_from][1]
         self._slots[slot] = (drawing, drawn)
@@ -190,7 +190,7 @@ class CompositeStage:
     `background`: background from files; None for the built-in room.
     `eyes`: places (3,) that the room holds from the first frame on, so that it never grows, not even after a restart.
     `planes`: detected planes to show.
-    `painters`: network of each avatar; empty where one paints all.
+    `painters`: network of each avatar; empty where one network paints all.
     `hud`: whether to show frame, rate and age.
     """
 

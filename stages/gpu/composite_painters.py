@@ -3,13 +3,13 @@
 The room is the built-in background: a wooden floor at y = 0 and walls, as a mesh and two textures. Rule: mesh and
 textures are computed from constants and a fixed seed, and the room always holds the camera.
 
-Background bytes are copied unchanged, as sRGB; everything blended over them is blended in linear light. Planes are
-those of the scene file; nothing is detected here. A contact shadow is a disc under a joint, which grows and fades with
-the height of its joint above the floor.
+Background bytes are copied unchanged, as sRGB; everything blended over them is blended in linear light. The planes come
+from the scene file; nothing is detected here. A contact shadow is a disc under a joint, which grows and fades with the
+height of its joint above the floor.
 
-A body fills about half of its rectangle, and a software driver takes as long for a pixel that stays as for any other.
-So the network's picture is cut into bands of rows. Each band is cut to the columns between its first and last texel
-that is not transparent, widened by what a screen pixel may read beside its middle.
+A body fills about half of its rectangle, and a software driver takes as long for an unchanged pixel as for any other.
+Therefore the network's picture is cut into bands of rows. Each band is cut to the columns between its first and last
+texel that is not transparent, widened by what a screen pixel may read beside its middle.
 """
 
 from __future__ import annotations
@@ -209,8 +209,8 @@ WHOLE: F32 = np.array([[0, 0, 1, 1]], np.float32)
 def spans(shown: Mask, margin: int) -> F32:
     """Return the parts (N,4) float32 to draw: left, top, right, bottom of each, as shares of the picture's sides.
 
-    `shown`: (h,w), where the picture is not transparent. `margin`: number of texels that are read beside a pixel's
-    middle.
+    `shown`: pixels (h,w) of the picture that are not transparent. `margin`: number of texels that are read beside a
+    pixel's middle.
     """
     height, width = shown.shape
     has_any = shown.any(axis=1)
@@ -420,7 +420,7 @@ class AvatarPainter:
 
 
 def taps_of(cell: tuple[int, int], pixels: tuple[float, float]) -> int:
-    """Return how many reads along a side a screen pixel is the mean of, when `cell` of a picture fills `pixels`.
+    """Return the number of reads along a side whose mean is a screen pixel, when `cell` of a picture fills `pixels`.
 
     Both are (height, width).
     """

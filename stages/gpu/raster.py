@@ -57,7 +57,7 @@ def texture_array(ctx: Any, texture: Floats, filtering: str = "linear", levels: 
     """Return an FP16 array texture of C/4 RGBA layers from `texture` (H,W,C), clamped at its edge.
 
     `filtering`: one of FILTERS. `levels`: smaller levels that were learnt. They replace the driver's means, and no
-    level is read below them, so `linear` becomes `mipmap`.
+    smaller level is read. Therefore `linear` becomes `mipmap`.
     """
     height, width, channels = texture.shape
     array = ctx.texture_array((width, height, channels // 4), 4, _pixels(texture), dtype="f2")
@@ -93,7 +93,7 @@ def texture_words(ctx: Any, texture: Floats) -> tuple[Any, float]:
 
 
 def filter_of(asked: str, learnt: bool) -> str:
-    """Return the filter of a texture for which the scene has `asked`; `learnt` levels are always read."""
+    """Return the filter of a texture when the scene names the filter `asked`; `learnt` levels are always read."""
     return "mipmap" if learnt and asked == "linear" else asked
 
 
@@ -304,7 +304,7 @@ class RasterStage:
 
     `passes`: draws the tensors of each network. `avatars[i]`: draws the scene's avatar i. `shapes`: tensor shapes
     (height, width) that may come. `posed_vertices`: number of skinned vertices of each avatar in the input slot; empty
-    when the GPU skins. `painters`: network of each avatar; empty where one paints all.
+    when the GPU skins. `painters`: network of each avatar; empty where one network paints all.
     """
 
     def __init__(
