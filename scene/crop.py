@@ -187,7 +187,7 @@ def _stretch(first: F64, second: F64) -> float:
 
 
 def cheapest_within(errors_px: Sequence[float], budget_px: float) -> int:
-    """Return the index of the first level, from the least work on, whose error is within the budget; else the last."""
+    """Return the index of the level with the least work whose error is within the budget; otherwise the last index."""
     return next((level for level, error in enumerate(errors_px) if error <= budget_px), len(errors_px) - 1)
 
 

@@ -67,7 +67,7 @@ class DrawnFrames:
         self._slots: dict[int, tuple[Drawing | None, int]] = {}
 
     def slot_of(self, drawing: Drawing | None, preferred: int) -> int | None:
-        """Return a slot that holds `drawing`, preferably `preferred`; None without one, or for None."""
+        """Return a slot that holds `drawing`, preferably `preferred`; None without such a slot or drawing."""
         if drawing is None:
             return None
         held = [slot for slot, (there, _) in self._slots.items() if there == drawing]
