@@ -71,8 +71,8 @@ class NetworkEntry(_Model):
 class Digests(_Model):
     """SHA-256, hexadecimal, of everything that an avatar's pictures depend on.
 
-    `body`, `texture`, `network`: digests of those files' bytes; offsets count as part of the body. Levels of the mesh
-    do not count: they name their body themselves, and a validation draws the whole mesh.
+    `body`, `texture`, `network`: digests of these files' bytes; offsets count as part of the body. Levels of the mesh
+    do not count, because their files name the body, and a validation draws the whole mesh.
     `constants`: digest of the manifest's numbers: shape, expression, and the scales and zero points of the network's
     bytes.
     """
@@ -182,7 +182,7 @@ AT_THE_TOP = ("psnr_db_by_band", "psnr_db_by_background", "see_through", "iou", 
 
 
 class Validation(AccuracyFigures):
-    """The figures of an avatar, and what they were measured on.
+    """The figures of an avatar, and the material on which they were measured.
 
     `date`: day of the validation, UTC. `date`, `digests`, `figures_digest` and `made_with` are None in a manifest that
     an older Trilane wrote.

@@ -53,7 +53,7 @@ class IntegerNetwork:
 
     @property
     def float_layers(self) -> frozenset[str]:
-        """Names of the layers that may run in float: those that the network's metadata lists.
+        """Names of the layers that may run in float, as the network's metadata lists them.
 
         Raises BadInputError when the metadata is not a JSON list.
         """

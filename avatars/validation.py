@@ -1,6 +1,6 @@
 """Decides which accuracy figures are valid for an avatar, and explains why others are not shown.
 
-Rule: a figure is shown only if bytes, constants and the way of drawing are those of its measurement. Otherwise a
+Rule: a figure is shown only if bytes, constants and the way of drawing are the same as in its measurement. Otherwise a
 sentence names the difference and the command that measures the figure.
 """
 
@@ -175,7 +175,7 @@ class SizeLoss:
     by_work: Mapping[int, float]
 
     def at(self, work: int) -> float | None:
-        """Return the loss with `work` thousandths of the pixels: that of the next smaller measured size, if any."""
+        """Return the loss with `work` thousandths of the pixels: the loss at the next smaller measured size, if any."""
         if work >= WHOLE and self.by_work:
             return 0.0
         measured = [size for size in self.by_work if size <= work]
