@@ -156,7 +156,7 @@ EVERYTHING = DETAILS[-1]
 
 
 def carried(weights: F32) -> F32:
-    """Return `weights` (V,55) with those of the hands' and the face's joints given to wrist and head."""
+    """Return `weights` (V,55) in which wrist and head carry the weights of the hands' and the face's joints."""
     given = weights.astype(np.float64)
     for name, carrier in CARRIED_BY.items():
         given[:, carrier] += given[:, JOINT_INDEX[name]]
