@@ -118,7 +118,7 @@ class LiveWindow:
             self._head[name] = value
 
     def newest(self, had: int) -> ShownPicture | None:
-        """Return the newest picture; None when there is none, or it is of frame `had`."""
+        """Return the newest picture; None without a picture, or when the newest one shows frame `had`."""
         for _ in range(TRIES):
             side = int(self._head["newest"][0]) & 1
             number = int(self._head["number"][0, side])

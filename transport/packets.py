@@ -38,7 +38,7 @@ def header_dtype(fields: Sequence[tuple[Any, ...]] = ()) -> np.dtype[Any]:
 
 @dataclass(frozen=True)
 class SlotLayout:
-    """The bytes of one slot: the header rounded up to a page, then `payload_bytes`, rounded up likewise."""
+    """The bytes of one slot: the header, then `payload_bytes`, each rounded up to whole pages."""
 
     header: np.dtype[Any]
     payload_bytes: int

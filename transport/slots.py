@@ -92,7 +92,7 @@ def _keeps_none(_frame: int) -> bool:
 
 
 class EdgeSlots:
-    """The slots behind one stage: of the edge to the next stage, or of a stream with several readers.
+    """The slots behind one stage. They belong to the edge to the next stage, or to a stream with several readers.
 
     A reader takes frame by frame and has a line of waiting slots, or it takes the newest frame alone and holds that
     frame's slot until a newer one comes. A slot is free when the last of its readers has released it.
