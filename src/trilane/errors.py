@@ -67,7 +67,7 @@ def package_line(name: str) -> str:
 
 
 def install_line(extra: str = "") -> str:
-    """Return the command that installs the packages of an `extra`; without one, those that every run needs.
+    """Return the command that installs the packages of `extra`, or without an extra, the packages that every run needs.
 
     `extra`: one of Trilane's extras, or several joined by commas.
     """

@@ -203,7 +203,7 @@ def read_npy(path: Path, expected: str) -> NDArray[Any]:
 
 
 def read_npz(path: Path, keys: Collection[str], expected: str) -> dict[str, NDArray[Any]]:
-    """Return those of `keys` that the `.npz` file has; other members are not opened. Raises BadInputError.
+    """Return the arrays of the `keys` that the `.npz` file has; other members are not opened. Raises BadInputError.
 
     Together they may have at most MAX_ARRAY_BYTES, and a header each.
     """
@@ -233,7 +233,7 @@ def npz_names(path: Path, expected: str) -> list[str]:
 
 
 def npz_pickles(path: Path, keys: Collection[str], most: int, expected: str) -> dict[str, bytes]:
-    """Return the unread pickles of those `keys` in an `.npz` file that hold Python objects. Raises BadInputError.
+    """Return the unread pickles of the `keys` whose arrays in an `.npz` file hold Python objects. Raises BadInputError.
 
     `most`: most bytes that they may have together.
     """

@@ -118,7 +118,7 @@ def _not_empty(text: str) -> str:
 
 
 def one_of(*words: str) -> AfterValidator:
-    """Return a validator that refuses a text which is none of `words`; None passes."""
+    """Return a validator that refuses every text outside `words`; None passes."""
 
     def known(word: str | None) -> str | None:
         if word is not None and word not in words:
@@ -137,7 +137,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class Options(BaseModel):
-    """A model of options. `model_fields_set` names those that somebody gave."""
+    """A model of options. `model_fields_set` names the options that somebody gave."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 

@@ -32,7 +32,7 @@ def _raise(number: int, _frame: FrameType | None) -> NoReturn:
 
 
 def that_end() -> list[signal.Signals]:
-    """Return SIGINT, SIGTERM, and those others of ENDING that the caller neither ignores nor handles.
+    """Return SIGINT, SIGTERM, and the other signals of ENDING that the caller neither ignores nor handles.
 
     A command that was started by `nohup` or as a shell's background job ignores some.
     """
