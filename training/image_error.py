@@ -1,4 +1,4 @@
-"""Error of an avatar's picture against the ground truth: PSNR, SSIM and IoU before backgrounds, and that of its alpha.
+"""Error of an avatar's picture against the ground truth: PSNR, SSIM and IoU before backgrounds, and its alpha's error.
 
 Rule: pictures are compared before each kind of background in turn, inside the box of the true mask. Before a single
 colour, a person who lets that colour through would have no error. That PSNR also counts the background inside the box,

@@ -203,7 +203,7 @@ def round_to_bytes(avatar: TrainableAvatar, grid: ByteGrid, groups: list[ShapeGr
 
 
 def keep_rounded_weights(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> None:
-    """Replace the weights of `avatar`, which was trained with rounding, by those on the grid.
+    """Replace the weights of `avatar`, which was trained with rounding, by their rounded values on the grid.
 
     `groups`, `seed`: as in `ranges_of`.
     """

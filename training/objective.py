@@ -1,4 +1,4 @@
-"""The objective that training minimises: the loss terms, and those that need networks of their own.
+"""The objective that training minimises: the loss terms, including the terms that need networks of their own.
 
 Rule: a term is computed only where it has a weight, and the same step on the same pictures gives the same numbers.
 """

@@ -104,7 +104,7 @@ def _step(state: TrainingState, stream: Iterator[Batch], settings: TrainingSetti
 def add_gradients(
     avatar: TrainableAvatar, batch: tuple[Tensor, Tensor, Tensor], objective: Objective, share: float = 1.0
 ) -> dict[str, float]:
-    """Add `share` of the gradients of `batch` to those of `avatar`, and return the terms of the loss by name.
+    """Add `share` of the gradients of `batch` to the gradients of `avatar`, and return the terms of the loss by name.
 
     `batch`: UV image, coverage and target, as `load_batch` returns them.
     `objective`: loss to minimise; its discriminators learn from every batch.

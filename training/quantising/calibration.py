@@ -94,14 +94,14 @@ def saturated(frames: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float32]
 
 
 def norm_inputs(model: onnx.ModelProto) -> set[str]:
-    """Return the tensors that norms over the picture read, and those that were moved to become them."""
+    """Return the tensors that norms over the picture read, and the tensors from which these were moved."""
     makers = {out: node for node in model.graph.node for out in node.output}
     norms = (node for node in model.graph.node if node.op_type == "InstanceNormalization")
     return {source for node in norms for source in _sources(node.input[0], makers)}
 
 
 def widen(ranges: Any, names: set[str], wider: Any) -> None:
-    """Extend the ranges of tensors `names` to those of `wider`, in place.
+    """Extend the ranges of tensors `names`, in place, to the ranges in `wider`.
 
     A norm divides by the picture's own deviation, so its input carries the same picture at any contrast. Clipped at the
     contrast of usual frames, a stronger picture would become a different one.
@@ -114,9 +114,9 @@ def widen(ranges: Any, names: set[str], wider: Any) -> None:
 def share_ranges(model: onnx.ModelProto, ranges: Any) -> None:
     """Give the inputs and the output of each Concat one range, so that it moves bytes and rounds nothing. In place.
 
-    Otherwise runtimes that fuse a Concat into the layers before it would clamp at other values than those that do not.
-    A Concat is left as it is when the common range would be signed and one of its tensors is rectified: that tensor
-    would lose its clamp at 0.
+    Otherwise runtimes that fuse a Concat into the layers before it would clamp at other values than runtimes that do
+    not. A Concat is left as it is when the common range would be signed and one of its tensors is rectified: that
+    tensor would lose its clamp at 0.
     """
     makers = {out: node for node in model.graph.node for out in node.output}
     for node in model.graph.node:
