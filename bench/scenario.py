@@ -362,7 +362,7 @@ def queries_needed(percentile: float, late: int = 1) -> int:
 
 
 def bound_ms(latencies_ms: list[float], percentile: float) -> float | None:
-    """Return the latency that `percentile` of all queries are within, at `CONFIDENCE`; None with too few queries.
+    """Return the latency that `percentile` of all queries stay within, at `CONFIDENCE`; None for too few queries.
 
     The result is the k-th largest latency. k is the number of queries that may be late, as in LoadGen.
     """

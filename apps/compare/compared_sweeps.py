@@ -96,7 +96,7 @@ class SweepComparison:
 
     @property
     def bound(self) -> str:
-        """How many runs of each sweep each unit bounded, as a sentence; empty where no run knows, as in predictions."""
+        """How many runs of each sweep each unit bounded, as a sentence; empty where no run names a bound."""
         base = [bound for pair in self.pairs for bound in pair.bounds.base]
         other = [bound for pair in self.pairs for bound in pair.bounds.other]
         if not any((*base, *other)):

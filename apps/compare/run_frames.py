@@ -62,7 +62,7 @@ class RunFrames:
 
 
 def read_frames(path: Path) -> RunFrames:
-    """Read the frames of the journal at `path`. Raises BadInputError for a file that is none or ends too early."""
+    """Read the frames of the journal at `path`. Raises BadInputError for another file, or one that ends too early."""
     frames = frames_of(read_journal(path))
     if frames is None:
         raise BadInputError(path, "fewer than two presented frames", "two or more", "run more frames")

@@ -92,7 +92,7 @@ class Segment:
     def add(self, frame: int, pixels: NDArray[np.uint8], repeats: bool = False) -> None:
         """Show `pixels`, (height, width, 3) RGB, from the instant of frame number `frame` on.
 
-        `repeats`: whether the pixels equal those of the last call, which the encoder's format already holds. Raises
+        `repeats`: whether the pixels equal those of the last call, which are already converted for the encoder. Raises
         UnwrittenError.
         """
         if not repeats:
