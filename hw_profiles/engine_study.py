@@ -19,7 +19,6 @@ import numpy as np
 from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.files import read_text
-from trilane.hw_profiles.engine_layers import NAMES, Layers
 from trilane.hw_profiles.fit_engines import (
     ON_CHIP_MB,
     UNITS_OF_RATES,
@@ -30,6 +29,7 @@ from trilane.hw_profiles.fit_engines import (
     fit_anchors,
     fit_engine,
 )
+from trilane.hw_profiles.operators import NAMES, Layers
 from trilane.hw_profiles.plot import figure_for
 from trilane.hw_profiles.published_times import Latency, layers_of_rows, read_latencies
 from trilane.hw_profiles.schema import ENGINES, NORMAL_80, EngineName

@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 
 from trilane.arrays import F64
-from trilane.hw_profiles.engine_layers import INDEX, NAMES, RATES, TERMS, Layers
+from trilane.hw_profiles.operators import INDEX, NAMES, RATES, TERMS, Layers
 from trilane.hw_profiles.schema import Engine
 
 #: Which power joins what goes on at once: 1 would be one after the other, infinity the slowest alone.

@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 
 from trilane.arrays import F64, I64
-from trilane.hw_profiles.engine_layers import NAMES, RATES, TERMS, Layers
 from trilane.hw_profiles.engine_times import amounts, join
+from trilane.hw_profiles.operators import NAMES, RATES, TERMS, Layers
 from trilane.hw_profiles.published_times import Latency
 from trilane.hw_profiles.schema import KEY_OF_RATE, EngineName
 

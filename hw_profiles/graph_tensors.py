@@ -25,7 +25,7 @@ from onnx import AttributeProto, TensorProto, helper, numpy_helper
 from onnx.reference import ReferenceEvaluator
 
 from trilane.hw_profiles.network_work import constant_tensors
-from trilane.hw_profiles.operator_kinds import CONVOLUTIONS, OF_SHAPES, Shape
+from trilane.hw_profiles.operators import CONVOLUTIONS, OF_SHAPES, Shape
 from trilane.unexpected_value import UnexpectedValue
 
 MAX_TENSOR_BYTES = 1 << 30

@@ -17,12 +17,11 @@ from typing import Any, Final, NamedTuple
 
 from trilane.arrays import F64
 from trilane.errors import BadInputError
-from trilane.hw_profiles.engine_layers import NAMES, EngineLayer
 from trilane.hw_profiles.engine_times import BOUNDS, Bound, engine_time, numbers_of
 from trilane.hw_profiles.graph_file import GraphFile, NumberFormat
 from trilane.hw_profiles.host_model import UNMEASURED, with_known_intervals
 from trilane.hw_profiles.network_work import Operator, Work
-from trilane.hw_profiles.operator_kinds import COMPILED
+from trilane.hw_profiles.operators import COMPILED, NAMES, EngineLayer
 from trilane.hw_profiles.over_time import (
     Moment,
     caps_of,

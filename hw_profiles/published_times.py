@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles.engine_layers import Layers
 from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.network_work import Work, count_work
+from trilane.hw_profiles.operators import Layers
 from trilane.hw_profiles.reference_networks import GraphBuilder, TensorRef, resnet18
 from trilane.hw_profiles.schema import EngineName, EngineRuntime, Profile, corners_of
 from trilane.hw_profiles.unit_times import time_on

@@ -18,10 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F64
-from trilane.hw_profiles.engine_layers import NAMES, RATES, TERMS
 from trilane.hw_profiles.engine_times import EngineTime, engine_time, numbers_of
 from trilane.hw_profiles.network_work import Work
-from trilane.hw_profiles.operator_kinds import ARITHMETIC, CLASSES, TRAFFIC
+from trilane.hw_profiles.operators import ARITHMETIC, CLASSES, NAMES, RATES, TERMS, TRAFFIC
 from trilane.hw_profiles.schema import KEY_OF_RATE, Engine, Memory, Unit
 
 TRAFFIC_KEYS = tuple(f"{kind}_traffic" for kind in ARITHMETIC) + TRAFFIC

@@ -13,7 +13,6 @@ import pytest
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles import engine_study
-from trilane.hw_profiles.engine_layers import NAMES, RATES, TERMS
 from trilane.hw_profiles.engine_study import (
     BEGIN,
     END,
@@ -38,6 +37,7 @@ from trilane.hw_profiles.fit_engines import (
     factor_prior,
     rate_prior,
 )
+from trilane.hw_profiles.operators import NAMES, RATES, TERMS
 from trilane.hw_profiles.published_times import Latency, read_latencies
 from trilane.hw_profiles.schema import NORMAL_80, EngineName
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles.engine_layers import INDEX, NAMES, RATES, Layers
 from trilane.hw_profiles.engine_study import (
     BEGIN,
     END,
@@ -45,6 +44,7 @@ from trilane.hw_profiles.fit_engines import (
 from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.network_time import interval, price
 from trilane.hw_profiles.network_work import count_work
+from trilane.hw_profiles.operators import INDEX, NAMES, RATES, Layers
 from trilane.hw_profiles.profile_files import load_profile, profile_folder
 from trilane.hw_profiles.published_times import Latency, layers_of_rows, read_latencies
 from trilane.hw_profiles.reference_networks import NetworkSpec, network_work
