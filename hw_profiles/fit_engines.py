@@ -5,7 +5,7 @@ Every number has a prior, what is believed before any latency is looked at. The 
     sum over rows of (NU + 1) log(1 + r^2 / NU) + sum over numbers of (log(number / prior) / spread)^2,
     r = log(predicted / published) / NOISE,
 
-by Gauss and Newton's method with Levenberg's damping and the exact derivatives of `engine_times.join`. That gives the
+by Gauss and Newton's method with Levenberg's damping and the exact derivatives of `unit_times.join`. That gives the
 most probable numbers if errors follow Student's t distribution, so that a row far off counts little.
 """
 
@@ -19,10 +19,10 @@ from typing import NamedTuple
 import numpy as np
 
 from trilane.arrays import F64, I64
-from trilane.hw_profiles.engine_times import amounts, join
 from trilane.hw_profiles.operators import NAMES, RATES, TERMS, Layers
 from trilane.hw_profiles.published_times import Latency
 from trilane.hw_profiles.schema import KEY_OF_RATE, EngineName
+from trilane.hw_profiles.unit_times import amounts, join
 
 NOISE, NU = 0.08, 3.0
 STEPS, ENOUGH = 60, 1e-5
