@@ -23,15 +23,17 @@ from trilane.hw_profiles.fit_engines import (
     ON_CHIP_MB,
     UNITS_OF_RATES,
     Fitted,
+    Latency,
     LeftOut,
     Prior,
     cross_validate,
     fit_anchors,
     fit_engine,
+    layers_of_rows,
+    read_latencies,
 )
 from trilane.hw_profiles.operators import NAMES, Layers
 from trilane.hw_profiles.plot import figure_for
-from trilane.hw_profiles.published_times import Latency, layers_of_rows, read_latencies
 from trilane.hw_profiles.schema import ENGINES, NORMAL_80, EngineName
 from trilane.writing import write_atomically
 
