@@ -23,8 +23,7 @@ from typing import Final, NamedTuple
 from trilane.pipeline.timeline import ExplainedJob
 from trilane.pipeline.unit_history import OVERHEAD
 from trilane.scheduler.events import NEVER, Graph, Settings
-from trilane.scheduler.placement import SCHEDULER_NS
-from trilane.scheduler.places import Placement
+from trilane.scheduler.placement import SCHEDULER_NS, Placement
 from trilane.scheduler.shared_cores import Need, SharedCores
 from trilane.scheduler.stats import LEAST_FRAMES, batch_interval
 

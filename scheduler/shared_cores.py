@@ -22,7 +22,7 @@ from typing import Any, Final, NamedTuple
 
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import NEVER, Dispatch, Event, Graph, Job, JobDone, OutcomeKind, Settings, UnitReady
-from trilane.scheduler.places import Placement
+from trilane.scheduler.placement import Placement
 
 #: Assumed: time between two looks of the kernel at cores that are idle while others are shared, a tick of 250 Hz.
 BALANCE_NS: Final = 4_000_000

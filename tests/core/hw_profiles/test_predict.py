@@ -32,7 +32,7 @@ from trilane.hw_profiles.predict import _frame_times, ema_range_ms, predict, pre
 from trilane.hw_profiles.profile_files import load_profile, load_tables, parse_profile
 from trilane.hw_profiles.reference_networks import NetworkSpec, read_table, reference_network
 from trilane.hw_profiles.schema import CORNERS, Profile, corners_of
-from trilane.scheduler.places import CpuCore, Place
+from trilane.scheduler.placement import CpuCore, Place
 from trilane.units import UNITS, UnitName
 
 NETWORK = reference_network(NetworkSpec("resnet18", "batch", 512, 512, 16))
