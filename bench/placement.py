@@ -25,8 +25,7 @@ from trilane.hw_profiles.schema import corners_of
 from trilane.pipeline.run_metrics import RunMetrics
 from trilane.pipeline.trial import Round
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.scheduler.placement import Ranked, Rules, frame_ns, ranked, worth_trying
-from trilane.scheduler.places import CpuCore, Placement
+from trilane.scheduler.placement import CpuCore, Placement, Ranked, Rules, frame_ns, ranked, worth_trying
 from trilane.scheduler.stats import median_interval
 from trilane.stages import PRELOAD
 from trilane.stages.avatar_assets import networks_of, painting

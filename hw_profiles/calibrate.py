@@ -43,11 +43,10 @@ import numpy as np
 from trilane.arrays import F64
 from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_text
-from trilane.hw_profiles.engine_layers import NAMES, RATES, TERMS
-from trilane.hw_profiles.engine_times import amounts, join, numbers_of
 from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.network_time import Interval, in_precision, interval, price, spread_of, under_runtime
 from trilane.hw_profiles.network_work import Work
+from trilane.hw_profiles.operators import NAMES, RATES, TERMS
 from trilane.hw_profiles.profile_files import load_tables, parse_profile
 from trilane.hw_profiles.schema import (
     KEY_OF_RATE,
@@ -59,7 +58,7 @@ from trilane.hw_profiles.schema import (
     Unit,
     corners_of,
 )
-from trilane.hw_profiles.unit_times import time_on
+from trilane.hw_profiles.unit_times import amounts, join, numbers_of, time_on
 from trilane.student import student_quantile
 from trilane.units import BURST, UNITS, UnitName
 

@@ -19,19 +19,21 @@ import numpy as np
 from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.files import read_text
-from trilane.hw_profiles.engine_layers import NAMES, Layers
 from trilane.hw_profiles.fit_engines import (
     ON_CHIP_MB,
     UNITS_OF_RATES,
     Fitted,
+    Latency,
     LeftOut,
     Prior,
     cross_validate,
     fit_anchors,
     fit_engine,
+    layers_of_rows,
+    read_latencies,
 )
-from trilane.hw_profiles.plot import figure_for
-from trilane.hw_profiles.published_times import Latency, layers_of_rows, read_latencies
+from trilane.hw_profiles.governor import figure_for
+from trilane.hw_profiles.operators import NAMES, Layers
 from trilane.hw_profiles.schema import ENGINES, NORMAL_80, EngineName
 from trilane.writing import write_atomically
 
@@ -254,7 +256,7 @@ def with_table(text: str, table: str, path: Path) -> str:
 def plot_errors(study: Study, path: Path) -> None:
     """Draw the published against the predicted time of each left-out row, by engine, on logarithmic axes.
 
-    `path`: path of the file; its ending is one of `trilane.hw_profiles.plot.SUFFIXES`.
+    `path`: path of the file; its ending is one of `trilane.hw_profiles.governor.SUFFIXES`.
     Raises MissingPartError without Matplotlib, BadInputError for another ending or a file that cannot be written.
     """
     figure = figure_for(path, (6.4, 6))

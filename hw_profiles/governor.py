@@ -1,24 +1,32 @@
-"""Temperatures of a device, the rules that throttle its units, and the governor that applies them to a run.
+"""Temperatures of a device, the rules that throttle its units, and the application over minutes under these rules.
 
 Each unit's junction (seconds) stands on the device's body (minutes). Each is an RC, T' = (T_below + R P - T) / tau,
 solved exactly over a step of constant power (lumped models of phones: Bhat, Gumussoy and Ogras, 2019). The rules are
 `step_wise` and `power_allocator` of the Linux thermal framework (Documentation/driver-api/thermal): pure functions of
 temperatures and power that move one unit by one corner per call. In a run on this machine a corner is a duty cycle: its
 clock divided by the highest clock.
+
+Between two polls of the governor the application stays in the settled state of its corners; nothing else changes the
+power. Reports and the picture of rate and temperature only sum up moments; they model nothing more. Matplotlib is an
+optional dependency; where it is missing, the error names it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import exp
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
-from trilane.errors import BadInputError
-from trilane.hw_profiles.schema import CORNERS, Profile, corners_of
+from trilane.errors import BadInputError, MissingPartError
+from trilane.hw_profiles.application import Plan, steady
+from trilane.hw_profiles.schema import CORNERS, Corners, Profile, corners_of
 from trilane.scheduler.events import SetDuty
 from trilane.scheduler.state import FULL_DUTY
-from trilane.units import PERFORMANCE_PROFILES, UNITS, UnitName
+from trilane.units import MAX_MINUTES, PERFORMANCE_PROFILES, UNITS, UnitName
+from trilane.writing import write_atomically
 
 #: Performance profiles that ask for a short wake-up of a sleeping unit: idle cores are kept awake.
 PROMPT = PERFORMANCE_PROFILES[:3]
@@ -292,3 +300,191 @@ class Governor:
                 events.append(SetDuty(unit, duty))
             self._duty[unit] = duty
         return events
+
+
+MOST_SHOWN = 360  # moments in a report
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The state at one poll of the governor.
+
+    `device_c`, `junction_c`: temperatures of the device and of the hottest junction, degrees Celsius. `throttled`:
+    whether a unit is below the corner that the performance profile requests. `corners`: corner of each unit.
+    """
+
+    t_s: float
+    frame_ms: float
+    device_c: float
+    junction_c: float
+    power_w: float
+    throttled: bool
+    corners: Corners
+
+
+class Settled(Protocol):
+    """A settled state at constant corners. `frame_ms`: its frame time. `busy`: share of the time, by unit."""
+
+    @property
+    def frame_ms(self) -> float: ...
+
+    @property
+    def busy(self) -> Mapping[str, float]: ...
+
+
+def over_time(
+    profile: Profile, plan: Plan, performance_profile: str, minutes: float, governor: str | None = None
+) -> list[Moment]:
+    """Run the application from a cold start and return one moment per poll of the governor.
+
+    `profile`: hardware profile of the chip.
+    `plan`: application that runs on it.
+    `performance_profile`: its name, one of PERFORMANCE_PROFILES.
+    `minutes`: virtual time, above 0 to MAX_MINUTES.
+    `governor`: name in GOVERNORS; None for the profile's own.
+    Raises BadInputError for an unknown name or a time out of range.
+    """
+    return warm_up(profile, lambda corners: steady(profile, plan, corners), performance_profile, minutes, governor)
+
+
+def warm_up(
+    profile: Profile,
+    at: Callable[[Corners], Settled],
+    performance_profile: str,
+    minutes: float,
+    governor: str | None = None,
+) -> list[Moment]:
+    """Do the same as `over_time` for any load whose settled state `at` gives.
+
+    `at`: returns the settled state at given corners; it is called once for each combination.
+    """
+    name = governor or profile.thermal.governor
+    if name not in GOVERNORS:
+        raise BadInputError("governor", repr(name), " or ".join(GOVERNORS))
+    if not 0 < minutes <= MAX_MINUTES:
+        raise BadInputError("minutes", f"{minutes:g}", f"above 0, at most {MAX_MINUTES}")
+    requested = dict(zip(UNITS, map(CORNERS.index, corners_of(profile, performance_profile)), strict=True))
+    thermal_state, throttle, moments = ThermalState.at_rest(profile), Throttle(), []
+    poll_s, steady_at = profile.thermal.poll_s.or_else(1.0), dict[Corners, Settled]()
+    for tick in range(max(1, round(60 * minutes / poll_s))):
+        cpu, gpu, dsp = (CORNERS[throttle.corner_index(unit, requested[unit])] for unit in UNITS)
+        corners = (cpu, gpu, dsp)
+        if corners not in steady_at:
+            steady_at[corners] = at(corners)
+        now = steady_at[corners]
+        power = unit_power_w(profile, now, corners)
+        thermal_state.advance(profile, power, poll_s)
+        total = sum(power.values()) + profile.thermal.base_power_w.or_else(0)
+        throttled = any(throttle.steps.values())
+        hottest = max(thermal_state.junction_c.values())
+        t_s = (tick + 1) * poll_s
+        moments.append(Moment(t_s, now.frame_ms, thermal_state.device_c, hottest, total, throttled, corners))
+        GOVERNORS[name](profile, thermal_state, throttle, requested, power)
+    return moments
+
+
+def unit_power_w(profile: Profile, now: Settled, corners: Corners) -> dict[UnitName, float]:
+    """Return the mean power of each unit in watts in the settled state `now`, with the units at `corners`."""
+    return {
+        name: profile.units[name].power_w(corner, now.busy[name]) for name, corner in zip(UNITS, corners, strict=True)
+    }
+
+
+def last_fifth(moments: Sequence[Moment]) -> Sequence[Moment]:
+    """Return the moments to which a run settles: the last fifth of them, at least one; empty without moments."""
+    return moments[-max(1, len(moments) // 5) :]
+
+
+def ends_of(moments: Sequence[Moment]) -> dict[str, float]:
+    """Return frames a second at the start, and those to which it settles: the mean of the last fifth of the time."""
+    last = last_fifth(moments)
+    return {"fps_start": 1e3 / moments[0].frame_ms, "fps_settled": 1e3 / (sum(m.frame_ms for m in last) / len(last))}
+
+
+def settled_corners(moments: Sequence[Moment]) -> Corners:
+    """Return the corners at which the units mostly are in the last fifth of the time."""
+    return Counter(moment.corners for moment in last_fifth(moments)).most_common(1)[0][0]
+
+
+def temperatures_of(moments: Sequence[Moment]) -> dict[str, float]:
+    """Return the degrees Celsius of the device and of its hottest junction; empty without moments."""
+    if not moments:
+        return {}
+    return {
+        "device_end": moments[-1].device_c,
+        "device_max": max(m.device_c for m in moments),
+        "junction_max": max(m.junction_c for m in moments),
+    }
+
+
+def caps_of(moments: Sequence[Moment]) -> dict[str, Any]:
+    """Return the share of the time in which a unit was lowered for heat, and the first second of it."""
+    throttled_s = [m.t_s for m in moments if m.throttled]
+    return {
+        "throttled_share": len(throttled_s) / len(moments) if moments else 0.0,
+        "first_throttled_s": throttled_s[0] if throttled_s else None,
+    }
+
+
+def timeline_of(moments: Sequence[Moment]) -> list[dict[str, Any]]:
+    """Return the moments as plain data, thinned."""
+    return [_shown(m) for m in moments[:: max(1, len(moments) // MOST_SHOWN)]]
+
+
+def _shown(moment: Moment) -> dict[str, Any]:
+    return {
+        "t_s": moment.t_s,
+        "fps": 1e3 / moment.frame_ms,
+        "device_c": moment.device_c,
+        "junction_c": moment.junction_c,
+        "power_w": moment.power_w,
+        "corners": dict(zip(UNITS, moment.corners, strict=True)),
+    }
+
+
+SUFFIXES = (".png", ".svg", ".pdf")
+
+
+def figure_for(path: Path, inches: tuple[float, float]) -> Any:
+    """Return an empty `matplotlib.figure.Figure`, `inches` wide and high, that can be drawn into the file.
+
+    `path`: path of the file; its ending is one of SUFFIXES.
+    Raises MissingPartError without Matplotlib, BadInputError for another ending.
+    """
+    if path.suffix not in SUFFIXES:
+        raise BadInputError(path, f"the ending {path.suffix!r}", "one of " + ", ".join(SUFFIXES))
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise MissingPartError("drawing needs Matplotlib", extra="plot") from None
+    return Figure(figsize=inches, layout="constrained")
+
+
+def plot_over_time(runs: Mapping[str, Sequence[Moment]], limit_c: float, title: str, path: Path) -> None:
+    """Draw frame rates and temperatures into a file.
+
+    `runs`: label of each curve -> its moments.
+    `limit_c`: temperature that is marked.
+    `title`: title of the picture.
+    `path`: path of the file; its ending is one of SUFFIXES.
+    Raises MissingPartError without Matplotlib, BadInputError for another ending or a file that cannot be written.
+    """
+    figure = figure_for(path, (8, 6))
+    rate, temperature = figure.subplots(2, 1, sharex=True)
+    for label, moments in runs.items():
+        minutes = [m.t_s / 60 for m in moments]
+        (line,) = rate.plot(minutes, [1e3 / m.frame_ms for m in moments], label=label)
+        colour = line.get_color()
+        temperature.plot(minutes, [m.device_c for m in moments], color=colour, label=f"{label}: device")
+        temperature.plot(
+            minutes, [m.junction_c for m in moments], color=colour, linestyle=":", label=f"{label}: junction"
+        )
+    temperature.axhline(limit_c, color="black", linewidth=0.8, linestyle="--", label=f"device limit {limit_c:g} °C")
+    rate.set(ylabel="frames per second", title=title)
+    rate.set_ylim(0, 1.15 * rate.get_ylim()[1])
+    temperature.set(xlabel="minutes (virtual clock)", ylabel="temperature, °C")
+    for axes in (rate, temperature):
+        axes.grid(alpha=0.3)
+        axes.legend(loc="lower right", fontsize="small")
+    with write_atomically(path) as draft:
+        figure.savefig(draft, dpi=120)

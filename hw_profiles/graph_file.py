@@ -18,10 +18,9 @@ from onnx import AttributeProto, TensorProto
 
 from trilane.errors import BadInputError
 from trilane.files import HEAD_BYTES, require_file, signature_of_head
-from trilane.hw_profiles.graph_checks import CUT_SHORT, check_structure, forget_data, in_order
-from trilane.hw_profiles.graph_shapes import with_shapes
+from trilane.hw_profiles.graph_tensors import CUT_SHORT, check_structure, forget_data, in_order, with_shapes
 from trilane.hw_profiles.network_work import Network, Work, constant_tensors, count_work
-from trilane.hw_profiles.operator_kinds import CONVOLUTIONS, PRODUCTS, Shape
+from trilane.hw_profiles.operators import CONVOLUTIONS, PRODUCTS, Shape
 from trilane.unexpected_value import UnexpectedValue
 
 MAX_BYTES = 512 << 20

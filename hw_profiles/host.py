@@ -18,8 +18,7 @@ from trilane import machine
 from trilane.errors import BadInputError, MissingPartError, did_you_mean, package_line
 from trilane.hw_profiles.schema import Profile
 from trilane.pipeline.description import UnitSettings
-from trilane.scheduler.placement import Ranked
-from trilane.scheduler.places import FULL, CpuCore, Place, Placement, has_own_cores
+from trilane.scheduler.placement import FULL, CpuCore, Place, Placement, Ranked, has_own_cores
 from trilane.units import NS_PER_MS, UNITS
 
 CORES = "UNIT=LIST, such as dsp=0,1 or dsp=2-5"

@@ -21,9 +21,20 @@ from trilane.hw_profiles.rates import without_interval
 from trilane.hw_profiles.reference_networks import CHANNELS_PER_PASS
 from trilane.hw_profiles.schema import Corners, Measured, Profile, Quantity, Unit
 from trilane.hw_profiles.unit_times import time_on
-from trilane.scheduler.placement import SCHEDULER_NS, Ranked, Rules, chosen, frame_ns, ranked
-from trilane.scheduler.places import CpuCore, Place, Placement, Times, shared_cores
-from trilane.scheduler.places import UnitWork as FrameWork
+from trilane.scheduler.placement import (
+    SCHEDULER_NS,
+    CpuCore,
+    Place,
+    Placement,
+    Ranked,
+    Rules,
+    Times,
+    chosen,
+    frame_ns,
+    ranked,
+    shared_cores,
+)
+from trilane.scheduler.placement import UnitWork as FrameWork
 from trilane.units import BEFORE_INFER, NS_PER_MS, UNITS, UnitName
 
 NETWORK: UnitName = "dsp"

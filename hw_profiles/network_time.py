@@ -17,13 +17,7 @@ from typing import Any, Final, NamedTuple
 
 from trilane.arrays import F64
 from trilane.errors import BadInputError
-from trilane.hw_profiles.engine_layers import NAMES, EngineLayer
-from trilane.hw_profiles.engine_times import BOUNDS, Bound, engine_time, numbers_of
-from trilane.hw_profiles.graph_file import GraphFile, NumberFormat
-from trilane.hw_profiles.host_model import UNMEASURED, with_known_intervals
-from trilane.hw_profiles.network_work import Operator, Work
-from trilane.hw_profiles.operator_kinds import COMPILED
-from trilane.hw_profiles.over_time import (
+from trilane.hw_profiles.governor import (
     Moment,
     caps_of,
     ends_of,
@@ -32,15 +26,23 @@ from trilane.hw_profiles.over_time import (
     timeline_of,
     warm_up,
 )
+from trilane.hw_profiles.graph_file import GraphFile, NumberFormat
+from trilane.hw_profiles.host_model import UNMEASURED, with_known_intervals
+from trilane.hw_profiles.network_work import Operator, Work
+from trilane.hw_profiles.operators import COMPILED, NAMES, EngineLayer
 from trilane.hw_profiles.rates import NOTHING, FrameInterval, FrameLoad, Wanted, answers, device_power
 from trilane.hw_profiles.schema import NORMAL_80, Corners, EngineRuntime, Profile, Unit, corners_of
 from trilane.hw_profiles.unit_times import (
+    BOUNDS,
+    Bound,
     JobTime,
     UnitNumbers,
+    engine_time,
     fallback_ms,
     job_time,
     layer_times,
     machine_of,
+    numbers_of,
     relative_error,
     time_on,
 )

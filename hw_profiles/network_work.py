@@ -18,21 +18,26 @@ import onnx
 from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles.engine_layers import NO_LAYERS, RENAMES, Layers, Shapes, first_result, layers_of
-from trilane.hw_profiles.operator_kinds import (
+from trilane.hw_profiles.operators import (
     CLASSES,
     CONVOLUTIONS,
     DOMAINS,
     FOLDED,
     KIND_OF,
     LAYOUT_CHANGES,
+    NO_LAYERS,
     OF_SHAPES,
     PRODUCTS,
     RECURRENT,
+    RENAMES,
     STATISTICS,
     UNKNOWN,
     WEIGHTED,
+    Layers,
+    Shapes,
+    first_result,
     has_rule,
+    layers_of,
     product_of,
 )
 
@@ -50,7 +55,7 @@ class Operator(NamedTuple):
     `op_type`: its ONNX type. `kind`: one of CLASSES. `macs`: multiply-accumulates. `moved`: activation elements read
     and written. `weights`: elements of its weights. `c_in`, `c_out`: input and output channels per group, 0 for an
     operator without products. `out`: elements of the result. `live`: elements that later operators still need after it.
-    `ruled`: whether `operator_kinds.py` knows the operator; an unknown one counts as the movement of its elements.
+    `ruled`: whether `operators.py` knows the operator; an unknown one counts as the movement of its elements.
     """
 
     name: str

@@ -23,11 +23,7 @@ from trilane.hw_profiles.application import (
     stage_times_ms,
     steady,
 )
-from trilane.hw_profiles.host import described, host_cores, usable_cores
-from trilane.hw_profiles.host_model import UNMEASURED, Placed, on_cores, place_units, with_known_intervals
-from trilane.hw_profiles.network_time import Interval, interval, price, spread_of
-from trilane.hw_profiles.network_work import Network
-from trilane.hw_profiles.over_time import (
+from trilane.hw_profiles.governor import (
     caps_of,
     ends_of,
     over_time,
@@ -36,6 +32,10 @@ from trilane.hw_profiles.over_time import (
     timeline_of,
     unit_power_w,
 )
+from trilane.hw_profiles.host import described, host_cores, usable_cores
+from trilane.hw_profiles.host_model import UNMEASURED, Placed, on_cores, place_units, with_known_intervals
+from trilane.hw_profiles.network_time import Interval, interval, price, spread_of
+from trilane.hw_profiles.network_work import Network
 from trilane.hw_profiles.rates import NOTHING, FrameInterval, FrameLoad, Wanted, answers, device_power
 from trilane.hw_profiles.reference_networks import ConfigurationRow, reference_network
 from trilane.hw_profiles.schema import Corners, Profile, corners_of

@@ -11,7 +11,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles.engine_layers import TERMS
+from trilane.hw_profiles.operators import TERMS
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import PERFORMANCE_PROFILES, UNITS, PerformanceProfile, UnitName
 
@@ -156,9 +156,7 @@ class Engine(ProfileTable):
     rates: EngineRates = Field(description="The numbers of the chip; the next table lists them.")
     factors: dict[str, Rate] = Field(
         default={},
-        description=(
-            "How many times more each term of `engine_layers.py` costs than a plain convolution; 1 if not given."
-        ),
+        description=("How many times more each term of `operators.py` costs than a plain convolution; 1 if not given."),
     )
     seen: dict[str, dict[str, Annotated[float, Field(ge=0, le=1)]]] = Field(
         default={}, description="Each network of the fit, with the share of its time that each term takes."

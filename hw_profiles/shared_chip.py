@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple
 
+from trilane.hw_profiles.governor import Moment, last_fifth, temperatures_of, unit_power_w, warm_up
 from trilane.hw_profiles.host_model import UNMEASURED
-from trilane.hw_profiles.over_time import Moment, last_fifth, temperatures_of, unit_power_w, warm_up
 from trilane.hw_profiles.pipeline_prediction import FED_FRAMES, Ends, over_ends, steady_ms
 from trilane.hw_profiles.rates import FrameInterval, holding, wanted_drops, without_interval
 from trilane.hw_profiles.schema import Corners, Profile, corners_of

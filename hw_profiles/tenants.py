@@ -24,7 +24,6 @@ from trilane.hw_profiles.application import (
     application_graph,
     stage_times_ms,
 )
-from trilane.hw_profiles.engine_times import numbers_of, spilled
 from trilane.hw_profiles.graph_file import GraphFile
 from trilane.hw_profiles.network_time import AS_IT_SAYS, Computes, interval, price
 from trilane.hw_profiles.network_work import Network, Work
@@ -41,7 +40,7 @@ from trilane.hw_profiles.pipeline_prediction import (
     repeats_after,
 )
 from trilane.hw_profiles.schema import Corners, Profile, Unit
-from trilane.hw_profiles.unit_times import time_on
+from trilane.hw_profiles.unit_times import numbers_of, spilled, time_on
 from trilane.pipeline.file_graph import edge_rules, graph_of, settings_of
 from trilane.pipeline.file_keys import OnnxStage
 from trilane.pipeline.pipeline_file import PipelineFile

@@ -24,7 +24,7 @@ from pydantic.functional_validators import ModelWrapValidatorHandler
 
 from trilane.errors import BadInputError
 from trilane.scheduler.events import Graph, Input, StageSpec
-from trilane.scheduler.places import Place
+from trilane.scheduler.placement import Place
 from trilane.scheduler.state import build
 from trilane.transport.packets import FRAME_FIELDS, header_dtype
 from trilane.transport.slots import edge_rule

@@ -15,7 +15,7 @@ from trilane.pipeline.timeline import ExplainedJob, Timeline
 from trilane.pipeline.what_if import SLOWER, Cost, Slowed, WhatIf
 from trilane.scheduler.events import Graph, Settings
 from trilane.scheduler.ledger import JobRecord
-from trilane.scheduler.places import Place, Placement, busiest_core_ns
+from trilane.scheduler.placement import Place, Placement, busiest_core_ns
 
 
 class RunEfficiencies:

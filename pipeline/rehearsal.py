@@ -22,7 +22,7 @@ from trilane.pipeline.result import UnitError
 from trilane.pipeline.unit_processes import START_S, UnitProcesses, listen_before_run, start_units
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.events import Graph, StageAlone
-from trilane.scheduler.places import Times, UnitWork
+from trilane.scheduler.placement import Times, UnitWork
 from trilane.transport.messages import Done, RunJob
 from trilane.transport.slots import edge_rule
 from trilane.unexpected_value import UnexpectedValue

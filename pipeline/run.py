@@ -121,7 +121,7 @@ def run_pipeline(
     `latch_ms`: margin in ms by which the first stage should end before the second can take its frame; 0: it begins at
     once.
     `works`: work of each rung of a ladder in thousandths, the most first; used where frames are released at a rate. A
-    frame that would be late is given less work (`trilane.scheduler.work_ladder`), and the first stage is told
+    frame that would be late is given less work (`trilane.scheduler.policy`), and the first stage is told
     (`SteppedStage`).
     `follow`: names of the stages whose time follows the work.
     `settings`: settings of the scheduler, which replace `frames` and the options above except `fps`.

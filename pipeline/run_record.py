@@ -36,7 +36,7 @@ from trilane.pipeline.reckoning import Reckoned, reckoned
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import Action, Event, Graph, Settings
 from trilane.scheduler.ledger import JobRecord
-from trilane.scheduler.places import Placement
+from trilane.scheduler.placement import Placement
 from trilane.scheduler.recording import Recording
 from trilane.scheduler.state import FULL_DUTY
 from trilane.writing import WRITABLE

@@ -1,7 +1,7 @@
 """Turns the journal of a run into frames, jobs, waits and idle time.
 
 Rule: no other module interprets a journal's events. The scheduler's own parts tell what it knew: its source says which
-frames are released and wait (frame_source.py). Its record of a frame says when the frame was sampled and how long it
+frames are released and wait (policy.py). Its record of a frame says when the frame was sampled and how long it
 took (state.py).
 
 A frame waits before the first stage from its release on. It waits before another stage from the step in which the
@@ -38,8 +38,8 @@ from trilane.scheduler.events import (
     UnitDied,
     UnitReady,
 )
-from trilane.scheduler.frame_source import Source
 from trilane.scheduler.ledger import JOIN, JobRecord
+from trilane.scheduler.policy import Source
 from trilane.scheduler.state import FrameState
 
 SOURCE: Final = "source"

@@ -14,8 +14,8 @@ from typing import Final, NamedTuple, Protocol
 
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import NEVER, Event, Graph, Job, JobDone, Settings
-from trilane.scheduler.frame_source import Source
 from trilane.scheduler.ledger import FrameLeft
+from trilane.scheduler.policy import Source
 from trilane.scheduler.state import FrameState
 
 UNKNOWN: Final = -1  # the number of a frame that is gone and cannot be told from others

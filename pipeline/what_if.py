@@ -4,7 +4,7 @@ Rule: nothing is measured here; equal journals give equal answers.
 
 A share of the critical path says how the time went. It does not say how a run reacts: a longer job is moved to another
 core more often, and takes that core from a unit that was on no path. Therefore the replay does some of the run's frames
-again (`trilane.scheduler.shared_cores`). It uses the CPU times of their own jobs, the run's placement and the run's
+again (`trilane.scheduler.virtual`). It uses the CPU times of their own jobs, the run's placement and the run's
 scheduler. After that it does them once more for each stage, with all jobs of the stage longer by SLOWER.
 
 The replay knows no other programs, caps or restarts. Therefore its frame time is compared with the run's, and it is
@@ -23,10 +23,9 @@ from typing import Final, NamedTuple
 from trilane.pipeline.timeline import ExplainedJob
 from trilane.pipeline.unit_history import OVERHEAD
 from trilane.scheduler.events import NEVER, Graph, Settings
-from trilane.scheduler.placement import SCHEDULER_NS
-from trilane.scheduler.places import Placement
-from trilane.scheduler.shared_cores import Need, SharedCores
+from trilane.scheduler.placement import SCHEDULER_NS, Placement
 from trilane.scheduler.stats import LEAST_FRAMES, batch_interval
+from trilane.scheduler.virtual import Need, SharedCores
 
 SLOWER: Final = 0.2
 #: Largest difference between the frame times of the replay and of the run, as a share, for which the replay is trusted.

@@ -21,9 +21,8 @@ from collections.abc import Mapping, Sequence
 
 from trilane.scheduler.events import NEVER, Action, Dispatch, DropCause, Settings
 from trilane.scheduler.flow import Bypass, Flow, next_slot, side_of, stale_slot
-from trilane.scheduler.frame_source import Source
 from trilane.scheduler.ledger import ASSIGNED, BLOCKED, JOIN, STARVED, THROTTLED, Ledger
-from trilane.scheduler.policy import Candidate, Policy
+from trilane.scheduler.policy import Candidate, Policy, Source
 from trilane.scheduler.state import READY, FrameState, StageState, UnitState
 from trilane.transport.slots import READING, EdgeSlots
 

@@ -70,9 +70,8 @@ from trilane.scheduler.events import (
     UnitReady,
 )
 from trilane.scheduler.flow import Flow
-from trilane.scheduler.frame_source import Source
 from trilane.scheduler.ledger import Books, Ledger
-from trilane.scheduler.policy import policy_named
+from trilane.scheduler.policy import Source, WorkLadder, policy_named
 from trilane.scheduler.state import (
     FULL_DUTY,
     KILL,
@@ -90,7 +89,6 @@ from trilane.scheduler.state import (
     next_alarm_ns,
     verdict,
 )
-from trilane.scheduler.work_ladder import WorkLadder
 
 
 class Core:

@@ -114,7 +114,7 @@ class Job(NamedTuple):
     slots of the bypassed edge are counted after those of the input edge.
     `fresh`: whether the stage must ignore what earlier frames left behind; set for the stage at which the bypass
     begins.
-    `rung`: rung of the frame's work (work_ladder.py).
+    `rung`: rung of the frame's work (policy.py).
     """
 
     id: int
@@ -455,7 +455,7 @@ class Settings:
     `latch_ns`: margin by which a frame's first stage is expected to end before the second can take it. The first stage
     begins that late so that its sample is newer and waits less.
     `deadline_ns`: longest time from a frame's release to its presentation.
-    `works`: work of each rung of the ladder (work_ladder.py) in thousandths, 1000 first, falling; empty: no ladder.
+    `works`: work of each rung of the ladder (policy.py) in thousandths, 1000 first, falling; empty: no ladder.
     `follow`: names of the stages whose time follows the work.
     `in_flight`: limit of frames between admission and presentation.
     `in_queue`: limit of released frames that wait; more are turned away.

@@ -1,16 +1,37 @@
-"""The scheduling policies, and the settings of a run under one of them.
+"""What is decided of a frame before its first job: its run's policy, when it is released, and how much work it gets.
 
 Rule: a policy is a row of the table; policies differ in their rows alone. Runs on this machine and runs in virtual time
-take their settings from here, so that a policy means the same on both clocks.
+take their settings from here, so that a policy means the same on both clocks. The source queues frames within limits:
+each frame leaves it once, or is counted.
+
+Less work is chosen so that a frame is in time. Rule: measured times decide; less work is chosen at once, more work only
+later. A ladder has rungs: rung 0 is all the work, and each further rung is less work at the price of a worse picture.
+Some stages take less time for less work (the network); the others are taken to need the same time.
+
+The time of a stage on a rung is the time that it took there alone, times its load. The time alone comes from
+`set_alone`, or else is proportional to the work. The load is the ratio of the stage's time to its time alone. The
+median over its last three jobs counts, so that one slow job decides nothing.
+
+The use of a rung is the larger of two shares:
+- the busiest unit's time for a frame, as a share of the period;
+- the time of all stages, as a share of the deadline.
+
+The wanted rung is the first whose use is at most `FULL`. Without such a rung, it is the first rung whose use exceeds
+the least use by at most a twentieth, because less work would save nothing.
+
+The ladder steps down at once. It takes one step up after `patience` frames in which the use of the rung above was at
+most `ROOM`. If the ladder steps down again sooner than that, the patience doubles, up to `MOST_PATIENCE`.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
-from trilane.scheduler.events import Settings
+from trilane.scheduler.events import NEVER, DropCause, Settings
+from trilane.scheduler.state import StageState
 from trilane.unexpected_value import UnexpectedValue
 
 
@@ -93,3 +114,238 @@ def run_settings(policy: str, frames: int, scene_period_ns: int, forced_period_n
     """
     period_ns = forced_period_ns or (scene_period_ns if policy_named(policy).paced else 0)
     return Settings(frames, policy, period_ns=period_ns, deadline_ns=DEADLINE_PERIODS * period_ns, **others)
+
+
+class Source:
+    """The source of frames 0..n-1. A released frame waits in `queue` until it is taken, turned away, or out of time.
+
+    Without a rate (no period, no arrivals, no requests) a frame counts as released at the moment when it can be taken.
+    While frames are held, `hold` alone releases them, a few at a time. After the hold the next frame is due at once,
+    and the frames after it follow at their usual distances.
+
+    `drop`: function that is called with each frame that is dropped here, its release time and the cause.
+    `due_ns`: time at which the next frame is released or the oldest waiting frame runs out of time.
+    `is_empty`: whether no frame can be taken now.
+    """
+
+    def __init__(self, settings: Settings, drop: Callable[[int, int, DropCause], None]) -> None:
+        self._settings = settings
+        self._drop = drop
+        self._next = 0
+        self._end = settings.frames
+        self._start_ns = 0
+        self._paced = bool(settings.period_ns or settings.arrivals_ns or settings.asked)
+        self._held = False
+        self._forgotten = 0
+        self.queue: deque[tuple[int, int]] = deque()
+        self.due_ns = NEVER
+        self.is_empty = self._paced or not self._end  # with a rate, no frame is released before `start`
+
+    @property
+    def _waits(self) -> bool:
+        """Whether a frame must be released before it can be taken."""
+        return self._paced or self._held
+
+    def start(self, now_ns: int) -> None:
+        """Begin the run: periods and arrivals count from `now_ns`."""
+        self._start_ns = now_ns
+        self._set_due()
+
+    def stop(self) -> None:
+        """Release nothing more, and forget the waiting frames."""
+        self._end = self._next
+        self._forgotten += len(self.queue)
+        self.queue.clear()
+        self._set_due()
+
+    @property
+    def released(self) -> int:
+        """The number of frames released so far: those that have left, those that wait, and those that `stop` forgot."""
+        return self._next
+
+    @property
+    def left(self) -> int:
+        """The number of frames that were taken or dropped here."""
+        return self._next - self._forgotten - len(self.queue)
+
+    @property
+    def exhausted(self) -> bool:
+        return self._next >= self._end and not self.queue
+
+    def advance(self, now_ns: int) -> bool:
+        """Release the frames that are due, drop those that waited too long, and return whether something changed."""
+        changed = False
+        while self._paced and not self._held and self._next < self._end:
+            release_ns = self._release_ns(self._next)
+            if release_ns > now_ns:
+                break
+            self._admit(self._next, release_ns)
+            self._next += 1
+            changed = True
+        timeout = self._settings.queue_timeout_ns
+        while timeout and self.queue and self.queue[0][1] + timeout <= now_ns:
+            self._drop(*self.queue.popleft(), DropCause.TIMEOUT)
+            changed = True
+        self._set_due()
+        return changed
+
+    def request(self, count: int, now_ns: int) -> None:
+        """Release `count` frames, or all that are left if they are fewer."""
+        for frame in range(self._next, min(self._next + count, self._end)):
+            self._admit(frame, now_ns)
+            self._next += 1
+        self._set_due()
+
+    def hold(self, frames: int, now_ns: int) -> None:
+        """Release `frames` frames and no more until the next call; -1 ends the hold."""
+        if frames >= 0:
+            self._held = True
+            self.request(frames, now_ns)
+        elif self._held:
+            self._held = False
+            if self._paced and not self._settings.asked and self._next < self._end:
+                # The schedule is moved on, so that the frames that came due in the hold are not all released at its
+                # end.
+                self._start_ns += now_ns - self._release_ns(self._next)
+            self._set_due()
+
+    def head(self, now_ns: int) -> tuple[int, int]:
+        """Return the next frame and its release time; only valid if `is_empty` is False."""
+        return self.queue[0] if self.queue else (self._next, now_ns)
+
+    def keep_newest(self) -> None:
+        """Drop all waiting frames but the newest, as stale."""
+        while len(self.queue) > 1:
+            self._drop(*self.queue.popleft(), DropCause.STALE)
+        self._set_due()
+
+    def drop_late_head(self) -> None:
+        """Drop the frame that has waited longest, as it cannot be in time."""
+        self._drop(*self.queue.popleft(), DropCause.LATE)
+        self._set_due()
+
+    def take(self, now_ns: int) -> tuple[int, int]:
+        """Remove the head, and return it with its release time."""
+        head = self.head(now_ns)
+        if self.queue:
+            self.queue.popleft()
+        else:
+            self._next += 1
+        self._set_due()
+        return head
+
+    def _admit(self, frame: int, release_ns: int) -> None:
+        limit = self._settings.in_queue
+        if limit and len(self.queue) >= limit:
+            self._drop(frame, release_ns, DropCause.QUEUE_FULL)
+        else:
+            self.queue.append((frame, release_ns))
+
+    def _set_due(self) -> None:
+        self.is_empty = not self.queue and (self._waits or self._next >= self._end)
+        is_timed = self._paced and not self._held and self._next < self._end
+        self.due_ns = self._release_ns(self._next) if is_timed else NEVER
+        if self._settings.queue_timeout_ns and self.queue:
+            self.due_ns = min(self.due_ns, self.queue[0][1] + self._settings.queue_timeout_ns)
+
+    def _release_ns(self, frame: int) -> int:
+        # Requests alone release frames.
+        if self._settings.asked:
+            return NEVER
+        arrivals = self._settings.arrivals_ns
+        return self._start_ns + (arrivals[frame] if arrivals else frame * self._settings.period_ns)
+
+
+FULL: Final = 900  # thousandths of the period or the deadline
+ROOM: Final = 750
+PATIENCE: Final = 30  # frames
+MOST_PATIENCE: Final = 960
+SAMPLES: Final = 3
+ALL: Final = 1000  # thousandths: all the work
+LOAD_ONE: Final = 1 << 20  # a load of 1
+TWENTIETH: Final = 20
+
+
+class WorkLadder:
+    """The ladder of a run.
+
+    `rung`: rung of the frames that begin from now on.
+    `patience`: number of frames until the next step up.
+    """
+
+    def __init__(
+        self,
+        stages: Sequence[StageState],
+        works: Sequence[int],
+        follow: Sequence[str],
+        period_ns: int,
+        deadline_ns: int,
+    ) -> None:
+        """Begin at rung 0.
+
+        `stages`: stages of the chain.
+        `works`: work of each rung in thousandths, ALL first, falling.
+        `follow`: names of the stages whose time follows the work.
+        `period_ns`: period of frames, more than 0.
+        `deadline_ns`: longest time from a frame's release to its presentation; 0: none.
+        """
+        self.rung = 0
+        self.patience = PATIENCE
+        self.last = max([stage.position for stage in stages if stage.name in follow], default=-1)
+        self._stages = stages
+        self._period_ns, self._deadline_ns = period_ns, deadline_ns
+        self._rungs = len(works)
+        self._alone = [list(works) if stage.name in follow else [ALL] * len(works) for stage in stages]
+        self._loads: list[deque[int]] = [deque(maxlen=SAMPLES) for _ in stages]
+        self._waited = 0
+        self._since_up = MOST_PATIENCE
+
+    def set_alone(self, position: int, rung: int, service_ns: int) -> None:
+        """Set the time that the stage at `position` takes on `rung` alone; to be called for all rungs or for none."""
+        self._alone[position][rung] = max(service_ns, 1)
+
+    def learn(self, position: int, rung: int, service_ns: int) -> None:
+        """Note that the stage at `position` took `service_ns` for a frame that began on `rung`."""
+        self._loads[position].append(service_ns * LOAD_ONE // self._alone[position][rung])
+
+    def service_ns(self, position: int, rung: int) -> int:
+        """Return the time that the stage at `position` would take now on `rung`; 0 before its first job."""
+        loads = sorted(self._loads[position])
+        return self._alone[position][rung] * loads[len(loads) // 2] // LOAD_ONE if loads else 0
+
+    def use(self, rung: int) -> int:
+        """Return the use of `rung` in thousandths."""
+        of_units: dict[str, int] = {}
+        for stage in self._stages:
+            name = stage.unit.name
+            of_units[name] = of_units.get(name, 0) + self.service_ns(stage.position, rung)
+        busiest = max(of_units.values()) * ALL // self._period_ns
+        if not self._deadline_ns:
+            return busiest
+        return max(busiest, sum(of_units.values()) * ALL // self._deadline_ns)
+
+    def consider(self) -> bool:
+        """Choose the rung, once for each frame that was measured, and return whether it changed."""
+        uses = [self.use(rung) for rung in range(self._rungs)]
+        wanted = _first_that_does(uses)
+        self._since_up += 1
+        if wanted > self.rung:
+            failed = self._since_up <= self.patience
+            self.patience = min(2 * self.patience, MOST_PATIENCE) if failed else PATIENCE
+            self.rung, self._waited, self._since_up = wanted, 0, MOST_PATIENCE
+            return True
+        has_room = self.rung > 0 and uses[self.rung - 1] <= ROOM
+        self._waited = self._waited + 1 if has_room else 0
+        if self._waited < self.patience:
+            return False
+        self.rung, self._waited, self._since_up = self.rung - 1, 0, 0
+        return True
+
+
+def _first_that_does(uses: Sequence[int]) -> int:
+    """Return the first rung whose use is at most `FULL`; without one, the first that is about as good as the best."""
+    for rung, use in enumerate(uses):
+        if use <= FULL:
+            return rung
+    enough = min(uses) + min(uses) // TWENTIETH
+    return [use <= enough for use in uses].index(True)

@@ -24,7 +24,7 @@ from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline
 from trilane.pipeline.trial import SLICE, Group, Round, try_in_turns
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.scheduler.places import CpuCore, Place, Placement
+from trilane.scheduler.placement import CpuCore, Place, Placement
 from trilane.stages import FACTORIES, PRELOAD
 from trilane.stages.avatar_assets import only_network_of
 from trilane.stages.config import MAX_CHANNELS, PAINTED_CHANNELS, RunConfig, pose_dtype, posed_vertices_bytes

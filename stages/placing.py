@@ -35,8 +35,21 @@ from trilane.hw_profiles.host import (
 from trilane.pipeline.rehearsal import Rehearsed
 from trilane.pipeline.surroundings import OtherPrograms
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.scheduler.placement import Ranked, Rules, chosen, fastest, frame_ns, ranked, typical, worth_trying
-from trilane.scheduler.places import CpuCore, Place, Placement, Times, UnitWork
+from trilane.scheduler.placement import (
+    CpuCore,
+    Place,
+    Placement,
+    Ranked,
+    Rules,
+    Times,
+    UnitWork,
+    chosen,
+    fastest,
+    frame_ns,
+    ranked,
+    typical,
+    worth_trying,
+)
 from trilane.stages.avatar_assets import networks_of
 from trilane.stages.avatar_pipeline import measured_times, thread_counts, tried
 from trilane.stages.configure import Checked

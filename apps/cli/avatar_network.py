@@ -281,7 +281,7 @@ def calibrations(
     methods = method or list(METHODS)
     console = stderr_console()
     if plot is not None:
-        from trilane.hw_profiles.plot import figure_for
+        from trilane.hw_profiles.governor import figure_for
         from trilane.writing import require_writable
 
         figure_for(plot, (1, 1))  # that it can be drawn and written is found out before the work

@@ -58,8 +58,7 @@ def draw(chip: Profile, plan: Plan, asked: str, minutes: float, governor: str | 
     `governor`: name of the governor that lowers the clocks; None for the profile's own.
     `path`: file to write.
     """
-    from trilane.hw_profiles.over_time import over_time
-    from trilane.hw_profiles.plot import plot_over_time
+    from trilane.hw_profiles.governor import over_time, plot_over_time
 
     names = dict.fromkeys((SUSTAINED, BURST, asked))
     runs = {name: over_time(chip, plan, name, minutes, governor) for name in names}

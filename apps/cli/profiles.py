@@ -97,8 +97,8 @@ def check(
     """Check profiles: their keys and ranges, and published latencies that they should reproduce."""
     from rich.table import Table
 
+    from trilane.hw_profiles.fit_engines import check_published
     from trilane.hw_profiles.profile_files import load_profile, profile_names
-    from trilane.hw_profiles.published_times import check_published
 
     profiles = {name: load_profile(name) for name in names or profile_names()}
     latencies = [row for profile in profiles.values() for row in check_published(profile.name, profile)]

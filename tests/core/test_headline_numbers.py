@@ -31,7 +31,7 @@ from trilane.pipeline.reckoning import Reckoned, reckoned
 from trilane.scene.crop import Rect
 from trilane.scene.planner import FrameWork
 from trilane.scheduler.events import Graph, SetDuty, Settings, chain
-from trilane.scheduler.places import Place
+from trilane.scheduler.placement import Place
 from trilane.scheduler.shared_units import Member, simulate_beside
 from trilane.scheduler.virtual import Simulation, simulate
 from trilane.stages.configure import configure

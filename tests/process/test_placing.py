@@ -13,7 +13,7 @@ from trilane import machine
 from trilane.errors import TrilaneError
 from trilane.hw_profiles.host import rule_placement, usable_cores
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.scheduler.places import Times
+from trilane.scheduler.placement import Times
 from trilane.stages import PRELOAD, placing
 from trilane.stages.configure import Checked, configure
 from trilane.stages.dsp.bare_calls import calls_of

@@ -19,13 +19,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trilane.hw_profiles.calibrate import OwnRow, _EngineRow, _solve, calibrate_tables, on_chip, with_numbers
-from trilane.hw_profiles.engine_layers import NAMES, RATES
 from trilane.hw_profiles.engine_study import LEAST_SHARE, LEFT_ASIDE, PROFILE_OF, EngineStudy, study_engine
-from trilane.hw_profiles.fit_engines import UNITS_OF_RATES
+from trilane.hw_profiles.fit_engines import UNITS_OF_RATES, Latency, layers_of_rows, read_latencies
 from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.network_time import Interval, interval, price
+from trilane.hw_profiles.operators import NAMES, RATES
 from trilane.hw_profiles.profile_files import load_tables, parse_profile
-from trilane.hw_profiles.published_times import Latency, layers_of_rows, read_latencies
 from trilane.hw_profiles.schema import ENGINES, EngineName, Profile, corners_of
 from trilane.units import BURST
 

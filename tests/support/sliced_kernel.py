@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from random import Random
 
-from trilane.scheduler.places import CpuCore, Placement
+from trilane.scheduler.placement import CpuCore, Placement
 
 STEP_MS, SLICE_MS, SLOTS, FRAMES, WARM = 0.1, 1.0, 2, 40, 10
 SPREAD = 0.05  # of a job's time

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F32
 from trilane.errors import BadInputError
-from trilane.hw_profiles.plot import figure_for
+from trilane.hw_profiles.governor import figure_for
 from trilane.training.quantising.calibration import METHODS
 from trilane.training.quantising.quantise import quantise
 from trilane.writing import write_atomically

@@ -13,8 +13,7 @@ from trilane.bench.lib.cast import Box
 from trilane.errors import BadInputError
 from trilane.pipeline.rehearsal import Rehearsed
 from trilane.pipeline.trial import Round
-from trilane.scheduler.placement import Ranked
-from trilane.scheduler.places import CpuCore, Place, UnitWork
+from trilane.scheduler.placement import CpuCore, Place, Ranked, UnitWork
 from trilane.stages.placing import TriedPlacement
 
 HERE = {"cpu": Place((0,), 1), "gpu": Place((1,), 1)}

@@ -34,9 +34,9 @@ from trilane.hw_profiles.calibrate import (
     prior_covariance,
     read_own_rows,
 )
+from trilane.hw_profiles.fit_engines import WORK, read_latencies
 from trilane.hw_profiles.network_time import Interval, interval, price, spread_of
 from trilane.hw_profiles.profile_files import load_profile, load_tables, parse_profile
-from trilane.hw_profiles.published_times import WORK, read_latencies
 from trilane.hw_profiles.reference_networks import NetworkSpec, network_work
 from trilane.hw_profiles.schema import KEY_OF_RATE, MOST_ERROR_SCALE, NORMAL_80, Profile, corners_of
 from trilane.units import BURST, UnitName

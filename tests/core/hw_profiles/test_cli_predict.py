@@ -16,7 +16,7 @@ from trilane.apps.cli import predict_output
 from trilane.apps.predict.predict_options import PredictOptions
 from trilane.apps.run.verdict_facts import predicted_verdict
 from trilane.avatars.bundle import load_bundle
-from trilane.hw_profiles import over_time, plot, profile_files, reference_networks
+from trilane.hw_profiles import governor, profile_files, reference_networks
 from trilane.hw_profiles import predict as predictions
 from trilane.hw_profiles.application import REFERENCE, Plan, Variant
 from trilane.hw_profiles.network_work import Network, count_work
@@ -391,8 +391,8 @@ def test_a_drawing_has_the_usual_profiles_beside_the_one_asked_for(
     asked_for: str, names: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: list[Any] = []
-    monkeypatch.setattr(over_time, "over_time", lambda *given: given)
-    monkeypatch.setattr(plot, "plot_over_time", lambda *given: drawn.append(given))
+    monkeypatch.setattr(governor, "over_time", lambda *given: given)
+    monkeypatch.setattr(governor, "plot_over_time", lambda *given: drawn.append(given))
     network: Any = SimpleNamespace(facts={"encoder": "resnet18", "norm": "batch"}, height=64, width=32, channels=4)
     plan = Plan(network, "gpu")
     chip: Any = SimpleNamespace(

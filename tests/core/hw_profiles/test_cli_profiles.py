@@ -12,9 +12,9 @@ import pytest
 
 from trilane.apps.cli import profiles as cli
 from trilane.hw_profiles import fit as fit_module
-from trilane.hw_profiles import profile_files, published_times
+from trilane.hw_profiles import fit_engines, profile_files
 from trilane.hw_profiles.fit import ProfileFit, Residual
-from trilane.hw_profiles.published_times import PublishedTime
+from trilane.hw_profiles.fit_engines import PublishedTime
 from trilane.hw_profiles.reference_networks import ConfigurationRow, NetworkSpec
 
 Command = Callable[..., tuple[str, str]]
@@ -54,7 +54,7 @@ def known(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(profile_files, "load_profile", load_profile)
     monkeypatch.setattr(profile_files, "profile_names", lambda: ["one", "form", "two"])
-    monkeypatch.setattr(published_times, "check_published", check_published)
+    monkeypatch.setattr(fit_engines, "check_published", check_published)
 
 
 @pytest.mark.usefixtures("known")

@@ -15,10 +15,10 @@ from onnx import TensorProto, helper
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import isolated_job_time, split_work
+from trilane.hw_profiles.fit_engines import PUBLISHED_MS, check_published, resnet18_work, unet_work
 from trilane.hw_profiles.network_work import Operator, Work, count_work, one_after_the_other
-from trilane.hw_profiles.operator_kinds import CLASSES, has_rule
+from trilane.hw_profiles.operators import CLASSES, has_rule
 from trilane.hw_profiles.profile_files import load_profile
-from trilane.hw_profiles.published_times import PUBLISHED_MS, check_published, resnet18_work, unet_work
 from trilane.hw_profiles.reference_networks import (
     LAYOUTS,
     NetworkSpec,

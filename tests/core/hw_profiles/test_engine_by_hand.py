@@ -11,12 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
-from trilane.hw_profiles.engine_layers import INDEX, NAMES, EngineLayer, Layers
-from trilane.hw_profiles.engine_times import EngineNumbers, engine_time, join, numbers_of, spilled
 from trilane.hw_profiles.network_work import count_work
+from trilane.hw_profiles.operators import INDEX, NAMES, EngineLayer, Layers
 from trilane.hw_profiles.profile_files import load_profile, profile_names
 from trilane.hw_profiles.reference_networks import NetworkSpec, network_work
-from trilane.hw_profiles.unit_times import time_on
+from trilane.hw_profiles.unit_times import EngineNumbers, engine_time, join, numbers_of, spilled, time_on
 
 
 def layers_of_nodes(nodes: list[Any], shapes: dict[str, tuple[int, ...]]) -> tuple[EngineLayer, ...]:

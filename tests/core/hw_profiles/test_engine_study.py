@@ -13,7 +13,6 @@ import pytest
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles import engine_study
-from trilane.hw_profiles.engine_layers import NAMES, RATES, TERMS
 from trilane.hw_profiles.engine_study import (
     BEGIN,
     END,
@@ -32,13 +31,15 @@ from trilane.hw_profiles.fit_engines import (
     ON_CHIP_MB,
     UNITS_OF_RATES,
     Fitted,
+    Latency,
     LeftOut,
     Numbers,
     Prior,
     factor_prior,
     rate_prior,
+    read_latencies,
 )
-from trilane.hw_profiles.published_times import Latency, read_latencies
+from trilane.hw_profiles.operators import NAMES, RATES, TERMS
 from trilane.hw_profiles.schema import NORMAL_80, EngineName
 
 KEYS = ("arithmetic_tmac_s", "activation_gb_s", "spill_gb_s", "weight_gb_s", "operator_us", "job_us")

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles.engine_layers import INDEX, NAMES, RATES, Layers
 from trilane.hw_profiles.engine_study import (
     BEGIN,
     END,
@@ -28,6 +27,7 @@ from trilane.hw_profiles.fit_engines import (
     FACTORS,
     UNITS_OF_RATES,
     Fitted,
+    Latency,
     LeftOut,
     Numbers,
     _cost,
@@ -38,15 +38,17 @@ from trilane.hw_profiles.fit_engines import (
     fit_anchors,
     fit_engine,
     folds,
+    layers_of_rows,
     predict_rows,
     priors,
     rate_prior,
+    read_latencies,
 )
 from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.network_time import interval, price
 from trilane.hw_profiles.network_work import count_work
+from trilane.hw_profiles.operators import INDEX, NAMES, RATES, Layers
 from trilane.hw_profiles.profile_files import load_profile, profile_folder
-from trilane.hw_profiles.published_times import Latency, layers_of_rows, read_latencies
 from trilane.hw_profiles.reference_networks import NetworkSpec, network_work
 from trilane.hw_profiles.schema import NORMAL_80, corners_of
 from trilane.hw_profiles.unit_times import nearest

@@ -13,7 +13,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles import graph_checks, graph_file
+from trilane.hw_profiles import graph_file, graph_tensors
 from trilane.hw_profiles.graph_file import GraphFile, read_graph
 from trilane.hw_profiles.network_work import count_work
 
@@ -315,7 +315,7 @@ def test_weights_are_forgotten_and_small_numbers_are_not(tmp_path: Path) -> None
     nodes = [node("Conv", "image w", "a", pads=[1] * 4), node("Reshape", "a shape", "y")]
     made = read(model(nodes, weights=[weight("w", 64, 3, 3, 3), integers("shape", 1, -1)]), tmp_path).model
     held = {tensor.name: len(tensor.raw_data) for tensor in made.graph.initializer}
-    assert graph_checks.KEPT_ELEMENTS < 64 * 27
+    assert graph_tensors.KEPT_ELEMENTS < 64 * 27
     assert held == {"w": 0, "shape": 16}
     assert count_work(made).weights == 64 * 27
     assert count_work(made).output_elements == 64 * 64

@@ -26,7 +26,7 @@ from trilane.hw_profiles.rates import Wanted
 from trilane.hw_profiles.reference_networks import ConfigurationRow, NetworkSpec, reference_network
 from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.hw_profiles.unit_times import time_on
-from trilane.scheduler.places import CpuCore
+from trilane.scheduler.placement import CpuCore
 from trilane.units import BURST
 
 NETWORK = reference_network(NetworkSpec("resnet18", "batch", 64, 96, 10))

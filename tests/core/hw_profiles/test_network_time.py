@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from trilane.hw_profiles.application import isolated_job_time
-from trilane.hw_profiles.engine_layers import NAMES, EngineLayer, Layers
+from trilane.hw_profiles.governor import caps_of, ends_of, settled_corners, temperatures_of, timeline_of
 from trilane.hw_profiles.network_time import Interval, NetworkTime, OperatorTime, interval, price, spread_of
 from trilane.hw_profiles.network_work import Operator, Work
-from trilane.hw_profiles.over_time import caps_of, ends_of, settled_corners, temperatures_of, timeline_of
+from trilane.hw_profiles.operators import NAMES, EngineLayer, Layers
 from trilane.hw_profiles.profile_files import load_profile
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
 from trilane.hw_profiles.schema import Profile, Quantity, corners_of

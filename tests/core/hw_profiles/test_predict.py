@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 
 from trilane.errors import BadInputError
+from trilane.hw_profiles import governor as governor_module
 from trilane.hw_profiles import host_model
-from trilane.hw_profiles import over_time as over_time_module
 from trilane.hw_profiles.application import (
     MOST_FPS,
     REFERENCE,
@@ -26,14 +26,13 @@ from trilane.hw_profiles.application import (
     stage_times_ms,
     steady,
 )
-from trilane.hw_profiles.governor import GOVERNORS, ThermalState, Throttle
+from trilane.hw_profiles.governor import GOVERNORS, ThermalState, Throttle, over_time
 from trilane.hw_profiles.host_model import on_cores, place_units
-from trilane.hw_profiles.over_time import over_time
 from trilane.hw_profiles.predict import _frame_times, ema_range_ms, predict, predict_table, what_if
 from trilane.hw_profiles.profile_files import load_profile, load_tables, parse_profile
 from trilane.hw_profiles.reference_networks import NetworkSpec, read_table, reference_network
 from trilane.hw_profiles.schema import CORNERS, Profile, corners_of
-from trilane.scheduler.places import CpuCore, Place
+from trilane.scheduler.placement import CpuCore, Place
 from trilane.units import UNITS, UnitName
 
 NETWORK = reference_network(NetworkSpec("resnet18", "batch", 512, 512, 16))
@@ -401,7 +400,7 @@ def test_heat_follows_the_power_from_poll_to_poll(monkeypatch: pytest.MonkeyPatc
     settled: list[Any] = []
     busy = {"cpu": 0.1, "gpu": 0.6, "dsp": 0.8}
     now = SimpleNamespace(frame_ms=25.0, busy=busy)
-    monkeypatch.setattr(over_time_module, "steady", lambda *asked: settled.append(asked) or now)
+    monkeypatch.setattr(governor_module, "steady", lambda *asked: settled.append(asked) or now)
 
     def govern(profile: Profile, state: ThermalState, throttle: Throttle, requested: Any, power: Any) -> None:
         seen.append((profile.name, state.device_c, dict(requested), dict(power)))

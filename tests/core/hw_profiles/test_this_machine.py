@@ -26,7 +26,7 @@ from trilane.machine import Machine
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.rehearsal import Rehearsed
 from trilane.pipeline.stage import UnitContext
-from trilane.scheduler.places import UnitWork
+from trilane.scheduler.placement import UnitWork
 from trilane.stages import machine_facts
 from trilane.stages.dsp import bare_calls, ort
 from trilane.units import BURST

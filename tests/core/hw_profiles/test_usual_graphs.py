@@ -14,7 +14,7 @@ from onnx import TensorProto, helper, numpy_helper
 from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.network_time import INSIDE, in_precision, predict_network
 from trilane.hw_profiles.network_work import Work, count_work
-from trilane.hw_profiles.operator_kinds import KIND_OF, has_rule
+from trilane.hw_profiles.operators import KIND_OF, has_rule
 from trilane.hw_profiles.profile_files import load_profile
 from trilane.hw_profiles.reference_networks import NetworkSpec, build_network
 from trilane.training.quantising.quantise import Quantised

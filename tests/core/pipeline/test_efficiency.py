@@ -13,7 +13,7 @@ from trilane.pipeline.journal import Begun, records_of
 from trilane.pipeline.reckoning import Reckoned, RunEfficiencies, places_of, reckoned
 from trilane.scheduler.events import Settings, chain
 from trilane.scheduler.ledger import JobRecord
-from trilane.scheduler.places import Place
+from trilane.scheduler.placement import Place
 from trilane.scheduler.shared_units import Member, simulate_beside
 from trilane.scheduler.virtual import Simulation, simulate
 

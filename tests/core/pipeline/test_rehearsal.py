@@ -12,8 +12,7 @@ from trilane.pipeline import rehearsal
 from trilane.pipeline.rehearsal import Chain, on_rungs, timed, works_of
 from trilane.pipeline.result import UnitError
 from trilane.scheduler.events import StageAlone, chain
-from trilane.scheduler.placement import Ranked
-from trilane.scheduler.places import CpuCore, Place, UnitWork
+from trilane.scheduler.placement import CpuCore, Place, Ranked, UnitWork
 from trilane.stages.placing import MEASURED, _reason, considered, thread_counts
 from trilane.transport.messages import Done, PongMessage, RunJob
 

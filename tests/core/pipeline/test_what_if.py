@@ -13,7 +13,7 @@ from trilane.pipeline.journal import records_of
 from trilane.pipeline.reckoning import reckoned
 from trilane.pipeline.what_if import MOST_BLOCKS, SLOWER
 from trilane.scheduler.events import SetDuty, Settings, chain
-from trilane.scheduler.places import Place, Placement
+from trilane.scheduler.placement import Place, Placement
 from trilane.scheduler.shared_units import Member, simulate_beside
 from trilane.scheduler.stats import LEAST_BATCHES, LEAST_FRAMES
 from trilane.scheduler.virtual import Simulation, simulate

@@ -8,8 +8,7 @@ from __future__ import annotations
 import pytest
 
 from support.sliced_kernel import CORES, FRAMES, STEP_MS, WARM, Kernel
-from trilane.scheduler.placement import Ranked, Rules, ranked, worth_trying
-from trilane.scheduler.places import Times, UnitWork
+from trilane.scheduler.placement import Ranked, Rules, Times, UnitWork, ranked, worth_trying
 
 FIRST = Rules("cpu")
 RULE = "[(0,), (0,), (1,)]"

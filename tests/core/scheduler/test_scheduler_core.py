@@ -45,12 +45,10 @@ PURE = (
     "core",
     "events",
     "flow",
-    "frame_source",
     "ledger",
     "policy",
     "state",
     "stats",
-    "work_ladder",
 )
 #: What of the lower layers the core may import.
 PURE_BELOW = ("trilane.transport.slots", "trilane.unexpected_value", "trilane.units")

@@ -10,8 +10,8 @@ import pytest
 
 from support.sliced_kernel import STAGES, Kernel
 from trilane.scheduler.events import Graph, Settings, chain
-from trilane.scheduler.places import Place, Placement
-from trilane.scheduler.shared_cores import BALANCE_NS, Need, SharedCores
+from trilane.scheduler.placement import Place, Placement
+from trilane.scheduler.virtual import BALANCE_NS, Need, SharedCores
 
 #: Frames that fill the pipeline, and as many at the end, behind which it runs empty, do not count.
 MS, FRAMES, WARM = 1_000_000, 72, 12

@@ -15,9 +15,24 @@ from trilane import machine
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host import asked_cores, host_cores, rule_placement, settings_of
 from trilane.machine import Machine
-from trilane.scheduler import placement, places
-from trilane.scheduler.placement import Ranked, Rules, chosen, fastest, frame_ns, ranked, typical, worth_trying
-from trilane.scheduler.places import CpuCore, Place, Placement, Times, UnitWork, busiest_core_ns, placements
+from trilane.scheduler import placement
+from trilane.scheduler.placement import (
+    CpuCore,
+    Place,
+    Placement,
+    Ranked,
+    Rules,
+    Times,
+    UnitWork,
+    busiest_core_ns,
+    chosen,
+    fastest,
+    frame_ns,
+    placements,
+    ranked,
+    typical,
+    worth_trying,
+)
 
 MS = 1_000_000
 FIRST = Rules("cpu")
@@ -183,7 +198,7 @@ def test_ties_go_to_fewer_shared_cores_then_to_lower_numbers() -> None:
     found = ranked(equal(3), times(5, 5, 5), FIRST)
     assert found[0].placement == on(0, 1, 2)
     same = [each.placement for each in found if each.frame_ns == found[0].frame_ns]
-    assert [len(places.shared_cores(each)) for each in same] == sorted(len(places.shared_cores(e)) for e in same)
+    assert [len(placement.shared_cores(each)) for each in same] == sorted(len(placement.shared_cores(e)) for e in same)
 
 
 def test_what_is_hardly_better_than_the_rule_is_not_taken() -> None:

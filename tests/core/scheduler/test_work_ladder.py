@@ -10,10 +10,10 @@ import pytest
 
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import Dispatch, Settings, StageAlone, chain
+from trilane.scheduler.policy import MOST_PATIENCE, PATIENCE, WorkLadder
 from trilane.scheduler.recording import read, replay
 from trilane.scheduler.state import build
 from trilane.scheduler.virtual import VirtualDriver
-from trilane.scheduler.work_ladder import MOST_PATIENCE, PATIENCE, WorkLadder
 
 MS = 1_000_000
 PERIOD_MS = 20

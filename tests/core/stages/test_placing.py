@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from trilane.pipeline.trial import Round
-from trilane.scheduler.placement import Ranked
-from trilane.scheduler.places import CpuCore, Place
+from trilane.scheduler.placement import CpuCore, Place, Ranked
 from trilane.stages import placing
 from trilane.stages.placing import TriedPlacement, choice
 

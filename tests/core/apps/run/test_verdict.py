@@ -22,7 +22,7 @@ from trilane.apps.watch.live_figures import looks
 from trilane.pipeline.journal import records_of
 from trilane.pipeline.reckoning import reckoned
 from trilane.scheduler.events import Graph, Settings, chain
-from trilane.scheduler.places import Place
+from trilane.scheduler.placement import Place
 from trilane.scheduler.policy import run_settings
 from trilane.scheduler.virtual import simulate
 
