@@ -35,9 +35,8 @@ from trilane.pipeline.description import Pipeline
 from trilane.pipeline.file_graph import settings_of
 from trilane.pipeline.file_keys import EncodeBlock, OnnxStage
 from trilane.pipeline.pipeline_file import PipelineFile, assignments, read_pipeline
-from trilane.pipeline.result import Failure, RunResult
+from trilane.pipeline.result import Failure, JournalFile, RunResult
 from trilane.pipeline.run import HANG_NS, run_pipeline
-from trilane.pipeline.run_record import JournalFile
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.stages.machine_facts import machine_facts
 from trilane.stages.run_options import RunOptions

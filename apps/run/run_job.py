@@ -30,8 +30,7 @@ from trilane.hw_profiles.governor import Governor
 from trilane.hw_profiles.profile_files import load_runnable
 from trilane.pipeline import journal
 from trilane.pipeline.controls import Interrupts, RunControls
-from trilane.pipeline.result import Failure, RunResult
-from trilane.pipeline.run_record import JournalFile
+from trilane.pipeline.result import Failure, JournalFile, RunResult
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.policy import policy_named
 from trilane.stages.avatar_pipeline import run_avatar

@@ -28,10 +28,9 @@ from trilane.pipeline.journal import (
     Worked,
     read_journal,
 )
-from trilane.pipeline.result import RunResult
+from trilane.pipeline.result import JournalFile, RunResult
 from trilane.pipeline.run import DdSketch
 from trilane.pipeline.run_metrics import ProcessorState, metrics_of
-from trilane.pipeline.run_record import JournalFile
 from trilane.scheduler.events import Outcome, OutcomeKind, Settings, StageAlone
 from trilane.scheduler.virtual import VirtualDriver
 from trilane.transport.messages import Done
