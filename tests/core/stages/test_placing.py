@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.pipeline.trial import Round
+from trilane.pipeline.rehearsal import Round
 from trilane.scheduler.placement import Ranked
 from trilane.scheduler.places import CpuCore, Place
 from trilane.stages import placing
