@@ -29,7 +29,7 @@ from trilane.pipeline.file_keys import (
     port_type,
 )
 from trilane.pipeline.pipeline_file import PipelineFile, stage_inputs
-from trilane.pipeline.ports import payload_bytes
+from trilane.pipeline.stage import payload_bytes
 from trilane.scheduler.places import Place
 from trilane.stages.blocks.video import DEFAULT_FPS, Footage, footage
 from trilane.stages.dsp.runtime import resolve

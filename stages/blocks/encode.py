@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.pipeline.ports import Arrays, PortedStage
-from trilane.pipeline.stage import UnitContext
+from trilane.pipeline.stage import Arrays, PortedStage, UnitContext
 from trilane.stages.cpu.present import Segment
 from trilane.transport.live_window import LiveWindow
 

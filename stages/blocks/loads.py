@@ -9,8 +9,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from trilane.pipeline.file_keys import BypassKeys
-from trilane.pipeline.ports import Arrays, PortedStage
-from trilane.pipeline.stage import Skip, UnitContext
+from trilane.pipeline.stage import Arrays, PortedStage, Skip, UnitContext
 from trilane.units import NS_PER_MS
 
 

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.pipeline.file_keys import TYPES, PortType, port_type
-from trilane.pipeline.ports import Arrays, PortedStage
-from trilane.pipeline.stage import UnitContext
+from trilane.pipeline.stage import Arrays, PortedStage, UnitContext
 from trilane.stages.blocks.prepare import Preparation
 from trilane.stages.dsp.any_network import engine_of
 from trilane.stages.dsp.runtime import RuntimeOptions, has_device

@@ -21,8 +21,7 @@ from PIL import Image
 
 from trilane.arrays import F32, U8
 from trilane.errors import BadInputError
-from trilane.pipeline.ports import Arrays, PortedStage
-from trilane.pipeline.stage import UnitContext
+from trilane.pipeline.stage import Arrays, PortedStage, UnitContext
 
 FRAME, MASK, DEPTH, BOXES = "frame", "mask", "depth", "boxes"
 LINE_PIXELS: Final = 2

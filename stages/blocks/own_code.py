@@ -28,8 +28,7 @@ from numpy.typing import NDArray
 
 from trilane.errors import BadInputError, TrilaneError, did_you_mean
 from trilane.pipeline.file_keys import TYPES
-from trilane.pipeline.ports import Arrays, PortedStage
-from trilane.pipeline.stage import Skip, UnitContext
+from trilane.pipeline.stage import Arrays, PortedStage, Skip, UnitContext
 
 OUT, SKIPS, FORGET = "out", "skips", "forget"
 

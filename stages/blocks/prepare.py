@@ -17,8 +17,7 @@ from PIL import Image
 from trilane.arrays import U8
 from trilane.errors import BadInputError
 from trilane.pipeline.file_keys import TYPES, PortType
-from trilane.pipeline.ports import Arrays, PortedStage
-from trilane.pipeline.stage import UnitContext
+from trilane.pipeline.stage import Arrays, PortedStage, UnitContext
 
 STEPS: Final = 255
 PAD: Final = 114  # the grey around a letterboxed picture, as detectors are trained with

@@ -18,8 +18,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 
 from trilane.arrays import U8, Shape
 from trilane.errors import BadInputError
-from trilane.pipeline.ports import Arrays, PortedStage
-from trilane.pipeline.stage import UnitContext
+from trilane.pipeline.stage import Arrays, PortedStage, UnitContext
 from trilane.stages.gpu.video_reader import VideoReader, video_stream
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
