@@ -1,4 +1,9 @@
-"""Compares the CPU time of units with their wall time, and adds both to the report of a run on the host clock.
+"""The clock of this machine, for the scheduler's loop. Rule: it waits and does what the core says; it decides nothing.
+
+`wait` turns messages of the units, signals and the governor's duties into events; `perform` turns actions into
+messages. Shares of the units include the time for which a viewer held the run, and the run says how much (`HeldTime`).
+
+Compares the CPU time of units with their wall time, and adds both to the report of a run on the host clock.
 
 Rule: only the run counts, and no core does more than it can. Figures that must agree stand side by side. Where they
 contradict each other, or were not measured, a message says so.
@@ -6,11 +11,6 @@ contradict each other, or were not measured, a message says so.
 A unit's CPU time is that of all threads of its process, including those that a runtime lets spin between jobs. Units
 that may only run on a set of cores cannot have more CPU time than these cores had time. Where the figures say
 otherwise, a thread has run elsewhere or a clock is wrong.
-
-The clock of this machine, for the scheduler's loop. Rule: it waits and does what the core says; it decides nothing.
-
-`wait` turns messages of the units, signals and the governor's duties into events; `perform` turns actions into
-messages. Shares of the units include the time for which a viewer held the run, and the run says how much (`HeldTime`).
 """
 
 from __future__ import annotations

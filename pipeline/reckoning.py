@@ -1,4 +1,9 @@
-"""Replays a run in virtual time with one stage slower, and says what that costs. The stage that costs most bounds it.
+"""Computes what bounded a run and how well it used its cores, once for everyone who shows it.
+
+Rule: report.json, the table, `trilane explain`, the dashboard and Python take these figures; nobody computes them
+again. The memory for reading a run is bounded, however long the run lasts.
+
+Replays a run in virtual time with one stage slower, and says what that costs. The stage that costs most bounds it.
 
 Rule: nothing is measured here; equal journals give equal answers.
 
@@ -9,11 +14,6 @@ scheduler. After that it does them once more for each stage, with all jobs of th
 
 The replay knows no other programs, caps or restarts. Therefore its frame time is compared with the run's, and it is
 trusted only where the two are near each other.
-
-Computes what bounded a run and how well it used its cores, once for everyone who shows it.
-
-Rule: report.json, the table, `trilane explain`, the dashboard and Python take these figures; nobody computes them
-again. The memory for reading a run is bounded, however long the run lasts.
 """
 
 from __future__ import annotations

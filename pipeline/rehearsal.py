@@ -1,12 +1,10 @@
 """Measures units before a run: what they need for a frame, and which placement has the shortest frames.
 
-The rehearsal measures what units need.
-
-Every frame goes through all stages before the next one, and through the slots of an edge in turn. That matters because
+The rehearsal measures what units need. Rule: frames go through in the order of a run, one at a time. Every frame goes through all stages before the next one, and through the slots of an edge in turn. That matters because
 the time of a stage depends on what it did last, on what its slot holds, and on how long it rested. Only time in which
 the unit had its cores counts, because others may use the machine meanwhile.
 
-Times placements with real frames. Rule: placements run in turns, a few frames each, the same frames.
+The trial times placements with real frames. Rule: placements run in turns, a few frames each, the same frames.
 
 Running units are moved from the cores of one placement to those of the next, while frames go through them. A slice of
 frames takes a fraction of a second, so what slows the machine for a second slows all placements that are compared. From
