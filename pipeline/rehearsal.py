@@ -1,6 +1,8 @@
 """Measures units before a run: what they need for a frame, and which placement has the shortest frames.
 
-The rehearsal measures what units need. Rule: frames go through in the order of a run, one at a time. Every frame goes through all stages before the next one, and through the slots of an edge in turn. That matters because
+The rehearsal measures what units need. Rule: frames go through in the order of a run, one at a time.
+
+Every frame goes through all stages before the next one, and through the slots of an edge in turn. That matters because
 the time of a stage depends on what it did last, on what its slot holds, and on how long it rested. Only time in which
 the unit had its cores counts, because others may use the machine meanwhile.
 
