@@ -36,9 +36,16 @@ from trilane.stages.dsp.runtime import resolve
 from trilane.transport.slots import edge_rule
 
 BLOCKS: Final = "trilane.stages.blocks"
-ENCODE: Final = f"{BLOCKS}.encode:build"
-#: Module of each block, where it is not the block's name.
-MODULES: Final = {"busy": "loads", "discard": "loads"}
+ENCODE: Final = f"{BLOCKS}.video:build_encode"
+#: Module and factory of each block.
+FACTORIES: Final = {
+    "busy": "own_code:build_load",
+    "discard": "own_code:build_load",
+    "encode": "video:build_encode",
+    "overlay": "pictures:build_overlay",
+    "prepare": "pictures:build_prepare",
+    "video": "video:build_video",
+}
 SEGMENTS: Final = "segments"  # of the first video, as `trilane.apps.run.run_files` reads them
 TOKEN: Final = {"": PortType("u8", (1,))}  # what a made-up load writes
 
@@ -70,7 +77,8 @@ def pipeline_of(file: PipelineFile, run_folder: Path) -> Pipeline:
 
 def preload_of(file: PipelineFile) -> tuple[str, ...]:
     """Return the modules that the stages of a file come from, none of them the file's own."""
-    return tuple(dict.fromkeys(_module(stage) for stage in file.stages.values() if not isinstance(stage, TimedStage)))
+    made = [_factory(stage) for stage in file.stages.values() if not isinstance(stage, TimedStage)]
+    return tuple(dict.fromkeys(factory.partition(":")[0] for factory in made))
 
 
 def imports_of(file: PipelineFile) -> list[str]:
@@ -195,9 +203,7 @@ def _stage(
     streams = stage_inputs(stage)
     inputs = tuple(StreamInput(stage=each.stage, latest=each.latest, max_age_ms=each.max_age_ms) for each in streams)
     place_of = {each.stage: place for place, each in enumerate(streams)}
-    made = PipelineStage(
-        name=name, unit=stage.unit, factory=f"{_module(stage)}:build", inputs=inputs, every=stage.every
-    )
+    made = PipelineStage(name=name, unit=stage.unit, factory=_factory(stage), inputs=inputs, every=stage.every)
     settings = {
         "where": f"{file.path.name}: stages.{name}",
         "folder": str(file.folder.absolute()),
@@ -232,11 +238,11 @@ def _bypassed(
     return tuple(found)
 
 
-def _module(stage: StageKeys) -> str:
-    """Return the module that makes a stage."""
+def _factory(stage: StageKeys) -> str:
+    """Return the module and the function that make a stage."""
     if isinstance(stage, BlockStage):
-        return f"{BLOCKS}.{MODULES.get(stage.block, stage.block)}"
-    return f"{BLOCKS}.{'network' if isinstance(stage, OnnxStage) else 'own_code'}"
+        return f"{BLOCKS}.{FACTORIES[stage.block]}"
+    return f"{BLOCKS}.{'network' if isinstance(stage, OnnxStage) else 'own_code'}:build"
 
 
 def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str, GraphFile]) -> dict[str, Any]:

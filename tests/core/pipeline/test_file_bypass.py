@@ -18,7 +18,7 @@ from trilane.pipeline.pipeline_file import PipelineFile, read_pipeline
 from trilane.pipeline.stage import PortedStage, Skip
 from trilane.pipeline.timeline import Presented, Timeline
 from trilane.scheduler.virtual import simulate
-from trilane.stages.blocks.loads import Busy
+from trilane.stages.blocks.own_code import Busy
 from trilane.transport.packets import header_dtype
 
 TEXT = """

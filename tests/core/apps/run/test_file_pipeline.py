@@ -68,7 +68,7 @@ def test_a_run_imports_the_code_that_it_names(tmp_path: Path) -> None:
     file = read(tmp_path)
     assert imports_of(file) == ["own"]
     blocks = "trilane.stages.blocks"
-    assert preload_of(file) == (f"{blocks}.video", f"{blocks}.own_code", f"{blocks}.loads")
+    assert preload_of(file) == (f"{blocks}.video", f"{blocks}.own_code")
 
 
 def test_a_run_has_as_many_frames_as_the_pictures(tmp_path: Path) -> None:
