@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from trilane.apps.run.trust import trust_of
+from trilane.apps.run.verdict import trust_of
 from trilane.machine import Machine
 from trilane.pipeline.run_metrics import ProcessorState
 from trilane.pipeline.surroundings import processor_of

@@ -14,8 +14,7 @@ from support.run_report import TIMES, make_report
 from trilane.apps.explain.explained_run import explain_run
 from trilane.apps.interface import load_run
 from trilane.apps.run.report import Report, read_report
-from trilane.apps.run.trust import Trust
-from trilane.apps.run.verdict import COMPUTED, SO_FAR, Bound, Facts, Lateness, Rate, judged
+from trilane.apps.run.verdict import COMPUTED, SO_FAR, Bound, Facts, Lateness, Rate, Trust, judged
 from trilane.apps.run.verdict_facts import predicted_verdict, verdict_of
 from trilane.apps.watch.followed_run import FollowedRun
 from trilane.apps.watch.live_figures import looks
