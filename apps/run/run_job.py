@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from trilane import machine
-from trilane.apps.run.avatar_facts import avatar_report, config_facts, resolution_note, resolution_of
 from trilane.apps.run.report import Report, write_report
+from trilane.apps.run.report_facts import avatar_report, config_facts, resolution_note, resolution_of
 from trilane.apps.run.run_folder import RunFolder
 from trilane.arrays import F64, U8, Mask
 from trilane.bench.lib.picture_error import psnr_of_frames, require_metrics
