@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from trilane.apps.run.file_pipeline import cores_of, frames_of, imports_of, pipeline_of, preload_of
-from trilane.apps.run.run_file import asked_file
+from trilane.apps.run.run_file import asked_file, cores_of, frames_of, imports_of, pipeline_of, preload_of
 from trilane.errors import BadInputError
 from trilane.pipeline.file_graph import DEFAULT_FRAMES
 from trilane.pipeline.pipeline_file import PipelineFile, read_pipeline
