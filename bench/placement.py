@@ -22,8 +22,8 @@ from trilane.hw_profiles.host import described, host_cores, rule_placement, sett
 from trilane.hw_profiles.host_model import on_cores, place_units
 from trilane.hw_profiles.profile_files import load_profile
 from trilane.hw_profiles.schema import corners_of
+from trilane.pipeline.rehearsal import Round
 from trilane.pipeline.run_metrics import RunMetrics
-from trilane.pipeline.trial import Round
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.placement import CpuCore, Placement, Ranked, Rules, frame_ns, ranked, worth_trying
 from trilane.scheduler.stats import median_interval

@@ -2,20 +2,193 @@
 
 Rule: report.json, the table, `trilane explain`, the dashboard and Python take these figures; nobody computes them
 again. The memory for reading a run is bounded, however long the run lasts.
+
+Replays a run in virtual time with one stage slower, and says what that costs. The stage that costs most bounds it.
+
+Rule: nothing is measured here; equal journals give equal answers.
+
+A share of the critical path says how the time went. It does not say how a run reacts: a longer job is moved to another
+core more often, and takes that core from a unit that was on no path. Therefore the replay does some of the run's frames
+again (`trilane.scheduler.virtual`). It uses the CPU times of their own jobs, the run's placement and the run's
+scheduler. After that it does them once more for each stage, with all jobs of the stage longer by SLOWER.
+
+The replay knows no other programs, caps or restarts. Therefore its frame time is compared with the run's, and it is
+trusted only where the two are near each other.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from dataclasses import replace
+from itertools import pairwise
+from random import Random
+from statistics import median
+from typing import Any, Final, NamedTuple
 
 from trilane.pipeline.critical_path import Budget, Part, Paths, Sharing, Taken
 from trilane.pipeline.journal import Begun, Record, config_of
 from trilane.pipeline.timeline import ExplainedJob, Timeline
-from trilane.pipeline.what_if import SLOWER, Cost, Slowed, WhatIf
-from trilane.scheduler.events import Graph, Settings
+from trilane.pipeline.unit_history import OVERHEAD
+from trilane.scheduler.events import NEVER, Graph, Settings
 from trilane.scheduler.ledger import JobRecord
-from trilane.scheduler.placement import Place, Placement, busiest_core_ns
+from trilane.scheduler.placement import SCHEDULER_NS, Place, Placement, busiest_core_ns
+from trilane.scheduler.stats import LEAST_FRAMES, batch_interval
+from trilane.scheduler.virtual import Need, SharedCores
+
+SLOWER: Final = 0.2
+#: Largest difference between the frame times of the replay and of the run, as a share, for which the replay is trusted.
+TRUSTED: Final = 0.15
+#: Least cost that names a bound; below it nothing that a stage does matters.
+LEAST_COST: Final = 0.01
+#: Most blocks of frames that are kept. Of more, as many are drawn: evenly spaced ones may all fall on the same part of
+#: a motion that repeats.
+MOST_BLOCKS: Final = 12
+HAND_OVERS: Final = 512
+#: Frames after which one that was begun and not presented is taken to be lost; more than can be in flight.
+MOST_OPEN: Final = 64
+
+
+class Cost(NamedTuple):
+    """What slowing a stage, or all stages of a unit, costs.
+
+    `share`: growth of the frame time as a share.
+    `of_blocks`: the same for each block of LEAST_FRAMES frames.
+    """
+
+    share: float
+    of_blocks: tuple[float, ...]
+
+    def half_width(self, other: Cost | None = None) -> float | None:
+        """Return half the 95 % interval of `share`, or of its difference from `other`; None for too few blocks."""
+        others = other.of_blocks if other is not None else (0.0,) * len(self.of_blocks)
+        return batch_interval([a - b for a, b in zip(self.of_blocks, others, strict=True)])
+
+
+class Slowed(NamedTuple):
+    """What the replays say.
+
+    `costs`: cost of slowing each stage by SLOWER.
+    `frames`: number of frames that were replayed and counted.
+    `over_measured`: frame time of the replay without a slower stage, divided by the run's frame time in the same
+    frames.
+    """
+
+    costs: Mapping[str, Cost]
+    frames: int
+    over_measured: float
+
+    @property
+    def is_trusted(self) -> bool:
+        """Whether the replay is near the run, and slowing a stage costs anything."""
+        worst = max(cost.share for cost in self.costs.values())
+        return abs(self.over_measured - 1) <= TRUSTED and worst >= LEAST_COST
+
+    def by(self, name_of: Mapping[str, str]) -> dict[str, Cost]:
+        """Return the cost of each group of stages, such as a unit, summed over them. `name_of`: group of a stage."""
+        found: dict[str, Cost] = {}
+        for stage, cost in self.costs.items():
+            was = found.get(name_of[stage], Cost(0.0, (0.0,) * len(cost.of_blocks)))
+            both = tuple(a + b for a, b in zip(was.of_blocks, cost.of_blocks, strict=True))
+            found[name_of[stage]] = Cost(was.share + cost.share, both)
+        return found
+
+
+class _Block(NamedTuple):
+    """LEAST_FRAMES presented frames in a row.
+
+    `needs`: needs of each frame's jobs by stage. `span_ns`: time from the frame before to the last of them.
+    """
+
+    needs: tuple[Mapping[str, Need], ...]
+    span_ns: int
+
+
+class WhatIf:
+    """Takes the jobs of a run in order; keeps those of a bounded number of frames, spread over the run.
+
+    `graph`, `settings`: graph and settings of the run. `places`: places of its units.
+    """
+
+    def __init__(self, graph: Graph, settings: Settings, places: Placement) -> None:
+        self._graph, self._settings, self._places = graph, settings, places
+        is_timed_here = not settings.asked and not settings.arrivals_ns
+        self._is_known = graph.is_chain and set(graph.units) <= places.keys() and is_timed_here
+        self._open: dict[int, dict[str, Need]] = {}
+        self._presented: list[Mapping[str, Need]] = []
+        self._blocks: list[_Block] = []
+        self._count, self._draw = 0, Random(0)
+        self._first_ns: int | None = None
+        self._handed_ns: list[int] = []
+
+    def add(self, explained: ExplainedJob) -> None:
+        """Count a job; jobs come in the order of their ends."""
+        if not self._is_known:
+            return
+        job = explained.job
+        cpu_ns = job.cpu_ns / self._places[job.unit].threads
+        other_ns = max(job.end_ns - job.begin_ns - job.preempted_ns - cpu_ns, 0.0)
+        self._open.setdefault(job.frame, {})[job.stage] = Need(cpu_ns, other_ns, explained.skips)
+        waited_ns = explained.waits_ns.get(OVERHEAD, 0)
+        if waited_ns and len(self._handed_ns) < HAND_OVERS:
+            self._handed_ns.append(waited_ns)
+        if explained.presented is not None:
+            self._present(self._open.pop(job.frame), job.end_ns)
+            for lost in [frame for frame in self._open if frame < job.frame - MOST_OPEN]:
+                del self._open[lost]
+
+    def _present(self, needs: Mapping[str, Need], end_ns: int) -> None:
+        if self._first_ns is None:  # the block before which nothing was presented has no span
+            self._first_ns = end_ns
+        self._presented.append(needs)
+        if len(self._presented) < LEAST_FRAMES:
+            return
+        self._count += 1
+        self._blocks.append(_Block(tuple(self._presented), end_ns - self._first_ns))
+        if len(self._blocks) > MOST_BLOCKS:
+            # Vitter's algorithm R: the last block takes the place of one that was kept, or goes.
+            place = self._draw.randrange(self._count)
+            del self._blocks[place if place < MOST_BLOCKS else MOST_BLOCKS]
+        self._first_ns = end_ns
+        self._presented = []
+
+    def close(self) -> Slowed | None:
+        """Return what slowing each stage costs; None for fewer than two blocks, or a run that cannot be replayed."""
+        if len(self._blocks) < 2:
+            return None
+        # The first frames fill the pipeline, and it runs empty behind the last ones; neither count.
+        frames = [needs for block in [*self._blocks, self._blocks[0]] for needs in block.needs]
+        measured_ns = sum(block.span_ns for block in self._blocks[1:])
+        message_ns = round(median(self._handed_ns)) if self._handed_ns else 0
+        names = [stage.name for stage in self._graph.stages]
+        replays = {name: self._replayed(frames, name, message_ns) for name in ["", *names]}
+        count = min(len(spans_ns) for spans_ns in replays.values())
+        if not count or not measured_ns or not any(need.cpu_ns for needs in frames for need in needs.values()):
+            return None
+        plain_ns = replays.pop("")
+        costs = {name: _stage_cost(spans_ns[:count], plain_ns[:count]) for name, spans_ns in replays.items()}
+        whole_ns = measured_ns / ((len(self._blocks) - 1) * LEAST_FRAMES)
+        return Slowed(costs, count * LEAST_FRAMES, sum(plain_ns) / len(plain_ns) / LEAST_FRAMES / whole_ns)
+
+    def _replayed(self, frames: Sequence[Mapping[str, Need]], slowed: str, message_ns: int) -> list[int]:
+        """Return the time of each LEAST_FRAMES presented frames but the first and the last."""
+
+        def need(stage: str, frame: int) -> Need:
+            found = frames[frame].get(stage, Need(0.0))
+            if stage != slowed:
+                return found
+            return Need(found.cpu_ns * (1 + SLOWER), found.other_ns * (1 + SLOWER), found.skips)
+
+        settings = replace(self._settings, frames=len(frames), works=(), follow=(), hang_ns=NEVER // 2)
+        scheduler_ns = min(SCHEDULER_NS, message_ns)
+        run = SharedCores(self._graph, settings, self._places, need, message_ns - scheduler_ns, scheduler_ns)
+        ends_ns = [end_ns for _, end_ns in run.run()]
+        cuts = ends_ns[LEAST_FRAMES - 1 :: LEAST_FRAMES]
+        return [after - before for before, after in pairwise(cuts[:-1])]
+
+
+def _stage_cost(slowed_ns: Sequence[int], plain_ns: Sequence[int]) -> Cost:
+    each = tuple(slow / plain - 1 for slow, plain in zip(slowed_ns, plain_ns, strict=True))
+    return Cost(sum(slowed_ns) / sum(plain_ns) - 1, each)
 
 
 class RunEfficiencies:

@@ -1,20 +1,52 @@
-"""The output of a run: its messages and its failure while it goes on, and its result.
+"""The output of a run: its messages and its failure while it goes on, its record of steps and jobs, and its result.
 
 Rule: the first failure stands; the report also has every message. A result is plain data; a recording is written only
 where the caller asks for it.
+
+Stores the steps and jobs of a run, either in memory or in the run's journal. Rule: one of the two, never both.
+
+Memory is for a caller that runs a few frames and wants all of them. With a journal, nothing is kept that grows with the
+number of frames. Steps are written a few at a time, after the units have been told what follows from the last one.
+Written one by one they take three times as long, because the code that writes them is then never in the caches.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
 
-from trilane.errors import TrilaneError
+from trilane import machine
+from trilane.errors import BadInputError, TrilaneError, UnwrittenError
+from trilane.pipeline.journal import (
+    SCHEMA,
+    Accounted,
+    Begun,
+    Counted,
+    Ended,
+    JournalWriter,
+    Said,
+    Sampled,
+    Stepped,
+    Stopped,
+    Worked,
+    read_journal,
+    records_of,
+)
+from trilane.pipeline.reckoning import Reckoned, reckoned
 from trilane.pipeline.run_metrics import RunMetrics
-from trilane.scheduler.events import Drop, Loss
+from trilane.scheduler.core import Core
+from trilane.scheduler.events import Action, Drop, Event, Graph, Loss, Settings
 from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.placement import Placement
 from trilane.scheduler.recording import Recording
+from trilane.scheduler.state import FULL_DUTY
 from trilane.transport.messages import Failed
+from trilane.writing import WRITABLE
 
 
 @dataclass(frozen=True)
@@ -119,3 +151,250 @@ def after_stderr(tail: str) -> str:
     """Return the last line that a unit wrote to stderr as part of a sentence; empty if it wrote nothing."""
     lines = tail.splitlines()
     return f"it wrote last: {lines[-1]}" if lines else ""
+
+
+FLUSH_NS = 250_000_000
+SAMPLE_NS = 5_000_000_000
+STEPS_AT_ONCE = 64  # some twelve frames
+PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
+
+
+@dataclass(frozen=True)
+class JournalFile:
+    """Where a run writes its journal, and what else goes there.
+
+    `path`: path of a file that does not exist yet.
+    `facts`: facts of the journal's `Begun`.
+    `sensors`: function that returns readings by dotted name; it is called every `SAMPLE_NS`.
+    """
+
+    path: Path
+    facts: Mapping[str, Any]
+    sensors: Callable[[], Mapping[str, float]] = dict
+
+
+class JobSource(Protocol):
+    """The clock of the run (`trilane.pipeline.realtime_clock.RealtimeClock`)."""
+
+    @property
+    def waiting(self) -> int:
+        """The number of jobs that `ended` would return now."""
+
+    def ended(self) -> list[Worked | None]:
+        """Return the jobs that ended since the last call; None stands for a job of a lost frame."""
+
+    def stopped(self) -> list[Stopped]:
+        """Return the units that were seen stopped since the last call."""
+
+
+class CapReadings(Protocol):
+    """The part of a run's governor that is recorded."""
+
+    @property
+    def temperatures_c(self) -> Mapping[str, float]:
+        """The temperatures that the governor goes by, in degrees Celsius, by name."""
+
+
+class RunRecord(Protocol):
+    """Takes steps from the scheduler's loop through `add`.
+
+    `recording`, `jobs`: part of the run that is in memory.
+    `failure`: why nothing more can be noted; None while all is well.
+    """
+
+    recording: Recording
+    jobs: list[JobRecord]
+
+    @property
+    def failure(self) -> UnwrittenError | None: ...
+
+    def begin(self, source: JobSource, pids: Callable[[], Mapping[str, int]]) -> None:
+        """Note that the loop begins. `pids`: function that returns the process id of each unit at any time."""
+
+    def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
+        """Note a step of `core` whose actions were carried out; raises `failure` when there is one."""
+
+    def say(self, text: str) -> None:
+        """Note a message to a person."""
+
+    def reckoned(self, places: Placement) -> Reckoned:
+        """Return what bounded the whole run; called after the loop. `places`: places of the run's units.
+
+        Raises `failure` where what was noted is gone.
+        """
+
+    def end(self, report: Mapping[str, Any]) -> None:
+        """Note that the run is over, with this report."""
+
+
+class _KeptRun:
+    """A record of the run in memory."""
+
+    def __init__(self, graph: Graph, settings: Settings) -> None:
+        self.recording = Recording(graph, settings)
+        self.jobs: list[JobRecord] = []
+        self.failure = None
+        self._source: JobSource | None = None
+
+    def begin(self, source: JobSource, pids: Callable[[], Mapping[str, int]]) -> None:  # noqa: ARG002 - a `RunRecord`
+        """Keep the source; jobs are read when the run is over, because units share the scheduler's core."""
+        self._source = source
+
+    def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
+        self.recording.add(now_ns, events, actions, core)
+
+    def say(self, text: str) -> None:
+        """Do nothing: the log of the run keeps messages."""
+
+    def reckoned(self, places: Placement) -> Reckoned:
+        if self._source is not None:
+            self.jobs += [worked.job for worked in self._source.ended() if worked is not None]
+        recording = self.recording
+        return reckoned(recording.graph, recording.settings, places, records_of(recording, self.jobs))
+
+    def end(self, report: Mapping[str, Any]) -> None:
+        """Do nothing: everything is in memory."""
+
+
+#: A step, the records that follow from it, and how many of the jobs since the last writing had ended by then.
+_Step = tuple[Stepped, list[Accounted | Counted], int]
+
+
+class _JournaledRun:
+    """A record of the run in the journal of `file`; `recording` has no steps and `jobs` stays empty.
+
+    `writer`: writer of that file.
+    `caps`: governor that sets the units' duties; duties and temperatures are sampled.
+    """
+
+    def __init__(
+        self, file: JournalFile, writer: JournalWriter, graph: Graph, settings: Settings, caps: CapReadings | None
+    ) -> None:
+        self.recording = Recording(graph, settings)
+        self.jobs: list[JobRecord] = []
+        self._file, self._writer, self._caps = file, writer, caps
+        self._source: JobSource | None = None
+        self._pids: Callable[[], Mapping[str, int]] = dict
+        self._accounts = dict.fromkeys(graph.units, -1)
+        self._steps: list[_Step] = []
+        self._left_out = self._flush_ns = self._sample_ns = 0
+        facts = {"clock": "host", "began_at": machine.here.now().isoformat(timespec="seconds"), **file.facts}
+        self._writer.add(Begun(SCHEMA, graph, settings, facts))
+        self._writer.flush()
+
+    def begin(self, source: JobSource, pids: Callable[[], Mapping[str, int]]) -> None:
+        self._source, self._pids = source, pids
+
+    @property
+    def failure(self) -> UnwrittenError | None:
+        return self._writer.failure
+
+    def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
+        if self._writer.failure is not None:
+            raise self._writer.failure
+        follows: list[Accounted | Counted] = []
+        accounts = self._accounts
+        for unit in core.units.values():
+            if accounts[unit.name] != unit.account:
+                accounts[unit.name] = unit.account
+                follows.append(Accounted(unit.account_ns, unit.name, unit.account))
+        ledger = core.ledger
+        if ledger.left_out != self._left_out:
+            self._left_out = ledger.left_out
+            follows.append(Counted(now_ns, ledger.lost_by_cause, ledger.dropped_by_cause))
+        ended = self._source.waiting if self._source is not None else 0
+        self._steps.append((Stepped(now_ns, events, actions), follows, ended))
+        if len(self._steps) == STEPS_AT_ONCE or now_ns >= self._flush_ns:
+            self._write()
+        if now_ns >= self._flush_ns:
+            self._sample(now_ns, core)
+
+    def _write(self) -> None:
+        """Write the notes since the last call; raises UnwrittenError when they cannot be written."""
+        add, told = self._writer.add, 0
+        jobs = self._source.ended() if self._source is not None else []
+        for stopped in self._source.stopped() if self._source is not None else []:
+            add(stopped)  # before the end of the job that it made longer
+        for step, follows, ended in self._steps:
+            add(step)
+            for record in (*follows, *jobs[told:ended]):
+                if record is not None:
+                    add(record)
+            told = ended
+        self._steps.clear()
+
+    def say(self, text: str) -> None:
+        with suppress(UnwrittenError):  # the next `add` raises it
+            self._writer.add(Said(time.monotonic_ns(), text))
+            self._writer.flush()
+
+    def reckoned(self, places: Placement) -> Reckoned:
+        with suppress(UnwrittenError):  # it stays as `failure`
+            self.flush()
+        records = read_journal(self._file.path)
+        try:
+            next(records)  # the header
+        except BadInputError:
+            if self.failure is not None:  # it was removed
+                raise self.failure from None
+            raise
+        return reckoned(self.recording.graph, self.recording.settings, places, records)
+
+    def end(self, report: Mapping[str, Any]) -> None:
+        with suppress(UnwrittenError):  # it stays as `failure`
+            self._writer.add(Ended(time.monotonic_ns(), report))
+            self._writer.flush()
+
+    def flush(self) -> None:
+        """Write everything that was noted to the file; raises UnwrittenError when it cannot be written."""
+        self._write()
+        self._writer.flush()
+
+    def _sample(self, now_ns: int, core: Core) -> None:
+        """Write the readings that are due, and flush so that whoever follows the journal sees them."""
+        self._flush_ns = now_ns + FLUSH_NS
+        values: dict[str, float] = {}
+        if self._caps is not None:
+            values = {f"duty.{unit.name}": unit.duty / FULL_DUTY for unit in core.units.values()}
+            values |= {f"temperature_c.{name}": celsius for name, celsius in self._caps.temperatures_c.items()}
+        if now_ns >= self._sample_ns:
+            self._sample_ns = now_ns + SAMPLE_NS
+            values |= self._file.sensors()
+            pids = {"scheduler": os.getpid(), **self._pids()}
+            values |= {f"memory_bytes.{name}": memory_bytes(pid) for name, pid in pids.items()}
+        if values:
+            self._writer.add(Sampled(now_ns, values))
+        self._writer.flush()
+
+
+@contextmanager
+def recorded(
+    file: JournalFile | None, graph: Graph, settings: Settings, caps: CapReadings | None
+) -> Iterator[RunRecord]:
+    """Yield the record of one run, which goes to `file`, or stays in memory without one.
+
+    Everything up to the end of the run is in the file, however the run ends. Raises BadInputError when the file cannot
+    be made.
+    """
+    if file is None:
+        yield _KeptRun(graph, settings)
+        return
+    try:
+        writer = JournalWriter(file.path)
+    except OSError as error:
+        raise BadInputError.of_os_error(file.path, error, WRITABLE) from None
+    with writer:
+        run = _JournaledRun(file, writer, graph, settings, caps)
+        try:
+            yield run
+        finally:
+            with suppress(UnwrittenError):  # the run raised this error already when it tried to write
+                run.flush()
+
+
+def memory_bytes(pid: int) -> int:
+    """Return the memory in use (RSS) of a process in bytes, including shared memory; 0 for a process that has ended."""
+    try:
+        return int((machine.here.proc / f"{pid}/statm").read_text(encoding="ascii").split()[1]) * PAGE_BYTES
+    except (OSError, IndexError):
+        return 0

@@ -18,14 +18,12 @@ from ddsketch import LogCollapsingLowestDenseDDSketch
 from trilane.errors import BadInputError, UnwrittenError
 from trilane.machine import awake
 from trilane.pipeline.controls import FrameRequestQueue, Interrupts, RunControls
-from trilane.pipeline.cpu_use import add_accounts
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.memory import BYTES, Assets, add_bytes
-from trilane.pipeline.realtime_clock import ClockGovernor, RealtimeClock
+from trilane.pipeline.realtime_clock import ClockGovernor, RealtimeClock, add_accounts
 from trilane.pipeline.rehearsal import Chain, on_rungs
-from trilane.pipeline.result import RunLog, RunResult
+from trilane.pipeline.result import JournalFile, RunLog, RunRecord, RunResult, recorded
 from trilane.pipeline.run_metrics import ProcessorState, RunMetrics, metrics_of
-from trilane.pipeline.run_record import JournalFile, RunRecord, recorded
 from trilane.pipeline.surroundings import (
     beside_units,
     check_cores,

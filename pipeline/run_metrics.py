@@ -300,7 +300,7 @@ class ProcessorState(Record):
 
 
 class SlowedCost(Record):
-    """What it costs when jobs take longer by `Slowed.by`, found by replaying the run (`trilane.pipeline.what_if`).
+    """What it costs when jobs take longer by `Slowed.by`, found by replaying the run (`trilane.pipeline.reckoning`).
 
     `cost`: growth of the frame time, as a share.
     `cost_low`, `cost_high`: bounds of the 95 % interval of `cost`, from the scatter over the run's frames; null for

@@ -24,8 +24,7 @@ from trilane.arrays import U8
 from trilane.errors import MissingPartError, TrilaneError, UnitLostError
 from trilane.machine import UNIT_SLICE_NS, shortage, use_slice
 from trilane.pipeline.description import Model, PipelineStage, UnitSettings
-from trilane.pipeline.hardware_counters import HardwareCounters, NoCounters, counters_here
-from trilane.pipeline.job_times import TASKS, CoreMeter, JobClock
+from trilane.pipeline.job_times import TASKS, CoreMeter, HardwareCounters, JobClock, NoCounters, counters_here
 from trilane.pipeline.memory import EdgeRegion, map_assets
 from trilane.pipeline.stage import JoiningStage, Skip, SkippingStage, Stage, StageFactory, SteppedStage, UnitContext
 from trilane.scheduler.events import unpacked

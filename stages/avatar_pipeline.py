@@ -19,10 +19,9 @@ from trilane.arrays import Shape
 from trilane.hw_profiles.host import settings_of
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage
 from trilane.pipeline.memory import Assets
-from trilane.pipeline.rehearsal import Rehearsed, rehearse
+from trilane.pipeline.rehearsal import SLICE, Group, Rehearsed, Round, rehearse, try_in_turns
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline
-from trilane.pipeline.trial import SLICE, Group, Round, try_in_turns
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.placement import CpuCore, Place, Placement
 from trilane.stages import FACTORIES, PRELOAD

@@ -13,7 +13,7 @@ from functools import cache
 from typing import Any
 
 from trilane import machine
-from trilane.pipeline.hardware_counters import availability
+from trilane.pipeline.job_times import availability
 
 #: Instruction sets that decide how fast INT8 and FP32 networks run; a network's speed means nothing without them.
 CPU_FLAGS = (

@@ -1,11 +1,17 @@
 """What `trilane check` says of a pipeline file, as one document: stages, streams, the bound on the period, memory.
 
 Rule: nothing runs here, and no Python of the file is imported.
+
+Draws a checked pipeline file: a lane for each unit, a box for each stage, a line for each input.
+
+A line of dashes is an input of the newest frame, a line of dots a bypass. The stages of the cycle that makes the period
+have a thick border.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from html import escape
 from pathlib import Path
 from typing import Any, Final
 
@@ -112,3 +118,88 @@ def _stream(file: PipelineFile, name: str, rule: str, types: PortTypes) -> dict[
         "ports": {port: str(kind) for port, kind in ports.items()},
         "memory_bytes": None if slot_bytes is None else slots * slot_bytes,
     }
+
+
+COLUMN, LANE, BOX, HEIGHT, LEFT, TOP = 170, 84, 130, 44, 90, 20
+OVER: Final = 10  # pixels above a row of boxes, where a line passes them
+LETTERS: Final = 17  # of a name that fit into a box
+DASHES: Final = {"frame": "", "latest": " stroke-dasharray='5 4'"}
+DOTS: Final = " stroke-dasharray='1 4'"
+STYLE: Final = "font-family='sans-serif' font-size='12'"
+
+
+def draw_graph(document: Mapping[str, Any]) -> str:
+    """Return an SVG of what `check_file` found."""
+    columns = _columns(document)
+    rows = _rows(document, columns)
+    tops, height = _lanes(document, rows)
+    places = {name: (LEFT + COLUMN * columns[name], tops[unit] + LANE * row + 16) for name, (unit, row) in rows.items()}
+    width, names = LEFT + COLUMN * (1 + max(columns.values())), [*tops]
+    ends = [*[tops[unit] for unit in names[1:]], height]
+    body = [
+        f"<rect x='0' y='{tops[unit]}' width='{width}' height='{end - tops[unit] - 6}' fill='#f3f4f6'/>"
+        f"<text x='10' y='{tops[unit] + 20}' {STYLE} font-weight='bold'>{escape(unit)}</text>"
+        for unit, end in zip(names, ends, strict=True)
+    ]
+    body += [
+        _line(places[each["from"].partition(".")[0]], places[stage["name"]], DASHES[each["sync"]])
+        for stage in document["stages"]
+        for each in stage["in"]
+    ]
+    body += [_line(places[each["from"]], places[each["to"]], DOTS) for each in document["routes"]]
+    body += [_box(stage, *places[stage["name"]], stage["name"] in document["cycle"]) for stage in document["stages"]]
+    head = f"<svg xmlns='http://www.w3.org/2000/svg' width='{width}' height='{height}' viewBox='0 0 {width} {height}'>"
+    return "\n".join([head, "<rect width='100%' height='100%' fill='white'/>", *body, "</svg>", ""])
+
+
+def _columns(document: Mapping[str, Any]) -> dict[str, int]:
+    """Return the column of each stage: one after the last of those that it reads."""
+    found: dict[str, int] = {}
+    for stage in document["stages"]:
+        before = [found[each["from"].partition(".")[0]] for each in stage["in"]]
+        found[stage["name"]] = max(before, default=-1) + 1
+    return found
+
+
+def _rows(document: Mapping[str, Any], columns: Mapping[str, int]) -> dict[str, tuple[str, int]]:
+    """Return the unit of each stage and its row in the unit's lane: stages in one column are below each other."""
+    used: dict[tuple[str, int], int] = {}
+    found = {}
+    for stage in document["stages"]:
+        key = stage["unit"], columns[stage["name"]]
+        found[stage["name"]] = stage["unit"], used.get(key, 0)
+        used[key] = used.get(key, 0) + 1
+    return found
+
+
+def _lanes(document: Mapping[str, Any], rows: Mapping[str, tuple[str, int]]) -> tuple[dict[str, int], int]:
+    """Return the top of each unit's lane, and the height of all, in pixels."""
+    tops, top = {}, TOP
+    for unit in document["units"]:
+        tops[unit] = top
+        top += LANE * (1 + max(row for other, row in rows.values() if other == unit))
+    return tops, top
+
+
+def _box(stage: Mapping[str, Any], x: int, y: int, is_bound: bool) -> str:
+    time = "" if stage["time_ms"] is None else f"{stage['time_ms']:g} ms"
+    every = f" every {stage['every']}" if stage["every"] > 1 else ""
+    name = stage["name"] if len(stage["name"]) <= LETTERS else stage["name"][: LETTERS - 1] + "…"
+    border = "stroke='#b91c1c' stroke-width='3'" if is_bound else "stroke='#374151'"
+    return (
+        f"<g><title>{escape(stage['name'])}: {escape(stage['what'] or stage['kind'])}</title>"
+        f"<rect x='{x}' y='{y}' width='{BOX}' height='{HEIGHT}' rx='5' fill='white' {border}/>"
+        f"<text x='{x + 8}' y='{y + 18}' {STYLE}>{escape(name)}</text>"
+        f"<text x='{x + 8}' y='{y + 35}' {STYLE} fill='#6b7280'>{escape((time or stage['kind']) + every)}</text></g>"
+    )
+
+
+def _line(start: tuple[int, int], end: tuple[int, int], dashes: str) -> str:
+    x, y, to_x, to_y = start[0] + BOX, start[1] + HEIGHT // 2, end[0], end[1] + HEIGHT // 2
+    bend = (x + to_x) // 2
+    path = f"M {x} {y} C {bend} {y} {bend} {to_y} {to_x} {to_y}"
+    if y == to_y and to_x - x > COLUMN:  # over the boxes between the two
+        over = y - HEIGHT // 2 - OVER
+        path = f"M {x} {y} C {x + OVER} {over} {x} {over} {x + 2 * OVER} {over} H {to_x - 2 * OVER}"
+        path += f" C {to_x} {over} {to_x - OVER} {over} {to_x} {to_y}"
+    return f"<path d='{path}' fill='none' stroke='#6b7280'{dashes}/><circle cx='{to_x}' cy='{to_y}' r='3'/>"

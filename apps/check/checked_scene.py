@@ -18,7 +18,7 @@ from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import corners_of
 from trilane.hw_profiles.shared_chip import alone_ms
 from trilane.hw_profiles.tenants import SKIPS
-from trilane.pipeline.file_text import file_text, tables_of, unsaid
+from trilane.pipeline.description import file_text, tables_of, unsaid
 from trilane.pipeline.pipeline_file import FORM, IF_EMPTY, MOST_BYTES, TABLES, checked_tables
 from trilane.scene.schema import scene_names
 from trilane.scheduler.policy import POLICIES

@@ -35,7 +35,7 @@ from trilane.pipeline.file_keys import (
     VideoBlock,
 )
 from trilane.pipeline.pipeline_file import PipelineFile
-from trilane.stages.blocks.prepare import Preparation
+from trilane.stages.blocks.pictures import Preparation
 
 #: Types of the ports that each stage writes, by name; without the stages of which nothing is known.
 PortTypes = dict[str, dict[str, PortType]]

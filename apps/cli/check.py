@@ -46,7 +46,7 @@ def check(file: FileArgument, svg: SvgOption = None, profile: ProfileOption = No
 
     For a scene, the command prints the pipeline file of its run. Nothing runs, and no Python of the file is imported.
     """
-    from trilane.apps.check.graph_svg import draw_graph
+    from trilane.apps.check.checked_file import draw_graph
     from trilane.errors import BadInputError
     from trilane.writing import require_writable, write_bytes
 

@@ -128,7 +128,7 @@ def _wakeup() -> PartCheck:
 
 def _counters() -> PartCheck:
     """Check the hardware counters, which are not needed: without them a trace has no instructions and cache misses."""
-    from trilane.pipeline.hardware_counters import absence, availability, remedy
+    from trilane.pipeline.job_times import absence, availability, remedy
 
     why = absence()
     install = "" if why is None else remedy(why)

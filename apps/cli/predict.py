@@ -1,25 +1,293 @@
 """`trilane predict`: a configuration, or a table of them, on a chip that is described by a hardware profile.
 
 Rule: this module reads options; every figure comes from `trilane.hw_profiles`, and `predict_output.py` shows them.
+
+`trilane predict FILE.toml`: a pipeline of one's own on a chip, as text and tables.
+
+Rule: nothing is computed here; `apps/predict/asked_file.py` reads what is asked, `hw_profiles` answers.
+
+`trilane predict SCENE --beside …`: several pipelines on one chip, as options and as tables.
+
+Rule: nothing is computed here; `apps/predict/asked_pipelines.py` reads the pipelines, and `hw_profiles/shared_chip.py`
+answers.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from trilane.apps.cli.commands import Commands, JsonOption, with_options
-from trilane.apps.cli.console import say, stderr_console
-from trilane.apps.cli.predict_file import predict_pipeline_file
-from trilane.apps.cli.predict_output import draw, show_answer, show_networks, show_table
-from trilane.apps.cli.predict_pipelines import predict_pipelines
+from trilane.apps.cli.console import (
+    print_json,
+    print_verdict,
+    say,
+    spinner,
+    stderr_console,
+    stdout_console,
+    without_controls,
+)
+from trilane.apps.cli.predict_output import IDLE, draw, show_answer, show_networks, show_table
 from trilane.apps.predict.asked_prediction import answer_of, application_of, predict_networks
 from trilane.apps.predict.predict_options import PredictOptions
+from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from trilane.hw_profiles.application import Plan
+    from rich.console import Console
+    from rich.table import Table
+
+    from trilane.hw_profiles.application import Plan, Variant
     from trilane.hw_profiles.schema import Profile
+    from trilane.hw_profiles.tenants import Pipeline
+
+CAUSES = ("starved", "blocked", "join", "throttled", "overhead")
+
+
+def predict_pipeline_file(options: PredictOptions, path: Path, as_json: bool) -> None:
+    """Print what the pipeline of a file and its variants do on a chip. Raises BadInputError."""
+    from trilane.apps.predict.asked_file import predict_asked_file
+
+    with spinner("predicting"):
+        answer = predict_asked_file(options, path, say)
+    if as_json:
+        print_json(answer)
+        return
+    console, first = stdout_console(), answer["pipelines"][0]
+    machine, requested = answer["machine"], first["frames"]["requested"]
+    where = f"{machine['title']}, {answer['config']['performance_profile']}" if machine else "times of the file"
+    name = without_controls(path.name)
+    console.print(f"{name} (virtual clock), {where}; {requested} frames, seed {answer['config']['seed']}", markup=False)
+    if first["what_if"]:  # the file itself lacks times
+        console.print(f"with {without_controls(first['what_if'])}", markup=False, soft_wrap=True)
+    _show_file(console, first)
+    if len(answer["pipelines"]) > 1:
+        console.print(_what_ifs(answer["pipelines"]))
+    for note in answer["notes"]:
+        console.print(f"note            {note}", soft_wrap=True)
+
+
+def _show_file(console: Console, answer: Mapping[str, Any]) -> None:
+    print_verdict(answer["verdict"]["lines"])
+    frame, latency, frames, needs = (answer[key] for key in ("frame_time_ms", "latency_ms", "frames", "needs_ms"))
+    if rate := answer.get("rate"):
+        console.print(rate["sentence"])
+    rate_said = f", {answer['fps']:.1f} fps" if frame["samples"] else ""
+    console.print(f"frame time      {_of_frames(frame)}{rate_said}")
+    console.print(f"latency         {_of_frames(latency)}")
+    dropped = sum(frames["dropped"].values())
+    console.print(f"frames          {frames['presented']} of {frames['requested']} presented, {dropped} dropped")
+    for cause, count in frames["dropped"].items():
+        console.print(f"                {count} by {cause}", markup=False)
+    console.print(f"always fed      {_ms(needs['mean'])}{_span(needs['low'], needs['high'])} a frame")
+    cycle = " -> ".join(answer["cycle"])
+    limit = f", by {answer['limit'].replace('_', ' ')}: {cycle}" if cycle else ""
+    console.print(f"period          {_ms(answer['period_ms'])} a frame{limit}", soft_wrap=True)
+    console.print(_stages(answer))
+    console.print(_units(answer))
+    for reason in dict.fromkeys(
+        reason for row in answer["stages"].values() if row["low_ms"] is None for reason in row["why"]
+    ):
+        console.print(f"no interval     {reason}", soft_wrap=True)
+    for name, row in answer.get("streams", {}).items():
+        age, behind = row["age_ms"], row["frames_behind"]
+        said = (
+            f"{_ms(age['mean'])} old, {behind['mean']:.1f} frames behind" if age["samples"] else "never there in time"
+        )
+        console.print(f"newest of       {name}: {said}")
+
+
+def _of_frames(times: Mapping[str, Any]) -> str:
+    if not times["samples"]:
+        return "unknown: too few frames were presented"
+    return f"{_ms(times['mean'])}{_span(times['low'], times['high'])}, p95 {_ms(times['p95'])}"
+
+
+def _ms(value: float) -> str:
+    return f"{_digits(value)} ms"
+
+
+def _digits(value: float) -> str:
+    """Return four digits, without an exponent."""
+    return f"{value:.4g}" if value < 1e4 else f"{value:.0f}"
+
+
+def _span(low: float | None, high: float | None, share: str = ", 80 %") -> str:
+    """Return an interval in brackets; nothing where it is a point or unknown."""
+    return "" if low == high or low is None or high is None else f" ({_digits(low)} to {_digits(high)}{share})"
+
+
+def _stages(answer: Mapping[str, Any]) -> Table:
+    from rich.table import Table
+
+    table = Table("stage", "unit", "alone, ms", "in the run, ms", "waits, ms", "time from")
+    for name, row in answer["stages"].items():
+        times = (_digits(row[key]["mean"]) for key in ("service_ms", "wait_ms"))
+        alone = f"{_digits(row['alone_ms'])}{_span(row['low_ms'], row['high_ms'], '')}"
+        table.add_row(name, row["unit"], alone, *times, row["source"])
+    return table
+
+
+def _units(answer: Mapping[str, Any]) -> Table:
+    from rich.table import Table
+
+    table = Table("unit", "busy", *CAUSES)
+    for name, row in answer["units"].items():
+        table.add_row(name, f"{row['busy']:.1%}", *(f"{row['idle'].get(cause, 0.0):.1%}" for cause in CAUSES))
+    return table
+
+
+def _what_ifs(answers: list[dict[str, Any]]) -> Table:
+    """Return a row for the file as it is, and one for each --set."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table("what if", "frame, ms", "fps", "latency, ms", "always fed, ms", "dropped", "holds")
+    for answer in answers:
+        rate = answer.get("rate")
+        table.add_row(
+            escape(without_controls(answer["what_if"])) or "the file",
+            _digits(answer["frame_time_ms"]["mean"]),
+            f"{answer['fps']:.1f}",
+            _digits(answer["latency_ms"]["mean"]),
+            _digits(answer["needs_ms"]["mean"]),
+            f"{sum(answer['frames']['dropped'].values())}",
+            "-" if rate is None else rate["sentence"].partition(": ")[2].partition(";")[0],
+        )
+    return table
+
+
+def predict_pipelines(options: PredictOptions, as_json: bool) -> None:
+    """Print how the scene of `options` and the pipelines beside it do on one chip.
+
+    Raises BadInputError for a fault in one of them.
+    """
+    from trilane.apps.predict.asked_pipelines import answer_of, tenants
+    from trilane.hw_profiles.profile_files import load_runnable
+    from trilane.units import HOST
+
+    scene = str(options.scene)
+    chip, variant = load_runnable(options.profile), _variant(options.policy or "", options.edge)
+    if chip.name == HOST and options.precision is None:
+        from trilane.apps.predict.this_machine import with_first
+
+        chip = with_first(chip, scene, say)
+    with spinner("predicting"):
+        found = tenants([scene, *options.beside], variant, options.numbers)
+        answer = answer_of(chip, found, options)
+        if options.trace is not None:
+            _write_beside(chip, found, options, answer, options.trace)
+    if as_json:
+        print_json(answer)
+        return
+    _show_beside(answer)
+
+
+def _write_beside(
+    chip: Profile, found: Sequence[Pipeline], options: PredictOptions, answer: Mapping[str, Any], target: Path
+) -> None:
+    """Write the simulated runs of the pipelines as one trace."""
+    from trilane.apps.explain.trace import write_predicted
+    from trilane.hw_profiles.schema import corners_of
+    from trilane.hw_profiles.shared_chip import together
+
+    runs = together(chip, found, corners_of(chip, options.cap), options.turns, keep=True).runs
+    named = {tenant.name: run for tenant, run in zip(found, runs, strict=True)}
+    write_predicted(named, {key: answer[key] for key in ("machine", "config")}, target)
+
+
+def _variant(policy: str, edge: str | None) -> Variant:
+    """Return how the avatars' stages are joined. `policy`: "" where none was asked for."""
+    from trilane.hw_profiles.application import REFERENCE
+    from trilane.hw_profiles.tenants import NEWEST
+    from trilane.transport.slots import edge_rule
+    from trilane.unexpected_value import UnexpectedValue
+
+    if policy == "reference":
+        return REFERENCE
+    try:
+        edge_rule(edge or NEWEST.edge)
+    except UnexpectedValue as error:
+        raise BadInputError.at("--edge", error) from None
+    return NEWEST._replace(policy=policy or NEWEST.policy, edge=edge or NEWEST.edge)
+
+
+def _show_beside(answer: dict[str, Any]) -> None:
+    console, config = stdout_console(), answer["config"]
+    console.print(f"{answer['machine']['title']} (virtual clock), {config['performance_profile']}")
+    for row in answer["pipelines"]:
+        alone = f"; alone {row['alone']['rate']['sentence']}" if len(answer["pipelines"]) > 1 else ""
+        where = "" if row["precision"] is None else f", {row['unit']} in {row['precision']}"
+        console.print(f"{row['name']}{where}: {row['rate']['sentence']}{alone}", soft_wrap=True)
+        print_verdict(row["verdict"]["lines"])
+    console.print(_pipelines(answer))
+    console.print(_idle(answer))
+    _show_chip(console, answer)
+    for note in answer["notes"]:
+        console.print(f"note            {note}", soft_wrap=True)
+
+
+def _pipelines(answer: dict[str, Any]) -> Table:
+    from rich.table import Table
+
+    from trilane.hw_profiles.rates import wanted_drops
+
+    minutes = answer["config"]["minutes"]
+    settled = [f"after {minutes:g} min, ms"] if minutes else []
+    table = Table(
+        "pipeline", "asked fps", "frame, ms", *settled, "alone, ms", "response, ms", "in time", "late", "dropped"
+    )
+    for row in answer["pipelines"]:
+        after = [f"{row['frame_ms_settled']:.1f}"] if minutes else []
+        table.add_row(
+            row["name"],
+            f"{row['rate_fps']:g}",
+            _mean(row["frame_time_ms"]),
+            *after,
+            _mean(row["alone"]["frame_time_ms"]),
+            _mean(row["response_ms"]),
+            f"{row['in_time']:.1%}",
+            f"{row['deadline_misses']}",
+            f"{wanted_drops(row['frames']['dropped'])}",
+        )
+    return table
+
+
+def _mean(times: Mapping[str, float]) -> str:
+    """Return the mean of some times in ms, a dash where there are none."""
+    return f"{times['mean']:.1f}" if times["samples"] else "-"
+
+
+def _idle(answer: dict[str, Any]) -> Table:
+    """Return a table of each unit: its busy time for all, and its busy time and idle causes per pipeline."""
+    from rich.table import Table
+
+    rows = [row for one in answer["pipelines"] for row in one["units"].values()]
+    causes = [*IDLE, *(["join"] if any("join" in row["idle"] for row in rows) else [])]
+    table = Table("unit", "pipeline", "busy", *causes)
+    for unit in dict.fromkeys([*answer["units"], *(row["hardware"] for row in rows)]):
+        heads = iter([unit])
+        if unit in answer["units"]:
+            table.add_row(next(heads), "all", f"{answer['units'][unit]['busy']:.1%}")
+        for one in answer["pipelines"]:
+            for name, own in one["units"].items():
+                if own["hardware"] == unit:
+                    said = one["name"] if name == unit else f"{one['name']}: {name}"
+                    shares = (f"{own['idle'].get(cause, 0.0):.1%}" for cause in causes)
+                    table.add_row(next(heads, ""), said, f"{own['busy']:.1%}", *shares)
+    return table
+
+
+def _show_chip(console: Console, answer: dict[str, Any]) -> None:
+    base = f"{answer['base_power_w']:.1f} W of it {answer['base_power_kind']} for all but the units"
+    console.print(f"power           {answer['power_w']:.1f} W ({base})")
+    if heat := answer["temperature_c"]:
+        console.print(
+            f"temperature     device {heat['device_max']:.1f} °C, junction {heat['junction_max']:.1f} °C; "
+            f"lowered for heat {answer['caps']['throttled_share']:.0%} of the time"
+        )
+
 
 app = Commands()
 

@@ -34,7 +34,7 @@ from trilane.apps.compare.rows import (
 from trilane.apps.compare.run_frames import INSTRUCTION_TIME, INSTRUCTIONS
 from trilane.apps.compare.sides import Change, ComparedRun, RunKind, Side, changes
 from trilane.apps.explain.reasons import bound_text
-from trilane.apps.run.trust import trust_of
+from trilane.apps.run.verdict import trust_of
 from trilane.errors import BadInputError
 
 SCHEMA: Final = 1

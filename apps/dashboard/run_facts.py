@@ -107,7 +107,7 @@ BOUND: Final = ("bottleneck", "bound", "efficiency", "core_efficiency", "machine
 def facts_of_checked(name: str, checked: Checked, options: RunOptions, machine: Mapping[str, Any]) -> RunFacts:
     """Return the facts of a run that begins."""
     # here and below: the process that shows a live run asks for neither, and starts sooner without
-    from trilane.apps.run.avatar_facts import config_facts
+    from trilane.apps.run.report_facts import config_facts
 
     config = checked.config
     scene = config.scene

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw
 
-from trilane.apps.run.avatar_facts import worst_loss
+from trilane.apps.run.report_facts import worst_loss
 from trilane.arrays import F64, I64, Shape
 from trilane.avatars.network_file import NetworkFile
 from trilane.body.joints import Skeleton

@@ -13,7 +13,7 @@ from trilane.apps.check.port_types import port_types, read_networks
 from trilane.apps.explain.explained_run import open_journal
 from trilane.apps.predict.predict_options import PredictOptions
 from trilane.apps.run.report import read_report
-from trilane.apps.run.trust import Trust, trust_of
+from trilane.apps.run.verdict import Trust, trust_of
 from trilane.apps.run.verdict_facts import predicted_verdict
 from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_file import GraphFile

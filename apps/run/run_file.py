@@ -1,46 +1,310 @@
 """A run of a pipeline file as somebody asked for it, from options to a run folder.
 
 Rule: nothing is printed here. The modules of the file's own code are named before any of them is imported.
+
+The pipeline that a pipeline file describes, ready for a run on this machine: factories, slots, and units' cores.
+
+Rule: the types of all ports are known before a slot is made, and nothing of the file is imported here.
 """
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from trilane.apps.run.file_pipeline import (
-    frames_of,
-    imports_of,
-    picture_fps,
-    picture_size,
-    pipeline_of,
-    preload_of,
-    segments_of,
-    with_window,
-)
+from trilane.apps.check.port_types import PortTypes, port_types, read_networks, require_weights, value_type
 from trilane.apps.run.report import write_report
 from trilane.apps.run.report_facts import made_facts, report_of
 from trilane.apps.run.run_files import VIDEO, join_folder, write_files
 from trilane.apps.run.run_folder import RunFolder, default_place
 from trilane.apps.run.run_job import ENDLESS, Hooks, RunOutcome, error_of, exit_code_of, sensors
 from trilane.errors import BadInputError, UnwrittenError
+from trilane.hw_profiles.graph_file import GraphFile, fed_inputs
+from trilane.hw_profiles.host import settings_of, usable_cores
 from trilane.machine import require_memory
 from trilane.pipeline import journal
 from trilane.pipeline.controls import Interrupts, RunControls
-from trilane.pipeline.description import Pipeline
-from trilane.pipeline.file_graph import settings_of
-from trilane.pipeline.file_keys import EncodeBlock, OnnxStage
-from trilane.pipeline.pipeline_file import PipelineFile, assignments, read_pipeline
-from trilane.pipeline.result import Failure, RunResult
+from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
+from trilane.pipeline.description import StageInput as StreamInput
+from trilane.pipeline.file_graph import DEFAULT_FRAMES, bypass_of, edge_rules
+from trilane.pipeline.file_graph import settings_of as scheduler_settings
+from trilane.pipeline.file_keys import (
+    BlockStage,
+    EncodeBlock,
+    OnnxStage,
+    PortType,
+    PythonStage,
+    StageInput,
+    StageKeys,
+    TimedStage,
+    VideoBlock,
+    port_type,
+)
+from trilane.pipeline.pipeline_file import PipelineFile, assignments, read_pipeline, stage_inputs
+from trilane.pipeline.result import Failure, JournalFile, RunResult
 from trilane.pipeline.run import HANG_NS, run_pipeline
-from trilane.pipeline.run_record import JournalFile
+from trilane.pipeline.stage import payload_bytes
 from trilane.pipeline.unit_starter import UnitStarter
+from trilane.scheduler.placement import Place
+from trilane.stages.blocks.video import DEFAULT_FPS, Footage, footage
+from trilane.stages.dsp.runtime import resolve
 from trilane.stages.machine_facts import machine_facts
 from trilane.stages.run_options import RunOptions
+from trilane.transport.slots import edge_rule
+
+BLOCKS: Final = "trilane.stages.blocks"
+ENCODE: Final = f"{BLOCKS}.video:build_encode"
+#: Module and factory of each block.
+FACTORIES: Final = {
+    "busy": "own_code:build_load",
+    "discard": "own_code:build_load",
+    "encode": "video:build_encode",
+    "overlay": "pictures:build_overlay",
+    "prepare": "pictures:build_prepare",
+    "video": "video:build_video",
+}
+SEGMENTS: Final = "segments"  # of the first video, as `trilane.apps.run.run_files` reads them
+TOKEN: Final = {"": PortType("u8", (1,))}  # what a made-up load writes
+
+
+def pipeline_of(file: PipelineFile, run_folder: Path) -> Pipeline:
+    """Return the pipeline of a checked file; its units' cores are dealt out by `cores_of`.
+
+    `run_folder`: folder in which the run leaves its files. Raises BadInputError naming the key, MissingPartError for a
+    runtime that is not installed.
+    """
+    networks = read_networks(file)
+    types = _all_types(file, networks)
+    rules = edge_rules(file, None)
+    stages = tuple(_stage(file, name, types, networks, run_folder) for name in file.stages)
+    if file.bypass is not None:
+        stages = _bypassed(file, stages, types, rules)
+    edges = tuple(PipelineEdge(payload_bytes=payload_bytes(types[name]), rule=rules[name]) for name in file.readers)
+    return Pipeline(
+        stages=stages,
+        edges=edges,
+        units=cores_of(file, usable_cores()),
+        latency_to=file.latency_to,
+        bypass=bypass_of(file),
+        warms_up=False,
+        from_release=file.run.fps is not None or file.run.arrivals is not None,
+        module_folders=(file.folder.absolute(),),
+    )
+
+
+def preload_of(file: PipelineFile) -> tuple[str, ...]:
+    """Return the modules that the stages of a file come from, none of them the file's own."""
+    made = [_factory(stage) for stage in file.stages.values() if not isinstance(stage, TimedStage)]
+    return tuple(dict.fromkeys(factory.partition(":")[0] for factory in made))
+
+
+def imports_of(file: PipelineFile) -> list[str]:
+    """Return the modules that a run of the file imports for its own code."""
+    return sorted({each.python.partition(":")[0] for each in file.stages.values() if isinstance(each, PythonStage)})
+
+
+def frames_of(file: PipelineFile) -> int:
+    """Return the number of frames of a run: that of the file, else that of its shortest video, else DEFAULT_FRAMES.
+
+    Raises BadInputError for a video that cannot be read.
+    """
+    if file.run.frames is not None:
+        return file.run.frames
+    counts = []
+    for stage in file.stages.values():
+        if isinstance(stage, VideoBlock) and not stage.is_camera:
+            found = _footage_of(file, stage)
+            rate = file.run.fps / found.fps if file.run.fps and found.fps else 1.0
+            counts += [max(round(found.pictures * rate), 1)] if found.pictures else []
+    return min(counts, default=DEFAULT_FRAMES)
+
+
+def _footage_of(file: PipelineFile, stage: VideoBlock) -> Footage:
+    """Return what the video of a stage holds. Raises BadInputError naming the stage's key."""
+    try:
+        return footage(file.folder / stage.path)
+    except BadInputError as error:
+        name = next(each for each, one in file.stages.items() if one is stage)
+        where = f"{file.path}: stages.{name}.path: {error.where}"
+        raise BadInputError(where, error.found, error.expected, error.remedy) from None
+
+
+def picture_fps(file: PipelineFile) -> float:
+    """Return the rate of what the file's videos show: that of the run, else of its first video, else DEFAULT_FPS."""
+    if file.run.fps is not None:
+        return file.run.fps
+    videos = [stage for stage in file.stages.values() if isinstance(stage, VideoBlock) and not stage.is_camera]
+    rates = [_footage_of(file, stage).fps for stage in videos]
+    return next((rate for rate in rates if rate), DEFAULT_FPS)
+
+
+def picture_size(pipeline: Pipeline) -> dict[str, dict[str, int]]:
+    """Return `output`, the size of the pictures that the first stage that encodes reads; empty without such a stage."""
+    for stage in pipeline.stages:
+        if stage.factory == ENCODE:
+            read = stage.settings["reads"][0]
+            height, width, _ = port_type(stage.settings["streams"][read["stream"]][read["port"]]).shape
+            return {"output": {"width": width, "height": height}}
+    return {}
+
+
+def with_window(pipeline: Pipeline, window: Path) -> Pipeline:
+    """Return the pipeline whose first stage that encodes shows its newest picture in `window`."""
+    name = next((stage.name for stage in pipeline.stages if stage.factory == ENCODE), "")
+    stages = tuple(
+        stage
+        if stage.name != name
+        else stage.model_copy(
+            update={"settings": {**stage.settings, "keys": {**stage.settings["keys"], "window": str(window)}}}
+        )
+        for stage in pipeline.stages
+    )
+    return pipeline.model_copy(update={"stages": stages})
+
+
+def segments_of(file: PipelineFile) -> dict[str, str]:
+    """Return the folder of segments of each stage that encodes, by the stage's name."""
+    names = [name for name, stage in file.stages.items() if isinstance(stage, EncodeBlock)]
+    return {name: f"{SEGMENTS}.{name}" if place else SEGMENTS for place, name in enumerate(names)}
+
+
+def cores_of(file: PipelineFile, cores: Sequence[int]) -> dict[str, UnitSettings]:
+    """Return cores and threads of each unit: those of the file, else a share of `cores`.
+
+    Cores are dealt out to the units in turn, in the order of the stages. Cores that are left over go to the units with
+    networks, in turn. Nothing is measured for it.
+    """
+    open_units = [unit for unit, keys in file.units.items() if keys.cores is None]
+    shares: dict[str, list[int]] = {unit: [cores[place % len(cores)]] for place, unit in enumerate(open_units)}
+    with_networks = [
+        unit
+        for unit in open_units
+        if any(isinstance(stage, OnnxStage) and stage.unit == unit for stage in file.stages.values())
+    ]
+    for place, core in enumerate(cores[len(open_units) :] if with_networks else ()):
+        shares[with_networks[place % len(with_networks)]].append(core)
+    places = {}
+    for unit, keys in file.units.items():
+        own = tuple(sorted(keys.cores or shares[unit]))
+        if absent := set(own) - set(cores):
+            found = f"core {', '.join(map(str, sorted(absent)))}"
+            expected = f"cores that this process may use: {', '.join(map(str, cores))}"
+            raise BadInputError(f"{file.path}: units.{unit}.cores", found, expected, "or leave out `cores`")
+        places[unit] = Place(own, keys.threads or len(own))
+    return settings_of(places)
+
+
+def _all_types(file: PipelineFile, networks: Mapping[str, GraphFile]) -> PortTypes:
+    """Return the types of all ports that are written. Raises BadInputError where one is read and not known."""
+    types = port_types(file, networks)
+    for name, stage in file.stages.items():
+        if isinstance(stage, VideoBlock) and stage.is_camera:
+            found, expected = "a camera, which a run cannot read yet", "a video or a folder of pictures"
+            raise BadInputError(f"{file.path}: stages.{name}.path", found, expected, "record a video of it first")
+        if isinstance(stage, TimedStage):
+            found, expected = "a time alone, with nothing to run", "onnx, python or block"
+            remedy = 'block = "busy" works for a time; `trilane predict` takes times alone'
+            raise BadInputError(f"{file.path}: stages.{name}", found, expected, remedy)
+        if name in file.readers and name not in types:
+            if not isinstance(stage, BlockStage) or stage.block != "busy":
+                found, expected = "nothing", "the type of what it writes, such as 'u8 256x256x3'"
+                raise BadInputError(f"{file.path}: stages.{name}.out", found, expected, "a run makes its slots by it")
+            types[name] = TOKEN
+    return types
+
+
+def _stage(
+    file: PipelineFile, name: str, types: PortTypes, networks: Mapping[str, GraphFile], run_folder: Path
+) -> PipelineStage:
+    stage = file.stages[name]
+    streams = stage_inputs(stage)
+    inputs = tuple(StreamInput(stage=each.stage, latest=each.latest, max_age_ms=each.max_age_ms) for each in streams)
+    place_of = {each.stage: place for place, each in enumerate(streams)}
+    made = PipelineStage(name=name, unit=stage.unit, factory=_factory(stage), inputs=inputs, every=stage.every)
+    settings = {
+        "where": f"{file.path.name}: stages.{name}",
+        "folder": str(file.folder.absolute()),
+        "run_folder": str(run_folder.absolute()),
+        "joins": made.joins,
+        "reads": [
+            {"name": each.port, "stream": place_of[each.stage], "port": _port(file, name, each, types)}
+            for each in stage.inputs
+        ],
+        "streams": [_texts(types[each.stage]) for each in streams],
+        "writes": _texts(types.get(name, {})) if name in file.readers else {},
+        "keys": _keys(file, name, stage, networks),
+    }
+    return made.model_copy(update={"settings": settings})
+
+
+def _bypassed(
+    file: PipelineFile, stages: Sequence[PipelineStage], types: PortTypes, rules: Mapping[str, str]
+) -> tuple[PipelineStage, ...]:
+    """Return the stages as a chain, whose stage at the bypass's end knows what the stage at its begin writes."""
+    assert file.bypass is not None
+    begin, way = file.bypass
+    found = []
+    for stage in stages:
+        settings = dict(stage.settings)
+        if stage.name == begin:
+            settings["keys"] = {**settings["keys"], "bypass": way.model_dump(mode="json")}
+        elif stage.name == way.to:
+            own = file.stages[way.to].inputs[0].stage
+            settings["bypass"] = {"behind": edge_rule(rules[own]).slots, "ports": _texts(types[begin])}
+        found.append(stage.model_copy(update={"inputs": None, "settings": settings}))
+    return tuple(found)
+
+
+def _factory(stage: StageKeys) -> str:
+    """Return the module and the function that make a stage."""
+    if isinstance(stage, BlockStage):
+        return f"{BLOCKS}.{FACTORIES[stage.block]}"
+    return f"{BLOCKS}.{'network' if isinstance(stage, OnnxStage) else 'own_code'}:build"
+
+
+def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str, GraphFile]) -> dict[str, Any]:
+    """Return the keys of a stage's own kind, and what follows from the rest of the file."""
+    common = set(StageKeys.model_fields)
+    keys: dict[str, Any] = {
+        key: value for key, value in stage.model_dump(mode="json").items() if key not in common and value is not None
+    }
+    if isinstance(stage, OnnxStage):
+        resolve(stage.runtime)
+        graph = networks[name]
+        values = [(value.name, value_type(value)) for value in fed_inputs(graph)]
+        require_weights(graph, f"{file.path}: stages.{name}.onnx")
+        keys["inputs"] = {}
+        for each, found in values:
+            if found is None:
+                odd, remedy = f"an input {each!r} of no numbers", "export it with inputs of numbers alone"
+                raise BadInputError(f"{file.path}: stages.{name}.onnx", odd, "numbers", remedy)
+            keys["inputs"][each] = str(found)
+    elif isinstance(stage, VideoBlock):
+        keys["fps"] = file.run.fps
+    elif isinstance(stage, EncodeBlock):
+        keys |= {"fps": picture_fps(file), "segments": segments_of(file)[name]}
+    return keys
+
+
+def _port(file: PipelineFile, name: str, each: StageInput, types: PortTypes) -> str:
+    """Return the port of a stream that an input reads. Raises BadInputError where it must be named and is not."""
+    ports = types[each.stage]
+    if each.from_port or len(ports) == 1:
+        chosen = each.from_port or next(iter(ports))
+        if chosen in ports:
+            return chosen
+    where = f"{file.path}: stages.{name}.in" + (f".{each.port}" if each.port else "")
+    found = f"{each.stage!r}, which has the ports {', '.join(ports)}"
+    raise BadInputError(where, found, "one of them", f"write '{each.stage}.{next(iter(ports))}'")
+
+
+def _texts(ports: Mapping[str, PortType]) -> dict[str, str]:
+    return {name: str(port) for name, port in ports.items()}
+
 
 AUTO: Final = "auto"
 #: Options of a run that stand for keys of [run] of a pipeline file, and all that it takes beside the file itself.
@@ -113,7 +377,7 @@ class _Asked:
     ) -> None:
         self.options, self.file, self.pipeline, self.watch = options, file, pipeline, watch
         is_endless = watch is not None and not options.frames and file.run.arrivals is None
-        self.settings = settings_of(file, ENDLESS if is_endless else frames, hang_ns=HANG_NS)
+        self.settings = scheduler_settings(file, ENDLESS if is_endless else frames, hang_ns=HANG_NS)
         self.machine, self.made = machine_facts(), made_facts(command)
         units = {unit: each.model_dump(mode="json") for unit, each in pipeline.units.items()}
         self.config: dict[str, Any] = {

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from trilane import machine
-from trilane.apps.run.avatar_facts import avatar_report, config_facts, resolution_note, resolution_of
 from trilane.apps.run.report import Report, write_report
+from trilane.apps.run.report_facts import avatar_report, config_facts, resolution_note, resolution_of
 from trilane.apps.run.run_folder import RunFolder
 from trilane.arrays import F64, U8, Mask
 from trilane.bench.lib.picture_error import psnr_of_frames, require_metrics
@@ -30,8 +30,7 @@ from trilane.hw_profiles.governor import Governor
 from trilane.hw_profiles.profile_files import load_runnable
 from trilane.pipeline import journal
 from trilane.pipeline.controls import Interrupts, RunControls
-from trilane.pipeline.result import Failure, RunResult
-from trilane.pipeline.run_record import JournalFile
+from trilane.pipeline.result import Failure, JournalFile, RunResult
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.policy import policy_named
 from trilane.stages.avatar_pipeline import run_avatar

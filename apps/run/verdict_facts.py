@@ -11,11 +11,11 @@ from math import inf
 from typing import TYPE_CHECKING, Any, Final
 
 from trilane.apps.explain.reasons import SHORTER
-from trilane.apps.run.trust import MOST_OTHERS, Trust, percent, trust_of
 from trilane.apps.run.verdict import (
     COMPUTED,
     DISPLAY,
     LEAST_NAMED,
+    MOST_OTHERS,
     SO_FAR,
     TARGET_FPS,
     UNKNOWN,
@@ -23,9 +23,12 @@ from trilane.apps.run.verdict import (
     Facts,
     Lateness,
     Rate,
+    Trust,
     Verdict,
     judged,
+    percent,
     slow_percentile,
+    trust_of,
 )
 from trilane.hw_profiles.rates import wanted_drops
 from trilane.scheduler.policy import POLICIES

@@ -29,7 +29,7 @@ from typing import Any
 import psutil
 
 from trilane import machine
-from trilane.apps.run.trust import Trust, trust_of
+from trilane.apps.run.verdict import Trust, trust_of
 from trilane.apps.sweep.definition import Trial, TrialClock
 from trilane.apps.sweep.store import SWEEP, Engine, Record
 from trilane.errors import BadInputError, MissingPartError

@@ -18,7 +18,7 @@ from typing import Any, Final
 
 from trilane.errors import BadInputError, did_you_mean
 from trilane.files import HEAD_BYTES, read_bytes, read_text, require_file, whole_number
-from trilane.pipeline.measurements import mlperf_files, runtime_files, trace_slices, vendor_files
+from trilane.pipeline.measurements import runtime_files, trace_slices, vendor_files
 from trilane.pipeline.measurements.measurement import CYCLES, PER_MS, QUEUEING, Found, Measurement, Refused
 
 MOST_TEXT_BYTES: Final = 64 << 20
@@ -91,8 +91,8 @@ def _of_text(path: Path, text: str) -> Found:
             return document
     if vendor_files.is_qnn(lines):
         return vendor_files.read_qnn(text)
-    if mlperf_files.TITLE in text:
-        return mlperf_files.read_loadgen(text)
+    if vendor_files.TITLE in text:
+        return vendor_files.read_loadgen(text)
     if runtime_files.is_benchmark(text):
         return runtime_files.read_benchmark(text)
     if lines and tuple(lines[0].split(",")) == OWN_COLUMNS:
@@ -137,8 +137,8 @@ def _of_table(document: Mapping[str, Any]) -> Found | None:
         return vendor_files.read_ai_hub(document)
     if "htp_overall_summary" in data:
         return vendor_files.read_qhas(document)
-    if mlperf_files.is_mlperf_app(document):
-        return mlperf_files.read_mlperf_app(document)
+    if vendor_files.is_mlperf_app(document):
+        return vendor_files.read_mlperf_app(document)
     if isinstance(document.get("cases"), list):
         return runtime_files.read_executorch(document)
     if isinstance(document.get("traceEvents"), list):
@@ -153,8 +153,8 @@ def _of_list(document: object) -> Found | None:
         return None
     if runtime_files.is_tensorrt(document):
         return runtime_files.read_tensorrt(document)
-    if mlperf_files.is_mlperf_app(document):
-        return mlperf_files.read_mlperf_app(document)
+    if vendor_files.is_mlperf_app(document):
+        return vendor_files.read_mlperf_app(document)
     tables = [each for each in document[:20] if isinstance(each, dict)]
     if any("average_time_ms" in each for each in tables):
         return runtime_files.read_layer_means(document)

@@ -152,7 +152,7 @@ def _calls(path: Path, shapes: Shapes, runtime: str, options: RuntimeOptions) ->
 
     Raises BadInputError for a graph that the runtime cannot load or whose inputs are no numbers.
     """
-    from trilane.stages.dsp.any_network import engine_of
+    from trilane.stages.blocks.network import engine_of
 
     graph = parse_network(path).graph
     held = {each.name for each in graph.initializer}

@@ -25,7 +25,7 @@ from trilane import machine
 from trilane.apps.run.run_folder import RunFolder
 from trilane.cache import cache_dir
 from trilane.hw_profiles.profile_files import load_profile
-from trilane.pipeline.hardware_counters import availability
+from trilane.pipeline.job_times import availability
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.stages.dsp.runtime import installed
 from trilane.stages.machine_facts import cpu_facts, package_version, runtime_facts

@@ -17,9 +17,9 @@ import pytest
 from support.cpu_load import FACTORY
 from trilane.hw_profiles.host import usable_cores
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
+from trilane.pipeline.result import JournalFile
 from trilane.pipeline.run import run_pipeline
 from trilane.pipeline.run_metrics import RunMetrics
-from trilane.pipeline.run_record import JournalFile
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
 OUTSIDE = Path(__file__).with_name("seen_from_outside.py")

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from support.doubles import pipeline_of_doubles as doubles
-from trilane.pipeline import run_record
+from trilane.pipeline import result as output
 from trilane.pipeline.journal import Sampled, Worked, read_journal
+from trilane.pipeline.result import JournalFile
 from trilane.pipeline.run import SKETCHED, run_pipeline
-from trilane.pipeline.run_record import JournalFile
 from trilane.scheduler.stats import MOST_EXACT, MOVED_AT_ONCE
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("nothing_left")]
@@ -24,7 +24,7 @@ BYTES_PER_FRAME = 24
 
 @pytest.mark.timeout(600)
 def test_memory_does_not_grow_with_the_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_record, "SAMPLE_NS", 1_000_000_000)
+    monkeypatch.setattr(output, "SAMPLE_NS", 1_000_000_000)
     pipeline = doubles(pose=0, raster=0, infer=0, composite=0, present=0)
     result = run_pipeline(pipeline, FRAMES, journal=JournalFile(tmp_path / "j", {}))
     assert (result.presented, result.report.percentiles) == (FRAMES, SKETCHED)

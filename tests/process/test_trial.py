@@ -9,7 +9,7 @@ import pytest
 from trilane import machine
 from trilane.hw_profiles.host import usable_cores
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
-from trilane.pipeline.trial import SLICE, Group, try_in_turns
+from trilane.pipeline.rehearsal import SLICE, Group, try_in_turns
 from trilane.pipeline.unit_starter import UnitStarter
 
 pytestmark = pytest.mark.usefixtures("nothing_left")

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.file_keys import port_type
-from trilane.pipeline.ports import PortedStage, payload_bytes, views
-from trilane.pipeline.stage import UnitContext
+from trilane.pipeline.stage import PortedStage, UnitContext, payload_bytes, views
 from trilane.transport.packets import Packet, SlotLayout, header_dtype, view_packet
 
 UNIT = UnitContext("cpu", UnitSettings(cores=(0,), threads=1), {})

@@ -11,8 +11,7 @@ import pytest
 from trilane.bench import placement, planner
 from trilane.bench.lib.cast import Box
 from trilane.errors import BadInputError
-from trilane.pipeline.rehearsal import Rehearsed
-from trilane.pipeline.trial import Round
+from trilane.pipeline.rehearsal import Rehearsed, Round
 from trilane.scheduler.placement import CpuCore, Place, Ranked, UnitWork
 from trilane.stages.placing import TriedPlacement
 

@@ -13,8 +13,7 @@ from typing import Any
 import pytest
 
 from support.small_pipeline import pipeline
-from trilane.pipeline import cpu_use
-from trilane.pipeline.cpu_use import CpuTimes, use_of_cores
+from trilane.pipeline import realtime_clock
 from trilane.pipeline.job_times import (
     HELD_NS,
     JOBS_PER_LOOK,
@@ -25,6 +24,7 @@ from trilane.pipeline.job_times import (
     lost_in_job,
     most_preempted_ns,
 )
+from trilane.pipeline.realtime_clock import CpuTimes, use_of_cores
 from trilane.pipeline.result import RunLog
 from trilane.scheduler.events import JobDone
 from trilane.transport.messages import Done
@@ -419,11 +419,11 @@ def a_report() -> dict[str, Any]:
 
 def test_accounts_that_contradict_themselves_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """`right` has 2.5 ms of CPU time in a run of 1 ms on two cores."""
-    monkeypatch.setattr(cpu_use, "counts_run_delay", lambda: False)
+    monkeypatch.setattr(realtime_clock, "counts_run_delay", lambda: False)
     cpu = CpuTimes({"left": 2, "right": 2})
     cpu.add("right", "mid", Done(0, MS, 2 * MS, 0, 0, 0, 0, 0, 2 * MS, MS // 2, {}), 0)
     report, heard = a_report(), []
-    cpu_use.add_accounts(report, PIPELINE, cpu, RunLog(heard.append))
+    realtime_clock.add_accounts(report, PIPELINE, cpu, RunLog(heard.append))
     right = report["units"]["right"]
     assert (right["cpu_s"], right["cpu_in_jobs_s"], right["idle"]) == (0.0025, 0.002, {"preempted": None})
     assert report["units"]["left"]["idle"] == {"preempted": None}
@@ -433,7 +433,7 @@ def test_accounts_that_contradict_themselves_are_told(monkeypatch: pytest.Monkey
         ((1, 3), pytest.approx(1.25), 0.125),
         ((0, 1, 3), pytest.approx(2.5 / 3), 0.25),
     ]
-    assert heard == ["right had 125.0% of the time of cores (1, 3): please report this", cpu_use.NO_RUN_DELAY]
+    assert heard == ["right had 125.0% of the time of cores (1, 3): please report this", realtime_clock.NO_RUN_DELAY]
 
 
 def test_a_process_of_one_thread_has_one_that_is_counted() -> None:

@@ -11,15 +11,14 @@ import numpy as np
 import pytest
 
 from support.pipeline_files import write_file
-from trilane.apps.run.file_pipeline import pipeline_of
+from trilane.apps.run.run_file import pipeline_of
 from trilane.pipeline.file_graph import bypass_of, edge_rules, graph_of, settings_of, skips_of
 from trilane.pipeline.journal import journal_of
 from trilane.pipeline.pipeline_file import PipelineFile, read_pipeline
-from trilane.pipeline.ports import PortedStage
-from trilane.pipeline.stage import Skip
+from trilane.pipeline.stage import PortedStage, Skip
 from trilane.pipeline.timeline import Presented, Timeline
 from trilane.scheduler.virtual import simulate
-from trilane.stages.blocks.loads import Busy
+from trilane.stages.blocks.own_code import Busy
 from trilane.transport.packets import header_dtype
 
 TEXT = """

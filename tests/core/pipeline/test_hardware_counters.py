@@ -15,7 +15,7 @@ import pytest
 
 from trilane import machine
 from trilane.machine import Machine
-from trilane.pipeline.hardware_counters import (
+from trilane.pipeline.job_times import (
     ATTR,
     KINDS,
     ROW,

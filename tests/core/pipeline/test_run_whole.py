@@ -13,8 +13,7 @@ import pytest
 
 from support.small_pipeline import pipeline
 from trilane.errors import BadInputError, UnwrittenError
-from trilane.pipeline import cpu_use, run
-from trilane.pipeline.cpu_use import CpuTimes
+from trilane.pipeline import realtime_clock, run
 from trilane.pipeline.journal import (
     Accounted,
     Begun,
@@ -28,10 +27,10 @@ from trilane.pipeline.journal import (
     Worked,
     read_journal,
 )
-from trilane.pipeline.result import RunResult
+from trilane.pipeline.realtime_clock import CpuTimes
+from trilane.pipeline.result import JournalFile, RunResult
 from trilane.pipeline.run import DdSketch
 from trilane.pipeline.run_metrics import ProcessorState, metrics_of
-from trilane.pipeline.run_record import JournalFile
 from trilane.scheduler.events import Outcome, OutcomeKind, Settings, StageAlone
 from trilane.scheduler.virtual import VirtualDriver
 from trilane.transport.messages import Done
@@ -112,7 +111,7 @@ def world(monkeypatch: pytest.MonkeyPatch) -> World:
         ("processor_of", lambda cores: lambda: ProcessorState(throttles=len(cores))),
     ):
         monkeypatch.setattr(run, name, part)
-    monkeypatch.setattr(cpu_use, "counts_run_delay", lambda: True)
+    monkeypatch.setattr(realtime_clock, "counts_run_delay", lambda: True)
     return world
 
 
@@ -184,11 +183,11 @@ def test_a_run_with_a_journal_keeps_nothing_and_writes_the_same(world: World, tm
 def test_messages_and_frames_left_out_are_in_the_journal(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cpu_use, "counts_run_delay", lambda: False)
+    monkeypatch.setattr(realtime_clock, "counts_run_delay", lambda: False)
     governor: Any = SimpleNamespace(is_prompt=True, power_w=None, report=dict, temperatures_c={"device": 30.0})
     go(journal=JournalFile(tmp_path / "j", {}), policy="latest", fps=2000.0, governor=governor)
     records = list(read_journal(tmp_path / "j"))
-    assert [each.text for each in records if isinstance(each, Said)] == [cpu_use.NO_RUN_DELAY]
+    assert [each.text for each in records if isinstance(each, Said)] == [realtime_clock.NO_RUN_DELAY]
     counts = [each for each in records if isinstance(each, Counted)]
     assert counts[-1].dropped == world.core.ledger.dropped_by_cause and counts[-1].lost == {}
     assert [sum(each.dropped.values()) for each in counts] == sorted({sum(each.dropped.values()) for each in counts})

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from trilane import machine
-from trilane.pipeline import trial
-from trilane.pipeline.trial import DRAIN, SKIPPED, SLICE, Group
+from trilane.pipeline import rehearsal
+from trilane.pipeline.rehearsal import DRAIN, SKIPPED, SLICE, Group
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import Settings, chain
 from trilane.scheduler.virtual import VirtualDriver
@@ -61,7 +61,7 @@ def live(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
 
     def made(interrupts: int = 0) -> Any:
         processes = Processes()
-        one = trial._Live(Group(PIPELINE, PLACES), processes, SimpleNamespace(count=interrupts))  # type: ignore[arg-type]
+        one = rehearsal._Live(Group(PIPELINE, PLACES), processes, SimpleNamespace(count=interrupts))  # type: ignore[arg-type]
         return SimpleNamespace(one=one, processes=processes, own=own, settings=settings)
 
     own: list[Any] = []
@@ -71,8 +71,8 @@ def live(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
         settings.append(core.settings)
         return VirtualClock(core, *others)
 
-    monkeypatch.setattr(trial, "RealtimeClock", clock)
-    monkeypatch.setattr(trial, "os", SimpleNamespace(sched_setaffinity=lambda pid, cores: own.append((pid, cores))))
+    monkeypatch.setattr(rehearsal, "RealtimeClock", clock)
+    monkeypatch.setattr(rehearsal, "os", SimpleNamespace(sched_setaffinity=lambda pid, cores: own.append((pid, cores))))
     return made
 
 
@@ -112,7 +112,7 @@ def test_the_frames_that_were_under_way_do_not_count() -> None:
     clock: Any = Clock()
     own = {"a": machine.here.cores()}
     places: Any = [{**own, "b": (5,)}, {**own, "b": (6,)}]
-    turns = trial._Turns(core, clock, processes, places)  # type: ignore[arg-type]
+    turns = rehearsal._Turns(core, clock, processes, places)  # type: ignore[arg-type]
     where = []
     for _ in steps:
         assert turns.wait(99) == "events"  # type: ignore[comparison-overlap]

@@ -10,8 +10,7 @@ import pytest
 
 from trilane.apps.explain.reasons import bound_text
 from trilane.pipeline.journal import records_of
-from trilane.pipeline.reckoning import reckoned
-from trilane.pipeline.what_if import MOST_BLOCKS, SLOWER
+from trilane.pipeline.reckoning import MOST_BLOCKS, SLOWER, reckoned
 from trilane.scheduler.events import SetDuty, Settings, chain
 from trilane.scheduler.placement import Place, Placement
 from trilane.scheduler.shared_units import Member, simulate_beside

@@ -16,7 +16,7 @@ from PIL import Image
 
 from support.ported_stages import Ported
 from trilane.errors import BadInputError, TrilaneError
-from trilane.stages.blocks import loads, network, overlay, own_code, prepare, video
+from trilane.stages.blocks import network, own_code, pictures, video
 from trilane.stages.dsp.runtime import installed
 
 RNG = np.random.default_rng(3)
@@ -31,7 +31,7 @@ def picture(height: int, width: int, channels: int = 3) -> NDArray[np.uint8]:
 
 def test_a_float_network_gets_each_channel_normalised_and_first(tmp_path: Path) -> None:
     mean, sd = [0.5, 0.25, 0.1], [0.2, 0.5, 1.0]
-    stage = Ported(prepare.build, {"": "u8 4x6x3"}, {"": "f32 1x3x4x6"}, tmp_path, mean=mean, sd=sd)
+    stage = Ported(pictures.build_prepare, {"": "u8 4x6x3"}, {"": "f32 1x3x4x6"}, tmp_path, mean=mean, sd=sd)
     shown = picture(4, 6)
     expected = [[[(int(shown[y, x, c]) / 255 - mean[c]) / sd[c] for x in range(6)] for y in range(4)] for c in range(3)]
     assert stage(shown)[0] == pytest.approx(np.array(expected), abs=1e-6)
@@ -39,8 +39,8 @@ def test_a_float_network_gets_each_channel_normalised_and_first(tmp_path: Path) 
 
 def test_bytes_stay_bytes_and_signed_bytes_are_128_less(tmp_path: Path) -> None:
     shown = picture(4, 6)
-    assert (Ported(prepare.build, {"": "u8 4x6x3"}, {"": "u8 1x4x6x3"}, tmp_path)(shown)[0] == shown).all()
-    signed = Ported(prepare.build, {"": "u8 4x6x3"}, {"": "i8 1x3x4x6"}, tmp_path)(shown)[0]
+    assert (Ported(pictures.build_prepare, {"": "u8 4x6x3"}, {"": "u8 1x4x6x3"}, tmp_path)(shown)[0] == shown).all()
+    signed = Ported(pictures.build_prepare, {"": "u8 4x6x3"}, {"": "i8 1x3x4x6"}, tmp_path)(shown)[0]
     assert (signed == shown.astype(int).transpose(2, 0, 1) - 128).all()
 
 
@@ -48,28 +48,32 @@ def test_quantised_numbers_follow_step_and_zero_point_and_are_clipped(tmp_path: 
     """(255/255 - 0.5) / 0.25 = 2, over 0.01 is 200, and 10 more; byte 0 gives -200 + 10, below the least of int8."""
     keys = {"mean": [0.5], "sd": [0.25], "step": 0.01, "zero_point": 10}
     shown = np.array([[[255] * 3, [0] * 3, [128] * 3]], np.uint8)
-    found = Ported(prepare.build, {"": "u8 1x3x3"}, {"": "i16 1x1x3x3"}, tmp_path, **keys, layout="nhwc")(shown)
+    found = Ported(pictures.build_prepare, {"": "u8 1x3x3"}, {"": "i16 1x1x3x3"}, tmp_path, **keys, layout="nhwc")(
+        shown
+    )
     assert found[0, 0, :, 0].tolist() == [210, -190, round((128 / 255 - 0.5) / 0.25 / 0.01 + 10)]
-    clipped = Ported(prepare.build, {"": "u8 1x3x3"}, {"": "i8 1x1x3x3"}, tmp_path, **keys, layout="nhwc")(shown)
+    clipped = Ported(pictures.build_prepare, {"": "u8 1x3x3"}, {"": "i8 1x1x3x3"}, tmp_path, **keys, layout="nhwc")(
+        shown
+    )
     assert clipped[0, 0, :2, 0].tolist() == [127, -128]
 
 
 def test_a_letterbox_keeps_the_shape_between_grey_bars_and_a_crop_its_middle(tmp_path: Path) -> None:
     """A white picture of 2 to 1 in a square of 8: two grey rows, four white ones, two grey ones."""
     white = np.full((4, 8, 3), 255, np.uint8)
-    boxed = Ported(prepare.build, {"": "u8 4x8x3"}, {"": "u8 1x8x8x3"}, tmp_path, fit="letterbox")(white)[0]
+    boxed = Ported(pictures.build_prepare, {"": "u8 4x8x3"}, {"": "u8 1x8x8x3"}, tmp_path, fit="letterbox")(white)[0]
     assert boxed[:, 0, 0].tolist() == [114, 114, 255, 255, 255, 255, 114, 114]
     sides = white.copy()
     sides[:, :2], sides[:, 6:] = 0, 0
-    cut = Ported(prepare.build, {"": "u8 4x8x3"}, {"": "u8 1x4x4x3"}, tmp_path, fit="crop")(sides)[0]
+    cut = Ported(pictures.build_prepare, {"": "u8 4x8x3"}, {"": "u8 1x4x4x3"}, tmp_path, fit="crop")(sides)[0]
     assert (cut == 255).all()
-    stretched = Ported(prepare.build, {"": "u8 4x8x3"}, {"": "u8 1x4x4x3"}, tmp_path)(sides)[0]
+    stretched = Ported(pictures.build_prepare, {"": "u8 4x8x3"}, {"": "u8 1x4x4x3"}, tmp_path)(sides)[0]
     assert stretched[:, 0].max() < 128 < stretched[:, 1].min()
 
 
 def test_a_grey_network_gets_luminance(tmp_path: Path) -> None:
     shown = np.array([[[255, 0, 0], [0, 255, 0], [0, 0, 255]]], np.uint8)
-    found = Ported(prepare.build, {"": "u8 1x3x3"}, {"": "u8 1x1x1x3"}, tmp_path, layout="nchw")(shown)
+    found = Ported(pictures.build_prepare, {"": "u8 1x3x3"}, {"": "u8 1x1x1x3"}, tmp_path, layout="nchw")(shown)
     assert found.ravel().tolist() == [76, 150, 29]  # ITU-R 601-2, as Pillow rounds it
 
 
@@ -87,7 +91,7 @@ def test_a_network_that_takes_no_such_picture_is_refused(
     writes: str, keys: dict[str, Any], match: str, tmp_path: Path
 ) -> None:
     with pytest.raises(BadInputError, match=match):
-        Ported(prepare.build, {"": "u8 4x4x3"}, {"": writes}, tmp_path, **keys)
+        Ported(pictures.build_prepare, {"": "u8 4x4x3"}, {"": writes}, tmp_path, **keys)
 
 
 # networks
@@ -186,18 +190,20 @@ def test_a_file_that_is_no_network_is_refused(runtime: str, tmp_path: Path) -> N
 def test_the_largest_of_several_channels_is_drawn_but_for_the_background(tmp_path: Path) -> None:
     classes = np.array([[0, 1], [2, 2]])
     scores = np.eye(3, dtype=np.float32)[np.kron(classes, np.ones((4, 4), int))].transpose(2, 0, 1)[None]
-    stage = Ported(overlay.build, {"frame": "u8 2x2x3", "mask": "f32 1x3x8x8"}, {"": "u8 2x2x3"}, tmp_path, alpha=1.0)
+    stage = Ported(
+        pictures.build_overlay, {"frame": "u8 2x2x3", "mask": "f32 1x3x8x8"}, {"": "u8 2x2x3"}, tmp_path, alpha=1.0
+    )
     shown = picture(2, 2)
-    colours = overlay.class_colours()
+    colours = pictures.class_colours()
     assert (stage(shown, scores) == np.array([[shown[0, 0], colours[1]], [colours[2], colours[2]]])).all()
-    half = Ported(overlay.build, {"frame": "u8 2x2x3", "mask": "u8 2x2"}, {"": "u8 2x2x3"}, tmp_path)
+    half = Ported(pictures.build_overlay, {"frame": "u8 2x2x3", "mask": "u8 2x2"}, {"": "u8 2x2x3"}, tmp_path)
     drawn = half(np.zeros((2, 2, 3)), np.array([[0, 1], [1, 0]], np.uint8))
     assert (drawn == np.where(np.eye(2)[..., None] > 0, 0, colours[1] // 2)).all()
 
 
 def test_a_box_is_a_frame_in_pixels_or_in_shares_and_only_with_a_score(tmp_path: Path) -> None:
     reads = {"frame": "u8 10x20x3", "boxes": "f32 2x5"}
-    stage = Ported(overlay.build, reads, {"": "u8 10x20x3"}, tmp_path)
+    stage = Ported(pictures.build_overlay, reads, {"": "u8 10x20x3"}, tmp_path)
     pixels = np.array([[4, 2, 14, 9, 0.9], [0, 0, 20, 10, 0.0]], np.float32)
     drawn = stage(np.zeros((10, 20, 3)), pixels).any(axis=2)
     expected = np.zeros((10, 20), bool)
@@ -298,7 +304,7 @@ def written_video(path: Path, count: int, fps: int = 25) -> None:
 def test_a_frame_of_a_video_is_found_by_its_number_and_the_video_begins_again(tmp_path: Path) -> None:
     written_video(tmp_path / "v.mp4", 40)
     assert video.footage(tmp_path / "v.mp4") == (40, 25.0)
-    stage = Ported(video.build, {}, {"": "u8 16x32x3"}, tmp_path, path="v.mp4")
+    stage = Ported(video.build_video, {}, {"": "u8 16x32x3"}, tmp_path, path="v.mp4")
     try:
         for frame in (0, 1, 2, 7, 30, 39, 40, 45, 3):
             assert stage(frame=frame).mean() == pytest.approx(5 * (frame % 40), abs=2), frame
@@ -308,7 +314,7 @@ def test_a_frame_of_a_video_is_found_by_its_number_and_the_video_begins_again(tm
 
 def test_a_run_at_half_the_rate_shows_every_second_picture(tmp_path: Path) -> None:
     written_video(tmp_path / "v.mp4", 40)
-    stage = Ported(video.build, {}, {"": "u8 16x32x3"}, tmp_path, path="v.mp4", fps=12.5)
+    stage = Ported(video.build_video, {}, {"": "u8 16x32x3"}, tmp_path, path="v.mp4", fps=12.5)
     try:
         assert [round(stage(frame=frame).mean() / 10) for frame in (0, 1, 5, 9)] == [0, 1, 5, 9]
     finally:
@@ -318,7 +324,7 @@ def test_a_run_at_half_the_rate_shows_every_second_picture(tmp_path: Path) -> No
 def test_pictures_of_a_folder_are_shown_by_name_at_one_size(tmp_path: Path) -> None:
     for number, size in enumerate([(8, 8), (4, 12), (20, 10)]):
         Image.new("RGB", size, (50 * number, 0, 0)).save(tmp_path / f"{number}.png")
-    stage = Ported(video.build, {}, {"": "u8 6x6x3"}, tmp_path, path=".")
+    stage = Ported(video.build_video, {}, {"": "u8 6x6x3"}, tmp_path, path=".")
     assert [int(stage(frame=frame)[0, 0, 0]) for frame in range(4)] == [0, 50, 100, 0]
     assert video.footage(tmp_path) == (3, None)
     (tmp_path / "no").mkdir()
@@ -330,7 +336,7 @@ def test_pictures_of_a_folder_are_shown_by_name_at_one_size(tmp_path: Path) -> N
 
 
 def test_a_made_up_load_takes_its_time_of_the_core(tmp_path: Path) -> None:
-    stage = Ported(loads.build, {"": "u8 1"}, {}, tmp_path, block="busy", load_ms=20.0)
+    stage = Ported(own_code.build_load, {"": "u8 1"}, {}, tmp_path, block="busy", load_ms=20.0)
     before = time.thread_time()
     stage(np.zeros(1))
     assert 0.02 <= time.thread_time() - before < 0.03

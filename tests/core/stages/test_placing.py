@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.pipeline.trial import Round
+from trilane.pipeline.rehearsal import Round
 from trilane.scheduler.placement import CpuCore, Place, Ranked
 from trilane.stages import placing
 from trilane.stages.placing import TriedPlacement, choice

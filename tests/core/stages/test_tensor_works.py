@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from support.small_inputs import validated
-from trilane.apps.run.avatar_facts import resolution_note, resolution_of
 from trilane.apps.run.report import Resolution
+from trilane.apps.run.report_facts import resolution_note, resolution_of
 from trilane.avatars.bundle import load_bundle, write_manifest
 from trilane.avatars.manifest import BySize
 from trilane.avatars.validation import SizeLoss, size_loss

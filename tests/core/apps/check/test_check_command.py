@@ -16,9 +16,17 @@ import pytest
 from support.pipeline_files import BRANCHES, CUT, DEPTH, STREET, write_file
 from trilane.apps.check.checked_scene import check_scene
 from trilane.apps.predict.asked_pipelines import asked, avatar
-from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, StageInput, UnitSettings
+from trilane.pipeline.description import (
+    Pipeline,
+    PipelineEdge,
+    PipelineStage,
+    StageInput,
+    UnitSettings,
+    file_text,
+    tables_of,
+    unsaid,
+)
 from trilane.pipeline.file_graph import edge_rules, graph_of, skips_of
-from trilane.pipeline.file_text import file_text, tables_of, unsaid
 from trilane.pipeline.pipeline_file import checked_tables, read_pipeline
 from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.configure import configure

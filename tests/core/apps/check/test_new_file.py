@@ -15,7 +15,7 @@ from onnx import TensorProto, helper
 
 from support.pipeline_files import network
 from trilane.apps.check.new_file import write_new_file
-from trilane.apps.run.file_pipeline import pipeline_of
+from trilane.apps.run.run_file import pipeline_of
 from trilane.errors import BadInputError
 from trilane.pipeline.pipeline_file import read_pipeline
 

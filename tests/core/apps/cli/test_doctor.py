@@ -16,7 +16,7 @@ import pytest
 from trilane import machine
 from trilane.apps.cli import doctor
 from trilane.apps.cli.doctor import PartCheck
-from trilane.pipeline import hardware_counters
+from trilane.pipeline import job_times
 from trilane.stages import machine_facts
 
 Command = Callable[..., tuple[str, str]]
@@ -62,7 +62,7 @@ def test_a_machine_that_has_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: P
         (machine_facts, "cpu_facts", lambda: CPU),
         (machine_facts, "runtime_facts", broken),
         (machine, "awake", asleep),
-        (hardware_counters, "absence", lambda: "kernel.perf_event_paranoid is 3"),
+        (job_times, "absence", lambda: "kernel.perf_event_paranoid is 3"),
         (doctor, "SHM", tmp_path / "none"),
         (os, "memfd_create", refused),
         (doctor, "package_line", lambda name: f"pip install {name}"),

@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from trilane.apps.run.file_pipeline import cores_of, frames_of, imports_of, pipeline_of, preload_of
-from trilane.apps.run.run_file import asked_file
+from trilane.apps.run.run_file import asked_file, cores_of, frames_of, imports_of, pipeline_of, preload_of
 from trilane.errors import BadInputError
 from trilane.pipeline.file_graph import DEFAULT_FRAMES
 from trilane.pipeline.pipeline_file import PipelineFile, read_pipeline
@@ -68,7 +67,7 @@ def test_a_run_imports_the_code_that_it_names(tmp_path: Path) -> None:
     file = read(tmp_path)
     assert imports_of(file) == ["own"]
     blocks = "trilane.stages.blocks"
-    assert preload_of(file) == (f"{blocks}.video", f"{blocks}.own_code", f"{blocks}.loads")
+    assert preload_of(file) == (f"{blocks}.video", f"{blocks}.own_code")
 
 
 def test_a_run_has_as_many_frames_as_the_pictures(tmp_path: Path) -> None:

@@ -20,9 +20,8 @@ from trilane.hw_profiles.application import application_graph
 from trilane.hw_profiles.governor import Governor
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.journal import JournalWriter, journal_of
-from trilane.pipeline.result import Failure, RunResult
+from trilane.pipeline.result import Failure, JournalFile, RunResult
 from trilane.pipeline.run_metrics import metrics_of
-from trilane.pipeline.run_record import JournalFile
 from trilane.scene.schema import OutputSpec, Scene
 from trilane.scheduler.events import Settings
 from trilane.scheduler.recording import Recording

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from trilane.pipeline.file_keys import port_type
-from trilane.pipeline.ports import payload_bytes, views
+from trilane.pipeline.stage import payload_bytes, views
 
 PORTS = {"mask": port_type("u8 5x13"), "boxes": port_type("f32 2x3"), "seen": port_type("bool 4")}
 
