@@ -61,8 +61,9 @@ def measure(minutes: float = 15.0, rounds: int = 7, seeds: int = 10, events: str
     the same rounds.
     `agree`: number of frames that all ways present at the same nanosecond. `same_traces`: number of seeds for which 10
     repeats of a run, in which a unit dies, give one trace. `different_traces`: number of different traces over the
-    seeds. `replay`: number of `steps` of the replayed `events`, and number of steps with a different answer. Raises
-    BadInputError when `events` is not a recording, TrilaneError when SimPy disagrees.
+    seeds. `replay`: number of `steps` of the replayed `events`, and number of steps with a different answer.
+
+    Raises BadInputError when `events` is not a recording, TrilaneError when SimPy disagrees.
     """
     if minutes <= 0 or rounds < 1 or seeds < 1:
         found = f"minutes {minutes:g}, rounds {rounds}, seeds {seeds}"

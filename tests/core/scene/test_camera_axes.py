@@ -40,15 +40,19 @@ def test_a_file_in_stated_axes_is_the_same_camera(tmp_path: Path, kind: str, axe
 
 
 def test_a_robot_s_table_without_names_is_told_by_its_stated_axes(tmp_path: Path) -> None:
-    """Forward-left-up poses in a world with Z up: as a camera's they lie on the side, so their order is in doubt."""
+    """Forward-left-up poses in a world with Z up: as a camera's they lie on the side, so their order is in doubt.
+
+    The robot turns far and goes where it looks. If it did not, the order would be in doubt with its axes too.
+    """
     z_up = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    body = z_up @ TURNS @ np.array(BY_HAND["forward-left-up"], dtype=float).T
-    path = WRITERS["tum"](tmp_path, body @ OPTICAL.T, PLACES)
+    turns = about(1, np.linspace(0.0, 2.5, 60)) @ about(0, -0.1)
+    body = z_up @ turns @ np.array(BY_HAND["forward-left-up"], dtype=float).T
+    path = WRITERS["tum"](tmp_path, body @ OPTICAL.T, 0.3 * np.cumsum(body[:, :, 0], axis=0))
     path.write_text("".join(path.read_text().splitlines(keepends=True)[1:]))
     with pytest.raises(BadInputError, match="quaternions whose order does not follow"):
         load(path)
     camera = load(path, axes="forward-left-up")
-    assert matrix_from_quat(camera.quats) == pytest.approx(TURNS, abs=1e-6)
+    assert matrix_from_quat(camera.quats) == pytest.approx(turns, abs=1e-6)
 
 
 def test_axes_are_right_handed_triples_of_directions() -> None:
