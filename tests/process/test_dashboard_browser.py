@@ -129,6 +129,11 @@ class Watched:
         """What is written there."""
         return str(self.page.inner_text(selector))
 
+    def says(self, selector: str, *words: str) -> bool:
+        """Each of `words` comes to stand there: what the page shows of state, picture and figures comes one by one."""
+        self.wait_until(lambda: all(each in self.text(selector) for each in words))
+        return True
+
     def is_well(self) -> bool:
         """Nothing went wrong; says what."""
         assert self.errors == []
@@ -179,12 +184,11 @@ def test_pictures_timeline_and_figures_of_a_live_run(opened: Callable[..., Watch
         seen.page.evaluate("() => scrollTo(0, 0)")
         for canvas in ("picture", "timeline"):
             seen.wait_for_other_pixels(canvas, seen.pixels(canvas))
-        assert seen.text("#fps") == "60.0"
-        assert "30.6 dB, worst frame 19.5 dB" in seen.text("#error")
+        assert seen.says("#fps", "60.0") and seen.says("#error", "30.6 dB, worst frame 19.5 dB")
         assert [row.split("\t")[3] for row in seen.text("#units tbody").splitlines()] == ["39 %", "66 %", "95 %"]
-        assert "pose->raster" in seen.text("#drops") and "64.0 KiB" in seen.text("#stages")
-        assert "running" in seen.text("#state") and seen.text("#link") == "connected"
-        assert seen.text("#bound-title") == "What bounds the frame time, so far" and "infer" in seen.text("#bound")
+        assert seen.says("#drops", "pose->raster") and seen.says("#stages", "64.0 KiB")
+        assert seen.says("#state", "running") and seen.says("#link", "connected")
+        assert seen.says("#bound-title", "What bounds the frame time, so far") and seen.says("#bound", "infer")
         assert seen.is_well()
 
 
@@ -259,7 +263,7 @@ def test_controls_act_restart_or_say_why_not(opened: Callable[..., Watched]) -> 
             assert policy.locator("select").input_value() == "sequential"
         edge = seen.page.locator("[data-control=edge] select")
         edge.select_option("triple")
-        assert "policy sequential, edge triple" in seen.text("#restart-controls")
+        assert seen.says("#restart-controls", "policy sequential, edge triple")
         apply.click()
         seen.wait_until(lambda: changes(view) == [{"policy": "sequential", "edge": "triple"}])
         seen.wait_for("() => document.querySelector('[data-action=apply]').disabled")
@@ -276,7 +280,7 @@ def test_controls_act_restart_or_say_why_not(opened: Callable[..., Watched]) -> 
         assert profile.locator("select").is_disabled() and "no hardware profile" in profile.inner_text()
         seen.page.get_by_role("button", name="Kill dsp").click()
         seen.wait_for("() => document.querySelector('#units tr[data-unit=dsp]').cells[10].textContent === '1'")
-        assert "dsp died" in seen.text("#notes")
+        assert seen.says("#notes", "dsp died")
         assert seen.is_well()
 
 
@@ -330,7 +334,7 @@ def test_a_finished_run_is_sought_and_played(opened: Callable[..., Watched]) -> 
         seen.page.locator("#seek").fill("5000")
         seen.wait_for("() => document.getElementById('picture').dataset.frame === '300'")
         seen.wait_for("() => document.getElementById('presented').textContent === '300'")
-        assert "0:05.0 of 0:20.0" in seen.text("#seek-time")
+        assert seen.says("#seek-time", "0:05.0 of 0:20.0")
         seen.page.locator("#seek").fill("5110")  # of which the slices are there already
         seen.wait_for("() => document.getElementById('picture').dataset.frame === '306'")
         still = seen.pixels("timeline")
@@ -339,8 +343,8 @@ def test_a_finished_run_is_sought_and_played(opened: Callable[..., Watched]) -> 
         seen.wait_for_other_pixels("timeline", still)
         seen.page.click("#seek-play")
         assert seen.page.locator("#transport button").count() == 0
-        assert seen.text("#bound-title") == "What bounded the frame time"
-        assert "gpu" in seen.text("#bound") and "infer" not in seen.text("#bound")  # the report's, not a moment's
+        assert seen.says("#bound-title", "What bounded the frame time") and seen.says("#bound", "gpu")
+        assert "infer" not in seen.text("#bound")  # the report's, not a moment's
         assert seen.is_well()
 
 
@@ -371,7 +375,7 @@ def test_everything_to_use_has_a_name_and_the_keys_are_listed(opened: Callable[.
           !each.labels?.length && !each.ariaLabel)).map(each => each.outerHTML)"""
         assert seen.page.evaluate(nameless) == []
         seen.page.keyboard.press("?")
-        assert seen.page.locator("#help").is_visible() and "pause, or go on" in seen.text("#help")
+        assert seen.says("#help", "pause, or go on") and seen.page.locator("#help").is_visible()
         seen.page.keyboard.press("Escape")
         assert not seen.page.locator("#help").is_visible()
         assert seen.is_well()
@@ -464,7 +468,11 @@ def cell(seen: Watched, unit: str, column: int) -> str:
 
 
 def in_flight(seen: Watched) -> int:
-    """The frames in flight that the page shows: several if pipelined, at most one if sequential, on any machine."""
+    """The frames in flight that the page shows: several if pipelined, at most one if sequential, on any machine.
+
+    A page that has a state need not have figures yet, so the figure is waited for.
+    """
+    seen.wait_for("() => /\\d+ in flight/.test(document.getElementById('presented-rest').textContent)")
     return int(seen.text("#presented-rest").split(" in flight")[0].split()[-1])
 
 
