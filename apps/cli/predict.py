@@ -27,7 +27,7 @@ from trilane.apps.cli.console import (
     stdout_console,
     without_controls,
 )
-from trilane.apps.cli.predict_output import IDLE, draw, show_answer, show_networks, show_table
+from trilane.apps.cli.predict_output import draw, idle_causes, show_answer, show_networks, show_table
 from trilane.apps.predict.asked_prediction import answer_of, application_of, predict_networks
 from trilane.apps.predict.predict_options import PredictOptions
 from trilane.errors import BadInputError
@@ -41,8 +41,6 @@ if TYPE_CHECKING:
     from trilane.hw_profiles.application import Plan, Variant
     from trilane.hw_profiles.schema import Profile
     from trilane.hw_profiles.tenants import Pipeline
-
-CAUSES = ("starved", "blocked", "join", "throttled", "overhead")
 
 
 def predict_pipeline_file(options: PredictOptions, path: Path, as_json: bool) -> None:
@@ -132,9 +130,10 @@ def _stages(answer: Mapping[str, Any]) -> Table:
 def _units(answer: Mapping[str, Any]) -> Table:
     from rich.table import Table
 
-    table = Table("unit", "busy", *CAUSES)
+    causes = idle_causes(answer["units"].values())
+    table = Table("unit", "busy", *causes)
     for name, row in answer["units"].items():
-        table.add_row(name, f"{row['busy']:.1%}", *(f"{row['idle'].get(cause, 0.0):.1%}" for cause in CAUSES))
+        table.add_row(name, f"{row['busy']:.1%}", *(f"{row['idle'].get(cause, 0.0):.1%}" for cause in causes))
     return table
 
 
@@ -264,7 +263,7 @@ def _idle(answer: dict[str, Any]) -> Table:
     from rich.table import Table
 
     rows = [row for one in answer["pipelines"] for row in one["units"].values()]
-    causes = [*IDLE, *(["join"] if any("join" in row["idle"] for row in rows) else [])]
+    causes = idle_causes(rows)
     table = Table("unit", "pipeline", "busy", *causes)
     for unit in dict.fromkeys([*answer["units"], *(row["hardware"] for row in rows)]):
         heads = iter([unit])

@@ -5,6 +5,7 @@ Rule: nothing is computed here; the answers are those of `trilane.hw_profiles.pr
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from trilane.hw_profiles.application import Plan
     from trilane.hw_profiles.schema import Profile
 
-IDLE = ("starved", "blocked", "throttled", "preempted", "overhead")
 MOST_EXPENSIVE = 10
 RANGES = "ranges in brackets hold 80 %"
 AT_RATE = ("holds", "dropped", "W")
@@ -262,11 +262,17 @@ def _print_times(console: Console, answer: dict[str, Any]) -> None:
 def _unit_table(answer: dict[str, Any]) -> Table:
     from rich.table import Table
 
-    units = Table("unit", "busy", *IDLE)
+    causes = idle_causes(answer["units"].values())
+    units = Table("unit", "busy", *causes)
     for name, unit in answer["units"].items():
-        causes = (f"{100 * unit['idle'].get(cause, 0):.1f} %" for cause in IDLE)
-        units.add_row(name, f"{100 * unit['busy']:.1f} %", *causes)
+        shares = (f"{100 * unit['idle'].get(cause, 0):.1f} %" for cause in causes)
+        units.add_row(name, f"{100 * unit['busy']:.1f} %", *shares)
     return units
+
+
+def idle_causes(units: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Return the causes that the units' `idle` names, in their order."""
+    return [*dict.fromkeys(cause for unit in units for cause in unit["idle"])]
 
 
 def _alternatives_table(answer: dict[str, Any]) -> Table:

@@ -8,7 +8,7 @@ too few frames says so.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -156,7 +156,6 @@ def _print_outcome(outcome: RunOutcome, as_json: bool, with_table: bool) -> None
 
 
 DASH = "–"
-IDLE = ("starved", "blocked", "throttled", "preempted", "overhead")
 UNSAID = "the report does not say where they come from"
 STATISTICS = ("mean", "p50", "p90", "p95", "p99", "max")
 TOO_SHORT = "too short to tell"
@@ -326,12 +325,12 @@ def _megabytes(moved: MovedBytes | None) -> str:
 
 def _unit_rows(runs: Sequence[PolicyMetrics]) -> Rows:
     for unit in runs[0].units:
-        joins = "join" in runs[0].units[unit].idle.model_fields_set
-        causes = (*IDLE, "join") if joins else IDLE
+        known = runs[0].units[unit].idle
+        causes = [cause for cause in type(known).model_fields if cause != "join" or cause in known.model_fields_set]
         yield unit, "busy / " + " ".join(causes) + ", %", [_shares(run.units.get(unit), causes) for run in runs]
 
 
-def _shares(unit: UnitShares | None, causes: Sequence[str]) -> str:
+def _shares(unit: UnitShares | None, causes: Iterable[str]) -> str:
     if unit is None:
         return DASH
     return f"{_percent(unit.busy)} / " + " ".join(_percent(getattr(unit.idle, cause)) for cause in causes)

@@ -71,10 +71,20 @@ function total(counts) {
   return Object.values(counts ?? {}).reduce((sum, count) => sum + count, 0);
 }
 
-// The timeline's figures as a table: each unit's busy share and idle by cause.
+function setHead(table, titles) {
+  const head = table.tHead.rows[0];
+  while (head.cells.length > titles.length) head.deleteCell(-1);
+  while (head.cells.length < titles.length) head.append(element("th", { scope: "col" }));
+  titles.forEach((title, place) => setText(head.cells[place], title));
+}
+
+// The timeline's figures as a table: each unit's busy share and idle by cause; `join` only in a graph.
 export function showUnits(figures) {
-  const causes = CAUSES.filter((cause) => cause !== "unexplained");
-  const rows = Object.entries(figures.units ?? {}).map(([name, unit]) => [
+  const units = Object.entries(figures.units ?? {});
+  const idle = units.map(([, unit]) => unit.run?.idle ?? {});
+  const causes = CAUSES.filter((cause) => idle.some((shares) => cause in shares));
+  setHead(byId("units"), ["unit", "process", "now", "busy", ...causes, "busy, whole run", "restarts", "duty (cap)"]);
+  const rows = units.map(([name, unit]) => [
     name,
     unit.is_up ? "up" : "down",
     unit.stage ? `${unit.stage} ${unit.frame}` : "idle",
@@ -95,11 +105,8 @@ export function showUnits(figures) {
 export function showStages(figures, edges) {
   const stages = Object.entries(figures.stages ?? {});
   const kinds = [...new Set(stages.flatMap(([, stage]) => Object.keys(stage.bytes ?? {})))].sort(byPlace);
-  const head = byId("stages").tHead.rows[0];
   const titles = ["stage", "unit", "edge before it", "frames waiting", "service", ...kinds.map((kind) => words(kind))];
-  while (head.cells.length > titles.length) head.deleteCell(-1);
-  while (head.cells.length < titles.length) head.append(element("th", { scope: "col" }));
-  titles.forEach((title, place) => setText(head.cells[place], title));
+  setHead(byId("stages"), titles);
   setRows(
     byId("stages").tBodies[0],
     stages.map(([name, stage], place) => [

@@ -15,6 +15,7 @@ const STROKES = {
   throttled: (pen) => line(pen, [0, 2, 8, 2], [0, 6, 8, 6]),
   preempted: (pen) => line(pen, [0, 0, 8, 8], [0, 8, 8, 0]),
   overhead: (pen) => line(pen, [2, 0, 2, 8], [6, 0, 6, 8]),
+  join: (pen) => line(pen, [0, 0, 4, 8], [8, 0, 4, 8]),
   unexplained: (pen) => pen.fillRect(1, 1, 4, 4),
 };
 

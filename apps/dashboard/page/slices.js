@@ -4,15 +4,16 @@ import { SliceRing } from "./ring.js";
 
 // At 60 frames a second a unit with two stages fills this many in over two minutes.
 export const SLICES_PER_UNIT = 16384;
-export const CAUSES = ["starved", "blocked", "throttled", "preempted", "overhead", "unexplained"];
 export const CAUSE_MEANINGS = {
   starved: "no input",
   blocked: "no free slot behind, or as many frames in flight as may be",
   throttled: "held by its duty",
   preempted: "it has a job, but another thread has its core",
   overhead: "a job is assigned but does not run yet, or the process is down",
+  join: "some inputs of a frame are there, others not",
   unexplained: "no cause was noted",
 };
+export const CAUSES = Object.keys(CAUSE_MEANINGS);
 
 export class Slices {
   constructor(stages, units) {
