@@ -40,7 +40,7 @@ from trilane.scheduler.events import (
 )
 from trilane.scheduler.ledger import JOIN, JobRecord
 from trilane.scheduler.policy import Source
-from trilane.scheduler.state import FrameState
+from trilane.scheduler.state import FrameState, fates
 
 SOURCE: Final = "source"
 
@@ -172,6 +172,7 @@ class Timeline:
         self._source = Source(settings, self._drop_at_source)
         self._turned_away: dict[str, deque[tuple[int, int]]] = {cause: deque() for cause in DropCause}
         self._track = track_of(graph, settings, self._source)
+        self._first = graph.stages[0].name
         self._lost: deque[GoneFrame] = deque()  # those whose cause was not counted yet
         self._counts: dict[tuple[str, str], int] = {}
         self._requested = settings.frames
@@ -352,17 +353,14 @@ class Timeline:
             self._source.start(self._now_ns)
 
     def _on_died(self, event: UnitDied) -> None:
-        """Lose the frame that the dead unit worked on.
-
-        Its other frames wait for their stage again, but a frame at a first stage may be lost too.
-        """
+        """Note that the unit is down; its frames are lost or wait again, as the scheduler says."""
         unit = self.units[event.unit]
         unit.fall(self._now_ns, is_gone=True)
-        for place, handed in enumerate(unit.held):
-            if place == 0:
-                self._lose(handed.job.frame)
-            elif (gone := self._track.give_back(handed.job, self._now_ns)) is not None:
-                self._lost.append(gone)
+        for job, is_lost in fates([handed.job for handed in unit.held], {self._first}):
+            if is_lost:
+                self._lose(job.frame)
+            else:
+                self._track.give_back(job)
         unit.held.clear()
 
     def _finish(self, kind: OutcomeKind) -> None:

@@ -46,8 +46,8 @@ class Track(Protocol):
     def end(self, job: Job, event: JobDone, now_ns: int) -> FrameState | None:
         """Note that a job has ended; return its frame if the job presents it."""
 
-    def give_back(self, job: Job, now_ns: int) -> Gone | None:
-        """Note that a job waits again because its unit died; return its frame if the frame is lost instead."""
+    def give_back(self, job: Job) -> None:
+        """Note that a job waits again because its unit died."""
 
     def lose(self, frame: int, now_ns: int) -> Gone | None:
         """Note that a frame is lost; return it unless `left` will return it."""
@@ -111,12 +111,9 @@ class ChainTrack:
         self._waiting[skips_to or self._next[job.stage]].append(job.frame)
         return None
 
-    def give_back(self, job: Job, now_ns: int) -> Gone | None:
-        if job.stage == self._first:
-            return self.lose(job.frame, now_ns)
+    def give_back(self, job: Job) -> None:
         self._waiting[job.stage].append(job.frame)
         self._waiting[job.stage].sort()
-        return None
 
     def lose(self, frame: int, now_ns: int) -> Gone:
         return Gone(frame, self._leave(frame, now_ns))
@@ -215,8 +212,8 @@ class GraphTrack:
         frame.latency_ns = left.latency_ns
         return frame
 
-    def give_back(self, _job: Job, _now_ns: int) -> Gone | None:
-        return None
+    def give_back(self, _job: Job) -> None:
+        """Do nothing: the second scheduler knows."""
 
     def lose(self, _frame: int, _now_ns: int) -> Gone | None:
         return None

@@ -32,7 +32,7 @@ from collections.abc import Mapping
 
 from trilane.scheduler.events import Drop, DropCause, Graph, Job, Loss, packed, unpacked
 from trilane.scheduler.ledger import Ledger
-from trilane.scheduler.state import FrameState, Inlet, NewestInlet, SourceLine, StageState, UnitState, build
+from trilane.scheduler.state import FrameState, Inlet, NewestInlet, SourceLine, StageState, UnitState, build, fates
 from trilane.transport.slots import EdgeSlots
 
 SKIPPING = 1  # line of the frames that skip, on the edge at which a bypass begins
@@ -420,17 +420,17 @@ class Flow:
     def reclaim(self, unit: UnitState, loss: Loss) -> None:
         """Give the slots of a unit whose process is gone back to their edges, under a new epoch.
 
-        The frame that the unit worked on is lost. Its other frames wait again, except before the only stage without
-        inputs. There they are lost too.
+        `fates` says which of its frames are lost; the others wait again.
         """
-        jobs = list(unit.queue)
+        judged = fates(unit.queue, {stage.name for stage in unit.stages if stage.input is None})
         unit.queue.clear()
-        for job in jobs[:1]:
-            self.free_slots(job)
-            if job.frame in self.frames:
-                self.mark_lost(job.frame, loss)
-        for job in reversed(jobs[1:]):
-            self._put_back(job, loss)
+        for job, is_lost in (*judged[:1], *reversed(judged[1:])):  # the last first: each goes before those that wait
+            if is_lost or job.frame in self.gone:
+                self.free_slots(job)
+                if job.frame in self.frames:
+                    self.mark_lost(job.frame, loss)
+            else:
+                self._put_back(job)
         for stage in unit.stages:
             for edge in (*(side.edge for side in stage.slots_of), stage.output, stage.bypassed):
                 if edge is not None:
@@ -459,15 +459,9 @@ class Flow:
             if not state.jobs:
                 self.gone.pop(job.frame, None)
 
-    def _put_back(self, job: Job, loss: Loss) -> None:
+    def _put_back(self, job: Job) -> None:
         """Let the job's frame wait for its stage again."""
         stage = self.stage_named[job.stage]
-        if stage.input is None or job.frame in self.gone:
-            is_gone = job.frame in self.gone
-            self.free_slots(job)
-            if not is_gone:
-                self.mark_lost(job.frame, loss)
-            return
         if stage.output:
             stage.output.abandon(job.slot_out)
         self._end_job(job)

@@ -17,7 +17,7 @@ A unit has one deadline, and its state says what happens when the deadline passe
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 from math import lcm
 from typing import Final
@@ -440,6 +440,18 @@ def next_alarm_ns(units: Iterable[UnitState], now_ns: int, lead_ns: int) -> int:
             if now_ns < lead_from_ns < alarm_ns:
                 alarm_ns = lead_from_ns
     return alarm_ns
+
+
+def fates(jobs: Iterable[Job], sources: Container[str]) -> list[tuple[Job, bool]]:
+    """Return the jobs of a unit whose process is gone, and whether the frame of each is lost with it.
+
+    The frame that the unit worked on is lost. The others wait for their stage again, except before a stage that takes
+    no slot of another one: nothing keeps their input.
+
+    `jobs`: jobs of the unit, the running one first.
+    `sources`: names of the stages that take no slot.
+    """
+    return [(job, place == 0 or job.stage in sources) for place, job in enumerate(jobs)]
 
 
 def back_off_ns(failures: int) -> int:
