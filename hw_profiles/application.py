@@ -21,6 +21,7 @@ from trilane.hw_profiles.unit_times import JobTime, time_on
 from trilane.scheduler.events import Graph, Settings, chain
 from trilane.scheduler.policy import POLICIES, run_settings
 from trilane.scheduler.virtual import Simulation, simulate
+from trilane.transport.slots import DEFAULT_EDGE
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import AFTER_INFER, BEFORE_INFER, INFER, LATENCY_TO, NS_PER_MS, UNITS, UnitName
 
@@ -186,7 +187,7 @@ class Steady:
     dropped: float
 
 
-def application_graph(edge: str = "double", infer: Iterable[tuple[str, str]] = (INFER,)) -> Graph:
+def application_graph(edge: str = DEFAULT_EDGE, infer: Iterable[tuple[str, str]] = (INFER,)) -> Graph:
     """Return the avatar's pipeline with the same rule on every edge. `infer`: the network's stages and their units."""
     return chain((*BEFORE_INFER, *infer, *AFTER_INFER), edge, LATENCY_TO)
 

@@ -44,6 +44,7 @@ from trilane.scheduler.placement import Ranked
 from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.stats import energy_score
 from trilane.scheduler.virtual import Simulation
+from trilane.transport.slots import EDGES
 from trilane.units import HOST, NS_PER_MS, SUSTAINED, UNITS, UnitName
 
 #: Rows of `what_if`: name, how the stages are joined, share of the network on the GPU. All release frames as
@@ -59,8 +60,6 @@ ALTERNATIVES: tuple[tuple[str, Variant, float], ...] = (
     ("pipelined, 5 % of the network on the GPU", Variant("pipelined", "double"), 0.05),
 )
 
-#: Edges that are compared at a rate.
-EDGES = ("single", "double", "triple", "fifo:4", "orphan")
 #: Part of a rate that may be missing while the rate still holds: the first frames of a simulated run take longer.
 MISSING = 0.002
 

@@ -46,10 +46,11 @@ from trilane.pipeline.file_keys import OnnxStage
 from trilane.pipeline.pipeline_file import PipelineFile
 from trilane.scheduler.events import Graph, Settings, chain
 from trilane.scheduler.policy import POLICIES, run_settings
+from trilane.transport.slots import DEFAULT_EDGE
 from trilane.units import BYPASS, INFER, NS_PER_MS, NS_PER_S, UNITS, UnitName
 
 #: How frames are taken by default: only the newest counts, as with a camera; an older one is dropped.
-NEWEST = Variant("latest", "double")
+NEWEST = Variant("latest", DEFAULT_EDGE)
 ENDLESS = 1 << 40
 SKIPS = -1
 

@@ -37,7 +37,7 @@ from trilane.scheduler.events import Graph, Input, StageSpec
 from trilane.scheduler.placement import Place
 from trilane.scheduler.state import build
 from trilane.transport.packets import FRAME_FIELDS, header_dtype
-from trilane.transport.slots import edge_rule
+from trilane.transport.slots import DEFAULT_EDGE, edge_rule
 from trilane.unexpected_value import UnexpectedValue, unexpected_in
 from trilane.units import NS_PER_MS
 
@@ -163,7 +163,7 @@ class PipelineEdge(Described):
 
     payload_bytes: int = Field(ge=0)
     header: HeaderDtype = header_dtype()
-    rule: str = "double"
+    rule: str = DEFAULT_EDGE
 
 
 class Pipeline(Described):

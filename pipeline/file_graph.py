@@ -17,6 +17,7 @@ from trilane.scheduler.events import Graph, Input, Settings, StageSpec
 from trilane.scheduler.period_bound import LEAST_SLOTS, fewest_slots
 from trilane.scheduler.policy import POLICIES, run_settings
 from trilane.scheduler.virtual import Skips, none_skips
+from trilane.transport.slots import DEFAULT_EDGE
 from trilane.units import NS_PER_MS, NS_PER_S
 
 DEFAULT_FRAMES: Final = 1000
@@ -97,7 +98,7 @@ def edge_rules(file: PipelineFile, times_ns: Mapping[str, int] | None = None) ->
     """
     given = {name: file.run.edge for name in file.readers} if file.run.edge else {}
     given |= file.edges
-    rules = {name: given.get(name, "double") for name in file.readers}
+    rules = {name: given.get(name, DEFAULT_EDGE) for name in file.readers}
     graph, in_flight, times_ns = graph_of(file, rules), in_flight_of(file), times_ns or _own_times_ns(file)
     if not times_ns:
         apart = tuple(replace(stage, unit=stage.name) for stage in graph.stages)

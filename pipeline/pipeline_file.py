@@ -55,7 +55,7 @@ from trilane.pipeline.measurements.measurement import Measurement
 from trilane.pipeline.measurements.read_file import chosen, read_measurements
 from trilane.scheduler.events import MOST_INPUTS
 from trilane.scheduler.policy import POLICIES
-from trilane.transport.slots import edge_rule
+from trilane.transport.slots import DEFAULT_EDGE, edge_rule
 from trilane.unexpected_value import UnexpectedValue, unexpected_in
 from trilane.units import UNITS
 
@@ -511,7 +511,7 @@ def _check_stage_together(file: PipelineFile, name: str, stage: StageKeys) -> No
             hint = did_you_mean(stage.like, networks) or "name the network that reads this stage"
             raise BadInputError(f"{where}.like", found, expected, hint)
     for each in stage.inputs:
-        rule = file.edges.get(each.stage, file.run.edge or "double")
+        rule = file.edges.get(each.stage, file.run.edge or DEFAULT_EDGE)
         if each.latest and edge_rule(rule).slots < 2:
             found = f"edge {rule!r} behind {each.stage}, whose newest frame {name} holds"
             remedy = f'add {each.stage} = "double" to [edges]'

@@ -29,10 +29,11 @@ from trilane.stages.avatar_assets import only_network_of
 from trilane.stages.config import MAX_CHANNELS, PAINTED_CHANNELS, RunConfig, pose_dtype, posed_vertices_bytes
 from trilane.stages.configure import Checked
 from trilane.stages.dsp.infer import crossing_bytes
+from trilane.transport.slots import DEFAULT_EDGE
 from trilane.units import AFTER_INFER, BEFORE_INFER, BYPASS, LATENCY_TO, UNITS
 
 
-def avatar_pipeline(config: RunConfig, assets: Assets, edge: str = "double") -> Pipeline:
+def avatar_pipeline(config: RunConfig, assets: Assets, edge: str = DEFAULT_EDGE) -> Pipeline:
     """Return the pipeline of `config`, every edge with the rule `edge`. Raises BadInputError for an unknown rule."""
     header = pose_dtype(len(config.avatar_dirs))
     return Pipeline(
@@ -71,7 +72,7 @@ def _stages(config: RunConfig) -> Iterator[PipelineStage]:
 
 
 def run_avatar(
-    config: RunConfig, assets: Assets, *, edge: str = "double", frames: int | None = None, **options: Any
+    config: RunConfig, assets: Assets, *, edge: str = DEFAULT_EDGE, frames: int | None = None, **options: Any
 ) -> RunResult:
     """Run the avatar of `config`.
 

@@ -14,7 +14,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from trilane.errors import BadInputError, did_you_mean
 from trilane.options import NOTHING, Finite, Name, OnePath, Option, Options, Text, Texts, texts_of
 from trilane.scheduler.policy import POLICIES
-from trilane.transport.slots import RULES, edge_rule
+from trilane.transport.slots import DEFAULT_EDGE, EDGES, RULES, edge_rule
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import PERFORMANCE_PROFILES
 
@@ -126,10 +126,8 @@ class RunOptions(Options):
         description="pipelined: highest rate; sequential: one frame at a time; latest: newest pose wins; "
         "deadline: frames that would be late are dropped.",
     )
-    edge: Annotated[
-        str, AfterValidator(_known_edge), Option(offered=("single", "double", "triple", "fifo:4", "orphan"))
-    ] = Field(
-        default="double",
+    edge: Annotated[str, AfterValidator(_known_edge), Option(offered=EDGES)] = Field(
+        default=DEFAULT_EDGE,
         description="Buffers between stages: single, double, triple, fifo:N, orphan or orphan:N "
         "(docs/policies-and-edges.md).",
     )

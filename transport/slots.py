@@ -62,6 +62,10 @@ RULES = {
     "fifo": EdgeRule("fifo", 4),
     "orphan": EdgeRule("orphan", 6, yields=True),
 }
+#: The rule of an edge for which nobody chose one.
+DEFAULT_EDGE: Final = "double"
+#: A rule of each kind, to choose from or to compare.
+EDGES: Final = ("single", "double", "triple", "fifo:4", "orphan")
 COUNTED = {"fifo": 1, "orphan": 4}  # least counts; an orphan edge has two slots read, one written and one waiting
 
 

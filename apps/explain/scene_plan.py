@@ -40,6 +40,7 @@ from trilane.stages.config import RunConfig, pose_dtype, posed_vertices, posed_v
 from trilane.stages.configure import Checked
 from trilane.stages.cpu.pose import FramePlan, PoseStage
 from trilane.transport.packets import Packet, SlotLayout, view_packet
+from trilane.transport.slots import DEFAULT_EDGE
 from trilane.units import COMPUTED, HOST, MEASURED, NS_PER_MS, UNITS, UnitName
 from trilane.writing import write_atomically
 
@@ -195,7 +196,7 @@ WHY = {
     FrameWork.NONE: "nobody is on the screen: nothing is drawn, packed or inferred",
     FrameWork.REUSE: "nothing has changed: the picture that is there is shown again",
 }
-PIPELINED = Variant("pipelined", "double")
+PIPELINED = Variant("pipelined", DEFAULT_EDGE)
 #: Numbers of the networks that paint a frame.
 Networks = tuple[int, ...]
 FIRST: Networks = (0,)

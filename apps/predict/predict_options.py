@@ -17,6 +17,7 @@ from trilane.errors import BadInputError
 from trilane.options import Finite, Name, OnePath, Option, Options, Text, Texts, one_of, paths_of
 from trilane.scheduler.policy import MOST_FRAMES, POLICIES
 from trilane.stages.run_options import AVATARS_HELP, PROFILE_HELP
+from trilane.transport.slots import DEFAULT_EDGE
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import BURST, HOST, MAX_MINUTES, PERFORMANCE_PROFILES, SUSTAINED, UNITS, UnitName
 
@@ -306,7 +307,7 @@ class PredictOptions(Options):
         policy = self.policy or ("reference" if self.is_published and self.profile != HOST else "pipelined")
         if policy != "reference":
             rate = {} if self.fps is None else {"fps": self.fps}
-            return Variant(policy, self.edge or "double", self.batch, **rate)
+            return Variant(policy, self.edge or DEFAULT_EDGE, self.batch, **rate)
         if self.edge not in (None, REFERENCE.edge):
             remedy = "choose a --policy of your own, such as pipelined"
             expected = f"{REFERENCE.edge}, which the reference application has"

@@ -24,6 +24,7 @@ from trilane.scheduler.policy import run_settings
 from trilane.scheduler.virtual import simulate
 from trilane.stages.avatar_assets import painting
 from trilane.stages.config import RunConfig
+from trilane.transport.slots import DEFAULT_EDGE
 from trilane.units import BEFORE_INFER, BYPASS, SUSTAINED
 
 MAX_SLOW_MOTION = 1000.0
@@ -72,7 +73,7 @@ def release_fps(pace: Pace, scene_fps: float) -> float:
 
 
 def compare(
-    pace: Pace, policy: str, frames: int, jobs: Sequence[JobRecord], *, edge: str = "double", fps: float = 30.0
+    pace: Pace, policy: str, frames: int, jobs: Sequence[JobRecord], *, edge: str = DEFAULT_EDGE, fps: float = 30.0
 ) -> dict[str, Any]:
     """Compare a paced run with the same run in virtual time; returns the block `pace` of report.json.
 

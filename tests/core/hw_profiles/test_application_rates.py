@@ -10,7 +10,6 @@ from trilane.hw_profiles import predict
 from trilane.hw_profiles.application import REFERENCE, Plan, Variant, stage_times_ms, steady
 from trilane.hw_profiles.network_time import Interval
 from trilane.hw_profiles.predict import (
-    EDGES,
     around_frame,
     at_rate,
     every_variant,
@@ -24,6 +23,7 @@ from trilane.hw_profiles.rates import FrameInterval, Wanted, device_power
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
 from trilane.hw_profiles.schema import corners_of
 from trilane.scheduler.policy import POLICIES
+from trilane.transport.slots import EDGES
 
 PROFILE = load_profile("snapdragon-888")
 CORNERS = corners_of(PROFILE, "burst")
