@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 from trilane.pipeline.journal import Accounted, Counted, Record, Stepped, Stopped, Worked
 from trilane.pipeline.tracks import UNKNOWN, track_of
@@ -22,9 +22,7 @@ from trilane.pipeline.unit_history import KEPT, Handed, IdleCutter, IdleSlice, K
 from trilane.scheduler.events import (
     Action,
     Dispatch,
-    DropCause,
     Finish,
-    FrameRequest,
     Graph,
     Hold,
     Job,
@@ -34,15 +32,11 @@ from trilane.scheduler.events import (
     OutcomeKind,
     SchedulerStalled,
     Settings,
-    Stop,
     UnitDied,
     UnitReady,
 )
 from trilane.scheduler.ledger import JOIN, JobRecord
-from trilane.scheduler.policy import Source
 from trilane.scheduler.state import FrameState, fates
-
-SOURCE: Final = "source"
 
 
 class Presented(NamedTuple):
@@ -169,9 +163,7 @@ class Timeline:
         self.presented = self.skipped = 0
         self.downs: deque[Down] = deque(maxlen=kept)
         self.stalls: deque[Span] = deque(maxlen=kept)
-        self._source = Source(settings, self._drop_at_source)
-        self._turned_away: dict[str, deque[tuple[int, int]]] = {cause: deque() for cause in DropCause}
-        self._track = track_of(graph, settings, self._source)
+        self._track = track_of(graph, settings)
         self._first = graph.stages[0].name
         self._lost: deque[GoneFrame] = deque()  # those whose cause was not counted yet
         self._counts: dict[tuple[str, str], int] = {}
@@ -185,9 +177,7 @@ class Timeline:
             JobFailed: self._on_failed,
             UnitReady: self._on_ready,
             UnitDied: self._on_died,
-            FrameRequest: lambda event: self._source.request(event.frames, self._now_ns),
             Hold: self._on_hold,
-            Stop: lambda _: self._source.stop(),
             SchedulerStalled: lambda event: self.stalls.append(Span(self._now_ns - event.ns, self._now_ns)),
         }
 
@@ -221,7 +211,7 @@ class Timeline:
     @property
     def not_begun(self) -> int:
         """The number of the run's frames that were never in flight and were not dropped before."""
-        return self._requested - self._source.left
+        return self._requested - self._track.left
 
     # records
 
@@ -238,7 +228,7 @@ class Timeline:
             elif (handler := self._handlers.get(type(event))) is not None:
                 handler(event)
         if self.start_ns is not None:
-            self._source.advance(step.now_ns)
+            self._track.advance(step.now_ns)
             if self._cutter is not None:
                 self._cutter.step(step.now_ns)
         for action in step.actions:
@@ -276,7 +266,10 @@ class Timeline:
 
     def _count(self, counted: Counted) -> Iterator[Gone]:
         """Yield the frames that were lost or dropped since the last such record."""
-        for kind, counts, gone in (("lost", counted.lost, self._lost_for), ("dropped", counted.dropped, self._dropped)):
+        for kind, counts, gone in (
+            ("lost", counted.lost, self._lost_for),
+            ("dropped", counted.dropped, self._track.dropped_for),
+        ):
             for cause, count in counts.items():
                 for _ in range(count - self._counts.get((kind, cause), 0)):
                     yield Gone(*gone(cause, counted.now_ns), counted.now_ns, kind, cause)
@@ -284,22 +277,9 @@ class Timeline:
 
     def _lost_for(self, cause: str, now_ns: int) -> GoneFrame:
         """Return the next frame that was lost."""
-        if (gone := self._track.left(cause, now_ns)) is not None:
+        if (gone := self._track.lost_for(cause, now_ns)) is not None:
             return gone
         return self._lost.popleft() if self._lost else GoneFrame(UNKNOWN, now_ns)
-
-    def _dropped(self, cause: str, now_ns: int) -> GoneFrame:
-        """Return the frame that was dropped for `cause`, given as `producer->consumer:kind`."""
-        if (gone := self._track.left(cause, now_ns)) is not None:
-            return gone
-        edge, _, kind = cause.rpartition(":")
-        if not edge.startswith(f"{SOURCE}->"):
-            return self._track.dropped(edge, now_ns)
-        queue = self._turned_away.get(kind) or self._source.queue
-        return GoneFrame(*queue.popleft()) if queue else GoneFrame(UNKNOWN, now_ns)
-
-    def _drop_at_source(self, frame: int, release_ns: int, cause: DropCause) -> None:
-        self._turned_away[cause].append((frame, release_ns))
 
     # jobs and frames
 
@@ -335,14 +315,13 @@ class Timeline:
         return Presented(number, frame.release_ns, end_ns, interval_ns, latency_ns, frame.skips, frame.rung)
 
     def _on_hold(self, event: Hold) -> None:
-        self._source.hold(event.frames, self._now_ns)
         self._is_held, self._was_held = event.frames >= 0, True
 
     def _on_failed(self, event: JobFailed) -> None:
         handed = self.units[event.unit].take(event.job)
         if handed is not None:
             self._lose(handed.job.frame)
-            self._source.stop()
+            self._track.stop()
 
     def _on_ready(self, event: UnitReady) -> None:
         down_ns = self.units[event.unit].rise(self._now_ns)
@@ -350,7 +329,7 @@ class Timeline:
             self.downs.append(Down(event.unit, down_ns, self._now_ns))
         if self.start_ns is None and all(unit.is_up for unit in self.units.values()):
             self.start_ns = self._now_ns
-            self._source.start(self._now_ns)
+            self._track.start(self._now_ns)
 
     def _on_died(self, event: UnitDied) -> None:
         """Note that the unit is down; its frames are lost or wait again, as the scheduler says."""

@@ -13,11 +13,23 @@ from itertools import pairwise
 from typing import Final, NamedTuple, Protocol
 
 from trilane.scheduler.core import Core
-from trilane.scheduler.events import NEVER, Event, Graph, Job, JobDone, Settings
+from trilane.scheduler.events import (
+    NEVER,
+    DropCause,
+    Event,
+    FrameRequest,
+    Graph,
+    Hold,
+    Job,
+    JobDone,
+    Settings,
+    Stop,
+)
 from trilane.scheduler.ledger import FrameLeft
 from trilane.scheduler.policy import Source
 from trilane.scheduler.state import FrameState
 
+SOURCE: Final = "source"
 UNKNOWN: Final = -1  # the number of a frame that is gone and cannot be told from others
 
 
@@ -40,6 +52,19 @@ class Track(Protocol):
     def step(self, now_ns: int, events: tuple[Event, ...]) -> None:
         """Note a step of the scheduler; called before what follows from its events."""
 
+    def start(self, now_ns: int) -> None:
+        """Note that the last unit got ready."""
+
+    def advance(self, now_ns: int) -> None:
+        """Release the frames that are due; called after what follows from the events of a step, before its actions."""
+
+    def stop(self) -> None:
+        """Note that no more frames are released, because a job failed."""
+
+    @property
+    def left(self) -> int:
+        """The number of frames that were in flight, or were dropped before."""
+
     def begin(self, job: Job, now_ns: int) -> int:
         """Note that a job is handed out, and return when the scheduler heard that the job's input was there."""
 
@@ -50,13 +75,13 @@ class Track(Protocol):
         """Note that a job waits again because its unit died."""
 
     def lose(self, frame: int, now_ns: int) -> Gone | None:
-        """Note that a frame is lost; return it unless `left` will return it."""
+        """Note that a frame is lost; return it unless `lost_for` will return it."""
 
-    def left(self, cause: str, now_ns: int) -> Gone | None:
-        """Return the next frame that was lost or dropped for `cause`, a key of the report; None: not known here."""
+    def lost_for(self, cause: str, now_ns: int) -> Gone | None:
+        """Return the next frame that was lost for `cause`, a key of the report; None: `lose` returned it."""
 
-    def dropped(self, edge: str, now_ns: int) -> Gone:
-        """Return the frame that was dropped on `edge`, where `left` knows none."""
+    def dropped_for(self, cause: str, now_ns: int) -> Gone:
+        """Return the next frame that was dropped for `cause`, a key of the report."""
 
     def waiting(self, stage: str) -> list[int]:
         """Return the frames that wait for a stage, the oldest first."""
@@ -72,10 +97,12 @@ class Track(Protocol):
 class ChainTrack:
     """The frames of a chain."""
 
-    def __init__(self, graph: Graph, source: Source) -> None:
+    def __init__(self, graph: Graph, settings: Settings) -> None:
         names = [stage.name for stage in graph.stages]
         self.frames: dict[int, FrameState] = {}
-        self._source, self._bypass, self._latency_to = source, graph.bypass, graph.latency_to
+        self._source = Source(settings, self._turn_away)
+        self._turned_away: dict[str, deque[tuple[int, int]]] = {cause: deque() for cause in DropCause}
+        self._bypass, self._latency_to = graph.bypass, graph.latency_to
         self._from_release = graph.from_release
         self._first, self._last = names[0], names[-1]
         self._next = dict(pairwise(names))
@@ -85,8 +112,28 @@ class ChainTrack:
     def waiting(self, stage: str) -> list[int]:
         return [frame for frame, _ in self._source.queue] if stage == self._first else [*self._waiting[stage]]
 
-    def step(self, _now_ns: int, _events: tuple[Event, ...]) -> None:
-        """Do nothing: journals of chains may be older than this scheduler, so their jobs alone count."""
+    def step(self, now_ns: int, events: tuple[Event, ...]) -> None:
+        """Tell the source what it hears; of the stages, the jobs alone count."""
+        for event in events:
+            if type(event) is FrameRequest:
+                self._source.request(event.frames, now_ns)
+            elif type(event) is Hold:
+                self._source.hold(event.frames, now_ns)
+            elif type(event) is Stop:
+                self._source.stop()
+
+    def start(self, now_ns: int) -> None:
+        self._source.start(now_ns)
+
+    def advance(self, now_ns: int) -> None:
+        self._source.advance(now_ns)
+
+    def stop(self) -> None:
+        self._source.stop()
+
+    @property
+    def left(self) -> int:
+        return self._source.left
 
     def begin(self, job: Job, now_ns: int) -> int:
         if job.stage == self._first:
@@ -118,11 +165,15 @@ class ChainTrack:
     def lose(self, frame: int, now_ns: int) -> Gone:
         return Gone(frame, self._leave(frame, now_ns))
 
-    def left(self, _cause: str, _now_ns: int) -> Gone | None:
+    def lost_for(self, _cause: str, _now_ns: int) -> Gone | None:
         return None
 
-    def dropped(self, edge: str, now_ns: int) -> Gone:
+    def dropped_for(self, cause: str, now_ns: int) -> Gone:
+        edge, _, kind = cause.rpartition(":")
         producer, _, consumer = edge.partition("->")
+        if producer == SOURCE:
+            queue = self._turned_away.get(kind) or self._source.queue
+            return Gone(*queue.popleft()) if queue else Gone(UNKNOWN, now_ns)
         is_bypass = (producer, consumer) == self._bypass
         for frame in self._waiting.get(consumer, ()):
             if self._frame(frame, now_ns).skips == is_bypass:
@@ -132,6 +183,9 @@ class ChainTrack:
     def late(self, _unit: str) -> list[str]:
         """Return none: no stage of a chain joins anything."""
         return []
+
+    def _turn_away(self, frame: int, release_ns: int, cause: DropCause) -> None:
+        self._turned_away[cause].append((frame, release_ns))
 
     def _frame(self, number: int, now_ns: int) -> FrameState:
         """Return a frame in flight; where the journal lacks its begin, make one that is known from now on."""
@@ -184,6 +238,19 @@ class GraphTrack:
             else:
                 self._presented[left.frame] = left
 
+    def start(self, _now_ns: int) -> None:
+        """Do nothing: the second scheduler knows."""
+
+    def advance(self, _now_ns: int) -> None:
+        """Do nothing: the second scheduler knows."""
+
+    def stop(self) -> None:
+        """Do nothing: the second scheduler knows."""
+
+    @property
+    def left(self) -> int:
+        return self._core.source.left
+
     def waiting(self, stage: str) -> list[int]:
         state = self._named[stage]
         frames = [state.input.frame[slot] for slot in state.waiting] if state.input is not None else []
@@ -218,17 +285,14 @@ class GraphTrack:
     def lose(self, _frame: int, _now_ns: int) -> Gone | None:
         return None
 
-    def left(self, cause: str, now_ns: int) -> Gone | None:
+    def lost_for(self, cause: str, now_ns: int) -> Gone:
         found = self._gone.get(cause)
         return found.popleft() if found else Gone(UNKNOWN, now_ns)
 
-    def dropped(self, _edge: str, now_ns: int) -> Gone:
-        return Gone(UNKNOWN, now_ns)
+    def dropped_for(self, cause: str, now_ns: int) -> Gone:
+        return self.lost_for(cause, now_ns)
 
 
-def track_of(graph: Graph, settings: Settings, source: Source) -> Track:
-    """Return the track of a run.
-
-    `source`: the chain's source, which the track takes frames from.
-    """
-    return ChainTrack(graph, source) if graph.is_chain else GraphTrack(graph, settings)
+def track_of(graph: Graph, settings: Settings) -> Track:
+    """Return the track of a run."""
+    return ChainTrack(graph, settings) if graph.is_chain else GraphTrack(graph, settings)
