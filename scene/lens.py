@@ -251,9 +251,7 @@ class Bent(NamedTuple):
 
 
 def distortion_note(lenses: Iterable[Bent]) -> tuple[str, ...]:
-    """Return a note on the largest distortion among `lenses`, which pictures leave out; empty if it is below half a
-    pixel.
-    """
+    """Return a note on the largest distortion of `lenses`, which pictures leave out; empty below LEAST_BEND_PX."""
     bent = [each for each in lenses if each.is_fisheye or any(each.parameters.values())]
     most, worst = max(((largest_px(*each), k) for k, each in enumerate(bent)), default=(0.0, 0))
     if most < LEAST_BEND_PX:
