@@ -352,8 +352,8 @@ class FrameSkinner:
 def posed_vertices(shaped: ShapedBody, poses: ArrayLike, translation: ArrayLike | None = None) -> Iterator[F64]:
     """Yield the vertices (V,3), metres, of each pose.
 
-    `poses` (T,165): axis-angle, radians, with absolute hand poses, as `Body.full_pose` returns them. `translation`
-    (3,): translation of the root, metres, the same for all poses.
+    `poses` (T,165): axis-angle, radians, with absolute hand poses, as `Body.full_pose` returns them.
+    `translation` (3,): translation of the root, metres, the same for all poses.
     Raises BadInputError when a number is not finite.
     """
     skeleton = Skeleton(shaped.joints, shaped.body.parents)

@@ -284,10 +284,10 @@ def _far(places: F64, points: F64, spec: CameraSpec) -> tuple[float, tuple[str, 
 
 
 def _from_the_middle(path: CameraPath) -> tuple[CameraPath, F64, F64]:
-    """Return `path` with its middle at the origin, first looking along -Z; and the transform that was removed.
+    """Return `path` moved to have its middle at the origin and to look along -Z at first, and this movement.
 
-    The transform is a rotation (3, 3) about the vertical, applied after subtracting the middle (3,). The search for a
-    place then gives the same result wherever the file's world has its origin and heading.
+    The movement is a rotation (3, 3) about the vertical and the middle (3,): new = rotation @ (old - middle). It makes
+    the search for a place independent of the origin and the heading of the file's world.
     """
     ahead = path.pose(0.0)[0][:, 2]
     level = about(1, -np.arctan2(ahead[0], ahead[2]))

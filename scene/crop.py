@@ -294,10 +294,10 @@ def by_network(networks: Sequence[int]) -> list[list[int]]:
 def apart(
     rects: Sequence[Rect], networks: Sequence[int], lay: Callable[[Sequence[Rect]], DenseLayout | None]
 ) -> DenseLayout | None:
-    """Return a layout with a separate tensor for the avatars of each network; None if any of them has no room.
+    """Return a layout with a separate tensor for the avatars of each network; None if the avatars of any do not fit.
 
     `rects`, `networks`: mesh rectangle of each visible avatar, and number of its network.
-    `lay`: lays out the avatars of one network, always in a tensor of the same shape.
+    `lay`: lays out the avatars of one network, always in a tensor of one shape.
     The density of the result is the least density of these tensors.
     """
     groups = by_network(networks)
@@ -413,7 +413,10 @@ def _scale(sizes: Sequence[tuple[float, float]], shape: Shape, rows: Sequence[Se
 def _crops(
     rects: Sequence[Rect], sizes: Sequence[tuple[float, float]], output: Shape, arrangement: _Arrangement, margin: int
 ) -> tuple[tuple[Rect, Cell], ...]:
-    """Return crop rectangle and cell of each avatar, in the order of `rects`."""
+    """Return crop rectangle and cell of each avatar, in the order of `rects`.
+
+    `sizes`: (height, width) of each avatar in picture pixels. `margin`: background between avatars, tensor pixels.
+    """
     placed: dict[int, tuple[Rect, Cell]] = {}
     top = 0
     for row in arrangement.rows:

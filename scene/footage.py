@@ -218,8 +218,9 @@ def _over_all(
 ) -> tuple[CameraPath, tuple[str, ...]]:
     """Return the camera that filmed the whole footage, and the notes on the background.
 
-    The footage is a video, a picture, or pictures that no pose belongs to; the first picture's shape stands for all.
-    The parameters are those of `filmed`, and `notes`: earlier notes.
+    The footage is a video, a picture, or pictures that are not matched to poses; the first picture's shape stands for
+    all.
+    `notes`: earlier notes. The other parameters are those of `filmed`.
     """
     camera, turn_notes = _turned(path, footage.stored[:1])
     camera = replace(camera, repeat_s=footage.period_s)
@@ -399,7 +400,7 @@ def _shape_notes(path: CameraPath) -> tuple[str, ...]:
 
 
 def _is_like(lens: Lens, shape: Shape) -> bool:
-    """Return whether a picture of `shape` (height, width) has the same aspect ratio as the lens's picture."""
+    """Return whether a picture of `shape` (height, width) has nearly the aspect ratio of the lens's picture."""
     return abs(lens.width_px * shape[0] / (lens.height_px * shape[1]) - 1) < LIKE_ASPECT
 
 

@@ -141,9 +141,9 @@ class Lens:
         return whole.cropped((whole.width_px - width) / 2, (whole.height_px - height) / 2, width, height)
 
     def covering(self, output: Shape) -> Lens:
-        """Return the lens after its picture is cut to cover `output` (height, width).
+        """Return the lens after its picture is scaled and cut to cover `output` (height, width).
 
-        `output` has whole pixels, and so does the lens's picture.
+        The size of the lens's picture is rounded to whole pixels.
         """
         cut = cover((round(self.height_px), round(self.width_px)), output)
         return self.scaled(cut.width, cut.height).cropped(cut.left, cut.top, output[1], output[0])

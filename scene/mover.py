@@ -65,9 +65,9 @@ class BodyOutline:
 
 
 def outline(body: ShapedBody, joints: Collection[str] = JOINT_NAMES) -> BodyOutline:
-    """Return the outline of `body`: for each joint, its outermost vertices in each of DIRECTIONS.
+    """Return the outline of `body`: of the vertices that each joint moves most, the outermost in each of DIRECTIONS.
 
-    A joint's vertices are those that it moves most. `joints`: names of the joints that count.
+    `joints`: names of the joints whose vertices are taken.
     """
     weights, rest = body.body.weights, body.vertices.astype(np.float64)
     owner = weights.argmax(axis=1)
@@ -195,7 +195,7 @@ class Mover:
 
 
 def make_mover(spec: AvatarSpec, motion: Motion, body: ShapedBody) -> Mover:
-    """Put `motion` on the floor for `body`, at the position and heading of `spec`."""
+    """Return the mover that puts `motion` on the floor for `body`, at the position and heading of `spec`."""
     leg = rest_leg_m(body.joints)
     scale = leg / motion.leg_m if motion.leg_m else 1.0
     shift = -body.joints[0]

@@ -63,8 +63,8 @@ def work_of(
 ) -> FrameWork:
     """Return the work for a frame that shows `shown`, as bytes of `shown_by`.
 
-    `of_picture`: what the frame of the present picture showed, None when there is none.
-    `of_nobody`: what the last frame without anybody showed, None when there was none.
+    `of_picture`: what the frame of the present picture showed; None before the first picture.
+    `of_nobody`: what the last frame without anybody showed; None before the first such frame.
     `is_anybody_seen`: finds out whether an avatar is on the screen; called only if the bytes do not decide.
     """
     if shown == of_picture:
@@ -137,8 +137,8 @@ class TensorBudget:
 class HeldShape:
     """The shape in use.
 
-    `foreseen`: foreseen shape that was taken last, None for none. `smaller_for`: number of successive frames for which
-    a smaller shape would have been good.
+    `shape`: (height, width). `foreseen`: foreseen shape that was taken last; None if none was taken yet.
+    `smaller_for`: number of successive frames for which a smaller shape would have been good.
     """
 
     shape: Shape
@@ -240,7 +240,7 @@ def _dense(rects: Sequence[Rect], networks: Sequence[int], output: Shape, shape:
 def _fits(
     rects: Sequence[Rect], networks: Sequence[int], output: Shape, shapes: Sequence[Shape], budget: TensorBudget
 ) -> tuple[dict[Shape, DenseLayout], list[Shape]]:
-    """Return the layout in each allowed shape that has room for the avatars, and those of these shapes that are good.
+    """Return {shape: layout} of all allowed shapes with room for the avatars, and a list of the good ones.
 
     A good shape is nearly as dense as the densest shape within the frame's budget. A good shape may exceed that budget,
     but not the largest budget of frames with as many avatars.
@@ -298,11 +298,16 @@ def foreseen_changes(
     budget: TensorBudget,
     networks: Sequence[int] = (),
 ) -> tuple[tuple[int, Shape], ...]:
-    """Return (frame, shape) of the first of `looks`, at least one, and of every change of shape after it.
+    """Return the shape at the first of `looks`, and each later change of shape, as (frame, shape).
 
+    `looks`: frames that were examined, in order, at least one.
+    `output`: (height, width) of the picture in pixels.
+    `shapes`: shapes that are ready.
+    `budget`: number of pixels that a tensor may have.
     `networks`: number of the network of each avatar of the scene; empty if one network paints all.
-    The sequence of good shapes is the cheapest in pixels: the pixels of all frames, plus the cost of the changes. A
-    shape that is not good at a look is left in the first frame after the look before.
+
+    The result is the cheapest sequence of good shapes in pixels: the pixels of all frames, plus the cost of the
+    changes. If a shape is not good at a look, the next shape begins in the first frame after the look before.
     """
     order = sorted(shapes, key=lambda shape: (area(shape), shape))
     costs, origins, needed = dict.fromkeys(order, 0.0), [], []

@@ -34,7 +34,8 @@ def rotvec_from_quat(quat: ArrayLike) -> F64:
 
 
 def _products_to_matrix() -> F64:
-    """Return the matrix (16, 9) that maps the flattened q q^T to the flattened rotation matrix, both row-major.
+    """Return the matrix (16, 9) that maps the flattened outer product q q^T to the flattened rotation matrix,
+    row-major.
 
     q is the unit quaternion (w, x, y, z).
     """

@@ -52,9 +52,9 @@ class StrictModel(BaseModel):
 
 
 class Table(StrictModel):
-    """A table of a scene file. Each value has the type of its key; other types are not converted.
+    """A table of a scene file. Each value must have the type of its key; other types are not converted.
 
-    Two exceptions: a number that need not be whole may be written as a whole one, and tuples are written as lists.
+    Two exceptions: a whole number may stand for a float, and a list stands for a tuple.
     """
 
     model_config = ConfigDict(strict=True)

@@ -41,10 +41,10 @@ MOST_FRAMES = 300
 
 
 class Camera(Protocol):
-    """A camera in the scene."""
+    """A camera in the scene, as this module needs it; `PlacedCamera` is one."""
 
     def sample(self, t_s: float) -> F64:
-        """Return the matrix (4, 4) from world to camera at `t_s`."""
+        """Return the transform (4, 4) from world to camera at `t_s`."""
 
     def projection(self, t_s: float, output: Shape) -> F64:
         """Return the OpenGL clip matrix (4, 4) at `t_s` for a picture of `output` (height, width)."""
@@ -76,8 +76,7 @@ def seen_at(
 ) -> Seen:
     """Return what `camera` shows of the `movers` with `bodies` at `times_s` (F,).
 
-    `output`: (height, width) of the picture. `joints`: names of joints; only vertices that these joints move most
-    count.
+    `output`: (height, width) of the picture. `joints`: names of the joints whose vertices are examined.
     """
     actors = [
         (mover, Skeleton(body.joints, body.body.parents), outline(body, joints))
@@ -335,8 +334,8 @@ def _rows(film: Filming) -> F64:
 def _reaches(film: Filming, rows: F64) -> tuple[F32, F32]:
     """Return the reaches (HEADINGS, ROWS, F) and the heights (HEADINGS, F) of the bodies.
 
-    A reach is what the bodies add to a row's value: for sides and the nearest depth that of the outermost point,
-    otherwise that of the middle. Heights are those at a depth of 1, in half pictures.
+    A reach is what the bodies add to a row's value. For rows of sides and of the nearest depth, their outermost point
+    counts; for other rows, their middle. Heights are those at a depth of 1, in half pictures.
     """
     headings = about(1, np.arange(HEADINGS) * (2 * np.pi / HEADINGS))
     reaches = np.empty((HEADINGS, ROWS, rows.shape[1]), np.float32)
@@ -421,7 +420,8 @@ def _filling_depth(film: Filming) -> float:
 
 
 def _looked_at(film: Filming) -> F64:
-    """Return the point (3,) nearest to all lines of sight; if several are, the one nearest to the middle of the eyes.
+    """Return the point (3,) nearest to all lines of sight; of several such points, the nearest to the middle of the
+    eyes.
 
     The point x solves the normal equations of the distances: sum (1 - d d') (x - p) = 0 for eyes p and directions d.
     """

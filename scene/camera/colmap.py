@@ -67,7 +67,7 @@ class ColmapCamera:
     values: dict[str, float]
 
     def lens(self) -> Lens:
-        """Return the lens without its distortion."""
+        """Return the lens as a pinhole, without distortion."""
         v = self.values
         fx, fy = v.get("fx", v.get("f", 0.0)), v.get("fy", v.get("f", 0.0))
         return Lens(self.width_px, self.height_px, fx, fy, v["cx"], v["cy"])
@@ -117,7 +117,7 @@ WORDS = 10  # words of an image's first line, with the name as one word
 
 
 def read_cameras_text(path: Path) -> dict[int, ColmapCamera]:
-    """Return the cameras of `path` by their numbers. Raises BadInputError with the line."""
+    """Return the cameras of `path`, a `cameras.txt`, by number. Raises BadInputError with the line."""
     cameras = {}
     for number, line in _lines(path, CAMERAS):
         where, words = f"{path}, line {number}", line.split()
@@ -134,7 +134,7 @@ def read_cameras_text(path: Path) -> dict[int, ColmapCamera]:
 
 
 def read_images_text(path: Path) -> list[ColmapImage]:
-    """Return the images of `path`. Raises BadInputError with the line."""
+    """Return the views of `path`, an `images.txt`. Raises BadInputError with the line."""
     images, is_points = [], False
     for number, line in _lines(path, IMAGES, keeps_blank=True):
         is_image = _is_image(line)
@@ -225,7 +225,7 @@ class _Reader:
 
 
 def read_cameras_binary(path: Path) -> dict[int, ColmapCamera]:
-    """Return the cameras of `path` by their numbers. Raises BadInputError."""
+    """Return the cameras of `path`, a `cameras.bin`, by number. Raises BadInputError."""
     cameras = {}
     size = require_file(path, "a COLMAP cameras.bin")
     with path.open("rb") as file:
@@ -242,7 +242,7 @@ def read_cameras_binary(path: Path) -> dict[int, ColmapCamera]:
 
 
 def read_images_binary(path: Path) -> list[ColmapImage]:
-    """Return the images of `path`. Raises BadInputError."""
+    """Return the views of `path`, an `images.bin`. Raises BadInputError."""
     images = []
     size = require_file(path, "a COLMAP images.bin")
     with path.open("rb") as file:
@@ -275,7 +275,7 @@ def model_in(folder: Path) -> tuple[Path, str] | None:
 def load_colmap(path: Path, rate_hz: float | None = None) -> RawCamera:
     """Read the COLMAP model at `path`, a folder or a file of the model. Raises BadInputError that names the file.
 
-    `rate_hz`: views a second by the scene, None if it does not say.
+    `rate_hz`: views a second by the scene; None if the scene does not say.
     """
     found = model_in(path if path.is_dir() else path.parent)
     if found is None:

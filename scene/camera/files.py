@@ -87,7 +87,7 @@ class Guess(NamedTuple):
 LEAST_ROWS = 5
 #: Least number of rows from which another order of columns is found by where the camera goes and looks.
 LEAST_LED = 20
-#: A column is a clock if `_unevenness` is below EVEN, and is none from UNEVEN on.
+#: A column is a clock if its `_unevenness` is below EVEN, and no clock if it is UNEVEN or more.
 EVEN, UNEVEN = 0.1, 0.5
 #: Largest coordinate of a map, in any unit; times since 1970 are larger.
 FARTHEST = 1e8
@@ -103,8 +103,8 @@ ALONG, UPRIGHT = 0.9, 0.7
 #: sight may miss the point. A person who pans holds the camera nearer than this to the axis of the turn; such lines of
 #: sight meet behind the camera.
 LEAST_AWAY, MOST_MISSED = 1.0, 0.2
-#: Range of depths below 0 of a camera held by a person, if Y is down and the floor is at 0. With Y up, no camera is
-#: that low. In a phone's world neither, as its origin is where the phone was.
+#: Range of depths below 0, metres, of a camera held by a person, if Y is down and the floor is at 0. With Y up, no
+#: camera is that low. In a phone's world, the origin is where the phone was, so no camera is that low either.
 BELOW_M = 0.7, 2.5
 #: Range of times of a device's clock, in seconds since it was switched on: more than times since the start of a
 #: recording, less than times since 1970.
@@ -223,8 +223,8 @@ def _require_pose(path: Path, layout: TableLayout) -> None:
 def _require_clock(path: Path, numbers: F64, others: Iterable[int]) -> None:
     """Raise BadInputError if a column of `numbers` (N, columns) other than the first looks like times.
 
-    `others`: indices of these columns. Their numbers are times if they are as large as times since 1970, or if they
-    grow evenly while the first column does not.
+    `others`: indices of columns to check. A column looks like times if its numbers are as large as times since 1970, or
+    if they grow evenly while those of the first column do not.
     """
     if len(numbers) < LEAST_ROWS:
         return
@@ -287,10 +287,12 @@ def _of_matrices(path: Path, numbers: F64, up_axis: str, axes: str) -> Guess:
 def _require_row_order(path: Path, matrices: F64, columns: str, kind: str, slack: float) -> None:
     """Raise BadInputError if `matrices` (N, 3, 4) of the format `kind` fit better with their numbers in another order.
 
-    `columns`: the table's columns, in words. `slack`: how much more astray the other order may look and still be
-    possible; if negative, it must look less astray by this. People hold a camera level while it pans. With transposed
-    matrices or exchanged axes, the picture swings, the camera looks up, or it looks away from where it goes. KITTI's
-    first pose is the identity, so its poses are as level when transposed.
+    `columns`: the table's columns, in words.
+    `slack`: another order is possible if its `_astray` is less than that of the present order plus this.
+
+    People hold a camera level while it pans. With transposed matrices or exchanged axes, the picture swings, the camera
+    looks up, or the camera looks away from where it goes. KITTI's first pose is the identity, so KITTI's poses are as
+    level when transposed.
     """
     turns, places = matrices[:, :, :3], matrices[:, :, 3]
     if len(turns) < LEAST_ROWS:
@@ -322,10 +324,11 @@ def _require_row_order(path: Path, matrices: F64, columns: str, kind: str, slack
 def _signs(matrices: F64, up_axis: str, times: F64 | None) -> dict[str, tuple[str, ...]]:
     """Return, in words, which features of poses (N, 3, 4) speak for KITTI, and which speak for ARKit, by format.
 
-    KITTI's axes are x right, y down, looking along +Z. `up_axis`: axis that is up, by the scene. `times` (N,): times of
-    the table, None without. If there are times, the clock of a device speaks for ARKit, and so does Y up: other
-    programs seldom write times before matrices of such a world. A device that is held upright is also upright along the
-    opposite axis. This speaks for ARKit only without times, as nobody else writes such a table.
+    `up_axis`: axis that is up, by the scene. `times` (N,): times of the table; None if it has no times.
+
+    KITTI's axes are x right, y down, looking along +Z. If the table has times, two features speak for ARKit, because
+    other programs seldom write times before such matrices: the clock of a device, and Y up. A device that is held
+    upright fits both directions of Z, so this feature speaks for ARKit only if the table has no times.
     """
     turns, places = matrices[:, :, :3], matrices[:, :, 3]
     ups = ("z", "y") if up_axis == AUTO else (up_axis,)
@@ -398,7 +401,7 @@ def _missed(turns: F64, places: F64) -> float:
 
 
 def _is_of_device(times: F64) -> bool:
-    """Return whether `times` (N,) may count from when a device was switched on; those of recordings begin at 0."""
+    """Return whether `times` (N,) may count from when a device was switched on; times of recordings begin at 0."""
     least, most = OF_A_DEVICE_S
     return any(least < times[0] * SECONDS[unit] < most for unit in units_of(times) if unit in SECONDS)
 
@@ -406,13 +409,13 @@ def _is_of_device(times: F64) -> bool:
 def _require_one_order(path: Path, numbers: F64, names: tuple[str, ...], axes: F64) -> None:
     """Raise BadInputError if the quaternion's parts may be in another order than `names` of the table's columns.
 
-    Each of the 24 orders gives a camera. Four of them are equally level, as they only mirror the camera's heading. They
-    are told apart by movement: a camera looks where it goes, or at one point that it goes round, and not up. A SLAM map
-    that begins with the identity has its 1 where the scalar is; of the six orders with that scalar, the most level one
-    counts.
-
     `numbers` (N, columns): numbers of the table.
     `axes` (3, 3): columns are the directions of the camera's OpenGL axes, in the coordinates of a pose.
+
+    Each of the 24 orders gives a camera. Four orders are equally level, as they only mirror the camera's heading.
+    Movement tells these apart: a camera looks where it goes, or at one point that it goes round, and not up. A SLAM map
+    that begins with the identity has its 1 where the scalar is. Of the six orders with that scalar, the most level one
+    counts.
     """
     at = names.index("qw"), names.index("qx"), names.index("qy"), names.index("qz")
     first_of = min(at)
@@ -460,7 +463,7 @@ def _has_digits(numbers: F64) -> bool:
 def _astray(turns: F64, places: F64) -> float:
     """Return how far cameras look away from where they go, or from the point that they go round.
 
-    A value below 1 means that they look there; infinity, that there are too few cameras. `turns` (N, 3, 3), `places`
+    Below 1, the cameras look there. The result is infinite if there are too few cameras. `turns` (N, 3, 3), `places`
     (N, 3): camera to world, OpenGL axes.
     """
     if len(places) < LEAST_LED:
@@ -532,7 +535,7 @@ BODY_AXES = "forward-left-up"
 
 
 def _require_camera(path: Path, raw: RawCamera, kind: str, spec: CameraSpec) -> None:
-    """Raise BadInputError if the poses are more likely those of a vehicle's body than those of a camera.
+    """Raise BadInputError if the poses more likely belong to a vehicle's body than to a camera.
 
     Nothing is checked if the scene states axes or up, or if the poses of the format have OpenGL axes.
     """

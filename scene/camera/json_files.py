@@ -65,11 +65,13 @@ NO_LENS_REMEDY = "cut the pictures into perspective ones first (ns-process-data 
 def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
     """Read a NeRF `transforms.json`, or its folder: `frames[].transform_matrix`, 4x4, usually Z up, no times.
 
-    The lens is that of the frame, or else that of the file: `fl_x`, `fl_y`, `cx`, `cy` in pixels of `w` x `h`, or an
-    angle. Distortion is left out and noted. nerfstudio makes such files from the exports of Polycam and Record3D.
+    A frame may have its own lens; otherwise the lens of the file holds. A lens is `fl_x`, `fl_y`, `cx`, `cy` in pixels
+    of
+    `w` x `h`, or an angle. Distortion is left out and noted. nerfstudio makes such files from the exports of Polycam
+    and Record3D.
 
-    `rate_hz`: frames a second by the scene, None if it does not say. Raises BadInputError that names the key. Format:
-    https://docs.nerf.studio/quickstart/data_conventions.html.
+    `rate_hz`: frames a second by the scene; None if the scene does not say. Raises BadInputError that names the key.
+    Format: https://docs.nerf.studio/quickstart/data_conventions.html.
     """
     path = path / NERF_FILE if path.is_dir() else path
     content = read_object(path, NERF)
@@ -103,7 +105,7 @@ def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
 
 
 def _nerf_lenses(path: Path, content: Mapping[str, Any], frames: Sequence[Any]) -> tuple[tuple[Lens, ...], str]:
-    """Return one lens for all views, or one for each if any view has a key of its own; and their source in words."""
+    """Return one lens for all views, or one for each view if any view has its own keys; and the source in words."""
     _check_models(path, (content, *frames))
     if not any(key in frame for frame in frames if isinstance(frame, dict) for key in LENS_KEYS):
         lens, source = _nerf_lens(path, content, "")
@@ -145,7 +147,7 @@ def _real(path: Path, content: Mapping[str, Any], key: str) -> float:
 
 
 def _pictures(frames: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
-    """Return the name of each view's photo, as the file states it; () if any view has none."""
+    """Return the name of each view's photo, as the file states it; () if any view has no photo."""
     names = tuple(frame.get("file_path") for frame in frames)
     return tuple(str(name) for name in names) if all(isinstance(name, str) and name for name in names) else ()
 
@@ -211,9 +213,10 @@ def _measured(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, st
 def _by_angle(
     width: float | None, height: float | None, angle_x: float | None, angle_y: float | None
 ) -> tuple[Lens, str]:
-    """Return a lens for which the file has no focal length, and its source in words.
+    """Return the lens of a file without focal lengths, and the source of its angles in words.
 
-    `width`, `height`: size of the picture, pixels. `angle_x`, `angle_y`: fields of view, radians. Each may be None.
+    `width`, `height`: size of the picture, pixels. `angle_x`, `angle_y`: fields of view, radians. Each is None if the
+    file does not state it.
     """
     angles = {"camera_angle_x": angle_x, "camera_angle_y": angle_y}
     source = f"by {' and '.join(f'`{key}`' for key, value in angles.items() if value)}"
@@ -230,9 +233,9 @@ def _by_angle(
 
 
 def _number(where: str, value: Any, key: str) -> float | None:
-    """Return `value` if it is a positive number, None if it is None. Raises BadInputError about `where` otherwise.
+    """Return `value` if it is a positive number, or None if it is None. Raises BadInputError about `where` otherwise.
 
-    `key`: its key; angles must be below pi.
+    `key`: key of the value; an angle must be below pi.
     """
     if value is None:
         return None

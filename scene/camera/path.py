@@ -153,7 +153,7 @@ class CameraPath:
 
     @property
     def duration_s(self) -> float:
-        """Time of the last sample."""
+        """Time of the last sample, seconds."""
         return float(self.times_s[-1])
 
     @property

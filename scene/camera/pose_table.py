@@ -33,8 +33,8 @@ HEAD = 3000
 #: and some save key frames.
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 LEAST_STEP_S, FAST_STEP_S = 0.9e-3, 3e-3
-#: Times of a clock since 1970, or with fractions, keep their unit for steps up to SURE_STEP_S, as of key frames. For
-#: steps up to LONGEST_STEP_S, another unit is as likely.
+#: Times since 1970, or times with fractions, keep their unit for steps up to SURE_STEP_S, such as those between key
+#: frames. For steps up to LONGEST_STEP_S, another unit is as likely.
 SURE_STEP_S, LONGEST_STEP_S = 3.0, 60.0
 #: Times from 2001 to 2100, in seconds since 1970, are those of a clock; other times are those of a device.
 EARLIEST_S, LATEST_S = 1e9, 4.1e9
@@ -97,8 +97,8 @@ class TableLayout(NamedTuple):
     `names`: content of each named column, a value of KNOWN or ""; empty without column names.
     `has_commas`: whether commas separate the numbers.
     `is_ns`: whether the first column has times in nanoseconds.
-    `unit`: unit of the times by the column names, `auto` without one.
-    `lengths`: unit of the positions by the column names, "" without one.
+    `unit`: unit of the times by the column names; `auto` if they state no unit.
+    `lengths`: unit of the positions by the column names; "" if they state no unit.
     """
 
     columns: int
@@ -134,9 +134,10 @@ def read_table(path: Path, columns: int, expected: str) -> NumberTable:
 
 
 def head_of(path: Path, columns: int, expected: str) -> NDArray[np.float64]:
-    """Return the numbers (N, columns) of those of the first HEAD rows that have as many finite numbers; N may be 0.
+    """Return the numbers (N, `columns`) among the first HEAD rows; N may be 0.
 
-    Raises BadInputError when the file is unreadable.
+    Rows with another number of columns, or with NaN or infinity, are left out. Raises BadInputError when the file is
+    unreadable.
     """
     rows = (words for _, words in islice(_rows(path, expected), HEAD))
     numbers = ([value for word in words for value in _number(word)] for words in rows)
@@ -173,7 +174,7 @@ def layout_of(path: Path, expected: str) -> TableLayout:
 
 
 def _require_one_of_each(path: Path, columns: Sequence[ColumnName]) -> None:
-    """Raise BadInputError if two columns have names of the same content, as either may be meant."""
+    """Raise BadInputError if two columns have names with the same meaning, as either column may be meant."""
     named: dict[str, str] = {}
     for column in columns:
         if column.holds in named:
@@ -194,8 +195,8 @@ def _number(word: str) -> list[float]:
 class ColumnName(NamedTuple):
     """The name of a column.
 
-    `text`: name as written. `holds`: content of the column, a value of KNOWN or "". `unit`: unit as written, "" without
-    one.
+    `text`: name as written. `holds`: content of the column, a value of KNOWN or "".
+    `unit`: unit as written; "" if the name has no unit.
     """
 
     text: str
@@ -233,7 +234,7 @@ def _plain(name: str) -> str:
 def _unit_of(
     path: Path, columns: tuple[ColumnName, ...], holding: tuple[str, ...], units: Mapping[str, float], key: str
 ) -> str:
-    """Return the unit, a key of `units`, that the columns with a content in `holding` state; "" without one.
+    """Return the unit, a key of `units`, that the columns with a content in `holding` state; "" if they state no unit.
 
     `key`: key of the scene that states the unit instead, for messages. Raises BadInputError when a unit is unknown, or
     when the names state different units.
@@ -257,9 +258,9 @@ def _first_other(found: Sequence[str]) -> int:
 
 
 def elapsed(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Return times (N,) since the first finite one, and the median of their steps, 0 with fewer than two finite times.
+    """Return the times (N,) since the first finite one, and the median step between finite times.
 
-    NaN stays NaN.
+    NaN stays NaN. The step is 0 if there are fewer than two finite times.
     """
     finite = times[np.isfinite(times)]
     if len(finite) < 2:
@@ -305,10 +306,10 @@ class Clock(NamedTuple):
     usual_hz: float = FILM_RATE_HZ
 
     def stated(self, path: Path, unit: str) -> Clock:
-        """Return this clock with the `unit` of the file's column names, unless the scene states one.
+        """Return this clock with the `unit` that column names state; the scene's own unit is kept.
 
-        The scene may say that the times are frame numbers. Raises BadInputError when it states another unit than the
-        names.
+        The scene may say that the times are frame numbers. Raises BadInputError when the scene states another unit than
+        the names.
         """
         if unit != AUTO and self.unit not in (AUTO, FRAMES, unit):
             found = f'column names with times in {unit} and camera.time_unit = "{self.unit}"'
@@ -397,8 +398,8 @@ MATRIX = 12
 ROW_ORDER = "the order r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
 #: Largest deviation of a quaternion's length from 1; rounding to two decimal places changes the length by 0.01 at most.
 MOST_OFF = 0.02
-#: A column is a clock if its steps differ from their median by less than the share EVEN, and is none if they differ by
-#: UNEVEN or more. It needs LEAST_OF_A_CLOCK rows to be judged.
+#: A column is a clock if all steps differ from their median by less than the share EVEN, and no clock if a step differs
+#: by UNEVEN or more. It is judged only if it has LEAST_OF_A_CLOCK rows.
 EVEN, UNEVEN, LEAST_OF_A_CLOCK = 0.01, 0.5, 8
 
 
@@ -409,10 +410,10 @@ class PoseTable:
     `times_s` (N,): times from 0.
     `turns` (N, 3, 3), `places` (N, 3): rotations and positions, as the file has them.
     `time`: unit of the file's times. `rate`: rate for notes, such as `, 30/s`.
-    `order`: source of the order of columns.
+    `order`: source of the order of columns, in words.
     `names`: content of each column of `table`.
     `began_s`: time 0 in seconds since 1970; None if the file's times are not those of a clock.
-    `lengths`: unit of the positions by the column names, "" without one.
+    `lengths`: unit of the positions by the column names; "" if they state no unit.
     """
 
     times_s: F64
@@ -474,9 +475,9 @@ def read_pose_table(
 class MatrixTable(NamedTuple):
     """The poses of a table with matrices.
 
-    `times`: times of the poses, None if the table has none.
+    `times`: times of the poses; None if the table has no times.
     `turns` (N, 3, 3), `places` (N, 3): rotations and positions, as the file has them.
-    `lengths`: unit of the positions by the column names, "" without one.
+    `lengths`: unit of the positions by the column names; "" if they state no unit.
     """
 
     times: ColumnTimes | None
@@ -562,9 +563,9 @@ def _require_quats(path: Path, quats: F64, table: NumberTable) -> None:
 
 
 def is_off(quats: F64, most: float = MOST_OFF) -> NDArray[np.bool_]:
-    """Return, for each of `quats` (N, 4), whether its length differs from 1 by more than `most`: (N,).
+    """Return, for each of `quats` (N, 4), whether the length differs from 1 by more than `most`: (N,).
 
-    Quaternions that are 0 or not finite do not count.
+    A quaternion that is 0 or not finite does not count as off.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         length = np.linalg.norm(quats, axis=1)

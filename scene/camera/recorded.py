@@ -179,7 +179,8 @@ class _Prices:
 
     `axis`: an unusual axis. `turn`: a turned picture.
     `between`: a direction between the axes; None if such a direction is never guessed.
-    `nadir`: a camera that looks straight down along the usual axis. `nadir_deg`: how far off it may look, degrees.
+    `nadir`: a camera that looks straight down along the usual axis. `nadir_deg`: largest deviation from that view,
+    degrees.
     """
 
     axis: float
@@ -198,11 +199,11 @@ ANY_WORLD = _Prices(axis=0.2, turn=0.4, between=0.25, nadir=0.5, nadir_deg=5.0)
 LEVELLED = _Prices(axis=0.4, turn=0.1, between=None, nadir=0.3, nadir_deg=18.0)
 #: Costs that compare horizons alone.
 FREE = _Prices(axis=0.0, turn=0.0, between=None, nadir=0.0, nadir_deg=18.0)
-#: A direction between the axes is believed if the cameras pan by at least the first, radians (root mean square), and if
-#: its cosine with every axis is at most the second.
+#: A direction between the axes is believed if the cameras pan by at least LEAST_PAN, radians (root mean square), and if
+#: its cosine with every axis is at most MOST_AXIS_COSINE.
 LEAST_PAN, MOST_AXIS_COSINE = 0.15, 0.995
-#: The world's axes are those of the first picture, OpenGL's or optical ones, if cosines are above this. The text is
-#: added to the note then, as nothing else shows this case.
+#: The world's axes count as the first picture's axes (OpenGL or optical) if their cosines are above this. A note then
+#: says OF_FIRST, as nothing else shows this case.
 AS_FIRST = 1 - 1e-8
 OF_FIRST = "; the axes are those of the first picture: if that looked down or up, the floor is tilted by as much"
 #: Another guess is named if its cost exceeds the least one by less than this.
@@ -254,7 +255,8 @@ def find_upright(turns: F64, usual: str, is_levelled: bool, stated: str = AUTO) 
 def _is_nadir(turns: F64, usual: str, most_deg: float) -> bool:
     """Return whether a camera looks straight down along the axis `usual`, within `most_deg` degrees.
 
-    In a map with the axes of the first picture, a camera that looks ahead also looks along an axis; it does not count.
+    In a map with the axes of the first picture, a camera that looks ahead also looks along an axis; such a view does
+    not count.
     """
     is_of_first = np.abs(np.diag(turns[0])).min() > AS_FIRST
     return bool(turns[:, :, 2].mean(axis=0) @ UP[usual] > np.cos(np.radians(most_deg)) and not is_of_first)
@@ -271,12 +273,12 @@ def price_of_horizons(turns: F64) -> float:
 
 
 def is_of_body(turns: F64, of_body: F64, usual: str) -> bool:
-    """Return whether poses are more likely those of a level vehicle than those of a camera.
+    """Return whether poses more likely belong to a level vehicle than to a camera.
 
-    `turns` (N, 3, 3): axes of the camera if the poses are a camera's. They must need two corrections: a turned picture,
-    and a view that is steeply up.
-    `of_body` (N, 3, 3): the same if the poses are a vehicle's. They must need no correction, look ahead or down, and be
-    cheaper by NEAR.
+    `turns` (N, 3, 3): camera axes if the poses are a camera's. They must need two corrections: a turned picture, and a
+    view that is steeply up.
+    `of_body` (N, 3, 3): camera axes if the poses are a vehicle's. They must need no correction, look ahead or down, and
+    cost less by NEAR.
     `usual`: axis that is usually up in the format.
     """
     cheapest = [
@@ -306,7 +308,7 @@ def _guesses(turns: F64, expected: str, prices: _Prices, stated: str) -> list[_G
 
 
 def _is_of_first(turns: F64, best: _Guess) -> bool:
-    """Return whether the world's axes are those of the first of several pictures, and up is that picture's own up.
+    """Return whether the world has the axes of the first of several pictures, and up is that picture's own up.
 
     SLAM maps are such worlds.
     """
@@ -388,8 +390,8 @@ FILM_STEP_DEG = 6.0
 def times_without(turns: F64, rate_hz: float | None) -> tuple[F64, str]:
     """Return times (N,), seconds, of views without times, and words on their rate.
 
-    `turns` (N, 3, 3): camera axes. `rate_hz`: views a second by the scene, None if it does not say. Without it, views
-    that are less than FILM_STEP_DEG apart are a film, and other views are stills.
+    `turns` (N, 3, 3): camera axes. `rate_hz`: views a second by the scene; None if the scene does not say. Without a
+    rate, views that are less than FILM_STEP_DEG apart are a film, and other views are stills.
     """
     rate, how = _rate(turns) if rate_hz is None else (rate_hz, f"{rate_hz:g} a second as given")
     return np.arange(len(turns)) / rate, how
@@ -490,10 +492,11 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
 
 
 def _in_metres(raw: RawCamera, where: str, spec: CameraSpec) -> tuple[F64, CameraSpec, tuple[str, ...]]:
-    """Return positions (N, 3) in metres if column names state a unit, `spec` without its unit in that case, and a note.
+    """Return positions (N, 3), the camera of the scene, and a note, after a unit of the column names is applied.
 
-    If the names state metres, nothing changes and `metres_per_unit` of the scene counts: programs write `[m]` over maps
-    that nobody measured. Raises BadInputError when the scene states another unit than the names.
+    If the names state a unit other than metres, the positions are converted, and the camera loses its
+    `metres_per_unit`. If the names state metres, nothing changes and `metres_per_unit` of the scene counts: programs
+    write `[m]` over maps that nobody measured. Raises BadInputError when the scene states another unit than the names.
     """
     metres = LENGTH_UNITS.get(raw.lengths, 1.0)
     if metres == 1.0:

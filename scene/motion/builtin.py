@@ -42,7 +42,7 @@ class Build:
 
     @property
     def leg_m(self) -> float:
-        """Length from hip over knee to ankle."""
+        """Length of a leg from hip over knee to ankle, metres."""
         return float(np.linalg.norm(self.knee) + np.linalg.norm(self.ankle))
 
     def side(self, offset: tuple[float, float, float], side: int) -> F64:

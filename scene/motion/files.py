@@ -74,7 +74,7 @@ def places_in(array: NDArray[Any]) -> F64 | None:
 
 
 def _sound(places: F64) -> NDArray[np.bool_]:
-    """Return, for each frame (T,), whether all bones are a person's, and as long as in the other frames.
+    """Return, for each frame (T,), whether all bones have a person's lengths, and nearly the same in all frames.
 
     `places`: positions (T, 22, 3).
     """
@@ -165,7 +165,7 @@ def load_npy(path: Path, units: str = "auto", rest: F64 = T_POSE) -> RawMotion:
 
 
 def load_npz(path: Path) -> RawMotion:
-    """Read an `.npz` file. Raises BadInputError."""
+    """Read an `.npz` file of the SMPL family. Raises BadInputError."""
     values = npz_values(path, NPZ_KEYS, EXPECTED)
     names = [printable(name) for name in npz_names(path, EXPECTED)]
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""

@@ -179,7 +179,7 @@ def match_names(path: Path, names: list[str], joint_map: Mapping[str, str] = NO_
 
 
 def _missing(found: Mapping[str, int], stated: Mapping[str, int | None]) -> list[str]:
-    """Return the REQUIRED joints that are neither in `found` nor `stated` with a joint of the file."""
+    """Return the REQUIRED joints that neither `found` nor `stated` matches to a joint of the file."""
     return [name for name in REQUIRED if name not in found and stated.get(name) is None]
 
 
@@ -215,7 +215,10 @@ def _by_table(table: Mapping[str, str], index_of: Mapping[str, int]) -> dict[str
 
 
 def _overruled(found: Mapping[str, int], stated: Mapping[str, int | None]) -> dict[str, int]:
-    """Return `found` with `stated` on top: the scene's joints replace matches of the same joint on either side."""
+    """Return the matches `found`, overridden by `stated`.
+
+    A match of `found` is dropped if `stated` has its SMPL-X joint or its joint of the file.
+    """
     taken = set(stated.values())
     kept = {target: index for target, index in found.items() if target not in stated and index not in taken}
     return kept | {target: index for target, index in stated.items() if index is not None}

@@ -85,7 +85,7 @@ class _Reader:
 
     `stack`, `memo`: as the format defines them.
     `encoded`: text and its bytes, by the `id` of a text that stands for bytes.
-    `paired`: number of items that dicts got as lists of pairs.
+    `paired`: number of (key, value) pairs from which dicts were built.
     """
 
     stack: list[Any] = field(default_factory=list)

@@ -265,9 +265,10 @@ def _steeper(work: Retarget, planted: Sequence[_RecordedFoot]) -> tuple[float, f
 
 
 def _levelled(work: Retarget, name: str, base: F64) -> F64:
-    """Return the file's rotations (T, 3, 3) of a joint, after one constant rotation; `base` if the file has none.
+    """Return the file's rotations (T, 3, 3) of a joint after one constant rotation; `base` if the file has none.
 
-    The constant makes their mean equal to that of `base` (T, 3, 3), over frames that stand, or over all if none stands.
+    The constant makes their mean equal to the mean of `base` (T, 3, 3). Means are over frames that stand, or over all
+    frames if none stands.
     """
     turns = work.tracks.turns.get(name)
     if turns is None:
@@ -293,7 +294,10 @@ def _arm(work: Retarget, side: str) -> None:
 
 
 def _arm_bone(tracks: Tracks, start: str, end: str) -> F64 | None:
-    """Return the vector (T, 3) from `start` to `end`, or to the end of its bone without `end`; None without both."""
+    """Return the vector (T, 3) of an arm's bone, from joint `start` to joint `end` or to the bone's end.
+
+    The result is None if the file has no `start`, or neither of these ends.
+    """
     if not tracks.has(start):
         return None
     far = tracks.places.get(end, tracks.tips.get(start))

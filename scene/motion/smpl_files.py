@@ -55,7 +55,7 @@ BOTH_HANDS: Widths = {90: (FINGERS, "")}
 
 
 def from_joint(joint: str, count: int) -> Widths:
-    """Return the number of columns of an array of `count` joints, the first of them `joint`, as Widths."""
+    """Return the Widths of an array of `count` joints, in SMPL-X order, whose first joint is `joint`."""
     first = JOINT_INDEX[joint]
     return {3 * count: (tuple(range(first, first + count)), "")}
 
@@ -116,18 +116,17 @@ class PoseArray:
 
 @dataclass(frozen=True)
 class ArrayLayout:
-    """The names that a program gives to its arrays.
+    """The names that a program gives to its arrays. A key is "" if the program has no such array.
 
     `name`: name of the layout, for people.
     `arrays`: arrays of rotations.
     `place`: key of positions of the pelvis; with `rest_pelvis`, key of translations of the body.
     `betas`: key of the shape coefficients.
-    `rate_hz`: rate without any key of RATE_KEYS, for the reason `rate_why`; None if such a key is required.
+    `rate_hz`: rate if a file has no key of RATE_KEYS, for the reason `rate_why`; None if a file must have such a key.
     `up`, `ups`: as in RawMotion.
     `rest_pelvis` (3,): position of the pelvis at rest, metres, to which translations are added.
     `scale`: key of a number by which positions are divided.
-    `mask`: key of which frames were measured.
-    A key is "" if the layout has no such array.
+    `mask`: key of an array that says which frames were measured.
     """
 
     name: str
@@ -149,7 +148,7 @@ class ArrayLayout:
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """All keys that are read."""
+        """All keys of a file that are read in this layout."""
         own = (self.place, self.betas, self.scale, self.mask, *RATE_KEYS)
         return (*(array.key for array in self.arrays), *(key for key in own if key))
 
@@ -300,7 +299,7 @@ def motion_of_frames(found: list[FoundTable], source: str) -> RawMotion:
 def _frame_numbers(found: list[FoundTable]) -> tuple[NDArray[np.int64], str]:
     """Return the number of each frame, and a note on its source.
 
-    The numbers are those in the frames' names, if all names end in different numbers; otherwise indices.
+    The numbers are those in the frames' names, if all names end in different numbers; otherwise the frames' indices.
     """
     matches = [_NUMBER.search(frame.name) for frame in found]
     named = [int(match[1][-9:]) for match in matches if match is not None]
@@ -338,7 +337,10 @@ def _row_turns(frame: FoundTable, row: int) -> JointTurns:
 
 
 def _row_place(frame: FoundTable, row: int) -> F64 | None:
-    """Return the position (3,) of the person in row `row`, metres, in the camera's coordinates; None without one."""
+    """Return the position (3,) of the person in row `row`, metres, in the camera's coordinates.
+
+    The result is None if the frame has no positions. Raises BadInputError when positions and poses do not match.
+    """
     if not frame.has(ROMP_PLACES):
         return None
     places = _rows_in(frame, ROMP_PLACES)
@@ -414,7 +416,7 @@ def motion_of(where: str, source: str, values: Any, there: str = "") -> RawMotio
 
 
 def _layout_of(tables: list[FoundTable]) -> tuple[ArrayLayout, list[FoundTable]] | None:
-    """Return the first layout that any of `tables` has, and all tables that have it; None if none has a layout."""
+    """Return the first layout that any of `tables` has, and all tables that have it; None if no table has a layout."""
     for layout in LAYOUTS:
         found = [table for table in tables if all(table.has(key) for key in layout.needs)]
         if found:

@@ -56,7 +56,10 @@ def npz_values(path: Path, keys: Collection[str], expected: str) -> dict[str, An
 
 
 def pickle_values(path: Path, expected: str) -> Any:
-    """Return the content of a pickle. Raises BadInputError."""
+    """Return the content of a pickle as plain values. Raises BadInputError.
+
+    `expected`: expected content in words, for messages.
+    """
     data = read_bytes(path, MAX_BYTES, expected)
     refuse_other(path, expected, PICKLE)
     return _values(path, data)

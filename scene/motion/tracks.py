@@ -189,9 +189,10 @@ def beside(vectors: F64, axis: F64) -> F64:
 def frames_along(exact: F64, other: F64, first: str) -> F64:
     """Return coordinate frames (T, 3, 3) with the directions left, up and forward as columns.
 
-    `exact` (T, 3): direction left if `first` is `left`, or up if `first` is `up`.
-    `other` (T, 3): approximate direction of the other of these two. If `exact` and `other` are parallel, any
-    perpendicular direction replaces `other`.
+    `first`: `left` or `up`, the direction that `exact` is.
+    `exact` (T, 3): this direction, kept exactly.
+    `other` (T, 3): the second of left and up, approximately. If both are parallel, any perpendicular direction replaces
+    it.
     """
     a = unit(exact)
     b = beside(unit(other), a)
@@ -462,8 +463,10 @@ def turns_of_collars(tracks: Tracks, rest: Tracks, chest: F64, stands: NDArray[n
 
     `chest` (T, 3, 3): global rotations of the chest.
     `stands` (T,): frames in which the person stands straight.
-    `own`: whether the recorded skeleton is built like the avatar's. If not, the collars point on average as the
-    avatar's at rest, over frames that stand and alike on both sides. If none stands, they keep their rest pose in the
+    `own`: whether the recorded skeleton is built like the avatar's.
+
+    If not `own`, both collars are corrected by one constant, symmetric rotation. After it, they point on average, over
+    frames that stand, as the avatar's collars at rest. If no frame stands, the collars keep their rest pose in the
     chest.
     """
     still = {f"{side}_collar": chest for side in SIDES}
@@ -496,7 +499,7 @@ def with_shoulders_on(across: F64, turns: dict[str, F64], rest: Tracks) -> dict[
 
 
 def turns_of_neck(tracks: Tracks, rest: Tracks, chest: F64) -> F64:
-    """Return global rotations (T, 3, 3) of the neck: it points to the recorded head; its left is that of the chest."""
+    """Return global rotations (T, 3, 3) of the neck: it points to the recorded head, and its left is the chest's."""
     if not tracks.has("neck", "head"):
         return chest
     left = chest[:, :, 0]
