@@ -217,8 +217,8 @@ def _bound(detail: Detail, lever: F64, change: F64, blend: F64) -> float:
 def _terms(shaped: ShapedBody) -> Arrays:
     """Return the terms of the bounds, each the largest in one of the G groups of vertices.
 
-    `lever`, `change` (levels,G,54): |E_b| |p - c_b| and |E_b|. `blend` (G,54): r_b. `reach` (55,): as in
-    `DetailBounds`.
+    `lever`, `change` (levels,G,54): |E_b| |p - c_b| and |E_b|. `blend` (G,54): r_b.
+    `reach` (55,): as in `DetailBounds`.
     """
     starts, order = _groups(shaped.body.weights)
     distance = joint_distance(shaped)

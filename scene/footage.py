@@ -237,9 +237,10 @@ def _over_all(
 
 
 def _turned(path: CameraPath, stored: tuple[Stored, ...]) -> tuple[CameraPath, tuple[str, ...]]:
-    """Return `path` with the shapes and quarter turns of the footage, by which camera and picture agree; and notes.
+    """Return `path` with the shape and the quarter turns of each picture, and notes.
 
-    `stored`: one picture for all samples of the path, or one for each.
+    The quarter turns make the camera and the picture agree. `stored`: one picture for all samples of the path, or one
+    for each.
     """
     lenses = path.optics.lenses
     turns = tuple(

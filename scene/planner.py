@@ -123,8 +123,7 @@ class TensorBudget:
         """Return the pixels for the avatars at `rects` on a picture of `output` (height, width).
 
         They get the pixels for which the network was trained, or as many as the picture shows if that is more. The
-        limits are
-        `most_of` and `work`.
+        result is limited by `most_of` and `work`.
         """
         own = len(rects) * self.own
         return min(self._allowed(max(own, area(tight_shape(rects, output)))), self.most_of(len(rects)))

@@ -124,9 +124,7 @@ def _mover(arrays: Arrays) -> Mover:
         None if leg_m is None else float(leg_m),
         bool(arrays["travels"]),
     )
-    vars(motion)["quats"] = arrays[
-        "quats"
-    ]  # fills the cached property, which is computed at the first sample otherwise
+    vars(motion)["quats"] = arrays["quats"]  # fills the cached property
     return Mover(
         motion, arrays["world"], float(arrays["scale"]), arrays["shift"], arrays["lift_times_s"], arrays["lift_m"], ()
     )

@@ -143,7 +143,7 @@ OF_FILES = (
 def detect(path: Path, up_axis: str = AUTO, axes: str = AUTO) -> Guess:
     """Return the format of `path`. Raises BadInputError for an unknown format, or when two formats fit.
 
-    `up_axis`: axis that is up, by the scene. `axes`: directions of x, y and z of a pose, by the scene. Both may be
+    `up_axis`: axis that is up, by the scene, or `auto`. `axes`: directions of x, y and z of a pose, by the scene, or
     `auto`.
     """
     if path.is_dir():
@@ -228,9 +228,8 @@ def _require_clock(path: Path, numbers: F64, others: Iterable[int]) -> None:
     """
     if len(numbers) < LEAST_ROWS:
         return
-    is_even = (
-        np.ptp(numbers[:, 0]) == 0 or _unevenness(numbers[:, 0]) < UNEVEN
-    )  # if all times are equal, the reader refuses them
+    # Equal times are refused by the reader.
+    is_even = np.ptp(numbers[:, 0]) == 0 or _unevenness(numbers[:, 0]) < UNEVEN
     for k in others:
         middle = float(np.median(numbers[:, k]))
         if abs(middle) > FARTHEST:
@@ -463,8 +462,9 @@ def _has_digits(numbers: F64) -> bool:
 def _astray(turns: F64, places: F64) -> float:
     """Return how far cameras look away from where they go, or from the point that they go round.
 
-    Below 1, the cameras look there. The result is infinite if there are too few cameras. `turns` (N, 3, 3), `places`
-    (N, 3): camera to world, OpenGL axes.
+    Below 1, the cameras look there. The result is infinite if there are too few cameras. The poses `turns` (N, 3, 3)
+    and
+    `places` (N, 3) are camera to world, with OpenGL axes.
     """
     if len(places) < LEAST_LED:
         return math.inf

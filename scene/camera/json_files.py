@@ -65,10 +65,9 @@ NO_LENS_REMEDY = "cut the pictures into perspective ones first (ns-process-data 
 def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
     """Read a NeRF `transforms.json`, or its folder: `frames[].transform_matrix`, 4x4, usually Z up, no times.
 
-    A frame may have its own lens; otherwise the lens of the file holds. A lens is `fl_x`, `fl_y`, `cx`, `cy` in pixels
-    of
-    `w` x `h`, or an angle. Distortion is left out and noted. nerfstudio makes such files from the exports of Polycam
-    and Record3D.
+    A frame may have its own lens; otherwise the lens of the file holds. A lens is an angle, or `fl_x`, `fl_y`, `cx`,
+    `cy` in pixels of `w` x `h`. Distortion is left out and noted. nerfstudio makes such files from the exports of
+    Polycam and Record3D.
 
     `rate_hz`: frames a second by the scene; None if the scene does not say. Raises BadInputError that names the key.
     Format: https://docs.nerf.studio/quickstart/data_conventions.html.

@@ -255,8 +255,7 @@ def find_upright(turns: F64, usual: str, is_levelled: bool, stated: str = AUTO) 
 def _is_nadir(turns: F64, usual: str, most_deg: float) -> bool:
     """Return whether a camera looks straight down along the axis `usual`, within `most_deg` degrees.
 
-    In a map with the axes of the first picture, a camera that looks ahead also looks along an axis; such a view does
-    not count.
+    If the map has the axes of the first picture, the result is False: such a camera looks ahead along an axis.
     """
     is_of_first = np.abs(np.diag(turns[0])).min() > AS_FIRST
     return bool(turns[:, :, 2].mean(axis=0) @ UP[usual] > np.cos(np.radians(most_deg)) and not is_of_first)
@@ -494,9 +493,9 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
 def _in_metres(raw: RawCamera, where: str, spec: CameraSpec) -> tuple[F64, CameraSpec, tuple[str, ...]]:
     """Return positions (N, 3), the camera of the scene, and a note, after a unit of the column names is applied.
 
-    If the names state a unit other than metres, the positions are converted, and the camera loses its
-    `metres_per_unit`. If the names state metres, nothing changes and `metres_per_unit` of the scene counts: programs
-    write `[m]` over maps that nobody measured. Raises BadInputError when the scene states another unit than the names.
+    If the names state another unit than metres, the positions are converted, and `metres_per_unit` of the camera
+    becomes None. If the names state metres, nothing changes and `metres_per_unit` of the scene counts: programs write
+    `[m]` over maps that nobody measured. Raises BadInputError when the scene states another unit than the names.
     """
     metres = LENGTH_UNITS.get(raw.lengths, 1.0)
     if metres == 1.0:
