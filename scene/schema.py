@@ -299,7 +299,7 @@ def _scene_size(size: str) -> str:
 
 
 class Scene(Table):
-    """The content of a scene file."""
+    """A scene."""
 
     name: str = Field(default="scene", min_length=1, max_length=80, pattern=NAME, description="Name of the scene.")
     fps: float = Field(

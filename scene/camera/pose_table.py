@@ -263,9 +263,9 @@ def elapsed(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     NaN stays NaN. The step is 0 if there are fewer than two finite times.
     """
     finite = times[np.isfinite(times)]
-    if len(finite) < 2:
-        return times - times[0], 0.0
-    return times - finite[0], float(np.median(np.diff(finite)))
+    if not len(finite):
+        return times, 0.0
+    return times - finite[0], float(np.median(np.diff(finite))) if len(finite) > 1 else 0.0
 
 
 def units_of(column: NDArray[np.float64]) -> tuple[str, ...]:
@@ -276,7 +276,7 @@ def units_of(column: NDArray[np.float64]) -> tuple[str, ...]:
     if is_index(column):
         return (FRAMES,)
     finite = column[np.isfinite(column)]
-    step, middle = elapsed(finite)[1] if len(finite) else 0.0, float(np.median(finite)) if len(finite) else 0.0
+    step, middle = elapsed(finite)[1], float(np.median(finite)) if len(finite) else 0.0
     film = next((unit for unit, second in SECONDS.items() if step * second < 1), "ns")
     clock = next((unit for unit in SECONDS if _since_1970(middle, unit) and step * SECONDS[unit] < LONGEST_STEP_S), "")
     if clock:
