@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from trilane.arrays import Shape
 from trilane.scene.camera.path import CameraPath, Optics
 from trilane.scene.lens import Known, Lens, cover
+from trilane.scene.recordings import natural
 from trilane.scene.rotations import quat_from_matrix
 
 #: Numbers in names are times only if at least the first share of neighbours are one step apart, and the film has fewer
@@ -65,11 +66,7 @@ class Film:
 
 def in_order(names: Sequence[str]) -> list[str]:
     """Return file names in their order, with numbers compared as numbers: `img9` before `img10`."""
-    return sorted(names, key=lambda name: ([_part(part) for part in re.split(r"(\d+)", name)], name))
-
-
-def _part(text: str) -> tuple[int, str]:
-    return (int(text), "") if text.isdecimal() else (-1, text)
+    return sorted(names, key=lambda name: (natural(name), name))
 
 
 def film_of(names: Sequence[str], fps: float) -> Film:

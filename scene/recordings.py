@@ -7,6 +7,7 @@ samples than good ones is refused.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
@@ -52,6 +53,11 @@ PlaceOf = Callable[[int], str]
 def by_number(index: int) -> str:
     """Return the place of sample `index`, for a file whose samples have neither lines nor names."""
     return f"number {index}"
+
+
+def natural(name: str) -> list[tuple[int, str]]:
+    """Return a sort key of a file name by which numbers compare as numbers: `img9` comes before `img10`."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def usable_samples(

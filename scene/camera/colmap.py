@@ -9,7 +9,6 @@ COLMAP's `sensor/models.h`.
 from __future__ import annotations
 
 import math
-import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from trilane.errors import BadInputError
 from trilane.files import read_text, require_file
 from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, LengthUnit, RawCamera, times_without
 from trilane.scene.lens import Bent, Lens, checked_lens, distortion_note
-from trilane.scene.recordings import Detected
+from trilane.scene.recordings import Detected, natural
 from trilane.scene.rotations import matrix_from_quat, normalised
 
 
@@ -284,7 +283,7 @@ def load_colmap(path: Path, rate_hz: float | None = None) -> RawCamera:
     cameras, images = _read(folder, ending)
     if not 1 <= len(images) <= MAX_VIEWS:
         raise BadInputError(folder / f"images{ending}", f"{len(images)} images", f"1 to {MAX_VIEWS}")
-    views = sorted(images, key=lambda image: _natural(image.name))
+    views = sorted(images, key=lambda image: natural(image.name))
     lenses, distorted = _lenses(folder / f"images{ending}", views, cameras)
     world_to_camera = matrix_from_quat(normalised(np.array([image.quat for image in views])))
     turns = np.swapaxes(world_to_camera, 1, 2)
@@ -306,11 +305,6 @@ def _read(folder: Path, ending: str) -> tuple[dict[int, ColmapCamera], list[Colm
     if ending == ".bin":
         return read_cameras_binary(cameras), read_images_binary(images)
     return read_cameras_text(cameras), read_images_text(images)
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Return a sort key by which `img9` comes before `img10`."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d{1,18})", name)]
 
 
 def _lenses(
