@@ -202,7 +202,7 @@ def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies
 def _going_along(
     camera: PlacedCamera, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]
 ) -> PlacedCamera:
-    """Return the built-in `camera`, which goes along with people who would leave its picture otherwise.
+    """Return the built-in `camera`, made to go along with people if they would leave its picture otherwise.
 
     The camera is judged over one cycle of camera and motions: by whole bodies, or by heads for a close-up. It stays
     where it is if going along would show fewer whole bodies or heads, or would change little.

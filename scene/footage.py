@@ -110,7 +110,7 @@ def _film_by_clock(clock: Sequence[float]) -> Film:
 
 
 def _numbers(names: Sequence[str]) -> list[int]:
-    """Return the last number in each name; [] unless the names differ only in that number and in their endings."""
+    """Return the last number in each name, or [] if the names differ in more than that number and their endings."""
     parts = [LAST_NUMBER.match(name.rpartition(".")[0]) for name in names]
     found = [part for part in parts if part]
     if len(found) < len(names) or len({(part[1], part[3]) for part in found}) > 1:

@@ -128,7 +128,7 @@ def _check_models(path: Path, tables: Sequence[Mapping[str, Any]]) -> None:
 def _distortion(
     path: Path, content: Mapping[str, Any], frames: Sequence[Any], lenses: Sequence[Lens]
 ) -> tuple[str, ...]:
-    """Return a note on the largest distortion among `lenses`, which is left out; empty if there is hardly any."""
+    """Return a note on the largest distortion of `lenses`, which is left out; empty below LEAST_BEND_PX."""
     bent = []
     for lens, frame in zip(lenses, frames, strict=False):  # a single lens stands for all frames
         keys = {**content, **frame}

@@ -80,9 +80,9 @@ class Optics:
     `lenses`: one lens for all samples of the path, or one for each.
     `near_m`, `far_m`: distances of the clip planes, metres.
     `filmed`: (height, width) of the background that the camera filmed, as it is shown; one for all samples or one for
-    each. It is empty if the camera did not film the background.
+    each. The tuple is empty if the camera did not film the background.
     `turned`: number of quarter turns clockwise by which the background's pixels are shown; one for all samples or one
-    for each. It is empty if each file's own turn holds.
+    for each. The tuple is empty if each picture is shown as its file prescribes.
     """
 
     lenses: tuple[Lens, ...]

@@ -48,7 +48,11 @@ PATH_M = 2.0
 
 
 class LengthUnit(Enum):
-    """The unit of a format's lengths: metres by definition, usually metres, metres if a person fits, or none."""
+    """The unit of a format's lengths.
+
+    METRES: metres by definition. USUALLY_M: metres, unless the camera is too fast. OFTEN_M: metres, if a person fits
+    into the pictures. NONE: no unit.
+    """
 
     METRES = "metres"
     USUALLY_M = "usually metres"
@@ -327,9 +331,9 @@ def _ups_and_rights(turns: F64, quarter: int) -> tuple[F64, F64]:
 
 
 def _price(turns: F64, up: F64, quarter: int) -> float | None:
-    """Return the cost of `up` (3,) after `quarter` quarter turns, by horizons and lines of sight.
+    """Return the cost of a guess by horizons and lines of sight; None if the pictures' own up is not up.
 
-    The result is None if the pictures' own up is not up. `turns` (N, 3, 3): camera axes.
+    `turns` (N, 3, 3): camera axes. `up` (3,): guessed up. `quarter`: guessed number of quarter turns of the pictures.
     """
     ups, rights = _ups_and_rights(turns, quarter)
     cosine = float((ups @ up).mean())

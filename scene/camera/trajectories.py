@@ -78,7 +78,7 @@ GREY = of_opencv(1241.0, 376.0, 718.856, 718.856, 607.1928, 185.2157)
 
 
 def load_kitti(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
-    """Read KITTI odometry poses: a 3x4 matrix per line, row by row, camera to the first camera's axes, metres.
+    """Read KITTI odometry poses: a 3x4 matrix per line, row by row, from the camera to the first camera's axes, metres.
 
     Axes are optical, so -Y is usually up. Some programs write a frame number or a time before each matrix. `clock`:
     what the scene says about the times. Raises BadInputError with the line.

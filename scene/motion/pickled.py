@@ -5,10 +5,10 @@ imported, called or built. `pickletools` splits the file into operations, and th
 such values. Any other object in the file becomes a `Foreign`, which only holds the object's name. An operation that is
 not in a table ends the reading.
 
-The size of a file limits the memory that it can use. Text and bytes are pieces of the file. An array is a view of such
-bytes and must have exactly as many as its shape requires. The number of operations is limited. Keys of dicts are text,
-whose hash a file cannot predict; other keys are left out. Values may contain themselves, so a search in them must limit
-its depth.
+The size of a file limits the memory that it can use. Text and bytes are pieces of the file. An array is a view of bytes
+whose number must match its shape. The number of operations is limited. Keys of dicts are text, whose hash a file cannot
+predict. Integer keys become text, and other keys are left out. Values may contain themselves, so a search in them must
+limit its depth.
 
 The format: https://docs.python.org/3/library/pickle.html, `pickletools`, PEP 3154 and PEP 574. What NumPy writes:
 `numpy.ndarray.__reduce__`, `__setstate__` and `numpy.dtype.__setstate__`.

@@ -236,7 +236,10 @@ def _ankle(work: Retarget, side: str) -> F64:
 
 
 def _foot(tracks: Tracks, side: str) -> F64 | None:
-    """Return the vector (T, 3) from the ankle to the toes, or to the end of its bone; None if its length is 0."""
+    """Return the vector (T, 3) from the ankle to the toes, or to the end of its bone.
+
+    The result is None if the file has neither of these ends, or if the vector is 0 in any frame.
+    """
     ankle, toes = f"{side}_ankle", f"{side}_foot"
     end = tracks.places.get(toes, tracks.tips.get(ankle))
     if end is None:
