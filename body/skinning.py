@@ -87,7 +87,10 @@ def joint_distance(shaped: ShapedBody) -> F64:
 
 
 def branch_sums(parents: NDArray[np.int32], values: F64) -> F64:
-    """Return, for each joint, the sum of `values` (..., 55) over that joint and all joints below it: (..., 55)."""
+    """Return, for each joint, the sum of `values` (..., 55) over that joint and all joints below it: (..., 55).
+
+    `parents` (55,): index of each joint's parent, -1 at the root.
+    """
     above = np.eye(len(parents))
     for joint in range(len(parents)):
         at = int(parents[joint])

@@ -95,10 +95,11 @@ def smoothed(places: F64, step_s: float, wrap: Wrap) -> F64:
 class PlacedCamera:
     """A camera in the scene.
 
+    `path`: path of the camera, in its own world.
     `turn` (3, 3), `shift` (3,): transform from the path's world to the scene's world.
     `mount` (3, 3): rotation from the camera's axes to those of the path.
     `notes`: what was decided, for people.
-    `ways`: ways of avatars; the camera moves by their mean. Empty for a camera that does not go along.
+    `ways`: ways of avatars, by whose mean the camera moves; empty for a camera that does not go along.
     """
 
     path: CameraPath
@@ -135,7 +136,7 @@ LEAST_LEVEL_M = 1e-6  # a camera is over the pivot if its horizontal distance, m
 
 
 def steered(view: F64, pivot: F64, azimuth_deg: float, elevation_deg: float, zoom: float) -> F64:
-    """Return the view of `view` after steering: turned about `pivot` (3,) and moved towards it.
+    """Return `view` after the camera is turned about `pivot` (3,) and moved towards it.
 
     `view` and the result: transform (4, 4) from world to camera.
     `azimuth_deg`: turn to the right about the vertical.

@@ -287,7 +287,7 @@ def lay_out_at(
 
 
 def by_network(networks: Sequence[int]) -> list[list[int]]:
-    """Return the indices of the avatars of each network. `networks`: number of each visible avatar's network."""
+    """Return a list of the avatars' indices for each network. `networks`: number of each visible avatar's network."""
     return [[place for place, one in enumerate(networks) if one == network] for network in sorted(set(networks))]
 
 

@@ -134,9 +134,9 @@ def seen_notes(camera: Camera, scene: Scene, movers: Sequence[Mover], bodies: Se
 
 
 def _walked(movers: Sequence[Mover], times_s: F64) -> float:
-    """Return the largest extent over the floor, metres, of the places of one mover at `times_s` (F,).
+    """Return the largest extent, metres, of a mover's walk over the floor at `times_s` (F,).
 
-    The extent is the diagonal of the rectangle that the places cover.
+    The extent is the diagonal of the rectangle that the walk covers.
     """
     ways = [[mover.sample(float(t_s))[1] @ mover.world[:3, :3].T for t_s in times_s] for mover in movers]
     return max(float(np.hypot(*np.ptp(np.array(way)[:, [0, 2]], axis=0))) for way in ways)

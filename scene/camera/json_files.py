@@ -255,8 +255,8 @@ def load_record3d(path: Path, rate_hz: float | None = None) -> RawCamera:
     The world is ARKit's: levelled, Y up, metres. The lens is `perFrameIntrinsicCoeffs` (fx, fy, cx, cy), or else `K`,
     column by column, in pixels of `w` x `h`. Times are `frameTimestamps`, or else follow from `fps`.
 
-    `rate_hz`: frames a second by the scene, None if it does not say. Raises BadInputError that names the key. Format:
-    keys of the exports of https://record3d.app, as nerfstudio's `process_data/record3d_utils.py` reads them.
+    `rate_hz`: frames a second by the scene; None if the scene does not say. Raises BadInputError that names the key.
+    Format: keys of the exports of https://record3d.app, as nerfstudio's `process_data/record3d_utils.py` reads them.
     """
     path = path / RECORD3D_FILE if path.is_dir() else path
     content = read_object(path, RECORD3D)

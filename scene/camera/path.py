@@ -215,7 +215,8 @@ HEAD_AND_SHOULDERS = "head and shoulders"
 class Orbit:
     """A camera that swings by `swing_deg` to either side around `target`, and moves from `far_m` to `near_m` and back.
 
-    `what`: description for people. `height_m`: height of the camera. `period_s`: duration of a cycle.
+    `what`: description for people. `height_m`: height of the camera. `far_m`, `near_m`: horizontal distances.
+    `period_s`: duration of a cycle.
     """
 
     what: str
@@ -235,7 +236,7 @@ class Orbit:
 
 @dataclass(frozen=True)
 class Descent:
-    """A camera that moves from `top_deg` above `target` down to the height `low_m`, and back.
+    """A camera that descends from the elevation `top_deg` over `target` to the height `low_m`, and rises again.
 
     It moves on an arc about `target` of radius `distance_m`, in the plane x = 0. `what`: description for people.
     `period_s`: duration of a cycle.

@@ -296,8 +296,8 @@ def _since_1970(time: float, unit: str) -> bool:
 class Clock(NamedTuple):
     """What the scene and the format say about a table's times.
 
-    `rate_hz`: frames a second by the scene, None if it does not say.
-    `unit`: unit of the times; FRAMES for frame numbers, `auto` if it is found from the times.
+    `rate_hz`: frames a second by the scene; None if the scene does not say.
+    `unit`: unit of the times; FRAMES for frame numbers, `auto` to find it from the times.
     `usual_hz`: frames a second by the format.
     """
 

@@ -156,7 +156,7 @@ STATED = "joint_map"
 def match_names(path: Path, names: list[str], joint_map: Mapping[str, str] = NO_MAP) -> tuple[str, dict[str, int]]:
     """Return the family that fits best, and the index in `names` of each matched joint by SMPL-X name.
 
-    `joint_map`: name in the file by SMPL-X name, or "" for none; it overrides the tables, and the family's text then
+    `joint_map`: name in the file by SMPL-X name, or "" for none. It overrides the tables, and the returned family
     mentions it. Raises BadInputError about `path` when the file lacks a joint that the map names, or when a REQUIRED
     joint is unmatched.
     """

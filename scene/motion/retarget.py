@@ -390,7 +390,7 @@ def _notes(work: Retarget) -> list[str]:
 
 
 def _backwards(work: Retarget) -> list[str]:
-    """Return a note if the feet point backwards, as left and right of the skeleton define the front."""
+    """Return a note if the feet point backwards; the skeleton's left and right define the front."""
     feet = [foot for foot in (_foot(work.tracks, side) for side in SIDES) if foot is not None]
     ahead = [np.median(turned(transposed(work.turns["pelvis"]), unit(foot))[:, 2]) for foot in feet]
     if not ahead or max(ahead) > -0.3:

@@ -191,8 +191,8 @@ def frames_along(exact: F64, other: F64, first: str) -> F64:
 
     `first`: `left` or `up`, the direction that `exact` is.
     `exact` (T, 3): this direction, kept exactly.
-    `other` (T, 3): the second of left and up, approximately. If both are parallel, any perpendicular direction replaces
-    it.
+    `other` (T, 3): the second of left and up, approximately. If `exact` and `other` are parallel, any perpendicular
+    direction replaces `other`.
     """
     a = unit(exact)
     b = beside(unit(other), a)
