@@ -1,8 +1,8 @@
 """A background that the user brings: the order and times of its pictures, and the camera that filmed it.
 
-A recorded camera counts as the camera that filmed the background: both begin together and repeat together, and the
-camera's picture is cut in the same way as the background. If the camera's file names photos of the background, each
-photo is shown with its own pose.
+A recorded camera counts as the camera that filmed the background. Camera and background begin together and repeat
+together, and the camera's picture is cut in the same way as the background. If the camera's file names photos of the
+background, each photo is shown with its own pose.
 
 Pictures of a folder follow each other by name, with numbers compared as numbers. If the names differ only in one
 number, the pictures are the frames of a film, and the number gives each frame's time. While a frame is missing, the
@@ -234,9 +234,9 @@ def _over_all(
 
 
 def _turned(path: CameraPath, stored: tuple[Stored, ...]) -> tuple[CameraPath, tuple[str, ...]]:
-    """Return `path` with the shape and the quarter turns of each picture, and notes.
+    """Return `path` with the shape of each picture and its quarter turns for display, and notes.
 
-    The quarter turns make the camera and the picture agree. `stored`: one picture for all samples of the path, or one
+    The quarter turns make the pictures agree with the camera. `stored`: one picture for all samples of the path, or one
     for each.
     """
     lenses = path.optics.lenses

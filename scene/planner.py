@@ -224,7 +224,7 @@ def _grouped(rects: Sequence[Rect], networks: Sequence[int]) -> list[list[Rect]]
 
 
 def pixels_of(rects: Sequence[Rect], networks: Sequence[int], output: Shape, budget: TensorBudget) -> int:
-    """Return the pixel budget of a frame's tensor: the most that the avatars of any one network may have.
+    """Return the pixel budget of a frame's tensor: the largest budget for the avatars of any one network.
 
     `networks`: number of the network of each avatar at `rects`; empty if one network paints all.
     """

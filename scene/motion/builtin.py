@@ -176,10 +176,9 @@ class Walker:
         return 0.12 + 0.55 * size, -0.28 * size
 
     def _ankle(self, place: F64, pitch: F64) -> F64:
-        """Return ankle positions (T, 3) of a foot on the ground with `pitch` (T,), which stands on its ball or its
-        heel.
+        """Return ankle positions (T, 3), metres, of a foot that stands on its ball or its heel.
 
-        `place` (3,): footprint, as x, z, heading.
+        `place` (3,): footprint, as x, z, heading. `pitch` (T,): pitch of the foot, radians; positive on the ball.
         """
         turn = about(1, np.full(len(pitch), place[2])) @ about(0, pitch)
         flat = about(1, np.array(place[2]))
@@ -404,7 +403,10 @@ def _along_z(times: F64, start_m: float, walks: Changes, turns: Changes) -> tupl
 
 
 def _eased(x: F64) -> F64:
-    """Return progress from 0 to 1 at constant speed, with a soft start and a soft end of 22 % of `x` in [0, 1] each."""
+    """Return the progress, 0 to 1, of a move over `x` from 0 to 1: constant speed, with a soft start and end.
+
+    The soft start and the soft end each take 22 % of the time.
+    """
     ramp = 0.22
     s = np.clip(x, 0.0, 1.0)
     speed = 1 / (1 - ramp)

@@ -73,7 +73,10 @@ def _values(where: Path | str, data: bytes) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """Return `value` without its StoredArray: an array, a list, or the one object that NumPy stored as an array."""
+    """Return the content of `value` if it is a StoredArray, otherwise `value` itself.
+
+    NumPy stores a single object as an array of one object; the result is then this object.
+    """
     if isinstance(value, StoredArray) and isinstance(value.values, list) and len(value.values) == 1:
         return value.values[0]
     return value.values if isinstance(value, StoredArray) else value
