@@ -30,8 +30,8 @@ from trilane.scene.lens import Known, Lens, cover
 from trilane.scene.recordings import natural
 from trilane.scene.rotations import quat_from_matrix
 
-#: Numbers in names are times only if at least the first share of neighbours are one step apart, and the film has fewer
-#: than the second number of frames per picture.
+#: Numbers in names are times only if the share LEAST_IN_STEP of neighbours is one step apart, and the film has fewer
+#: than MOST_MISSING frames per picture.
 LEAST_IN_STEP, MOST_MISSING = 0.5, 4
 NAMED_GAPS = 3
 #: A step between times is a gap if it is longer than this many usual steps.

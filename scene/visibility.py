@@ -170,9 +170,9 @@ SCORED_MOMENTS, SCORED_S = 120, 10.0
 SEEDS_EVERY, RAYS_EVERY = 3, 10
 #: Positions of rays in a picture, as shares of its half width and half height.
 RAYS_AT = (-0.8, -0.4, 0.0, 0.4, 0.8)
-#: Nearest and farthest distance on a ray, in units of the distance at which the bodies fill the picture.
-#: FARTHEST_OF_PATH lengths of the path are added to the farthest, as a path seen from far off is hardly more than a
-#: pan. FARTHER is the factor from one distance to the next.
+#: Nearest and farthest distance on a ray, in units of the distance at which the bodies fill the picture. The farthest
+#: is increased by FARTHEST_OF_PATH lengths of the path; from there, the path looks like a pan. FARTHER is the factor
+#: from one distance to the next.
 NEAREST, FARTHEST, FARTHEST_OF_PATH, FARTHER = 0.7, 30.0, 10.0, 1.25
 #: Number of places that climb, and their least distance from each other at first, as a share of the distance from the
 #: camera.

@@ -29,8 +29,8 @@ MAX_ROWS = 1_000_000
 #: Number of first rows from which the content of columns is found.
 HEAD = 3000
 #: Units of times in seconds, the longest first. Poses are less than 1 s and at least LEAST_STEP_S apart, so the size of
-#: a step fits only one unit. Steps up to FAST_STEP_S may fit two units: few programs save 300 poses a second and more,
-#: and some save key frames.
+#: a step fits only one unit. A step up to FAST_STEP_S is doubtful, as few programs save 300 poses a second: it may also
+#: be a step between key frames in a longer unit.
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 LEAST_STEP_S, FAST_STEP_S = 0.9e-3, 3e-3
 #: Times since 1970, or times with fractions, keep their unit for steps up to SURE_STEP_S, such as those between key

@@ -344,9 +344,10 @@ def _price(turns: F64, up: F64, quarter: int) -> float | None:
 
 
 def _between(turns: F64, dearer: float) -> list[_Guess]:
-    """Return a guess whose up is most nearly perpendicular to the right axes of all pictures; [] if it is not believed.
+    """Return a guess whose up may be between the axes; [] if it is not believed.
 
-    The horizons are level about this direction. `dearer`: additional cost.
+    This up is most nearly perpendicular to the right axes of all pictures, so the horizons are most nearly level.
+    `dearer`: additional cost.
     """
     ups, rights = _ups_and_rights(turns, 0)
     spread, directions = np.linalg.eigh(rights.T @ rights / len(rights))

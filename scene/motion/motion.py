@@ -217,7 +217,7 @@ def _are_within(heights: F64, within: tuple[float, float], spread: float) -> boo
 
 #: The height at which a joint stands is this percentile of its heights.
 STANDING_PERCENTILE = 5.0
-#: A joint stands up to the first height above that, and does not stand from the second on; metres.
+#: A joint stands up to the height FOOT_STANDS_M above that, and does not stand from FOOT_FLIES_M on; metres.
 FOOT_STANDS_M, FOOT_FLIES_M = 0.03, 0.06
 
 

@@ -52,13 +52,14 @@ HAND_ENDS = ("middle1", "index1", "ring1", "pinky1")
 #: Weights of evidence for a twist, against the bend of a limb: the toes' direction, and the least twist from the
 #: parent.
 OF_TOES, OF_LEAST_TWIST = 0.5, 0.02
-#: Difference in slope, radians, from which a planted foot is laid flat instead of along its recorded bone. Such a bone
-#: is steeper or flatter in the recording than in the avatar.
+#: A planted foot is laid flat if its slope differs from the avatar's by this or more, radians; otherwise it is laid
+#: along its recorded bone.
 SAME_SLOPE = np.radians(8.0)
 #: Distance of the heel behind the ankle, as a share of the bone from the ankle to the toes: that of the built-in
 #: walker.
 HEEL_BEHIND = 0.057 / np.hypot(0.062, 0.146)
-#: Largest difference, radians, that the steepness of a program's feet explains; beyond it, heels are raised throughout.
+#: Largest difference in slope, radians, between a program's feet and the avatar's; beyond it, the heels are raised
+#: throughout.
 MOST_STEEPER = np.radians(27.0)
 
 

@@ -85,8 +85,8 @@ def angle_between(a: F64, b: F64) -> F64:
 
 #: A person stands if the angles between thighs and trunk line, and the bends of the knees, are below these; radians.
 STRAIGHT_HIP, STANDING_KNEE = np.radians(25.0), np.radians(50.0)
-#: A standing frame is straight if its knees bend by less than the first angle, or by at most the second more than those
-#: of the straightest frame; radians.
+#: A standing frame is straight if its knees bend by less than STRAIGHT_KNEE, or by at most LITTLE_MORE than in the
+#: straightest frame; radians.
 STRAIGHT_KNEE, LITTLE_MORE = np.radians(10.0), np.radians(5.0)
 #: Largest lean, radians, of a leg that counts as below its hip; share of these frames in which the foot lies flat.
 LEG_BELOW, PLANTED_SHARE = np.radians(35.0), 0.25
@@ -98,7 +98,7 @@ RIGID = (
     ("spine1", "spine2"), ("spine2", "spine3"), ("spine3", "neck"), ("spine3", "left_collar"), ("neck", "left_collar"),
     ("left_collar", "right_collar"), ("left_collar", "left_shoulder"), ("left_ankle", "left_foot"),
 )  # fmt: skip
-#: Largest difference of such distances: this share of the distance plus this share of the legs.
+#: Such distances may differ by SAME_SHARE of the distance plus SAME_LEGS of the length of a leg.
 SAME_SHARE, SAME_LEGS = 0.02, 0.003
 
 
@@ -442,8 +442,8 @@ def with_neck_on(line: F64, turns: dict[str, F64], rest: Tracks) -> dict[str, F6
     """Return `turns` with spine1 and spine2 turned once more, so that the neck is in the direction `line` (T, 3).
 
     `line`: vector from the pelvis, of any length. The neck is at q + R c: R is the rotation to find, c the vector from
-    the lowest joint of the spine to the highest, and q the sum of the other bones. Therefore the neck is at s times the
-    unit vector of `line`, for the s at which that point is |c| from q.
+    the lowest joint of the spine to the highest, and q the sum of the other bones. The neck must also be at s times the
+    unit vector of `line`. Therefore s is chosen so that the neck is |c| from q.
     """
     joint = {name: rest.places[name][0] for name in ("pelvis", *SPINE, "neck")}
     along = unit(line)
