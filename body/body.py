@@ -1,11 +1,11 @@
-"""A body, read from a file in the SMPL-X layout: no pickle, sizes checked before memory is taken, read-only arrays.
+"""A body file in the SMPL-X layout. The reader executes no pickles and checks sizes before it allocates memory.
 
-A `Body` is finite, consistent and ready for use; anything wrong with a file raises one BadInputError. A body whose rest
-pose is lower or higher than people are is refused, since everything else is in metres. Pose blend shapes are read as a
-stream. An array of zeros (80 MB in many files) takes no memory: memory is allocated at the first number that is not 0.
+A `Body` is finite, consistent and read-only. Any fault of the file raises one BadInputError. A body is refused if its
+height at rest is not a person's, because all lengths must be metres. Pose blend shapes are read in chunks. Memory is
+allocated at their first nonzero number, as many files hold 80 MB of zeros.
 
-The layout is that of https://smpl-x.is.tue.mpg.de, read as the `smplx` package reads it: the rest shape is `v_template
-+ shapedirs @ [betas, expression]`, the joints are `J_regressor @ rest shape`.
+The layout is that of https://smpl-x.is.tue.mpg.de, interpreted as the `smplx` package does. The rest shape is
+`v_template + shapedirs @ [betas, expression]`; the joints are `J_regressor @ rest shape`.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from trilane.errors import BadInputError
 from trilane.files import DAMAGED, npz_names, read_header, read_npz
 from trilane.unexpected_value import UnexpectedValue
 
-#: Range of heights from sole to crown, metres: from less than a newborn child's to more than anybody's.
+#: Range of heights from sole to crown, metres: from less than a newborn child's to more than any adult's.
 LEAST_HEIGHT_M, MOST_HEIGHT_M = 0.3, 3.0
 USUAL_HEIGHT_M = 1.7
 UNITS_M = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "feet": 0.3048, "decimetres": 0.1}
 
 
 def check_height(height: float) -> None:
-    """Raise UnexpectedValue for a `height` that no body in metres has, with the unit that would make it one."""
+    """Raise UnexpectedValue if `height`, metres, is not a person's. The remedy names the unit that would explain it."""
     if LEAST_HEIGHT_M <= height <= MOST_HEIGHT_M:
         return
     found = f"a body {height:.4g} m high, along Y at rest"
@@ -55,9 +55,9 @@ _CHUNK_ITEMS = 1 << 18
 
 
 def read_pose_blend(path: Path, shape: tuple[int, int, int]) -> NDArray[np.float32] | None:
-    """Return the array `posedirs` of the npz at `path`, float32 of `shape`, read-only; None when it is all zero.
+    """Return the array `posedirs` of the npz file at `path`: float32 of `shape`, read-only; None when it is all zero.
 
-    Raises BadInputError when it is missing, misshapen, pickled, too large, truncated or not finite.
+    Raises BadInputError when the array is missing, misshapen, pickled, too large, truncated or not finite.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -109,16 +109,16 @@ EXPECTED = "a body file in the SMPL-X layout (.npz)"
 MAX_VERTICES = 1 << 18
 MAX_FACES = 1 << 19
 SUM_TOLERANCE = 1e-3
-#: Names of arrays that belong to a motion, in AMASS files and similar ones.
+#: Names of arrays that show that a file holds a motion, in AMASS files and similar ones.
 MOTION_KEYS = frozenset(
     {"poses", "smpl_poses", "smpl_pose", "smpl_thetas", "body_pose", "pose_body", "mocap_framerate", "mocap_frame_rate"}
 )
 MOST_NAMED = 16
-#: Unit roundoff of float32: a weight that a file has rounded is off by at most this share of itself.
+#: Unit roundoff of float32: the largest relative error of a weight that was rounded to float32.
 ROUNDING = 2.0**-24
 
-#: For each array of the file, its shape ("V" vertices, "F" faces, "T" texture coordinates, "*" any) and whether it
-#: holds indices.
+#: For each array of the file: its shape ("V" vertices, "F" faces, "T" texture coordinates, "*" any size), and whether
+#: it holds indices.
 _LAYOUT: dict[str, tuple[tuple[int | str, ...], bool]] = {
     "v_template": (("V", 3), False),
     "shapedirs": (("V", 3, "*"), False),
@@ -135,7 +135,7 @@ _LAYOUT: dict[str, tuple[tuple[int | str, ...], bool]] = {
 }
 _LIMITS = {"V": MAX_VERTICES, "F": MAX_FACES, "T": 3 * MAX_FACES}
 
-#: (least number of columns of `shapedirs`, first expression column, number of expression columns).
+#: Least number of columns of `shapedirs`, first expression column, number of expression columns.
 _FULL, _SHORT = (400, 300, 100), (20, 10, 10)
 
 
@@ -143,11 +143,18 @@ _FULL, _SHORT = (400, 300, 100), (20, 10, 10)
 class Body:
     """A body of V vertices, F triangles and T texture coordinates. Metres, Y up. Arrays are read-only.
 
-    `v_template` (V,3); `shape_dirs` (V,3,S) and `expression_dirs` (V,3,E): metres per unit of each coefficient;
-    `posedirs` (V,3,486), or None when the file's are all zero; `j_regressor` (55,V); `weights` (V,55);
-    `parents` (55,), -1 at the root; `faces` (F,3); `uv` (T,2), u right, v up; `uv_faces` (F,3), per corner;
-    `hand_components` (left (C,45), right (C,45)); `hand_mean` (90,), axis-angle, left then right.
-    `offsets` (V,3): vectors from the rest shape to the drawn surface, such as clothes and hair; None for none.
+    `source`: path of the body file.
+    `v_template` (V,3): vertices of the mean shape at rest.
+    `shape_dirs` (V,3,S), `expression_dirs` (V,3,E): metres per unit of each coefficient.
+    `posedirs` (V,3,486): metres per unit of each pose feature (`Posed.feature`); None when the file has only zeros.
+    `j_regressor` (55,V): weights that give the rest joints from the rest vertices.
+    `weights` (V,55): skinning weights.
+    `parents` (55,): index of each joint's parent, -1 at the root.
+    `faces` (F,3): vertex indices.
+    `uv` (T,2): texture coordinates, u right, v up. `uv_faces` (F,3): index into `uv` of each corner of a face.
+    `hand_components`: left (C,45) and right (C,45), principal components of hand poses.
+    `hand_mean` (90,): mean hand pose, axis-angle, left then right.
+    `offsets` (V,3): vectors from the rest shape to the drawn surface, such as clothes and hair; None without them.
     """
 
     source: str
@@ -170,9 +177,9 @@ class Body:
         return self.posedirs is not None
 
     def shape(self, betas: ArrayLike = (), expression: ArrayLike = ()) -> ShapedBody:
-        """Return the body with up to S `betas` and up to E `expression` coefficients; missing ones are 0.
+        """Return the body shaped by up to S `betas` and up to E `expression` coefficients; missing coefficients are 0.
 
-        Raises BadInputError for too many coefficients or ones that are not finite.
+        Raises BadInputError when there are too many coefficients, or when some are not finite.
         """
         rest = self.v_template.astype(np.float64)
         for name, dirs, coefficients in (
@@ -191,9 +198,10 @@ class Body:
         return ShapedBody(_frozen(rest.astype(np.float32)), _frozen(joints), self)
 
     def full_pose(self, poses: ArrayLike, flat_hand_mean: bool) -> F64:
-        """Return axis-angle `poses` (..., 165) with the mean hand pose added unless `flat_hand_mean`.
+        """Return axis-angle `poses` (..., 165) with absolute hand poses.
 
-        Raises BadInputError.
+        `flat_hand_mean`: whether hand poses in `poses` are absolute already; otherwise the mean hand pose is added.
+        Raises BadInputError for another shape.
         """
         full = np.array(poses, np.float64)
         if full.ndim == 0 or full.shape[-1] != POSE_SIZE:
@@ -205,20 +213,23 @@ class Body:
 
 @dataclass(frozen=True)
 class ShapedBody:
-    """One person at rest: `vertices` (V,3) float32 and `joints` (55,3) float64, metres, body space."""
+    """One person at rest, in body space.
+
+    `vertices` (V,3) float32 and `joints` (55,3) float64: positions, metres. `body`: body that was shaped.
+    """
 
     vertices: F32
     joints: F64
     body: Body
 
     def bare(self) -> ShapedBody:
-        """Return the person without offsets: the skin that clothes are put on."""
+        """Return the person without offsets, which is the skin under clothes and hair."""
         if self.body.offsets is None:
             return self
         return ShapedBody(_frozen(self.vertices - self.body.offsets), self.joints, replace(self.body, offsets=None))
 
     def with_offsets(self, offsets: F32) -> ShapedBody:
-        """Return the person with `offsets` (V,3), metres from the skin at rest, in place of earlier ones."""
+        """Return the person with `offsets` (V,3), metres from the skin at rest, which replace all earlier offsets."""
         bare = self.bare()
         moved = (bare.vertices.astype(np.float64) + offsets).astype(np.float32)
         # Copied, because freezing would make the caller's array read-only.
@@ -228,8 +239,8 @@ class ShapedBody:
 def load_body(path: Path) -> Body:
     """Read a body file.
 
-    Raises BadInputError when it is missing, truncated, pickled, too large, of another layout, not finite or
-    inconsistent.
+    Raises BadInputError when the file is missing, truncated, pickled, too large, not finite, inconsistent or of another
+    layout.
     """
     arrays = read_npz(path, _LAYOUT, EXPECTED)
     _check_layout(path, arrays)
@@ -289,7 +300,7 @@ def _check_layout(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
 
 
 def _instead_of_body(names: Collection[str]) -> str:
-    """Say what a file with the arrays `names` holds instead of a body."""
+    """Return a message part that lists the array `names` of a file that is no body, and says if it is a motion."""
     listed = f"arrays that were found: {', '.join(sorted(names)[:MOST_NAMED]) or 'none'}"
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
     motion = ": a motion, which `trilane run --motion` takes" if MOTION_KEYS & set(names) else ""
@@ -325,9 +336,10 @@ def _check_weights(path: Path, weights: F32) -> None:
 
 
 def weights_of_one(weights: F32) -> F32:
-    """Return skin weights (V,J) without negative numbers; rows are scaled to sum to 1 unless they do within rounding.
+    """Return skinning weights (V,J) with negative weights set to 0 and each row scaled to sum to 1.
 
-    A body that stands p metres from the origin would be off by p times the difference of the sum from 1.
+    A row without negative weights stays as it is if its sum is 1 within rounding. A sum that is off by e would displace
+    a vertex p metres from the origin by e p.
     """
     bounded = np.maximum(weights, 0)
     sums = bounded.sum(axis=1, dtype=np.float64, keepdims=True)
@@ -345,7 +357,10 @@ def _split_shape(path: Path, dirs: F32) -> tuple[F32, F32]:
 
 
 def _parents(path: Path, table: NDArray[Any]) -> I32:
-    """Return the parents (55,) from the table's first row; the root's is always -1. Raises BadInputError."""
+    """Return each joint's parent (55,) from the table's first row; the root's parent is always -1.
+
+    Raises BadInputError when a parent is out of range, or when the joints form a cycle.
+    """
     stored = [int(parent) for parent in table[0]]
     where = f"{path}[kintree_table]"
     for joint, parent in enumerate(stored[1:], start=1):

@@ -1,10 +1,10 @@
 """The 55 joints of the SMPL-X layout, and their kinematics: from an axis-angle pose to skinning matrices, in float64.
 
-Rule: only this file knows joint numbers; all other code looks joints up by name.
+Rule: this file defines the joint numbers; other code looks joints up by name wherever it can.
 
-Kinematics is exact at every angle, in memory that is allocated once. A rotation by t = |v| about v has the quaternion
-w = cos(t/2), u = v sin(t/2) / t. Then R - I = 2 (u u^T - (u.u) I + w [u]x) (O. Rodrigues, 1840), in which no digits
-cancel near 0 or pi.
+Rotations are exact at every angle. A rotation by the angle t = |v| about v has the quaternion w = cos(t/2), u = v
+sin(t/2) / t. Then R - I = 2 (u u^T - (u.u) I + w [u]x) (O. Rodrigues, 1840). No digits cancel in this form near 0 or
+pi.
 """
 
 from __future__ import annotations
@@ -34,36 +34,36 @@ def _hand_parents(wrist: int, first: int) -> list[int]:
     return [wrist if part == 0 else first + 3 * finger + part - 1 for finger in range(5) for part in range(3)]
 
 
-#: Parent of each joint; -1 for the root.
+#: Index of each joint's parent; -1 for the root.
 JOINT_PARENTS: tuple[int, ...] = (
     *(-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 15, 15, 15),
     *_hand_parents(wrist=20, first=25),
     *_hand_parents(wrist=21, first=40),
 )
 
-#: Joints without face and hands.
+#: Names of the joints without those of the face and the hands.
 BODY_JOINTS: tuple[str, ...] = JOINT_NAMES[:22]
 
 #: Index of each joint by name.
 JOINT_INDEX: dict[str, int] = {name: i for i, name in enumerate(JOINT_NAMES)}
 
-#: Length of a pose: axis-angle, three numbers a joint.
+#: Length of a flat pose: three axis-angle numbers per joint.
 POSE_SIZE = 3 * len(JOINT_NAMES)
 LEFT_HAND = slice(3 * 25, 3 * 40)
 RIGHT_HAND = slice(3 * 40, 3 * 55)
 
 
-#: At this x and below, sin(x) / x is exactly 1 in float64. Smaller half angles are replaced by it, so 0 needs no
-#: special case.
+#: At this x and below, sin(x) / x is exactly 1 in float64. Smaller half angles are raised to this x, so an angle of 0
+#: needs no special case.
 _TINY = 1e-150
-#: Largest joint angle (radians) and coordinate (metres): float64 and float32 lose too many digits beyond it.
+#: Largest joint angle (radians) and coordinate (metres); float64 and float32 lose too many digits beyond it.
 MAX_VALUE = 1e6
 
 
 def _products_to_turn() -> F64:
-    """Return the matrix (16, 9) that turns the outer product of (w, ux, uy, uz) with itself into R - I.
+    """Return the matrix (16, 9) that maps the flattened outer product q q^T to the flattened R - I, both row-major.
 
-    Both are row-major.
+    q is the quaternion (w, ux, uy, uz) of the rotation R.
     """
     table = np.zeros((4, 4, 3, 3))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -78,7 +78,7 @@ _IDENTITY = np.eye(3)
 
 
 def turn(rotvec: ArrayLike) -> F64:
-    """Return R - I (..., 3, 3) of axis-angle vectors (..., 3), radians, any magnitude."""
+    """Return R - I (..., 3, 3) for axis-angle vectors (..., 3), radians, of any magnitude."""
     v = np.asarray(rotvec, np.float64)
     half = 0.5 * np.sqrt(np.einsum("...i,...i->...", v, v))
     floor = np.maximum(half, _TINY)
@@ -90,16 +90,17 @@ def turn(rotvec: ArrayLike) -> F64:
 
 
 def rodrigues(rotvec: ArrayLike) -> F64:
-    """Return rotation matrices (..., 3, 3) of axis-angle vectors (..., 3), radians, any magnitude."""
+    """Return rotation matrices (..., 3, 3) for axis-angle vectors (..., 3), radians, of any magnitude."""
     return turn(rotvec) + _IDENTITY
 
 
 @dataclass(frozen=True)
 class Posed:
-    """One frame of a skeleton. The arrays are the skeleton's own buffers, valid until its next `pose`.
+    """A skeleton in one pose. The arrays are the skeleton's own buffers: its next `pose` overwrites them.
 
-    `matrices` (55,3,4) float32: x_world = sum_k w_k (matrices_k @ [x_rest, 1]). `joints` (55,3) float64, metres,
-    world. `feature` (486,) float32: R - I of joints 1..54, row-major, R local.
+    `matrices` (55,3,4) float32: skinning matrices; x_world = sum_k w_k (matrices_k @ [x_rest, 1]).
+    `joints` (55,3) float64: positions in the world, metres.
+    `feature` (486,) float32: R - I of joints 1 to 54, row-major, with R the rotation relative to the parent.
     """
 
     matrices: F32
@@ -110,14 +111,15 @@ class Posed:
 class Skeleton:
     """The joint chain of one shaped body.
 
-    World transforms come by pointer jumping: after round k each joint holds the product of the 2^k transforms that end
-    at it. A tree of depth 11 then takes four batched products instead of 55 steps.
+    World transforms come from pointer jumping: after round k, each joint holds the product of the 2^k transforms that
+    end at that joint. A tree of depth 11 then takes four batched products instead of 55 steps.
     """
 
     def __init__(self, joints: F64, parents: NDArray[np.int32]) -> None:
         """Prepare the chain.
 
-        `joints`: rest positions (J,3), metres. `parents`: (J,), -1 at the root, which is joint 0.
+        `joints` (J,3): rest positions, metres.
+        `parents` (J,): index of each joint's parent, -1 at the root, which is joint 0.
         """
         count = len(parents)
         self._rest = np.asarray(joints, np.float64)
@@ -133,12 +135,12 @@ class Skeleton:
         self._posed = Posed(self._matrices, self._world[:-1, :3, 3], self._feature.reshape(-1))
 
     def pose(self, pose: ArrayLike, translation: ArrayLike | None = None, world: F64 | None = None) -> Posed:
-        """Pose the chain.
+        """Pose the chain, and return its buffers.
 
-        `pose`: axis-angle (J * 3,), radians.
-        `translation`: translation of the root in body space, (3,) metres; None for none.
-        `world`: matrix (4,4) from body space to the world; None for the identity.
-        Raises BadInputError when a number is not finite or an angle or coordinate is beyond a million.
+        `pose` (J * 3,): axis-angle, radians.
+        `translation` (3,): translation of the root in body space, metres; None for no translation.
+        `world` (4,4): transform from body space to the world; None for the identity.
+        Raises BadInputError when a number is not finite, or when the angles or coordinates are beyond a million.
         """
         self._angles.reshape(-1)[:] = np.asarray(pose, np.float64).reshape(-1)
         _require_finite(self._angles, "pose", "joint angles below 1e6 rad")
@@ -176,7 +178,10 @@ def _require_finite(values: F64, where: str, expected: str) -> None:
 
 
 def _ancestors(parents: NDArray[np.int32]) -> list[NDArray[np.intp]]:
-    """Return, per round, each joint's 2^k-th ancestor; index J is an identity that stands above the root."""
+    """Return an array (J + 1,) for each round k: the 2^k-th ancestor of each joint.
+
+    Index J stands for an identity transform above the root; it is its own ancestor.
+    """
     count = len(parents)
     jump = np.append(np.where(parents < 0, count, parents), count).astype(np.intp)
     rounds = []

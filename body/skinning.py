@@ -1,16 +1,19 @@
-"""Linear blend skinning on the CPU: skin weights, levels of detail of a body, and the vertices of a pose.
+"""Linear blend skinning on the CPU: skinning weights, levels of detail of a body, and the vertices of a pose.
 
-x_world = sum_j w_j (matrix_j @ [x_rest, 1]); the products are small enough that the BLAS starts no threads. The K
-largest weights of a vertex remain, scaled to sum to 1. The error of what a level of detail leaves out has a proved
-bound; the last level leaves nothing out.
+x_world = sum_j w_j (matrix_j @ [x_rest, 1]). Matrix products are kept so small that the BLAS starts no threads. A level
+of detail may keep only the K largest weights of a vertex, scaled to sum to 1. The error of each level has a proved
+bound. The last level leaves nothing out.
 
-Proof. Let w be a vertex's skin weights, w' those of the level, p its rest position, c_b the centre of joint b and t_b
-the angle by which b is turned. As in `weight_error_bound`, the change of weights moves the vertex by at most sum_b
-|E_b| |y_b - y_parent|, with E_b the sum of w' - w over b and the joints below it. The turn of b moves p by |y_b -
-y_parent| = 2 sin(t_b / 2) dist(p, axis of b) <= 2 sin(t_b / 2) |p - c_b|. Pose blend shapes move p by at most r = sum_b
-r_b |R_b - I|, with r_b the norm of the vertex's block of them. Left out, they move the skinned vertex by at most r,
-because its weights are shares of rigid motions; kept, they make |p - c_b| larger by at most r. The Frobenius norm |R_b
-- I| is 2 sqrt(2) sin(t_b / 2). Vertices are taken in groups, with the largest of each term in the group.
+Proof. Let w be a vertex's weights, w' its weights at the level, and p its rest position. Let c_b be the centre of joint
+b, t_b the angle by which b is turned, and y_b the position to which joint b alone moves p. As in `weight_error_bound`,
+the change of weights moves the vertex by at most sum_b |E_b| |y_b - y_parent|, with E_b the sum of w' - w over b and
+the joints below b. The turn of b moves p by |y_b - y_parent| = 2 sin(t_b / 2) dist(p, axis of b) <= 2 sin(t_b / 2) |p -
+c_b|.
+
+Pose blend shapes move p by at most r = sum_b r_b |R_b - I|, with r_b the norm of the vertex's block of blend shapes of
+joint b. If they are left out, the skinned vertex moves by at most r, because skinning averages rigid motions. If they
+are kept, |p - c_b| grows by at most r. The Frobenius norm |R_b - I| is 2 sqrt(2) sin(t_b / 2). Vertices are bounded in
+groups: each term takes its largest value in the group.
 """
 
 from __future__ import annotations
@@ -33,9 +36,10 @@ WEIGHT_COUNTS = (4, 8, 12)
 
 @dataclass(frozen=True)
 class TopWeights:
-    """The largest skin weights of each vertex.
+    """The largest skinning weights of each vertex.
 
-    `joints` (V,K) int32 and `weights` (V,K) float32, largest first, rows sum to 1; unused columns have weight 0.
+    `joints` (V,K) int32: joint indices. `weights` (V,K) float32: their weights, largest first. Rows sum to 1; unused
+    columns have weight 0.
     """
 
     joints: NDArray[np.int32]
@@ -49,9 +53,9 @@ class TopWeights:
 
 
 def largest_weights(weights: F32, k: int) -> TopWeights:
-    """Return the `k` largest of each row of `weights` (V,55), scaled to sum to 1.
+    """Return the `k` largest weights of each row of `weights` (V,55), scaled to sum to 1.
 
-    Raises BadInputError unless `k` is 4, 8 or 12.
+    Raises BadInputError if `k` is not 4, 8 or 12.
     """
     if k not in WEIGHT_COUNTS:
         raise BadInputError("skin weights", str(k), "4, 8 or 12")
@@ -61,16 +65,16 @@ def largest_weights(weights: F32, k: int) -> TopWeights:
 
 
 def weight_error_bound(shaped: ShapedBody, weight_count: int) -> F64:
-    """Return the furthest (V,), metres, that any pose moves a vertex drawn with its `weight_count` largest weights.
+    """Return a bound (V,), metres, on each vertex's error, in any pose, with only its `weight_count` largest weights.
 
     Proof. Let joint j alone move the rest vertex p to y_j, and let e_j be the change of its weight; the e_j sum to 0.
-    Joint b and its parent both move p rigidly, and both move the centre c_b of b to the same point. So y_b and y_parent
-    lie on one sphere about that point: |y_b - y_parent| <= 2 |p - c_b|. With each y_j written as the root's y plus the
-    steps down the chain to j,
+    Joint b and its parent both move p rigidly, and both move the centre c_b of b to the same point. Therefore y_b and
+    y_parent lie on one sphere about that point: |y_b - y_parent| <= 2 |p - c_b|. If each y_j is written as the root's y
+    plus the steps down the chain to j,
 
         sum_j e_j y_j = sum_b E_b (y_b - y_parent),   E_b the sum of e_j over b and the joints below it,
 
-    so the vertex moves by at most sum_b |E_b| 2 |p - c_b|. With pose blend shapes, p is the vertex that they moved.
+    and the vertex moves by at most sum_b |E_b| 2 |p - c_b|. With pose blend shapes, p is the vertex after them.
     """
     largest = largest_weights(shaped.body.weights, weight_count).dense()
     change = branch_sums(shaped.body.parents, largest.astype(np.float64) - shaped.body.weights)
@@ -78,12 +82,15 @@ def weight_error_bound(shaped: ShapedBody, weight_count: int) -> F64:
 
 
 def joint_distance(shaped: ShapedBody) -> F64:
-    """Return the distance (V,55), metres, from each rest vertex to each joint."""
+    """Return the distance (V,55), metres, of each rest vertex from each rest joint."""
     return np.asarray(np.linalg.norm(shaped.vertices[:, None, :] - shaped.joints[None], axis=2))
 
 
 def branch_sums(parents: NDArray[np.int32], values: F64) -> F64:
-    """Return `values` (..., 55) summed over each joint and all joints below it."""
+    """Return, for each joint, the sum of `values` (..., 55) over that joint and all joints below it: (..., 55).
+
+    `parents` (55,): index of each joint's parent, -1 at the root.
+    """
     above = np.eye(len(parents))
     for joint in range(len(parents)):
         at = int(parents[joint])
@@ -93,13 +100,13 @@ def branch_sums(parents: NDArray[np.int32], values: F64) -> F64:
     return np.asarray(values @ above)
 
 
-#: For each joint of the hands and the face, the joint that carries it.
+#: For each joint of the hands and the face: the index of the joint that takes over its weights, a wrist or the head.
 CARRIED_BY = {
     name: JOINT_INDEX["head" if name in ("jaw", "left_eye", "right_eye") else f"{name.partition('_')[0]}_wrist"]
     for name in JOINT_NAMES[JOINT_INDEX["jaw"] :]
 }
-VERSION = "detail bounds 1"  # raise it when the same body gives other bounds
-#: Error that float32 may add, metres: the rounding of weights and of skinned vertices.
+VERSION = "detail bounds 1"  # part of the cache key; raise it when the same body gets other bounds
+#: Error, metres, that float32 may add by rounding weights and skinned vertices.
 ROUNDING_M = 5e-6
 
 
@@ -107,8 +114,10 @@ ROUNDING_M = 5e-6
 class Detail:
     """A level of detail.
 
-    `weight_count`: number of skin weights of a vertex, None for all. `hands_and_face`: whether their joints count; else
-    wrist and head carry them. `pose_blend`: whether pose blend shapes are applied, where there are any.
+    `name`: description for people.
+    `weight_count`: number of skinning weights per vertex; None for all.
+    `hands_and_face`: whether joints of hands and face move the mesh; otherwise wrists and head take over their weights.
+    `pose_blend`: whether the body's pose blend shapes, if any, are applied.
     """
 
     name: str
@@ -117,7 +126,7 @@ class Detail:
     pose_blend: bool
 
     def weights(self, shaped: ShapedBody) -> F32:
-        """Return the skin weights (V,55) of this level; rows sum to 1."""
+        """Return the skinning weights (V,55) of this level; rows sum to 1."""
         weights = shaped.body.weights
         if not self.hands_and_face:
             weights = carried(weights)
@@ -128,7 +137,7 @@ class Detail:
 
 
 def left_out(detail: Detail, body: Body) -> list[str]:
-    """Name the parts of `body` that `detail` leaves out, in words; empty when it leaves out nothing."""
+    """Return, in words, each part of `body` that `detail` leaves out; an empty list when nothing is left out."""
     found = []
     weights = body.weights
     if not detail.hands_and_face:
@@ -143,7 +152,7 @@ def left_out(detail: Detail, body: Body) -> list[str]:
     return found
 
 
-#: Levels of detail, from the least work to all of it.
+#: Levels of detail, from the least work to the most.
 DETAILS = (
     Detail("4 weights, hands and face at rest, no pose blend shapes", 4, hands_and_face=False, pose_blend=False),
     Detail("4 weights, no pose blend shapes", 4, hands_and_face=True, pose_blend=False),
@@ -156,7 +165,7 @@ EVERYTHING = DETAILS[-1]
 
 
 def carried(weights: F32) -> F32:
-    """Return `weights` (V,55) in which wrist and head carry the weights of the hands' and the face's joints."""
+    """Return `weights` (V,55) after wrists and head take over the weights of the joints of hands and face."""
     given = weights.astype(np.float64)
     for name, carrier in CARRIED_BY.items():
         given[:, carrier] += given[:, JOINT_INDEX[name]]
@@ -165,10 +174,10 @@ def carried(weights: F32) -> F32:
 
 
 class DetailBounds:
-    """The bounds of every level of `DETAILS`, for one shaped body.
+    """Error bounds of every level of `DETAILS`, for one shaped body.
 
-    `reach` (55,): greatest distance in metres from each joint's centre at rest to a vertex that any level moves with
-    it.
+    `reach` (55,): largest distance, metres, from each joint's centre at rest to a rest vertex that the joint moves at
+    any level.
     """
 
     def __init__(self, shaped: ShapedBody) -> None:
@@ -180,9 +189,9 @@ class DetailBounds:
         self.reach: F64 = arrays["reach"]
 
     def metres(self, posed: Posed) -> list[float]:
-        """Return the furthest, in metres, that each level of `DETAILS` moves a vertex in this frame.
+        """Return a bound, metres, on the error of any vertex in this pose, for each level of `DETAILS`.
 
-        `posed`: a frame of `Skeleton.pose`.
+        `posed`: result of `Skeleton.pose`.
         """
         turned = _turned(posed)
         swing = turned / np.sqrt(2.0)
@@ -194,12 +203,12 @@ class DetailBounds:
         ]
 
     def blend_m(self, posed: Posed) -> float:
-        """Return the furthest, in metres, that pose blend shapes move a vertex in this frame."""
+        """Return a bound, metres, on how far pose blend shapes move any vertex in this pose."""
         return float((self._blend @ _turned(posed)).max())
 
 
 def _turned(posed: Posed) -> F64:
-    """Return the Frobenius norm |R - I| (54,) of joints 1 to 54."""
+    """Return the Frobenius norms |R - I| (54,) of joints 1 to 54."""
     return np.asarray(np.linalg.norm(posed.feature.reshape(-1, 9).astype(np.float64), axis=1))
 
 
@@ -209,9 +218,10 @@ def _bound(detail: Detail, lever: F64, change: F64, blend: F64) -> float:
 
 
 def _terms(shaped: ShapedBody) -> Arrays:
-    """Return the largest terms of each of the G groups of vertices.
+    """Return the terms of the bounds, each the largest in one of the G groups of vertices.
 
-    `lever`, `change` (levels,G,54): |E_b| |p - c_b| and |E_b|. `blend` (G,54): r_b of the blend shapes. `reach` (55,).
+    `lever`, `change` (levels,G,54): |E_b| |p - c_b| and |E_b|. `blend` (G,54): r_b.
+    `reach` (55,): as in `DetailBounds`.
     """
     starts, order = _groups(shaped.body.weights)
     distance = joint_distance(shaped)
@@ -232,7 +242,7 @@ def _terms(shaped: ShapedBody) -> Arrays:
 
 
 def blend_reach(shaped: ShapedBody) -> F64:
-    """Return how far (V,54), metres, each joint's pose blend shapes can move each vertex at |R - I| = 1."""
+    """Return a bound (V,54), metres, on how far each joint's pose blend shapes move each vertex at |R - I| = 1."""
     posedirs = shaped.body.posedirs
     if posedirs is None:
         return np.zeros((len(shaped.vertices), JOINTS - 1))
@@ -241,9 +251,9 @@ def blend_reach(shaped: ShapedBody) -> F64:
 
 
 def _groups(weights: F32) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Sort vertices by the two joints that weigh most on each.
+    """Group vertices by the two joints with the largest weights.
 
-    Return where each group begins in the sorted list, and the sorted vertex indices (V,).
+    Return where each group begins in the sorted list of vertices, and that list: vertex indices (V,).
     """
     two = np.sort(np.argsort(-weights, axis=1, kind="stable")[:, :2], axis=1)
     key = two[:, 0] * JOINTS + two[:, 1]
@@ -252,13 +262,13 @@ def _groups(weights: F32) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return starts, order
 
 
-#: Number of vertices in one product. OpenBLAS wakes its other threads above 2**18 multiplications, which stalls on
+#: Number of vertices in one matrix product. Beyond 2**18 multiplications OpenBLAS wakes other threads, which stall on
 #: shared cores.
 _BLOCK_ROWS = 256
 
 
 def blend_matrices(weights: F64, per_joint: F64) -> F64:
-    """Return `weights` (N,55) @ `per_joint` (55,M), (N,M), in blocks that the BLAS computes on the calling thread."""
+    """Return the product (N,M) of `weights` (N,55) and `per_joint` (55,M), computed in blocks on the calling thread."""
     blended = np.empty((len(weights), per_joint.shape[1]))
     whole = len(weights) // _BLOCK_ROWS * _BLOCK_ROWS
     blocks = weights[:whole].reshape(-1, _BLOCK_ROWS, weights.shape[1])
@@ -268,10 +278,10 @@ def blend_matrices(weights: F64, per_joint: F64) -> F64:
 
 
 class CpuSkinner:
-    """Computes vertices of one shaped body, frame by frame, in float64.
+    """Computes the vertices of one shaped body, pose by pose, in float64.
 
-    `weight_count`: number of weights, 4, 8 or 12; None for all. `pose_blend`: whether to apply the body's pose blend
-    shapes, if any.
+    `weight_count`: number of skinning weights per vertex, 4, 8 or 12; None for all. `pose_blend`: whether the body's
+    pose blend shapes, if any, are applied.
     """
 
     def __init__(self, shaped: ShapedBody, weight_count: int | None = None, pose_blend: bool = True) -> None:
@@ -282,7 +292,7 @@ class CpuSkinner:
         self._blend = body.posedirs.reshape(-1, POSE_FEATURES) if pose_blend and body.posedirs is not None else None
 
     def vertices(self, posed: Posed) -> F64:
-        """Return the vertices (V,3), world metres, of a frame of `Skeleton.pose`."""
+        """Return the skinned vertices (V,3), world, metres. `posed`: result of `Skeleton.pose`."""
         rest = self._rest
         if self._blend is not None:
             rest = rest + (self._blend @ posed.feature).reshape(-1, 3)
@@ -291,15 +301,15 @@ class CpuSkinner:
 
 
 class FrameSkinner:
-    """Writes vertices of one shaped body, float32, into the caller's memory; the CPU unit does this each frame.
+    """Writes the vertices of one shaped body, float32, into the caller's memory; the CPU unit uses it in each frame.
 
-    Vertices are computed in blocks. Neighbouring vertices depend on few joints, so a block is multiplied only by the
-    joints that it has weights for. Every block uses as many joints as the block with the most. x of all vertices is
-    stored in one row, then y, then z.
+    Vertices are computed in blocks. Neighbouring vertices depend on few joints, so each block is multiplied only by
+    joints that move it. All blocks use the same number of joints, the most that any block needs. Positions are stored
+    as three rows, of x, y and z, so that NumPy works on contiguous memory.
     """
 
     def __init__(self, shaped: ShapedBody, detail: Detail = EVERYTHING) -> None:
-        """Prepare the blocks. `detail`: level of detail of the body."""
+        """Prepare the blocks for `shaped` at the level of detail `detail`."""
         body = shaped.body
         count = len(body.weights)
         blocks = -(-count // _BLOCK_ROWS)
@@ -320,12 +330,12 @@ class FrameSkinner:
 
     @property
     def constant_bytes(self) -> int:
-        """Bytes that every frame reads besides its pose: rest positions, weights, pose blend shapes."""
+        """Bytes that every frame reads besides its pose: rest positions, weights, joint indices, pose blend shapes."""
         kept = (self._rest, self._weights, self._joints, *(() if self._blend is None else (self._blend,)))
         return sum(array.nbytes for array in kept)
 
     def skin_into(self, posed: Posed, vertices: F32) -> None:
-        """Write the skinned vertices of a frame of `Skeleton.pose` into `vertices` (V,3), world metres."""
+        """Write the skinned vertices into `vertices` (V,3), world, metres. `posed`: result of `Skeleton.pose`."""
         count = len(vertices)
         if self._blend is not None:
             np.add(self._rest[:, :count], (self._blend @ posed.feature).reshape(-1, 3).T, out=self._blended[:, :count])
@@ -343,9 +353,11 @@ class FrameSkinner:
 
 
 def posed_vertices(shaped: ShapedBody, poses: ArrayLike, translation: ArrayLike | None = None) -> Iterator[F64]:
-    """Yield vertices (V,3), metres, for each pose of `poses` (T,165), as `Body.full_pose` returns them.
+    """Yield the vertices (V,3), metres, of each pose.
 
-    `translation`: (3,) metres, the same for all poses. Raises BadInputError when a number is not finite.
+    `poses` (T,165): axis-angle, radians, with absolute hand poses, as `Body.full_pose` returns them.
+    `translation` (3,): translation of the root, metres, the same for all poses.
+    Raises BadInputError when a number is not finite.
     """
     skeleton = Skeleton(shaped.joints, shaped.body.parents)
     skinner = CpuSkinner(shaped)

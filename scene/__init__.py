@@ -1,4 +1,4 @@
-"""What is shown: scene files, motions and cameras, and how they are put together in one place.
+"""Content of the pictures: scene files, motions and cameras, and how a scene is staged from them.
 
 It may use `pipeline/` and the folders below it; so far it needs `body/` and the modules in `src/trilane`.
 """

@@ -1,18 +1,18 @@
 """The camera in the scene: places a recorded camera so that it films the avatars, and lets a person steer it.
 
-The recording is moved as one rigid, upright piece: it is turned about the vertical and shifted; its movement from frame
-to frame never changes. `best_place` finds the place. At first the camera is in front of the avatars, in the
-direction that a heading of 0 faces. Over a drawn background the camera is also tilted by one constant angle, so that it
-does not look down on people, unless that hides them. The moments are those of the scene's first seconds, however many
-frames a run shows and at whatever rate: a frame of a scene is the same picture in every run.
+A recorded camera is moved as one rigid piece: its path is turned about the vertical and shifted. Its movement from
+frame to frame never changes. `best_place` finds the place. At the first frame, the camera is in front of the avatars,
+in the direction of heading 0. Over a drawn background, the camera may also be tilted by one constant angle, so that it
+does not look down on people. The tilt is left out if it would hide people. Places are judged by the scene's first
+seconds, whatever the length and rate of a run. Therefore a frame of a scene shows the same picture in every run.
 
-A built-in camera is a formula of time for a person at the origin. It goes along where a person would leave the picture:
-its place is moved by the mean of the avatars' ways over the floor. A way repeats as its motion does, so a frame does
-not depend on those before it. Steps and sways are smoothed out of it, because a camera that shows them shakes.
+A built-in camera is a formula of time for a person at the origin. The camera goes along with the avatars if they would
+leave the picture: its place moves by the mean of their ways over the floor. A way repeats as its motion does, so no
+frame depends on earlier frames. Steps and sways are smoothed out of a way, because they would shake the camera.
 
-A person turns the view about the vertical through a pivot, then about the level axis that runs to the camera's right.
-The camera stays upright, above the floor and off the pole; where the scene's own camera is beyond that, it is not
-turned further out. Coming nearer is a move along the line to the pivot; the lens stays the same.
+A person who steers turns the view about the vertical through a pivot, then about the level axis to the camera's right.
+The camera stays upright, above the floor and off the pole. If the scene's own camera is beyond these limits, steering
+turns it no further out. Zooming moves the camera along the line to the pivot; the lens stays the same.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from trilane.scene.rotations import about, quat_from_matrix, quat_multiply
 from trilane.scene.schema import MAX_DEPTH_RATIO, CameraSpec, Scene
 from trilane.scene.visibility import SCORED_MOMENTS, SCORED_S, best_place, facing, filming, outermost_points, seen_at
 
-#: Step between samples of a way, and most samples; a longer motion has longer steps.
+#: Step between samples of a way, seconds, and most samples; a longer motion has longer steps.
 STEP_S, MOST_SAMPLES = 0.1, 6000
-#: Standard deviation of the Gaussian that smooths a way. It leaves a sixth of a sway of 1 Hz and nothing of a step of
-#: 2 Hz; a runner at 6 m/s who turns at once is 1.4 m from the smoothed way.
+#: Standard deviation, seconds, of the Gaussian that smooths a way. A sixth of a sway of 1 Hz remains, and nothing of a
+#: step of 2 Hz. A runner at 6 m/s who turns back at once is 1.4 m from the smoothed way.
 SMOOTH_S = 0.3
-#: Standard deviations after which the Gaussian ends.
+#: Number of standard deviations at which the Gaussian is cut off.
 ENDS_AFTER = 3.0
-#: How an array of samples continues beyond its ends, by what follows the motion's last frame.
+#: Mode of `np.pad` that continues a way beyond its ends, by what follows the motion's last frame.
 PADDING = {Wrap.LOOP: "wrap", Wrap.BOUNCE: "reflect", Wrap.HOLD: "edge"}
 
 
@@ -47,8 +47,8 @@ PADDING = {Wrap.LOOP: "wrap", Wrap.BOUNCE: "reflect", Wrap.HOLD: "edge"}
 class Way:
     """The smoothed way of an avatar over the floor.
 
-    `times_s` (T,): times from 0, strictly increasing. `places` (T, 3): places on the floor, metres. `wrap`: what
-    follows the last one.
+    `times_s` (T,): times from 0, strictly increasing. `places` (T, 3): positions on the floor, metres.
+    `wrap`: what follows the last sample.
     """
 
     times_s: F64
@@ -56,18 +56,18 @@ class Way:
     wrap: Wrap
 
     def at(self, t_s: float) -> F64:
-        """Return the place (3,) at `t_s`, linear between samples."""
+        """Return the position (3,) at `t_s`, linear between samples."""
         i, j, fraction = bracket(self.times_s, wrapped_time(t_s, float(self.times_s[-1]), self.wrap))
         return np.asarray(self.places[i] + (self.places[j] - self.places[i]) * fraction)
 
 
 def way_cycle_s(mover: Mover) -> float:
-    """Return the time after which the way of `mover` repeats; the motion's length if the motion holds its end."""
+    """Return the time, seconds, after which the way of `mover` repeats; if it does not repeat, the motion's length."""
     return mover.motion.duration_s * (2 if mover.motion.wrap is Wrap.BOUNCE else 1)
 
 
 def way_of(mover: Mover, body: ShapedBody) -> Way:
-    """Return the way of the pelvis of `mover`, who has `body`."""
+    """Return the smoothed way of the pelvis of `mover`, whose body is `body`."""
     motion = mover.motion
     count = min(int(np.ceil(motion.duration_s / STEP_S)), MOST_SAMPLES - 1) + 1
     times = np.linspace(0.0, motion.duration_s, count)
@@ -78,13 +78,13 @@ def way_of(mover: Mover, body: ShapedBody) -> Way:
 
 
 def smoothed(places: F64, step_s: float, wrap: Wrap) -> F64:
-    """Return `places` (T, 3), `step_s` apart, smoothed by a Gaussian; beyond their ends they go on by `wrap`."""
+    """Return `places` (T, 3), sampled every `step_s`, smoothed by a Gaussian. `wrap`: what follows the last sample."""
     if len(places) == 1:
         return places
     reach = int(np.ceil(ENDS_AFTER * SMOOTH_S / step_s))
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) * step_s / SMOOTH_S) ** 2)
     weights /= weights.sum()
-    # The last sample of a loop is the first one of the next.
+    # The last sample of a loop is the first sample of the next cycle.
     own = places[:-1] if wrap is Wrap.LOOP else places
     padded = np.pad(own, ((reach, reach), (0, 0)), mode=PADDING[wrap])  # type: ignore[call-overload]
     smooth = np.stack([np.convolve(column, weights, mode="valid") for column in padded.T], axis=1)
@@ -95,9 +95,11 @@ def smoothed(places: F64, step_s: float, wrap: Wrap) -> F64:
 class PlacedCamera:
     """A camera in the scene.
 
-    `turn` (3, 3), `shift` (3,): transform from the path's world to the scene's. `mount` (3, 3): turn from the camera's
-    axes to those of the path. `notes`: what was decided, for people. `ways`: ways that the camera goes along with, by
-    their mean; none for a camera that goes its own way.
+    `path`: path of the camera, in its own world.
+    `turn` (3, 3), `shift` (3,): transform from the path's world to the scene's world.
+    `mount` (3, 3): rotation from the camera's axes to those of the path.
+    `notes`: what was decided, for people.
+    `ways`: ways of avatars, by whose mean the camera moves; empty for a camera that does not go along.
     """
 
     path: CameraPath
@@ -108,7 +110,7 @@ class PlacedCamera:
     ways: tuple[Way, ...] = ()
 
     def sample(self, t_s: float) -> F64:
-        """Return the matrix (4, 4) from world to camera at `t_s`; the world is the scene's."""
+        """Return the transform (4, 4) from the scene's world to the camera at `t_s`."""
         turn, place = self.path.pose(t_s)
         at = self.turn @ place + self.shift
         if self.ways:
@@ -116,7 +118,7 @@ class PlacedCamera:
         return view_from_pose(self.turn @ turn @ self.mount, at)
 
     def reach(self) -> tuple[F64, F64]:
-        """Return the lowest and highest coordinates (3,) of all places of the camera in the scene, and of its ways."""
+        """Return the lowest and the highest coordinates (3,) of the camera in the scene, ways included."""
         places = self.path.places @ self.turn.T + self.shift
         low, high = places.min(axis=0), places.max(axis=0)
         if self.ways:
@@ -130,14 +132,16 @@ class PlacedCamera:
 
 
 LOWEST_DEG, HIGHEST_DEG = -8.0, 85.0
-LEAST_LEVEL_M = 1e-6  # least level distance of the camera from the pivot; below it, the camera stands over the pivot
+LEAST_LEVEL_M = 1e-6  # a camera is over the pivot if its horizontal distance, metres, is below this
 
 
 def steered(view: F64, pivot: F64, azimuth_deg: float, elevation_deg: float, zoom: float) -> F64:
-    """Return the matrix (4, 4) from world to the camera of `view`, turned about `pivot` (3,) and moved towards it.
+    """Return `view` after the camera is turned about `pivot` (3,) and moved towards it.
 
-    `view`: matrix (4, 4) from world to camera. `azimuth_deg`: turn to the right about the vertical. `elevation_deg`:
-    turn upwards. `zoom`: factor by which the camera is nearer, above 0.
+    `view` and the result: transform (4, 4) from world to camera.
+    `azimuth_deg`: turn to the right about the vertical.
+    `elevation_deg`: turn upwards.
+    `zoom`: factor by which the camera comes nearer, above 0.
     """
     if azimuth_deg == 0.0 and elevation_deg == 0.0 and zoom == 1.0:
         return view
@@ -153,7 +157,10 @@ def steered(view: F64, pivot: F64, azimuth_deg: float, elevation_deg: float, zoo
 
 
 def _turn(arm: F64, azimuth_deg: float, elevation_deg: float) -> F64:
-    """Return the turn (3, 3) of a camera at `arm` (3,) from the pivot."""
+    """Return the rotation (3, 3) that steers a camera at `arm` (3,) from the pivot.
+
+    The elevation stays between LOWEST_DEG and HIGHEST_DEG, or the camera's own elevation if that is beyond.
+    """
     level = float(np.hypot(arm[0], arm[2]))
     if level < LEAST_LEVEL_M:
         return about(1, np.radians(azimuth_deg))
@@ -164,28 +171,26 @@ def _turn(arm: F64, azimuth_deg: float, elevation_deg: float) -> F64:
     return about(1, heading + np.radians(azimuth_deg)) @ about(0, -raised) @ about(1, -heading)
 
 
-#: Range of the camera's median line of sight, degrees above the horizon; beyond it the camera is tilted to its end.
+#: Range of the camera's median line of sight, degrees above the horizon; a camera beyond it is tilted to its end.
 SIGHT_DEG = (-24.0, 0.0)
 LARGEST_TILT_DEG = 40.0
 SYNTHETIC_BACKGROUNDS = ("room",)
-#: Share by which the far clip plane is beyond the farthest that a body can be from the camera.
+#: Factor on the farthest distance that a body can have from the camera: the far clip plane is there.
 BEYOND = 1.1
-#: A built-in camera is judged at moments so far apart, or at so many evenly spread over a longer cycle.
+#: A built-in camera is judged at moments this far apart, seconds, or at this many in a longer cycle.
 JUDGED_EVERY_S, MOST_JUDGED = 0.25, 480
-#: Least gain in the share of the bodies in the picture, on average, for which a built-in camera goes along with them
-#: where somebody is in the picture all the time.
+#: A built-in camera that always shows somebody goes along only if the mean visible share of the bodies grows by this.
 LEAST_GAIN = 0.02
 
 
 def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> PlacedCamera:
-    """Place the camera of a scene: a recorded one where it films the avatars, a built-in one along with them.
+    """Return the camera of `scene` at its place: a recorded one films the avatars, a built-in one goes along with them.
 
-    One whose spec has `place = "none"` stays where it is.
+    A camera stays where it is if `scene.camera.place` is `none`.
 
     `path`: path of the camera.
-    `scene`: scene, which states the background, the picture's size, and whether the camera is placed.
-    `movers`: avatars of the scene.
-    `bodies`: bodies of these avatars, in the same order.
+    `scene`: its background, picture size and camera keys are used.
+    `movers`: avatars of the scene. `bodies`: their bodies, in the same order.
     """
     camera = PlacedCamera(path, np.eye(3), np.zeros(3), np.eye(3), ())
     if scene.camera.place == "none":
@@ -198,10 +203,10 @@ def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies
 def _going_along(
     camera: PlacedCamera, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]
 ) -> PlacedCamera:
-    """Return the built-in `camera`, going along with people who would leave its picture otherwise.
+    """Return the built-in `camera`, made to go along with people if they would leave its picture otherwise.
 
-    It is judged over one cycle of camera and motions: by whole bodies, a close-up by heads. It never shows fewer of
-    these for going along, and it stays where that changes little.
+    The camera is judged over one cycle of camera and motions: by whole bodies, or by heads for a close-up. It stays
+    where it is if going along would show fewer whole bodies or heads, or would change little.
     """
     ways = tuple(way_of(mover, body) for mover, body in zip(movers, bodies, strict=True))
     times = _judged(camera.path, movers, ways)
@@ -225,9 +230,10 @@ def _going_along(
 
 
 def _judged(path: CameraPath, movers: Sequence[Mover], ways: Sequence[Way]) -> F64:
-    """Return the moments (F,) at which a built-in camera is judged: over one cycle, and where each way is farthest off.
+    """Return the moments (F,), seconds, at which a built-in camera is judged.
 
-    A motion that holds its end is looked at for one cycle of the camera after it.
+    They cover one cycle, with the moment at which each way is farthest from the origin. If a motion holds its end, one
+    cycle of the camera after that end is covered too.
     """
     after = [path.duration_s if mover.motion.wrap is Wrap.HOLD else 0.0 for mover in movers]
     cycles = (way_cycle_s(mover) + more for mover, more in zip(movers, after, strict=True))
@@ -238,7 +244,7 @@ def _judged(path: CameraPath, movers: Sequence[Mover], ways: Sequence[Way]) -> F
 
 
 def _placed(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> PlacedCamera:
-    """Return the recorded camera of `path` at its best place."""
+    """Return the recorded camera of `path` at its best place in `scene`."""
     times = np.linspace(0.0, SCORED_S, SCORED_MOMENTS)
     levelled, level, middle = _from_the_middle(path)
     output = (scene.output.height, scene.output.width)
@@ -266,9 +272,9 @@ def _placed(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Seq
 
 
 def _far(places: F64, points: F64, spec: CameraSpec) -> tuple[float, tuple[str, ...]]:
-    """Return the distance of the far clip plane, at which none of `points` is cut off, and a note where it grows.
+    """Return a distance of the far clip plane, metres, that cuts off none of `points`, and a note if it is increased.
 
-    `places` (N, 3): places of the camera. `points` (F, P, 3): points of the bodies, in the same world.
+    `places` (N, 3): positions of the camera. `points` (F, P, 3): points of the bodies, in the same world.
     """
     corners = points.reshape(-1, 3)
     low, high = np.minimum(places.min(axis=0), corners.min(axis=0)), np.maximum(places.max(axis=0), corners.max(axis=0))
@@ -279,9 +285,10 @@ def _far(places: F64, points: F64, spec: CameraSpec) -> tuple[float, tuple[str, 
 
 
 def _from_the_middle(path: CameraPath) -> tuple[CameraPath, F64, F64]:
-    """Return `path` about its middle, first looking along -Z, and the turn (3, 3) and middle (3,) taken off it.
+    """Return `path` moved to have its middle at the origin and to look along -Z at first, and this movement.
 
-    So the grid of places is the same however the file's world is turned, and wherever it has its origin.
+    The movement is a rotation (3, 3) about the vertical and the middle (3,): new = rotation @ (old - middle). It makes
+    the search for a place independent of the origin and the heading of the file's world.
     """
     ahead = path.pose(0.0)[0][:, 2]
     level = about(1, -np.arctan2(ahead[0], ahead[2]))
@@ -291,6 +298,6 @@ def _from_the_middle(path: CameraPath) -> tuple[CameraPath, F64, F64]:
 
 
 def _tilt_deg(path: CameraPath, times: F64) -> float:
-    """Return the degrees by which the camera is tilted up so that its median line of sight is within SIGHT_DEG."""
+    """Return the angle, degrees, by which the camera is tilted up so that its median line of sight is in SIGHT_DEG."""
     sight = float(np.median([np.degrees(np.arcsin(np.clip(-path.pose(float(t))[0][1, 2], -1, 1))) for t in times]))
     return float(np.clip(np.clip(sight, *SIGHT_DEG) - sight, -LARGEST_TILT_DEG, LARGEST_TILT_DEG))

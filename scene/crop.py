@@ -1,22 +1,22 @@
 """The crop: a rectangle of the screen, the tensor shape that fits it, its projection, and its place in the tensor.
 
-Rectangles are x0, y0, x1, y1 in normalised device coordinates, y up; a tensor's pixels are square on the screen.
+Rectangles are x0, y0, x1, y1 in normalised device coordinates (NDC), y up. A tensor's pixels are square on the screen.
 
-**Layout.** One visible avatar has the whole tensor. Several are drawn at one scale in rows, so each has a share of the
-tensor in proportion to its area on the screen. At least `MARGIN_PX` of background lie between them. `lay_out` fills the
-tensor: the scale is the largest that the tensor has room for. `lay_out_at` stops at a density. At density 1 a tensor
-pixel is a pixel of the picture, on its grid; the rest of the tensor is background. Avatars of different networks have a
-tensor each, all of one shape: `apart` lays them out, network by network.
+**Layout.** One visible avatar has the whole tensor. Several avatars are drawn at one scale in rows, so that each has
+tensor pixels in proportion to its area on the screen. At least `MARGIN_PX` of background lie between them. `lay_out`
+fills the tensor: it takes the largest scale at which all avatars fit. `lay_out_at` takes no scale beyond a given
+density. At density 1, tensor pixels coincide with pixels of the picture, and the rest of the tensor is background.
+Avatars of different networks have separate tensors of one shape; `apart` lays out the avatars of each network.
 
-**Error.** `error_px` leads from metres to pixels, with a proved bound. A vertex has the clip coordinates X, Y, W. The
-vectors r_x, r_y, r_w are the first three numbers of the clip matrix's rows. With x = X / W and y = Y / W, an error d
-moves it by
+**Error.** `error_px` converts an error in metres to pixels, with a proved bound. Let a vertex have the clip coordinates
+X, Y, W, and let r_x, r_y, r_w be the first three numbers of the clip matrix's rows 0, 1 and 3. With x = X / W and y = Y
+/ W, an error d of the vertex moves it on the picture by
 
     (x' - x, y' - y) = J d / (W + r_w . d),   with the rows r_x - x r_w and r_y - y r_w of J,
 
-where x and y count in halves of the picture's sides. The largest stretch of J is convex in (x, y), so no vertex that is
-seen has a larger one than a corner of the picture. The error is at most that, times |d| / (W - |d| |r_w|). W is the
-least of the body: a skinned vertex is a mean of points that lie no further from the centre of joint j than at rest
+where x and y count in halves of the picture's sides. The largest stretch of J is convex in (x, y), so it is largest at
+a corner of the picture. The error is at most that stretch, times |d| / (W - |d| |r_w|). For W, the least W of the body
+is taken: a skinned vertex is a mean of points that are no farther from the centre of joint j than at rest
 (`DetailBounds.reach`).
 """
 
@@ -34,13 +34,13 @@ from trilane.arrays import BUCKET_STEP, F64, MOST_ASPECT, Shape
 from trilane.body.joints import Posed
 from trilane.errors import BadInputError
 
-#: Least height and width of a crop, in output pixels, however small the body is on the screen.
+#: Least height and width of a crop, in pixels of the picture, however small the body is on the screen.
 LEAST_PIXELS = 1.0
-ROUNDING_PX = 1e-4  # a side this little beyond the edge of a pixel is still on that edge
+ROUNDING_PX = 1e-4  # a side at most this far beyond a pixel's edge counts as on the edge
 
 
 class Rect(NamedTuple):
-    """A rectangle with x0 < x1, y0 < y1 in normalised device coordinates, y up."""
+    """A rectangle with x0 < x1 and y0 < y1 in NDC, y up."""
 
     x0: float
     y0: float
@@ -60,10 +60,11 @@ SCREEN = Rect(-1.0, -1.0, 1.0, 1.0)
 
 
 def choose_bucket(rect: Rect, output: Shape, buckets: Sequence[Shape]) -> tuple[Shape, Rect]:
-    """Return the tensor shape that wastes the least area on `rect`, and `rect` grown to the shape's aspect.
+    """Return the tensor shape that wastes the least area on `rect`, and `rect` grown to that shape's aspect ratio.
 
-    The grown rectangle holds `rect`. It is moved onto the screen where it fits; a side longer than the screen reaches
-    over both of its edges by the same length. Of two shapes that waste the same area the larger is chosen.
+    The grown rectangle contains `rect`. It is moved onto the screen if it fits there. If a side is longer than the
+    screen, it extends beyond both edges of the screen by the same length. Of two shapes that waste the same area, the
+    larger one is chosen.
 
     `rect`: rectangle of the mesh.
     `output`: (height, width) of the picture in pixels.
@@ -87,7 +88,10 @@ def choose_bucket(rect: Rect, output: Shape, buckets: Sequence[Shape]) -> tuple[
 
 
 def grow(low: float, high: float, length: float) -> tuple[float, float]:
-    """Return an interval of `length` about the middle of [low, high], moved onto [-1, 1] if it fits, else centred."""
+    """Return the ends of an interval of `length` about the middle of [low, high].
+
+    The interval is moved into [-1, 1] if it fits; otherwise it is centred on 0.
+    """
     if length >= 2.0:
         return -length / 2.0, length / 2.0
     start = min(max((low + high - length) / 2.0, -1.0), 1.0 - length)
@@ -95,7 +99,7 @@ def grow(low: float, high: float, length: float) -> tuple[float, float]:
 
 
 def on_grid(rect: Rect, output: Shape) -> Rect:
-    """Widen `rect` to whole pixels of a picture of `output` (height, width), at least one each way."""
+    """Return `rect` widened to whole pixels of a picture of `output` (height, width), to at least one pixel."""
     x0, x1 = _whole_pixels(rect.x0, rect.x1, output[1])
     y0, y1 = _whole_pixels(rect.y0, rect.y1, output[0])
     return Rect(x0, y0, x1, y1)
@@ -108,10 +112,10 @@ def _whole_pixels(low: float, high: float, side: int) -> tuple[float, float]:
 
 
 def grow_on_grid(rect: Rect, output: Shape, size: tuple[float, float]) -> Rect:
-    """Grow `rect`, which lies on the pixel grid of a picture of `output`, to `size` (height, width) in its pixels.
+    """Return `rect`, which lies on the pixel grid of a picture of `output` (height, width), grown to `size`.
 
-    The result begins on the grid, and where `size` is whole, each of its pixels is a pixel of the picture. It has
-    `rect` in its middle, unless it has to be moved onto the screen, where it fits.
+    `size`: (height, width) in pixels of the picture. The result begins on the grid; if `size` is whole, it also ends on
+    the grid. `rect` stays in the middle of the result, except where the result must be moved to fit on the screen.
     """
     x0, x1 = _grow_from_pixel(rect.x0, rect.x1, size[1], output[1])
     y0, y1 = _grow_from_pixel(rect.y0, rect.y1, size[0], output[0])
@@ -128,10 +132,10 @@ def _grow_from_pixel(low: float, high: float, length: float, side: int) -> tuple
 
 
 def crop_projection(projection: ArrayLike, rect: Rect) -> F64:
-    """Return `projection` (4,4) followed by the map of `rect` onto the whole screen; depth does not change.
+    """Return `projection` (4,4) followed by the map from `rect` to the whole screen; depth does not change.
 
-    With x' = (2 x - (x0 + x1)) / (x1 - x0) in normalised device coordinates the clip coordinate is X' = (2 X - (x0 +
-    x1) W) / (x1 - x0), which is linear, so the crop is exact for any projection.
+    In NDC, x' = (2 x - (x0 + x1)) / (x1 - x0). In clip space, X' = (2 X - (x0 + x1) W) / (x1 - x0), which is linear.
+    Therefore the crop is exact for any projection.
     """
     after = np.eye(4)
     after[0, 0], after[0, 3] = 2.0 / rect.width, -(rect.x0 + rect.x1) / rect.width
@@ -140,19 +144,21 @@ def crop_projection(projection: ArrayLike, rect: Rect) -> F64:
 
 
 def least_w(posed: Posed, clip: F64, reach: F64, blend_m: float = 0.0) -> float:
-    """Return the least W of clip space that a vertex can have, 0 or less when it may lie behind the camera.
+    """Return a lower bound on the clip coordinate W of all vertices; 0 or less if a vertex may be behind the camera.
 
-    `clip`: projection @ view, (4,4). `reach`: `DetailBounds.reach`, (55,). `blend_m`: furthest that pose blend shapes
-    move a vertex, metres.
+    `posed`: the body's joints in this frame.
+    `clip` (4,4): projection @ view.
+    `reach` (55,): `DetailBounds.reach`, metres.
+    `blend_m`: largest displacement of a vertex by pose blend shapes, metres.
     """
     centres = posed.joints @ clip[3, :3] + clip[3, 3]
     return float((centres - (reach + blend_m) * np.linalg.norm(clip[3, :3]))[reach > 0].min())
 
 
 class Stretch(NamedTuple):
-    """How far a metre in the world is on the picture at W = 1.
+    """The effect of an error of one metre in the world, in any direction, at W = 1.
 
-    `pixels`: most pixels. `depth`: most by which it changes W.
+    `pixels`: largest displacement on the picture, pixels. `depth`: largest change of W.
     """
 
     pixels: float
@@ -160,7 +166,7 @@ class Stretch(NamedTuple):
 
 
 def stretch_of(clip: ArrayLike, output: Shape) -> Stretch:
-    """Return the stretch of `clip`, projection @ view (4,4), on a picture of `output` (height, width)."""
+    """Return the stretch of `clip` (4,4), which is projection @ view, on a picture of `output` (height, width)."""
     x, y, _, depth = np.asarray(clip, np.float64)[:, :3]
     sides = output[1] / 2.0, output[0] / 2.0
     corners = ((x - at_x * depth, y - at_y * depth) for at_x in (-1.0, 1.0) for at_y in (-1.0, 1.0))
@@ -169,10 +175,10 @@ def stretch_of(clip: ArrayLike, output: Shape) -> Stretch:
 
 
 def error_px(metres: float, stretch: Stretch, w: float) -> float:
-    """Return the largest error in pixels of a vertex that is wrong by `metres`.
+    """Return the largest error on the picture, pixels, of a vertex that is off by `metres`.
 
-    `stretch`: that of the picture. `w`: least W of the body in clip space. The result is infinite when a vertex may be
-    behind the camera.
+    `stretch`: stretch of the picture. `w`: least clip coordinate W of the body. The result is infinite if a vertex may
+    be behind the camera.
     """
     if metres == 0.0:
         return 0.0
@@ -181,29 +187,32 @@ def error_px(metres: float, stretch: Stretch, w: float) -> float:
 
 
 def _stretch(first: F64, second: F64) -> float:
-    """Return the largest factor by which the matrix of two rows (3,) makes a vector longer."""
+    """Return the largest singular value of the matrix with rows `first` and `second` (3,)."""
     a, b, c = float(first @ first), float(second @ second), float(first @ second)
     return math.sqrt((a + b) / 2.0 + math.hypot((a - b) / 2.0, c))
 
 
 def cheapest_within(errors_px: Sequence[float], budget_px: float) -> int:
-    """Return the index of the level with the least work whose error is within the budget; otherwise the last index."""
+    """Return the first index whose error is within the budget, or the last index if there is none.
+
+    `errors_px`: error of each level, the level with the least work first.
+    """
     return next((level for level, error in enumerate(errors_px) if error <= budget_px), len(errors_px) - 1)
 
 
-#: top, left, height, width in tensor pixels.
+#: A rectangle in a tensor: top, left, height, width in tensor pixels.
 Cell = tuple[int, int, int, int]
 
-#: Background between two avatars, tensor pixels: at this distance the default network paints each as if the other were
-#: not there. Measured by `trilane bench several`; the numbers are in docs/decisions/several-avatars.md.
+#: Least background between two avatars, tensor pixels. At this distance, the default network paints each avatar as if
+#: the other were not there. Measured by `trilane bench several`; figures are in docs/decisions/several-avatars.md.
 MARGIN_PX = 16
 
 
 @dataclass(frozen=True)
 class TensorLayout:
-    """A layout.
+    """The places of the avatars in a tensor.
 
-    `shape`: (height, width) of the tensor. `crops`: crop rectangle and cell of each avatar.
+    `shape`: (height, width) of the tensor. `crops`: crop rectangle and cell of each avatar, in the avatars' order.
     """
 
     shape: Shape
@@ -212,7 +221,7 @@ class TensorLayout:
 
 @dataclass(frozen=True)
 class DenseLayout:
-    """A layout, and its `density`: tensor pixels for one pixel of the picture, along a side."""
+    """A layout and its `density`: the number of tensor pixels per picture pixel, along a side."""
 
     layout: TensorLayout
     density: float
@@ -220,9 +229,10 @@ class DenseLayout:
 
 @dataclass(frozen=True)
 class _Arrangement:
-    """An arrangement of the avatars in rows.
+    """An arrangement of the avatars in the rows of a tensor.
 
-    `rows`: numbers of the avatars, row by row, in a tensor of `shape`. `scale`: tensor pixels for one output pixel.
+    `shape`: (height, width) of the tensor. `rows`: indices of the avatars in each row. `scale`: number of tensor pixels
+    per picture pixel, along a side.
     """
 
     shape: Shape
@@ -231,7 +241,7 @@ class _Arrangement:
 
 
 def lay_out(rects: Sequence[Rect], output: Shape, buckets: Sequence[Shape], margin_px: int = MARGIN_PX) -> TensorLayout:
-    """Place the visible avatars in one tensor; margins shrink where it is too small for them.
+    """Return the layout of the visible avatars in one tensor; margins shrink if the tensor is too small for them.
 
     `rects`: the avatars' mesh rectangles on the screen, at least one.
     `output`: (height, width) of the picture in pixels.
@@ -254,10 +264,12 @@ def lay_out(rects: Sequence[Rect], output: Shape, buckets: Sequence[Shape], marg
 def lay_out_at(
     rects: Sequence[Rect], output: Shape, shape: Shape, most_density: float = 1.0, margin_px: int = MARGIN_PX
 ) -> DenseLayout | None:
-    """Place the visible avatars in a tensor of `shape`, no denser than `most_density`; None without room for all.
+    """Return the layout of the visible avatars in a tensor of `shape`; None if there is no room for all.
 
     `rects`: the avatars' mesh rectangles on the screen, at least one; each is widened to whole pixels of the picture.
     `output`: (height, width) of the picture in pixels.
+    `shape`: (height, width) of the tensor.
+    `most_density`: largest density of the layout.
     `margin_px`: background between two avatars, tensor pixels.
     """
     whole = [on_grid(rect, output) for rect in rects]
@@ -275,18 +287,18 @@ def lay_out_at(
 
 
 def by_network(networks: Sequence[int]) -> list[list[int]]:
-    """Return the places of the avatars of each network. `networks`: network of each avatar in view."""
+    """Return a list of the avatars' indices for each network. `networks`: number of each visible avatar's network."""
     return [[place for place, one in enumerate(networks) if one == network] for network in sorted(set(networks))]
 
 
 def apart(
     rects: Sequence[Rect], networks: Sequence[int], lay: Callable[[Sequence[Rect]], DenseLayout | None]
 ) -> DenseLayout | None:
-    """Place the avatars of each network in a tensor of its own; None where one of them has no room.
+    """Return a layout with a separate tensor for the avatars of each network; None if the avatars of any do not fit.
 
-    `rects`, `networks`: mesh rectangle and network of each visible avatar.
-    `lay`: lays out the avatars of one network, always in a tensor of the same shape. The least density of these tensors
-    counts.
+    `rects`, `networks`: mesh rectangle of each visible avatar, and number of its network.
+    `lay`: lays out the avatars of one network, always in a tensor of one shape.
+    The density of the result is the least density of these tensors.
     """
     groups = by_network(networks)
     found = [lay([rects[place] for place in places]) for places in groups]
@@ -305,10 +317,10 @@ def apart(
 def lay_out_apart(
     rects: Sequence[Rect], networks: Sequence[int], output: Shape, buckets: Sequence[Shape]
 ) -> TensorLayout:
-    """Place the visible avatars as `lay_out` does; each network has a tensor of its own.
+    """Return a layout as `lay_out` does, but with a separate tensor for the avatars of each network.
 
-    All tensors have the shape in which the least dense one is densest.
-    `networks`: network of each avatar. The other parameters and the errors are those of `lay_out`.
+    All tensors have the same shape: the bucket that gives the least dense tensor the highest density.
+    `networks`: number of each avatar's network. The other parameters and the errors are those of `lay_out`.
     """
     if len(set(networks)) == 1:
         return lay_out(rects, output, buckets)
@@ -335,10 +347,10 @@ def _no_room(rects: Sequence[Rect], buckets: Sequence[Shape]) -> BadInputError:
 
 
 def tight_shape(rects: Sequence[Rect], output: Shape, density: float = 1.0, margin_px: int = MARGIN_PX) -> Shape:
-    """Return the shape of least area, sides in multiples of `BUCKET_STEP`, with room for the avatars at `density`.
+    """Return the shape of least area with room for the avatars at `density`; sides are multiples of `BUCKET_STEP`.
 
-    For several avatars, no arrangement is longer than `MOST_ASPECT` times its width, unless all are. The parameters are
-    those of `lay_out_at`.
+    For several avatars, shapes whose longer side exceeds `MOST_ASPECT` times the shorter side are taken only if all
+    arrangements have such shapes. The other parameters are those of `lay_out_at`.
     """
     whole = [_pixels(on_grid(rect, output), output) for rect in rects]
     sizes = [(math.ceil(height * density), math.ceil(width * density)) for height, width in whole]
@@ -349,33 +361,39 @@ def tight_shape(rects: Sequence[Rect], output: Shape, density: float = 1.0, marg
 
 
 def _pixels(rect: Rect, output: Shape) -> tuple[int, int]:
-    """Return height and width of a rectangle on the grid."""
+    """Return (height, width) in pixels of a rectangle on the pixel grid of a picture of `output`."""
     return round(rect.height * output[0] / 2), round(rect.width * output[1] / 2)
 
 
 def _extent(sizes: Sequence[tuple[int, int]], rows: Sequence[Sequence[int]], margin: int) -> Shape:
-    """Return the extent of `rows`; a pixel of each side is reserved for rounding up, as in `_scale`."""
+    """Return the least tensor shape for `rows`; one pixel per row and per avatar is reserved, as in `_scale`.
+
+    `sizes`: (height, width) of each avatar in tensor pixels. `margin`: background between avatars, tensor pixels.
+    """
     height = sum(max(sizes[k][0] for k in row) for row in rows) + margin * (len(rows) - 1) + len(rows)
     width = max(sum(sizes[k][1] for k in row) + margin * (len(row) - 1) + len(row) for row in rows)
     return _whole_steps(height), _whole_steps(width)
 
 
 def _whole_steps(side: int) -> int:
-    """Round `side` up to a multiple of `BUCKET_STEP`."""
+    """Return `side` rounded up to a multiple of `BUCKET_STEP`."""
     return -(-side // BUCKET_STEP) * BUCKET_STEP
 
 
 def _arrangements(
     sizes: Sequence[tuple[float, float]], buckets: Sequence[Shape], margin: int
 ) -> Iterator[_Arrangement]:
-    """Yield the avatars' arrangements, tallest first, in each bucket: one row, two rows, up to a row for each."""
+    """Yield the avatars' arrangements in each bucket: in one row, in two rows, and so on up to one row per avatar.
+
+    `sizes`: (height, width) of each avatar in picture pixels. `margin`: background between avatars, tensor pixels.
+    """
     for rows in _rows(sizes):
         for shape in buckets:
             yield _Arrangement(shape, rows, _scale(sizes, shape, rows, margin))
 
 
 def _rows(sizes: Sequence[tuple[float, float]]) -> Iterator[tuple[tuple[int, ...], ...]]:
-    """Yield the avatars' numbers, tallest first, in one row, in two, and so on."""
+    """Yield the avatars' indices, tallest avatar first, divided into one row, two rows, and so on."""
     order = sorted(range(len(sizes)), key=lambda k: -sizes[k][0])
     for count in range(1, len(order) + 1):
         each = math.ceil(len(order) / count)
@@ -383,7 +401,10 @@ def _rows(sizes: Sequence[tuple[float, float]]) -> Iterator[tuple[tuple[int, ...
 
 
 def _scale(sizes: Sequence[tuple[float, float]], shape: Shape, rows: Sequence[Sequence[int]], margin: int) -> float:
-    """Return the largest scale at which all rows fit; one pixel of each side is reserved for rounding up."""
+    """Return the largest scale at which `rows` fit in `shape`, the number of tensor pixels per picture pixel.
+
+    One pixel per row and per avatar is reserved for rounding up. The other parameters are those of `_arrangements`.
+    """
     high = (shape[0] - margin * (len(rows) - 1) - len(rows)) / sum(max(sizes[k][0] for k in row) for row in rows)
     wide = ((shape[1] - margin * (len(row) - 1) - len(row)) / sum(sizes[k][1] for k in row) for row in rows)
     return min(high, *wide)
@@ -392,7 +413,10 @@ def _scale(sizes: Sequence[tuple[float, float]], shape: Shape, rows: Sequence[Se
 def _crops(
     rects: Sequence[Rect], sizes: Sequence[tuple[float, float]], output: Shape, arrangement: _Arrangement, margin: int
 ) -> tuple[tuple[Rect, Cell], ...]:
-    """Return crop rectangle and cell of each avatar, in the order of `rects`."""
+    """Return crop rectangle and cell of each avatar, in the order of `rects`.
+
+    `sizes`: (height, width) of each avatar in picture pixels. `margin`: background between avatars, tensor pixels.
+    """
     placed: dict[int, tuple[Rect, Cell]] = {}
     top = 0
     for row in arrangement.rows:

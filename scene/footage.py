@@ -1,11 +1,12 @@
-"""A background that the user brings: its order and times, and the camera that filmed it.
+"""A background that the user brings: the order and times of its pictures, and the camera that filmed it.
 
-A recorded camera counts as the one that filmed the background: both begin together and start again together, and the
-camera's picture is cut as the background is. Photos that the camera's file names belong to their views.
+A recorded camera counts as the camera that filmed the background. Camera and background begin together and repeat
+together, and the camera's picture is cut in the same way as the background. If the camera's file names photos of the
+background, each photo is shown with its own pose.
 
-Pictures of a folder follow each other by name, with numbers compared as numbers. Names that differ in a single number
-are the frames of a film, and the number is their time. While a frame is missing, the picture before it is shown. Names
-that are times, as in robots' data sets, are used as they are.
+Pictures of a folder follow each other by name, with numbers compared as numbers. If the names differ only in one
+number, the pictures are the frames of a film, and the number gives each frame's time. While a frame is missing, the
+picture before it is shown. Names that are times, as in robots' data sets, give the times directly.
 """
 
 from __future__ import annotations
@@ -26,15 +27,17 @@ from numpy.typing import NDArray
 from trilane.arrays import Shape
 from trilane.scene.camera.path import CameraPath, Optics
 from trilane.scene.lens import Known, Lens, cover
+from trilane.scene.recordings import natural
 from trilane.scene.rotations import quat_from_matrix
 
-#: Least share of a film's neighbours that are one step apart, and most frames for each picture; else the numbers are
-#: not times.
+#: Numbers in names are times only if the share LEAST_IN_STEP of neighbours is one step apart, and the film has fewer
+#: than MOST_MISSING frames per picture.
 LEAST_IN_STEP, MOST_MISSING = 0.5, 4
 NAMED_GAPS = 3
-#: A step between times above so many usual ones is a gap.
+#: A step between times is a gap if it is longer than this many usual steps.
 GAP = 1.5
-#: Patterns of names that are times since 1970, and their unit in seconds; and their range, the years 2001 to 2100.
+#: Patterns of names that are times since 1970, with their unit in seconds; and the range of such times, the years 2001
+#: to 2100.
 CLOCKS = {r"\d{10}\.\d{1,9}": 1.0, r"\d{13}": 1e-3, r"\d{16}": 1e-6, r"\d{19}": 1e-9}
 EARLIEST_S, LATEST_S = 1e9, 4.1e9
 ROUNDING_S = 1e-6
@@ -45,9 +48,10 @@ LAST_NUMBER = re.compile(r"(.*?)(\d{1,15})(\D*)\Z", re.DOTALL)
 class Film:
     """The times of a folder's pictures.
 
-    `times_s`: time at which each picture is first shown, from 0. `period_s`: time after which the film starts again.
-    `rate`: rate of the pictures, and the missing ones, for people. `began_s`: time of the first one, seconds since
-    1970; None where names do not say it.
+    `times_s`: time at which each picture is first shown, from 0.
+    `period_s`: time after which the film starts again.
+    `rate`: notes on the rate of the pictures and on missing pictures.
+    `began_s`: time of the first picture, seconds since 1970; None where names do not state it.
     """
 
     times_s: tuple[float, ...]
@@ -56,21 +60,20 @@ class Film:
     began_s: float | None = None
 
     def number_at(self, time_s: float) -> int:
-        """Return the number of the picture that is shown at `time_s`."""
+        """Return the index of the picture that is shown at `time_s`."""
         return bisect_right(self.times_s, (time_s + ROUNDING_S) % self.period_s) - 1
 
 
 def in_order(names: Sequence[str]) -> list[str]:
-    """Return the file names `names` in order."""
-    return sorted(names, key=lambda name: ([_part(part) for part in re.split(r"(\d+)", name)], name))
-
-
-def _part(text: str) -> tuple[int, str]:
-    return (int(text), "") if text.isdecimal() else (-1, text)
+    """Return file names in their order, with numbers compared as numbers: `img9` before `img10`."""
+    return sorted(names, key=lambda name: (natural(name), name))
 
 
 def film_of(names: Sequence[str], fps: float) -> Film:
-    """Return the film of the pictures `names`, at least one, in order; numbered ones follow each other at `fps`."""
+    """Return the times of a folder's pictures.
+
+    `names`: file names in order, at least one. `fps`: rate of numbered pictures; ignored if the names are times.
+    """
     clock = _clock(names)
     if clock:
         return _film_by_clock(clock)
@@ -83,7 +86,10 @@ def film_of(names: Sequence[str], fps: float) -> Film:
 
 
 def _clock(names: Sequence[str]) -> list[float]:
-    """Return the increasing times of the names, seconds since 1970; none for a single picture, or other names."""
+    """Return the times that the names state, seconds since 1970.
+
+    The list is empty for one picture, for other names, and for times that do not increase.
+    """
     stems = [name.rpartition(".")[0] for name in names]
     for pattern, unit in CLOCKS.items():
         times = [float(stem) * unit for stem in stems if re.fullmatch(pattern, stem)]
@@ -104,7 +110,7 @@ def _film_by_clock(clock: Sequence[float]) -> Film:
 
 
 def _numbers(names: Sequence[str]) -> list[int]:
-    """Return the number in each of `names`, when they differ in nothing else but their endings; else no numbers."""
+    """Return the last number in each name, or [] if the names differ in more than that number and their endings."""
     parts = [LAST_NUMBER.match(name.rpartition(".")[0]) for name in names]
     found = [part for part in parts if part]
     if len(found) < len(names) or len({(part[1], part[3]) for part in found}) > 1:
@@ -113,7 +119,7 @@ def _numbers(names: Sequence[str]) -> list[int]:
 
 
 def _step(numbers: Sequence[int]) -> int:
-    """Return the step from one frame to the next; 0 when `numbers` are no film's."""
+    """Return the step of `numbers` from one frame to the next; 0 if the numbers are not those of a film."""
     steps = Counter(later - earlier for earlier, later in pairwise(numbers))
     if not steps:
         return 0
@@ -133,11 +139,11 @@ def _missing(numbers: Sequence[int], step: int) -> str:
     return f"{count} numbers missing ({', '.join(named)}{more}): the picture before is held"
 
 
-#: A note says it when the lengths of camera and background differ by more than this share.
+#: If the lengths of camera and background differ by more than this share, a note says it.
 LIKE_LENGTH = 0.05
-#: Shapes whose aspects differ by more than this are different.
+#: Two shapes differ if the ratio of their aspects is off 1 by this or more.
 LIKE_ASPECT = 0.01
-#: A camera that moves farther than this does not fit a picture that stands still.
+#: A camera that moves farther than this, metres, does not fit a picture that stands still.
 STILL_M = 0.05
 NAMED = 3
 
@@ -146,28 +152,30 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Stored:
-    """A picture, or the frames of a video.
+    """A picture, or the frames of a video, as stored in a file.
 
-    `shape`: (height, width) of its pixels as stored, with square pixels. `turned`: number of quarters by which they are
-    to be turned clockwise, as the file says.
+    `shape`: (height, width) of the stored pixels, scaled to square pixels. `turned`: number of quarter turns clockwise
+    that the file prescribes for display.
     """
 
     shape: Shape
     turned: int = 0
 
     def shown(self, turned: int | None = None) -> Shape:
-        """Return (height, width) after a turn by `turned` quarters, or as the file says."""
+        """Return (height, width) after `turned` quarter turns, or after those that the file prescribes if None."""
         return self.shape[::-1] if (self.turned if turned is None else turned) % 2 else self.shape
 
 
 @dataclass(frozen=True)
 class Footage:
-    """A background.
+    """A background that the user brings.
 
-    `what`: description for people. `rate`: rate at which its frames follow each other, for people. `stored`: the video
-    or the picture; for a folder, each of its pictures. `files`: names of pictures, in the order of `stored`; none for a
-    video. `folder`: folder of the files. `period_s`: time after which it starts again; 0 for a single picture.
-    `clock_s`: time of each picture, seconds since 1970, increasing; none where names do not say it.
+    `what`, `rate`: notes on what it is and on its frame rate.
+    `stored`: the video or the picture; for a folder, each of its pictures.
+    `files`: file names of the pictures, in the order of `stored`; empty for a video.
+    `folder`: folder of the files.
+    `period_s`: time after which the background starts again; 0 for a single picture.
+    `clock_s`: time of each picture, seconds since 1970, increasing; empty where names do not state it.
     """
 
     what: tuple[str, ...]
@@ -180,9 +188,9 @@ class Footage:
 
 
 def filmed(path: CameraPath, footage: Footage | None, output: Shape) -> tuple[CameraPath, tuple[str, ...]]:
-    """Return `path` as the camera that filmed `footage`, and notes on the background; None is a drawn one.
+    """Return `path` as the camera that filmed `footage`, and notes on the background.
 
-    `output`: (height, width) of the picture that is shown.
+    `footage`: None for a drawn background. `output`: (height, width) of the shown picture.
     """
     if footage is None:
         return path, ()
@@ -205,7 +213,12 @@ def filmed(path: CameraPath, footage: Footage | None, output: Shape) -> tuple[Ca
 def _over_all(
     path: CameraPath, footage: Footage, output: Shape, notes: tuple[str, ...]
 ) -> tuple[CameraPath, tuple[str, ...]]:
-    """Handle a video, a picture, or pictures unrelated to single poses, whose first one stands for all."""
+    """Return the camera that filmed the whole footage, and the notes on the background.
+
+    The footage is a video, a picture, or pictures that are not matched to poses; the first picture's shape stands for
+    all.
+    `notes`: earlier notes. The other parameters are those of `filmed`.
+    """
     camera, turn_notes = _turned(path, footage.stored[:1])
     camera = replace(camera, repeat_s=footage.period_s)
     return camera, (
@@ -221,14 +234,18 @@ def _over_all(
 
 
 def _turned(path: CameraPath, stored: tuple[Stored, ...]) -> tuple[CameraPath, tuple[str, ...]]:
-    """Turn `path` so that camera and picture agree over `stored`, one for all samples or one for each."""
+    """Return `path` with the shape of each picture and its quarter turns for display, and notes.
+
+    The quarter turns make the pictures agree with the camera. `stored`: one picture for all samples of the path, or one
+    for each.
+    """
     lenses = path.optics.lenses
     turns = tuple(
         _turn(lenses[k % len(lenses)], path.quarter, one, is_own=path.is_held) for k, one in enumerate(stored)
     )
     shapes = tuple(one.shown(turned) for one, turned in zip(stored, turns, strict=True))
     differ = sum((one.turned - turned) % 4 != 0 for one, turned in zip(stored, turns, strict=True))
-    as_files_say = not differ and not path.is_held  # its turn may mirror, and differs by picture
+    as_files_say = not differ and not path.is_held  # what its file prescribes may also mirror, and differs by photo
     optics = replace(path.optics, filmed=_once(shapes), turned=() if as_files_say else _once(turns))
     said = f" ({differ} of {len(stored)})" if len(stored) > 1 else ""
     note = (f"turned with the camera's picture, and not as the file says{said}",) if differ else ()
@@ -236,11 +253,12 @@ def _turned(path: CameraPath, stored: tuple[Stored, ...]) -> tuple[CameraPath, t
 
 
 def _turn(lens: Lens, quarter: int, stored: Stored, is_own: bool) -> int:
-    """Return the quarters by which `stored` is turned clockwise to be seen through `lens`.
+    """Return the number of quarter turns clockwise after which `stored` is seen upright through `lens`.
 
-    `quarter`: turn of the lens. A photo that the camera's file measured (`is_own`) was measured as stored, or as its
-    file says, whichever has the shape of the lens. Any other file is believed, with one exception: its pixels have the
-    shape of a measured lens, but as shown it lies across that lens.
+    `quarter`: quarter turns of the lens. `is_own`: whether the camera's file measured the lens on this photo. Such a
+    photo was measured either as stored or as its file displays it; the shape of the lens decides. For any other photo,
+    its file's turn holds, with one exception: the stored pixels have the shape of a measured lens, but lie across it
+    when displayed.
     """
     measured = lens.turned(-quarter)
     if is_own and lens.known is Known.ALL:
@@ -251,13 +269,18 @@ def _turn(lens: Lens, quarter: int, stored: Stored, is_own: bool) -> int:
 
 
 def _once(values: tuple[T, ...]) -> tuple[T, ...]:
+    """Return `values`, reduced to a single one if all are equal."""
     return values[:1] if len(set(values)) == 1 else values
 
 
 def _with_photos(
     path: CameraPath, footage: Footage
 ) -> tuple[tuple[CameraPath, tuple[Stored, ...]] | None, tuple[str, ...]]:
-    """Return `path` without the poses whose photo is missing, and the other photos; None when all are missing."""
+    """Match the poses of `path` to photos of `footage` by name.
+
+    Return the path without the poses whose photo is missing, with the matching photos, and notes; None in place of path
+    and photos if no photo matches.
+    """
     if not path.pictures or not footage.files:
         return None, ()
     places = _matches(path.pictures, footage)
@@ -287,7 +310,11 @@ def _with_photos(
 def _by_clock(
     path: CameraPath, footage: Footage
 ) -> tuple[tuple[CameraPath, tuple[Stored, ...]], tuple[str, ...]] | None:
-    """Return `path` at the times of the pictures taken during it, and these; None where the clocks do not meet."""
+    """Match the pictures of `footage` to times of `path` by their clocks.
+
+    Return the path sampled at the times of the pictures that were taken during it, with those pictures, and notes. None
+    if there are no such pictures.
+    """
     if path.began_s is None:
         return None
     times = np.array(footage.clock_s) - path.began_s
@@ -313,14 +340,15 @@ def _by_clock(
 
 
 def _of_samples(optics: Optics, kept: NDArray[np.intp]) -> Optics:
+    """Return `optics` with only the lenses of the samples with indices `kept`."""
     return optics if len(optics.lenses) == 1 else replace(optics, lenses=tuple(optics.lenses[k] for k in kept))
 
 
 def _matches(names: tuple[str, ...], footage: Footage) -> Mapping[int, int]:
-    """Return the number of the folder's file for each of the `names` that has one.
+    """Return {index in `names`: index of the file in the footage's folder} for each name that has a file.
 
-    Names are compared without their folders. Endings are ignored where one has none or another one. Where files of
-    several folders have the same name, only those whose folder is called like this one count.
+    Names are compared without their folders; endings need not match. If several names are equal without their folders,
+    only those count whose folder has the name of the footage's folder.
     """
     paths = [PurePosixPath(name.replace("\\", "/")) for name in names]
     if len({one.name for one in paths}) < len(paths):
@@ -339,7 +367,7 @@ def _loop(footage: Footage) -> str:
 
 
 def cut_note(shapes: tuple[Shape, ...] | list[Shape], output: Shape) -> str:
-    """Say what part of pictures of `shapes` is not shown when they cover `output`."""
+    """Return a note on what part of pictures of `shapes` is cut off when they cover `output`; all (height, width)."""
     height, width = output
     cuts = {_cut(shape, output) for shape in shapes}
     how = cuts.pop() if len(cuts) == 1 else "cut according to their shapes"
@@ -356,7 +384,7 @@ def _cut(shape: Shape, output: Shape) -> str:
 
 
 def _shape_notes(path: CameraPath) -> tuple[str, ...]:
-    """Say what does not fit between the camera's lens and the background that it is said to have filmed."""
+    """Return a note if the camera's lens does not fit the background that it is said to have filmed."""
     lens, shape = path.optics.lenses[0], path.optics.filmed[0]
     if lens.lies_across(shape):
         held, lies = ("upright", "lies") if lens.height_px > lens.width_px else ("level", "stands")
@@ -370,7 +398,7 @@ def _shape_notes(path: CameraPath) -> tuple[str, ...]:
 
 
 def _is_like(lens: Lens, shape: Shape) -> bool:
-    """Return whether a picture of `shape` (height, width) has the aspect of the lens's."""
+    """Return whether a picture of `shape` (height, width) has nearly the aspect ratio of the lens's picture."""
     return abs(lens.width_px * shape[0] / (lens.height_px * shape[1]) - 1) < LIKE_ASPECT
 
 

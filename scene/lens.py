@@ -1,9 +1,9 @@
-"""A pinhole lens as pixels of the picture that it makes, and the effect of scaling, cutting and turning that picture.
+"""A pinhole lens in pixels of its picture, and what scaling, cutting and turning the picture does to the lens.
 
-Whatever is done to a picture is done to its lens by the method of the same name, so a point of the world stays on its
-pixel. Pixels are counted from the picture's top left corner, x to the right and y down: the centre of the first pixel
-is at (0.5, 0.5), as in COLMAP (https://colmap.github.io/cameras.html). `of_opencv` is for formats that count from that
-centre.
+When a picture is scaled, cut or turned, the lens's method of that name does the same to the lens. A point of the world
+then stays on its pixel. Pixel coordinates start at the picture's top left corner, x to the right and y down: the centre
+of the first pixel is (0.5, 0.5), as in COLMAP (https://colmap.github.io/cameras.html). `of_opencv` is for formats that
+count from the centre of the first pixel.
 
 Pictures are drawn without distortion. `distortion_note` says how far distortion would move points of the picture's
 border, by the models of OpenCV and COLMAP. A person can then judge whether it matters.
@@ -23,14 +23,14 @@ import numpy as np
 from trilane.arrays import F64, Shape
 from trilane.errors import BadInputError
 
-#: Size of the picture of a lens for which only an angle is known.
+#: Size of the picture of a lens of which only an angle is known.
 ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX = 640.0, 480.0
 
 
 class Known(Enum):
-    """What is known of a lens: all of it, or the angle over one side of a picture whose shape is not known.
+    """What is known of a lens: everything (ALL), or only the angle over one side of a picture of unknown shape.
 
-    LONG: the angle over the longer side, whether that side lies or stands.
+    LONG is the longer side of the picture, whichever that is.
     """
 
     ALL = "all"
@@ -39,12 +39,12 @@ class Known(Enum):
     LONG = "long"
 
 
-#: What is known of a lens after its picture is turned by a quarter.
+#: What is known of a lens after a quarter turn of its picture.
 TURNED = {**{known: known for known in Known}, Known.WIDTH: Known.HEIGHT, Known.HEIGHT: Known.WIDTH}
 
 
 class PictureCut(NamedTuple):
-    """How a picture is cut: it is scaled to `height` x `width`, then loses its first `top` rows and `left` columns."""
+    """A way to cut a picture: scale it to `height` x `width`, then remove its first `top` rows and `left` columns."""
 
     height: int
     width: int
@@ -53,9 +53,9 @@ class PictureCut(NamedTuple):
 
 
 def cover(picture: Shape, output: Shape) -> PictureCut:
-    """Return how `picture` covers `output`, both (height, width).
+    """Return how `picture` is cut to cover `output`, both (height, width).
 
-    It is scaled until no border is left; the overhang is cut equally.
+    The picture is scaled until it leaves no border; the overhang is cut equally at both ends.
     """
     scale = max(output[0] / picture[0], output[1] / picture[1])
     height, width = (max(side, round(full * scale)) for side, full in zip(output, picture, strict=True))
@@ -66,7 +66,7 @@ def cover(picture: Shape, output: Shape) -> PictureCut:
 class Lens:
     """A lens without distortion: x = `cx` + `fx` X / Z, y = `cy` + `fy` Y / Z, with Y down and Z ahead.
 
-    All numbers are in pixels of a picture of `width_px` x `height_px`. `known`: what is known of the lens.
+    `width_px`, `height_px`: size of the picture. All numbers are in its pixels. `known`: what is known of the lens.
     """
 
     width_px: float
@@ -78,7 +78,7 @@ class Lens:
     known: Known = Known.ALL
 
     def lies_across(self, picture: Shape) -> bool:
-        """Return whether one of the lens's picture and `picture` (height, width) is upright and the other one wide."""
+        """Return whether one of the lens's picture and `picture` (height, width) is upright and the other is wide."""
         is_known = self.known in (Known.ALL, Known.LONG)
         return is_known and (self.height_px - self.width_px) * (picture[0] - picture[1]) < 0
 
@@ -93,7 +93,7 @@ class Lens:
         return math.degrees(math.atan(self.cx / self.fx) + math.atan((self.width_px - self.cx) / self.fx))
 
     def scaled(self, width_px: float, height_px: float) -> Lens:
-        """Return the lens of the picture scaled to `width_px` x `height_px`."""
+        """Return the lens after its picture is scaled to `width_px` x `height_px`."""
         x, y = width_px / self.width_px, height_px / self.height_px
         return replace(
             self,
@@ -106,11 +106,14 @@ class Lens:
         )
 
     def cropped(self, x: float, y: float, width_px: float, height_px: float) -> Lens:
-        """Return the lens of a part of `width_px` x `height_px`; its corner (`x`, `y`) may be outside the picture."""
+        """Return the lens of a part of the picture, of `width_px` x `height_px` pixels.
+
+        (`x`, `y`): top left corner of the part, which may be outside the picture.
+        """
         return replace(self, width_px=width_px, height_px=height_px, cx=self.cx - x, cy=self.cy - y)
 
     def turned(self, quarters: int) -> Lens:
-        """Return the lens of the picture turned clockwise by `quarters` of 90 degrees."""
+        """Return the lens after its picture is turned clockwise by `quarters` quarter turns."""
         lens = self
         for _ in range(quarters % 4):
             lens = Lens(
@@ -119,10 +122,11 @@ class Lens:
         return lens
 
     def onto(self, picture: Shape) -> Lens:
-        """Return the lens of `picture` (height, width), which it made.
+        """Return the lens in pixels of `picture` (height, width), which was made with this lens.
 
-        A picture of another shape than the lens's counts as cut equally at both sides, by its sensor or later. A lens
-        whose shape is not known takes the picture's, with square pixels and the angle that is known.
+        If the picture has another shape than the lens's picture, it counts as cut equally at both sides. If the shape
+        of the lens's picture is unknown, the lens takes over the shape of `picture`, with square pixels and the known
+        angle.
         """
         height, width = float(picture[0]), float(picture[1])
         if self.known is not Known.ALL:
@@ -137,19 +141,25 @@ class Lens:
         return whole.cropped((whole.width_px - width) / 2, (whole.height_px - height) / 2, width, height)
 
     def covering(self, output: Shape) -> Lens:
-        """Return the lens of the picture cut by `cover` to `output` (height, width); the picture has whole pixels."""
+        """Return the lens after its picture is scaled and cut to cover `output` (height, width).
+
+        The size of the lens's picture is rounded to whole pixels.
+        """
         cut = cover((round(self.height_px), round(self.width_px)), output)
         return self.scaled(cut.width, cut.height).cropped(cut.left, cut.top, output[1], output[0])
 
     def filling_height(self, output: Shape) -> Lens:
-        """Return the lens of a drawing of `output` (height, width) as high as the picture; its width may differ."""
+        """Return the lens of a drawing of `output` (height, width) with the picture's vertical field of view.
+
+        Its horizontal field of view may be wider or narrower than the picture's.
+        """
         height, width = output
         scale = height / self.height_px
         whole = self.scaled(self.width_px * scale, height)
         return whole.cropped((whole.width_px - width) / 2, 0.0, width, height)
 
     def between(self, other: Lens, fraction: float) -> Lens:
-        """Return the lens at `fraction` between this one, at 0, and `other`, at 1, whose picture has the same size."""
+        """Return the lens at `fraction` of the way from this lens to `other`, whose picture has the same size."""
 
         def mix(a: float, b: float) -> float:
             return a + (b - a) * fraction
@@ -158,10 +168,10 @@ class Lens:
         return replace(self, fx=fx, fy=fy, cx=mix(self.cx, other.cx), cy=mix(self.cy, other.cy))
 
     def projection(self, near_m: float, far_m: float) -> F64:
-        """Return the OpenGL clip matrix (4, 4) of a camera with y up, looking along -Z.
+        """Return the OpenGL clip matrix (4, 4) of a camera with y up that looks along -Z.
 
-        `near_m`, `far_m`: distances of the clip planes. x / w = 2 (cx + fx X / -Z) / width - 1, and y / w = 1 - 2 (cy -
-        fy Y / -Z) / height.
+        `near_m`, `far_m`: distances of the clip planes. In NDC, x / w = 2 (cx + fx X / -Z) / width - 1 and y / w = 1 -
+        2 (cy - fy Y / -Z) / height.
         """
         depth = near_m - far_m
         return np.array(
@@ -175,35 +185,35 @@ class Lens:
 
 
 def centred(width_px: float, height_px: float, focal_px: float, known: Known = Known.ALL) -> Lens:
-    """Return a lens with square pixels whose principal point is the middle of its picture."""
+    """Return a lens with square pixels, whose principal point is the middle of its picture."""
     return Lens(width_px, height_px, focal_px, focal_px, width_px / 2, height_px / 2, known)
 
 
 def of_opencv(width_px: float, height_px: float, fx: float, fy: float, cx: float, cy: float) -> Lens:
-    """Return a lens whose principal point is counted from the centre of the first pixel, as OpenCV and Kalibr do."""
+    """Return a lens from numbers of OpenCV or Kalibr, which count `cx` and `cy` from the centre of the first pixel."""
     return Lens(width_px, height_px, fx, fy, cx + 0.5, cy + 0.5)
 
 
 def of_fov_y(fov_y_deg: float) -> Lens:
-    """Return a lens by its field of view over the picture's height, degrees."""
+    """Return a lens of which only the field of view over the picture's height is known, degrees."""
     focal = ASSUMED_HEIGHT_PX / 2 / math.tan(math.radians(fov_y_deg) / 2)
     return centred(ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX, focal, Known.HEIGHT)
 
 
 def of_fov_x(fov_x_deg: float) -> Lens:
-    """Return a lens by its field of view over the picture's width, degrees."""
+    """Return a lens of which only the field of view over the picture's width is known, degrees."""
     focal = ASSUMED_WIDTH_PX / 2 / math.tan(math.radians(fov_x_deg) / 2)
     return centred(ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX, focal, Known.WIDTH)
 
 
 LEAST_FOV_DEG, MOST_FOV_DEG = 1.0, 170.0
-LEAST_SIDE_PX, MOST_SIDE_PX = 1.0, 1e6  # of a side of the picture
+LEAST_SIDE_PX, MOST_SIDE_PX = 1.0, 1e6
 
 
 def checked_lens(where: str | Path, lens: Lens) -> Lens:
-    """Return `lens` if its picture and its angles are plausible; else raise BadInputError about `where`.
+    """Return `lens` if its picture and its angles are plausible. Raises BadInputError about `where` otherwise.
 
-    Each side has LEAST_SIDE_PX to MOST_SIDE_PX pixels and spans LEAST_DEG to MOST_DEG degrees.
+    Each side has LEAST_SIDE_PX to MOST_SIDE_PX pixels and spans LEAST_FOV_DEG to MOST_FOV_DEG degrees.
     """
     if not LEAST_SIDE_PX <= min(lens.width_px, lens.height_px) <= max(lens.width_px, lens.height_px) <= MOST_SIDE_PX:
         found = f"a picture of {lens.width_px:.4g}x{lens.height_px:.4g} pixels"
@@ -217,12 +227,15 @@ def checked_lens(where: str | Path, lens: Lens) -> Lens:
 
 #: Number of points along each side of the border.
 BORDER_STEPS = 9
-#: Displacements below this are not worth a note.
+#: Displacements below this, pixels, are not worth a note.
 LEAST_BEND_PX = 0.5
 
 
 def measured_lens(where: str | Path, width_px: float, height_px: float, numbers: F64) -> Lens:
-    """Return the lens of a file's fx, fy, cx and cy, in pixels. Raises BadInputError about `where` for no lens."""
+    """Return the lens of a file. `numbers` (4,): fx, fy, cx, cy in pixels of a picture of `width_px` x `height_px`.
+
+    Raises BadInputError about `where` when the numbers are not those of a lens.
+    """
     if not (np.isfinite(numbers).all() and (numbers > 0).all()):
         raise BadInputError(where, "a lens whose numbers are not all positive", "fx, fy, cx and cy in pixels")
     fx, fy, cx, cy = (float(value) for value in numbers)
@@ -230,7 +243,7 @@ def measured_lens(where: str | Path, width_px: float, height_px: float, numbers:
 
 
 class Bent(NamedTuple):
-    """A lens and the `parameters` k1 to k6, p1 and p2 of its distortion."""
+    """A lens with distortion. `parameters`: values of k1 to k6, p1 and p2, by name; missing parameters are 0."""
 
     lens: Lens
     parameters: Mapping[str, float]
@@ -238,7 +251,7 @@ class Bent(NamedTuple):
 
 
 def distortion_note(lenses: Iterable[Bent]) -> tuple[str, ...]:
-    """Say what is left out of the most distorted lens; nothing where nothing is."""
+    """Return a note on the largest distortion of `lenses`, which pictures leave out; empty below LEAST_BEND_PX."""
     bent = [each for each in lenses if each.is_fisheye or any(each.parameters.values())]
     most, worst = max(((largest_px(*each), k) for k, each in enumerate(bent)), default=(0.0, 0))
     if most < LEAST_BEND_PX:
@@ -249,7 +262,7 @@ def distortion_note(lenses: Iterable[Bent]) -> tuple[str, ...]:
 
 
 def largest_px(lens: Lens, parameters: Mapping[str, float], is_fisheye: bool = False) -> float:
-    """Return the farthest, in pixels, that the lens moves a point of the pinhole picture's border."""
+    """Return the largest displacement, in pixels, by distortion, of a point on the picture's border."""
     part = np.linspace(0.0, 1.0, BORDER_STEPS)
     zero, one = np.zeros(BORDER_STEPS), np.ones(BORDER_STEPS)
     border = np.column_stack([np.concatenate([part, part, zero, one]), np.concatenate([zero, one, part, part])])
@@ -261,7 +274,7 @@ def largest_px(lens: Lens, parameters: Mapping[str, float], is_fisheye: bool = F
 
 
 def _polynomial(points: F64, parameters: Mapping[str, float]) -> F64:
-    """Apply OpenCV's radial and tangential model to `points` (N, 2), X / Z and Y / Z."""
+    """Return `points` (N, 2), X / Z and Y / Z, after OpenCV's radial and tangential distortion."""
     k1, k2, k3, k4, k5, k6, p1, p2 = (
         parameters.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
     )
@@ -275,7 +288,10 @@ def _polynomial(points: F64, parameters: Mapping[str, float]) -> F64:
 
 
 def _fisheye(points: F64, parameters: Mapping[str, float]) -> F64:
-    """Apply OpenCV's fisheye model: the distance from the middle follows the angle, not its tangent."""
+    """Return `points` (N, 2), X / Z and Y / Z, after OpenCV's fisheye distortion.
+
+    The model replaces the tangent of the angle from the axis by a polynomial of that angle.
+    """
     k1, k2, k3, k4 = (parameters.get(key, 0.0) for key in ("k1", "k2", "k3", "k4"))
     radius = np.linalg.norm(points, axis=1)
     angle = np.arctan(radius)

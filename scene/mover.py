@@ -1,9 +1,9 @@
 """An avatar in the scene: its motion on the floor, at the avatar's place and heading.
 
-A body touches the floor with its outermost vertices, not with its joints; pose blend shapes are left out. The rule
-`sequence` lifts the whole motion by one amount, so that jumps leave the floor. `frame` lifts each frame by its own
-amount, so that some point always touches it. `stance` is for a recording that says when its feet stand: standing feet
-are on the floor, and other frames are lifted by the average lift of the standing frames.
+The outermost vertices of a body touch the floor, not its joints; pose blend shapes are left out. The rule `sequence`
+lifts the whole motion by one amount, so that jumps leave the floor. `frame` lifts each frame by its own amount, so that
+the lowest point always touches the floor. `stance` is for a recording that says when its feet stand: standing feet are
+on the floor, and other frames are lifted by the average lift of the standing frames.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from trilane.scene.motion.motion import Motion, bracket, rest_leg_m, wrapped_tim
 from trilane.scene.rotations import about
 from trilane.scene.schema import AvatarSpec
 
-#: Number of a vertex's skin weights that are used: the largest ones.
+#: Number of skinning weights that are used per vertex: the largest ones.
 WEIGHTS = 4
-#: Number of frames whose heights are computed together: so few that the arrays stay in the processor's cache.
+#: Number of frames whose heights are computed together; few enough that the arrays stay in the processor's cache.
 FRAMES_AT_ONCE = 16
 FEET = ("left_ankle", "right_ankle", "left_foot", "right_foot")
 HEAD = ("head", "jaw", "left_eye", "right_eye")
-#: Directions in which the outermost vertices of each joint are taken: the axes and the diagonals of a cube.
+#: Unit vectors (D, 3) in which each joint's outermost vertices are taken: the axes and the diagonals of a cube.
 _SIGNS = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if abs(x) + abs(y) + abs(z) in (1, 3)]
 DIRECTIONS: F64 = np.array(_SIGNS, dtype=np.float64) / np.linalg.norm(_SIGNS, axis=1, keepdims=True)
 
@@ -37,8 +37,8 @@ DIRECTIONS: F64 = np.array(_SIGNS, dtype=np.float64) / np.linalg.norm(_SIGNS, ax
 class BodyOutline:
     """The K outermost vertices of a body.
 
-    `points` (K, 4): places at rest, metres, with a 1 appended. `joints`, `weights` (K, W): joints that move each of
-    them, and by how much.
+    `points` (K, 4): positions at rest, metres, with a 1 appended.
+    `joints`, `weights` (K, W): indices of the joints that move each vertex, and their weights.
     """
 
     points: F64
@@ -46,12 +46,15 @@ class BodyOutline:
     weights: F64
 
     def posed(self, matrices: F32) -> F64:
-        """Return world positions (K, 3) under skinning matrices (55, 3, 4)."""
+        """Return world positions (K, 3), metres, under skinning `matrices` (55, 3, 4)."""
         blend = np.einsum("kw,kwc->kc", self.weights, matrices.reshape(-1, 12)[self.joints])
         return np.asarray(np.einsum("kab,kb->ka", blend.reshape(-1, 3, 4), self.points))
 
     def lowest(self, height_rows: F32) -> F64:
-        """Return the least height (T,) that `posed` would give, from row 1 of the skinning matrices, (T, 55, 4)."""
+        """Return the height (T,), metres, of the lowest point in each frame.
+
+        `height_rows` (T, 55, 4): row 1, which gives y, of each skinning matrix.
+        """
         parts = np.split(height_rows, range(FRAMES_AT_ONCE, len(height_rows), FRAMES_AT_ONCE))
         return np.concatenate([self._heights(rows).min(axis=1) for rows in parts])
 
@@ -62,9 +65,9 @@ class BodyOutline:
 
 
 def outline(body: ShapedBody, joints: Collection[str] = JOINT_NAMES) -> BodyOutline:
-    """Return the outline of the vertices furthest along each of DIRECTIONS, among those that each joint moves most.
+    """Return the outline of `body`: of the vertices that each joint moves most, the outermost in each of DIRECTIONS.
 
-    `joints`: names of the joints that count.
+    `joints`: names of the joints whose vertices are taken.
     """
     weights, rest = body.body.weights, body.vertices.astype(np.float64)
     owner = weights.argmax(axis=1)
@@ -77,12 +80,12 @@ def outline(body: ShapedBody, joints: Collection[str] = JOINT_NAMES) -> BodyOutl
 
 
 def feet(body: ShapedBody) -> BodyOutline:
-    """Return all vertices that ankles and toes move most; these stand on the floor to the millimetre."""
+    """Return all vertices that ankles and toes move most. All are kept so that feet stand exactly on the floor."""
     return _of(body, np.flatnonzero(np.isin(body.body.weights.argmax(axis=1), [JOINT_INDEX[name] for name in FEET])))
 
 
 def _of(body: ShapedBody, index: NDArray[np.intp]) -> BodyOutline:
-    """Return the outline of the vertices `index`."""
+    """Return the outline that consists of the vertices with the indices `index` (K,)."""
     weights, rest = body.body.weights[index], body.vertices[index].astype(np.float64)
     points = np.concatenate([rest, np.ones((len(index), 1))], axis=1)
     top = np.argsort(-weights, axis=1)[:, :WEIGHTS]
@@ -93,21 +96,21 @@ def _of(body: ShapedBody, index: NDArray[np.intp]) -> BodyOutline:
 Ground = Literal["auto", "sequence", "frame", "none"]
 Rule = Literal["sequence", "frame", "stance", "none"]
 
-#: Number of times per second of a motion at which the lowest point is computed.
+#: Number of times per second of the motion at which the lowest point is computed.
 SAMPLES_PER_S = 30
-#: Most of these times: with `stance` those of 200 s, beyond which feet are less exactly on the floor.
+#: Most such times. With `stance` they cover 200 s; in longer motions, feet are less exactly on the floor.
 MAX_SAMPLES: dict[Rule, int] = {"sequence": 600, "frame": 600, "stance": 6000}
-#: With `sequence`, 5 % of the frames may dip below the floor, so that one bad frame does not lift all others.
+#: With `sequence`, 5 % of the frames may go below the floor, so that one bad frame does not lift all others.
 LOWEST_PERCENTILE = 5.0
-#: With `stance`, greatest depth of any point of the body below the floor, metres: hands and knees may differ in length.
+#: With `stance`, greatest depth of the body below the floor, metres: its limbs may be longer than the recorded ones.
 DEEPEST_M = 0.03
 
 
 def ground_rule(motion: Motion, ground: Ground) -> Rule:
-    """Return `ground`, or the rule that `motion` allows where it is `auto`.
+    """Return `ground`, or the rule that suits `motion` if `ground` is `auto`.
 
-    That rule is `stance` when the motion says when its feet stand, `sequence` when it has a recorded place of the
-    pelvis, else `frame`.
+    The rule is `stance` when the motion says when its feet stand. Otherwise it is `sequence` when the pelvis's
+    positions were recorded, and `frame` when they were not.
     """
     if ground != "auto":
         return ground
@@ -124,14 +127,14 @@ def _sample_count(motion: Motion, rule: Rule) -> int:
 def floor_lift(
     motion: Motion, skeleton: Skeleton, shape: BodyOutline, shift: F64, scale: float, rule: Rule, soles: BodyOutline
 ) -> tuple[F64, F64]:
-    """Return times (L,) in seconds, and metres (L,) by which the body is lifted at them; linear between.
+    """Return times (L,), seconds, and the lift (L,) of the body at these times, metres; linear between the times.
 
     `motion`: motion to put on the floor.
-    `skeleton`: joints of the body that does it.
+    `skeleton`: skeleton of the body that performs it.
     `shape`: outline of that body.
     `shift`, `scale`: as in `Mover`.
     `rule`: rule from `ground_rule`.
-    `soles`: outline of the body's feet.
+    `soles`: vertices of that body's feet.
     """
     if rule == "none":
         return np.zeros(1), np.zeros(1)
@@ -153,9 +156,10 @@ def floor_lift(
 
 
 def _lift_of_feet(feet: F64, lowest: F64, stance: F64) -> F64:
-    """Return the lift (L,) in metres from heights (L,) of the feet and of the body's `lowest` point.
+    """Return the lift (L,), metres, for the rule `stance`.
 
-    `stance` (L,): how much the feet stand.
+    `feet`, `lowest` (L,): heights of the feet's and of the body's lowest point, metres. `stance` (L,): how much the
+    feet stand, 0 to 1.
     """
     usual = -float(np.average(feet, weights=stance)) if stance.any() else -np.percentile(lowest, LOWEST_PERCENTILE)
     lift = usual + stance * (-feet - usual)
@@ -164,12 +168,13 @@ def _lift_of_feet(feet: F64, lowest: F64, stance: F64) -> F64:
 
 @dataclass(frozen=True)
 class Mover:
-    """A motion in its place.
+    """A motion in its place in the scene.
 
-    `world` (4, 4): map from the motion's space to the scene's. `scale`: factor on the pelvis's places, the ratio of the
-    leg lengths. `shift` (3,): vector added to these places, minus the pelvis of the rest pose. `lift_times_s` (L,),
-    `lift_m` (L,): metres by which the body is lifted onto the floor, linear between these times. `notes`: what was
-    decided, for people.
+    `world` (4, 4): transform from the motion's space to the scene.
+    `scale`: factor on the pelvis's recorded positions, the ratio of the leg lengths.
+    `shift` (3,): vector added to the scaled positions: minus the pelvis of the rest pose.
+    `lift_times_s`, `lift_m` (L,): lift of the body onto the floor, metres, linear between these times.
+    `notes`: what was decided, for people.
     """
 
     motion: Motion
@@ -181,7 +186,7 @@ class Mover:
     notes: tuple[str, ...]
 
     def sample(self, t_s: float) -> tuple[F64, F64]:
-        """Return pose (55, 3), axis-angle, and translation (3,), metres, at `t_s`; both before `world`."""
+        """Return the pose (55, 3), axis-angle, and the translation (3,), metres, at `t_s`, both before `world`."""
         pose, pelvis = self.motion.sample(t_s)
         translation = pelvis * self.scale + self.shift
         i, j, fraction = bracket(self.lift_times_s, wrapped_time(t_s, self.motion.duration_s, self.motion.wrap))
@@ -190,7 +195,7 @@ class Mover:
 
 
 def make_mover(spec: AvatarSpec, motion: Motion, body: ShapedBody) -> Mover:
-    """Put `motion` on the floor for `body`, at the position and heading of `spec`."""
+    """Return the mover that puts `motion` on the floor for `body`, at the position and heading of `spec`."""
     leg = rest_leg_m(body.joints)
     scale = leg / motion.leg_m if motion.leg_m else 1.0
     shift = -body.joints[0]

@@ -1,30 +1,30 @@
-"""The planner: how much of a frame is made, which tensor it gets, and which shapes of tensors a run prepares.
+"""The planner: how much of a frame is made, which tensor it gets, and which tensor shapes a run prepares.
 
-**Work.** A picture is used again only when everything that it depends on is the same, bit for bit.
+**Work.** A picture is used again only if everything that it depends on is the same, bit for bit.
 
-**Tensor.** A network paints a body best at about the size that it has learnt, whatever the distance: much smaller it
-loses the face, much larger it paints ragged edges. So each avatar in view gets the pixels that its network was trained
-to paint. A body that has more pixels on the picture than in its tensor loses detail, so it gets up to `MOST_GROWTH`
-times the pixels (docs/decisions/planner.md has the figures).
+**Tensor.** A network paints a body best at about the size at which it was trained, whatever the distance. At a much
+smaller size it loses the face; at a much larger size it paints ragged edges. Therefore each visible avatar gets the
+number of pixels for which its network was trained. A body with more pixels on the picture than in its tensor loses
+detail, so it gets up to `MOST_GROWTH` times that number (docs/decisions/planner.md has the figures).
 
-Avatars of different networks have a tensor each, of one shape. The network that needs most sets the budgets of a frame,
-and the least dense tensor sets its density.
+Avatars of different networks have separate tensors of one shape. The network that needs the most pixels sets a frame's
+budget, and the least dense tensor sets its density.
 
-**Mesh.** An avatar whose surface may move by less than the error budget is drawn with fewer triangles. `hold_mesh`
-keeps a level while it can, and goes to coarser ones step by step.
+**Mesh.** An avatar whose surface may be off by less than the error budget is drawn with fewer triangles. `hold_mesh`
+keeps a level while it is good enough, and goes to coarser levels step by step.
 
-**Changes.** A change of shape is seen, so it costs as much as the pixels of `PATIENCE` frames. The scene is known
-ahead: before the run `foreseen_changes` finds the changes that cost least. Each is made while both shapes are good, and
-where nobody is in view or the scene moves fast. A frame whose shape is not good enough gets a good one at once,
-whatever was foreseen. Where nothing is foreseen, a smaller shape is taken after `PATIENCE` frames in which it would
-have done.
+**Changes.** A change of shape is visible, so its cost is that of the pixels of `PATIENCE` frames. Before the run,
+`foreseen_changes` finds the changes that cost least. Each is made while both shapes are good, and preferably while
+nobody is visible or the scene moves fast. If a frame's shape is not good enough, the frame gets a good shape at once,
+whatever was foreseen. If nothing was foreseen, a smaller shape is taken after `PATIENCE` frames in which it would have
+been good.
 
-**Shapes.** They are chosen before the run from the frames that can be foreseen, so that every shape has its network
-ready; their number and their memory have limits. A shape serves a frame when it is within the frame's budget of pixels
-and nearly as dense as the frame's ideal shape. First come the shapes that serve most frames, until all are served; then
-those that save enough work.
+**Shapes.** Shapes are chosen before the run, from the frames that can be foreseen. Every shape then has its network
+ready. Number and memory of the shapes are limited. A shape serves a frame if it is within the frame's pixel budget and
+nearly as dense as the frame's ideal shape. The shapes that serve the most frames are chosen first, until all frames are
+served. After that, shapes that save enough work are added.
 
-All functions are pure: they take what is on the screen, held and foreseen.
+All functions are pure: they take what is visible, held and foreseen as arguments.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ class FrameWork(IntEnum):
 
 
 def shown_by(arrays: Iterable[Floats]) -> bytes:
-    """Return everything that the picture of the avatars depends on as bytes to compare.
+    """Return, as bytes to compare, everything that the picture of the avatars depends on.
 
-    `arrays`: numbers of always the same shapes.
+    `arrays`: these values; their number and shapes never change during a run.
     """
     return b"".join(array.tobytes() for array in arrays)
 
@@ -61,11 +61,11 @@ def shown_by(arrays: Iterable[Floats]) -> bytes:
 def work_of(
     shown: bytes, of_picture: bytes | None, of_nobody: bytes | None, is_anybody_seen: Callable[[], bool]
 ) -> FrameWork:
-    """Return the work for a frame that shows `shown`.
+    """Return the work for a frame that shows `shown`, as bytes of `shown_by`.
 
-    `of_picture`: what the frame of the present picture showed, None when there is none.
-    `of_nobody`: what a frame showed on which nobody was seen, None when there was none.
-    `is_anybody_seen`: finds out whether an avatar is on the screen; called only when neither frame tells.
+    `of_picture`: what the frame of the present picture showed; None before the first picture.
+    `of_nobody`: what the last frame without anybody showed; None before the first such frame.
+    `is_anybody_seen`: finds out whether an avatar is on the screen; called only if the bytes do not decide.
     """
     if shown == of_picture:
         return FrameWork.REUSE
@@ -74,36 +74,37 @@ def work_of(
     return FrameWork.FULL
 
 
-#: Most tensor pixels for one pixel of the picture, along a side: more could not be seen.
+#: Largest density, tensor pixels per picture pixel along a side: more detail would not be visible.
 MOST_DENSITY = 4.0
-#: Least share of the best density at which a density is as good.
+#: A density counts as good if it is at least this share of the best density.
 AS_GOOD = 0.95
-#: Cost of a change in view, in pixels of so many frames; also the number of frames for which a smaller shape must do
-#: before it is taken.
+#: Cost of a visible change of shape, in pixels of this many frames; also the number of frames in which a smaller shape
+#: must be good before it is taken.
 PATIENCE = 10
-#: Movement in a frame, as a share of the picture's side, at which a change shows half as much as at rest.
+#: Movement per frame, as a share of the picture's side, at which a change is half as visible as at rest.
 FAST = 0.01
-#: Factor by which a change of the density shows twice as much as a change of the shape alone.
+#: A change of the density by this factor makes a change of shape twice as visible.
 DENSITY_STEP = 1.25
-#: Most pixels of an avatar, as a multiple of its own, where the picture shows as many: 5/4 of the sides.
+#: Most pixels of an avatar, as a multiple of those for which its network was trained: sides of 5/4.
 MOST_GROWTH = 25 / 16
-#: Sides of a tensor, as shares of those that its network was trained to paint: sizes for stepping down when frames
-#: would be late, or for an error budget.
+#: Sides of a tensor, as shares of the sides for which its network was trained. The smaller ones are for frames that
+#: would be late, and for error budgets.
 SIDES = (1.0, 0.75, 0.5)
 ALL_WORK = 1000
 
 
 def work_of_side(side: float) -> int:
-    """Return the thousandths of all pixels in a tensor whose sides are `side` times as long."""
+    """Return the work, in thousandths of all pixels, of a tensor whose sides are scaled by `side`."""
     return math.ceil(ALL_WORK * side * side)
 
 
 @dataclass(frozen=True)
 class TensorBudget:
-    """The pixels that a tensor may have.
+    """The number of pixels that a tensor may have.
 
-    `own`: pixels of the network's own shape, for each avatar. `most`: most pixels of all avatars together. `work`:
-    thousandths of these two that are allowed.
+    `own`: pixels for which the network was trained, per avatar.
+    `most`: most pixels of all avatars together.
+    `work`: thousandths of these pixels that are allowed.
     """
 
     own: int
@@ -111,15 +112,19 @@ class TensorBudget:
     work: int = ALL_WORK
 
     def scaled(self, work: int) -> TensorBudget:
-        """Return the budget with `work` thousandths of the pixels."""
+        """Return this budget with `work` thousandths of the pixels allowed."""
         return replace(self, work=work)
 
     def most_of(self, avatars: int) -> int:
-        """Return the most pixels for `avatars` avatars in view, whatever their size."""
+        """Return the most pixels for `avatars` visible avatars, whatever their size on the picture."""
         return self._allowed(avatars * self.own * MOST_GROWTH)
 
     def of(self, rects: Sequence[Rect], output: Shape) -> int:
-        """Return the pixels for the avatars at `rects` on a picture of `output`: their own, or as many as it shows."""
+        """Return the pixels for the avatars at `rects` on a picture of `output` (height, width).
+
+        They get the pixels for which the network was trained, or as many as the picture shows if that is more. The
+        result is limited by `most_of` and `work`.
+        """
         own = len(rects) * self.own
         return min(self._allowed(max(own, area(tight_shape(rects, output)))), self.most_of(len(rects)))
 
@@ -131,8 +136,8 @@ class TensorBudget:
 class HeldShape:
     """The shape in use.
 
-    `foreseen`: foreseen shape that was taken last. `smaller_for`: number of successive frames for which a smaller shape
-    would have done.
+    `shape`: (height, width). `foreseen`: foreseen shape that was taken last; None if none was taken yet.
+    `smaller_for`: number of successive frames for which a smaller shape would have been good.
     """
 
     shape: Shape
@@ -140,7 +145,7 @@ class HeldShape:
     smaller_for: int = 0
 
 
-#: Share of the error budget below which a coarser level of the mesh does well.
+#: A coarser level of the mesh is good if its error is below this share of the error budget.
 EASE = 0.8
 
 
@@ -148,8 +153,8 @@ EASE = 0.8
 class HeldMesh:
     """The level of an avatar's mesh in use.
 
-    `level`: 0 for the whole mesh. `coarser_for`: number of successive frames for which the next level would have done
-    well.
+    `level`: 0 for the whole mesh. `coarser_for`: number of successive frames for which the next coarser level would
+    have been good.
     """
 
     level: int
@@ -157,11 +162,15 @@ class HeldMesh:
 
 
 def hold_mesh(errors_px: Sequence[float], budget_px: float, before: HeldMesh | None) -> HeldMesh:
-    """Return the level of a frame whose levels have the bounds `errors_px`, finest first; the first is always 0.
+    """Return the mesh level for a frame.
 
-    A level beyond `budget_px` is left at once, for the coarsest finer one within it. A coarser level is taken one step
-    at a time, after `PATIENCE` frames in which its bound was well within the budget. The first frame takes the coarsest
-    level within the budget.
+    `errors_px`: error bound of each level in this frame, finest level first; the first bound is 0.
+    `budget_px`: error budget.
+    `before`: level of the frame before, None for the first frame.
+
+    The first frame takes the coarsest level within the budget. A level beyond the budget is left at once, for the
+    coarsest finer level within the budget. Coarser levels are taken one by one, each after `PATIENCE` frames in which
+    its bound was well within the budget.
     """
     within = [level for level, error in enumerate(errors_px) if error <= budget_px]
     if before is None:
@@ -177,7 +186,7 @@ def hold_mesh(errors_px: Sequence[float], budget_px: float, before: HeldMesh | N
 
 @dataclass(frozen=True)
 class TensorPlan:
-    """The layout of one frame's tensor, its density, and what to hand to the next `plan_tensor`."""
+    """The layout of one frame's tensor. `held`: state that the next call of `plan_tensor` gets as `before`."""
 
     dense: DenseLayout
     held: HeldShape
@@ -192,13 +201,14 @@ def plan_tensor(
     foreseen: Shape | None = None,
     networks: Sequence[int] = (),
 ) -> TensorPlan:
-    """Plan the tensor for the avatars at `rects`, at least one.
+    """Return the plan of the tensor for the avatars at `rects`, at least one.
 
     `output`: (height, width) of the picture in pixels.
-    `shapes`: shapes that are ready. Where all of them are larger than the budget allows, any may be taken.
-    `before`: shape of the frame before, None for the first.
-    `foreseen`: shape of this frame by `foreseen_changes`; None where nothing was foreseen.
-    `networks`: network of each avatar at `rects`; empty where one paints all.
+    `shapes`: shapes that are ready. If all of them are larger than the budget allows, any may be taken.
+    `budget`: number of pixels that the tensor may have.
+    `before`: state after the frame before, None for the first frame.
+    `foreseen`: shape of this frame by `foreseen_changes`; None if nothing was foreseen.
+    `networks`: number of the network of each avatar at `rects`; empty if one network paints all.
     Raises BadInputError when no shape has room for all avatars.
     """
     fits, good = _fits(rects, networks, output, shapes, budget)
@@ -209,30 +219,30 @@ def plan_tensor(
 
 
 def _grouped(rects: Sequence[Rect], networks: Sequence[int]) -> list[list[Rect]]:
-    """Return the rectangles of each network."""
+    """Return the rectangles of the avatars of each network."""
     return [[rects[place] for place in places] for places in by_network(networks or [0] * len(rects))]
 
 
 def pixels_of(rects: Sequence[Rect], networks: Sequence[int], output: Shape, budget: TensorBudget) -> int:
-    """Return the pixels of a frame's tensor: the most that the avatars of one network may have.
+    """Return the pixel budget of a frame's tensor: the largest budget for the avatars of any one network.
 
-    `networks`: network of each avatar at `rects`; empty where one paints all.
+    `networks`: number of the network of each avatar at `rects`; empty if one network paints all.
     """
     return max(budget.of(own, output) for own in _grouped(rects, networks))
 
 
 def _dense(rects: Sequence[Rect], networks: Sequence[int], output: Shape, shape: Shape) -> DenseLayout | None:
-    """Return the densest layout in tensors of `shape`, one for each network; None without room for all avatars."""
+    """Return the densest layout in tensors of `shape`, one per network; None if there is no room for all avatars."""
     return apart(rects, networks or [0] * len(rects), lambda own: lay_out_at(own, output, shape, MOST_DENSITY))
 
 
 def _fits(
     rects: Sequence[Rect], networks: Sequence[int], output: Shape, shapes: Sequence[Shape], budget: TensorBudget
 ) -> tuple[dict[Shape, DenseLayout], list[Shape]]:
-    """Return the layout in each shape that may be taken and has room for the avatars, and which of the shapes are good.
+    """Return {shape: layout} of all allowed shapes with room for the avatars, and a list of the good ones.
 
-    A good shape is nearly as dense as the densest within the frame's budget. It may be larger than that one, but not
-    than the budget of any frame with as many avatars.
+    A good shape is nearly as dense as the densest shape within the frame's budget. A good shape may exceed that budget,
+    but not the largest budget of frames with as many avatars.
     """
     most = budget.most_of(max(map(len, _grouped(rects, networks))))
     pixels = pixels_of(rects, networks, output, budget)
@@ -244,7 +254,11 @@ def _fits(
 
 
 def _held(good: Sequence[Shape], before: HeldShape | None, foreseen: Shape | None) -> HeldShape:
-    """Return the foreseen shape once, as soon as it is good; then the held one while it is good, else the smallest."""
+    """Return the shape to use, one of `good`.
+
+    A foreseen shape is taken once, as soon as it is good. Otherwise the held shape stays while it is good. If it is
+    not, the smallest good shape is taken.
+    """
     last = before.foreseen if before is not None else None
     is_kept = before is not None and before.shape in good
     if foreseen is not None and foreseen in good and (foreseen != last or not is_kept):
@@ -260,16 +274,19 @@ def _held(good: Sequence[Shape], before: HeldShape | None, foreseen: Shape | Non
 
 @dataclass(frozen=True)
 class LookAhead:
-    """A frame that was looked at before the run.
+    """A frame that was examined before the run.
 
-    `rects`: rectangles of the visible avatars, by their numbers.
+    `frame`: number of the frame. `rects`: mesh rectangle of each visible avatar, by the avatar's index.
     """
 
     frame: int
     rects: Mapping[int, Rect]
 
     def networks(self, of_all: Sequence[int]) -> list[int]:
-        """Return the network of each visible avatar. `of_all`: that of each avatar; empty where one paints all."""
+        """Return the number of each visible avatar's network.
+
+        `of_all`: number of each avatar's network; empty if one network paints all, and so is the result.
+        """
         return [of_all[number] for number in self.rects] if of_all else []
 
 
@@ -280,11 +297,16 @@ def foreseen_changes(
     budget: TensorBudget,
     networks: Sequence[int] = (),
 ) -> tuple[tuple[int, Shape], ...]:
-    """Return the shape from the first of `looks` on, at least one, and every change of shape with its frame.
+    """Return the shape at the first of `looks`, and each later change of shape, as (frame, shape).
 
-    `networks`: network of each avatar of the scene; empty where one paints all.
-    The chosen sequence of good shapes is the cheapest in pixels: the pixels of all frames, plus the cost of the
-    changes. A shape that is not good at a look is left in the first frame after the look before.
+    `looks`: frames that were examined, in order, at least one.
+    `output`: (height, width) of the picture in pixels.
+    `shapes`: shapes that are ready.
+    `budget`: number of pixels that a tensor may have.
+    `networks`: number of the network of each avatar of the scene; empty if one network paints all.
+
+    The result is the cheapest sequence of good shapes in pixels: the pixels of all frames, plus the cost of the
+    changes. If a shape is not good at a look, the next shape begins in the first frame after the look before.
     """
     order = sorted(shapes, key=lambda shape: (area(shape), shape))
     costs, origins, needed = dict.fromkeys(order, 0.0), [], []
@@ -311,9 +333,10 @@ def foreseen_changes(
 def _cheapest_way(
     shape: Shape, costs: Mapping[Shape, float], fits: Mapping[Shape, DenseLayout], price: float
 ) -> tuple[float, Shape]:
-    """Return the cost of the cheapest way to `shape`, and the shape of `costs` where it begins.
+    """Return the cost of the cheapest sequence that ends with `shape`, and the shape before `shape` in it.
 
-    `price`: cost of a change.
+    `costs`: cost of the cheapest sequence that ends with each shape at the look before.
+    `fits`: layout in each shape. `price`: cost of a change of shape at the same density.
     """
 
     def change(origin: Shape) -> float:
@@ -327,7 +350,7 @@ def _cheapest_way(
 
 
 def _speed(before: LookAhead, now: LookAhead) -> float:
-    """Return the largest move of a side of the avatars' rectangles in a frame, as a share of the picture's sides."""
+    """Return the fastest movement of a side of a rectangle, per frame, as a share of the picture's sides."""
     frames = max(now.frame - before.frame, 1)
     both = now.rects.keys() & before.rects.keys()
     moved = [abs(a - b) / 2.0 for one in both for a, b in zip(now.rects[one], before.rects[one], strict=True)]
@@ -335,9 +358,9 @@ def _speed(before: LookAhead, now: LookAhead) -> float:
 
 
 def ideal_shape(rects: Sequence[Rect], output: Shape, budget: TensorBudget, networks: Sequence[int] = ()) -> Shape:
-    """Return the shape in which the avatars at `rects` are densest within the budget; the smallest of equal ones.
+    """Return the shape within the budget that gives the avatars at `rects` the highest density; if equal, the smallest.
 
-    `networks`: network of each of them; empty where one paints all.
+    `networks`: number of the network of each avatar at `rects`; empty if one network paints all.
     """
     pixels = pixels_of(rects, networks, output, budget)
     tight = [tight_shape(own, output, MOST_DENSITY) for own in _grouped(rects, networks)]
@@ -349,17 +372,17 @@ def ideal_shape(rects: Sequence[Rect], output: Shape, budget: TensorBudget, netw
 
 
 def area(shape: Shape) -> int:
-    """Return the number of pixels of a tensor."""
+    """Return the number of pixels of a tensor of `shape`."""
     return shape[0] * shape[1]
 
 
 MOST_SHAPES = 10
-#: Least share of the pixels of all frames that a further shape has to save.
+#: A further shape must save at least this share of the pixels of all frames.
 LEAST_SAVING = 0.02
 
 
 class Demand(NamedTuple):
-    """The needs of a frame: its ideal shape (height, width), and the pixels that its tensor may have."""
+    """The needs of a frame: its ideal shape (height, width), and the number of pixels that its tensor may have."""
 
     ideal: Shape
     pixels: int
@@ -369,8 +392,9 @@ class Demand(NamedTuple):
 class ShapeSet:
     """The shapes that a run prepares.
 
-    `shapes`: (height, width), the smallest first. `memory_bytes`: memory of their networks. `unserved`: number of
-    frames that none of them serves, because there may be no more; they are drawn less densely.
+    `shapes`: (height, width) of each, the smallest first.
+    `memory_bytes`: memory of their networks.
+    `unserved`: number of frames that no shape serves, because of the limits; these frames are drawn less densely.
     """
 
     shapes: tuple[Shape, ...]
@@ -386,12 +410,13 @@ def choose_shapes(
     *,
     optional: bool = False,
 ) -> ShapeSet:
-    """Choose the shapes to prepare: at least one, whatever its memory, unless they are `optional`.
+    """Return the shapes to prepare.
 
-    `demands`: demands of the foreseen frames, at least one.
-    `bytes_per_pixel`: memory of a network that is ready to run, for each pixel of its tensor.
-    `memory_bytes`: most memory of all of them.
+    `demands`: needs of the foreseen frames, at least one.
+    `bytes_per_pixel`: memory of a network that is ready to run, per tensor pixel.
+    `memory_bytes`: most memory of all networks.
     `most_shapes`: largest number of shapes.
+    `optional`: whether the result may be empty; otherwise it has at least one shape, whatever its memory.
     """
     frames = Counter(demands)
     chosen: list[Shape] = []
@@ -408,9 +433,9 @@ def choose_shapes(
 
 
 def joined(first: ShapeSet, second: ShapeSet) -> ShapeSet:
-    """Join both sets; a shape in both counts twice as memory.
+    """Return the union of two sets of shapes; the memory of a shape in both sets counts twice.
 
-    `unserved` is the first one's, unless it has no shapes.
+    `unserved` is taken from `first`, or from `second` if `first` has no shapes.
     """
     shapes = sorted({*first.shapes, *second.shapes}, key=lambda shape: (area(shape), shape))
     unserved = first.unserved if first.shapes else second.unserved
@@ -418,20 +443,23 @@ def joined(first: ShapeSet, second: ShapeSet) -> ShapeSet:
 
 
 def larger_shapes(shapes: Sequence[Shape], most_pixels: int) -> list[Shape]:
-    """Return new shapes that hold two of `shapes` each, with at most `most_pixels`."""
+    """Return each new shape that just contains two of `shapes`, of at most `most_pixels`; the smallest first."""
     both = {(max(a[0], b[0]), max(a[1], b[1])) for a, b in combinations(shapes, 2)}
     return sorted((shape for shape in both - set(shapes) if area(shape) <= most_pixels), key=area)
 
 
 def serves(shape: Shape, demand: Demand) -> bool:
-    """Return whether the frame of `demand` can be drawn well in a tensor of `shape`."""
+    """Return whether a tensor of `shape` meets the needs `demand` of a frame."""
     (height, width), (ideal_height, ideal_width) = shape, demand.ideal
     large_enough = height >= AS_GOOD * ideal_height and width >= AS_GOOD * ideal_width
     return large_enough and area(shape) <= demand.pixels
 
 
 def _next(frames: Mapping[Demand, int], chosen: Sequence[Shape]) -> Shape | None:
-    """Return the shape to add, None when a further one is not worth it."""
+    """Return the shape to add to `chosen`; None if no further shape is worth it.
+
+    `frames`: number of frames with each demand.
+    """
     candidates = sorted({demand.ideal for demand in frames} - set(chosen))
     if not candidates:
         return None
@@ -444,7 +472,7 @@ def _next(frames: Mapping[Demand, int], chosen: Sequence[Shape]) -> Shape | None
 
 
 def _work(frames: Mapping[Demand, int], chosen: Sequence[Shape]) -> int:
-    """Return the pixels of all frames, each in the smallest shape that serves it."""
+    """Return the pixels of all frames, each in the smallest chosen shape that serves it."""
     return sum(
         count * min(area(shape) for shape in chosen if serves(shape, demand)) for demand, count in frames.items()
     )

@@ -1,12 +1,14 @@
-"""What a reader finds in the file of a motion or a camera, and which of its samples are usable.
+"""Facts that a reader finds in the file of a motion or a camera, the choice of its usable samples, and an order of
+names.
 
 A sample is left out when its reader finds it unreadable, or when its time is not after the time of the last usable
-sample. Sampling interpolates across the hole, and a note says how many are left out. A file with more bad samples than
-good ones is refused.
+sample. Sampling interpolates across such holes, and a note says how many samples are left out. A file with more bad
+samples than good ones is refused.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
@@ -19,11 +21,13 @@ from trilane.errors import BadInputError
 
 @dataclass(frozen=True)
 class Detected:
-    """What a file is.
+    """Facts about a file, as texts for people.
 
-    `format`: its name for people. `reason`: what told the format apart. `axes`: axis that is up, and why. `unit`: unit
-    of its lengths, and why. `rate`: source of the rate. `lens`: source of a camera's lens. `joints`: the file's name of
-    each SMPL-X joint. `unmapped`: names of the file's joints that have no partner, in its order.
+    `format`: name of the format. `reason`: how the format was recognised.
+    `axes`: axis that points up, and why. `unit`: unit of lengths, and why.
+    `rate`: source of the rate. `lens`: source of a camera's lens.
+    `joints`: the file's joint name by SMPL-X joint name.
+    `unmapped`: names of the file's joints that match no SMPL-X joint, in file order.
     """
 
     format: str = ""
@@ -36,20 +40,25 @@ class Detected:
     unmapped: tuple[str, ...] = ()
 
 
-#: For a source that is no file.
+#: Facts about a source that is no file.
 NOTHING = Detected()
 
 
-#: An interval longer than this many median intervals is reported as a gap.
+#: A time step longer than this many median steps is reported as a gap.
 GAP = 1.5
 
-#: A function that says, for messages, where the sample of an index stands in its file.
+#: A function from a sample's index to the sample's place in its file, for messages.
 PlaceOf = Callable[[int], str]
 
 
 def by_number(index: int) -> str:
-    """Name the place of sample `index` in a file without lines or names."""
+    """Return the place of sample `index`, for a file whose samples have neither lines nor names."""
     return f"number {index}"
+
+
+def natural(name: str) -> list[tuple[int, str]]:
+    """Return a sort key of a file name by which numbers compare as numbers: `img9` comes before `img10`."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def usable_samples(
@@ -59,11 +68,14 @@ def usable_samples(
     place_of: PlaceOf = by_number,
     broken_as: str = "not finite or no rotation",
 ) -> tuple[NDArray[np.intp], tuple[str, ...]]:
-    """Return indices of the usable samples, and notes on the others and on gaps in time.
+    """Return the indices of the usable samples, and notes on left-out samples and on gaps in time.
 
-    `where`: file, for messages. `times_s` (T,): times of the samples. `readable` (T,): whether their values are
-    readable. `place_of`: place of each sample in the file. `broken_as`: words for samples that are not readable. Raises
-    BadInputError when less than half of the samples are usable.
+    `where`: file, for messages.
+    `times_s` (T,): times of the samples.
+    `readable` (T,): whether the values of each sample are readable.
+    `place_of`: place of each sample in the file.
+    `broken_as`: what is wrong with unreadable samples, in words.
+    Raises BadInputError when less than half of the samples are usable.
     """
     timed = readable & np.isfinite(times_s)
     broken = int(len(times_s) - timed.sum())
@@ -86,7 +98,7 @@ def usable_samples(
 
 
 def _strictly_increasing(times_s: F64) -> NDArray[np.bool_]:
-    """Return whether each time (T,) is later than all before it."""
+    """Return whether each time (T,) is later than all times before it, as an array (T,)."""
     highest = np.maximum.accumulate(times_s)
     later = np.ones(len(times_s), dtype=bool)
     later[1:] = times_s[1:] > highest[:-1]

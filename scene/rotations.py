@@ -1,6 +1,7 @@
 """Conversions of rotations: quaternions `w, x, y, z`, axis-angle vectors in radians, 3x3 matrices for column vectors.
 
-Rule: every function accepts any leading axes, computes in float64 and is exact at angles of 0 and pi.
+Rule: unless a shape is fixed, every function accepts any leading axes. All compute in float64 and are exact at angles
+of 0 and pi.
 """
 
 from __future__ import annotations
@@ -10,19 +11,19 @@ from numpy.typing import ArrayLike
 
 from trilane.arrays import F64
 
-#: Turns a Z-up world into a Y-up one and keeps x.
+#: Rotation matrix from a Z-up world to a Y-up world; x stays the same.
 Y_UP_FROM_Z_UP: F64 = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def quat_from_rotvec(rotvec: ArrayLike) -> F64:
-    """Turn axis-angle (..., 3) into unit quaternions (..., 4); w is negative for angles between pi and 3 pi."""
+    """Convert axis-angle (..., 3) to unit quaternions (..., 4); w is negative for angles between pi and 3 pi."""
     vectors = np.asarray(rotvec, dtype=np.float64)
     half = np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True)) / 2
     return np.concatenate([np.cos(half), np.sinc(half / np.pi) * vectors / 2], axis=-1)
 
 
 def rotvec_from_quat(quat: ArrayLike) -> F64:
-    """Turn unit quaternions (..., 4) into the shortest axis-angle (..., 3), angles in [0, pi]."""
+    """Convert unit quaternions (..., 4) to the shortest axis-angle (..., 3), with angles in [0, pi]."""
     q = np.asarray(quat, dtype=np.float64)
     sine = np.sqrt((q[..., 1:] * q[..., 1:]).sum(axis=-1))
     flip = np.where(q[..., 0] < 0, -1.0, 1.0)
@@ -33,9 +34,10 @@ def rotvec_from_quat(quat: ArrayLike) -> F64:
 
 
 def _products_to_matrix() -> F64:
-    """Return the table (16, 9) from the outer product of (w, x, y, z) with itself to the rotation matrix.
+    """Return the matrix (16, 9) that maps the flattened outer product q q^T to the flattened rotation matrix,
+    row-major.
 
-    Both are row-major.
+    q is the unit quaternion (w, x, y, z).
     """
     table = np.zeros((4, 4, 3, 3))
     table[0, 0] = np.eye(3)
@@ -50,14 +52,14 @@ _MATRIX = _products_to_matrix()
 
 
 def matrix_from_quat(quat: ArrayLike) -> F64:
-    """Turn unit quaternions (..., 4) into rotation matrices (..., 3, 3)."""
+    """Convert unit quaternions (..., 4) to rotation matrices (..., 3, 3)."""
     q = np.asarray(quat, dtype=np.float64)
     products = q[..., :, None] * q[..., None, :]
     return np.asarray((products.reshape(*q.shape[:-1], 16) @ _MATRIX).reshape(*q.shape[:-1], 3, 3))
 
 
 def quat_from_matrix(matrix: ArrayLike) -> F64:
-    """Turn rotation matrices (..., 3, 3) into unit quaternions (..., 4), computed from the largest component.
+    """Convert rotation matrices (..., 3, 3) to unit quaternions (..., 4), computed from the largest component.
 
     Shepperd, "Quaternion from rotation matrix", J. Guidance and Control 1(3), 1978.
     """
@@ -80,17 +82,17 @@ def quat_from_matrix(matrix: ArrayLike) -> F64:
 
 
 def matrix_from_rotvec(rotvec: ArrayLike) -> F64:
-    """Turn axis-angle (..., 3) into rotation matrices (..., 3, 3)."""
+    """Convert axis-angle (..., 3) to rotation matrices (..., 3, 3)."""
     return matrix_from_quat(quat_from_rotvec(rotvec))
 
 
 def rotvec_from_matrix(matrix: ArrayLike) -> F64:
-    """Turn rotation matrices (..., 3, 3) into axis-angle (..., 3)."""
+    """Convert rotation matrices (..., 3, 3) to the shortest axis-angle (..., 3)."""
     return rotvec_from_quat(quat_from_matrix(matrix))
 
 
 def about(axis: int, angle_rad: ArrayLike) -> F64:
-    """Return rotation matrices (..., 3, 3) about coordinate axis 0, 1 or 2 by angles (...)."""
+    """Return rotation matrices (..., 3, 3) about coordinate axis 0, 1 or 2 by the angles `angle_rad` (...)."""
     angle = np.asarray(angle_rad, dtype=np.float64)
     unit = np.zeros(3)
     unit[axis] = 1.0
@@ -98,7 +100,7 @@ def about(axis: int, angle_rad: ArrayLike) -> F64:
 
 
 def quat_multiply(left: ArrayLike, right: ArrayLike) -> F64:
-    """Return the Hamilton product (..., 4): the turn by `right` and then by `left`."""
+    """Return the Hamilton product (..., 4): the rotation by `right`, followed by `left`."""
     aw, ax, ay, az = np.moveaxis(np.asarray(left, dtype=np.float64), -1, 0)
     bw, bx, by, bz = np.moveaxis(np.asarray(right, dtype=np.float64), -1, 0)
     return np.stack(
@@ -115,7 +117,8 @@ def quat_multiply(left: ArrayLike, right: ArrayLike) -> F64:
 def slerp(start: ArrayLike, end: ArrayLike, fraction: ArrayLike) -> F64:
     """Interpolate unit quaternions (..., 4) on the great circle, along the shorter arc; `fraction` (...) in [0, 1].
 
-    Shoemake, "Animating rotation with quaternion curves", SIGGRAPH 1985. Between nearly equal ends it is linear.
+    Between nearly equal quaternions, the interpolation is linear. Shoemake, "Animating rotation with quaternion
+    curves", SIGGRAPH 1985.
     """
     a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     s = np.asarray(fraction, dtype=np.float64)
@@ -130,16 +133,16 @@ def slerp(start: ArrayLike, end: ArrayLike, fraction: ArrayLike) -> F64:
 
 
 def normalised(vectors: ArrayLike) -> F64:
-    """Scale vectors (..., n) to unit length; one whose square is zero gives no finite numbers."""
+    """Scale vectors (..., n) to unit length. A vector whose squared length is 0 becomes NaN or infinity."""
     v = np.asarray(vectors, dtype=np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(v / np.sqrt((v * v).sum(axis=-1, keepdims=True)))
 
 
 def shortest_turn(source: ArrayLike, target: ArrayLike, fallback: ArrayLike = (1.0, 0.0, 0.0)) -> F64:
-    """Return the rotation (3, 3) of the least angle that turns direction `source` (3,) to `target` (3,).
+    """Return the rotation (3, 3) of the smallest angle that takes direction `source` (3,) to direction `target` (3,).
 
-    Between opposite directions the axis is the part of `fallback` (3,) that is perpendicular to them, if it has one.
+    `fallback` (3,): preferred axis between opposite directions, made perpendicular to them.
     """
     a, b = normalised(source), normalised(target)
     axis = np.cross(a, b)
@@ -150,7 +153,7 @@ def shortest_turn(source: ArrayLike, target: ArrayLike, fallback: ArrayLike = (1
 
 
 def _perpendicular_to(unit: F64, preferred: F64) -> F64:
-    """Return the part of `preferred` (3,) perpendicular to `unit` (3,), or any such direction where it has none."""
+    """Return the part of `preferred` (3,) perpendicular to `unit` (3,), or any perpendicular direction if it is 0."""
     side = preferred - (preferred @ unit) * unit
     if np.linalg.norm(side) > 1e-6:
         return np.asarray(side)

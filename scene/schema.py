@@ -1,7 +1,7 @@
-"""Scene files (TOML): their schema, how they are loaded, and one sentence for people about the first defect.
+"""Scene files (TOML): their schema, how they are loaded, and a message about the first error.
 
-The schema checks types and ranges; the loaders check whether a named file exists and what is in it. The values of a
-file never change, except paths, which are made absolute.
+The schema checks types and ranges; the loaders check whether a named file exists and what it contains. The values of a
+scene file never change, except that its paths are made absolute.
 """
 
 from __future__ import annotations
@@ -32,29 +32,29 @@ from trilane.files import read_text
 from trilane.unexpected_value import UnexpectedValue, unexpected_in
 
 MAX_DEPTH_RATIO = 1e6  # largest ratio of far to near clip plane; beyond it a depth buffer of 24 bits is too coarse
-AUTO = "auto"  # size of a planned tensor
+AUTO = "auto"  # value of a key that Trilane decides
 BUILT_IN_PREFIX = "builtin:"
 LEAST_FPS = 1e-3  # far below that, a period in nanoseconds overflows
-LONGEST_S = 1e6  # longest motion
-FARTHEST_M = 1e4  # farthest avatar from the scene's origin; there float32 still resolves millimetres
+LONGEST_S = 1e6  # longest motion, seconds
+FARTHEST_M = 1e4  # farthest coordinate of an avatar, metres; there float32 still resolves millimetres
 
 NAME = r"^[\w .-]+$"
 
-LISTED = Strict(strict=False)  # for a tuple, which is a list in a file
+LISTED = Strict(strict=False)  # lets a list of the file become a tuple
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Metres = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False)]
 
 
 class StrictModel(BaseModel):
-    """Base of all tables: unknown keys are errors, and values never change after loading."""
+    """Base of the models of files: unknown keys are errors, and values never change after loading."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Table(StrictModel):
-    """A table of a scene file. Each value has the type of its key; other types are not converted.
+    """A table of a scene file. Each value must have the type of its key; other types are not converted.
 
-    Two exceptions: a number that need not be whole may be written as a whole one, and tuples are written as lists.
+    Two exceptions: a whole number may stand for a float, and a list stands for a tuple.
     """
 
     model_config = ConfigDict(strict=True)
@@ -139,7 +139,7 @@ class AvatarSpec(Table):
         return self
 
 
-#: Directions of a camera, right-handed: x right, y up, z back.
+#: Unit vectors of a camera's directions, in axes x right, y up, z back.
 DIRECTIONS = {
     "right": (1, 0, 0),
     "left": (-1, 0, 0),
@@ -155,7 +155,10 @@ AXES_EXPECTED = (
 
 
 def axes_of(text: str) -> tuple[tuple[int, int, int], ...] | None:
-    """Return the directions of x, y and z, as DIRECTIONS has them; None unless they are right-handed axes."""
+    """Return the directions of x, y and z that `text` names, such as `forward-left-up`, as vectors of DIRECTIONS.
+
+    Return None if they are not right-handed axes.
+    """
     words = text.split("-")
     if len(words) != 3 or not set(words) <= set(DIRECTIONS):
         return None
@@ -236,7 +239,7 @@ class CameraSpec(Table):
 
     @model_validator(mode="after")
     def _is_of_a_file(self) -> Self:
-        """Refuse keys that say how a file is read where none is."""
+        """Refuse keys that say how a file is read if the camera is built in."""
         for key in FILE_KEYS if self.source.startswith(BUILT_IN_PREFIX) else ():
             value = getattr(self, key)
             if value != type(self).model_fields[key].default:
@@ -359,7 +362,7 @@ class Scene(Table):
     @field_validator("avatars")
     @classmethod
     def _avatars_named(cls, avatars: tuple[AvatarSpec, ...]) -> tuple[AvatarSpec, ...]:
-        """Give each avatar a name of its own."""
+        """Give each avatar without a name the name `avatarN`, and refuse equal names."""
         places: dict[str, int] = {}
         for place, avatar in enumerate(avatars):
             name = avatar.name or f"avatar{place + 1}"
@@ -379,7 +382,7 @@ class Scene(Table):
 
     @property
     def plans_tensor(self) -> bool:
-        """Whether the tensor's shapes follow from the scene."""
+        """Whether the planner chooses the tensor's shapes, as `size` is `auto`."""
         return self.size == AUTO
 
 
@@ -387,7 +390,7 @@ INPUT_SHOULD = "Input should be "
 ENDING = ".toml"
 SCENES = Path(__file__).parent / "scenes"
 LONGEST_FOUND = 80
-#: What was expected, by the type of a pydantic error, where pydantic's own text is not fit for people.
+#: Expected value in words, by the type of a pydantic error; only where pydantic's own text is not fit for people.
 EXPECTED = {
     "too_short": "at least {min_length} of them",
     "too_long": "at most {max_length} of them",
@@ -400,15 +403,15 @@ EXPECTED = {
     "string_too_short": "at least one character",
     "string_pattern_mismatch": "letters, digits, spaces, dots, hyphens and underscores",
 }
-#: Types of pydantic errors for numbers out of range, or between two steps.
+#: Types of pydantic errors for numbers that are out of range or not a multiple of a step.
 IN_STEPS = ("multiple_of", "greater_than_equal", "less_than_equal")
-#: Reason why a key cannot have its value, where the range alone does not tell.
+#: Reason why a key cannot have its value, where the range alone does not explain it.
 REASONS = {"error_budget_px": "numbers are rounded, so nothing is drawn without an error"}
-BUILT_IN = ("room", "default", "hiker")  # a background, and avatars
+BUILT_IN = ("room", "default", "hiker")  # names of a background and of two avatars
 
 
 def bad_input(where: str | Path, error: ValidationError) -> BadInputError:
-    """Return the first defect that `error` lists, as a BadInputError about `where` with the key."""
+    """Return a BadInputError about the first defect in `error`; its place is `where` with the key."""
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"])
     place = f"{where}: {key}" if key else str(where)
@@ -427,7 +430,10 @@ def bad_input(where: str | Path, error: ValidationError) -> BadInputError:
 
 
 def _steps(first: Mapping[str, Any]) -> str:
-    """Say all conditions of a number that must be a multiple of another; empty for other errors."""
+    """Return the conditions of a number that must be a multiple of a step, in words; "" for other errors.
+
+    `first`: one of pydantic's `errors()`.
+    """
     if first["type"] not in IN_STEPS or not isinstance(first["loc"][-1], str):
         return ""
     limits = ("multiple_of", "ge", "le")
@@ -436,29 +442,32 @@ def _steps(first: Mapping[str, Any]) -> str:
 
 
 def _remedy(first: Mapping[str, Any]) -> str:
-    """Say how to fix a value, by one of the `errors()` of a scene; empty when the expectation says all."""
+    """Return how to fix a value, in words; "" when the expected value says it all.
+
+    `first`: one of pydantic's `errors()`.
+    """
     if first["type"] == "literal_error":
         return did_you_mean(str(first["input"]), _choices(first["loc"]))
     return REASONS.get(".".join(map(str, first["loc"])), "") if first["type"] == "greater_than" else ""
 
 
 def _keys_beside(loc: tuple[int | str, ...]) -> list[str]:
-    """Return the keys of the table in which the key at `loc` stands."""
+    """Return the keys of the table that holds the key at `loc`."""
     return list(_table_of(loc).model_fields)
 
 
 def _choices(loc: tuple[int | str, ...]) -> list[str]:
-    """Return the words that the key at `loc` may be, if it may be nothing else."""
+    """Return the words that the key at `loc` allows, if it allows only fixed words."""
     return [str(word) for word in get_args(_field(loc).annotation)]
 
 
 def _field(loc: tuple[int | str, ...]) -> FieldInfo:
-    """Return the schema's field of the key at `loc`."""
+    """Return the pydantic field of the key at `loc`."""
     return _table_of(loc).model_fields[str(loc[-1])]
 
 
 def _table_of(loc: tuple[int | str, ...]) -> type[BaseModel]:
-    """Return the schema of the table in which the key at `loc` stands."""
+    """Return the model of the table that holds the key at `loc`."""
     table: type[BaseModel] = Scene
     for key in loc[:-1]:
         if isinstance(key, str):
@@ -477,12 +486,12 @@ def scene_from(where: str | Path, values: Mapping[str, Any]) -> Scene:
 
 
 def scene_names() -> list[str]:
-    """Return the names of the scenes that come with the package."""
+    """Return the names of the bundled scenes."""
     return sorted(file.stem for file in SCENES.glob(f"*{ENDING}"))
 
 
 def find_scene(name: str) -> Path:
-    """Return the file of a scene: a path, or the name of one that comes with the package. Raises BadInputError."""
+    """Return the file of a scene. `name`: path of a `.toml` file, or name of a bundled scene. Raises BadInputError."""
     if name in scene_names():
         return SCENES / f"{name}{ENDING}"
     path = Path(name)
@@ -493,9 +502,9 @@ def find_scene(name: str) -> Path:
 
 
 def load_scene(path: Path) -> dict[str, Any]:
-    """Return the values of a scene file, checked against the schema, with paths made absolute from its folder.
+    """Return the values of a scene file, checked against the schema, with absolute paths.
 
-    Raises BadInputError naming the line or the key.
+    Relative paths start at the file's folder. Raises BadInputError that names the line or the key.
     """
     try:
         values = tomllib.loads(read_text(path, "a scene file (TOML)"))
@@ -515,7 +524,7 @@ def load_scene(path: Path) -> dict[str, Any]:
 
 
 def located(source: str, base: Path) -> str:
-    """Return `source` unchanged if it names something built in, else as a path that starts at `base`.
+    """Return `source` unchanged if it names something built in, otherwise as a path that starts at `base`.
 
     Raises BadInputError for an empty text.
     """

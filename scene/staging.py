@@ -1,14 +1,14 @@
-"""A scene with everything in its place: the motions on the floor, and a camera that films them.
+"""A staged scene: the motions are on the floor, and a camera films them.
 
-`stage_scene` is the only way from a scene and its bodies to what is sampled per frame, and the pose stage does what the
-command line reports. Other processes get a staged scene as plain arrays. That round trip is exact: every mover and the
-camera sample to the same bits afterwards; notes do not travel. A key is `mover.N.FIELD` or `camera.FIELD`; a field that
-is None has no key.
+`stage_scene` is the only way from a scene and its bodies to what is sampled per frame. Therefore the pose stage does
+what the command line reports. Other processes get a staged scene as plain arrays. This round trip is exact: afterwards,
+every mover and the camera sample to the same bits; notes are not transferred. Arrays are named `mover.N.FIELD` or
+`camera.FIELD`; a field that is None has no array.
 
-`require_person` refuses a recorded camera that does not show the person. Nothing in a file tells the axes of a robot's
-poses, the up of a map or the unit of its lengths for certain. A wrong one leads to a camera that looks past the person
-wherever it is placed. So each likely value is tried, and the one that shows the person most is named; whether it is
-true only the user knows.
+`require_person` refuses a recorded camera that does not show the person. No file states for certain the axes of a
+robot's poses, the up direction of a map or its unit of length. If one is wrong, the camera looks past the person
+wherever it is placed. The refusal tries each likely value and names the one that shows the person most; only the user
+knows if it is true.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ from trilane.scene.visibility import seen_at, seen_notes
 class Staged:
     """A staged scene.
 
-    `movers`: one per avatar of the scene. `notes`: what was decided about motions, floor and camera, for people.
+    `movers`: one per avatar of the scene, in order. `camera`: camera at its place. `notes`: what was decided about
+    motions, floor and camera, for people.
     """
 
     movers: tuple[Mover, ...]
@@ -49,9 +50,12 @@ class Staged:
 
 
 def stage_scene(scene: Scene, bodies: Sequence[ShapedBody], base: Path, footage: Footage | None = None) -> Staged:
-    """Load the motions and the camera of `scene`, whose avatars have `bodies`; relative paths start at `base`.
+    """Load the motions and the camera of `scene`, and put them in their places.
 
-    `footage`: facts of its background; None for a drawn one. Raises BadInputError when a file is unusable.
+    `bodies`: body of each avatar.
+    `base`: folder at which relative paths start.
+    `footage`: facts of the background; None for a drawn one.
+    Raises BadInputError when a file is unusable.
     """
     motions = [load_motion(spec, base, body.joints) for spec, body in zip(scene.avatars, bodies, strict=True)]
     movers = tuple(
@@ -78,7 +82,7 @@ LENS = ("width_px", "height_px", "fx", "fy", "cx", "cy")
 
 
 def staged_to_arrays(staged: Staged) -> Arrays:
-    """Return the arrays of `staged`, copied only where it has none yet. They hold no Python objects."""
+    """Return `staged` as plain arrays by name, without Python objects. Arrays of `staged` are not copied."""
     arrays: Arrays = {"movers": np.array(len(staged.movers))}
     for index, mover in enumerate(staged.movers):
         arrays |= {f"mover.{index}.{key}": value for key, value in _mover_arrays(mover).items()}
@@ -87,9 +91,9 @@ def staged_to_arrays(staged: Staged) -> Arrays:
 
 
 def staged_from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Staged:
-    """Return the scene that `staged_to_arrays` stored, without its notes; it keeps `arrays`, which may be read-only.
+    """Return the scene that `staged_to_arrays` stored, without its notes.
 
-    Raises KeyError when one is missing.
+    `arrays`: may be read-only; the scene keeps them. Raises KeyError when one is missing.
     """
     movers = tuple(_mover(_below(arrays, f"mover.{index}.")) for index in range(int(arrays["movers"])))
     return Staged(movers, _camera(_below(arrays, "camera.")), ())
@@ -120,7 +124,7 @@ def _mover(arrays: Arrays) -> Mover:
         None if leg_m is None else float(leg_m),
         bool(arrays["travels"]),
     )
-    vars(motion)["quats"] = arrays["quats"]  # sets the cached property, which otherwise is computed at the first sample
+    vars(motion)["quats"] = arrays["quats"]  # fills the cached property
     return Mover(
         motion, arrays["world"], float(arrays["scale"]), arrays["shift"], arrays["lift_times_s"], arrays["lift_m"], ()
     )
@@ -177,15 +181,15 @@ def _optics(arrays: Arrays) -> Optics:
     return Optics(lenses, near_m, far_m, filmed, tuple(int(quarters) for quarters in arrays["turned"]))
 
 
-#: Least share of the frames in which a recorded camera has to show the person.
+#: A recorded camera has to show the person in at least this share of the frames.
 ENOUGH = 0.5
-#: Number of frames that are looked at; of a longer run as many, evenly spread.
+#: Most frames that are examined; in a longer run, frames are evenly spread over the run.
 MOST_JUDGED = 120
-#: Score of the person's share of the picture's height beside the share of moments: it only breaks ties.
+#: Weight of the person's share of the picture's height, against the share of frames: it only breaks ties.
 HEIGHT_WEIGHT = 0.01
-#: Axes of poses that are tried: of cameras (optical, OpenGL), of robots and of aircraft.
+#: Axes of poses that are tried: those of cameras (optical and OpenGL), of robots and of aircraft.
 LIKELY_AXES = ("right-down-forward", "right-up-back", "forward-left-up", "forward-right-down")
-#: Factors on the unit of lengths that are tried.
+#: Factors on the unit of length that are tried.
 FACTORS = (0.3, 0.1, 0.03, 3.0, 10.0)
 RUNS_ANYHOW = "--allow-empty runs it as it is"
 
@@ -198,11 +202,11 @@ def require_person(
     footage: Footage | None = None,
     say: Callable[[str], object] = lambda _: None,
 ) -> None:
-    """Raise BadInputError where the recorded camera of `staged` does not show the person; it names a key that helps.
+    """Raise BadInputError if the recorded camera of `staged` does not show the person; the remedy names a key.
 
-    A camera that was placed has to show whole bodies, any other a part of one, in half of the frames, of which
-    some are looked at. The parameters are those of `stage_scene`, and its result. `say`: function that is given the
-    notes and what is tried, before a refusal's trials, which take up to a minute.
+    Half of the examined frames must show the whole bodies if the camera was placed, or a part of a body otherwise.
+    `staged` is the result of `stage_scene` for the other parameters. `say`: function that gets the notes and a message
+    before other values are tried, which takes up to a minute.
     """
     if not staged.camera.path.recorded:
         return
@@ -228,7 +232,10 @@ def _is_enough(share: float) -> bool:
 def _shares(
     camera: PlacedCamera, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]
 ) -> tuple[float, float]:
-    """Return the share of the frames in which the camera shows the bodies, and their mean share of its height."""
+    """Return the share of the frames in which the camera shows the bodies, and the mean height of the bodies.
+
+    The height is a share of the picture's height.
+    """
     times = np.linspace(0.0, (scene.frames - 1) / scene.fps, min(MOST_JUDGED, scene.frames))
     seen = seen_at(times, camera, movers, bodies, (scene.output.height, scene.output.width))
     share = seen.whole.mean() if scene.camera.place == "auto" else 1 - seen.nobody.mean()
@@ -236,7 +243,7 @@ def _shares(
 
 
 def _remedy(scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], base: Path, footage: Footage | None) -> str:
-    """Return what to set, by trial."""
+    """Return a remedy in words: the key and value that show the person most, found by trying all variants."""
     best, text = 0.0, ""
     for key, value in _variants(scene.camera, staged.camera.path, base):
         spec = scene.camera.model_copy(update={key: value})
@@ -255,7 +262,7 @@ def _remedy(scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], base: Pa
 
 
 def _variants(spec: CameraSpec, path: CameraPath, base: Path) -> Iterator[tuple[str, Any]]:
-    """Yield keys of the camera and values that may be true in place of those in use; stated keys stay."""
+    """Yield each (key, value) of the camera that may be right in place of the present value; stated keys stay."""
     if spec.place == "none":
         yield "place", "auto"
         return
@@ -268,7 +275,7 @@ def _variants(spec: CameraSpec, path: CameraPath, base: Path) -> Iterator[tuple[
 
 
 def _metres_per_unit(spec: CameraSpec, path: CameraPath, base: Path) -> float:
-    """Return the metres in a length of 1 of the file that `path` was read with; 1 for a camera that stands still."""
+    """Return the metres per unit of the file with which `path` was read; 1 for a camera that stands still."""
     raw = load_camera(spec.model_copy(update={"metres_per_unit": 1.0}), base)
     length, own = (float(np.linalg.norm(np.ptp(one.places, axis=0))) for one in (path, raw))
     return length / own if own > 0 else 1.0

@@ -1,18 +1,19 @@
-"""How much of the avatars a camera shows, and from which place in its world a recorded camera films them best.
+"""How much of the avatars a camera shows, and the best place in a recorded camera's world for the scene.
 
-**Shown.** A body is given by its outline. It is whole in a frame when all points of the outline are in the picture and
-between the clip planes. Nobody is seen when all points of every body are beyond one side of the picture.
+**Shown.** A body is represented by its outline, a set of points. A body is whole in a frame when all these points are
+in the picture and between the clip planes. Nobody is seen when all points of each body are beyond one plane of the view
+volume.
 
-**Best place.** A place is where the scene's origin comes to in the recording's world. The bodies turn about the
-vertical there, so that a heading of 0 faces the first eye. The best place shows whole bodies at the most moments. Among
-places with about as many, the place with larger bodies, nearer to the middle of the picture, wins. Places are proposed
-where the camera looks: along rays through its pictures, at distances from one that fills the picture with the bodies to
-many times the length of the path. So the search has no scale of its own. The best of them climb, in steps that are
-shares of the distance.
+**Best place.** A place is the position that the scene's origin gets in the world of the recording. At each place, the
+scene is turned about the vertical so that a heading of 0 faces the first eye. The best place shows whole bodies at the
+most moments. Among places with about as many, the place wins where bodies are larger and nearer to the picture's
+middle. Candidates are points on rays through the camera's pictures. Their distances range from the one at which the
+bodies fill the picture to many times the length of the path. The search therefore works at any scale. The best
+candidates then climb: each tries random steps, which are shares of its distance from the camera.
 
-In the search, a body is in the picture while no point of it is beyond one of the picture's four sides. A side is a
-plane, so only the point that is outermost across it counts. Which one that is depends on the bodies' heading alone:
-these reaches are computed once for each heading, and a place then costs one product with each plane.
+In the search, a body is in the picture when no point of it is beyond any of the picture's four sides. A side is a
+plane, so only the body's outermost point across that plane counts. The reach of this point depends only on the bodies'
+heading. Reaches are computed once for each heading; after that, a place costs one product with each plane.
 """
 
 from __future__ import annotations
@@ -31,19 +32,19 @@ from trilane.scene.mover import Mover, outline
 from trilane.scene.rotations import about
 from trilane.scene.schema import BUILT_IN_PREFIX, Scene
 
-#: Share of the picture's height below which a person is hard to find, in the median over the frames.
+#: A person whose median share of the picture's height is below this is hard to find.
 SMALL = 0.08
-#: Walk over the floor, metres, from which on a small person is small because the camera sees all of it.
+#: Extent of a walk over the floor, metres, from which a person looks small because the camera shows the whole walk.
 FAR_WALK_M = 10.0
-#: Number of frames that are looked at; of a longer run as many, evenly spread.
+#: Most frames that are examined; in a longer run, frames are evenly spread over the run.
 MOST_FRAMES = 300
 
 
 class Camera(Protocol):
-    """A camera in the scene."""
+    """A camera in the scene, as this module needs it; `PlacedCamera` is one."""
 
     def sample(self, t_s: float) -> F64:
-        """Return the matrix (4, 4) from world to camera at `t_s`."""
+        """Return the transform (4, 4) from world to camera at `t_s`."""
 
     def projection(self, t_s: float, output: Shape) -> F64:
         """Return the OpenGL clip matrix (4, 4) at `t_s` for a picture of `output` (height, width)."""
@@ -51,11 +52,12 @@ class Camera(Protocol):
 
 @dataclass(frozen=True)
 class Seen:
-    """What a camera shows at F moments.
+    """What a camera shows at F moments; booleans are stored as 0 and 1.
 
-    `whole` (F,): whether all bodies are whole in the picture. `nobody` (F,): whether nothing of any body is in it.
-    `share` (F,): share of all outlines' points that are in it. `height` (F,): share of the picture's height between the
-    lowest and the highest visible point.
+    `whole` (F,): whether all bodies are whole in the picture.
+    `nobody` (F,): whether no part of any body is in the picture.
+    `share` (F,): share of the outline points in the picture, averaged over the bodies.
+    `height` (F,): distance from the lowest to the highest visible point, as a share of the picture's height.
     """
 
     whole: F64
@@ -74,7 +76,7 @@ def seen_at(
 ) -> Seen:
     """Return what `camera` shows of the `movers` with `bodies` at `times_s` (F,).
 
-    `output`: (height, width) of the picture. `joints`: names of the joints whose part of a body is looked at.
+    `output`: (height, width) of the picture. `joints`: names of the joints whose vertices are examined.
     """
     actors = [
         (mover, Skeleton(body.joints, body.body.parents), outline(body, joints))
@@ -100,9 +102,9 @@ def seen_at(
 
 
 def _shown(clip: F64) -> tuple[float, float, float]:
-    """Return the share of points (K, 4) in clip space that are in the picture, and the lowest and highest visible y.
+    """Return the share of points (K, 4), clip space, in the view volume, and their lowest and highest visible y in NDC.
 
-    With nothing in the picture the lowest is 1 and the highest -1.
+    If all points are beyond one plane, the lowest y is 1 and the highest is -1.
     """
     w = clip[:, 3]
     beyond = np.concatenate([clip[:, :3] > w[:, None], clip[:, :3] < -w[:, None]], axis=1)
@@ -114,9 +116,9 @@ def _shown(clip: F64) -> tuple[float, float, float]:
 
 
 def seen_notes(camera: Camera, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> tuple[str, ...]:
-    """Say in how many of the run's frames the bodies are whole in the picture, in how many nobody is, and how large.
+    """Return notes: how often the bodies are whole in the picture, how often nobody is seen, and how large they are.
 
-    A recorded camera that was placed and shows them very small gets a hint at the key that may be wrong.
+    If a placed recorded camera shows people very small, a second note says which key may be wrong.
     """
     count = min(scene.frames, MOST_FRAMES)
     frames = np.arange(count) * scene.frames // count
@@ -132,13 +134,19 @@ def seen_notes(camera: Camera, scene: Scene, movers: Sequence[Mover], bodies: Se
 
 
 def _walked(movers: Sequence[Mover], times_s: F64) -> float:
-    """Return how far apart over the floor the places are where one of the `movers` is at `times_s` (F,), metres."""
+    """Return the largest extent, metres, of a mover's walk over the floor at `times_s` (F,).
+
+    The extent is the diagonal of the rectangle that the walk covers.
+    """
     ways = [[mover.sample(float(t_s))[1] @ mover.world[:3, :3].T for t_s in times_s] for mover in movers]
     return max(float(np.hypot(*np.ptp(np.array(way)[:, [0, 2]], axis=0))) for way in ways)
 
 
 def _hint(scene: Scene, heights: F64, movers: Sequence[Mover], times_s: F64) -> tuple[str, ...]:
-    """Return a note where `heights` (F,), shares of the picture's height, are small: a long walk, or another unit."""
+    """Return a note when people are very small: either the walk is long, or the camera file has another unit.
+
+    `heights` (F,): people's shares of the picture's height. The result is empty for a camera that was not placed.
+    """
     is_placed = scene.camera.place == "auto" and not scene.camera.source.startswith(BUILT_IN_PREFIX)
     if not is_placed or not len(heights) or np.median(heights) >= SMALL:
         return ()
@@ -156,51 +164,54 @@ def _hint(scene: Scene, heights: F64, movers: Sequence[Mover], times_s: F64) -> 
 
 
 #: Number of moments at which a place is scored, evenly spread over the first SCORED_S seconds of the scene. A shorter
-#: motion or recording is repeated as in a run; what a longer one shows later does not count.
+#: motion or recording repeats, as in a run. Anything later does not count.
 SCORED_MOMENTS, SCORED_S = 120, 10.0
-#: One moment of so many decides which of the proposed places climb, and has rays through its picture.
+#: Every SEEDS_EVERY-th moment decides which candidates climb; every RAYS_EVERY-th has rays through its picture.
 SEEDS_EVERY, RAYS_EVERY = 3, 10
-#: Where rays go through a picture, as shares of its half width and half height.
+#: Positions of rays in a picture, as shares of its half width and half height.
 RAYS_AT = (-0.8, -0.4, 0.0, 0.4, 0.8)
-#: Nearest distance on a ray, in distances at which the bodies fill the picture; the farthest, in these distances and in
-#: lengths of the path added; factor from one distance to the next. Far off a path of any length is a pan.
+#: Nearest and farthest distance on a ray, in units of the distance at which the bodies fill the picture. The farthest
+#: is increased by FARTHEST_OF_PATH lengths of the path; from there, the path looks like a pan. FARTHER is the factor
+#: from one distance to the next.
 NEAREST, FARTHEST, FARTHEST_OF_PATH, FARTHER = 0.7, 30.0, 10.0, 1.25
-#: Number of places that climb, and least distance between them in the beginning, as a share of that from the camera.
+#: Number of places that climb, and their least distance from each other at first, as a share of the distance from the
+#: camera.
 CLIMBERS, APART = 96, 0.07
-#: Steps of a climb, as shares of the distance from the camera, and number of random ones from each place at each step.
-#: Of the places that climb the worst stop after each step, as long as there are more than LAST_CLIMBERS.
+#: A climb: the steps as shares of the distance from the camera, and the number of random steps tried from each place.
+#: After each step only the share STAY of the places goes on, but at least LAST_CLIMBERS.
 STEPS, TRIED, LAST_CLIMBERS, STAY = tuple(0.3 * 0.8**k for k in range(28)), 40, 12, 0.92
-#: Least height of the camera above the floor.
+#: Least height, metres, of the camera above the floor.
 LOWEST_EYE_M = 0.3
-#: Share of the picture's half width and half height within which a body counts as whole in the picture.
+#: A body counts as whole within this share of the picture's half width and half height.
 MARGIN = 0.98
-#: Depth from which on a body is seen, unless the near clip plane is farther.
+#: Least depth, metres, at which a body is seen; a near clip plane farther away takes its place.
 NEAREST_M = 0.3
-#: Score of how well bodies are shown: their share of the picture's height, up to ENOUGH_SIZE, less MIDDLE_WEIGHT of it
-#: for a body at the border. Whole bodies at all moments score 1. Nothing gained in this is worth a fortieth of the
-#: moments.
+#: Weight of how well bodies are shown, against whole bodies at all moments, which score 1. A body scores its share of
+#: the picture's height, at most ENOUGH_SIZE; a body at the border loses the share MIDDLE_WEIGHT of this score. The
+#: largest possible gain is less than a fortieth of the moments.
 SIZE_WEIGHT, ENOUGH_SIZE, MIDDLE_WEIGHT = 0.03, 0.75, 0.5
-#: Score of bodies that are nearly in the picture, in moments: it leads a climb to the next moment.
+#: Weight, in moments, of bodies that are nearly whole in the picture. It leads a climb towards places with more whole
+#: bodies.
 NEARLY_MOMENTS = 0.5
-#: Number of headings for which reaches are computed. The nearest is off by 0.35 degrees at most, 4 mm at a hand.
+#: Number of headings for which reaches are computed. The nearest one is off by at most 0.35 degrees, 4 mm at a hand.
 HEADINGS = 512
-#: Number of directions in which the outermost points of a body stand for all of them.
+#: Number of directions in which a body's outermost points are taken to represent the body.
 DIRECTIONS = 120
-#: Number of places that are scored together: so few that the arrays stay in the processor's cache.
+#: Number of places that are scored together; few enough that the arrays stay in the processor's cache.
 PLACES_AT_ONCE = 128
-#: Rows of a moment: the picture's four sides, the depth of the nearest point, and of the bodies' middle the depth and
-#: its x and y in the picture.
+#: Rows of a moment: the picture's four sides, the depth of the nearest point, then the depth, x and y of the bodies'
+#: middle. NEAR and MIDDLE are the indices of the nearest depth and of the middle's depth.
 ROWS, NEAR, MIDDLE = 8, 4, 5
 
 
 def outermost_points(times_s: F64, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> F64:
-    """Return the points (F, P, 3) of each of the bodies at `times_s` (F,) that are outermost, in the scene."""
+    """Return the outermost points (F, P, 3) of all bodies at `times_s` (F,), in the scene's world, metres."""
     directions = _spread(DIRECTIONS).T
     found = []
     for mover, body in zip(movers, bodies, strict=True):
         skeleton, shape = Skeleton(body.joints, body.body.parents), outline(body)
         posed = [shape.posed(skeleton.pose(*mover.sample(float(t_s)), mover.world).matrices) for t_s in times_s]
-        # Made as wide and deep as high: arms that are spread hide a back from most directions.
+        # Each body is scaled to equal extents first; otherwise spread arms would hide the back in most directions.
         found.append(
             np.stack([points[((points / np.ptp(points, axis=0)) @ directions).argmax(axis=0)] for points in posed])
         )
@@ -208,7 +219,7 @@ def outermost_points(times_s: F64, movers: Sequence[Mover], bodies: Sequence[Sha
 
 
 def _spread(count: int) -> F64:
-    """Return unit vectors (count, 3) spread evenly over the sphere, in a Fibonacci spiral."""
+    """Return `count` unit vectors (count, 3), evenly spread over the sphere in a Fibonacci spiral."""
     k = np.arange(count)
     height, angle = 1 - (2 * k + 1) / count, np.pi * (1 + 5**0.5) * k
     level = np.sqrt(1 - height**2)
@@ -217,11 +228,12 @@ def _spread(count: int) -> F64:
 
 @dataclass(frozen=True)
 class Filming:
-    """The recording and the bodies at the F moments at which places are scored.
+    """The recorded camera and the bodies at the F moments at which places are scored.
 
-    `eyes`, (F, 3), `turns`, (F, 3, 3): places and axes (columns) of the camera in the recording's world. `lenses`
-    (F, 2, 2): factor and addend of x and of y, where ndc = factor * x / depth + addend. `points` (F, P, 3): outermost
-    points of the bodies in the scene. `nearest_m`: depth from which on a body is seen.
+    `eyes` (F, 3), `turns` (F, 3, 3): positions of the camera, and its axes as columns, in the world of the recording.
+    `lenses` (F, 2, 2): for x and y, a factor and an addend: ndc = factor * x / depth + addend.
+    `points` (F, P, 3): outermost points of the bodies in the scene.
+    `nearest_m`: least depth at which a body is seen, metres.
     """
 
     eyes: F64
@@ -231,12 +243,18 @@ class Filming:
     nearest_m: float = NEAREST_M
 
     def every(self, step: int) -> Filming:
-        """Return the first of every `step` moments."""
+        """Return every `step`-th moment, beginning with the first."""
         return Filming(self.eyes[::step], self.turns[::step], self.lenses[::step], self.points[::step], self.nearest_m)
 
 
 def filming(path: CameraPath, mount: F64, times_s: F64, output: Shape, points: F64, near_m: float) -> Filming:
-    """Return the recording `path` on `mount` (3, 3) at `times_s` (F,), with a picture of `output` (height, width)."""
+    """Return the `Filming` of the recording `path` at `times_s` (F,).
+
+    `mount` (3, 3): rotation from the camera's axes to those of the path.
+    `output`: (height, width) of the picture.
+    `points` (F, P, 3): outermost points of the bodies.
+    `near_m`: distance of the near clip plane, metres.
+    """
     poses = [path.pose(float(t_s)) for t_s in times_s]
     clips = np.stack([path.projection(float(t_s), output) for t_s in times_s])
     lenses = np.stack([[clips[:, k, k], -clips[:, k, 2]] for k in range(2)]).transpose(2, 0, 1)
@@ -246,10 +264,11 @@ def filming(path: CameraPath, mount: F64, times_s: F64, output: Shape, points: F
 
 @dataclass(frozen=True)
 class PlaceMerits:
-    """How S places show the bodies, each (S,).
+    """How S places show the bodies; all arrays (S,).
 
-    `whole`: share of the moments with whole bodies. `well`: how well bodies are shown when they are whole, 0 to
-    ENOUGH_SIZE, on average. `nearly`: how nearly bodies that are not whole are in the picture, 0 to 1 on average.
+    `whole`: share of the moments with whole bodies.
+    `well`: size of whole bodies, less for those near the border, averaged over all moments: 0 to ENOUGH_SIZE.
+    `nearly`: how nearly the other bodies are in the picture, averaged over all moments: 0 to 1.
     """
 
     whole: F64
@@ -258,14 +277,15 @@ class PlaceMerits:
 
     @property
     def score(self) -> F64:
-        """What decides between places."""
+        """Score (S,) that decides between places."""
         return np.asarray(self.whole + SIZE_WEIGHT * self.well)
 
 
 class PlaceJudge:
     """Judges places for one `Filming`.
 
-    A row of a moment is a direction in the recording's world that is multiplied with a place: ROWS in all.
+    Each moment has ROWS rows. A row is a direction in the recording's world. The product of a row with a place gives a
+    number, such as the distance of the place from a side of the picture.
     """
 
     def __init__(self, film: Filming) -> None:
@@ -277,12 +297,12 @@ class PlaceJudge:
         self._reaches, self._heights = _reaches(film, rows)
 
     def shown(self, places: F64) -> PlaceMerits:
-        """Return how each of `places` (S, 3) shows the bodies."""
+        """Return how each of the `places` (S, 3) shows the bodies."""
         parts = [self._shown(part) for part in np.split(places, range(PLACES_AT_ONCE, len(places), PLACES_AT_ONCE))]
         return PlaceMerits(*np.concatenate(parts, axis=1))
 
     def _shown(self, places: F64) -> F64:
-        """Return `whole`, `well` and `nearly` (3, S) of a few places."""
+        """Return an array (3, S) with `whole`, `well` and `nearly` of at most PLACES_AT_ONCE places (S, 3)."""
         film = self._film
         turned = np.rint(facing(film, places) * (HEADINGS / (2 * np.pi))).astype(np.intp) % HEADINGS
         values = (places.astype(np.float32) @ self._along).reshape(len(places), ROWS, -1)
@@ -301,7 +321,10 @@ class PlaceJudge:
 
 
 def _rows(film: Filming) -> F64:
-    """Return the rows (ROWS, F, 3): those of sides point inwards, and a value over the depth is in half pictures."""
+    """Return the rows (ROWS, F, 3).
+
+    Rows of sides point inwards. A row's value divided by the depth is in half sides of the picture.
+    """
     right, up, ahead = film.turns[:, :, 0], film.turns[:, :, 1], -film.turns[:, :, 2]
     x, y = (film.lenses[:, k, :1] * axis + film.lenses[:, k, 1:] * ahead for k, axis in enumerate((right, up)))
     sides = [MARGIN * ahead + x, MARGIN * ahead - x, MARGIN * ahead + y, MARGIN * ahead - y]
@@ -309,16 +332,17 @@ def _rows(film: Filming) -> F64:
 
 
 def _reaches(film: Filming, rows: F64) -> tuple[F32, F32]:
-    """Return what the bodies add to each row, (HEADINGS, ROWS, F), and their heights (HEADINGS, F) in half pictures.
+    """Return the reaches (HEADINGS, ROWS, F) and the heights (HEADINGS, F) of the bodies.
 
-    The outermost point counts towards a side and for the depth. Heights are those at a depth of 1.
+    A reach is what the bodies add to a row's value. For rows of sides and of the nearest depth, their outermost point
+    counts; for other rows, their middle. Heights are those at a depth of 1, in half pictures.
     """
     headings = about(1, np.arange(HEADINGS) * (2 * np.pi / HEADINGS))
     reaches = np.empty((HEADINGS, ROWS, rows.shape[1]), np.float32)
     heights = np.empty((HEADINGS, rows.shape[1]), np.float32)
     middles = (film.points.min(axis=1) + film.points.max(axis=1)) / 2
     for k, (points, middle) in enumerate(zip(film.points, middles, strict=True)):
-        turned = (rows[:, k] @ headings).astype(np.float32)  # a row times the turned point is the turned row times it
+        turned = (rows[:, k] @ headings).astype(np.float32)  # turning the rows, not the points, gives the same products
         across = turned[:, :MIDDLE].reshape(-1, 3) @ points.T.astype(np.float32)
         reaches[:, :MIDDLE, k] = across.min(axis=1).reshape(HEADINGS, MIDDLE)
         reaches[:, MIDDLE:, k] = turned[:, MIDDLE:] @ middle.astype(np.float32)
@@ -328,7 +352,10 @@ def _reaches(film: Filming, rows: F64) -> tuple[F32, F32]:
 
 
 def facing(film: Filming, places: F64) -> F64:
-    """Return angles (S,) about +Y from the scene to the recording's world, with which +Z points to the first eye."""
+    """Return, for each of `places` (S, 3), the angle (S,), radians, by which the scene is turned about +Y.
+
+    At this angle the scene's +Z points to the first eye.
+    """
     towards = film.eyes[0] - places
     return np.asarray(np.arctan2(towards[:, 0], towards[:, 2]))
 
@@ -351,19 +378,19 @@ def best_place(film: Filming) -> tuple[F64, float]:
 
 
 def _merits(film: Filming, judge: PlaceJudge, places: F64) -> F64:
-    """Return the scores (S,) of places for a climb; below 0 where the floor is too near to an eye."""
+    """Return the scores (S,) of places in a climb; -1 where the floor is too near to an eye."""
     shown = judge.shown(places)
     merits = shown.score + NEARLY_MOMENTS / len(film.eyes) * shown.nearly
     return np.where(places[:, 1] <= highest_floor(film), merits, -1.0)
 
 
 def highest_floor(film: Filming) -> float:
-    """Return the greatest height of the floor at which no eye is too near to it."""
+    """Return the greatest height of the floor, metres, at which every eye is at least LOWEST_EYE_M above it."""
     return float(film.eyes[:, 1].min()) - LOWEST_EYE_M
 
 
 def _seeds(film: Filming) -> F64:
-    """Return places (S, 3) where the camera looks, those that show most first."""
+    """Return candidate places (S, 3) on rays where the camera looks, best first."""
     picked = slice(None, None, RAYS_EVERY)
     x, y = (axis.ravel() for axis in np.meshgrid(RAYS_AT, RAYS_AT))
     lenses, turns, eyes = film.lenses[picked], film.turns[picked], film.eyes[picked]
@@ -374,7 +401,7 @@ def _seeds(film: Filming) -> F64:
     depths = NEAREST * fills * FARTHER ** np.arange(np.log(far / (NEAREST * fills)) / np.log(FARTHER) + 1)
     points = (eyes[:, None, None] + rays[:, :, None] * depths[:, None]).reshape(-1, 3)
     points = np.concatenate([points, _looked_at(film)[None]])
-    # The middle of the bodies comes to each point; they face the camera as they would with the origin there.
+    # The middle of the bodies is put at each point; they face the camera as if the origin were there.
     middles = (film.points.min(axis=1) + film.points.max(axis=1)) / 2
     middle = np.repeat(middles[picked], len(x) * len(depths), axis=0)
     middle = np.concatenate([middle, middles.mean(axis=0)[None]])
@@ -386,16 +413,17 @@ def _seeds(film: Filming) -> F64:
 
 
 def _filling_depth(film: Filming) -> float:
-    """Return the depth at which the bodies fill the picture, upright or across, at the moment when they are largest."""
+    """Return the depth, metres, at which the bodies fill the picture in height or width when they are largest."""
     extents = np.ptp(film.points, axis=1)
     sizes = np.stack([np.hypot(extents[:, 0], extents[:, 2]), extents[:, 1]], axis=1)
     return float((sizes * film.lenses[:, :, 0]).max() / 2)
 
 
 def _looked_at(film: Filming) -> F64:
-    """Return the point (3,) nearest to all lines of sight; of several, the one nearest to the middle of the eyes.
+    """Return the point (3,) nearest to all lines of sight; of several such points, the nearest to the middle of the
+    eyes.
 
-    The point solves the normal equations of the distances: sum (1 - d d') (x - p) = 0 for places p and directions d.
+    The point x solves the normal equations of the distances: sum (1 - d d') (x - p) = 0 for eyes p and directions d.
     """
     ahead = -film.turns[:, :, 2]
     across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
@@ -405,7 +433,7 @@ def _looked_at(film: Filming) -> F64:
 
 
 def _apart(film: Filming, places: F64) -> F64:
-    """Return the first CLIMBERS of `places` (S, 3) that are not near an earlier one."""
+    """Return up to CLIMBERS of `places` (S, 3), in order, and skip places near one that is already returned."""
     apart = APART * _distances(film, places)
     kept: list[int] = []
     for k in range(len(places)):
@@ -417,6 +445,6 @@ def _apart(film: Filming, places: F64) -> F64:
 
 
 def _distances(film: Filming, places: F64) -> F64:
-    """Return the median distance of the eyes from each of `places` (S, 3)."""
+    """Return, for each of `places` (S, 3), its median distance (S,) from the eyes."""
     some = film.eyes[::RAYS_EVERY]
     return np.asarray(np.median(np.linalg.norm(some[None] - places[:, None], axis=2), axis=1))

@@ -1,4 +1,4 @@
-"""Reads camera files and makes the built-in cameras: a view and a projection over time.
+"""Cameras over time: paths read from camera files, and built-in cameras.
 
 From `scene/` it may use the rotations, the schema, and the sampling in time of `scene/motion/`.
 """

@@ -2,14 +2,13 @@
 
 Poses are world to camera with optical axes (x right, y down, looks along +Z). Views are in the order of their photos'
 names. The map has no unit, no levelled axis and no times. Distortion is left out and noted. Format:
-https://colmap.github.io/format.html, https://colmap.github.io/cameras.html; the numbers of the camera models are those
-of COLMAP's `sensor/models.h`.
+https://colmap.github.io/format.html, https://colmap.github.io/cameras.html. The numbers of camera models are those in
+COLMAP's `sensor/models.h`.
 """
 
 from __future__ import annotations
 
 import math
-import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,15 +21,12 @@ from trilane.errors import BadInputError
 from trilane.files import read_text, require_file
 from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, LengthUnit, RawCamera, times_without
 from trilane.scene.lens import Bent, Lens, checked_lens, distortion_note
-from trilane.scene.recordings import Detected
+from trilane.scene.recordings import Detected, natural
 from trilane.scene.rotations import matrix_from_quat, normalised
 
 
 class CameraModel(NamedTuple):
-    """A camera model.
-
-    `parameters`: names of its parameters, in order; `f` is both focal lengths, `k` the first of radial distortion.
-    """
+    """A camera model. `parameters`: names of its parameters, in file order; `f` is both focal lengths."""
 
     name: str
     parameters: tuple[str, ...]
@@ -38,7 +34,7 @@ class CameraModel(NamedTuple):
 
 
 _F, _FXY = ("f", "cx", "cy"), ("fx", "fy", "cx", "cy")
-#: Camera models by COLMAP's number.
+#: Camera models, by COLMAP's number.
 MODELS = {
     0: CameraModel("SIMPLE_PINHOLE", _F),
     1: CameraModel("PINHOLE", _FXY),
@@ -53,15 +49,15 @@ MODELS = {
     10: CameraModel("THIN_PRISM_FISHEYE", (*_FXY, "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"), is_fisheye=True),
 }
 BY_NAME = {model.name: model for model in MODELS.values()}
-#: Largest plausible side of a picture, in pixels; most letters of a photo's name.
+#: Largest plausible side of a picture, pixels; largest length of a photo's name, letters.
 MAX_SIDE_PX, MAX_NAME = 1e6, 256
 
 
 @dataclass(frozen=True)
 class ColmapCamera:
-    """A camera of the model.
+    """A camera of the file.
 
-    `model`: name of its camera model. `values`: its parameters, by name.
+    `model`: name of its camera model. `width_px`, `height_px`: size of its pictures. `values`: parameters by name.
     """
 
     model: str
@@ -70,7 +66,7 @@ class ColmapCamera:
     values: dict[str, float]
 
     def lens(self) -> Lens:
-        """Return the lens without its distortion."""
+        """Return the lens as a pinhole, without distortion."""
         v = self.values
         fx, fy = v.get("fx", v.get("f", 0.0)), v.get("fy", v.get("f", 0.0))
         return Lens(self.width_px, self.height_px, fx, fy, v["cx"], v["cy"])
@@ -82,9 +78,10 @@ class ColmapCamera:
 
 
 class ColmapImage(NamedTuple):
-    """A view of the model.
+    """A view.
 
-    `quat` (w, x, y, z), `shift`: transform from world to camera. `camera`: number of its camera.
+    `name`: name of its photo. `quat` (w, x, y, z), `shift`: transform from world to camera. `camera`: number of its
+    camera.
     """
 
     name: str
@@ -96,7 +93,10 @@ class ColmapImage(NamedTuple):
 def checked_camera(
     where: str | Path, model: CameraModel, size: tuple[float, float], values: Sequence[float]
 ) -> ColmapCamera:
-    """Return a camera whose numbers make sense. Raises BadInputError."""
+    """Return a camera of `model` with the parameters `values`. `size`: (width, height) in pixels.
+
+    Raises BadInputError about `where` when the numbers are not plausible.
+    """
     if len(values) != len(model.parameters):
         raise BadInputError(where, f"{len(values)} parameters", f"{len(model.parameters)} of {model.name}")
     if not all(1 <= side <= MAX_SIDE_PX for side in size):
@@ -112,11 +112,11 @@ def checked_camera(
 
 CAMERAS = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS a line"
 IMAGES = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME a line, then its points"
-WORDS = 10  # words of an image's first line, when its name has no blanks
+WORDS = 10  # words of an image's first line, with the name as one word
 
 
 def read_cameras_text(path: Path) -> dict[int, ColmapCamera]:
-    """Return the cameras of `path` by their numbers. Raises BadInputError with the line."""
+    """Return the cameras of `path`, a `cameras.txt`, by number. Raises BadInputError with the line."""
     cameras = {}
     for number, line in _lines(path, CAMERAS):
         where, words = f"{path}, line {number}", line.split()
@@ -133,7 +133,7 @@ def read_cameras_text(path: Path) -> dict[int, ColmapCamera]:
 
 
 def read_images_text(path: Path) -> list[ColmapImage]:
-    """Return the images of `path`. Raises BadInputError with the line."""
+    """Return the views of `path`, an `images.txt`. Raises BadInputError with the line."""
     images, is_points = [], False
     for number, line in _lines(path, IMAGES, keeps_blank=True):
         is_image = _is_image(line)
@@ -151,7 +151,10 @@ def _lines(path: Path, expected: str, keeps_blank: bool = False) -> list[tuple[i
 
 
 def _is_image(line: str) -> bool:
-    """Return whether the line has a name behind its numbers; points are triples of numbers."""
+    """Return whether `line` is the first line of an image, and not a line of points.
+
+    An image's line has a name after its numbers; a line of points consists of triples of numbers.
+    """
     words = line.split(maxsplit=WORDS - 1)
     if len(words) < WORDS:
         return False
@@ -179,13 +182,13 @@ MAX_ENTRIES = 1_000_000
 
 
 class _Reader:
-    """Reads `file` of `size` bytes and refuses to read beyond its end."""
+    """Reads `file`, which has `size` bytes, and refuses to read beyond its end."""
 
     def __init__(self, path: Path, file: IO[bytes], size: int) -> None:
         self.path, self._file, self._size = path, file, size
 
     def require(self, count: int, what: str) -> None:
-        """Raise BadInputError unless the file has `count` bytes more."""
+        """Raise BadInputError if the file has fewer than `count` further bytes. `what`: these bytes in words."""
         left = self._size - self._file.tell()
         if count > left:
             raise BadInputError(self.path, f"{left} bytes, truncated", f"{count} bytes of {what}")
@@ -195,7 +198,11 @@ class _Reader:
         return form.unpack(self._file.read(form.size))
 
     def entries(self, least: int, what: str) -> Iterator[int]:
-        """Yield numbers of the entries, as many as the file says, each of at least `least` bytes."""
+        """Return an iterator over the indices of the entries, whose number is read from the file.
+
+        `least`: least size of an entry, bytes. `what`: entries in words. Raises BadInputError when the file is too
+        short.
+        """
         count = self.take(COUNT, f"the count of {what}")[0]
         if count > MAX_ENTRIES:
             raise BadInputError(self.path, f"{count} {what}", f"at most {MAX_ENTRIES}")
@@ -203,7 +210,7 @@ class _Reader:
         return iter(range(count))
 
     def name(self) -> str:
-        """Read text up to a NUL byte."""
+        """Return the text up to the next NUL byte, and continue after that byte."""
         at = self._file.tell()
         head, end, _ = self._file.read(MAX_NAME_BYTES).partition(b"\0")
         if not end:
@@ -217,7 +224,7 @@ class _Reader:
 
 
 def read_cameras_binary(path: Path) -> dict[int, ColmapCamera]:
-    """Return the cameras of `path` by their numbers. Raises BadInputError."""
+    """Return the cameras of `path`, a `cameras.bin`, by number. Raises BadInputError."""
     cameras = {}
     size = require_file(path, "a COLMAP cameras.bin")
     with path.open("rb") as file:
@@ -234,7 +241,7 @@ def read_cameras_binary(path: Path) -> dict[int, ColmapCamera]:
 
 
 def read_images_binary(path: Path) -> list[ColmapImage]:
-    """Return the images of `path`. Raises BadInputError."""
+    """Return the views of `path`, an `images.bin`. Raises BadInputError."""
     images = []
     size = require_file(path, "a COLMAP images.bin")
     with path.open("rb") as file:
@@ -250,13 +257,13 @@ def read_images_binary(path: Path) -> list[ColmapImage]:
 
 EXPECTED = "a COLMAP model: cameras.txt and images.txt, or cameras.bin and images.bin"
 MAX_VIEWS = 100_000
-#: Places of the model below the folder of a project.
+#: Folders below a project's folder that may hold the model.
 BELOW = (Path(), Path("sparse/0"), Path("sparse"), Path("0"), Path("colmap/sparse/0"))
 ENDINGS = (".bin", ".txt")
 
 
 def model_in(folder: Path) -> tuple[Path, str] | None:
-    """Return the folder at or below `folder` that has a model, and the ending of its files."""
+    """Return the folder at or below `folder` that holds a model, and the suffix of its files; None without a model."""
     for below in BELOW:
         for ending in ENDINGS:
             if all((folder / below / f"{name}{ending}").is_file() for name in ("cameras", "images")):
@@ -265,9 +272,9 @@ def model_in(folder: Path) -> tuple[Path, str] | None:
 
 
 def load_colmap(path: Path, rate_hz: float | None = None) -> RawCamera:
-    """Read `path`, a folder or a file of the model. Raises BadInputError naming the file.
+    """Read the COLMAP model at `path`, a folder or a file of the model. Raises BadInputError that names the file.
 
-    `rate_hz`: views a second, from the scene.
+    `rate_hz`: views a second by the scene; None if the scene does not say.
     """
     found = model_in(path if path.is_dir() else path.parent)
     if found is None:
@@ -276,7 +283,7 @@ def load_colmap(path: Path, rate_hz: float | None = None) -> RawCamera:
     cameras, images = _read(folder, ending)
     if not 1 <= len(images) <= MAX_VIEWS:
         raise BadInputError(folder / f"images{ending}", f"{len(images)} images", f"1 to {MAX_VIEWS}")
-    views = sorted(images, key=lambda image: _natural(image.name))
+    views = sorted(images, key=lambda image: natural(image.name))
     lenses, distorted = _lenses(folder / f"images{ending}", views, cameras)
     world_to_camera = matrix_from_quat(normalised(np.array([image.quat for image in views])))
     turns = np.swapaxes(world_to_camera, 1, 2)
@@ -300,15 +307,13 @@ def _read(folder: Path, ending: str) -> tuple[dict[int, ColmapCamera], list[Colm
     return read_cameras_text(cameras), read_images_text(images)
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Return a sort key that places `img10` after `img9`."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d{1,18})", name)]
-
-
 def _lenses(
     where: Path, views: Sequence[ColmapImage], cameras: Mapping[int, ColmapCamera]
 ) -> tuple[tuple[Lens, ...], tuple[str, ...]]:
-    """Return one lens for all views or one for each, and notes on what is left out of them."""
+    """Return one lens for all views, or one for each, without distortion; and notes on the distortion.
+
+    `where`: file of images, for messages. Raises BadInputError when the camera of a view does not exist.
+    """
     for image in views:
         if image.camera not in cameras:
             raise BadInputError(f"{where}: {image.name}", f"camera {image.camera}", "a camera of the model")

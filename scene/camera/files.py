@@ -1,8 +1,9 @@
-"""Loads the camera of a scene: a built-in one by name, or a file whose format follows from its content.
+"""Loads the camera of a scene: a built-in one by name, or a file whose format is found from its content.
 
-The scene may state the format. Else a folder is known by the names of its files, and a text by its column names, then
-by the number of columns and what they hold. A file that fits a second format, or another order of columns, becomes a
-question to the user: the message names both and what settles it. A note gives the reason of each guess.
+The scene may state the format. Otherwise a folder is recognised by the names of its files, and a text by its column
+names, or else by the number of columns and what they hold. A file that fits a second format, or another order of
+columns, is refused. The message then names both possibilities, and the key that decides. A note gives the reason of
+each guess.
 """
 
 from __future__ import annotations
@@ -76,53 +77,51 @@ COLMAP_FILES = tuple(f"{name}{ending}" for name in ("cameras", "images") for end
 
 
 class Guess(NamedTuple):
-    """A guess at a file's format.
-
-    `kind`: format, as in the scene's `format`. `reason`: part of a sentence.
-    """
+    """A guess at a file's format. `kind`: format, as in the scene's `format`. `reason`: reason in words, for notes."""
 
     kind: str
     reason: str
 
 
-#: Least number of rows that tell how a camera moves.
+#: Least number of rows from which a camera's movement is judged.
 LEAST_ROWS = 5
-#: Least number of rows that tell another order of columns by where the camera goes and looks.
+#: Least number of rows from which another order of columns is found by where the camera goes and looks.
 LEAST_LED = 20
-#: Median deviation of the steps of a column, in medians: below the first they are a clock's, above the second they are
-#: not.
+#: A column is a clock if its `_unevenness` is below EVEN, and no clock if it is UNEVEN or more.
 EVEN, UNEVEN = 0.1, 0.5
-#: Largest distance of a place from the origin of its map, in any unit; times since 1970 are larger.
+#: Largest coordinate of a map, in any unit; times since 1970 are larger.
 FARTHEST = 1e8
-#: Tolerance within which numbers of more than three digits form a quaternion or a rotation matrix, and largest share of
-#: rows beyond it.
+#: Tolerance of quaternions and rotation matrices whose numbers have more than three digits; largest share of rows that
+#: may exceed it.
 PRECISE, MOST_IMPRECISE = 1e-3, 0.25
-#: Tolerance within which a pose has no turn and is at the origin.
+#: Tolerance within which a pose is the identity.
 EXACT = 1e-6
-#: Mean cosine between the camera's way and its axis, and between its axes and the world's, above which both count as
-#: one.
+#: Directions count as equal above these mean cosines: the camera's movement and an axis of the camera; an axis of the
+#: camera and one of the world.
 ALONG, UPRIGHT = 0.9, 0.7
-#: Nearest point that people walk round, and the largest share of its distance by which lines of sight miss it. Somebody
-#: who pans holds the camera at less than this from the axis of the turn, so their lines of sight meet behind it.
+#: Least distance of a point that a camera goes round, and the largest share of that distance by which its lines of
+#: sight may miss the point. A person who pans holds the camera nearer than this to the axis of the turn; such lines of
+#: sight meet behind the camera.
 LEAST_AWAY, MOST_MISSED = 1.0, 0.2
-#: Depths of a camera held at a person's height in a world with Y down and the floor at 0. With Y up none is there, nor
-#: in a phone's world, which begins where the phone is held.
+#: Range of depths below 0, metres, of a camera held by a person, if Y is down and the floor is at 0. With Y up, no
+#: camera is that low. In a phone's world, the origin is where the phone was, so no camera is that low either.
 BELOW_M = 0.7, 2.5
-#: Times of a device's clock, in seconds since it was switched on: later than the start of a recording, before 1970's.
+#: Range of times of a device's clock, in seconds since it was switched on: more than times since the start of a
+#: recording, less than times since 1970.
 OF_A_DEVICE_S = 60.0, 1e9
-#: Another order of numbers is possible unless it is dearer by this.
+#: Another order of numbers is possible if its price is higher by less than this.
 MUCH_DEARER = 0.1
-#: Its camera looks clearly more astray by the first for one of the 24 orders of a quaternion, by the second for one of
-#: a matrix. Matrices that differ by less than the last, as turns by 5 degrees do, are the same.
+#: Another order looks clearly more astray if `_astray` is higher by this: for one of the 24 orders of a quaternion, and
+#: for an order of a matrix. Matrices whose entries differ by at most SAME, as by a rotation of 5 degrees, are the same.
 MUCH_ASTRAY, AS_ASTRAY, SAME = 0.3, 0.1, 2 * math.sin(math.radians(2.5))
-#: Sine of the mean elevation up to which a camera looks ahead: one degree.
+#: A camera looks ahead if the sine of its mean elevation is below this: one degree.
 LEVEL = 0.02
 WHICH_MATRIX = (
     'set camera.format to "kitti" if the camera looks along +Z of its axes (x right, y down), to "arkit" if along -Z '
     "(x right, y up); camera.axes states other axes"
 )
 
-#: How a table becomes usable, by the columns that other programs save.
+#: How to convert a table, by the number of columns that other programs save.
 OTHERS = {
     1: "part the numbers by blanks, commas or semicolons",
     7: "if these are rotation vectors, as in ARKitScenes, or a place and a quaternion: write time, place and "
@@ -131,7 +130,7 @@ OTHERS = {
     17: "if these are a time and a 4x4 matrix: leave the last four columns out, which are 0 0 0 1",
 }
 
-#: How an array of matrices, and a folder of files with a matrix each, become a table.
+#: How to make a table from an array of matrices, and from a folder of files with one matrix each.
 OF_ARRAY = (
     "if it has shape (N, 4, 4) or (N, 3, 4): python -c \"import numpy as np; np.savetxt('poses.txt', "
     "np.load('{name}')[:, :3].reshape(-1, 12))\""
@@ -144,7 +143,8 @@ OF_FILES = (
 def detect(path: Path, up_axis: str = AUTO, axes: str = AUTO) -> Guess:
     """Return the format of `path`. Raises BadInputError for an unknown format, or when two formats fit.
 
-    `up_axis`: axis that is up, by the scene. `axes`: where x, y and z of a pose point, by the scene.
+    `up_axis`: axis that is up, by the scene, or `auto`. `axes`: directions of x, y and z of a pose, by the scene, or
+    `auto`.
     """
     if path.is_dir():
         return _of_folder(path)
@@ -183,7 +183,7 @@ def _of_folder(path: Path) -> Guess:
 
 
 def _has_matrices(folder: Path) -> bool:
-    """Return whether `folder` has several text files, and the first one has 16 numbers."""
+    """Return whether `folder` has several text files, the first of which holds a 4x4 matrix."""
     files = sorted(folder.glob("*.txt"))
     try:
         return len(files) > 1 and read_table(files[0], 4, EXPECTED).numbers.shape == (4, 4)
@@ -214,17 +214,22 @@ def _of_table(path: Path, layout: TableLayout, up_axis: str, axes: str) -> Guess
 
 
 def _require_pose(path: Path, layout: TableLayout) -> None:
-    """Raise BadInputError where column names have a part of a quaternion, but not the whole pose."""
+    """Raise BadInputError if column names include a part of a quaternion, but not the whole pose."""
     if any(name in layout.names for name in ("qw", "qx", "qy", "qz")):
         missing = ", ".join(name for name in POSE if name not in layout.names)
         raise BadInputError(path, f"column names without {missing}", f"names of {', '.join(POSE)} in any order")
 
 
 def _require_clock(path: Path, numbers: F64, others: Iterable[int]) -> None:
-    """Raise BadInputError where one of the columns `others` of `numbers` (N, columns) has times, or grows like them."""
+    """Raise BadInputError if a column of `numbers` (N, columns) other than the first looks like times.
+
+    `others`: indices of columns to check. A column looks like times if its numbers are as large as times since 1970, or
+    if they grow evenly while those of the first column do not.
+    """
     if len(numbers) < LEAST_ROWS:
         return
-    is_even = np.ptp(numbers[:, 0]) == 0 or _unevenness(numbers[:, 0]) < UNEVEN  # a single time: the reader says so
+    # Equal times are refused by the reader.
+    is_even = np.ptp(numbers[:, 0]) == 0 or _unevenness(numbers[:, 0]) < UNEVEN
     for k in others:
         middle = float(np.median(numbers[:, k]))
         if abs(middle) > FARTHEST:
@@ -235,7 +240,10 @@ def _require_clock(path: Path, numbers: F64, others: Iterable[int]) -> None:
 
 
 def _unevenness(column: F64) -> float:
-    """Return the median deviation of the steps of `column` (N,) from their median, in medians; inf unless it grows."""
+    """Return the median deviation of the steps of `column` (N,) from their median, as a share of the median.
+
+    It is infinite if the column does not grow.
+    """
     steps = np.diff(column)
     middle = float(np.median(steps))
     if not middle > 0 or (steps > 0).mean() < LEAST_GROWING:
@@ -244,9 +252,10 @@ def _unevenness(column: F64) -> float:
 
 
 def _of_matrices(path: Path, numbers: F64, up_axis: str, axes: str) -> Guess:
-    """Return the format of a table (N, 12 or 13) of matrices.
+    """Return the format of a table (N, 12 or 13) of 3x4 matrices: KITTI or ARKit.
 
-    KITTI's and ARKit's cameras look along opposite axes, unless the scene states `axes`.
+    Cameras of KITTI and ARKit look along opposite axes, so BadInputError is raised if the poses fit both formats,
+    unless the scene states `axes`.
     """
     matrices = numbers[:, -MATRIX:].reshape(-1, 3, 4)
     rows = numbers[sound := are_rotations(matrices[:, :, :3])]
@@ -258,7 +267,7 @@ def _of_matrices(path: Path, numbers: F64, up_axis: str, axes: str) -> Guess:
         if (~precise).mean() > MOST_IMPRECISE:
             found = f"{columns}matrices that are nearly rotations, but not as exactly as their digits"
             raise BadInputError(path, found, "numbers row by row", WHICH_MATRIX)
-    is_readable = 0 < len(rows) >= len(numbers) / 2  # otherwise the reader names the rows that are no rotation
+    is_readable = 0 < len(rows) >= len(numbers) / 2  # otherwise the reader refuses the file and names a row
     has_times = has_time or path.with_name(KITTI_TIMES).is_file()
     if is_readable and has_time:
         _require_clock(path, rows, (4, 8, 12))
@@ -275,11 +284,13 @@ def _of_matrices(path: Path, numbers: F64, up_axis: str, axes: str) -> Guess:
 
 
 def _require_row_order(path: Path, matrices: F64, columns: str, kind: str, slack: float) -> None:
-    """Raise BadInputError where matrices (N, 3, 4) of the format `kind` fit better with their numbers in another order.
+    """Raise BadInputError if `matrices` (N, 3, 4) of the format `kind` fit better with their numbers in another order.
 
-    `columns`: the table's columns, in words. `slack`: how much more astray the other order may look to be a question;
-    negative where it must look less astray. People hold a camera level while it pans. Transposed, or seen along another
-    axis, its picture swings, or it looks up, or elsewhere than it goes. KITTI's poses begin without a turn and are as
+    `columns`: the table's columns, in words.
+    `slack`: another order is possible if its `_astray` is less than that of the present order plus this.
+
+    People hold a camera level while it pans. With transposed matrices or exchanged axes, the picture swings, the camera
+    looks up, or the camera looks away from where it goes. KITTI's first pose is the identity, so KITTI's poses are as
     level when transposed.
     """
     turns, places = matrices[:, :, :3], matrices[:, :, 3]
@@ -310,11 +321,13 @@ def _require_row_order(path: Path, matrices: F64, columns: str, kind: str, slack
 
 
 def _signs(matrices: F64, up_axis: str, times: F64 | None) -> dict[str, tuple[str, ...]]:
-    """Return what poses (N, 3, 4) say for KITTI's axes (x right, y down, looks along +Z), and what for ARKit's.
+    """Return, in words, which features of poses (N, 3, 4) speak for KITTI, and which speak for ARKit, by format.
 
-    `up_axis`: axis that is up, by the scene. `times` (N,): times of the table. With times, the clock of a device counts
-    for ARKit, and so does Y that is up: others seldom write times before matrices of such a world. A device that is
-    held upright is as upright along the other axis, so it counts only where nobody else writes such a table.
+    `up_axis`: axis that is up, by the scene. `times` (N,): times of the table; None if it has no times.
+
+    KITTI's axes are x right, y down, looking along +Z. If the table has times, two features speak for ARKit, because
+    other programs seldom write times before such matrices: the clock of a device, and Y up. A device that is held
+    upright fits both directions of Z, so this feature speaks for ARKit only if the table has no times.
     """
     turns, places = matrices[:, :, :3], matrices[:, :, 3]
     ups = ("z", "y") if up_axis == AUTO else (up_axis,)
@@ -325,7 +338,8 @@ def _signs(matrices: F64, up_axis: str, times: F64 | None) -> dict[str, tuple[st
     starts = np.abs(turns[0] - np.eye(3)).max() < EXACT and np.abs(places[0]).max() < EXACT
     has_time = times is not None
     is_up = has_time and own_up[ups[-1]] > LEAST_UP_COSINE
-    # of a phone with its lower end, where X points, down: how steeply the view along -Z goes down, and that along +Z up
+    # For a phone whose lower end points down, which is its X: how steeply the view along -Z goes down. The view along
+    # +Z then goes up as steeply.
     downwards = float(mean[:, 2] @ gravity) if has_time and is_upright and mean[:, 0] @ gravity < 0 else 0.0
     said = {
         "kitti": {
@@ -354,21 +368,27 @@ def _signs(matrices: F64, up_axis: str, times: F64 | None) -> dict[str, tuple[st
 
 
 def _along(turns: F64, places: F64) -> float:
-    """Return the mean cosine, by length, between the way of cameras (N, 3, 3) at places (N, 3) and their Z."""
+    """Return the mean cosine, weighted by length, between the steps of `places` (N, 3) and Z of the cameras `turns`.
+
+    `turns` (N, 3, 3): camera to world. The result is 0 for fewer than LEAST_ROWS cameras.
+    """
     steps = np.diff(places, axis=0)
     length = float(np.linalg.norm(steps, axis=1).sum())
     return float((steps * turns[:-1, :, 2]).sum()) / length if length > 0 and len(turns) >= LEAST_ROWS else 0.0
 
 
 def _meet(turns: F64, places: F64) -> bool:
-    """Return whether cameras with OpenGL axes (N, 3, 3) at places (N, 3) look at one point that they go round."""
+    """Return whether cameras look at one point that they go round.
+
+    `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes.
+    """
     return _missed(turns, places) < MOST_MISSED
 
 
 def _missed(turns: F64, places: F64) -> float:
-    """Return by how much lines of sight miss the point that cameras go round, as a share of its distance.
+    """Return by how much lines of sight miss the point that the cameras go round, as a share of its distance.
 
-    Infinity where they go round none. `turns` (N, 3, 3), `places` (N, 3): OpenGL axes.
+    The result is infinite if there is no such point. `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes.
     """
     point = meeting_point(turns, places) if len(turns) >= LEAST_ROWS else None
     if point is None:
@@ -380,25 +400,28 @@ def _missed(turns: F64, places: F64) -> float:
 
 
 def _is_of_device(times: F64) -> bool:
-    """Return whether times (N,) may count from when a device was switched on; recordings begin at 0."""
+    """Return whether `times` (N,) may count from when a device was switched on; times of recordings begin at 0."""
     least, most = OF_A_DEVICE_S
     return any(least < times[0] * SECONDS[unit] < most for unit in units_of(times) if unit in SECONDS)
 
 
 def _require_one_order(path: Path, numbers: F64, names: tuple[str, ...], axes: F64) -> None:
-    """Raise BadInputError where the quaternion's parts may be in another order than `names` of a table's columns.
+    """Raise BadInputError if the quaternion's parts may be in another order than `names` of the table's columns.
 
-    Each order makes a camera. Four of the 24 are equally level, as they only mirror where it turns to. What tells them
-    apart: a camera looks where it goes, or at one point that it goes round, and not up. A map of SLAM that begins
-    without a turn has the 1 where its scalar is; of its six orders the most level one counts.
-    `axes` (3, 3): columns are the directions of the camera's axes, in the coordinates of a pose.
+    `numbers` (N, columns): numbers of the table.
+    `axes` (3, 3): columns are the directions of the camera's OpenGL axes, in the coordinates of a pose.
+
+    Each of the 24 orders gives a camera. Four orders are equally level, as they only mirror the camera's heading.
+    Movement tells these apart: a camera looks where it goes, or at one point that it goes round, and not up. A SLAM map
+    that begins with the identity has its 1 where the scalar is. Of the six orders with that scalar, the most level one
+    counts.
     """
     at = names.index("qw"), names.index("qx"), names.index("qy"), names.index("qz")
     first_of = min(at)
     numbers = numbers[np.any(numbers[:, first_of : first_of + 4] != 0, axis=1)]
     quats = numbers[:, first_of : first_of + 4]
     if not len(numbers) or 2 * np.count_nonzero(is_off(quats)) > len(quats):
-        return  # the reader says what is wrong
+        return  # the reader refuses such quaternions
     where = f"columns {first_of + 1} to {first_of + 4}"
     if len(quats) >= LEAST_ROWS and _has_digits(quats) and is_off(quats, PRECISE).mean() > MOST_IMPRECISE:
         found = f"quaternions in {where} that have length 1, but not as exactly as their digits"
@@ -432,14 +455,16 @@ def _require_one_order(path: Path, numbers: F64, names: tuple[str, ...], axes: F
 
 
 def _has_digits(numbers: F64) -> bool:
-    """Return whether numbers have more than three digits after the point."""
+    """Return whether any of `numbers` has more than three digits after the point."""
     return bool((np.abs(numbers - np.round(numbers, 3)) > EXACT).any())
 
 
 def _astray(turns: F64, places: F64) -> float:
-    """Return how far cameras look from where they go, or from the point that they go round: below 1 where they do.
+    """Return how far cameras look away from where they go, or from the point that they go round.
 
-    `turns` (N, 3, 3), `places` (N, 3): OpenGL axes.
+    Below 1, the cameras look there. The result is infinite if there are too few cameras. The poses `turns` (N, 3, 3)
+    and
+    `places` (N, 3) are camera to world, with OpenGL axes.
     """
     if len(places) < LEAST_LED:
         return math.inf
@@ -447,11 +472,11 @@ def _astray(turns: F64, places: F64) -> float:
 
 
 def _skywards(turns: F64) -> float:
-    """Return the sine of the mean elevation of the views of cameras with OpenGL axes (N, 3, 3)."""
+    """Return the sine of the mean elevation of the views of cameras with OpenGL axes `turns` (N, 3, 3)."""
     return -float(turns[:, :, 2].mean(axis=0) @ find_upright(turns, "z", False).up)
 
 
-#: Reader of each table, called with a path and the scene's clock.
+#: Reader of each table format, called with a path and what the scene says about times.
 _TABLES: dict[str, Callable[[Path, Clock], RawCamera]] = {
     "arkit": load_arkit,
     "euroc": load_euroc,
@@ -459,7 +484,7 @@ _TABLES: dict[str, Callable[[Path, Clock], RawCamera]] = {
     "stray": load_stray,
     "tum": load_tum,
 }
-#: Reader of each other format, called with a path and the scene's rate.
+#: Reader of each other format, called with a path and the rate in Hz that the scene states, if any.
 _OTHERS: dict[str, Callable[[Path, float | None], RawCamera]] = {
     "colmap": load_colmap,
     "nerf": load_nerf,
@@ -469,12 +494,15 @@ _OTHERS: dict[str, Callable[[Path, float | None], RawCamera]] = {
 FOLDERS = ("colmap", "nerf", "record3d", "stray")
 
 
-#: Formats whose poses have OpenGL axes; those of the others are optical.
+#: Formats whose poses have OpenGL axes; the poses of other formats have optical axes.
 OPENGL_KINDS = ("arkit", "nerf", "record3d")
 
 
 def _read(kind: str, path: Path, spec: CameraSpec) -> RawCamera:
-    """Return the content of `path`. Raises BadInputError, also where the scene states a unit of times in vain."""
+    """Return the content of `path`, a file of the format `kind`.
+
+    Raises BadInputError, also when the scene states a unit of times for a file without times.
+    """
     if kind in _TABLES:
         return _TABLES[kind](path, Clock(spec.rate_hz, spec.time_unit))
     if spec.time_unit != AUTO:
@@ -484,18 +512,18 @@ def _read(kind: str, path: Path, spec: CameraSpec) -> RawCamera:
 
 
 def _axes(kind: str, stated: str) -> F64:
-    """Return the directions of the camera's OpenGL axes as columns (3, 3), in the coordinates of a pose.
+    """Return the directions of the camera's OpenGL axes, as columns (3, 3), in the coordinates of a pose.
 
     `kind`: format of the file. `stated`: axes of its poses by the scene; `auto` for those of the format.
     """
     axes = axes_of(stated)
     if axes is None:
         return np.eye(3) if kind in OPENGL_KINDS else OPENGL_FROM_OPTICAL
-    return np.array(axes, dtype=np.float64)  # row k: direction of the pose's axis k in the camera
+    return np.array(axes, dtype=np.float64)  # row k is the direction of the pose's axis k, in the camera's axes
 
 
 def _with_axes(raw: RawCamera, kind: str, stated: str) -> RawCamera:
-    """Return `raw` with the axes that the scene states in place of those of the format."""
+    """Return `raw`, read with the axes that the scene states instead of those of the format `kind`."""
     if stated == AUTO:
         return raw
     turns = raw.turns @ _axes(kind, AUTO).T @ _axes(kind, stated)
@@ -507,7 +535,10 @@ BODY_AXES = "forward-left-up"
 
 
 def _require_camera(path: Path, raw: RawCamera, kind: str, spec: CameraSpec) -> None:
-    """Raise BadInputError where the poses are rather those of a vehicle's body, unless the scene states its axes."""
+    """Raise BadInputError if the poses more likely belong to a vehicle's body than to a camera.
+
+    Nothing is checked if the scene states axes or up, or if the poses of the format have OpenGL axes.
+    """
     if spec.axes != AUTO or spec.up_axis != AUTO or kind in OPENGL_KINDS:
         return
     sound = are_rotations(np.nan_to_num(raw.turns))
@@ -520,9 +551,9 @@ def _require_camera(path: Path, raw: RawCamera, kind: str, spec: CameraSpec) -> 
 
 
 def load_camera(spec: CameraSpec, base: Path) -> CameraPath:
-    """Load the camera that `spec.source` names; a relative path starts at `base`.
+    """Load the camera that `spec.source` names. `base`: folder at which a relative path starts.
 
-    Raises BadInputError when there is no such camera or the file is unusable.
+    Raises BadInputError when there is no such camera, or when the file is unusable.
     """
     if spec.source.startswith(BUILT_IN_PREFIX):
         name, names = spec.source.removeprefix(BUILT_IN_PREFIX), ", ".join(BUILTIN)

@@ -35,7 +35,7 @@ from trilane.scene.rotations import matrix_from_quat, normalised
 
 
 def read_object(path: Path, expected: str) -> dict[str, Any]:
-    """Return the object in `path`, empty for another value. Raises BadInputError for anything but JSON.
+    """Return the JSON object in `path`, or {} for another JSON value. Raises BadInputError if it is no JSON.
 
     `expected`: expected content in words.
     """
@@ -51,13 +51,13 @@ NERF = "a NeRF transforms.json: `frames`, each with a 4x4 `transform_matrix`"
 DEFAULT_ANGLE_X = math.radians(50.0)
 DEFAULT_ASPECT = 4 / 3
 MAX_FRAMES = 100_000
-#: Least determinant of a matrix whose columns have unit length; a rotation's is 1. A place far off makes it less: 1e-5
-#: at 100 km.
+#: A matrix with columns of unit length is singular if its determinant is below this; that of a rotation is 1. A distant
+#: position makes it smaller: 1e-5 at 100 km.
 LEAST_DETERMINANT = 1e-9
 LENS_KEYS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 FISHEYE = "FISHEYE"  # part of a camera model's name
-#: Parts of the names of nerfstudio's models whose pictures no pinhole makes.
+#: Parts of the names of nerfstudio's camera models that are no perspective cameras.
 NO_LENS = ("EQUIRECTANGULAR", "OMNIDIRECTIONAL", "VR180", "ORTHOPHOTO")
 NO_LENS_REMEDY = "cut the pictures into perspective ones first (ns-process-data --camera-type equirectangular)"
 
@@ -65,9 +65,11 @@ NO_LENS_REMEDY = "cut the pictures into perspective ones first (ns-process-data 
 def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
     """Read a NeRF `transforms.json`, or its folder: `frames[].transform_matrix`, 4x4, usually Z up, no times.
 
-    The lens is that of the frame, else that of the file: `fl_x`, `fl_y`, `cx`, `cy` in pixels of `w` x `h`, or an
-    angle. Distortion is left out and noted. nerfstudio makes such files from the exports of Polycam and Record3D.
-    `rate_hz`: frames a second, from the scene. Raises BadInputError naming the key.
+    A frame may have its own lens; otherwise the lens of the file holds. A lens is an angle, or `fl_x`, `fl_y`, `cx`,
+    `cy` in pixels of `w` x `h`. Distortion is left out and noted. nerfstudio makes such files from the exports of
+    Polycam and Record3D.
+
+    `rate_hz`: frames a second by the scene; None if the scene does not say. Raises BadInputError that names the key.
     Format: https://docs.nerf.studio/quickstart/data_conventions.html.
     """
     path = path / NERF_FILE if path.is_dir() else path
@@ -102,7 +104,7 @@ def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
 
 
 def _nerf_lenses(path: Path, content: Mapping[str, Any], frames: Sequence[Any]) -> tuple[tuple[Lens, ...], str]:
-    """Return one lens for all views, or one for each where a view has a key of its own; and where they come from."""
+    """Return one lens for all views, or one for each view if any view has its own keys; and the source in words."""
     _check_models(path, (content, *frames))
     if not any(key in frame for frame in frames if isinstance(frame, dict) for key in LENS_KEYS):
         lens, source = _nerf_lens(path, content, "")
@@ -113,7 +115,10 @@ def _nerf_lenses(path: Path, content: Mapping[str, Any], frames: Sequence[Any]) 
 
 
 def _check_models(path: Path, tables: Sequence[Mapping[str, Any]]) -> None:
-    """Raise BadInputError where a camera of the file makes pictures that no pinhole makes."""
+    """Raise BadInputError if a camera of the file is no perspective camera.
+
+    `tables`: the file's object and its frames.
+    """
     for keys in tables:
         model = str(keys.get("camera_model", ""))
         if any(word in model.upper() for word in NO_LENS):
@@ -123,7 +128,7 @@ def _check_models(path: Path, tables: Sequence[Mapping[str, Any]]) -> None:
 def _distortion(
     path: Path, content: Mapping[str, Any], frames: Sequence[Any], lenses: Sequence[Lens]
 ) -> tuple[str, ...]:
-    """Say what is left out of the most distorted lens."""
+    """Return a note on the largest distortion of `lenses`, which is left out; empty below LEAST_BEND_PX."""
     bent = []
     for lens, frame in zip(lenses, frames, strict=False):  # a single lens stands for all frames
         keys = {**content, **frame}
@@ -133,7 +138,7 @@ def _distortion(
 
 
 def _real(path: Path, content: Mapping[str, Any], key: str) -> float:
-    """Return a finite number of the file, 0 when the key is not there. Raises BadInputError."""
+    """Return the number at `key`, 0 if the key is absent. Raises BadInputError when it is not a finite number."""
     value = content.get(key, 0.0)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise BadInputError(f"{path}: {key}", repr(value)[:40], "a number")
@@ -141,7 +146,7 @@ def _real(path: Path, content: Mapping[str, Any], key: str) -> float:
 
 
 def _pictures(frames: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
-    """Return the photo of each view as the file names it; nothing when a view has none."""
+    """Return the name of each view's photo, as the file states it; () if any view has no photo."""
     names = tuple(frame.get("file_path") for frame in frames)
     return tuple(str(name) for name in names) if all(isinstance(name, str) and name for name in names) else ()
 
@@ -167,18 +172,21 @@ def _matrix(path: Path, index: int, frame: Any) -> NDArray[np.float64]:
 
 
 def _is_singular(matrix: NDArray[np.float64]) -> bool:
-    """Return whether the columns of `matrix` (3 or 4, 4), of any length, do not span all directions."""
+    """Return whether `matrix` (3 or 4, 4) has no inverse, whatever the length of its columns.
+
+    A matrix with NaN or infinity does not count as singular.
+    """
     square = matrix[:, : len(matrix)]
     if not np.isfinite(square).all():
-        return False  # a hole in a recording; sampling interpolates across it
+        return False  # the pose is a hole in the recording, and sampling interpolates across it
     lengths = np.linalg.norm(square, axis=0)
     return bool(not lengths.all() or abs(np.linalg.det(square / lengths)) < LEAST_DETERMINANT)
 
 
 def _nerf_lens(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, str]:
-    """Return the lens, and where it comes from.
+    """Return the lens of a view or of the file, and its source in words.
 
-    `of`: beginning of its keys, for messages.
+    `content`: keys of the lens. `of`: prefix of the keys in messages, such as `frames[3].`; "" for the file.
     """
     lens, source = _measured(path, content, of)
     return checked_lens(f"{path}: {of.rstrip('.')}" if of else path, lens), source
@@ -204,7 +212,11 @@ def _measured(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, st
 def _by_angle(
     width: float | None, height: float | None, angle_x: float | None, angle_y: float | None
 ) -> tuple[Lens, str]:
-    """Return a lens for which the file has angles at most, and the source of its numbers."""
+    """Return the lens of a file without focal lengths, and the source of its angles in words.
+
+    `width`, `height`: size of the picture, pixels. `angle_x`, `angle_y`: fields of view, radians. Each is None if the
+    file does not state it.
+    """
     angles = {"camera_angle_x": angle_x, "camera_angle_y": angle_y}
     source = f"by {' and '.join(f'`{key}`' for key, value in angles.items() if value)}"
     if not (angle_x or angle_y):
@@ -220,7 +232,10 @@ def _by_angle(
 
 
 def _number(where: str, value: Any, key: str) -> float | None:
-    """Return a positive number of the file, or None when the key is not there. Raises BadInputError."""
+    """Return `value` if it is a positive number, or None if it is None. Raises BadInputError about `where` otherwise.
+
+    `key`: key of the value; an angle must be below pi.
+    """
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float) or not (math.isfinite(value) and value > 0):
@@ -235,12 +250,13 @@ RECORD3D = "Record3D's metadata: `poses`, `K`, `w` and `h`"
 
 
 def load_record3d(path: Path, rate_hz: float | None = None) -> RawCamera:
-    """Read Record3D's `metadata.json`, or its folder: a pose `qx qy qz qw tx ty tz`, a time and a lens of each frame.
+    """Read Record3D's `metadata.json`, or its folder: a pose `qx qy qz qw tx ty tz`, a time and a lens per frame.
 
-    The world is ARKit's: levelled, Y up, metres. The lens is `perFrameIntrinsicCoeffs` (fx, fy, cx, cy), else `K`,
-    column by column, in pixels of `w` x `h`. Times are `frameTimestamps`, else by `fps`.
-    `rate_hz`: frames a second, from the scene. Raises BadInputError naming the key.
-    Format: keys of the exports of https://record3d.app, as nerfstudio's `process_data/record3d_utils.py` takes them.
+    The world is ARKit's: levelled, Y up, metres. The lens is `perFrameIntrinsicCoeffs` (fx, fy, cx, cy), or else `K`,
+    column by column, in pixels of `w` x `h`. Times are `frameTimestamps`, or else follow from `fps`.
+
+    `rate_hz`: frames a second by the scene; None if the scene does not say. Raises BadInputError that names the key.
+    Format: keys of the exports of https://record3d.app, as nerfstudio's `process_data/record3d_utils.py` reads them.
     """
     path = path / RECORD3D_FILE if path.is_dir() else path
     content = read_object(path, RECORD3D)
@@ -260,7 +276,7 @@ def load_record3d(path: Path, rate_hz: float | None = None) -> RawCamera:
 
 
 def _array(path: Path, content: Mapping[str, Any], key: str, columns: int) -> F64:
-    """Return the table (N, columns) at `key`. Raises BadInputError."""
+    """Return the table (N, `columns`) at `key`. Raises BadInputError when it has another shape."""
     try:
         array = np.array(content.get(key), dtype=np.float64)
     except (TypeError, ValueError):
@@ -271,7 +287,7 @@ def _array(path: Path, content: Mapping[str, Any], key: str, columns: int) -> F6
 
 
 def _times(path: Path, content: Mapping[str, Any], count: int, rate_hz: float | None) -> tuple[F64, str]:
-    """Return the seconds (N,) of the poses, and where they come from."""
+    """Return times (N,), seconds, of the poses, and their source in words. `count`: number N of poses."""
     if rate_hz is None and content.get("frameTimestamps"):
         values = content["frameTimestamps"]
         rows = {"frameTimestamps": [[value] for value in values] if isinstance(values, list) else None}
@@ -286,7 +302,7 @@ def _times(path: Path, content: Mapping[str, Any], count: int, rate_hz: float | 
 
 
 def _lenses(path: Path, content: Mapping[str, Any], count: int) -> tuple[tuple[Lens, ...], str]:
-    """Return one lens for all poses or one for each, and where they come from."""
+    """Return one lens for all poses or one for each, and their source in words. `count`: number of poses."""
     width, height = (_side(path, content, key) for key in ("w", "h"))
     if content.get("perFrameIntrinsicCoeffs"):
         rows = _array(path, content, "perFrameIntrinsicCoeffs", 4)

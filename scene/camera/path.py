@@ -1,8 +1,9 @@
 """A camera over time, from any source: poses at increasing times, their lenses, and the built-in cameras.
 
-A pose is camera to world with OpenGL axes (x right, y up, looks along -Z) and world Y up. Between samples, place and
-lens are interpolated linearly, the turn by slerp. After the last sample the path loops or runs backwards (`wrap`). A
-built-in camera is a formula of time for a person at the origin who faces +Z, sampled over one cycle.
+A pose is a transform from camera to world, with OpenGL axes (x right, y up, looks along -Z) and world Y up. Between
+samples, position and lens are interpolated linearly, the rotation by slerp. After the last sample, the path loops or
+runs backwards (`wrap`). A built-in camera is a formula of time for a person at the origin who faces +Z, sampled over
+one cycle.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ HALFWAY = 0.5
 
 
 def view_from_pose(turn: F64, place: F64) -> F64:
-    """Return the matrix (4, 4) from world to a camera whose axes are the columns of `turn` (3, 3).
+    """Return the transform (4, 4) from world to camera.
 
-    `place`: place of the camera, (3,).
+    `turn` (3, 3): axes of the camera as columns. `place` (3,): position of the camera.
     """
     view = np.eye(4)
     view[:3, :3] = turn.T
@@ -34,15 +35,15 @@ def view_from_pose(turn: F64, place: F64) -> F64:
 
 
 def look_at(place: F64, target: F64) -> F64:
-    """Return the matrix (4, 4) from world to a level camera at `place` (3,) that looks at `target` (3,).
+    """Return the transform (4, 4) from world to a level camera at `place` (3,) that looks at `target` (3,).
 
-    It must not look straight up or down.
+    The camera must not look straight up or down.
     """
     return view_from_pose(axes_towards(place[None], target)[0], place)
 
 
 def axes_towards(places: F64, target: F64) -> F64:
-    """Return camera axes as columns (N, 3, 3) of level cameras at `places` (N, 3) that look at `target` (3,)."""
+    """Return the axes, as columns (N, 3, 3), of level cameras at `places` (N, 3) that look at `target` (3,)."""
     back = _unit_rows(places - target)
     right = _unit_rows(np.cross([0.0, 1.0, 0.0], back))
     return np.stack([right, np.cross(back, right), back], axis=-1)
@@ -74,12 +75,14 @@ def projection_matrix(fov_y_deg: float, aspect: float, near_m: float, far_m: flo
 
 @dataclass(frozen=True)
 class Optics:
-    """How the camera's picture is made.
+    """The lenses of a camera path, and the pictures that they made.
 
-    `lenses`: one lens for all samples of the path, or one for each. `near_m`, `far_m`: distances of the clip planes.
-    `filmed`: (height, width) of the background that the camera filmed, as it is shown, one for all samples or one for
-    each; empty where the background is not the camera's. `turned`: number of quarters by which its pixels are turned
-    clockwise to be shown, likewise; empty for what its file says.
+    `lenses`: one lens for all samples of the path, or one for each.
+    `near_m`, `far_m`: distances of the clip planes, metres.
+    `filmed`: (height, width) of the background that the camera filmed, as it is shown; one for all samples or one for
+    each. The tuple is empty if the camera did not film the background.
+    `turned`: number of quarter turns clockwise by which the background's pixels are shown; one for all samples or one
+    for each. The tuple is empty if each picture is shown as its file prescribes.
     """
 
     lenses: tuple[Lens, ...]
@@ -91,8 +94,8 @@ class Optics:
     def lens(self, i: int, j: int, fraction: float, output: Shape) -> Lens:
         """Return the lens for a picture of `output` (height, width), a `fraction` of the way from sample `i` to `j`.
 
-        Over a background that the camera filmed, the lens is cut as the background is; otherwise the picture has the
-        camera's height.
+        If the camera filmed the background, the lens is cut as the background is. Otherwise the picture keeps the
+        vertical field of view of the camera.
         """
         first = self._shown(i, output)
         is_one = len(self.lenses) == 1 and len(self.filmed) <= 1
@@ -108,7 +111,8 @@ class Optics:
 def one_lens(fov_y_deg: float, near_m: float, far_m: float) -> Optics:
     """Return optics with one lens for all samples.
 
-    `fov_y_deg`: field of view over the picture's height, degrees.
+    `fov_y_deg`: field of view over the picture's height, degrees. `near_m`, `far_m`: distances of the clip planes,
+    metres.
     """
     return Optics((of_fov_y(fov_y_deg),), near_m, far_m)
 
@@ -117,14 +121,19 @@ def one_lens(fov_y_deg: float, near_m: float, far_m: float) -> Optics:
 class CameraPath:
     """A camera over time.
 
-    `times_s` (N,): times from 0, strictly increasing. `quats` (N, 4), `places` (N, 3): transforms from camera to world,
-    metres. `notes`: how the source was read, for people. `wrap`: what follows the last sample. `recorded`: whether the
-    path comes from a recording, which has to be placed in the scene. `detected`: facts about its file. `pictures`: name
-    of the photo of each sample; empty where the file names none. `quarter`: number of quarters by which the camera's
-    picture was turned clockwise. `is_held`: whether each sample holds, halfway to its neighbours, because its photo
-    does. `repeat_s`: time after which the path starts again, as its background does; 0 for `wrap` alone. `began_s`:
-    time of the recording, seconds since 1970; None where the file does not say it. `is_closeup`: whether it is made for
-    a head, and not for a whole body.
+    `times_s` (N,): times from 0, strictly increasing.
+    `quats` (N, 4), `places` (N, 3): rotations and positions, from camera to world, metres.
+    `optics`: lenses of the samples.
+    `notes`: how the source was read, for people.
+    `wrap`: what follows the last sample.
+    `recorded`: whether the path comes from a recording, which has to be placed in the scene.
+    `detected`: facts about its file.
+    `pictures`: name of the photo of each sample; empty if the file names none.
+    `quarter`: number of quarter turns clockwise of the camera's picture.
+    `is_held`: whether each sample holds until halfway to its neighbours, as its photo does.
+    `repeat_s`: time after which the path starts again, as its background does; 0 if only `wrap` counts.
+    `began_s`: time 0 in seconds since 1970; None if the file does not state it.
+    `is_closeup`: whether the camera is made for a head, not for a whole body.
     """
 
     times_s: F64
@@ -144,30 +153,30 @@ class CameraPath:
 
     @property
     def duration_s(self) -> float:
-        """Time of the last sample."""
+        """Time of the last sample, seconds."""
         return float(self.times_s[-1])
 
     @property
     def course(self) -> str:
-        """Length of the path and what follows it, for people."""
+        """Duration of the path and what follows it, for people."""
         if len(self.times_s) == 1:
             return "one pose: held"
         then = "starts again with the background" if self.repeat_s else self.wrap.value
         return f"{self.duration_s:.2f} s, then {then}"
 
     def pose(self, t_s: float) -> tuple[F64, F64]:
-        """Return turn (3, 3) and place (3,) of the camera at `t_s`."""
+        """Return the rotation (3, 3) and the position (3,) of the camera at `t_s`, from camera to world."""
         i, j, fraction = self._between(t_s)
         turn = matrix_from_quat(slerp(self.quats[i], self.quats[j], fraction))
         return turn, self.places[i] + (self.places[j] - self.places[i]) * fraction
 
     def nearest(self, t_s: float) -> int:
-        """Return the sample that is nearest to `t_s`."""
+        """Return the index of the sample nearest to `t_s`."""
         i, j, fraction = self._bracket(t_s)
         return i if fraction < HALFWAY else j
 
     def _between(self, t_s: float) -> tuple[int, int, float]:
-        """Return two samples, and how far `t_s` is from the first to the second, 0 to 1."""
+        """Return the indices of two samples, and how far `t_s` is from the first to the second, 0 to 1."""
         if not self.is_held:
             return self._bracket(t_s)
         held = self.nearest(t_s)
@@ -179,17 +188,17 @@ class CameraPath:
         return bracket(self.times_s, wrapped_time(t_s, self.duration_s, self.wrap))
 
     def sample(self, t_s: float) -> F64:
-        """Return the matrix (4, 4) from world to camera at `t_s`."""
+        """Return the transform (4, 4) from world to camera at `t_s`."""
         return view_from_pose(*self.pose(t_s))
 
     def own_lens(self, t_s: float) -> Lens:
-        """Return the lens at `t_s`, for the picture that the camera took."""
+        """Return the lens at `t_s` in pixels of the picture that the camera took."""
         i, j, fraction = self._between(t_s)
         lenses = self.optics.lenses
         return lenses[i % len(lenses)].between(lenses[j % len(lenses)], fraction) if len(lenses) > 1 else lenses[0]
 
     def lens(self, t_s: float, output: Shape) -> Lens:
-        """Return the lens at `t_s`, for a picture of `output` (height, width)."""
+        """Return the lens at `t_s` for a picture of `output` (height, width)."""
         return self.optics.lens(*self._between(t_s), output)
 
     def projection(self, t_s: float, output: Shape) -> F64:
@@ -204,7 +213,11 @@ HEAD_AND_SHOULDERS = "head and shoulders"
 
 @dataclass(frozen=True)
 class Orbit:
-    """A swing of `swing_deg` either way around `target` in `period_s`, from `far_m` in to `near_m` and back."""
+    """A camera that swings by `swing_deg` to either side around `target`, and moves from `far_m` to `near_m` and back.
+
+    `what`: description for people. `height_m`: height of the camera. `far_m`, `near_m`: horizontal distances.
+    `period_s`: duration of a cycle.
+    """
 
     what: str
     target: tuple[float, float, float]
@@ -215,7 +228,7 @@ class Orbit:
     period_s: float
 
     def places(self, phase: F64) -> F64:
-        """Return places (N, 3), metres, at `phase` (N,) of the cycle, radians."""
+        """Return positions (N, 3), metres, at `phase` (N,) of the cycle, radians."""
         angle = np.radians(self.swing_deg) * np.sin(phase - 0.6)
         distance = self.far_m + (self.near_m - self.far_m) * (1 - np.cos(phase)) / 2
         return np.column_stack([distance * np.sin(angle), np.full(len(phase), self.height_m), distance * np.cos(angle)])
@@ -223,7 +236,11 @@ class Orbit:
 
 @dataclass(frozen=True)
 class Descent:
-    """A way from `top_deg` above `target` down to `low_m` and back, on an arc of `distance_m` in the plane x = 0."""
+    """A camera that descends from the elevation `top_deg` over `target` to the height `low_m`, and rises again.
+
+    It moves on an arc about `target` of radius `distance_m`, in the plane x = 0. `what`: description for people.
+    `period_s`: duration of a cycle.
+    """
 
     what: str
     target: tuple[float, float, float]
@@ -233,7 +250,7 @@ class Descent:
     period_s: float
 
     def places(self, phase: F64) -> F64:
-        """Return places (N, 3), metres, at `phase` (N,): the top at 0, `low_m` after half a cycle."""
+        """Return positions (N, 3), metres, at `phase` (N,), radians: the top at 0, the lowest point at pi."""
         top, low = np.radians(self.top_deg), np.arcsin((self.low_m - self.target[1]) / self.distance_m)
         angle = low + (top - low) * (1 + np.cos(phase)) / 2
         arc = np.column_stack([np.zeros(len(phase)), np.sin(angle), np.cos(angle)])
@@ -242,7 +259,7 @@ class Descent:
 
 @dataclass(frozen=True)
 class Stand:
-    """A camera that stands at `place` and looks at `target`."""
+    """A camera that stands at `place` and looks at `target`. `what`: description for people."""
 
     what: str
     target: tuple[float, float, float]
@@ -250,7 +267,7 @@ class Stand:
     period_s: float = 1.0
 
     def places(self, phase: F64) -> F64:
-        """Return its one place, metres, for each of `phase` (N,): (N, 3)."""
+        """Return the camera's position, metres, once for each of `phase` (N,): (N, 3)."""
         return np.tile(self.place, (len(phase), 1))
 
 
@@ -275,7 +292,10 @@ def _pace(camera: Orbit | Descent | Stand) -> str:
 
 
 def load_builtin(name: str, spec: CameraSpec) -> CameraPath | None:
-    """Return the built-in camera `name`, or None when no camera has that name."""
+    """Return the built-in camera `name`; None if there is no such camera.
+
+    `spec`: its field of view and clip planes are used.
+    """
     camera = BUILTIN.get(name)
     if camera is None:
         return None

@@ -1,9 +1,9 @@
-"""Text tables of camera poses: one pose a line, numbers separated by blanks or commas, `#` for comments.
+"""Text tables of camera poses: one pose per line, numbers separated by blanks or commas, `#` for comments.
 
-Every line has as many numbers as the others; the error names the first line that has not. An empty field between two
-commas is NaN, at the end of a line it is nothing. Column names, in a comment or in the first line, win over the order
-of the format. Columns that seldom hold a quaternion of length 1 are refused: another order of columns would give a
-camera that looks anywhere.
+All lines must have the same number of columns; the error names the first line that has not. An empty field between two
+commas is NaN; empty fields at the end of a line are ignored. Column names, in a comment or in the first line, override
+the order of the format. Columns that seldom hold a quaternion of length 1 are refused, as another order of columns
+would give a camera that looks in arbitrary directions.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ from trilane.scene.camera.recorded import AUTO, FILM_RATE_HZ, LENGTH_UNITS, are_
 from trilane.scene.rotations import matrix_from_quat, normalised
 
 MAX_ROWS = 1_000_000
-#: Number of rows that tell what columns hold.
+#: Number of first rows from which the content of columns is found.
 HEAD = 3000
-#: Units of times in seconds, the longest first. Poses follow each other by less than 1 s and are at least LEAST_STEP_S
-#: apart, so the steps of one unit are no steps of another. Those up to FAST_STEP_S may be: few programs save 300 poses
-#: a second and more, and some save key frames.
+#: Units of times in seconds, the longest first. Poses are less than 1 s and at least LEAST_STEP_S apart, so the size of
+#: a step fits only one unit. A step up to FAST_STEP_S is doubtful, as few programs save 300 poses a second: it may also
+#: be a step between key frames in a longer unit.
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 LEAST_STEP_S, FAST_STEP_S = 0.9e-3, 3e-3
-#: Poses that follow each other within the first are likely, as of key frames, if the times are those of a clock since
-#: 1970 or have fractions. Up to the second they may as well have another unit.
+#: Times since 1970, or times with fractions, keep their unit for steps up to SURE_STEP_S, such as those between key
+#: frames. For steps up to LONGEST_STEP_S, another unit is as likely.
 SURE_STEP_S, LONGEST_STEP_S = 3.0, 60.0
-#: Times from 2001 to 2100 are those of a clock; others are those of a device.
+#: Times from 2001 to 2100, in seconds since 1970, are those of a clock; other times are those of a device.
 EARLIEST_S, LATEST_S = 1e9, 4.1e9
-#: Number of lines of numbers that tell a table's layout.
+#: Number of lines of numbers from which a table's layout is found.
 LOOKED_AT = 20
-#: Whole numbers below the first number frames, when at least the second share of their steps is 1.
+#: Whole numbers below MOST_FRAMES are frame numbers if at least the share LEAST_GROWING of their steps is 1 or more.
 MOST_FRAMES, LEAST_GROWING = 1e7, 0.75
-#: Unit of a first column that numbers frames.
+#: Unit of a first column that holds frame numbers.
 FRAMES = "frames"
-#: Units of times that column names may state, in seconds, and how these and those of lengths are written.
+#: Units of times that column names may state, in seconds; and the spellings of units of times and lengths.
 TIME_UNITS = {**SECONDS, "min": 60.0}
 SPELLINGS = {
     **{unit: unit for unit in (*TIME_UNITS, *LENGTH_UNITS)},
@@ -60,13 +60,13 @@ SPELLINGS = {
     **dict.fromkeys(("foot", "feet"), "ft"),
     **dict.fromkeys(("inch", "inches"), "in"),
 }
-#: Parts of a column's name: a unit in brackets, one at its end, and one at the end of a name of times; words in
-#: brackets for no unit; the frames of EuRoC's symbols; all but letters and digits.
+#: Parts of a column's name: a unit in brackets; a unit at the end; a unit at the end of a name of times.
 UNIT, AT_END = re.compile(r"\[[^\[\]]*\]|\([^()]*\)"), re.compile(r"[_ ](s|ms|us|ns|min|m|cm|mm|km|ft|in)$")
 OF_TIMES = re.compile(r"^(?:timestamp|time|t|timestamps)(ns|us|ms)$")
+#: Texts in brackets that state no unit; EuRoC's symbols of coordinate frames; everything but letters and digits.
 NO_UNIT = ("", "-", "1")
 SYMBOLS, OTHER = re.compile(r"_rs(_r)?_"), re.compile(r"[^a-z0-9]")
-#: What a column holds, by its name.
+#: Content of a column, by its plain name.
 KNOWN = {
     **{name + unit: "time" for name in ("timestamp", "time", "t", "timestamps") for unit in ("", "ns", "us", "ms")},
     **{name: axis for axis in "xyz" for name in (axis, f"t{axis}", f"p{axis}", f"pos{axis}")},
@@ -79,23 +79,26 @@ POSE = ("time", "x", "y", "z", "qw", "qx", "qy", "qz")
 class NumberTable(NamedTuple):
     """The numbers of a table.
 
-    `numbers` (N, columns): numbers of each pose. `lines` (N,): line of each, from 1 on.
+    `numbers` (N, columns): one row per pose. `lines` (N,): line of each pose in the file, from 1.
     """
 
     numbers: NDArray[np.float64]
     lines: NDArray[np.int64]
 
     def place_of(self, index: int) -> str:
-        """Say where pose `index` stands in the file."""
+        """Return the place of pose `index` in the file, for messages."""
         return f"line {self.lines[index]}"
 
 
 class TableLayout(NamedTuple):
-    """The layout of the first line of numbers in a table.
+    """The layout of a table, by its column names and its first lines of numbers.
 
-    `columns`: number of columns. `names`: content of each, by KNOWN, "" for others; none without column names.
-    `has_commas`: whether commas separate the numbers. `is_ns`: whether the first column has times in nanoseconds.
-    `unit`: unit of the times by the column names, `auto` without one. `lengths`: unit of the places, "" without one.
+    `columns`: number of columns in the first line of numbers.
+    `names`: content of each named column, a value of KNOWN or ""; empty without column names.
+    `has_commas`: whether commas separate the numbers.
+    `is_ns`: whether the first column has times in nanoseconds.
+    `unit`: unit of the times by the column names; `auto` if they state no unit.
+    `lengths`: unit of the positions by the column names; "" if they state no unit.
     """
 
     columns: int
@@ -107,12 +110,15 @@ class TableLayout(NamedTuple):
 
     @property
     def has_pose(self) -> bool:
-        """Whether the names say where time, place and quaternion are."""
+        """Whether the names say which columns hold time, position and quaternion."""
         return all(name in self.names for name in POSE)
 
 
 def read_table(path: Path, columns: int, expected: str) -> NumberTable:
-    """Return the poses of `path`, at least one; `nan` and `inf` stay. Raises BadInputError with the line."""
+    """Return the numbers of the table `path`, with at least one row; `nan` and `inf` are kept.
+
+    `columns`: required number of columns. `expected`: expected content in words. Raises BadInputError with the line.
+    """
     rows, lines = [], []
     for number, words in _rows(path, expected):
         if len(words) != columns:
@@ -128,14 +134,21 @@ def read_table(path: Path, columns: int, expected: str) -> NumberTable:
 
 
 def head_of(path: Path, columns: int, expected: str) -> NDArray[np.float64]:
-    """Return numbers (N, columns) of the first rows that have as many; N may be 0. Raises BadInputError."""
+    """Return the numbers (N, `columns`) among the first HEAD rows; N may be 0.
+
+    Rows with another number of columns, or with NaN or infinity, are left out. Raises BadInputError when the file is
+    unreadable.
+    """
     rows = (words for _, words in islice(_rows(path, expected), HEAD))
     numbers = ([value for word in words for value in _number(word)] for words in rows)
     return np.array([row for row in numbers if len(row) == columns]).reshape(-1, columns)
 
 
 def layout_of(path: Path, expected: str) -> TableLayout:
-    """Return the layout of the first line of numbers; without such a line it has no columns. Raises BadInputError."""
+    """Return the layout of the table `path`; it has 0 columns if the file has no line of numbers.
+
+    `expected`: expected content in words. Raises BadInputError when column names contradict each other.
+    """
     named: tuple[ColumnName, ...] = ()
     first: list[str] = []
     times: list[float] = []
@@ -161,7 +174,7 @@ def layout_of(path: Path, expected: str) -> TableLayout:
 
 
 def _require_one_of_each(path: Path, columns: Sequence[ColumnName]) -> None:
-    """Raise BadInputError where two column names state the same content: either may be meant."""
+    """Raise BadInputError if two columns have names with the same meaning, as either column may be meant."""
     named: dict[str, str] = {}
     for column in columns:
         if column.holds in named:
@@ -172,7 +185,7 @@ def _require_one_of_each(path: Path, columns: Sequence[ColumnName]) -> None:
 
 
 def _number(word: str) -> list[float]:
-    """Return `word` as a number, if it is a finite one."""
+    """Return [number] if `word` is a finite number, otherwise []."""
     try:
         return [float(word)] if np.isfinite(float(word)) else []
     except ValueError:
@@ -182,7 +195,8 @@ def _number(word: str) -> list[float]:
 class ColumnName(NamedTuple):
     """The name of a column.
 
-    `text`: name as written. `holds`: content, by KNOWN, "" for others. `unit`: unit as written, "" without one.
+    `text`: name as written. `holds`: content of the column, a value of KNOWN or "".
+    `unit`: unit as written; "" if the name has no unit.
     """
 
     text: str
@@ -191,9 +205,9 @@ class ColumnName(NamedTuple):
 
 
 def columns_in(line: str) -> tuple[ColumnName, ...]:
-    """Return the column names in `line`, maybe a comment, if it has four or more known names; otherwise nothing."""
+    """Return the column names in `line`, maybe a comment; () if it has fewer than four different known names."""
     text = UNIT.sub(lambda unit: re.sub(r"[\s,]+", "_", unit[0]), _parted(line.strip().lstrip("#")))
-    text = re.sub(r"(?<!\s)\s+(?=[\[(])", "", text)  # a unit belongs to the name before it
+    text = re.sub(r"(?<!\s)\s+(?=[\[(])", "", text)  # a unit in brackets belongs to the name before it
     columns = tuple(map(_named, text.split(",") if "," in text else text.split()))
     return columns if len({column.holds for column in columns} - {""}) >= 4 else ()
 
@@ -220,9 +234,10 @@ def _plain(name: str) -> str:
 def _unit_of(
     path: Path, columns: tuple[ColumnName, ...], holding: tuple[str, ...], units: Mapping[str, float], key: str
 ) -> str:
-    """Return the unit that the names of the columns `holding` something state, one of `units`; "" without one.
+    """Return the unit, a key of `units`, that the columns with a content in `holding` state; "" if they state no unit.
 
-    `key`: key of the scene that states it instead. Raises BadInputError where it is unknown or differs.
+    `key`: key of the scene that states the unit instead, for messages. Raises BadInputError when a unit is unknown, or
+    when the names state different units.
     """
     of = [column for column in columns if column.holds in holding]
     found = [SPELLINGS.get(column.unit.lower(), column.unit) for column in of]
@@ -243,22 +258,25 @@ def _first_other(found: Sequence[str]) -> int:
 
 
 def elapsed(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Return times (N,) since the first finite one, and the median of their steps, 0 with fewer than two.
+    """Return the times (N,) since the first finite one, and the median step between finite times.
 
-    NaNs stay NaN.
+    NaN stays NaN. The step is 0 if there are fewer than two finite times.
     """
     finite = times[np.isfinite(times)]
-    if len(finite) < 2:
-        return times - times[0], 0.0
-    return times - finite[0], float(np.median(np.diff(finite)))
+    if not len(finite):
+        return times, 0.0
+    return times - finite[0], float(np.median(np.diff(finite))) if len(finite) > 1 else 0.0
 
 
 def units_of(column: NDArray[np.float64]) -> tuple[str, ...]:
-    """Return the units that the times or frames of a column (N,) may have; several where they do not tell."""
+    """Return the units that the times in `column` (N,) may have; FRAMES stands for frame numbers.
+
+    There are several units if the times do not decide.
+    """
     if is_index(column):
         return (FRAMES,)
     finite = column[np.isfinite(column)]
-    step, middle = elapsed(finite)[1] if len(finite) else 0.0, float(np.median(finite)) if len(finite) else 0.0
+    step, middle = elapsed(finite)[1], float(np.median(finite)) if len(finite) else 0.0
     film = next((unit for unit, second in SECONDS.items() if step * second < 1), "ns")
     clock = next((unit for unit in SECONDS if _since_1970(middle, unit) and step * SECONDS[unit] < LONGEST_STEP_S), "")
     if clock:
@@ -276,10 +294,11 @@ def _since_1970(time: float, unit: str) -> bool:
 
 
 class Clock(NamedTuple):
-    """What is known of a table's times beside them.
+    """What the scene and the format say about a table's times.
 
-    `rate_hz`: frames a second, from the scene; None for `usual_hz`. `unit`: unit of the times, `frames` for numbers of
-    frames; `auto` where it follows from them.
+    `rate_hz`: frames a second by the scene; None if the scene does not say.
+    `unit`: unit of the times; FRAMES for frame numbers, `auto` to find it from the times.
+    `usual_hz`: frames a second by the format.
     """
 
     rate_hz: float | None = None
@@ -287,9 +306,10 @@ class Clock(NamedTuple):
     usual_hz: float = FILM_RATE_HZ
 
     def stated(self, path: Path, unit: str) -> Clock:
-        """Return this clock with the `unit` of the file's column names; the scene may say that they count frames.
+        """Return this clock with the `unit` that column names state; the scene's own unit is kept.
 
-        Raises BadInputError where the scene states another unit.
+        The scene may say that the times are frame numbers. Raises BadInputError when the scene states another unit than
+        the names.
         """
         if unit != AUTO and self.unit not in (AUTO, FRAMES, unit):
             found = f'column names with times in {unit} and camera.time_unit = "{self.unit}"'
@@ -300,8 +320,9 @@ class Clock(NamedTuple):
 class ColumnTimes(NamedTuple):
     """The times of a column.
 
-    `since_s` (N,): times since the first finite one. `unit`: unit of the column, one of TIME_UNITS or `frames`. `rate`:
-    rate for notes, such as `, 30/s`; empty where it is unknown.
+    `since_s` (N,): seconds since the first finite time.
+    `unit`: unit of the column, a key of TIME_UNITS or FRAMES.
+    `rate`: rate for notes, such as `, 30/s`; "" when unknown.
     """
 
     since_s: NDArray[np.float64]
@@ -310,9 +331,9 @@ class ColumnTimes(NamedTuple):
 
 
 def times_of(where: str | Path, column: NDArray[np.float64], clock: Clock) -> ColumnTimes:
-    """Return the times in a column (N,) of the table `where`, or times that follow from its frame numbers.
+    """Return the times in `column` (N,), or the times of its frame numbers.
 
-    Raises BadInputError where another unit is as likely, or no unit fits these steps.
+    `where`: table, for messages. Raises BadInputError when several units are likely, or when no unit fits the steps.
     """
     units = units_of(column) if clock.unit == AUTO else (clock.unit,)
     since, step = elapsed(column)
@@ -333,7 +354,7 @@ def times_of(where: str | Path, column: NDArray[np.float64], clock: Clock) -> Co
 
 
 def is_index(column: NDArray[np.float64]) -> bool:
-    """Return whether a column (N,) numbers frames; some may be missing."""
+    """Return whether `column` (N,) holds frame numbers; some numbers may be missing."""
     finite = column[np.isfinite(column)]
     if len(finite) < 2 or not ((finite % 1 == 0) & (finite >= 0) & (finite < MOST_FRAMES)).all():
         return False
@@ -342,7 +363,10 @@ def is_index(column: NDArray[np.float64]) -> bool:
 
 
 def _parted(text: str) -> str:
-    """Return a line with commas between its fields if it has semicolons: its numbers may then have decimal commas."""
+    """Return `text` with its fields separated by commas or blanks, and with decimal points.
+
+    If it has semicolons, they separate the fields, and its commas are decimal commas.
+    """
     return text.replace(",", ".").replace(";", ",") if ";" in text else text
 
 
@@ -372,10 +396,10 @@ SAY_ORDER = "say the order in a first line, such as `timestamp qx qy qz qw tx ty
 #: Number of columns of a 3x4 matrix, and the order of its numbers in a line.
 MATRIX = 12
 ROW_ORDER = "the order r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
-#: Largest deviation of a quaternion's length from 1: two digits after the point change it by 0.01 at most.
+#: Largest deviation of a quaternion's length from 1; rounding to two decimal places changes the length by 0.01 at most.
 MOST_OFF = 0.02
-#: Steps of a clock differ by less than the first share of their median; steps that differ by more than the second are
-#: none of a clock. A column is judged from so many rows on.
+#: A column is a clock if all steps differ from their median by less than the share EVEN, and no clock if a step differs
+#: by UNEVEN or more. It is judged only if it has LEAST_OF_A_CLOCK rows.
 EVEN, UNEVEN, LEAST_OF_A_CLOCK = 0.01, 0.5, 8
 
 
@@ -383,10 +407,13 @@ EVEN, UNEVEN, LEAST_OF_A_CLOCK = 0.01, 0.5, 8
 class PoseTable:
     """The poses of a table with quaternions.
 
-    `times_s` (N,): times from 0. `turns` (N, 3, 3), `places` (N, 3): poses as the file has them. `time`: unit of the
-    file's times. `rate`: rate for notes, such as `, 30/s`. `order`: source of the order of columns. `names`: contents
-    of the columns of `table`. `began_s`: seconds since 1970 at time 0; None where the file has other times. `lengths`:
-    unit of the places by the column names, "" without one.
+    `times_s` (N,): times from 0.
+    `turns` (N, 3, 3), `places` (N, 3): rotations and positions, as the file has them.
+    `time`: unit of the file's times. `rate`: rate for notes, such as `, 30/s`.
+    `order`: source of the order of columns, in words.
+    `names`: content of each column of `table`.
+    `began_s`: time 0 in seconds since 1970; None if the file's times are not those of a clock.
+    `lengths`: unit of the positions by the column names; "" if they state no unit.
     """
 
     times_s: F64
@@ -401,7 +428,7 @@ class PoseTable:
     lengths: str = ""
 
     def column(self, name: str) -> F64:
-        """Return the numbers (N,) of the column that holds `name`."""
+        """Return the numbers (N,) of the column with the content `name`."""
         return self.table.numbers[:, self.names.index(name)]
 
 
@@ -410,8 +437,11 @@ def read_pose_table(
 ) -> PoseTable:
     """Return the poses of `path`.
 
-    `usual`: contents of the columns by the format. `may_have_more`: whether other columns may follow. Raises
-    BadInputError with the line.
+    `clock`: what the scene says about the times.
+    `usual`: content of each column by the format.
+    `expected`: expected content in words.
+    `may_have_more`: whether further columns may follow.
+    Raises BadInputError with the line.
     """
     layout = layout_of(path, expected)
     names = layout.names if layout.has_pose else tuple(usual)
@@ -445,8 +475,9 @@ def read_pose_table(
 class MatrixTable(NamedTuple):
     """The poses of a table with matrices.
 
-    `turns` (N, 3, 3), `places` (N, 3): poses as the file has them. `times`: times, None where it has none.
-    `lengths`: unit of the places by the column names, "" without one.
+    `times`: times of the poses; None if the table has no times.
+    `turns` (N, 3, 3), `places` (N, 3): rotations and positions, as the file has them.
+    `lengths`: unit of the positions by the column names; "" if they state no unit.
     """
 
     times: ColumnTimes | None
@@ -457,9 +488,10 @@ class MatrixTable(NamedTuple):
 
 
 def read_matrix_table(path: Path, clock: Clock, expected: str) -> MatrixTable:
-    """Return the poses of `path`: 3x4 matrices row by row, maybe with a time or a frame's number before each.
+    """Return the poses of `path`: 3x4 matrices row by row, each of which may follow a time or a frame number.
 
-    Raises BadInputError with the line.
+    `clock`: what the scene says about the times. `expected`: expected content in words. Raises BadInputError with the
+    line.
     """
     layout = layout_of(path, expected)
     columns = MATRIX if layout.columns == MATRIX else MATRIX + 1
@@ -471,9 +503,9 @@ def read_matrix_table(path: Path, clock: Clock, expected: str) -> MatrixTable:
 
 
 def _require_row_order(path: Path, table: NumberTable) -> None:
-    """Raise BadInputError where most matrices are rotations only by the first nine of their twelve numbers.
+    """Raise BadInputError if most poses are rotations only when their first nine numbers are taken as the 3x3 matrix.
 
-    Such a table has each place after its rotation, or each matrix column by column.
+    Such a table has each position after its rotation, or each matrix column by column.
     """
     numbers = np.nan_to_num(table.numbers[:, -MATRIX:])
     by_row = are_rotations(numbers.reshape(-1, 3, 4)[:, :, :3])
@@ -486,9 +518,9 @@ def _require_row_order(path: Path, table: NumberTable) -> None:
 
 
 def _require_times(path: Path, times: F64, places: F64) -> None:
-    """Raise BadInputError if a column of `places` (N, 3) is a clock and `times` (N,) are not.
+    """Raise BadInputError if a column of `places` (N, 3) looks like a clock and `times` (N,) do not.
 
-    A clock's steps are all alike. No camera moves so evenly along an axis while it is sampled at uneven times.
+    The steps of a clock are equal. No camera moves so evenly along an axis while it is sampled at uneven times.
     """
     if len(times) < LEAST_OF_A_CLOCK or _unevenness(times) < UNEVEN:
         return
@@ -499,14 +531,17 @@ def _require_times(path: Path, times: F64, places: F64) -> None:
 
 
 def _unevenness(column: F64) -> float:
-    """Return how far steps are from their median, as a share of it; infinity where the column does not grow."""
+    """Return the largest deviation of the steps of `column` (N,) from their median, as a share of the median.
+
+    It is infinite if the column does not grow.
+    """
     steps = np.diff(column)
     median = float(np.median(steps))
     return float(np.abs(steps - median).max() / median) if median > 0 and np.isfinite(steps).all() else math.inf
 
 
 def _began(times: F64, unit: str) -> float | None:
-    """Return the first of `times`, seconds since 1970; None when it is no such time."""
+    """Return the first finite time in seconds since 1970; None if the times are not those of a clock."""
     finite = times[np.isfinite(times)]
     if unit not in TIME_UNITS or not len(finite) or not _since_1970(float(finite[0]), unit):
         return None
@@ -514,10 +549,7 @@ def _began(times: F64, unit: str) -> float | None:
 
 
 def _require_quats(path: Path, quats: F64, table: NumberTable) -> None:
-    """Raise BadInputError when most of `quats` (N, 4) do not have length 1.
-
-    `table`: table that has them.
-    """
+    """Raise BadInputError when most of `quats` (N, 4) do not have length 1. `table`: their table, for the message."""
     off = is_off(quats)
     if 2 * np.count_nonzero(off) <= len(off):
         return
@@ -531,7 +563,10 @@ def _require_quats(path: Path, quats: F64, table: NumberTable) -> None:
 
 
 def is_off(quats: F64, most: float = MOST_OFF) -> NDArray[np.bool_]:
-    """Return which rows (N, 4) have a length that differs from 1 by more than `most`; unusable rows do not count."""
+    """Return, for each of `quats` (N, 4), whether the length differs from 1 by more than `most`: (N,).
+
+    A quaternion that is 0 or not finite does not count as off.
+    """
     with np.errstate(over="ignore", invalid="ignore"):
         length = np.linalg.norm(quats, axis=1)
         return np.asarray(np.isfinite(length) & (length > 0) & (np.abs(length - 1) > most))

@@ -1,16 +1,18 @@
-"""Turns a recorded camera into a CameraPath: it finds the unit of the map, its up and how the device was held.
+"""Turns a recorded camera into a CameraPath: finds the unit of the map, its up, and how the device was held.
 
-The movement from pose to pose never changes. Three constants are applied. One turn of the world makes +Y up. One turn
-of the picture by a multiple of 90 degrees acts as a phone does with its display. One scale leads to metres.
+The movement from pose to pose never changes. Three constants are applied. A rotation of the world makes +Y up. A
+rotation of the picture by a multiple of 90 degrees does what a phone does with its display. A scale converts to metres.
 
-**Unit.** The scene states it, or the format defines it as a metre. Otherwise, or where cameras would be faster than
-anything that carries one, the scale is guessed: a person fills the pictures where the cameras look. Files of NeRF have
-no unit, but many are in metres: the scale is guessed only where the views circle a point at which no person fits.
+**Unit.** The scene states the unit, or the format defines it as a metre. Otherwise, or if the camera would be faster
+than anything that carries a camera, the scale is guessed: a person fills the pictures where the cameras look. Files of
+NeRF have no unit, but many are in metres. Their scale is guessed only if the views circle a point at which no person
+fits.
 
 **Up.** People hold a camera level. Each axis of the world is tried with each quarter turn of the picture. A guess costs
-more the farther the horizon is from level, and the more steeply the camera looks down or up and the more that changes.
-It also costs more where it is not the format's usual axis or turns the picture. The cheapest guess wins; a near rival
-is named. Where no axis fits, and the horizons agree on a direction between the axes, that direction is up.
+more the farther the horizon is from level, the more steeply the camera looks down or up, and the more this elevation
+changes. It also costs more if the axis is not the format's usual one, or if the picture is turned. The cheapest guess
+wins; if another guess is nearly as cheap, a note names it. If no axis fits, and the horizons agree on a direction
+between the axes, that direction is up.
 """
 
 from __future__ import annotations
@@ -30,21 +32,27 @@ from trilane.scene.recordings import NOTHING, Detected, PlaceOf, by_number, usab
 from trilane.scene.rotations import about, quat_from_matrix, shortest_turn
 from trilane.scene.schema import CameraSpec
 
-#: Distance of the places' middle from the origin beyond which it is moved there; farther off, float32 no longer
-#: resolves tenths of a millimetre.
+#: If the median position is farther from the origin than this, metres, all positions are moved. Beyond it, float32 no
+#: longer resolves tenths of a millimetre.
 MAP_M = 1e3
-#: Median speed above which the unit of a map is no metre.
+#: Median speed, units per second, above which the unit of a map cannot be a metre.
 FASTEST_M_S = 40.0
-#: Height of a person, and the share of the picture's height that a person fills where the cameras look.
+#: Height of a person, metres, and the share of the picture's height that a person fills at the point where the cameras
+#: look.
 PERSON_M, SHARE = 1.7, 0.75
-#: Least eigenvalue of the mean projection of the lines of sight; below it they are nearly parallel and meet nowhere.
+#: Least eigenvalue of the mean projection matrix (1 - d d'); below it, the lines of sight are nearly parallel and meet
+#: nowhere.
 LEAST_SPREAD = 0.02
-#: Distance from end to end that a camera goes when it looks at nothing in particular.
+#: Extent, metres, of the path of a camera that looks at no particular point.
 PATH_M = 2.0
 
 
 class LengthUnit(Enum):
-    """The unit of a format's lengths: metres by its definition, usually metres, metres where a person fits, or none."""
+    """The unit of a format's lengths.
+
+    METRES: metres by definition. USUALLY_M: metres, unless the camera is too fast. OFTEN_M: metres, if a person fits
+    into the pictures. NONE: no unit.
+    """
 
     METRES = "metres"
     USUALLY_M = "usually metres"
@@ -53,7 +61,7 @@ class LengthUnit(Enum):
 
 
 def near_origin(places: F64) -> tuple[F64, tuple[str, ...]]:
-    """Return `places` (N, 3) without the offset of a map, such as UTM coordinates have, and a note on it."""
+    """Return `places` (N, 3) without the offset of a map, such as that of UTM coordinates, and a note on the offset."""
     finite = np.isfinite(places).all(axis=1)
     middle = np.median(places[finite], axis=0) if finite.any() else np.zeros(3)
     if np.abs(middle).max() <= MAP_M:
@@ -66,10 +74,13 @@ def near_origin(places: F64) -> tuple[F64, tuple[str, ...]]:
 def metres_per_unit(
     turns: F64, places: F64, times_s: F64, fov_y_deg: float, unit: LengthUnit, spec: CameraSpec
 ) -> tuple[float, tuple[str, ...]]:
-    """Return the metres in a length of 1 of the map, and notes on them.
+    """Return the number of metres per unit of the map, and notes on it.
 
-    `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes. `times_s` (N,): times in seconds. `fov_y_deg`:
-    field of view over the picture's height. `unit`: unit of the format. `spec`: camera of the scene.
+    `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes.
+    `times_s` (N,): times.
+    `fov_y_deg`: field of view over the picture's height, degrees.
+    `unit`: unit of the format.
+    `spec`: camera of the scene.
     """
     if spec.metres_per_unit is not None:
         return spec.metres_per_unit, (f"1 unit of the file is {spec.metres_per_unit:g} m, as given",)
@@ -92,20 +103,23 @@ def metres_per_unit(
 
 
 def _looked_at_height(turns: F64, places: F64, fov_y_deg: float) -> float | None:
-    """Return the height, in units, of what the pictures show where the cameras look; None where they look nowhere."""
+    """Return the height, in units of the map, that the pictures show at the point where the cameras look.
+
+    The result is None without such a point. The parameters are those of `metres_per_unit`.
+    """
     distance = looked_at_from(turns, places)
     return None if distance is None else float(2 * np.tan(np.radians(fov_y_deg) / 2) * distance)
 
 
 def _speed(places: F64, times_s: F64) -> float:
-    """Return the median speed, units a second; 0 for a single place."""
+    """Return the median speed, units per second; 0 for a single position."""
     if len(places) < 2:
         return 0.0
     return float(np.median(np.linalg.norm(np.diff(places, axis=0), axis=1) / np.diff(times_s)))
 
 
 def _fitting(turns: F64, places: F64, fov_y_deg: float) -> tuple[float, str]:
-    """Return a scale that follows only from the path's shape and where it looks, and its effect in words."""
+    """Return a scale that depends only on the shape of the path and where the cameras look, and its effect in words."""
     height = _looked_at_height(turns, places, fov_y_deg)
     if height is not None:
         return PERSON_M / SHARE / height, f"a person fills {SHARE:.0%} of the picture's height where the cameras look"
@@ -118,7 +132,7 @@ def _fitting(turns: F64, places: F64, fov_y_deg: float) -> tuple[float, str]:
 def looked_at_from(turns: F64, places: F64) -> float | None:
     """Return the median distance of the cameras from the point that is nearest to all their lines of sight.
 
-    None where the lines are nearly parallel, or meet behind the cameras.
+    The result is None if the lines are nearly parallel, or if they meet behind the cameras.
     """
     point = meeting_point(turns, places)
     if point is None:
@@ -130,9 +144,10 @@ def looked_at_from(turns: F64, places: F64) -> float | None:
 
 
 def meeting_point(turns: F64, places: F64) -> F64 | None:
-    """Return the point (3,) that is nearest to all lines of sight, before or behind the cameras; None if parallel.
+    """Return the point (3,) nearest to all lines of sight, before or behind the cameras; None if they are parallel.
 
-    It solves the normal equations of the distances: sum (1 - d d') (x - p) = 0 for places p and unit directions d.
+    The point x solves the normal equations of the distances: sum (1 - d d') (x - p) = 0 for positions p and unit
+    directions d.
     """
     ahead = -turns[:, :, 2]
     across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
@@ -142,7 +157,8 @@ def meeting_point(turns: F64, places: F64) -> F64 | None:
 
 
 AUTO = "auto"
-#: Units of lengths that column names may state, in metres, and the share by which the scene's may differ.
+#: Units of lengths that column names may state, in metres; relative difference within which the scene's unit is the
+#: same.
 LENGTH_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "ft": 0.3048, "in": 0.0254}
 SAME_UNIT = 1e-3
 UP: dict[str, tuple[float, float, float]] = {
@@ -153,18 +169,22 @@ UP: dict[str, tuple[float, float, float]] = {
     "-z": (0.0, 0.0, -1.0),
     "-x": (-1.0, 0.0, 0.0),
 }
-#: Least mean cosine between a picture's up and the world's.
+#: A picture's up is up in the world only if their mean cosine is above this.
 LEAST_UP_COSINE = 0.3
-#: Cost of a horizon that is off by a radian (root mean square), of a line of sight that goes up and down by a radian
-#: (standard deviation; people turn round, but seldom look up and down), and of one that is never level.
+#: Costs: per radian by which the horizon is off level (root mean square), per radian by which the elevation of the line
+#: of sight varies (standard deviation), and for a view along the vertical. People turn round, but seldom look up and
+#: down.
 PER_ROLL, PER_TILT, PER_PITCH = 2.0, 1.0, 0.5
 
 
 @dataclass(frozen=True)
 class _Prices:
-    """Costs of a guess: an unusual axis, a turned picture, a direction between the axes (None: it is never guessed).
+    """Additional costs of a guess at what is up.
 
-    `nadir`: cost of a camera that looks straight down along the usual axis. `nadir_deg`: how far off it may look.
+    `axis`: an unusual axis. `turn`: a turned picture.
+    `between`: a direction between the axes; None if such a direction is never guessed.
+    `nadir`: a camera that looks straight down along the usual axis. `nadir_deg`: largest deviation from that view,
+    degrees.
     """
 
     axis: float
@@ -174,34 +194,35 @@ class _Prices:
     nadir_deg: float
 
 
-#: Costs in a format whose world is whatever the program chose, and in one whose world is aligned with gravity by
-#: definition. In the first, a turn of the device is believed only after every axis. It costs as much as another axis
-#: plus the most that the picture's own up can be off an axis (45 degrees). A view straight down along the usual axis is
-#: believed there only where other axes have horizons that are 0.15 rad off; under gravity, before every other axis.
+#: Costs in a format whose world is arbitrary (ANY_WORLD), and in a format whose world is aligned with gravity by
+#: definition (LEVELLED). In ANY_WORLD, a turn of the device is believed only after every axis. Its cost is that of
+#: another axis plus the most by which the picture's own up can be off an axis (45 degrees). A view straight down along
+#: the usual axis is believed only if other axes have horizons that are 0.15 rad off. In LEVELLED, such a view is
+#: believed before every other axis.
 ANY_WORLD = _Prices(axis=0.2, turn=0.4, between=0.25, nadir=0.5, nadir_deg=5.0)
 LEVELLED = _Prices(axis=0.4, turn=0.1, between=None, nadir=0.3, nadir_deg=18.0)
-#: Without an opinion on world and device, to compare horizons alone.
+#: Costs that compare horizons alone.
 FREE = _Prices(axis=0.0, turn=0.0, between=None, nadir=0.0, nadir_deg=18.0)
-#: A direction between the axes is believed when the cameras pan by at least this, in radians (root mean square), and
-#: its cosine with every axis is below this.
+#: A direction between the axes is believed if the cameras pan by at least LEAST_PAN, radians (root mean square), and if
+#: its cosine with every axis is at most MOST_AXIS_COSINE.
 LEAST_PAN, MOST_AXIS_COSINE = 0.15, 0.995
-#: Cosine above which the first picture's axes, OpenGL's or optical ones, are the world's; and the words for that case,
-#: as nothing else tells it.
+#: The world's axes count as the first picture's axes (OpenGL or optical) if their cosines are above this. A note then
+#: says OF_FIRST, as nothing else shows this case.
 AS_FIRST = 1 - 1e-8
 OF_FIRST = "; the axes are those of the first picture: if that looked down or up, the floor is tilted by as much"
-#: A rival that is dearer than the best by at most this is named.
+#: Another guess is named if its cost exceeds the least one by less than this.
 NEAR = 0.1
 
 
-#: Sine of the elevation above which a view is steeply up: 20 degrees.
+#: A view is steeply up if the sine of its elevation is above this: 20 degrees.
 LEAST_SKYWARDS = 0.34
 
 
 @dataclass(frozen=True)
 class Upright:
-    """Up of a world.
+    """The up direction of a world, and how the device was held.
 
-    `up` (3,): unit vector. `quarter`: number of 90-degree turns of the picture.
+    `up` (3,): unit vector. `quarter`: number of quarter turns of the picture. `note`: how they were found, for people.
     """
 
     up: F64
@@ -219,10 +240,12 @@ class _Guess:
 
 
 def find_upright(turns: F64, usual: str, is_levelled: bool, stated: str = AUTO) -> Upright:
-    """Find up of a world, and the quarter turns of the picture, from camera axes `turns` (N, 3, 3), camera to world.
+    """Return the up direction of a world and the quarter turns of the picture.
 
-    `usual`: axis that is up in the format. `is_levelled`: whether the format's world is aligned with gravity by
-    definition. `stated`: axis that the scene says is up; only turns of the picture are tried then.
+    `turns` (N, 3, 3): camera axes, camera to world, OpenGL.
+    `usual`: axis that is usually up in the format.
+    `is_levelled`: whether the format's world is aligned with gravity by definition.
+    `stated`: axis that is up by the scene, or `auto`. If it is stated, only quarter turns of the picture are tried.
     """
     expected = usual if stated == AUTO else stated
     guesses = _guesses(turns, expected, LEVELLED if is_levelled else ANY_WORLD, stated)
@@ -234,29 +257,32 @@ def find_upright(turns: F64, usual: str, is_levelled: bool, stated: str = AUTO) 
 
 
 def _is_nadir(turns: F64, usual: str, most_deg: float) -> bool:
-    """Return whether a camera looks straight down along the axis `usual`, within `most_deg`.
+    """Return whether a camera looks straight down along the axis `usual`, within `most_deg` degrees.
 
-    A map whose axes are those of the first picture also has a view along an axis, but ahead.
+    If the map has the axes of the first picture, the result is False: such a camera looks ahead along an axis.
     """
     is_of_first = np.abs(np.diag(turns[0])).min() > AS_FIRST
     return bool(turns[:, :, 2].mean(axis=0) @ UP[usual] > np.cos(np.radians(most_deg)) and not is_of_first)
 
 
 def price_of(turns: F64, usual: str) -> float:
-    """Return the cost of the cheapest guess for camera axes `turns` (N, 3, 3): 0 where they are level about `usual`."""
+    """Return the cost of the cheapest guess for camera axes `turns` (N, 3, 3): 0 if they are level about `usual`."""
     return min((guess.price for guess in _guesses(turns, usual, ANY_WORLD, AUTO)), default=math.inf)
 
 
 def price_of_horizons(turns: F64) -> float:
-    """Return the cost of camera axes `turns` (N, 3, 3) with the axis and the quarter turn that suit them best."""
+    """Return the least cost of camera axes `turns` (N, 3, 3) over all axes and quarter turns, by horizons alone."""
     return min((guess.price for guess in _guesses(turns, "y", FREE, AUTO)), default=math.inf)
 
 
 def is_of_body(turns: F64, of_body: F64, usual: str) -> bool:
-    """Return whether the poses more likely show a level vehicle than a camera.
+    """Return whether poses more likely belong to a level vehicle than to a camera.
 
-    As a camera's `turns` (N, 3, 3) they need two corrections at once: a turned picture, and a view that is steeply up.
-    As `of_body` (N, 3, 3) they need none, look ahead or down, and are cheaper by NEAR. `usual`: axis usually up.
+    `turns` (N, 3, 3): camera axes if the poses are a camera's. They must need two corrections: a turned picture, and a
+    view that is steeply up.
+    `of_body` (N, 3, 3): camera axes if the poses are a vehicle's. They must need no correction, look ahead or down, and
+    cost less by NEAR.
+    `usual`: axis that is usually up in the format.
     """
     cheapest = [
         min(_guesses(one, usual, ANY_WORLD, AUTO), key=lambda guess: guess.price, default=None)
@@ -285,9 +311,9 @@ def _guesses(turns: F64, expected: str, prices: _Prices, stated: str) -> list[_G
 
 
 def _is_of_first(turns: F64, best: _Guess) -> bool:
-    """Return whether the world's axes are those of the first of several pictures, and up is its own up.
+    """Return whether the world has the axes of the first of several pictures, and up is that picture's own up.
 
-    A SLAM map is such a world.
+    SLAM maps are such worlds.
     """
     first = turns[0]
     is_unturned = abs(first[0, 0]) > AS_FIRST and abs(first[1, 1]) > AS_FIRST
@@ -299,13 +325,16 @@ def _why_without(stated: str) -> str:
 
 
 def _ups_and_rights(turns: F64, quarter: int) -> tuple[F64, F64]:
-    """Return up and right (N, 3) of pictures that are turned by `quarter` times 90 degrees."""
+    """Return the directions up and right (N, 3) of pictures after `quarter` quarter turns."""
     x, y = turns[:, :, 0], turns[:, :, 1]
     return ((y, x), (-x, y), (-y, -x), (x, -y))[quarter]
 
 
 def _price(turns: F64, up: F64, quarter: int) -> float | None:
-    """Return the cost of a pair by its horizons and lines of sight; None when the picture's up is not up at all."""
+    """Return the cost of a guess by horizons and lines of sight; None if the pictures' own up is not up.
+
+    `turns` (N, 3, 3): camera axes. `up` (3,): guessed up. `quarter`: guessed number of quarter turns of the pictures.
+    """
     ups, rights = _ups_and_rights(turns, quarter)
     cosine = float((ups @ up).mean())
     if cosine <= LEAST_UP_COSINE:
@@ -315,9 +344,10 @@ def _price(turns: F64, up: F64, quarter: int) -> float | None:
 
 
 def _between(turns: F64, dearer: float) -> list[_Guess]:
-    """Return the direction to which the right axes of all pictures are most nearly at right angles.
+    """Return a guess whose up may be between the axes; [] if it is not believed.
 
-    The horizons are level about it.
+    This up is most nearly perpendicular to the right axes of all pictures, so the horizons are most nearly level.
+    `dearer`: additional cost.
     """
     ups, rights = _ups_and_rights(turns, 0)
     spread, directions = np.linalg.eigh(rights.T @ rights / len(rights))
@@ -344,7 +374,7 @@ def _note(best: _Guess, usual: str, stated: str) -> str:
 
 
 def _rival(best: _Guess, guesses: list[_Guess], stated: str) -> str:
-    """Name the next guess, when it is nearly as cheap and the two are far apart."""
+    """Return words on the second cheapest guess, if it is nearly as cheap but far from the best; otherwise ""."""
     for guess in guesses:
         if guess.is_nadir and guess.name != best.name:
             return f"; {guess.name.upper()} up fits if it looks straight down: camera.up_axis decides"
@@ -362,10 +392,10 @@ FILM_STEP_DEG = 6.0
 
 
 def times_without(turns: F64, rate_hz: float | None) -> tuple[F64, str]:
-    """Return seconds (N,) of views with camera axes `turns` (N, 3, 3), and how they were decided.
+    """Return times (N,), seconds, of views without times, and words on their rate.
 
-    `rate_hz`: views a second, from the scene, if it says so. Views less than FILM_STEP_DEG apart are a film, others are
-    stills.
+    `turns` (N, 3, 3): camera axes. `rate_hz`: views a second by the scene; None if the scene does not say. Without a
+    rate, views that are less than FILM_STEP_DEG apart are a film, and other views are stills.
     """
     rate, how = _rate(turns) if rate_hz is None else (rate_hz, f"{rate_hz:g} a second as given")
     return np.arange(len(turns)) / rate, how
@@ -381,26 +411,32 @@ def _rate(turns: F64) -> tuple[float, str]:
     return FILM_RATE_HZ, f"{FILM_RATE_HZ:g} a second assumed"
 
 
-#: A matrix counts as a rotation when |R^T R - 1| is below this.
+#: A matrix counts as a rotation if the entries of |R^T R - 1| are below this.
 SKEW = 0.05
-#: Places farther than this from the others are left out.
+#: Positions with a coordinate beyond this are left out, metres, after the map is moved to the origin.
 FARTHEST_M = 1e5
 NOT_FINITE, FAR_OFF = "not finite", f"farther than {FARTHEST_M / 1000:.0f} km from the others"
-#: Turns optical axes (x right, y down, z ahead) into OpenGL axes.
+#: Converts between optical axes (x right, y down, z ahead) and OpenGL axes.
 OPENGL_FROM_OPTICAL: F64 = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True)
 class RawCamera:
-    """The content of a camera file, before anything is left out or turned.
+    """The content of a camera file, before poses are left out and the world is turned.
 
-    `times_s` (N,): times in seconds. `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes, metres.
-    `usual_up`: axis of the world that is usually up in the format. `lenses`: lens of the picture, along the axes of its
-    pose; one for all poses or one for each. `lens`: source of the lenses. `notes`: notes on the file, for people.
-    `place_of`: place of a sample in the file. `detected`: facts about the file, without its axes and lens. `pictures`:
-    name of the photo of each pose, or none. `is_levelled`: whether the world of the format is aligned with gravity, by
-    its definition. `unit`: unit of the lengths by the format. `began_s`: seconds since 1970 at time 0; None where the
-    file does not say it. `lengths`: unit of the places by the file's column names, "" without one.
+    `times_s` (N,): times in seconds.
+    `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes, in the file's unit.
+    `usual_up`: axis of the world that is usually up in the format.
+    `lenses`: one lens for all poses or one for each, of pictures along the axes of the poses.
+    `lens`: source of the lenses, in words.
+    `notes`: notes on the file, for people.
+    `place_of`: place of a sample in the file.
+    `detected`: facts about the file, but not its axes and lens.
+    `pictures`: name of the photo of each pose; empty if the file names none.
+    `is_levelled`: whether the format's world is aligned with gravity by definition.
+    `unit`: unit of lengths by the format.
+    `began_s`: time 0 of `times_s` in seconds since 1970; None if the file does not state it.
+    `lengths`: unit of positions by the file's column names, "" without one.
     """
 
     times_s: F64
@@ -422,7 +458,9 @@ class RawCamera:
 def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraPath:
     """Return the camera path of a file.
 
-    `raw`: content of the file. `where`: path of the file, for messages. `spec`: camera of the scene, with its lens.
+    `raw`: content of the file.
+    `where`: path of the file, for messages.
+    `spec`: camera of the scene.
     Raises BadInputError when more than half of the poses are unusable.
     """
     places_m, spec, length_notes = _in_metres(raw, where, spec)
@@ -458,10 +496,11 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
 
 
 def _in_metres(raw: RawCamera, where: str, spec: CameraSpec) -> tuple[F64, CameraSpec, tuple[str, ...]]:
-    """Return the places (N, 3) in the unit that column names state, the camera of the scene without it, and a note.
+    """Return positions (N, 3), the camera of the scene, and a note, after a unit of the column names is applied.
 
-    Names with metres leave the places as they are, and `metres_per_unit` of the scene counts: programs write `[m]` over
-    maps that nobody measured. Raises BadInputError where the scene states another unit than the names.
+    If the names state another unit than metres, the positions are converted, and `metres_per_unit` of the camera
+    becomes None. If the names state metres, nothing changes and `metres_per_unit` of the scene counts: programs write
+    `[m]` over maps that nobody measured. Raises BadInputError when the scene states another unit than the names.
     """
     metres = LENGTH_UNITS.get(raw.lengths, 1.0)
     if metres == 1.0:
@@ -474,7 +513,7 @@ def _in_metres(raw: RawCamera, where: str, spec: CameraSpec) -> tuple[F64, Camer
 
 
 def _optics(raw: RawCamera, usable: NDArray[np.intp], quarter: int, spec: CameraSpec) -> tuple[Optics, str]:
-    """Return the lenses of the `usable` poses for a picture turned by `quarter`, and a note."""
+    """Return the lenses of the poses with indices `usable`, for a picture after `quarter` quarter turns, and a note."""
     if spec.fov_y_deg is not None:
         optics = one_lens(spec.fov_y_deg, spec.near_m, spec.far_m)
         return optics, f"field of view {spec.fov_y_deg:.4g} degrees high, as given"
@@ -487,7 +526,7 @@ def _optics(raw: RawCamera, usable: NDArray[np.intp], quarter: int, spec: Camera
 
 
 def _faults(times_s: F64, turns: F64, places: F64) -> dict[str, NDArray[np.bool_]]:
-    """Return faults of poses in words, and which poses (N,) have each; a pose has one fault at most."""
+    """Return, for each fault in words, which poses (N,) have it; a pose has at most one fault."""
     finite = np.isfinite(times_s) & np.isfinite(turns).all(axis=(1, 2)) & np.isfinite(places).all(axis=1)
     safe, near = np.where(finite[:, None, None], turns, 0.0), np.where(finite[:, None], places, 0.0)
     rotation = are_rotations(safe)
@@ -496,7 +535,10 @@ def _faults(times_s: F64, turns: F64, places: F64) -> dict[str, NDArray[np.bool_
 
 
 def are_rotations(matrices: F64, skew: float = SKEW) -> NDArray[np.bool_]:
-    """Return which of `matrices` (N, 3, 3) are rotations, with |R^T R - 1| below `skew`."""
+    """Return, for each of `matrices` (N, 3, 3), whether it is a rotation: (N,).
+
+    The entries of |R^T R - 1| must be below `skew`, and the determinant above 0.
+    """
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(np.swapaxes(matrices, -1, -2) @ matrices - np.eye(3)).max(axis=(1, 2))
         return np.asarray((off < skew) & (np.linalg.det(matrices) > 0))

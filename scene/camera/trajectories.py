@@ -1,7 +1,8 @@
-"""Readers of camera trajectories, which are text tables with a pose in each line: five formats.
+"""Readers of camera trajectories, text tables with one pose per line, in five formats.
 
-A format states the order of its columns, its axes and the lens that its devices usually have. `pose_table.py` reads the
-lines; a file's own column names win over the order of the format. Optical axes are x right, y down, looking along +Z.
+A format states the order of its columns, its axes, and the lens that its devices usually have. `pose_table.py` reads
+the lines; a file's own column names override the order of the format. Optical axes are x right, y down, looking along
++Z.
 """
 
 from __future__ import annotations
@@ -35,14 +36,15 @@ from trilane.scene.recordings import Detected
 ANY_CLOCK = Clock()
 ARKIT_COLUMNS = 13
 ARKIT = "an ARKit log: time and the 12 numbers of a 3x4 matrix a line"
-#: An iPhone's main camera, 26 mm equivalent, on a 16:9 picture: 36 degrees high, 60 wide.
+#: Lens of an iPhone's main camera, 26 mm equivalent, on a 16:9 picture: 36 degrees high, 60 wide.
 PHONE = centred(1920, 1080, 540 / math.tan(math.radians(18.0)), Known.LONG)
 
 
 def load_arkit(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
-    """Read an ARKit log: `time r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz` a line, camera to world, metres, Y up.
+    """Read an ARKit log: `time r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz` per line, camera to world, metres, Y up.
 
-    The axes belong to the sensor in landscape (x right, y up, looks along -Z). Raises BadInputError with the line.
+    The camera's axes are those of the sensor in landscape (x right, y up, looks along -Z). `clock`: what the scene says
+    about the times. Raises BadInputError with the line.
     """
     read = read_matrix_table(path, clock, ARKIT)
     count = len(read.turns)
@@ -71,15 +73,15 @@ def load_arkit(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
 KITTI = "KITTI poses: the 12 numbers of a 3x4 matrix a line"
 KITTI_HZ = 10.0
 KITTI_TIMES = "times.txt"
-#: Left grey camera of the first sequences, rectified.
+#: Lens of KITTI's left grey camera in the first sequences, rectified.
 GREY = of_opencv(1241.0, 376.0, 718.856, 718.856, 607.1928, 185.2157)
 
 
 def load_kitti(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
-    """Read KITTI odometry poses: a 3x4 matrix a line, row by row, camera to the first camera's axes, metres.
+    """Read KITTI odometry poses: a 3x4 matrix per line, row by row, from the camera to the first camera's axes, metres.
 
-    Axes are optical, so -Y is usually up. Some programs write a frame's number or a time before each matrix.
-    Raises BadInputError with the line.
+    Axes are optical, so -Y is usually up. Some programs write a frame number or a time before each matrix. `clock`:
+    what the scene says about the times. Raises BadInputError with the line.
     Format: https://www.cvlibs.net/datasets/kitti/eval_odometry.php, readme.txt of the development kit.
     """
     clock = clock._replace(usual_hz=KITTI_HZ)
@@ -93,9 +95,9 @@ def load_kitti(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
 
 
 def _kitti_times(path: Path, read: MatrixTable, clock: Clock) -> tuple[F64, str]:
-    """Return seconds (N,) of the poses and their source: the file, `times.txt`, the scene or the usual rate.
+    """Return times (N,), seconds, of the poses, and their source: the file, `times.txt`, the scene or the usual rate.
 
-    Raises BadInputError where `times.txt` has another number of times.
+    Raises BadInputError when `times.txt` has another number of times than there are poses.
     """
     if read.times is not None and read.times.unit != FRAMES:
         return read.times.since_s, f"by the times of the file, in {read.times.unit}"
@@ -111,7 +113,10 @@ def _kitti_times(path: Path, read: MatrixTable, clock: Clock) -> tuple[F64, str]
 
 
 def _counted(path: Path, clock: Clock) -> Clock:
-    """Return the clock of poses without times. Raises BadInputError where the scene states their unit."""
+    """Return the clock of poses without times: it counts frames.
+
+    Raises BadInputError when the scene states a unit of times.
+    """
     if clock.unit not in (AUTO, FRAMES):
         found = f'camera.time_unit = "{clock.unit}" with poses without times'
         raise BadInputError(path, found, "times in the file", "remove it, or set camera.rate_hz")
@@ -121,15 +126,15 @@ def _counted(path: Path, clock: Clock) -> Clock:
 TUM_NAMES = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
 TUM_COLUMNS = len(TUM_NAMES)
 TUM = "a TUM trajectory: time, tx ty tz, qx qy qz qw a line"
-#: Colour camera of the Kinect, as calibrated for the first of these recordings: 49.8 degrees high, 63.5 wide.
+#: Lens of the Kinect's colour camera, as calibrated for the first TUM recordings: 49.8 degrees high, 63.5 wide.
 KINECT = centred(640, 480, 517.0)
 
 
 def load_tum(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
-    """Read a TUM RGB-D trajectory: `time tx ty tz qx qy qz qw` a line, camera to world, metres, seconds.
+    """Read a TUM RGB-D trajectory: `time tx ty tz qx qy qz qw` per line, camera to world, metres, seconds.
 
-    Axes are optical. SLAM programs also write their maps in this format, some with times in nanoseconds.
-    Raises BadInputError with the line.
+    Axes are optical. SLAM programs also write their maps in this format, some with times in nanoseconds. `clock`: what
+    the scene says about the times. Raises BadInputError with the line.
     Format: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats.
     """
     poses = read_pose_table(path, clock, TUM_NAMES, TUM)
@@ -159,17 +164,18 @@ def load_tum(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
 EUROC_NAMES = ("time", "x", "y", "z", "qw", "qx", "qy", "qz")
 EUROC = "EuRoC poses: time in ns, x, y, z, qw, qx, qy, qz a line"
 EUROC_SENSOR = Path("cam0") / "sensor.yaml"
-#: Left camera of the data sets.
+#: Lens of the left camera of the EuRoC data sets.
 CAM0 = of_opencv(752.0, 480.0, 458.654, 457.296, 367.215, 248.375)
-#: Keys of the sensor's file, and how many numbers follow each.
+#: Keys of `sensor.yaml`, with the number of values of each.
 SENSOR_KEYS = {"data": 16, "resolution": 2, "intrinsics": 4, "distortion_coefficients": 4}
 
 
 def load_euroc(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
-    """Read EuRoC MAV poses, `data.csv`: time in nanoseconds, place, quaternion `w, x, y, z`, then any other columns.
+    """Read EuRoC MAV poses, `data.csv`: time in nanoseconds, position, quaternion `w, x, y, z`, then any other columns.
 
-    The poses describe the device's body. `cam0/sensor.yaml` beside them leads to the camera; without it the body's axes
-    are used. Camera axes are optical; the world's Z is up.
+    The poses are those of the device's body. `cam0/sensor.yaml` next to the file's folder leads to the camera; without
+    it, the body's axes are used. Camera axes are optical; the world's Z is up. `clock`: what the scene says about the
+    times.
     Raises BadInputError with the line.
     Format: M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.
     """
@@ -213,7 +219,10 @@ def _sensor_distortion(lens: Lens, numbers: Mapping[str, F64]) -> tuple[str, ...
 
 
 def _sensor(path: Path) -> dict[str, F64]:
-    """Return the numbers of a `sensor.yaml` by SENSOR_KEYS; each is a list in brackets. Raises BadInputError."""
+    """Return the numbers of a `sensor.yaml`, by the keys of SENSOR_KEYS; each value is a list in brackets.
+
+    Raises BadInputError when numbers are missing or not plausible.
+    """
     text = "\n".join(line.split("#", 1)[0] for line in read_text(path, "a EuRoC sensor.yaml").splitlines())
     numbers = {}
     for key, count in SENSOR_KEYS.items():
@@ -233,16 +242,16 @@ def _sensor(path: Path) -> dict[str, F64]:
 STRAY_FILE, STRAY_MATRIX = "odometry.csv", "camera_matrix.csv"
 STRAY_NAMES = ("time", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 STRAY = "a Stray Scanner odometry.csv: timestamp, frame, x, y, z, qx, qy, qz, qw"
-#: Width and height of the video; a principal point within the last number of its middle belongs to it.
+#: Width and height of Stray Scanner's video. A principal point within NEAR_PX of its middle belongs to it.
 VIDEO_PX, NEAR_PX = (1920.0, 1440.0), 100.0
 
 
 def load_stray(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
-    """Read Stray Scanner's `odometry.csv`, or its folder: time, frame, place and quaternion of each frame.
+    """Read Stray Scanner's `odometry.csv`, or its folder: time, frame, position and quaternion of each frame.
 
     Axes are optical in ARKit's world, which is levelled, Y up, metres. Newer files have a lens for each frame, in
-    pixels of the sensor in landscape; `camera_matrix.csv` beside older ones has one for all.
-    Raises BadInputError with the line.
+    pixels of the sensor in landscape. Next to older files, `camera_matrix.csv` has one lens for all frames. `clock`:
+    what the scene says about the times. Raises BadInputError with the line.
     Format: https://docs.strayrobots.io/apps/scanner/format.html.
     """
     file = path / STRAY_FILE if path.is_dir() else path
@@ -268,7 +277,7 @@ def load_stray(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
 
 
 def _stray_lenses(file: Path, poses: PoseTable) -> tuple[tuple[Lens, ...], str]:
-    """Return one lens for all poses or one for each, and where they come from."""
+    """Return one lens for all poses or one for each, and their source in words."""
     parts = ("fx", "fy", "cx", "cy")
     if all(name in poses.names for name in parts):
         table = np.column_stack([poses.column(name) for name in parts])
@@ -286,9 +295,10 @@ def _stray_lenses(file: Path, poses: PoseTable) -> tuple[tuple[Lens, ...], str]:
 
 
 def _stray_lens(where: str | Path, numbers: F64) -> Lens:
-    """Return the lens of fx, fy, cx and cy; a principal point near the usual middle means a video of the usual size.
+    """Return the lens with fx, fy, cx and cy in `numbers` (4,).
 
-    Raises BadInputError about `where`.
+    A principal point near the middle of the usual video means a picture of that size; otherwise it is taken as the
+    middle of the picture. Raises BadInputError about `where`.
     """
     _, _, cx, cy = (float(value) for value in numbers)
     is_usual = abs(cx - VIDEO_PX[0] / 2) < NEAR_PX and abs(cy - VIDEO_PX[1] / 2) < NEAR_PX

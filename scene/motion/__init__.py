@@ -1,4 +1,4 @@
-"""Reads motion files and makes the built-in motions: SMPL-X poses over time.
+"""Motions: SMPL-X poses over time, read from motion files or built in.
 
 It may use `body/`, and from `scene/` the rotations and the schema.
 """

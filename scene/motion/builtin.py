@@ -1,12 +1,12 @@
-"""The built-in motions: a person who walks, waves and turns; one who walks there and back; one who stands; the T pose.
+"""The built-in motions: a person who walks, waves and turns; walks there and back; stands; or is in the T pose.
 
-Walks are on planned footprints. Rule: a foot that carries weight does not move, and the legs are solved to reach it, so
-that feet do not slide. All times wrap around the cycle. Positions are in metres, Y up; headings are in radians about
-+Y, and 0 faces +Z.
+Walks follow planned footprints. Rule: a foot that carries weight does not move, and the legs are solved to reach it, so
+that feet do not slide. All times wrap around the cycle. Positions are in metres, Y up. Headings are in radians about
++Y; heading 0 faces +Z.
 
-Tables say what happens when; the curves between are computed, and a cycle ends where it began. In the poses of arms and
-hands, `side` is +1 for left and -1 for right. Turns are local to the parent joint, from the T pose: +X left, +Y up, +Z
-ahead.
+Tables state the times of steps, walks, turns and waves; the curves between them are computed. A cycle ends where it
+began. A `side` is +1 for left and -1 for right. In the poses of arms and hands, rotations are relative to the parent
+joint, from the T pose, with +X left, +Y up and +Z ahead.
 """
 
 from __future__ import annotations
@@ -25,7 +25,12 @@ from trilane.scene.rotations import about, matrix_from_quat, normalised, quat_fr
 
 @dataclass(frozen=True)
 class Build:
-    """Measures of the legs that walk, metres. Offsets are of the left side at rest, each from the joint before."""
+    """Measures of the legs that walk, metres.
+
+    `hip`, `knee`, `ankle`, `ball`: left side at rest, each as an offset from the joint before; `hip` from the pelvis.
+    `ankle_height`: height of the ankle above the sole. `heel_behind`: distance of the heel behind the ankle.
+    `feet_apart`: distance between the feet.
+    """
 
     hip: tuple[float, float, float]
     knee: tuple[float, float, float]
@@ -37,24 +42,24 @@ class Build:
 
     @property
     def leg_m(self) -> float:
-        """Length from hip over knee to ankle."""
+        """Length of a leg from hip over knee to ankle, metres."""
         return float(np.linalg.norm(self.knee) + np.linalg.norm(self.ankle))
 
     def side(self, offset: tuple[float, float, float], side: int) -> F64:
-        """Return `offset` for side +1 (left) or -1 (right)."""
+        """Return `offset` (3,), which is given for the left side, for `side` +1 (left) or -1 (right)."""
         return np.array([offset[0] * side, offset[1], offset[2]])
 
 
 @dataclass(frozen=True)
 class Swing:
-    """The time of one foot (+1 left, -1 right) in the air, from `start_s` to `end_s`."""
+    """A swing of one foot through the air, from `start_s` to `end_s` in the cycle. `side`: +1 left, -1 right."""
 
     side: int
     start_s: float
     end_s: float
 
 
-#: Function from times (T,) to x, z, heading, each (T,), at which the walker would stand.
+#: Function from times (T,), seconds, to x, z (metres) and heading (radians) of the walker, each (T,).
 Route = Callable[[F64], tuple[F64, F64, F64]]
 
 
@@ -62,8 +67,10 @@ Route = Callable[[F64], tuple[F64, F64, F64]]
 class FootTrack:
     """One foot over time.
 
-    `ankle` (T, 3): place of the ankle. `heading` (T,): heading of the foot. `pitch` (T,): radians, positive with the
-    heel up. `load` (T,): 1 on the ground, 0 in the air.
+    `ankle` (T, 3): position of the ankle, metres.
+    `heading` (T,): heading of the foot, radians.
+    `pitch` (T,): pitch of the foot, radians, positive when the heel is up.
+    `load` (T,): 1 on the ground, 0 in the air.
     """
 
     ankle: F64
@@ -73,13 +80,13 @@ class FootTrack:
 
 
 def smooth_step(x: F64) -> F64:
-    """Map `x` from 0 to 1 with flat ends and flat slopes: 6x^5 - 15x^4 + 10x^3."""
+    """Return 6x^5 - 15x^4 + 10x^3, with `x` clipped to [0, 1]: a step from 0 to 1 with smooth ends."""
     s = np.clip(x, 0.0, 1.0)
     return np.asarray(s * s * s * (s * (6 * s - 15) + 10))
 
 
 def blurred(values: F64, sigma: float) -> F64:
-    """Blur (T, ...) cyclically along time by a Gaussian, `sigma` in samples."""
+    """Return cyclic `values` (T, ...) blurred along time by a Gaussian. `sigma`: standard deviation in samples."""
     frequency = np.fft.rfftfreq(len(values)).reshape(-1, *[1] * (values.ndim - 1))
     gain = np.exp(-2 * (np.pi * sigma * frequency) ** 2)
     return np.fft.irfft(np.fft.rfft(values, axis=0) * gain, n=len(values), axis=0)
@@ -87,7 +94,11 @@ def blurred(values: F64, sigma: float) -> F64:
 
 @dataclass(frozen=True)
 class Walker:
-    """Footprints from a route and a table of swings over a cycle of `period_s`."""
+    """A walker over a cycle of `period_s`, whose footprints follow from a route and a table of swings.
+
+    `roll_s`: time in which the foot rolls onto its ball before it leaves the ground.
+    `plant_s`: time in which the foot becomes flat after it has reached the ground.
+    """
 
     build: Build
     route: Route
@@ -97,7 +108,10 @@ class Walker:
     plant_s: float = 0.1
 
     def foot(self, side: int, times_s: F64) -> FootTrack:
-        """Return the track of one foot at `times_s` (T,)."""
+        """Return the track of the foot of `side` (+1 left, -1 right) at `times_s` (T,).
+
+        Raises ValueError when swings of the foot overlap.
+        """
         swings = sorted((s for s in self.swings if s.side == side), key=lambda s: s.start_s)
         tracks = [self._step(swings, k, times_s) for k in range(len(swings))]
         in_part = np.stack([inside for inside, _ in tracks])
@@ -108,9 +122,10 @@ class Walker:
         return FootTrack(columns[:, :3], columns[:, 3], columns[:, 4], columns[:, 5])
 
     def _step(self, swings: list[Swing], k: int, times_s: F64) -> tuple[NDArray[np.bool_], F64]:
-        """Return the part of the cycle from the start of swing `k` to the start of the next one.
+        """Return the part of a foot's track from the start of swing `k` to the start of the next swing.
 
-        It is which times are in it (T,), and a table (T, 6): ankle, heading, pitch, load.
+        It consists of which times are in that part (T,), and a table (T, 6) with ankle x, y, z, heading, pitch and
+        load.
         """
         swing, after = swings[k], swings[(k + 1) % len(swings)]
         before = swings[k - 1]
@@ -140,7 +155,10 @@ class Walker:
         return local < until_next, table
 
     def _print(self, swing: Swing, after: Swing) -> tuple[float, float, float]:
-        """Return the footprint between two swings: x and z of the point below the ankle, and heading."""
+        """Return the footprint between swing `swing` and the next swing `after`.
+
+        It consists of x and z of the point below the ankle, metres, and the heading, radians.
+        """
         stance = (after.start_s - swing.end_s) % self.period_s
         middle = np.array([(swing.end_s + stance / 2) % self.period_s])
         x, z, heading = (float(value[0]) for value in self.route(middle))
@@ -149,13 +167,19 @@ class Walker:
 
     @staticmethod
     def _pitches(old: tuple[float, float, float], new: tuple[float, float, float]) -> tuple[float, float]:
-        """Return the pitch at toe-off, heel up, and at heel strike, toes up; both grow with the stride."""
+        """Return the pitch at toe-off (heel up) and at heel strike (toes up), radians; both grow with the stride.
+
+        `old`, `new`: footprints before and after the swing.
+        """
         ahead = np.array([np.sin(new[2]), np.cos(new[2])]) @ (np.array(new[:2]) - np.array(old[:2]))
         size = float(np.clip(ahead / 0.9, 0.0, 1.0))
         return 0.12 + 0.55 * size, -0.28 * size
 
     def _ankle(self, place: F64, pitch: F64) -> F64:
-        """Return the ankle (T, 3) of a foot at `place` (x, z, heading) with `pitch` (T,), on its ball or heel."""
+        """Return ankle positions (T, 3), metres, of a foot that stands on its ball or its heel.
+
+        `place` (3,): footprint, as x, z, heading. `pitch` (T,): pitch of the foot, radians; positive on the ball.
+        """
         turn = about(1, np.full(len(pitch), place[2])) @ about(0, pitch)
         flat = about(1, np.array(place[2]))
         ball = np.array(self.build.ball)
@@ -166,13 +190,13 @@ class Walker:
 
 
 def solve_leg(build: Build, side: int, hip: F64, pelvis: F64, foot: FootTrack) -> tuple[F64, F64, F64]:
-    """Return local turns (T, 3, 3) of hip, knee and ankle that put the ankle on its track.
+    """Return rotations (T, 3, 3) of hip, knee and ankle, relative to their parents, that put the ankle on its track.
 
     `build`: measures of the leg.
     `side`: +1 left, -1 right.
-    `hip` (T, 3): place of the hip joint.
-    `pelvis` (T, 3, 3): turn of the pelvis.
-    `foot`: track of the foot. The leg is stretched towards an ankle out of reach.
+    `hip` (T, 3): positions of the hip joint.
+    `pelvis` (T, 3, 3): rotations of the pelvis.
+    `foot`: track of the foot. If the ankle is out of reach, the leg is stretched towards it.
     """
     thigh, shin = build.side(build.knee, side), build.side(build.ankle, side)
     to_ankle = foot.ankle - hip
@@ -186,14 +210,17 @@ def solve_leg(build: Build, side: int, hip: F64, pelvis: F64, foot: FootTrack) -
 
 
 def _knee_angle(thigh: F64, shin: F64, distance: F64) -> F64:
-    """Return the flexion (T,) about +X at which |thigh + R shin| = distance: a cos + b sin = c."""
+    """Return the flexion (T,), radians about +X, at which hip and ankle are `distance` (T,) apart.
+
+    It solves |thigh + R shin| = distance, which has the form a cos + b sin = c.
+    """
     a, b = thigh[1] * shin[1] + thigh[2] * shin[2], thigh[2] * shin[1] - thigh[1] * shin[2]
     c = (distance**2 - thigh @ thigh - shin @ shin) / 2 - thigh[0] * shin[0]
     return np.asarray(np.arctan2(b, a) + np.arccos(np.clip(c / np.hypot(a, b), -1.0, 1.0)))
 
 
 def _frame(along: F64, lateral: F64) -> F64:
-    """Return matrices (T, 3, 3) whose second column is `along` and whose first is nearest to `lateral`."""
+    """Return matrices (T, 3, 3) whose second column is along `along` (T, 3) and whose first is nearest to `lateral`."""
     second = normalised(along)
     third = normalised(np.cross(np.broadcast_to(lateral, second.shape), second))
     return np.stack([np.cross(second, third), second, third], axis=-1)
@@ -202,11 +229,11 @@ def _frame(along: F64, lateral: F64) -> F64:
 #: Angle of a hanging arm below the T pose, radians, without the collar's part.
 HANG = 1.27
 ELBOW_EASE = 0.22
-#: Directions of the right arm raised to wave: upper arm and forearm at the middle of the wave.
+#: Directions of the raised right arm at the middle of the wave: upper arm and forearm.
 UPPER_ARM = (-0.80, -0.38, 0.30)
 FOREARM = (-0.22, 0.95, 0.22)
 WAVE_REACH = 0.42
-#: Curl of a relaxed finger's three joints, radians.
+#: Curl of the three joints of a relaxed finger, radians.
 CURL = {
     "index": (0.22, 0.32, 0.18),
     "middle": (0.30, 0.38, 0.22),
@@ -216,7 +243,10 @@ CURL = {
 
 
 def hanging_arm(side: int, swing: F64) -> tuple[F64, F64, F64]:
-    """Return shoulder, elbow and wrist (T, 3, 3) of an arm at the side, swung back by `swing` (T,) radians."""
+    """Return rotations (T, 3, 3) of shoulder, elbow and wrist of an arm that hangs and swings.
+
+    `side`: +1 left, -1 right. `swing` (T,): angle by which the arm swings back, radians.
+    """
     shoulder = about(0, swing + 0.03) @ about(2, np.array(-side * HANG))
     bend = ELBOW_EASE + np.clip(-swing, 0, None) * 0.7 + 0.1 * np.abs(swing)
     elbow = about(1, -side * bend)
@@ -225,7 +255,7 @@ def hanging_arm(side: int, swing: F64) -> tuple[F64, F64, F64]:
 
 
 def waving_arm(wave: F64) -> tuple[F64, F64, F64]:
-    """Return shoulder, elbow and wrist (T, 3, 3) of the right arm with the palm to the viewer.
+    """Return rotations (T, 3, 3) of shoulder, elbow and wrist of the right arm, with the palm to the viewer.
 
     `wave` (T,): position in the wave, -1 to 1; positive is outward.
     """
@@ -239,14 +269,14 @@ def waving_arm(wave: F64) -> tuple[F64, F64, F64]:
 
 
 def relaxed_hands(side: int) -> F64:
-    """Return axis-angle (15, 3) of one hand's fingers, SMPL-X order: index, middle, pinky, ring, thumb."""
+    """Return axis-angle (15, 3) of the fingers of one relaxed hand, in SMPL-X order. `side`: +1 left, -1 right."""
     fingers = [[(0.0, 0.0, -side * angle) for angle in CURL[name]] for name in ("index", "middle", "pinky", "ring")]
     thumb = [(0.1, -side * 0.15, 0.0), (0.0, side * 0.1, 0.0), (0.0, side * 0.12, 0.0)]
     return np.array([*fingers, thumb]).reshape(15, 3)
 
 
 RATE_HZ = 60
-#: An adult of 1.76 m; the translation is scaled to other bodies by their legs.
+#: Measures of an adult of 1.76 m; for other bodies the translation is scaled by the length of their legs.
 BUILD = Build(
     hip=(0.117, -0.008, -0.010),
     knee=(0.014, -0.408, 0.034),
@@ -261,11 +291,12 @@ REACH = 0.993
 
 Changes = tuple[tuple[float, float, float], ...]
 
-#: Start in seconds, end in seconds, and by how much the route changes in between: z in metres, heading in radians.
+#: Changes of the route: start and end in seconds, and the change between them. WALKS change z, in metres; TURNS change
+#: the heading, in radians.
 WALKS = ((0.25, 2.65, 1.5), (6.45, 8.85, -1.5))
 TURNS = ((5.25, 6.55, np.pi), (8.75, 9.95, np.pi))
 START_Z_M = -1.1
-#: Steps of the feet: side (+1 left), lift and landing in seconds.
+#: Steps of the feet: side (+1 left, -1 right), and times of lift and landing in seconds.
 SWINGS = (
     Swing(-1, 0.30, 0.76),
     Swing(1, 0.88, 1.34),
@@ -284,14 +315,14 @@ SWINGS = (
 )
 PERIOD_S = 10.0
 
-#: The motion there and back: the same tables, over FAR_M metres either way in FAR_STEPS steps of STEP_S seconds.
+#: The motion there and back has the same kinds of tables: FAR_M metres each way, in FAR_STEPS steps of STEP_S seconds.
 FAR_M, FAR_STEPS, STEP_S = 5.0, 10, 0.58
 FAR_WALKS = ((0.50, 6.38, FAR_M), (7.90, 13.78, -FAR_M))
 FAR_TURNS = ((6.40, 7.60, np.pi), (13.80, 15.00, np.pi))
 FAR_PERIOD_S = 15.0
-#: Steps of a turn: seconds from the turn's beginning to lift and landing.
+#: Steps of a turn: times of lift and landing, seconds after the turn's beginning.
 TURN_STEPS = ((0.09, 0.41), (0.47, 0.77), (0.83, 1.13))
-#: Times of the waving arm, seconds: it starts to rise, is up, starts to sink, is down.
+#: Times, seconds, at which the waving arm starts to rise, is up, starts to sink, and is down.
 WAVE_S = (2.45, 3.05, 4.75, 5.45)
 WAVES_PER_S = 1.7
 
@@ -305,7 +336,7 @@ def walk_wave_turn() -> Motion:
 
 
 def there_and_back() -> Motion:
-    """Return fifteen seconds of a person who walks five metres, turns, walks back and turns again, along z."""
+    """Return fifteen seconds of a person who walks five metres along z, turns, walks back and turns again."""
     times = np.arange(int(FAR_PERIOD_S * RATE_HZ)) / RATE_HZ
     walker = Walker(BUILD, _far_route, far_swings(), FAR_PERIOD_S)
     left, right = walker.foot(1, times), walker.foot(-1, times)
@@ -313,7 +344,7 @@ def there_and_back() -> Motion:
 
 
 def far_swings() -> tuple[Swing, ...]:
-    """Return the steps of the person who walks there and back; the feet take turns, the right one first."""
+    """Return the steps of the person who walks there and back; the feet alternate, the right foot first."""
     spans = []
     for (walk_s, _, _), (turn_s, _, _) in zip(FAR_WALKS, FAR_TURNS, strict=True):
         lifts = (walk_s + 0.05 + k * STEP_S for k in range(FAR_STEPS))
@@ -332,7 +363,7 @@ def idle() -> Motion:
 
 
 def t_pose() -> Motion:
-    """Return the rest pose, one frame."""
+    """Return the rest pose as a motion of one frame."""
     poses, places = np.zeros((1, JOINTS, 3)), np.array([[0.0, 0.94, 0.0]])
     return Motion(np.zeros(1), poses, places, None, ("built in: the T pose",), Wrap.LOOP, None, False)
 
@@ -346,7 +377,7 @@ BUILTIN: dict[str, Callable[[], Motion]] = {
 
 
 def _closed(times: F64, poses: F64, places: F64, what: str) -> Motion:
-    """Return a loop whose last frame is its first."""
+    """Return a motion that loops: its last frame equals its first. `what`: words for the note."""
     times = np.append(times, len(times) / RATE_HZ)
     poses, places = np.concatenate([poses, poses[:1]]), np.concatenate([places, places[:1]])
     notes = (f"built in: {what}, {RATE_HZ} frames/s",)
@@ -362,14 +393,20 @@ def _far_route(times: F64) -> tuple[F64, F64, F64]:
 
 
 def _along_z(times: F64, start_m: float, walks: Changes, turns: Changes) -> tuple[F64, F64, F64]:
-    """Return a route (see `Route`) that begins at z = `start_m` and changes by the tables `walks` and `turns`."""
+    """Return the route along z that begins at `start_m`, in metres, and changes by the tables `walks` and `turns`.
+
+    The result has the form of `Route`.
+    """
     z = start_m + sum(far * _eased((times - start) / (end - start)) for start, end, far in walks)
     heading = sum(angle * smooth_step((times - start) / (end - start)) for start, end, angle in turns)
     return np.zeros_like(times), np.asarray(z), np.asarray(heading)
 
 
 def _eased(x: F64) -> F64:
-    """Map `x` to 0 to 1 at constant speed, with a soft start and end of a fifth each."""
+    """Return the progress, 0 to 1, of a move over `x` from 0 to 1: constant speed, with a soft start and end.
+
+    The soft start and the soft end each take 22 % of the time.
+    """
     ramp = 0.22
     s = np.clip(x, 0.0, 1.0)
     speed = 1 / (1 - ramp)
@@ -386,7 +423,7 @@ def _standing(side: int, count: int) -> FootTrack:
 def _body(
     times: F64, left: FootTrack, right: FootTrack, wave: bool = True, shift_m: F64 | float = 0.0
 ) -> tuple[F64, F64]:
-    """Return poses (T, 55, 3) and pelvis places (T, 3) of a body on two feet.
+    """Return poses (T, 55, 3) and pelvis positions (T, 3) of a body on two feet.
 
     `times` (T,): seconds in the cycle.
     `left`, `right`: tracks of the feet.
@@ -414,7 +451,10 @@ def _body(
 
 
 def blurred_heading(left: FootTrack, right: FootTrack) -> F64:
-    """Return the pelvis's heading (T,), smoothed and midway between the feet's; a cycle may end whole turns further."""
+    """Return the heading (T,) of the pelvis: midway between the feet's headings, smoothed.
+
+    Over a cycle, the heading may change by whole turns.
+    """
     sines, cosines = (f(left.heading) + f(right.heading) for f in (np.sin, np.cos))
     mean = np.unwrap(np.arctan2(sines, cosines))
     drift = np.linspace(0, round((mean[-1] - mean[0]) / (2 * np.pi)) * 2 * np.pi, len(mean), endpoint=False)
@@ -432,11 +472,11 @@ def _along(heading: F64, vectors: F64) -> F64:
 def _pelvis_place(
     left: FootTrack, right: FootTrack, heading: F64, pelvis: F64, weight: F64, shift_m: F64 | float
 ) -> F64:
-    """Return pelvis places (T, 3): between the feet, towards the loaded one, and low enough for both legs to reach.
+    """Return pelvis positions (T, 3): between the feet, shifted to the loaded foot, low enough for both legs to reach.
 
     `left`, `right`: tracks of the feet.
-    `heading` (T,): heading of the pelvis.
-    `pelvis` (T, 3, 3): turn of the pelvis.
+    `heading` (T,): heading of the pelvis, radians.
+    `pelvis` (T, 3, 3): rotations of the pelvis.
     `weight` (T,): 1 with all weight on the left foot, -1 on the right.
     `shift_m`: further shift to the left, metres.
     """
@@ -452,17 +492,17 @@ def _pelvis_place(
 
 
 def _eroded(values: F64, reach: int) -> F64:
-    """Return the cyclic running minimum (T,) over `reach` samples either side."""
+    """Return the minimum (T,) of cyclic `values` (T,) over `reach` samples on either side."""
     return np.asarray(np.min([np.roll(values, k) for k in range(-reach, reach + 1)], axis=0))
 
 
 def _height_within_reach(side: int, foot: FootTrack, place: F64, pelvis: F64) -> F64:
-    """Return the greatest pelvis height (T,) at which the leg reaches its ankle.
+    """Return the greatest pelvis height (T,), metres, at which the leg reaches its ankle.
 
     `side`: +1 left, -1 right.
     `foot`: track of the foot.
-    `place` (T, 3): place of the pelvis; only x and z count.
-    `pelvis` (T, 3, 3): turn of the pelvis.
+    `place` (T, 3): positions of the pelvis; only x and z count.
+    `pelvis` (T, 3, 3): rotations of the pelvis.
     """
     hip = pelvis @ BUILD.side(BUILD.hip, side)
     flat = foot.ankle - place - hip
@@ -471,7 +511,7 @@ def _height_within_reach(side: int, foot: FootTrack, place: F64, pelvis: F64) ->
 
 
 def _trunk(poses: F64, times: F64, pelvis_yaw: F64, weight: F64, pace: F64) -> None:
-    """Set spine, neck and head: shoulders turn against the hips, the body leans with the pace and breathes.
+    """Set spine, neck and head in `poses`: shoulders turn against the hips; the body leans with the pace and breathes.
 
     `poses` (T, 55, 3): changed in place.
     `times` (T,): seconds in the cycle.
@@ -492,7 +532,12 @@ def _trunk(poses: F64, times: F64, pelvis_yaw: F64, weight: F64, pace: F64) -> N
 
 
 def _arms(poses: F64, times: F64, stride: F64, wave: bool) -> None:
-    """Set arms and hands: they swing against the legs, and the right one waves when `wave` is set."""
+    """Set arms and hands in `poses`: they swing against the legs; the right arm waves if `wave` is set.
+
+    `poses` (T, 55, 3): changed in place.
+    `times` (T,): seconds in the cycle.
+    `stride` (T,): distance by which the left foot is ahead of the right, metres.
+    """
     lag = np.roll(stride, 3)
     up = _wave_weight(times) if wave else np.zeros_like(times)
     for side, name in ((1, "left"), (-1, "right")):

@@ -1,8 +1,9 @@
-"""Reads the motion of a BVH file: its skeleton and channels; the joints are laid on the avatar's by `retarget.py`.
+"""Reads the motion of a BVH file: its skeleton and channels; `retarget.py` computes the avatar's poses from them.
 
-The syntax is read first, and every error in it names the line. Joints are then matched by name. A BVH states no unit.
-With `auto` it is the one that makes the legs nearest to USUAL_LEG_M; where none makes human legs the file is scaled. A
-T pose at the beginning is no part of the motion when the recording jumps away from it; one from which it moves on is.
+The syntax is read first, and every error in it names the line. After that, joints are matched by name. A BVH file
+states no unit. If the scene does not state it either, the unit is the one that makes the legs nearest to USUAL_LEG_M.
+If no unit makes human legs, the file is scaled to that length. A T pose at the beginning is left out if the recording
+jumps away from it. If the recording moves on from the T pose, it is kept.
 """
 
 from __future__ import annotations
@@ -36,11 +37,14 @@ _CHANNEL_OF = {name.lower(): name for name in CHANNELS}
 
 @dataclass
 class BvhJoint:
-    """One joint of the file.
+    """A joint of the file.
 
-    `parent`: index of its parent, -1 at a root; a file may have several roots. `offset` (3,): vector from its parent,
-    file units. `channels`: names such as `Zrotation`, in file order. `first`: column of the first of them. `tip` (3,):
-    offset of its end site, None without.
+    `name`: name in the file.
+    `parent`: index of the parent, -1 for a root; a file may have several roots.
+    `offset` (3,): vector from the parent at rest, file units.
+    `channels`: names such as `Zrotation`, in file order.
+    `first`: column of the joint's first channel in the frames.
+    `tip` (3,): vector from the joint to its end site, file units; None without an end site.
     """
 
     name: str
@@ -53,9 +57,9 @@ class BvhJoint:
 
 @dataclass(frozen=True)
 class Bvh:
-    """The content of a file.
+    """The content of a BVH file.
 
-    `frames` (T, channels): file units and degrees. `frame_time_s`: seconds per frame.
+    `frames` (T, columns): value of each channel, in file units or degrees. `frame_time_s`: seconds per frame.
     """
 
     joints: list[BvhJoint]
@@ -63,7 +67,7 @@ class Bvh:
     frame_time_s: float
 
     def forward(self) -> tuple[F64, F64]:
-        """Return global rotations (T, J, 3, 3) and positions (T, J, 3) of every joint, in file units."""
+        """Return global rotations (T, J, 3, 3) and positions (T, J, 3), file units, of all J joints."""
         count = len(self.frames)
         turns, places = np.empty((count, len(self.joints), 3, 3)), np.empty((count, len(self.joints), 3))
         for index, joint in enumerate(self.joints):
@@ -91,7 +95,10 @@ class Bvh:
 
 @dataclass
 class _Words:
-    """The words of the hierarchy, one after the other, each with its line."""
+    """The words of the hierarchy, read one after the other.
+
+    `words`: (line number, word) pairs. `line`: line of the last word. `read`: number of words that were read.
+    """
 
     path: Path
     words: Sequence[tuple[int, str]]
@@ -189,9 +196,9 @@ class _Hierarchy:
 
 
 def load_bvh(path: Path) -> Bvh:
-    """Read `path`.
+    """Read the BVH file `path`.
 
-    Raises BadInputError with the line for wrong syntax, a short or long frame, or a truncated file.
+    Raises BadInputError with the line for wrong syntax, too few frames, or a frame with a wrong number of channels.
     """
     lines = read_text(path, EXPECTED).splitlines()
     start = next((k for k, line in enumerate(lines) if line.strip().upper() == "MOTION"), len(lines))
@@ -237,17 +244,17 @@ def _rows(path: Path, lines: list[str], start: int, count: int, columns: int) ->
     return frames
 
 
-#: Metres in one unit; `cmu` is the unit of the CMU recordings, 1/0.45 inches.
+#: Metres per unit; `cmu` is the unit of the CMU recordings, 1/0.45 inches.
 UNITS_M = {"m": 1.0, "cm": 0.01, "in": 0.0254, "cmu": 0.0254 / 0.45}
 USUAL_LEG_M = 0.85
-#: Range of a human leg's length over USUAL_LEG_M.
+#: Range of a human leg's length, as a multiple of USUAL_LEG_M.
 HUMAN_LEG = (0.6, 1.6)
 
 
 def unit_of(leg: float, units: str) -> tuple[str, float]:
-    """Return a note on the unit, and its length in metres.
+    """Return a note on the unit of lengths, and the unit in metres.
 
-    `leg`: length of a leg in the file's units. `units`: a key of UNITS_M, or `auto` to guess.
+    `leg`: length of a leg in the file's unit. `units`: a key of UNITS_M, or `auto` to find it by the leg.
     """
     if units != "auto":
         return f"{units}, as given", UNITS_M[units]
@@ -257,18 +264,19 @@ def unit_of(leg: float, units: str) -> tuple[str, float]:
     return f"unknown, scaled to a leg of {USUAL_LEG_M} m", USUAL_LEG_M / leg
 
 
-#: Largest angle of arms to the line of the hips, and of legs to that of the trunk; largest turn of a still bone;
-#: radians.
+#: Largest angle, in a T pose, between arms and hip line and between legs and trunk; largest rotation of a bone that is
+#: still. Radians.
 IN_T, STILL = np.radians(20.0), np.radians(2.0)
-#: Least turn between two frames with which a bone jumps, radians.
+#: A bone jumps if it turns by at least this angle between two frames, radians.
 JUMP = np.radians(20.0)
 CHAINS = (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"))
 
 
 def leading_t_pose(tracks: Tracks, trunk: F64) -> tuple[int, tuple[str, ...]]:
-    """Return the number of frames in a T pose before the motion jumps away from it, and a note on a T pose there.
+    """Return the number of frames in a T pose before the motion jumps away from it, and a note on that T pose.
 
-    `trunk`: line of the trunk, (T, 3).
+    `trunk` (T, 3): vector along the trunk. The number is 0 if there is no T pose, or if the motion moves on without a
+    jump.
     """
     pairs = [(f"{side}_{start}", f"{side}_{end}") for start, end in CHAINS for side in SIDES]
     if tracks.frames < 2 or not all(tracks.has(*pair) for pair in pairs):
@@ -284,26 +292,32 @@ def leading_t_pose(tracks: Tracks, trunk: F64) -> tuple[int, tuple[str, ...]]:
 
 
 def _in_t(tracks: Tracks, trunk: F64, bones: F64) -> NDArray[np.bool_]:
-    """Return whether the bones (8, T, 3) of CHAINS are in a T pose, per frame (T,)."""
+    """Return whether the body is in a T pose, for each frame (T,).
+
+    `bones` (8, T, 3): vectors along the bones of CHAINS.
+    """
     left = tracks.across("hip")
     expected = np.array([left, -left, left, -left, -trunk, -trunk, -trunk, -trunk])
     return np.asarray((angle_between(bones, expected) < IN_T).all(axis=0))
 
 
 LEAST_LENGTH = 1e-6
-#: Least distance of an end site from its joint, as a share of the legs; a nearer one is a mark, not the end of a bone.
+#: Least distance of an end site from its joint, as a share of the legs; a nearer one is a marker, not the end of a
+#: bone.
 LEAST_TIP = 0.02
-#: Axes that are tried as up; along X a body would lie.
+#: Axes that may be up; with X up, a body would lie.
 UPS = ("y", "z", "-y", "-z")
-#: Largest coordinate in the file's units; a larger one is damaged.
+#: A frame with a larger coordinate, in the file's unit, is damaged.
 FARTHEST = 1e9
 
 
 def load_retargeted(path: Path, units: str, joint_map: Mapping[str, str] = NO_MAP, rest: F64 = T_POSE) -> RawMotion:
-    """Read a BVH file onto the 55 joints.
+    """Read a BVH file as poses of the 55 SMPL-X joints.
 
-    `units`: a key of UNITS_M or `auto`. `joint_map`: as in `match_names`. `rest` (55, 3): rest joints of the avatar,
-    metres. Raises BadInputError when the file is no BVH or its names belong to no known skeleton.
+    `units`: a key of UNITS_M, or `auto`.
+    `joint_map`: as in `match_names`.
+    `rest` (55, 3): rest joints of the avatar, metres.
+    Raises BadInputError when the file is no BVH, or when its joint names belong to no known skeleton.
     """
     bvh = load_bvh(path)
     dialect, index_of, of_roots = _person(path, bvh.joints, joint_map)
@@ -353,10 +367,10 @@ def _without_partner(index_of: Collection[str]) -> tuple[str, ...]:
 def _person(
     path: Path, joints: Sequence[BvhJoint], joint_map: Mapping[str, str]
 ) -> tuple[str, dict[str, int], tuple[str, ...]]:
-    """Return the family of names, {SMPL-X name: index} of the person, and a note when there are several roots.
+    """Return the family of joint names, the index of each joint by SMPL-X name, and a note if there are several roots.
 
-    The person with the most joints is taken, or the first of equals; a person may also be spread over all roots. Raises
-    BadInputError as `match_names` does.
+    If several roots are persons, the person with the most matched joints is taken, the first among equals. If no root
+    is one, all roots together are matched as one person. Raises BadInputError as `match_names` does.
     """
     names = [joint.name for joint in joints]
     roots = [index for index, joint in enumerate(joints) if joint.parent < 0]
@@ -378,7 +392,7 @@ def _person(
 
 
 def feet_of(tracks: Tracks) -> F64:
-    """Return places (T, 2, n, 3) of the ankles, and of the toes or another end of both feet."""
+    """Return positions (T, 2, n, 3) of n joints of the left and the right foot: ankles, and toes or bone ends."""
     feet = [[tracks.places[f"{side}_ankle"]] for side in SIDES]
     ends = [tracks.places.get(f"{side}_foot", tracks.tips.get(f"{side}_ankle")) for side in SIDES]
     if all(end is not None for end in ends):
@@ -387,7 +401,7 @@ def feet_of(tracks: Tracks) -> F64:
 
 
 def tracks_of(bvh: Bvh, index_of: dict[str, int]) -> tuple[Tracks, NDArray[np.bool_]]:
-    """Return the named joints over the frames whose numbers are usable, and which frames (T,) these are."""
+    """Return the joints of `index_of` over the readable frames, and which of all frames (T,) are readable."""
     turns, places = bvh.forward()
     with np.errstate(invalid="ignore"):
         readable = np.asarray((np.abs(places) < FARTHEST).all(axis=(1, 2)) & np.isfinite(turns).all(axis=(1, 2, 3)))
@@ -403,10 +417,10 @@ def tracks_of(bvh: Bvh, index_of: dict[str, int]) -> tuple[Tracks, NDArray[np.bo
 
 
 def _tip(bvh: Bvh, index: int, turns: F64, places: F64, least: float) -> F64 | None:
-    """Return the place (T, 3) where a joint's own bone ends: its end site or the furthest of the next joints below.
+    """Return the positions (T, 3) at which a joint's bone ends: its end site, or the farthest joint directly below it.
 
-    A joint at the same place counts as the joint itself; thumbs do not count. None when there is nothing below, or
-    nothing further than `least`, in the file's units.
+    A joint at the same place counts as the joint itself; thumbs do not count. The result is None if nothing below is
+    farther than `least`, in the file's unit.
     """
     here, found, reach = {index}, None, max(least, LEAST_LENGTH)
     for k, joint in enumerate(bvh.joints):
@@ -423,7 +437,10 @@ def _tip(bvh: Bvh, index: int, turns: F64, places: F64, least: float) -> F64 | N
 
 
 def among_all(values: F64, readable: NDArray[np.bool_]) -> F64:
-    """Put `values` of the readable frames among all frames; the others are NaN."""
+    """Return an array over all frames (T, ...): `values` in the readable frames, NaN in the other frames.
+
+    `readable` (T,): which frames are readable.
+    """
     spread = np.full((len(readable), *values.shape[1:]), np.nan)
     spread[readable] = values
     return spread

@@ -1,14 +1,14 @@
-"""Loads the motion of a scene's avatar, a built-in one by name or a file, and plays the part that the scene asks for.
+"""Loads the motion of an avatar, built in or from a file, and applies what the scene says about playing it.
 
-The ending of the file decides which reader is used; the reader's errors name the file. A key that a format has no use
-for is refused, not ignored. `start_s` and `end_s` are times of the motion itself, before `speed`. A part of a motion is
-placed as a whole one: it faces +Z at first and is centred on the ground that it covers.
+The suffix of a file decides which reader is used; the reader's errors name the file. A key that a format does not use
+is refused, not ignored. `start_s` and `end_s` are times of the motion itself, before `speed`. A part of a motion is
+placed like a whole motion: at first it faces +Z, and it is centred on the ground that it covers.
 
-Arrays hold poses, dicts of arrays, or only places of joints. Places, as in HumanML3D, are (T, 22, 3) in the order of
-SMPL's joints. Turns have the same shapes, so the content tells them apart. An array has places if its bones, apart from
-the legs, are as long as a person's, alike on both sides, and rigid. The hips must also lie on either side of the
-pelvis, and the trunk must not be folded. `retarget.py` makes turns from places. What places cannot tell is chosen: a
-limb twists as its bend and the toes say, the head turns as the neck.
+Files of NumPy hold poses, dicts of arrays, or only positions of joints. Positions, as in HumanML3D, are (T, 22, 3) in
+the order of SMPL's joints. Poses may have the same shape, so the content decides. An array holds positions if its
+bones, apart from the legs, are as long as a person's, alike on both sides, and rigid. Also, the hips must be on either
+side of the pelvis, and the trunk must not be folded. `retarget.py` computes rotations from positions. What positions do
+not determine is chosen: a limb twists as its bend and the toes suggest, and the head turns as the neck does.
 
 HumanML3D: https://github.com/EricGuo5513/HumanML3D (`new_joints`: 20 frames a second, metres, Y up).
 """
@@ -41,30 +41,30 @@ from trilane.scene.rotations import matrix_from_rotvec, rotvec_from_matrix
 from trilane.scene.schema import BUILT_IN_PREFIX, AvatarSpec
 
 RATE_HZ = 20.0
-#: Joints that are read; further ones, such as SMPL's hands or fingers, are not.
+#: Joints that are read from positions; further joints, such as SMPL's hands or fingers, are ignored.
 NAMES = JOINT_NAMES[:22]
 COUNTS = (22, 24, 52, JOINTS)
 _ENDS = np.arange(1, len(NAMES))
 _STARTS = np.array(JOINT_PARENTS[1 : len(NAMES)])
 #: Indices of thighs and shins among the bones.
 _LEGS = [index for index, end in enumerate(_ENDS) if NAMES[end].endswith(("knee", "ankle"))]
-#: Bones of the left side, and those of the right one in the same order.
+#: Indices of the bones of the left side, and of those of the right side in the same order.
 _LEFT, _RIGHT = (
     [index for index, end in enumerate(_ENDS) if NAMES[end].startswith(side)] for side in ("left", "right")
 )
 _TRUNK = [index for index, end in enumerate(_ENDS) if "_" not in NAMES[end]]
-#: Largest factor by which a bone may be longer or shorter than a plain body's, apart from the legs: for limbs, and for
-#: the trunk, which skeletons divide as they like.
+#: Largest factor by which a bone may be longer or shorter than a plain body's, relative to the legs: for limbs, and for
+#: the trunk, which skeletons divide differently.
 LIKE_A_LIMB, LIKE_A_SPINE = 2.0, 4.0
-#: The same factor against the other side's bone, and against the bone's own median.
+#: Largest such factor against the same bone of the other side, and against the bone's median length over time.
 LIKE_THE_OTHER, RIGID = 1.3, 1.25
-#: Least distance between the hips as a share of the way over the pelvis; least distance between pelvis and neck as a
-#: share of the way along the spine.
+#: Least distance between the hips, as a share of the way from hip to hip over the pelvis; least distance between pelvis
+#: and neck, as a share of the way along the spine.
 HIPS_APART, TRUNK_STRAIGHT = 0.45, 0.7
 
 
 def places_in(array: NDArray[Any]) -> F64 | None:
-    """Return places (T, 22, 3) of joints in `array`, (T, J, 3) or (T, 3 J); None when it holds none."""
+    """Return the joint positions (T, 22, 3) in `array`, (T, J, 3) or (T, 3 J); None if it does not hold positions."""
     flat = array.reshape(len(array), -1) if array.ndim in (2, 3) and array.size else np.zeros((0, 0))
     if flat.shape[1] not in [3 * count for count in COUNTS] or flat.dtype.kind not in "fiu":
         return None
@@ -74,7 +74,10 @@ def places_in(array: NDArray[Any]) -> F64 | None:
 
 
 def _sound(places: F64) -> NDArray[np.bool_]:
-    """Return which frames (T,) have a person's bones, each as long as in the other frames."""
+    """Return, for each frame (T,), whether all bones have a person's lengths, and nearly the same in all frames.
+
+    `places`: positions (T, 22, 3).
+    """
     with np.errstate(all="ignore"):
         bones = _bones(places)
         usual = np.nanmedian(bones, axis=0) if np.isfinite(bones).any(axis=0).all() else np.zeros(len(_ENDS))
@@ -92,7 +95,7 @@ def _sound(places: F64) -> NDArray[np.bool_]:
 
 
 def _upright_parts(places: F64) -> NDArray[np.bool_]:
-    """Return whether the hips are apart and the trunk is not folded, per frame (T,)."""
+    """Return, for each frame (T,), whether the hips are apart and the trunk is not folded."""
     at = {name: places[:, index] for index, name in enumerate(NAMES)}
 
     def way(*names: str) -> F64:
@@ -104,20 +107,21 @@ def _upright_parts(places: F64) -> NDArray[np.bool_]:
 
 
 def _within(ratios: F64, times: float) -> bool:
-    """Return whether all `ratios` are between `times` and its inverse."""
+    """Return whether all `ratios` are between 1 / `times` and `times`."""
     return bool(((ratios < times) & (ratios > 1 / times)).all())
 
 
 def _bones(places: F64) -> F64:
-    """Return lengths (T, 21) of the bones between joints (T, 22, 3)."""
+    """Return the lengths (T, 21) of the bones between joint positions (T, 22, 3)."""
     return np.asarray(np.linalg.norm(places[:, _ENDS] - places[:, _STARTS], axis=-1))
 
 
 def motion_of_places(source: str, places: F64, units: str, rest: F64) -> RawMotion:
-    """Return the motion of joints whose `places` (T, 22, 3) `places_in` found.
+    """Return the motion of joints with the positions `places` (T, 22, 3), as `places_in` found them.
 
-    `source`: ending of the file, for people. `units`: a key of UNITS_M, or `auto`. `rest` (55, 3): rest joints of the
-    avatar, metres.
+    `source`: suffix of the file, for people.
+    `units`: a key of UNITS_M, or `auto`.
+    `rest` (55, 3): rest joints of the avatar, metres.
     """
     sound = _sound(places)
     tracks = Tracks({name: places[sound, index] for index, name in enumerate(NAMES)})
@@ -141,7 +145,7 @@ def motion_of_places(source: str, places: F64, units: str, rest: F64) -> RawMoti
 
 
 EXPECTED = "a motion: arrays of axis-angle poses of SMPL, SMPL-H or SMPL-X"
-#: Name that NumPy gives to an array that is saved without one.
+#: Name that NumPy gives to an array that is saved without a name.
 NAMELESS = "arr_0"
 NPZ_KEYS = (*KEYS, ROMP_POSES, ROMP_PLACES, ROMP_PERSONS, NAMELESS)
 MOST_NAMED = 12
@@ -150,7 +154,8 @@ MOST_NAMED = 12
 def load_npy(path: Path, units: str = "auto", rest: F64 = T_POSE) -> RawMotion:
     """Read a `.npy` file. Raises BadInputError.
 
-    `units`: unit of joints' places, a key of UNITS_M or `auto`. `rest` (55, 3): rest joints of the avatar, metres.
+    `units`: unit of joint positions, a key of UNITS_M or `auto`.
+    `rest` (55, 3): rest joints of the avatar, metres.
     """
     values = plain(npy_values(path, EXPECTED))
     places = places_in(values) if isinstance(values, np.ndarray) else None
@@ -160,7 +165,7 @@ def load_npy(path: Path, units: str = "auto", rest: F64 = T_POSE) -> RawMotion:
 
 
 def load_npz(path: Path) -> RawMotion:
-    """Read an `.npz` file. Raises BadInputError."""
+    """Read an `.npz` file of the SMPL family. Raises BadInputError."""
     values = npz_values(path, NPZ_KEYS, EXPECTED)
     names = [printable(name) for name in npz_names(path, EXPECTED)]
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
@@ -169,7 +174,7 @@ def load_npz(path: Path) -> RawMotion:
 
 
 def load_pickle(path: Path) -> RawMotion:
-    """Read a pickle; nothing in it is executed. Raises BadInputError."""
+    """Read a pickle without executing anything in it. Raises BadInputError."""
     return _motion(path, pickle_values(path, EXPECTED))
 
 
@@ -182,14 +187,14 @@ def _motion(path: Path, values: Any, there: str = "") -> RawMotion:
 
 
 WRAPS = {"repeat": Wrap.LOOP, "back-and-forth": Wrap.BOUNCE, "hold": Wrap.HOLD}
-#: Least move of the body at a repeat that a note mentions, metres.
+#: A note mentions a jump of the body at a repeat if it is longer than this, metres.
 JUMP_M = 0.05
 
 
 def as_played(motion: Motion, spec: AvatarSpec, where: str) -> Motion:
-    """Return `motion` as `spec` plays it; notes say what was changed and what follows the last frame.
+    """Return `motion` as `spec` plays it, with notes on what was changed and on what follows the last frame.
 
-    `where`: name of the motion in messages. Raises BadInputError when it is shorter than `spec` requires.
+    `where`: name of the motion, for messages. Raises BadInputError when the motion is shorter than `spec` requires.
     """
     played = replace(motion, wrap=WRAPS.get(spec.loop, motion.wrap))
     changes = []
@@ -214,7 +219,7 @@ def _check_length(motion: Motion, start_s: float, end_s: float, where: str) -> N
 
 
 def _part(motion: Motion, start_s: float, end_s: float) -> Motion:
-    """Return the part of `motion` between two of its times, which become 0 and its length."""
+    """Return the part of `motion` from `start_s` to `end_s`, with times from 0."""
     inside = (motion.times_s > start_s) & (motion.times_s < end_s)
     ends = replace(motion, wrap=Wrap.HOLD)
     (first, here), (last, there) = ends.sample(start_s), ends.sample(end_s)
@@ -229,7 +234,7 @@ def _part(motion: Motion, start_s: float, end_s: float) -> Motion:
 
 
 def _standing_alone(motion: Motion) -> Motion:
-    """Turn `motion` to face +Z in its first frame, and move it to the middle of its ground."""
+    """Return `motion`, turned to face +Z in its first frame, and centred on the ground that it covers."""
     roots = matrix_from_rotvec(motion.poses[:, 0])
     turn = facing(roots[0])
     poses = motion.poses.copy()
@@ -254,15 +259,16 @@ _READERS: dict[str, Callable[[Path, AvatarSpec, F64], RawMotion]] = {
     ".pickle": lambda path, _spec, _rest: load_pickle(path),
     ".bvh": lambda path, spec, rest: load_retargeted(path, spec.units, spec.joint_map, rest),
 }
-#: Endings of files whose joints have names.
+#: Suffixes of files whose joints have names.
 NAMED = (".bvh",)
 
 
 def load_motion(spec: AvatarSpec, base: Path, rest: F64 = T_POSE) -> Motion:
-    """Load the motion that `spec.motion` names, as `spec` plays it; a relative path starts at `base`.
+    """Load the motion that `spec.motion` names, as `spec` plays it.
 
-    `rest` (55, 3): rest joints of the avatar that does it, metres; those of a plain body when there is none. Raises
-    BadInputError when there is no such motion or the file is unusable.
+    `base`: folder at which a relative path starts.
+    `rest` (55, 3): rest joints of the avatar that performs the motion, metres; by default those of a plain body.
+    Raises BadInputError when there is no such motion, or when the file is unusable.
     """
     if spec.motion.startswith(BUILT_IN_PREFIX):
         name, names = spec.motion.removeprefix(BUILT_IN_PREFIX), ", ".join(BUILTIN)
@@ -284,7 +290,7 @@ def load_motion(spec: AvatarSpec, base: Path, rest: F64 = T_POSE) -> Motion:
 
 
 def _of_no_reader(path: Path) -> BadInputError:
-    """Return the error for a file that has the ending of no motion."""
+    """Return the error for a file whose suffix is not that of a motion."""
     expected = f"a motion file: {', '.join(_READERS)}"
     try:
         require_file(path, expected)
@@ -295,6 +301,6 @@ def _of_no_reader(path: Path) -> BadInputError:
 
 
 def _check_named(spec: AvatarSpec, motion: str | Path) -> None:
-    """Raise BadInputError when `spec` maps joints of a `motion` that has no names."""
+    """Raise BadInputError if `spec` maps joints of a `motion` whose joints have no names."""
     if spec.joint_map and Path(motion).suffix.lower() not in NAMED:
         raise BadInputError(motion, "joint_map", f"none: only joints of {', '.join(NAMED)} files have names")

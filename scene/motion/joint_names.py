@@ -1,8 +1,8 @@
-"""Matches a file's joints to the body's: names that programs have for the SMPL-X joints.
+"""Matches a file's joints to the SMPL-X joints by the names that programs use.
 
-The statements of the scene (`joint_map`) come first; a table of names fills the rest; no joint of the file stands for
-two of the body's. There is one table per family of skeletons, and names are compared without prefix, case and
-separators. The family whose table has the most of a file's names is taken, the first one among equals.
+The scene's `joint_map` decides first; a table of names decides for all other joints. No joint of the file stands for
+two joints of the body. Each family of skeletons has one table. Names are compared without prefix, case and separators.
+The family is chosen whose table contains the most of a file's names, the first one among equals.
 
 Sources of the names, besides files of those programs: Unity's `HumanBodyBones`
 (https://docs.unity3d.com/ScriptReference/HumanBodyBones.html); VRM's humanoid bones, 0.x and 1.0
@@ -23,7 +23,7 @@ from trilane.body.joints import JOINT_NAMES
 from trilane.errors import BadInputError, did_you_mean
 
 NO_MAP: Mapping[str, str] = {}
-#: Prefixes before all names: a namespace, or those that Mixamo, 3ds Max, Rigify, VRoid and Character Creator write.
+#: Prefix of all names of a file: a namespace, or what Mixamo, 3ds Max, Rigify, VRoid and Character Creator write.
 _PREFIX = re.compile(r"^(?:.*:)?(?:mixamorig\d*_?(?=[a-z])|bip0*1|def-|org-|j_bip_|cc_base_)?")
 
 
@@ -33,13 +33,13 @@ def plain(name: str) -> str:
 
 
 def _named(names: str, joints: str) -> dict[str, str]:
-    """Return the joint of each of `names`, which are in the order of `joints`; `-` stands for none."""
+    """Return {name: joint} for `names` in the order of `joints`, both separated by blanks; the name `-` means none."""
     pairs = zip(names.split(), joints.split(), strict=True)
     return {name: joint for name, joint in pairs if name != "-"}
 
 
 def _limbs(names: str) -> dict[str, str]:
-    """Return the joint of each of `names` of a leg and an arm, from the hip to the toes and from the collar."""
+    """Return {name: joint} for `names` of a leg, from hip to toes, and of an arm, from collar to wrist."""
     return _named(names, "hip knee ankle foot collar shoulder elbow wrist")
 
 
@@ -50,10 +50,13 @@ def _family(
     more: Mapping[str, str] = NO_MAP,
     behind: bool = False,
 ) -> dict[str, str]:
-    """Return the table of a family of skeletons.
+    """Return the table {plain name: SMPL-X name} of a family of skeletons.
 
-    `trunk`: names of pelvis, three joints of the spine, neck and head. `limbs`: names on either side. `sides`: marks of
-    the left and the right side before those names, or `behind` them. `more`: further names.
+    `trunk`: names of pelvis, three joints of the spine, neck and head.
+    `limbs`: joint by name, without a side.
+    `sides`: marks of the left and the right side, which come before these names.
+    `more`: further joints by name.
+    `behind`: whether the marks come after the names instead.
     """
     table = {**_named(trunk, "pelvis spine1 spine2 spine3 neck head"), **more}
     for mark, side in zip(sides.split(), ("left", "right"), strict=True):
@@ -72,10 +75,7 @@ _RIGIFY_FINGERS = {
 
 
 def _phalanges(thumb: str) -> dict[str, str]:
-    """Return Unity's names of the fingers' bones.
-
-    `thumb`: names of the thumb's three bones.
-    """
+    """Return {name: joint} for Unity's names of the fingers' bones. `thumb`: names of the thumb's three bones."""
     return {
         f"{theirs}{bone}": f"{ours}{k}"
         for theirs, ours in _LITTLE_FINGERS.items()
@@ -147,17 +147,18 @@ DIALECTS: dict[str, dict[str, str]] = {
 
 
 REQUIRED = ("pelvis", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle")
-#: Names of the pelvis in most families: found beside any other table, since it is one joint and no limb.
+#: Names of the pelvis in most families. They are used in addition to any table, as they cannot mean another joint.
 PELVIS = ("hips", "pelvis", "hip")
-#: Source of the names of joints that are in no table.
+#: Key of the scene that maps joints which no table has.
 STATED = "joint_map"
 
 
 def match_names(path: Path, names: list[str], joint_map: Mapping[str, str] = NO_MAP) -> tuple[str, dict[str, int]]:
-    """Return the source of the names, such as the family that fits best, and {SMPL-X name: index in `names`}.
+    """Return the family that fits best, and the index in `names` of each matched joint by SMPL-X name.
 
-    `joint_map`: name in the file by SMPL-X name, or empty for none; it overrules the tables. Raises BadInputError about
-    `path` when the file has no joint that the map names, or REQUIRED ones have no partner.
+    `joint_map`: name in the file by SMPL-X name, or "" for none. It overrides the tables, and the returned family
+    mentions it. Raises BadInputError about `path` when the file lacks a joint that the map names, or when a REQUIRED
+    joint is unmatched.
     """
     stated = {target: _stated(path, names, target, source) for target, source in joint_map.items()}
     index_of: dict[str, int] = {}
@@ -178,12 +179,15 @@ def match_names(path: Path, names: list[str], joint_map: Mapping[str, str] = NO_
 
 
 def _missing(found: Mapping[str, int], stated: Mapping[str, int | None]) -> list[str]:
-    """Return the REQUIRED joints that neither has."""
+    """Return the REQUIRED joints that neither `found` nor `stated` matches to a joint of the file."""
     return [name for name in REQUIRED if name not in found and stated.get(name) is None]
 
 
 def _stated(path: Path, names: list[str], target: str, source: str) -> int | None:
-    """Return the index of the joint `source`, in the file's case or another one; None for an empty name."""
+    """Return the index of the joint named `source`, if need be in another spelling of `plain`; None if it is "".
+
+    `target`: SMPL-X joint that `source` is to be matched to. Raises BadInputError when the file has no such joint.
+    """
     if not source:
         return None
     if source in names:
@@ -196,7 +200,10 @@ def _stated(path: Path, names: list[str], target: str, source: str) -> int | Non
 
 
 def _by_table(table: Mapping[str, str], index_of: Mapping[str, int]) -> dict[str, int]:
-    """Return {SMPL-X name: index} of what `table` finds, and the pelvis; of several names the first in the table."""
+    """Return the index of each joint that `table` matches, by SMPL-X name; the pelvis is also found by PELVIS.
+
+    `index_of`: index by plain name. If several names match a joint, the first one in the table counts.
+    """
     found: dict[str, int] = {}
     for source, target in table.items():
         if source in index_of:
@@ -208,7 +215,10 @@ def _by_table(table: Mapping[str, str], index_of: Mapping[str, int]) -> dict[str
 
 
 def _overruled(found: Mapping[str, int], stated: Mapping[str, int | None]) -> dict[str, int]:
-    """Return `found` without joints that are `stated`, or whose joint of the file is."""
+    """Return the matches `found`, overridden by `stated`.
+
+    A match of `found` is dropped if `stated` has its SMPL-X joint or its joint of the file.
+    """
     taken = set(stated.values())
     kept = {target: index for target, index in found.items() if target not in stated and index not in taken}
     return kept | {target: index for target, index in stated.items() if index is not None}

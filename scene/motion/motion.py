@@ -1,15 +1,16 @@
-"""A motion from any source: SMPL-X poses at increasing times, sampled at any time between and beyond them.
+"""A motion from any source: SMPL-X poses at increasing times, which can be sampled at any time.
 
-A motion of one frame can be sampled like one of a thousand; a `Motion` does not depend on a file format. A recording
-becomes one by `motion_from_recording`: bad frames left out, Y up, facing +Z at first, centred on its ground.
+A motion of one frame can be sampled like a motion of a thousand; a `Motion` does not depend on a file format.
+`motion_from_recording` makes a motion from a recording: bad frames are left out, Y is up, the first frame faces +Z, and
+the middle of the covered ground is the origin.
 
-**Up** is the axis that the scene states, else the one that the body's own up points along on average, else the usual
-one of the format. A body that lies or stands on its hands throughout does not turn the world over. Files that have a
-floor have it at 0, so a body is on the floor along an axis when its lowest joint hardly leaves 0. If that does not
-decide either, a note says which other axis may be up.
+**Up** is the axis that the scene states. Otherwise it is the axis along which the body's own up points on average. If
+there is no such axis, it is the usual axis of the format. A body that always lies or stands on its hands must not turn
+the world over. In files that have a floor, the floor is at 0. Therefore, if the lowest joint stays near 0 along an
+axis, the body is on the floor along that axis. If this does not decide, a note says which other axis may be up.
 
-**Stance** says when the feet stand. Ankles and toes each have their own height while their foot stands; a person stands
-while at least one of them is at its height.
+**Stance** says when the feet stand. Each of ankles and toes has its own height while its foot stands. A person stands
+while at least one of these joints is at that height.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ from trilane.scene.rotations import (
     slerp,
 )
 
-#: Places in millimetres with the pelvis at the origin; right joints are the left ones, mirrored.
+#: Positions of a plain body's rest joints, millimetres, with the pelvis at the origin; right joints mirror the left
+#: ones.
 _PLACES_MM = {
     "pelvis": (0, 0, 0), "left_hip": (117, -8, -10), "spine1": (0, 87, -35), "left_knee": (131, -416, 24),
     "spine2": (0, 239, -29), "left_ankle": (131, -859, -1), "spine3": (0, 368, -47), "left_foot": (143, -908, 146),
@@ -50,7 +52,7 @@ _PLACES_MM = {
 
 
 def _joints() -> F64:
-    """Return the joints (55, 3), metres."""
+    """Return the rest joints (55, 3) of a plain body, metres."""
     rows = [
         np.multiply(_PLACES_MM[name.replace("right_", "left_")], (-1 if name.startswith("right_") else 1, 1, 1))
         for name in JOINT_NAMES
@@ -58,24 +60,25 @@ def _joints() -> F64:
     return np.array(rows, dtype=np.float64) / 1000
 
 
-#: Rest joints (55, 3), metres.
+#: Rest joints (55, 3) of a plain body, metres.
 T_POSE = _joints()
 
 
-#: Rest place of the pelvis of the published neutral SMPL-X body, metres; translations in AMASS files start from it.
+#: Rest position (3,) of the pelvis of the published neutral SMPL-X body, metres; AMASS files state translations from
+#: it.
 REST_PELVIS: F64 = np.array([0.003, -0.351, 0.012])
-#: Rest place of the pelvis of SMPL's neutral body, to some 2 cm: betas and sex move it by as much.
+#: Rest position (3,) of the pelvis of SMPL's neutral body, metres, to within 2 cm: betas and sex move it by as much.
 SMPL_REST_PELVIS: F64 = np.array([-0.002, -0.23, 0.028])
 
 
 def rest_leg_m(joints: F64) -> float:
-    """Return the length of the left leg of rest `joints` (55, 3), hip to knee to ankle, metres."""
+    """Return the length of the left leg of rest `joints` (55, 3), from hip over knee to ankle, metres."""
     hip, knee, ankle = (joints[JOINT_INDEX[f"left_{name}"]] for name in ("hip", "knee", "ankle"))
     return float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
 
 
 class Wrap(enum.Enum):
-    """What follows the last frame. The values are words for notes."""
+    """What follows the last frame. The values are texts for notes."""
 
     LOOP = "loops"
     BOUNCE = "plays back and forth"
@@ -83,7 +86,7 @@ class Wrap(enum.Enum):
 
 
 def wrapped_time(t_s: float, length_s: float, wrap: Wrap) -> float:
-    """Return the time in [0, length_s] whose frame is shown at `t_s`; 0 for a length of 0."""
+    """Return the time in [0, length_s] whose frame is shown at `t_s`; 0 if the length is 0."""
     if length_s <= 0:
         return 0.0
     if wrap is Wrap.HOLD:
@@ -95,7 +98,10 @@ def wrapped_time(t_s: float, length_s: float, wrap: Wrap) -> float:
 
 
 def bracket(times_s: F64, t_s: float) -> tuple[int, int, float]:
-    """Return the neighbours `i <= j` of `t_s` in increasing `times_s` (T,), and its share of the way, 0 to 1."""
+    """Return the indices `i <= j` of the neighbours of `t_s` in increasing `times_s` (T,), and its share of the way.
+
+    The share is from 0 at `i` to 1 at `j`. A time outside the range counts as the nearest end.
+    """
     last = len(times_s) - 1
     j = min(max(int(np.searchsorted(times_s, t_s, side="right")), 1), last) if last else 0
     i = max(j - 1, 0)
@@ -106,14 +112,18 @@ def bracket(times_s: F64, t_s: float) -> tuple[int, int, float]:
 
 @dataclass(frozen=True)
 class Motion:
-    """Poses over time, upright, facing +Z at first, in the middle of the ground they cover.
+    """Poses over time: Y is up, the first frame faces +Z, the middle of the covered ground is the origin.
 
-    `times_s` (T,): times from 0, strictly increasing. `poses` (T, 55, 3): axis-angle, radians, SMPL-X joint order.
-    `translation` (T, 3): place of the pelvis, metres, Y up. `betas` (n,): coefficients of the shape, or None. `notes`:
-    how the source was read, for people. `wrap`: what follows the last frame. `leg_m`: hip to ankle of the recorded
-    person, by which the translation is scaled to another body; None when unknown. `travels`: whether the translation
-    was recorded. `detected`: facts about its file. `stance` (T,): how much the recorded feet stand on the floor, 0 to
-    1; None when unknown.
+    `times_s` (T,): times from 0, strictly increasing.
+    `poses` (T, 55, 3): axis-angle, radians, SMPL-X joint order.
+    `translation` (T, 3): positions of the pelvis, metres.
+    `betas` (n,): shape coefficients; None when unknown.
+    `notes`: how the source was read, for people.
+    `wrap`: what follows the last frame.
+    `leg_m`: length of the recorded person's leg, by which the translation is scaled to another body; None when unknown.
+    `travels`: whether the translation was recorded.
+    `detected`: facts about the file.
+    `stance` (T,): how much the recorded feet stand on the floor, 0 to 1; None when unknown.
     """
 
     times_s: F64
@@ -129,23 +139,23 @@ class Motion:
 
     @property
     def duration_s(self) -> float:
-        """Time of the last frame."""
+        """Time of the last frame, seconds."""
         return float(self.times_s[-1])
 
     @cached_property
     def quats(self) -> F64:
-        """Return `poses` as unit quaternions (T, 55, 4)."""
+        """`poses` as unit quaternions (T, 55, 4)."""
         return quat_from_rotvec(self.poses)
 
     def sample(self, t_s: float) -> tuple[F64, F64]:
-        """Return pose (55, 3) and translation (3,) at `t_s`: turns interpolated by slerp, the translation linearly."""
+        """Return the pose (55, 3) and the translation (3,) at `t_s`; rotations by slerp, the translation linearly."""
         i, j, fraction = bracket(self.times_s, wrapped_time(t_s, self.duration_s, self.wrap))
         pose = rotvec_from_quat(slerp(self.quats[i], self.quats[j], fraction))
         start, end = self.translation[i], self.translation[j]
         return pose, start + (end - start) * fraction
 
     def sample_all(self, times_s: F64) -> tuple[F64, F64]:
-        """Return poses (N, 55, 3) and translations (N, 3) at `times_s` (N,), each as `sample` gives it."""
+        """Return poses (N, 55, 3) and translations (N, 3) at `times_s` (N,), as `sample` returns them."""
         brackets = [bracket(self.times_s, wrapped_time(float(t_s), self.duration_s, self.wrap)) for t_s in times_s]
         i, j = (np.array([neighbours[k] for neighbours in brackets]) for k in (0, 1))
         fraction = np.array([fraction for _, _, fraction in brackets])
@@ -154,21 +164,23 @@ class Motion:
         return poses, start + (end - start) * fraction[:, None]
 
 
-#: Number of the body's joints; hands and face follow them.
+#: Number of joints of the body; in the joint order, face and hands come after them.
 BODY_JOINT_COUNT = 22
-#: Most frames, evenly spread, that are examined.
+#: Most frames that are examined, evenly spread over the motion.
 MOST_LOOKED_AT = 200
-#: Height of the lowest joint of a person who lies or stands on the hands: least and greatest, and largest range between
-#: a tenth and nine tenths of the frames. Joints of a lying person are up to half a trunk's depth above the floor.
+#: A person lies, or stands on the hands, if the median height of the lowest joint is in LIES_M and 80 % of the heights
+#: are within LIES_SPREAD_M; metres. Joints of a lying person are up to half a trunk's depth above the floor.
 LIES_M, LIES_SPREAD_M = (-0.02, 0.17), 0.08
-#: The same for a person who walks; toes are 2 to 5 cm above the floor, and floors of recordings are off by centimetres.
+#: The same ranges for a person who stands or walks. Toes are 2 to 5 cm above the floor, and floors of recordings are
+#: off by centimetres.
 STANDS_M, STANDS_SPREAD_M = (-0.12, 0.25), 0.25
 
 
 def joint_places(poses: F64, places: F64, leg_m: float | None) -> F64:
-    """Return places (T, 22, 3) of a plain body's joints, scaled to legs of length `leg_m`; unscaled for None.
+    """Return the positions (T, 22, 3) of a plain body's joints, metres.
 
-    `poses` (T, 55, 3): axis-angle. `places` (T, 3): places of the pelvis, metres.
+    `poses` (T, 55, 3): axis-angle. `places` (T, 3): positions of the pelvis, metres. `leg_m`: length of a leg, to which
+    the body is scaled; None for the plain body's own.
     """
     rest = T_POSE * (leg_m / rest_leg_m(T_POSE) if leg_m else 1.0)
     turns = matrix_from_rotvec(poses[:, :BODY_JOINT_COUNT])
@@ -180,21 +192,21 @@ def joint_places(poses: F64, places: F64, leg_m: float | None) -> F64:
 
 
 def lowest(poses: F64, places: F64, leg_m: float | None, up: F64) -> F64:
-    """Return heights (n,) along `up` (3,) of the lowest joint in at most MOST_LOOKED_AT of the frames.
+    """Return the height (n,), metres, of the lowest joint in n <= MOST_LOOKED_AT frames.
 
-    The other parameters are those of `joint_places`.
+    `up` (3,): direction of heights. The other parameters are those of `joint_places`.
     """
     some = np.linspace(0, len(poses) - 1, min(len(poses), MOST_LOOKED_AT)).round().astype(int)
     return np.asarray((joint_places(poses[some], places[some], leg_m) @ up).min(axis=1))
 
 
 def lies(heights: F64) -> bool:
-    """Return whether `heights` (n,) of the lowest joint show a person who lies on the floor or stands on the hands."""
+    """Return whether the `heights` (n,) of the lowest joint are those of a person who lies or stands on the hands."""
     return _are_within(heights, LIES_M, LIES_SPREAD_M)
 
 
 def stands(heights: F64) -> bool:
-    """Return whether `heights` (n,) show a person who stands or walks on the floor."""
+    """Return whether the `heights` (n,) of the lowest joint are those of a person who stands or walks on the floor."""
     return _are_within(heights, STANDS_M, STANDS_SPREAD_M)
 
 
@@ -203,16 +215,16 @@ def _are_within(heights: F64, within: tuple[float, float], spread: float) -> boo
     return bool(within[0] <= middle <= within[1] and high - low <= spread)
 
 
-#: Percentile of a joint's heights that is the height at which it stands.
+#: The height at which a joint stands is this percentile of its heights.
 STANDING_PERCENTILE = 5.0
-#: Height above that, up to which a joint still stands, and from which on it does not; metres.
+#: A joint stands up to the height FOOT_STANDS_M above that, and does not stand from FOOT_FLIES_M on; metres.
 FOOT_STANDS_M, FOOT_FLIES_M = 0.03, 0.06
 
 
 def stance(heights: F64) -> F64:
-    """Return how much the person stands, per frame (T,): 1 on the floor, 0 in the air.
+    """Return how much the person stands, for each frame (T,): 1 on the floor, 0 in the air.
 
-    `heights` (T, 2, n): heights along up of the n recorded joints of both feet, left and right, metres.
+    `heights` (T, 2, n): heights of n recorded joints of the left and the right foot, metres.
     """
     standing = np.percentile(heights, STANDING_PERCENTILE, axis=(0, 1))
     above = (heights - standing).min(axis=(1, 2))
@@ -222,7 +234,7 @@ def stance(heights: F64) -> F64:
 MAX_FRAMES = 200_000
 MAX_ANGLE_RAD = 64.0
 MAX_PLACE_M = 10_000.0
-#: Turn (3, 3) that makes an axis +Y, by the axis.
+#: For each axis, the rotation (3, 3) that makes it +Y.
 UPRIGHT: dict[str, F64] = {
     "y": np.eye(3),
     "z": Y_UP_FROM_Z_UP,
@@ -231,22 +243,25 @@ UPRIGHT: dict[str, F64] = {
     "-z": about(0, np.pi / 2),
     "-x": about(2, -np.pi / 2),
 }
-#: Axes that may be up in a world, and in any coordinates, such as a camera's.
+#: Axes that may be up: in a world, and in arbitrary coordinates such as a camera's.
 WORLD, ANY = ("y", "z"), tuple(UPRIGHT)
-#: Least mean cosine between the body's own up and an axis with which it decides.
+#: The body's own up decides if its mean cosine with an axis is above this.
 LEAST_UP_COSINE = 0.7
 
 
 @dataclass(frozen=True)
 class RawMotion:
-    """The content of a motion file, before anything is left out or turned.
+    """The content of a motion file, before frames are left out and the world is turned.
 
-    `times_s` (T,): seconds; NaNs and repeated times are still in. `poses` (T, 55, 3): axis-angle, radians, SMPL-X joint
-    order. `translation` (T, 3): places of the pelvis, metres; None when the format has none. `betas` (n,): coefficients
-    of the shape, or None. `up`: axis that is usually up in the format. `ups`: axes that may be up in it. `notes`: notes
-    on the file, for people. `leg_m`: hip to ankle of the recorded person; None when unknown. `detected`: facts about
-    the file, without its axes. `feet` (T, 2, n, 3): places of n joints of the left and the right foot, metres; None
-    when the format has no places.
+    `times_s` (T,): seconds; may contain NaN and repeated times.
+    `poses` (T, 55, 3): axis-angle, radians, SMPL-X joint order.
+    `translation` (T, 3): positions of the pelvis, metres; None when the format has none.
+    `betas` (n,): shape coefficients; None when the file has none.
+    `up`: axis that is usually up in the format. `ups`: all axes that may be up.
+    `notes`: notes on the file, for people.
+    `leg_m`: length of the recorded person's leg, metres; None when unknown.
+    `detected`: facts about the file, but not its axes.
+    `feet` (T, 2, n, 3): positions of n joints of the left and the right foot, metres; None when unknown.
     """
 
     times_s: F64
@@ -264,9 +279,9 @@ class RawMotion:
 def motion_from_recording(raw: RawMotion, where: str, up_axis: str) -> Motion:
     """Return the motion of a file.
 
-    `raw`: content of the file. `where`: path of the file, for messages. `up_axis`: a key of UPRIGHT, or `auto`. Raises
-    BadInputError when it has more than MAX_FRAMES frames, is in degrees, or is unreadable in more than half of its
-    frames.
+    `raw`: content of the file. `where`: path of the file, for messages. `up_axis`: a key of UPRIGHT, or `auto`.
+    Raises BadInputError when the file has more than MAX_FRAMES frames, is in degrees, or is unreadable in more than
+    half of its frames.
     """
     if len(raw.times_s) > MAX_FRAMES:
         raise BadInputError(where, f"{len(raw.times_s)} frames", f"at most {MAX_FRAMES}")
@@ -299,14 +314,14 @@ def motion_from_recording(raw: RawMotion, where: str, up_axis: str) -> Motion:
 
 
 def _readable(poses: F64, shift: F64) -> NDArray[np.bool_]:
-    """Return whether the numbers of each frame (T,) are finite and its place is within MAX_PLACE_M."""
+    """Return, for each frame (T,), whether its numbers are finite and its position is within MAX_PLACE_M."""
     finite = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(shift).all(axis=1)
     with np.errstate(invalid="ignore"):
         return np.asarray(finite & (np.abs(shift) < MAX_PLACE_M).all(axis=1))
 
 
 def _broken_as(poses: F64, shift: F64) -> str:
-    """Say what is wrong with the unreadable frames."""
+    """Return what is wrong with the unreadable frames, in words."""
     not_finite = not (np.isfinite(poses).all() and np.isfinite(shift).all())
     with np.errstate(invalid="ignore"):
         is_far = bool((np.abs(np.where(np.isfinite(shift), shift, 0.0)) >= MAX_PLACE_M).any())
@@ -322,9 +337,10 @@ def _check_angles(poses: F64, where: str) -> None:
 
 
 def _up_axis(poses: F64, places: F64 | None, raw: RawMotion, stated: str) -> tuple[str, str, tuple[str, ...]]:
-    """Return the axis that is up, how it was decided, and a note where another one may be it.
+    """Return the axis that is up, how it was decided, and a note if another axis may be up.
 
-    `poses` (T, 55, 3), `places` (T, 3) of the pelvis, if recorded: those of the usable frames.
+    `poses` (T, 55, 3), `places` (T, 3): poses, and positions of the pelvis if recorded, of the usable frames.
+    `stated`: axis by the scene, or `auto`.
     """
     if stated != "auto":
         return stated, "as given", ()
@@ -345,9 +361,9 @@ def _up_axis(poses: F64, places: F64 | None, raw: RawMotion, stated: str) -> tup
 
 
 def facing(root: F64) -> F64:
-    """Return the turn about Y (3, 3) after which a body with root turn `root` (3, 3) faces +Z.
+    """Return the rotation (3, 3) about Y after which a body with root rotation `root` (3, 3) faces +Z.
 
-    It is the identity for a body that lies.
+    The result is the identity for a body that lies.
     """
     x, _, z = root[:, 2]
     if np.hypot(x, z) < 0.3:
@@ -356,7 +372,7 @@ def facing(root: F64) -> F64:
 
 
 def centred(translation: F64) -> F64:
-    """Shift `translation` (T, 3) so that the rectangle of ground that it covers has its middle at the origin."""
+    """Return `translation` (T, 3), shifted so that the middle of the covered ground's rectangle is the origin."""
     low, high = translation.min(axis=0), translation.max(axis=0)
     middle = (low + high) / 2
     return np.asarray(translation - np.array([middle[0], 0.0, middle[2]]))

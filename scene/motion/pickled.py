@@ -1,16 +1,16 @@
-"""Reads the plain values and arrays of a Python pickle without running anything that it says.
+"""Reads the plain values and arrays of a Python pickle without executing anything in it.
 
-Rule: only None, numbers, text, bytes, lists, tuples, dicts and NumPy arrays of numbers are built; nothing else is
+Rule: only None, numbers, text, bytes, lists, tuples, dicts and NumPy arrays of numbers are built. Nothing else is
 imported, called or built. `pickletools` splits the file into operations, and the tables below execute those that make
 such values. Any other object in the file becomes a `Foreign`, which only holds the object's name. An operation that is
 not in a table ends the reading.
 
-The size of a file limits the memory that it can take. Text and bytes are pieces of the file; an array is a view of such
-bytes and must have exactly as many as its shape says. The number of operations is limited. Keys of dicts are text
-(whose hash a file cannot foresee) or are left out. Values may contain themselves, so a search in them must limit its
-depth.
+The size of a file limits the memory that it can use. Text and bytes are pieces of the file. An array is a view of bytes
+whose number must match its shape. The number of operations is limited. Keys of dicts are text, whose hash a file cannot
+predict. Integer keys become text, and other keys are left out. Values may contain themselves, so a search in them must
+limit its depth.
 
-The format: https://docs.python.org/3/library/pickle.html, `pickletools`, PEP 3154 and PEP 574; what NumPy writes:
+The format: https://docs.python.org/3/library/pickle.html, `pickletools`, PEP 3154 and PEP 574. What NumPy writes:
 `numpy.ndarray.__reduce__`, `__setstate__` and `numpy.dtype.__setstate__`.
 """
 
@@ -35,7 +35,7 @@ MAX_INDEX = 1 << 32
 MAX_NAME = 200
 MAX_SIDES = 32
 ARRAYS = "save its arrays with NumPy where it was made: numpy.savez(FILE, poses=..., trans=..., mocap_frame_rate=...)"
-#: Types of numbers that NumPy writes: kind, and bytes of one number.
+#: Names of numeric dtypes as NumPy writes them: byte order, kind, and number of bytes.
 _NUMBERS = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248])")
 _OBJECT = "O"
 _ORDERS = ("<", ">", "|", "=")
@@ -43,10 +43,7 @@ _ORDERS = ("<", ">", "|", "=")
 
 @dataclass(frozen=True)
 class Foreign:
-    """Something that is not built.
-
-    `name`: name of its class or function, module first.
-    """
+    """An object that is not built. `name`: name of its class or function, module first."""
 
     name: str
 
@@ -55,7 +52,7 @@ class Foreign:
 class StoredArray:
     """An array of the file.
 
-    `values`: its numbers; for an array of objects, a list of its content; None until they come.
+    `values`: the array, or a list of the items of an array of objects; None until the state is read.
     """
 
     values: NDArray[Any] | list[Any] | None = None
@@ -63,7 +60,7 @@ class StoredArray:
 
 @dataclass
 class _Kind:
-    """A `numpy.dtype`; `code` is empty for one that is no plain number."""
+    """A `numpy.dtype`. `code`: name such as `f8`, "" if it is not a plain number. `order`: byte order."""
 
     code: str
     order: str = "|"
@@ -76,7 +73,7 @@ class _Kind:
 
 
 class _Mark:
-    """Where a run of values begins on the stack."""
+    """A mark on the stack, above which a run of values begins."""
 
 
 _MARK = _Mark()
@@ -86,8 +83,9 @@ _MARK = _Mark()
 class _Reader:
     """The state of reading.
 
-    `stack`, `memo`: as in the format. `encoded`: bytes of a text that holds bytes, by the text's identity. `paired`:
-    number of items that were given to dicts in lists.
+    `stack`, `memo`: as the format defines them.
+    `encoded`: text and its bytes, by the `id` of a text that stands for bytes.
+    `paired`: number of (key, value) pairs from which dicts were built.
     """
 
     stack: list[Any] = field(default_factory=list)
@@ -96,7 +94,7 @@ class _Reader:
     paired: int = 0
 
     def since_mark(self) -> list[Any]:
-        """Return the values above the last mark; they and the mark leave the stack."""
+        """Remove the values above the last mark, and the mark, from the stack. Return the values."""
         values: list[Any] = []
         while True:
             value = self.stack.pop()
@@ -105,9 +103,9 @@ class _Reader:
             values.append(value)
 
     def bytes_of(self, raw: Any) -> bytes:
-        """Return `raw` itself, or the bytes of the text as which Python 2 and older protocols wrote it.
+        """Return `raw`, which is bytes, or the bytes of a text that Python 2 and older protocols wrote for bytes.
 
-        The same text gives the same bytes object.
+        The same text object always gives the same bytes object.
         """
         if isinstance(raw, str):
             known = self.encoded.get(id(raw))
@@ -118,9 +116,9 @@ class _Reader:
 
 
 def values_of(data: bytes) -> Any:
-    """Return the content of the pickle `data`, with its arrays as StoredArray.
+    """Return the content of the pickle `data`; its arrays are StoredArray.
 
-    Raises UnexpectedValue when it is damaged, too large, or does what no file of plain values and arrays does.
+    Raises UnexpectedValue when the pickle is damaged or too large, or has an operation that plain values do not need.
     """
     if len(data) > MAX_BYTES:
         raise UnexpectedValue(f"{len(data)} bytes", f"at most {MAX_BYTES}", ARRAYS)
@@ -135,7 +133,10 @@ def values_of(data: bytes) -> Any:
 
 
 def _run(data: bytes) -> Any:
-    """Return what the operations of `data` make. Raises UnexpectedValue, and what Python raises for unfit values."""
+    """Return the value that the operations of `data` make.
+
+    Raises UnexpectedValue, and the errors that Python raises for unfit values.
+    """
     reader = _Reader()
     for count, (operation, value, _) in enumerate(pickletools.genops(data)):
         if operation.name == "STOP":
@@ -147,12 +148,12 @@ def _run(data: bytes) -> Any:
 
 
 def printable(text: str) -> str:
-    """Return `text` in a form and of a length that every console can show."""
+    """Return `text` in ASCII, cut to MAX_NAME letters, so that every console can show it."""
     return ascii(text[:MAX_NAME])[1:-1]
 
 
 def wanted(value: Any, kind: type, what: str) -> Any:
-    """Return `value`, which must be of the type `kind`; raises TypeError that says `what` was expected."""
+    """Return `value` if its type is `kind`. Raises TypeError otherwise. `what`: expected value in words."""
     if type(value) is not kind:
         found = "nothing" if value is None else type(value).__name__
         raise TypeError(f"{found} in place of {what}")
@@ -170,7 +171,7 @@ def _refuse(name: str) -> Callable[[_Reader, Any], None]:
 
 
 def _ignore(reader: _Reader, value: Any) -> None:
-    """Do nothing, for an operation that says nothing about values."""
+    """Do nothing, for an operation that does not change values."""
 
 
 def _push(reader: _Reader, value: Any) -> None:
@@ -227,7 +228,7 @@ def _update(target: Any, items: list[Any]) -> None:
 
 
 def _dict_of(items: list[Any]) -> dict[str, Any]:
-    """Return a dict of alternating keys and values; numbers become text, and other keys are left out."""
+    """Return a dict of alternating keys and values; integer keys become text, and keys of other types are left out."""
     keys = ((str(key) if type(key) is int and abs(key) < 1 << 64 else key) for key in items[::2])
     return {key: value for key, value in zip(keys, items[1::2], strict=True) if type(key) is str}
 
@@ -303,7 +304,10 @@ def _build(reader: _Reader, _value: Any) -> None:
 
 
 def _array(reader: _Reader, shape: Any, kind: Any, fortran: Any, raw: Any) -> NDArray[Any] | list[Any]:
-    """Return the array of a state, with as many bytes as shape and type say, or the list of an array of objects."""
+    """Return the array of a state, or the list of items of an array of objects.
+
+    Raises ValueError unless `raw` has exactly the bytes that `shape` and `kind` require.
+    """
     sides = wanted(shape, tuple, "a shape")
     if len(sides) > MAX_SIDES or any(type(side) is not int or side < 0 for side in sides):
         raise ValueError("a shape that none can have")
@@ -346,7 +350,7 @@ def _encoded(reader: _Reader, arguments: tuple[Any, ...]) -> bytes:
 
 
 def _no_bytes(_reader: _Reader, arguments: tuple[Any, ...]) -> bytes:
-    """Return empty bytes, as older protocols write them."""
+    """Return empty bytes, for the call `bytes()` that older protocols write."""
     if arguments:
         raise ValueError("bytes of something")
     return b""

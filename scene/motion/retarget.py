@@ -1,8 +1,9 @@
-"""Puts recorded joints on the 55 SMPL-X joints of an avatar.
+"""Retargeting: computes poses of an avatar's 55 SMPL-X joints from recorded joints.
 
-Turns come from places: limbs point where the recorded ones point; pelvis and trunk turn as hip line, trunk and shoulder
-line do. The file's own turns only say how limbs twist (`tracks.py`), and how head and toes turn. So neither a file's
-zero pose nor its axes matter. A joint that the file does not have follows its parent.
+Rotations are computed from positions. Limbs point where the recorded limbs point. Pelvis and trunk turn as the recorded
+hip line, trunk and shoulder line turn. The file's own rotations only determine how limbs twist (`tracks.py`), and how
+head and toes turn. Therefore neither a file's zero pose nor its axes matter. A joint that the file does not have
+follows its parent.
 """
 
 from __future__ import annotations
@@ -45,25 +46,32 @@ from trilane.scene.rotations import rotvec_from_matrix
 
 UP, LEFT, FORWARD = (np.eye(3)[k] for k in (1, 0, 2))
 FINGERS = ("index", "middle", "pinky", "ring", "thumb")
-#: Joints that a hand points to: the first of these that the file has, else the end of its bone.
+#: Finger joints to which a hand points: the first of these that the file has. Without any, the hand points to the end
+#: of its bone.
 HAND_ENDS = ("middle1", "index1", "ring1", "pinky1")
-#: Weights of evidence for a twist beside the bend of a limb: toes, and the least twist from the part above.
+#: Weights of evidence for a twist, against the bend of a limb: the toes' direction, and the least twist from the
+#: parent.
 OF_TOES, OF_LEAST_TWIST = 0.5, 0.02
-#: Difference in slope above which a planted foot is laid flat, not along its bone: its bone is steeper or flatter than
-#: the avatar's.
+#: A planted foot is laid flat if its slope differs from the avatar's by this or more, radians; otherwise it is laid
+#: along its recorded bone.
 SAME_SLOPE = np.radians(8.0)
-#: How far the heel is behind the ankle, as a share of the bone from the ankle to the toes: the built-in walker's.
+#: Distance of the heel behind the ankle, as a share of the bone from the ankle to the toes: that of the built-in
+#: walker.
 HEEL_BEHIND = 0.057 / np.hypot(0.062, 0.146)
-#: Largest difference by which a program's feet are steeper than the avatar's; beyond it, a heel is raised throughout.
+#: Largest difference in slope, radians, between a program's feet and the avatar's; beyond it, the heels are raised
+#: throughout.
 MOST_STEEPER = np.radians(27.0)
 
 
 @dataclass
 class Retarget:
-    """The turns of one recording on one avatar, filled in from the pelvis outwards.
+    """The rotations of one recording on one avatar, filled in from the pelvis outwards.
 
-    `tracks`: the recording. `rest`: joints of the avatar. `stands` (T,): frames in which the person stands. `own`:
-    whether the skeleton is built like the avatar's. `turns`: global turns (T, 3, 3) of each joint that is done.
+    `tracks`: the recording.
+    `rest`: joints of the avatar at rest.
+    `stands` (T,): whether the person stands in each frame.
+    `own`: whether the recorded skeleton is built like the avatar's.
+    `turns`: global rotations (T, 3, 3) of each joint that is done, by name.
     `notes`: notes for people.
     """
 
@@ -75,15 +83,18 @@ class Retarget:
     notes: list[str] = field(default_factory=list)
 
     def bone(self, start: str, end: str) -> F64:
-        """Return a bone (3,) of the avatar at rest."""
+        """Return the direction (3,) of a bone of the avatar at rest, as a unit vector."""
         return unit(self.rest.bone(start, end)[0])
 
     def above(self, name: str) -> F64:
-        """Return the turn of a joint's parent."""
+        """Return the global rotations (T, 3, 3) of a joint's parent."""
         return self.turns[JOINT_NAMES[JOINT_PARENTS[JOINT_INDEX[name]]]]
 
     def lay(self, name: str, bone: F64, recorded: F64, evidence: list[Evidence]) -> None:
-        """Turn `name` so that its `bone` (3,) points as `recorded` (T, 3)."""
+        """Set the rotations of joint `name` such that its `bone` (3,) points along `recorded` (T, 3).
+
+        `evidence`: evidence for the twist about the bone.
+        """
         swing = swung(self.above(name), bone, recorded)
         side = UP if abs(bone[1]) < 0.7 else FORWARD
         weight = OF_LEAST_TWIST * (1 + (unit(recorded) * turned(self.above(name), bone)).sum(axis=-1))
@@ -93,17 +104,17 @@ class Retarget:
 
 
 def retarget(tracks: Tracks, joints: F64) -> tuple[F64, F64, tuple[str, ...]]:
-    """Return poses (T, 55, 3), axis-angle, places (T, 3) of the avatar's pelvis, and notes for people.
+    """Return poses (T, 55, 3), axis-angle, positions (T, 3) of the avatar's pelvis, and notes for people.
 
-    Places are in the unit of `tracks`. `tracks`: the recording; it must have hips, knees and ankles, with the hips
-    apart. `joints` (55, 3): rest joints of the avatar, metres.
+    `tracks`: the recording; it must have hips, knees and ankles, with the hips apart. Positions are in its unit.
+    `joints` (55, 3): rest joints of the avatar, metres.
     """
     rest = at_rest(joints)
     line = trunk_line(tracks)
     trunk = line.along(tracks)
     stands = standing_frames(tracks, trunk)
     work = Retarget(tracks, rest, stands, built_alike(tracks, rest))
-    shares, by_collars = line.shares(rest), work.own or bool(stands.any())  # otherwise the collars are as at rest
+    shares, by_collars = line.shares(rest), work.own or bool(stands.any())  # otherwise the collars stay as at rest
     recorded, ours = (trunk_of(joints_of, line, shares, by_collars) for joints_of in (tracks, rest))
     spine = turns_of_trunk(recorded, ours, stands, work.own)
     upper = spine | turns_of_collars(tracks, rest, spine["spine3"], stands, work.own)
@@ -135,9 +146,9 @@ def _leg(work: Retarget, side: str) -> None:
 
 
 def _feet(work: Retarget, up: F64) -> None:
-    """Lay the feet along the recorded ones, as far as toes and heels stay above the floor.
+    """Lay the feet along the recorded feet, but keep toes and heels above the floor.
 
-    `up` (3,): direction that is up in the recording.
+    `up` (3,): up direction of the recording.
     """
     tracks = work.tracks
     feet = [foot for side in SIDES if (foot := _recorded_foot(work, side, up)) is not None]
@@ -161,9 +172,12 @@ def _feet(work: Retarget, up: F64) -> None:
 class _RecordedFoot:
     """A recorded foot on the avatar.
 
-    `way` (T, 3): way from the ankle to the toes. `falls` (T,): how steeply it falls, radians. `planted` (T,): frames in
-    which it most likely lies flat. `height` (T,): height of the avatar's ankle, metres, from any zero. `ours`,
-    `length`: how steeply the avatar's own bone falls at rest, radians, and its length, metres.
+    `side`: `left` or `right`.
+    `way` (T, 3): vector from the ankle to the toes in the recording.
+    `falls` (T,): slope of that vector, radians below the horizontal.
+    `planted` (T,): whether the foot most likely lies flat on the floor.
+    `height` (T,): height of the avatar's ankle, metres, from any zero.
+    `ours`, `length`: slope of the avatar's own bone at rest, radians below the horizontal, and its length, metres.
     """
 
     side: str
@@ -175,11 +189,15 @@ class _RecordedFoot:
     length: float
 
     def above(self, floor: float, steeper: float, flat_by: float, up: F64) -> F64:
-        """Return the way (T, 3) of the foot, raised or lowered as far as toes or heel would pass through the floor.
+        """Return the vector (T, 3) from ankle to toes, raised or lowered to keep toes and heel above the floor.
 
-        A foot that lies flat falls by `ours` + `flat_by`. With its ankle raised by r it may fall by the angle whose
-        sine is larger by r / `length`: then the toes are as high as those of a flat foot. In the other direction the
-        heel turns about the ankle. `floor`: height of the ankle of a flat foot. `steeper`: as `_steeper` says.
+        A foot that lies flat has the slope `ours` + `flat_by`. If its ankle is raised by r, the sine of its slope may
+        be larger by r / `length`: the toes are then as high as those of a flat foot. In the other direction, the heel
+        turns about the ankle.
+
+        `floor`: height of the ankle of a flat foot, metres.
+        `steeper`, `flat_by`: results of `_steeper`, radians.
+        `up` (3,): up direction of the recording.
         """
         if not steeper:
             return self.way
@@ -194,7 +212,7 @@ class _RecordedFoot:
 
 
 def _recorded_foot(work: Retarget, side: str, up: F64) -> _RecordedFoot | None:
-    """Return the recorded foot of a leg whose thigh and shin are laid; None when the file does not tell it."""
+    """Return the recorded foot of a leg whose thigh and shin are done; None if the file has no direction of it."""
     way = _foot(work.tracks, side)
     if way is None:
         return None
@@ -211,7 +229,7 @@ def _recorded_foot(work: Retarget, side: str, up: F64) -> _RecordedFoot | None:
 
 
 def _ankle(work: Retarget, side: str) -> F64:
-    """Return places (T, 3) of the avatar's ankle in metres, from the recording's origin."""
+    """Return positions (T, 3) of the avatar's ankle, metres, from the origin of the recording."""
     rest, hip, knee, ankle = work.rest, *(f"{side}_{part}" for part in ("hip", "knee", "ankle"))
     from_middle = rest.places[hip][0] - rest.between("hip")[0]
     legs = turned(work.turns[hip], rest.bone(hip, knee)[0]) + turned(work.turns[knee], rest.bone(knee, ankle)[0])
@@ -219,7 +237,10 @@ def _ankle(work: Retarget, side: str) -> F64:
 
 
 def _foot(tracks: Tracks, side: str) -> F64 | None:
-    """Return the way (T, 3) from the ankle to the toes, or to the end of its bone; None when the foot has no length."""
+    """Return the vector (T, 3) from the ankle to the toes, or to the end of its bone.
+
+    The result is None if the file has neither of these ends, or if the vector is 0 in any frame.
+    """
     ankle, toes = f"{side}_ankle", f"{side}_foot"
     end = tracks.places.get(toes, tracks.tips.get(ankle))
     if end is None:
@@ -229,10 +250,11 @@ def _foot(tracks: Tracks, side: str) -> F64 | None:
 
 
 def _steeper(work: Retarget, planted: Sequence[_RecordedFoot]) -> tuple[float, float]:
-    """Return how much steeper the recorded feet are than the avatar's, and by how much a flat one falls more; radians.
+    """Return how much steeper the recorded feet are than the avatar's, and how much more a flat foot slopes.
 
-    `planted`: feet that lie flat in some frames. The flatter of both counts, as the other may stand on its toes. Both
-    results are 0 where they are nearly as steep; the second is what is beyond MOST_STEEPER.
+    `planted`: feet that lie flat in some frames. The flatter of both feet counts, as the other may stand on its toes.
+    Both results are in radians, and 0 if the slopes are nearly equal. The first is at most MOST_STEEPER either way; the
+    second is the part beyond.
     """
     found = min((float(np.median(foot.falls[foot.planted]) - foot.ours) for foot in planted), default=0.0)
     steeper = float(np.clip(found, -MOST_STEEPER, MOST_STEEPER))
@@ -247,7 +269,11 @@ def _steeper(work: Retarget, planted: Sequence[_RecordedFoot]) -> tuple[float, f
 
 
 def _levelled(work: Retarget, name: str, base: F64) -> F64:
-    """Return the file's turns of a joint, equal to `base` on average over standing frames, or all if none stands."""
+    """Return the file's rotations (T, 3, 3) of a joint after one constant rotation; `base` if the file has none.
+
+    The constant makes their mean equal to the mean of `base` (T, 3, 3). Means are over frames that stand, or over all
+    frames if none stands.
+    """
     turns = work.tracks.turns.get(name)
     if turns is None:
         return base
@@ -272,7 +298,10 @@ def _arm(work: Retarget, side: str) -> None:
 
 
 def _arm_bone(tracks: Tracks, start: str, end: str) -> F64 | None:
-    """Return the way (T, 3) from one joint of an arm to the next, or to the end of its bone where there is none."""
+    """Return the vector (T, 3) of an arm's bone, from joint `start` to joint `end` or to the bone's end.
+
+    The result is None if the file has no `start`, or neither of these ends.
+    """
     if not tracks.has(start):
         return None
     far = tracks.places.get(end, tracks.tips.get(start))
@@ -296,7 +325,10 @@ def _hand(work: Retarget, side: str) -> None:
 
 
 def _palm(work: Retarget, side: str) -> list[Evidence]:
-    """Return evidence for a hand's turn about its length: from the little finger to the index finger, or the thumb."""
+    """Return evidence for a hand's rotation about its length.
+
+    It is the vector from the little finger to the index finger, or that from the wrist to the thumb.
+    """
     for start, end in (("pinky1", "index1"), ("wrist", "thumb1")):
         names = f"{side}_{start}", f"{side}_{end}"
         if work.tracks.has(*names):
@@ -319,7 +351,7 @@ def _head(work: Retarget) -> None:
 
 
 def _local(turns: dict[str, F64], frames: int) -> F64:
-    """Return axis-angle (T, 55, 3) of each joint relative to its parent."""
+    """Return the rotation of each joint relative to its parent, axis-angle (T, 55, 3), from global ones (T, 3, 3)."""
     poses = np.zeros((frames, JOINTS, 3))
     for index, name in enumerate(JOINT_NAMES):
         above = turns[JOINT_NAMES[JOINT_PARENTS[index]]] if index else np.eye(3)
@@ -328,13 +360,13 @@ def _local(turns: dict[str, F64], frames: int) -> F64:
 
 
 def _pelvis_places(work: Retarget, joints: F64) -> F64:
-    """Return places (T, 3) of the avatar's pelvis that bring the middle of its hips to the recorded one."""
+    """Return positions (T, 3) of the avatar's pelvis that put the middle of its hips at the recorded middle."""
     from_hips = joints[0] - work.rest.between("hip")[0]
     return np.asarray(work.tracks.between("hip") + turned(work.turns["pelvis"], from_hips * _scale(work)))
 
 
 def _scale(work: Retarget) -> float:
-    """Return the length of a recorded leg, in the recording's unit, over the avatar's in metres."""
+    """Return the ratio of the recorded leg's length, in the recording's unit, to that of the avatar's leg in metres."""
     return leg_length(work.tracks) / leg_length(work.rest)
 
 
@@ -359,7 +391,7 @@ def _notes(work: Retarget) -> list[str]:
 
 
 def _backwards(work: Retarget) -> list[str]:
-    """Return a note when the feet point to where left and right say is the back."""
+    """Return a note if the feet point backwards; the skeleton's left and right define the front."""
     feet = [foot for foot in (_foot(work.tracks, side) for side in SIDES) if foot is not None]
     ahead = [np.median(turned(transposed(work.turns["pelvis"]), unit(foot))[:, 2]) for foot in feet]
     if not ahead or max(ahead) > -0.3:

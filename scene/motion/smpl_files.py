@@ -1,16 +1,16 @@
 """Motions of the SMPL family from arrays in any file: AMASS, AIST++, GLAMR, smplx, ROMP, or one array.
 
-An `ArrayLayout`, which is data, says how a program names its arrays. Joints that a layout does not have are at rest;
-other keys are ignored. The person with the most frames is read, and a note says so when there are several.
+An `ArrayLayout`, which is data, states how a program names its arrays. Joints that a layout does not have are at rest;
+other keys are ignored. Of several persons, the one with the most frames is read, and a note says so.
 
-An array alone has no frame rate. Where neighbouring frames are similar, 30 a second are assumed. Where they differ by
+An array alone has no frame rate. If neighbouring frames are similar, 30 frames a second are assumed. If they differ by
 more than POSE_SET_STEP_RAD, they are separate poses, one a second. ROMP saves a dict for each frame, with a row for
-each person in it; the number in a frame's name is its time, and coordinates are the camera's, y down.
+each person in it. The number in a frame's name is its time. Coordinates are those of the camera, with Y down.
 
 Sources: AMASS (https://amass.is.tue.mpg.de); `smplx` (https://github.com/vchoutas/smplx, arguments of `forward`);
 AIST++ (https://github.com/google/aistplusplus_api: 60 frames a second, Y up, `smpl_trans` in units in which the body is
-`smpl_scaling` times as large); GLAMR (https://github.com/NVlabs/GLAMR: `root_trans_world` is the pelvis's place, Z up);
-ROMP (https://github.com/Arthur151/ROMP, `simple_romp`).
+`smpl_scaling` times as large); GLAMR (https://github.com/NVlabs/GLAMR: `root_trans_world` is the pelvis's position, Z
+up); ROMP (https://github.com/Arthur151/ROMP, `simple_romp`).
 """
 
 from __future__ import annotations
@@ -34,37 +34,39 @@ from trilane.scene.motion.stored import FoundTable, contents, tables_in
 from trilane.scene.recordings import Detected
 from trilane.scene.rotations import matrix_from_rotvec, rotvec_from_matrix
 
-#: Stands for a joint where turns belong to SMPL's two hands.
+#: Index for SMPL's two hand joints, which the SMPL-X body does not have.
 NO_JOINT = -1
-#: By number of columns: the joints, in their order, and the layout that has them.
+#: For each number of columns: indices of the joints in their order, and name of the layout that has them.
 Widths = Mapping[int, tuple[tuple[int, ...], str]]
 BODY = tuple(range(22))
 SMPL_HANDS = (NO_JOINT, NO_JOINT)
 FINGERS = tuple(range(25, JOINTS))
-#: Widths of whole poses, from the pelvis on.
+#: Numbers of columns of whole poses, pelvis first.
 WHOLE: Widths = {
     66: (BODY, "SMPL body"),
     72: ((*BODY, *SMPL_HANDS), "SMPL"),
     156: ((*BODY, *FINGERS), "SMPL-H"),
     165: (tuple(range(JOINTS)), "SMPL-X"),
 }
-#: Widths of parts of poses that have arrays of their own.
+#: Numbers of columns of parts of poses, which have arrays of their own.
 PELVIS: Widths = {3: ((0,), "")}
 BELOW_PELVIS: Widths = {63: (BODY[1:], "SMPL-X body"), 69: ((*BODY[1:], *SMPL_HANDS), "SMPL")}
 BOTH_HANDS: Widths = {90: (FINGERS, "")}
 
 
 def from_joint(joint: str, count: int) -> Widths:
-    """Return the widths of `count` joints from `joint` on."""
+    """Return the Widths of an array of `count` joints, in SMPL-X order, whose first joint is `joint`."""
     first = JOINT_INDEX[joint]
     return {3 * count: (tuple(range(first, first + count)), "")}
 
 
 @dataclass(frozen=True)
 class JointTurns:
-    """The turns in an array.
+    """The rotations in an array.
 
-    `turns` (T, 55, 3): axis-angle. `columns`: number of the array's columns. `whose`: layout that they belong to.
+    `turns` (T, 55, 3): axis-angle.
+    `columns`: number of columns of the array.
+    `whose`: name of the layout, "" for a part of a pose.
     `notes`: notes for people.
     """
 
@@ -75,9 +77,11 @@ class JointTurns:
 
 
 def turns_in(where: str, array: NDArray[Any], widths: Widths) -> JointTurns:
-    """Return the turns of an `array` (T, W) or (T, W / 3, 3), whose W is one of `widths`; other joints are at rest.
+    """Return the rotations in `array`, (T, W) or (T, W / 3, 3); joints that it does not have are at rest.
 
-    `where`: name of the array, for messages. Raises BadInputError for any other shape, and for anything but numbers.
+    `where`: name of the array, for messages.
+    `widths`: allowed numbers of columns W.
+    Raises BadInputError for any other shape, and for anything but numbers.
     """
     flat = array.reshape(len(array), -1) if array.ndim == 3 and array.shape[2] == 3 and len(array) else array
     if flat.ndim != 2 or flat.shape[1] not in widths or not len(flat):
@@ -93,16 +97,16 @@ def turns_in(where: str, array: NDArray[Any], widths: Widths) -> JointTurns:
 
 
 def shapes(widths: Widths) -> str:
-    """Return the shapes as text: `(T, 66), (T, 72) or (T, 156)`."""
+    """Return the allowed shapes as text: `(T, 66), (T, 72) or (T, 156)`."""
     *others, last = [f"(T, {width})" for width in widths]
     return f"{', '.join(others)} or {last}" if others else last
 
 
 @dataclass(frozen=True)
 class PoseArray:
-    """An array of axis-angle turns.
+    """An array of axis-angle rotations in a layout.
 
-    `needed`: whether the layout requires it.
+    `key`: name of the array. `widths`: allowed numbers of columns. `needed`: whether the layout requires the array.
     """
 
     key: str
@@ -112,12 +116,17 @@ class PoseArray:
 
 @dataclass(frozen=True)
 class ArrayLayout:
-    """The way in which a program names its arrays.
+    """The names that a program gives to its arrays. A key is "" if the program has no such array.
 
-    `place`: key of the pelvis's places. With `rest_pelvis` (3,) it is the key of shifts of the whole body, whose pelvis
-    is there at rest. `scale`: key of the divisor of places. `mask`: key of the frames that are measured. `rate_hz`:
-    rate that is assumed, for the reason `rate_why`, without any key of RATE_KEYS; None when one is required. `up`,
-    `ups`: as in RawMotion.
+    `name`: name of the layout, for people.
+    `arrays`: arrays of rotations.
+    `place`: key of positions of the pelvis; with `rest_pelvis`, key of translations of the body.
+    `betas`: key of the shape coefficients.
+    `rate_hz`: rate if a file has no key of RATE_KEYS, for the reason `rate_why`; None if a file must have such a key.
+    `up`, `ups`: as in RawMotion.
+    `rest_pelvis` (3,): position of the pelvis at rest, metres, to which translations are added.
+    `scale`: key of a number by which positions are divided.
+    `mask`: key of an array that says which frames were measured.
     """
 
     name: str
@@ -134,12 +143,12 @@ class ArrayLayout:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Keys without which a dict has another layout."""
+        """Keys that a dict must have to have this layout."""
         return tuple(array.key for array in self.arrays if array.needed)
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """All keys that are read."""
+        """All keys of a file that are read in this layout."""
         own = (self.place, self.betas, self.scale, self.mask, *RATE_KEYS)
         return (*(array.key for array in self.arrays), *(key for key in own if key))
 
@@ -147,7 +156,7 @@ class ArrayLayout:
 RATE_KEYS = ("mocap_framerate", "mocap_frame_rate", "fps", "frame_rate")
 _VIDEO = "no rate in the file, 30 frames/s assumed"
 
-#: The layout of a dict is the first one whose needed keys it has.
+#: A dict has the first layout whose needed keys it has.
 LAYOUTS = (
     ArrayLayout(
         "AMASS", (PoseArray("poses", WHOLE),), "trans", "betas", None, "", "z", REST_PELVIS,
@@ -189,7 +198,7 @@ EXPECTED = "; or ".join(f"{' and '.join(f'`{key}`' for key in layout.needs)} ({l
 ASSUMED_RATE_HZ = 30.0
 POSE_SET_STEP_RAD = 0.7
 _AS_VECTORS = "turn them into axis-angle vectors, such as with scipy.spatial.transform.Rotation.as_rotvec"
-#: How an array becomes usable, by the shape of a row that other programs save.
+#: How to convert an array of another kind, by the shape of one frame.
 OTHERS: dict[tuple[int, ...], str] = {
     (263,): "these are HumanML3D's features: make places of joints of them with its recover_from_ric and save those",
     (322,): "these are rows of Motion-X: its columns 0 to 155 are `poses`, 309 to 311 `trans` of an .npz",
@@ -203,9 +212,10 @@ OTHERS: dict[tuple[int, ...], str] = {
 
 
 def motion_of_array(where: str, source: str, array: NDArray[Any]) -> RawMotion:
-    """Return the motion of an `array` (T, W) or (T, W / 3, 3), whose W is a key of WHOLE.
+    """Return the motion of `array`, (T, W) or (T, W / 3, 3), where W is a key of WHOLE.
 
-    `where`: name of the file. `source`: ending of the file, for people. Raises BadInputError for anything else.
+    `where`: path of the file, for messages. `source`: suffix of the file, for people. Raises BadInputError for anything
+    else.
     """
     if array.shape[1:] in OTHERS:
         raise BadInputError(where, f"shape {array.shape}", f"{shapes(WHOLE)}, axis-angle", OTHERS[array.shape[1:]])
@@ -230,7 +240,10 @@ def motion_of_array(where: str, source: str, array: NDArray[Any]) -> RawMotion:
 
 
 def median_step_rad(poses: NDArray[np.float64]) -> float:
-    """Return the median over all frames of the largest turn among the 22 body joints; 0 for one frame."""
+    """Return the median, over frames, of the largest rotation of any body joint since the frame before, radians.
+
+    `poses` (T, 55, 3): axis-angle; at most the first 512 readable frames count. The result is 0 for one frame.
+    """
     readable = poses[np.isfinite(poses).all(axis=(1, 2)) & (np.abs(poses) < 100).all(axis=(1, 2))]
     if len(readable) < 2:
         return 0.0
@@ -250,9 +263,9 @@ _NUMBER = re.compile(r"(\d+)(?:\.[A-Za-z]+)?$")
 
 
 def motion_of_frames(found: list[FoundTable], source: str) -> RawMotion:
-    """Return the motion of one person over the frames `found`, which all have ROMP_POSES.
+    """Return the motion of one person over the frames `found`, dicts of ROMP that all have ROMP_POSES.
 
-    `source`: ending of the file, for people. Raises BadInputError when a frame's arrays are no arrays, or do not fit.
+    `source`: suffix of the file, for people. Raises BadInputError when an array of a frame is unusable.
     """
     rows, who = _rows_of_person(found)
     numbers, how = _frame_numbers(found)
@@ -284,7 +297,10 @@ def motion_of_frames(found: list[FoundTable], source: str) -> RawMotion:
 
 
 def _frame_numbers(found: list[FoundTable]) -> tuple[NDArray[np.int64], str]:
-    """Return the number of each frame, by its name where all names end in different numbers, and a note."""
+    """Return the number of each frame, and a note on its source.
+
+    The numbers are those in the frames' names, if all names end in different numbers; otherwise the frames' indices.
+    """
     matches = [_NUMBER.search(frame.name) for frame in found]
     named = [int(match[1][-9:]) for match in matches if match is not None]
     if len(named) == len(found) == len(set(named)):
@@ -293,7 +309,7 @@ def _frame_numbers(found: list[FoundTable]) -> tuple[NDArray[np.int64], str]:
 
 
 def _rows_of_person(found: list[FoundTable]) -> tuple[list[int], str]:
-    """Return the row of the person in each frame, -1 where there is none; and a note on who it is."""
+    """Return the row of the chosen person in each frame, -1 if the person is not in it; and a note on the person."""
     counts = [len(_rows_in(frame, ROMP_POSES)) for frame in found]
     if all(frame.has(ROMP_PERSONS) for frame in found):
         persons = [
@@ -321,7 +337,10 @@ def _row_turns(frame: FoundTable, row: int) -> JointTurns:
 
 
 def _row_place(frame: FoundTable, row: int) -> F64 | None:
-    """Return the place (3,) of the body in the camera's coordinates, metres."""
+    """Return the position (3,) of the person in row `row`, metres, in the camera's coordinates.
+
+    The result is None if the frame has no positions. Raises BadInputError when positions and poses do not match.
+    """
     if not frame.has(ROMP_PLACES):
         return None
     places = _rows_in(frame, ROMP_PLACES)
@@ -345,10 +364,12 @@ NO_RATE = "save it again with mocap_frame_rate=..., or its poses alone as .npy, 
 
 
 def motion_of(where: str, source: str, values: Any, there: str = "") -> RawMotion:
-    """Return the motion in `values`, which a file holds.
+    """Return the motion in `values`, the content of a file.
 
-    `where`: name of the file. `source`: ending of the file, for people. `there`: content of the file, for messages,
-    when `values` are not all of it. Raises BadInputError when no layout fits.
+    `where`: path of the file, for messages.
+    `source`: suffix of the file, for people.
+    `there`: content of the file, for messages, when `values` are only a part of it.
+    Raises BadInputError when no layout fits.
     """
     tables = [
         FoundTable(f"{where}[{printable(name)}]" if name else where, name, table) for name, table in tables_in(values)
@@ -395,7 +416,7 @@ def motion_of(where: str, source: str, values: Any, there: str = "") -> RawMotio
 
 
 def _layout_of(tables: list[FoundTable]) -> tuple[ArrayLayout, list[FoundTable]] | None:
-    """Return the first layout that one of `tables` has, and all tables that have it."""
+    """Return the first layout that any of `tables` has, and all tables that have it; None if no table has a layout."""
     for layout in LAYOUTS:
         found = [table for table in tables if all(table.has(key) for key in layout.needs)]
         if found:
@@ -404,7 +425,10 @@ def _layout_of(tables: list[FoundTable]) -> tuple[ArrayLayout, list[FoundTable]]
 
 
 def _turns(layout: ArrayLayout, found: FoundTable) -> JointTurns:
-    """Return the turns of all of the layout's arrays, which add up since each has joints of its own."""
+    """Return the sum of the rotations in all of the layout's arrays, no two of which have a joint in common.
+
+    Raises BadInputError when an array has another number of frames than the first one.
+    """
     parts, notes = [], []
     for array in layout.arrays:
         if not found.has(array.key):
@@ -438,7 +462,7 @@ def _rate(layout: ArrayLayout, found: FoundTable) -> tuple[float, str]:
 
 
 def _places(layout: ArrayLayout, found: FoundTable, frames: int) -> tuple[F64 | None, tuple[str, ...]]:
-    """Return places of the pelvis (T, 3), metres, or None; and notes."""
+    """Return positions (T, 3) of the pelvis, metres, or None if the file has none; and notes."""
     key = layout.place
     if not found.has(key):
         return None, (f"no `{key}`: stays in place",)
@@ -466,7 +490,7 @@ def _scale(layout: ArrayLayout, found: FoundTable) -> float:
 
 
 def _measured(layout: ArrayLayout, found: FoundTable, frames: int) -> NDArray[np.bool_]:
-    """Return which frames (T,) hold the person; all where the layout does not say."""
+    """Return, for each frame (T,), whether it was measured; all True if the file does not say."""
     if not found.has(layout.mask):
         return np.ones(frames, dtype=bool)
     mask = found.array(layout.mask)
@@ -476,7 +500,7 @@ def _measured(layout: ArrayLayout, found: FoundTable, frames: int) -> NDArray[np
 
 
 def _betas(layout: ArrayLayout, found: FoundTable) -> F64 | None:
-    """Return the betas of the whole motion; the mean where each frame has its own."""
+    """Return the shape coefficients (n,), averaged if each frame has its own; None if the file has none."""
     if not found.has(layout.betas):
         return None
     where = f"{found.where}[{layout.betas}]"

@@ -1,7 +1,7 @@
 """The content of a `.npy`, `.npz` or `.pkl` file as plain values: dicts, lists, numbers, text and arrays.
 
-Rule: sizes are known before memory is taken; nothing in a file is executed (`pickled.py`); only requested arrays of an
-archive are read. Nesting may be endless. Therefore a search only goes a few levels deep.
+Rule: sizes are checked before memory is allocated. Nothing in a file is executed (`pickled.py`). Only requested arrays
+of an archive are read. Values may contain themselves, so a search goes only a few levels deep.
 """
 
 from __future__ import annotations
@@ -36,15 +36,18 @@ MOST_NAMED = 12
 
 
 def npy_values(path: Path, expected: str) -> Any:
-    """Return the array of a `.npy` file, or the object that it holds. Raises BadInputError."""
+    """Return the array of a `.npy` file, or the object that it holds. Raises BadInputError.
+
+    `expected`: expected content in words, for messages.
+    """
     pickled = npy_pickle(path, MAX_BYTES, expected)
     return read_npy(path, expected) if pickled is None else _values(path, pickled)
 
 
 def npz_values(path: Path, keys: Collection[str], expected: str) -> dict[str, Any]:
-    """Return the arrays of an `.npz` file that `keys` names, and everything in it that is an object.
+    """Return the arrays of an `.npz` file whose names are in `keys`, and every stored object, by name.
 
-    Raises BadInputError.
+    `expected`: expected content in words, for messages. Raises BadInputError.
     """
     names = npz_names(path, expected)
     pickles = npz_pickles(path, names, MAX_BYTES, expected)
@@ -53,7 +56,10 @@ def npz_values(path: Path, keys: Collection[str], expected: str) -> dict[str, An
 
 
 def pickle_values(path: Path, expected: str) -> Any:
-    """Return the content of a pickle. Raises BadInputError."""
+    """Return the content of a pickle as plain values. Raises BadInputError.
+
+    `expected`: expected content in words, for messages.
+    """
     data = read_bytes(path, MAX_BYTES, expected)
     refuse_other(path, expected, PICKLE)
     return _values(path, data)
@@ -67,16 +73,19 @@ def _values(where: Path | str, data: bytes) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """Return `value`, or the one object in an array of one, as NumPy stores an object."""
+    """Return the content of `value` if it is a StoredArray, otherwise `value` itself.
+
+    NumPy stores a single object as an array of one object; the result is then this object.
+    """
     if isinstance(value, StoredArray) and isinstance(value.values, list) and len(value.values) == 1:
         return value.values[0]
     return value.values if isinstance(value, StoredArray) else value
 
 
 def tables_in(value: Any) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the dicts in `value`, from the outermost inwards, each once.
+    """Yield (path, dict) for each dict in `value`, from the outermost inwards, each once.
 
-    Each comes with the names on the way to it, joined by `.`.
+    The path consists of the keys and list indices that lead to the dict, joined by `.`.
     """
     seen: set[int] = set()
     level = [("", plain(value))]
@@ -93,7 +102,7 @@ def tables_in(value: Any) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def _items(value: dict[str, Any] | list[Any]) -> list[tuple[Any, Any]]:
-    """Return keys, or places in the list, and values of a value that may hold a dict."""
+    """Return (key or list index, item) for those items of `value` that may contain a dict."""
     pairs = value.items() if isinstance(value, dict) else enumerate(value)
     return [(key, below) for key, below in pairs if isinstance(below, dict | list | StoredArray)]
 
@@ -110,7 +119,7 @@ def array_of(value: Any) -> NDArray[Any] | None:
 
 
 def contents(value: Any) -> str:
-    """Say what is in `value`, for messages: names of its outermost dict that has arrays, with their shapes."""
+    """Describe `value` for messages: keys and shapes in its outermost dict that has arrays, or its type."""
     value = plain(value)
     for name, table in tables_in(value):
         arrays = {key: array_of(each) for key, each in table.items()}
@@ -131,7 +140,9 @@ def contents(value: Any) -> str:
 class FoundTable:
     """A dict of a file.
 
-    `where`: its place, for messages. `name`: its own name in the file, empty for the outermost.
+    `where`: file and path of the dict, for messages.
+    `name`: path of the dict in the file, "" for the outermost.
+    `table`: the dict.
     """
 
     where: str
@@ -143,7 +154,7 @@ class FoundTable:
         return bool(key) and self.table.get(key) is not None
 
     def array(self, key: str) -> NDArray[Any]:
-        """Return the array `key`. Raises BadInputError when its value is no array."""
+        """Return the value of `key` as an array. Raises BadInputError when it is not one."""
         value = self.table[key]
         array = array_of(value)
         if array is None:
@@ -153,5 +164,5 @@ class FoundTable:
         return array
 
     def numbers(self, key: str) -> F64:
-        """Return the array `key` as numbers. Raises BadInputError."""
+        """Return the array `key` in float64. Raises BadInputError when it does not hold numbers."""
         return as_numbers(f"{self.where}[{key}]", self.array(key), "numbers")

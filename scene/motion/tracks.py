@@ -1,18 +1,19 @@
-"""Tracks of named joints over time, and turns computed from them: the input of retargeting, from any file.
+"""Tracks of named joints over time, and rotations computed from them: the input of retargeting, from any file.
 
-Names are those of the SMPL-X joints; units and axes are the file's own, the same in all arrays. Places alone tell which
-frames stand, and whether a skeleton is built like the avatar's: the file's zero pose does not matter.
+Names are those of the SMPL-X joints. Unit and axes are the file's own, and equal in all arrays. Positions alone tell in
+which frames the person stands, and whether a skeleton is built like the avatar's. The file's zero pose does not matter.
 
-**Trunk.** Hip line, line of the trunk and shoulder line define frames, alike in the recording and in the avatar's rest
-pose; a joint's turn takes one to the other. Programs put the joints of the trunk at different depths in the body. In a
-skeleton that is not built like the avatar's, the constant pitch of each part therefore comes from the moments in which
-the person stands straight.
+**Trunk.** Hip line, trunk line and shoulder line define coordinate frames, in the same way for the recording and for
+the avatar at rest. A joint's rotation takes the avatar's frame to the recorded one. Programs put the joints of the
+trunk at different depths in the body. Therefore, in a skeleton that is not built like the avatar's, the constant pitch
+of each part comes from the moments at which the person stands straight.
 
-**Limbs.** A bone points where the recorded one points. The twist about it follows the file's own turns, so it never
-flips where a limb is straight. Those turns are right up to one constant angle. At this angle elbows and knees bend, and
-toes and fingers point, as the avatar's do, on average over the recording. No zero pose is needed for it.
+**Limbs.** A bone points where the recorded bone points. Its twist about its length follows the file's own rotations, so
+that it never flips when the limb is straight. These rotations are right except for one constant angle. The angle is
+chosen so that, on average over the recording, elbows and knees bend, and toes and fingers point, as the avatar's do. No
+zero pose is needed for this.
 
-Functions take (T, 3) and (T, 3, 3) arrays and give proper turns where their input is finite.
+Functions take vectors (T, 3) and rotation matrices (T, 3, 3), and return proper rotations for finite input.
 """
 
 from __future__ import annotations
@@ -32,10 +33,11 @@ SIDES = ("left", "right")
 
 @dataclass(frozen=True)
 class Tracks:
-    """Joints over T frames.
+    """Joints over T frames, by SMPL-X name.
 
-    `places`: place (T, 3) of each joint. `turns`: global turn (T, 3, 3) of each joint, where the file has one. `tips`:
-    place (T, 3) where a joint's bone ends, at a joint of any name or an end site.
+    `places`: positions (T, 3) of each joint.
+    `turns`: global rotations (T, 3, 3) of each joint, if the file has them.
+    `tips`: positions (T, 3) at which a joint's bone ends: at a joint of any name, or at an end site.
     """
 
     places: Mapping[str, F64]
@@ -48,24 +50,24 @@ class Tracks:
         return len(self.places["left_hip"])
 
     def has(self, *names: str) -> bool:
-        """Return whether all of these joints have places."""
+        """Return whether all of these joints have positions."""
         return all(name in self.places for name in names)
 
     def between(self, part: str) -> F64:
-        """Return the middle (T, 3) of the left and the right joint of a pair, such as `hip`."""
+        """Return the middle (T, 3) between the left and the right joint of a pair, such as `hip`."""
         return (self.places[f"left_{part}"] + self.places[f"right_{part}"]) / 2
 
     def across(self, part: str) -> F64:
-        """Return the way (T, 3) from the right joint of a pair to the left one."""
+        """Return the vector (T, 3) from the right to the left joint of a pair."""
         return self.places[f"left_{part}"] - self.places[f"right_{part}"]
 
     def bone(self, start: str, end: str) -> F64:
-        """Return the way (T, 3) from one joint to another."""
+        """Return the vector (T, 3) from joint `start` to joint `end`."""
         return self.places[end] - self.places[start]
 
 
 def at_rest(joints: F64) -> Tracks:
-    """Return one frame of Tracks: the rest joints (55, 3) of an avatar."""
+    """Return the rest joints (55, 3) of an avatar as Tracks of one frame."""
     return Tracks({name: joints[None, index] for index, name in enumerate(JOINT_NAMES[: len(joints)])})
 
 
@@ -81,27 +83,30 @@ def angle_between(a: F64, b: F64) -> F64:
     return np.asarray(np.arctan2(np.sqrt((cross * cross).sum(axis=-1)), (a * b).sum(axis=-1)))
 
 
-#: Largest angle between the thighs and the trunk's line, and largest bend of the knees, of a person who stands;
-#: radians.
+#: A person stands if the angles between thighs and trunk line, and the bends of the knees, are below these; radians.
 STRAIGHT_HIP, STANDING_KNEE = np.radians(25.0), np.radians(50.0)
-#: Bend of the knees below which a standing frame counts as straight, and how much more than the best one's it may be.
+#: A standing frame is straight if its knees bend by less than STRAIGHT_KNEE, or by at most LITTLE_MORE than in the
+#: straightest frame; radians.
 STRAIGHT_KNEE, LITTLE_MORE = np.radians(10.0), np.radians(5.0)
-#: Largest lean of a leg that is below its hip, radians; share of such frames in which the foot is flat on the floor.
+#: Largest lean, radians, of a leg that counts as below its hip; share of these frames in which the foot lies flat.
 LEG_BELOW, PLANTED_SHARE = np.radians(35.0), 0.25
-#: Cosine of the angle within which the direction that a body stands in counts as the axis beside it.
+#: A mean up direction counts as an axis of the file if the cosine between them is above this.
 NEAR_AXIS = np.cos(np.radians(30.0))
-#: Pairs of joints of one bone or one part: some of their distances are the same in two skeletons that are built alike.
+#: Pairs of joints with a constant distance. If two skeletons are built alike, their distances are the same.
 RIGID = (
     ("left_hip", "right_hip"), ("pelvis", "left_hip"), ("pelvis", "spine1"), ("left_hip", "spine1"),
     ("spine1", "spine2"), ("spine2", "spine3"), ("spine3", "neck"), ("spine3", "left_collar"), ("neck", "left_collar"),
     ("left_collar", "right_collar"), ("left_collar", "left_shoulder"), ("left_ankle", "left_foot"),
 )  # fmt: skip
-#: Largest difference of such distances, as a share of them and of the legs.
+#: Such distances may differ by SAME_SHARE of the distance plus SAME_LEGS of the length of a leg.
 SAME_SHARE, SAME_LEGS = 0.02, 0.003
 
 
 def standing_frames(tracks: Tracks, trunk: F64) -> NDArray[np.bool_]:
-    """Return which frames (T,) stand straightest: thighs in line with the trunk (T, 3), and straight knees."""
+    """Return, for each frame (T,), whether the person stands as straight as anywhere in the recording.
+
+    Thighs must be in line with the vector `trunk` (T, 3), and the knees straight.
+    """
     bend = np.zeros(tracks.frames)
     stands = np.ones(tracks.frames, dtype=bool)
     for side in SIDES:
@@ -115,9 +120,10 @@ def standing_frames(tracks: Tracks, trunk: F64) -> NDArray[np.bool_]:
 
 
 def upward(tracks: Tracks, trunk: F64, stands: NDArray[np.bool_]) -> F64:
-    """Return up (3,) in the recording: the file's axis nearest to the mean direction of trunk and legs.
+    """Return the up direction (3,) of the recording: the file's axis nearest to the mean direction of trunk and legs.
 
-    The mean is over the frames that stand, or over all when none does. It is up itself where no axis is near.
+    `trunk` (T, 3): vector along the trunk. `stands` (T,): frames over which the mean is taken; all if none stands. If
+    no axis is near the mean direction, that direction itself is up.
     """
     legs = tracks.between("hip") - tracks.between("ankle")
     both = unit(trunk) + unit(legs)
@@ -127,9 +133,9 @@ def upward(tracks: Tracks, trunk: F64, stands: NDArray[np.bool_]) -> F64:
 
 
 def planted_frames(tracks: Tracks, side: str, foot: F64, up: F64) -> NDArray[np.bool_]:
-    """Return the frames (T,) in which a foot most likely lies flat: it hardly moves, and the leg is below the hip.
+    """Return, for each frame (T,), whether a foot most likely lies flat: it hardly moves, and the leg is below the hip.
 
-    `foot` (T, 3): way from the ankle to the toes. `up` (3,): direction that is up in the recording.
+    `foot` (T, 3): vector from the ankle to the toes. `up` (3,): up direction of the recording.
     """
     below = angle_between(tracks.bone(f"{side}_ankle", f"{side}_hip"), up) < LEG_BELOW
     if tracks.frames == 1 or not below.any():
@@ -140,7 +146,7 @@ def planted_frames(tracks: Tracks, side: str, foot: F64, up: F64) -> NDArray[np.
 
 
 def leg_length(tracks: Tracks) -> float:
-    """Return the mean length of both legs, hip to knee to ankle: the median over all frames."""
+    """Return the length of a leg from hip over knee to ankle: the mean of both legs, and the median over all frames."""
     bones = [
         np.linalg.norm(tracks.bone(f"{side}_{start}", f"{side}_{end}"), axis=-1)
         for side in SIDES
@@ -150,7 +156,7 @@ def leg_length(tracks: Tracks) -> float:
 
 
 def built_alike(tracks: Tracks, rest: Tracks) -> bool:
-    """Return whether `tracks` and `rest` have the same distances between joints, relative to their legs."""
+    """Return whether `tracks` and `rest` have equal distances between joints, relative to the length of their legs."""
     scale = leg_length(tracks) / leg_length(rest)
     pairs = [pair for pair in RIGID if tracks.has(*pair)]
     for pair in pairs:
@@ -161,30 +167,32 @@ def built_alike(tracks: Tracks, rest: Tracks) -> bool:
     return ("spine1", "spine2") in pairs or ("spine3", "neck") in pairs
 
 
-#: Share of a direction at right angles to another one below which it is too short to tell a turn.
+#: A unit vector's part perpendicular to another vector is too short to define a direction if its length is below this.
 TOO_SHORT = 1e-6
 
 
 def transposed(turns: F64) -> F64:
-    """Return the inverse of each turn (T, 3, 3)."""
+    """Return the inverse of each rotation (T, 3, 3)."""
     return np.swapaxes(turns, -1, -2)
 
 
 def turned(turns: F64, vectors: F64) -> F64:
-    """Return vectors (T, 3) or (3,) under turns (T, 3, 3) or (3, 3)."""
+    """Return `vectors` (T, 3) or (3,), rotated by `turns` (T, 3, 3) or (3, 3)."""
     return np.asarray((turns @ vectors[..., None])[..., 0])
 
 
 def beside(vectors: F64, axis: F64) -> F64:
-    """Return the part of vectors (T, 3) that is perpendicular to unit vectors `axis` (T, 3)."""
+    """Return the part of `vectors` (T, 3) that is perpendicular to the unit vectors `axis` (T, 3)."""
     return np.asarray(vectors - (vectors * axis).sum(axis=-1, keepdims=True) * axis)
 
 
 def frames_along(exact: F64, other: F64, first: str) -> F64:
-    """Return frames (T, 3, 3) with left, up and forward as columns.
+    """Return coordinate frames (T, 3, 3) with the directions left, up and forward as columns.
 
-    `first`: `left` when `exact` (T, 3) is the left and `other` (T, 3) is towards up; `up` when it is the other way
-    round. Where both are along one line, any perpendicular direction takes the place of `other`.
+    `first`: `left` or `up`, the direction that `exact` is.
+    `exact` (T, 3): this direction, kept exactly.
+    `other` (T, 3): the second of left and up, approximately. If `exact` and `other` are parallel, any perpendicular
+    direction replaces `other`.
     """
     a = unit(exact)
     b = beside(unit(other), a)
@@ -195,9 +203,9 @@ def frames_along(exact: F64, other: F64, first: str) -> F64:
 
 
 def least_turns(source: F64, target: F64) -> F64:
-    """Return the turn (T, 3, 3) of the least angle from each direction `source` (T, 3) to `target` (T, 3).
+    """Return the rotations (T, 3, 3) of the least angle from directions `source` (T, 3) to directions `target` (T, 3).
 
-    As a quaternion it is (1 + cos, cross product), at unit length. Between opposite directions the axis is any
+    The quaternion of each is (1 + cos, cross product), normalised. Between opposite directions, the axis is any
     perpendicular one.
     """
     a, b = unit(source), unit(target)
@@ -211,7 +219,7 @@ def least_turns(source: F64, target: F64) -> F64:
 
 
 def mean_turn(turns: F64) -> F64:
-    """Return the rotation (3, 3) nearest to the mean of turns (T, 3, 3), by least squares of their entries.
+    """Return the rotation (3, 3) nearest to the mean of `turns` (T, 3, 3), by least squares of the entries.
 
     Moakher, "Means and averaging in the group of rotations", SIAM J. Matrix Analysis 24(1), 2002.
     """
@@ -220,23 +228,27 @@ def mean_turn(turns: F64) -> F64:
 
 
 def level_with(turns: F64, base: F64, where: NDArray[np.bool_]) -> F64:
-    """Return `turns` (T, 3, 3) after one constant turn, so that on average over `where` (T,) they equal `base`."""
+    """Return `turns` (T, 3, 3) after one constant rotation that makes their mean equal to that of `base` (T, 3, 3).
+
+    `where` (T,): frames over which the means are taken.
+    """
     return np.asarray(turns @ mean_turn(transposed(base[where]) @ turns[where]).T)
 
 
-#: Sine of the bend below which a limb counts as straight, so that a knee bent backwards a little turns nothing round.
+#: A limb is straight if the sine of its bend is below this. A knee that is bent backwards a little then does not flip.
 LEAST_BEND = np.sin(np.radians(15.0))
 
-#: Evidence for a twist: a direction in the avatar at rest (3,), and where it points in the recording (T, 3). Their
-#: length beside the bone is their weight.
+#: Evidence for a twist: a direction (3,) of the avatar at rest, and its recorded directions (T, 3). The lengths of
+#: their parts perpendicular to the bone are weights.
 Evidence = tuple[F64, F64]
 
 
 def limb_turns(bone: F64, recorded: F64, carrier: F64, evidence: Sequence[Evidence]) -> F64:
-    """Return global turns (T, 3, 3) that lay the avatar's rest bone (3,) on the recorded ones (T, 3).
+    """Return global rotations (T, 3, 3) that take the avatar's rest `bone` (3,) to the recorded directions (T, 3).
 
-    `carrier` (T, 3, 3): turns that the bone takes part in; only their change over time counts. `evidence`: evidence for
-    the twist; without any, the twist is the least one from the rest pose to the carrier.
+    `carrier` (T, 3, 3): rotations whose change over time the twist follows.
+    `evidence`: evidence for the constant part of the twist; without any, this part is the least from the rest pose to
+    the carrier.
     """
     target = unit(recorded)
     within = unit(turned(transposed(carrier), target).mean(axis=0))
@@ -246,7 +258,10 @@ def limb_turns(bone: F64, recorded: F64, carrier: F64, evidence: Sequence[Eviden
 
 
 def _twist(held: F64, axis: F64, laid: F64, evidence: Sequence[Evidence]) -> F64:
-    """Return the turn (3, 3) about `axis` (3,) that brings all of the evidence closest to the recorded directions."""
+    """Return the rotation (3, 3) about `axis` (3,) that brings the evidence closest to its recorded directions.
+
+    `held` (T, 3, 3): rotations before the twist. `laid` (3, 3): rotation that takes the rest bone to `axis`.
+    """
     cosine = sine = 0.0
     inside = transposed(held)
     for ours, theirs in evidence:
@@ -262,7 +277,7 @@ def _twist(held: F64, axis: F64, laid: F64, evidence: Sequence[Evidence]) -> F64
 def hinge(upper: F64, lower: F64) -> F64:
     """Return axes (T, 3) about which a limb bends from `upper` to `lower` (T, 3).
 
-    Their length grows with the bend, up to 1.
+    The length of each is the sine of the bend less LEAST_BEND, or 0 for a straight limb.
     """
     axes = np.cross(unit(upper), unit(lower))
     sines = np.linalg.norm(axes, axis=-1, keepdims=True)
@@ -270,30 +285,32 @@ def hinge(upper: F64, lower: F64) -> F64:
 
 
 def swung(parent: F64, bone: F64, recorded: F64) -> F64:
-    """Return turns (T, 3, 3) that lay `bone` (3,) on `recorded` (T, 3) with the least turn from `parent` (T, 3, 3)."""
+    """Return the rotations (T, 3, 3) nearest to `parent` (T, 3, 3) that take `bone` (3,) to `recorded` (T, 3)."""
     return least_turns(turned(parent, bone), recorded) @ parent
 
 
 SPINE = ("spine1", "spine2", "spine3")
-#: Upper end of the trunk's line: the first of these that the recording has.
+#: Joints that may be the upper end of the trunk line: the first of these that the recording has.
 TOPS = ("neck", "shoulder", "head", "spine3")
-#: Least distance of the collar joints, as a share of the shoulders', at which they count as apart from the spine.
+#: Least distance between the collar joints, as a share of that between the shoulders; closer ones count as in the
+#: spine.
 LEAST_COLLARS = 0.1
-#: Share of the turn from the hips' left to the shoulders' left that each part of the spine has made.
+#: Share of the rotation from hip line to shoulder line that each part of the trunk has made.
 TWIST = {"pelvis": 0.0, "spine1": 1 / 3, "spine2": 2 / 3, "spine3": 1.0}
 
 
 @dataclass(frozen=True)
 class TrunkLine:
-    """The line of the trunk.
+    """The line of the trunk, from the hips to its upper end.
 
-    `top`: a name of TOPS, or `knee` for a recording without trunk, which is seen from the hips.
+    `top`: a name of TOPS, or `knee` for a recording without trunk: the line then continues from the knees through the
+    hips.
     """
 
     top: str
 
     def end(self, tracks: Tracks) -> F64:
-        """Return its upper end (T, 3)."""
+        """Return the upper end of the line, positions (T, 3)."""
         if self.top == "shoulder":
             return tracks.between("shoulder")
         if self.top == "knee":
@@ -301,27 +318,30 @@ class TrunkLine:
         return tracks.places[self.top]
 
     def along(self, tracks: Tracks) -> F64:
-        """Return the way (T, 3) from the pelvis to its upper end."""
+        """Return the vector (T, 3) from the pelvis to the upper end."""
         return self.end(tracks) - tracks.places["pelvis"]
 
     def points(self, tracks: Tracks) -> F64:
-        """Return the middle of the hips, the recorded joints of the spine, and the upper end: (n, T, 3)."""
+        """Return the middle of the hips, the recorded joints of the spine, and the upper end: positions (n, T, 3)."""
         inner = [tracks.places[name] for name in self.inner if name in tracks.places]
         return np.stack([tracks.between("hip"), *inner, self.end(tracks)])
 
     @property
     def inner(self) -> tuple[str, ...]:
-        """Names of the joints of the spine that may lie between its ends."""
+        """Names of the joints of the spine that may be between the ends of the line."""
         return {"knee": (), "spine3": SPINE[:2]}.get(self.top, SPINE)
 
     def shares(self, rest: Tracks) -> F64:
-        """Return how far along the line (3,) the spine's joints are in an avatar; 1 for those at its end and above."""
+        """Return how far along the line (3,) the avatar's three joints of the spine are, 0 to 1.
+
+        Joints at the upper end and above get 1.
+        """
         inner = line_shares(self.points(rest))[1:-1, 0]
         return np.append(inner, np.ones(len(SPINE) - len(inner)))
 
 
 def trunk_line(tracks: Tracks) -> TrunkLine:
-    """Return the line of the trunk that the joints of `tracks` allow."""
+    """Return the trunk line for the joints that `tracks` has."""
     for top in TOPS:
         names = [f"{side}_{top}" for side in SIDES] if top == "shoulder" else [top]
         if tracks.has(*names):
@@ -330,14 +350,14 @@ def trunk_line(tracks: Tracks) -> TrunkLine:
 
 
 def line_shares(points: F64) -> F64:
-    """Return how far along a line (n, T, 3) each of its points lies: 0 at its beginning, 1 at its end, (n, T)."""
+    """Return how far along a polyline (n, T, 3) each of its points is: (n, T), 0 at its beginning and 1 at its end."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=-1)
     reached = np.concatenate([np.zeros((1, points.shape[1])), np.cumsum(steps, axis=0)])
     return np.asarray(reached / np.where(reached[-1] > 0, reached[-1], 1.0))
 
 
 def points_at(points: F64, shares: F64) -> F64:
-    """Return the points (m, T, 3) of a line (n, T, 3) at constant `shares` (m,) of its length."""
+    """Return the points (m, T, 3) of a polyline (n, T, 3) at constant `shares` (m,) of its length."""
     at = line_shares(points)
     found = np.empty((len(shares), *points.shape[1:]))
     for k, share in enumerate(shares):
@@ -351,9 +371,10 @@ def points_at(points: F64, shares: F64) -> F64:
 
 @dataclass(frozen=True)
 class Trunk:
-    """Frames over time of a trunk, before they are laid on the avatar's.
+    """Coordinate frames of a trunk over time.
 
-    `frames`: frame (T, 3, 3) of each joint, with left, up and forward as columns. `line` (T, 3): line of the trunk.
+    `frames`: frame (T, 3, 3) of each joint, with the directions left, up and forward as columns.
+    `line` (T, 3): vector from the pelvis to the upper end of the trunk.
     """
 
     frames: dict[str, F64]
@@ -361,9 +382,9 @@ class Trunk:
 
 
 def trunk_of(tracks: Tracks, line: TrunkLine, shares: F64, by_collars: bool) -> Trunk:
-    """Return the frames of pelvis and spine, with the joints of the spine at `shares` (3,) of the line.
+    """Return the frames of pelvis and spine, with the joints of the spine at `shares` (3,) of the trunk line.
 
-    `by_collars`: whether the chest turns with its collar joints, where they are apart, or with the shoulders.
+    `by_collars`: whether the chest turns with the collar joints, if these are apart; otherwise with the shoulders.
     """
     low, *inner, top = points_at(line.points(tracks), np.array([0.0, *shares, 1.0]))
     hips = unit(tracks.across("hip"))
@@ -377,7 +398,7 @@ def trunk_of(tracks: Tracks, line: TrunkLine, shares: F64, by_collars: bool) -> 
 
 
 def _across_chest(tracks: Tracks, hips: F64, by_collars: bool) -> F64:
-    """Return the left (T, 3) of the chest: along the collar joints if they are apart, else along the shoulders."""
+    """Return the left direction (T, 3) of the chest: along the collar joints, else the shoulders, else the hips."""
     if not tracks.has("left_shoulder", "right_shoulder"):
         return hips
     shoulders = tracks.across("shoulder")
@@ -387,7 +408,7 @@ def _across_chest(tracks: Tracks, hips: F64, by_collars: bool) -> F64:
 
 
 def collars_apart(tracks: Tracks) -> bool:
-    """Return whether the recording has collar joints that stand beside the spine, not in it."""
+    """Return whether the recording has collar joints that are beside the spine, not in it."""
     if not tracks.has("left_collar", "right_collar", "left_shoulder", "right_shoulder"):
         return False
     widths = [np.median(np.linalg.norm(tracks.across(part), axis=-1)) for part in ("collar", "shoulder")]
@@ -395,16 +416,17 @@ def collars_apart(tracks: Tracks) -> bool:
 
 
 def pitch_in(frames: F64, vectors: F64) -> F64:
-    """Return the angle (T,) of vectors (T, 3) from up to forward, in frames (T, 3, 3); radians."""
+    """Return the angle (T,), radians, of `vectors` (T, 3) from up towards forward, in coordinate frames (T, 3, 3)."""
     local = turned(transposed(frames), vectors)
     return np.asarray(np.arctan2(local[:, 2], local[:, 1]))
 
 
 def turns_of_trunk(recorded: Trunk, rest: Trunk, stands: NDArray[np.bool_], own: bool) -> dict[str, F64]:
-    """Return global turns (T, 3, 3) of pelvis and spine.
+    """Return global rotations (T, 3, 3) of pelvis and spine, by joint name.
 
-    `recorded`, `rest`: trunk of the recording, and of the avatar. `stands` (T,): frames in which the person stands
-    straight, which give the pitch of each part unless `own`. `own`: whether the skeleton is built like the avatar's.
+    `recorded`, `rest`: trunk of the recording, and of the avatar at rest.
+    `stands` (T,): frames in which the person stands straight; they give the constant pitch of each part if not `own`.
+    `own`: whether the recorded skeleton is built like the avatar's.
     """
     turns = {}
     for name, frames in recorded.frames.items():
@@ -417,11 +439,11 @@ def turns_of_trunk(recorded: Trunk, rest: Trunk, stands: NDArray[np.bool_], own:
 
 
 def with_neck_on(line: F64, turns: dict[str, F64], rest: Tracks) -> dict[str, F64]:
-    """Turn the lower two parts of the spine once more, so that the neck lies along `line` (T, 3).
+    """Return `turns` with spine1 and spine2 turned once more, so that the neck is in the direction `line` (T, 3).
 
-    `line`: direction from the pelvis, of any length. The neck is at q + R c: R is the turn to find, c the way from the
-    lowest joint of the spine to the highest, and q the rest of the way. So the neck is at s times the direction of
-    `line`, for the s at which q is |c| from it.
+    `line`: vector from the pelvis, of any length. The neck is at q + R c: R is the rotation to find, c the vector from
+    the lowest joint of the spine to the highest, and q the sum of the other bones. The neck must also be at s times the
+    unit vector of `line`. Therefore s is chosen so that the neck is |c| from q.
     """
     joint = {name: rest.places[name][0] for name in ("pelvis", *SPINE, "neck")}
     along = unit(line)
@@ -437,10 +459,15 @@ def with_neck_on(line: F64, turns: dict[str, F64], rest: Tracks) -> dict[str, F6
 
 
 def turns_of_collars(tracks: Tracks, rest: Tracks, chest: F64, stands: NDArray[np.bool_], own: bool) -> dict[str, F64]:
-    """Return global turns (T, 3, 3) of both collar joints from where they point in the chest, whose turns are `chest`.
+    """Return global rotations (T, 3, 3) of both collar joints, by joint name.
 
-    With `own` false they point, on average over the frames that stand, as the avatar's do at rest, the same on both
-    sides. When none stands, they stay as at rest in the chest.
+    `chest` (T, 3, 3): global rotations of the chest.
+    `stands` (T,): frames in which the person stands straight.
+    `own`: whether the recorded skeleton is built like the avatar's.
+
+    If not `own`, both collars are corrected by one constant, symmetric rotation. After it, they point on average, over
+    frames that stand, as the avatar's collars at rest. If no frame stands, the collars keep their rest pose in the
+    chest.
     """
     still = {f"{side}_collar": chest for side in SIDES}
     if not tracks.has(*still, "left_shoulder", "right_shoulder") or not (own or stands.any()):
@@ -458,7 +485,11 @@ def turns_of_collars(tracks: Tracks, rest: Tracks, chest: F64, stands: NDArray[n
 
 
 def with_shoulders_on(across: F64, turns: dict[str, F64], rest: Tracks) -> dict[str, F64]:
-    """Turn chest and collars once more by the least turn that lays the shoulders along `across` (T, 3)."""
+    """Return `turns` with chest and collars turned once more, by the least angle, so that the shoulders fit.
+
+    `across` (T, 3): vector from the right to the left recorded shoulder, along which the avatar's shoulder line is
+    laid.
+    """
     ends = []
     for side in SIDES:
         chest, collar, shoulder = (rest.places[name][0] for name in ("spine3", f"{side}_collar", f"{side}_shoulder"))
@@ -468,7 +499,7 @@ def with_shoulders_on(across: F64, turns: dict[str, F64], rest: Tracks) -> dict[
 
 
 def turns_of_neck(tracks: Tracks, rest: Tracks, chest: F64) -> F64:
-    """Return global turns (T, 3, 3) of the neck: it points to the head as recorded; its left is the chest's."""
+    """Return global rotations (T, 3, 3) of the neck: it points to the recorded head, and its left is the chest's."""
     if not tracks.has("neck", "head"):
         return chest
     left = chest[:, :, 0]

@@ -339,8 +339,17 @@ def test_elapsed_times_by_hand() -> None:
     assert step == 1.0
     times, step = elapsed(np.array([4.0, np.nan]))
     assert (times[0], step) == (0.0, 0.0)
+    times, step = elapsed(np.array([np.nan, 4.0]))
+    assert (times[1], step) == (0.0, 0.0)
     times, step = elapsed(np.array([4.0, 6.0]))
     assert (times.tolist(), step) == ([0.0, 2.0], 2.0)
+
+
+def test_a_time_that_is_no_number_leaves_out_its_own_pose_alone(tmp_path: Path) -> None:
+    (tmp_path / "two.txt").write_text("nan 0 0 0 0 0 0 1\n5 1 2 3 0 0 0 1\n")
+    camera = load(tmp_path / "two.txt", format="tum")
+    assert len(camera.times_s) == 1
+    assert "1 samples not finite (first: line 1), interpolated across" in camera.notes
 
 
 def test_the_format_is_told_by_columns_or_given(tmp_path: Path) -> None:
